@@ -1,0 +1,40 @@
+//! Every numeric threshold of the renderer, once, as the f32 value that all three implementations
+//! use (the f64 reference widens it, so that no comparison lands on another side there).
+
+/// Side of a square tile in pixels. 16 keeps a tile's state inside the first-level cache.
+pub const TILE: u32 = 16;
+
+/// Pairs fainter than this contribute nothing: below it an 8-bit picture cannot change.
+pub const ALPHA_MIN: f32 = 1.0 / 255.0;
+
+/// No splat is fully opaque, so that `1 - alpha` stays invertible and gradients pass through it.
+pub const ALPHA_MAX: f32 = 0.99;
+
+/// A pixel stops before its transmittance would fall under this; what lies behind is invisible.
+pub const TRANSMITTANCE_MIN: f32 = 1e-4;
+
+/// Default variance in px^2 added to both axes of every 2D covariance (EWA low-pass; gsplat's
+/// `eps2d`), so that no splat falls between pixel centres.
+pub const BLUR: f32 = 0.3;
+
+/// Default near plane in world units, as gsplat's.
+pub const NEAR: f32 = 0.01;
+
+/// Default far plane in world units, as gsplat's.
+pub const FAR: f32 = 1e10;
+
+/// The Jacobian's x/z and y/z are limited to this part of `tan(fov / 2)` beyond each image edge:
+/// the affine approximation has no meaning far outside the picture (EWA splatting, 3DGS).
+pub const JACOBIAN_MARGIN: f32 = 0.3;
+
+/// Quaternions with a smaller squared norm name no rotation; their splats are culled.
+pub const QUAT_NORM2_MIN: f32 = 1e-12;
+
+/// Largest deviation of `R R^T` from the identity that still counts as a rigid viewmat.
+pub const RIGID_TOLERANCE: f64 = 1e-3;
+
+/// Highest degree of spherical harmonics that is stored or evaluated.
+pub const SH_DEGREE_MAX: u32 = 4;
+
+/// Coefficients per channel at [`SH_DEGREE_MAX`].
+pub const SH_COEFFS_MAX: usize = 25;

@@ -1,0 +1,40 @@
+//! The one error type: each variant is one sentence that names the culprit and the mend.
+
+/// What can go wrong, in one sentence each.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// An argument has a wrong shape, size or value.
+    #[error("{argument}: {reason}")]
+    Argument {
+        /// Name of the argument as the caller wrote it.
+        argument: String,
+        /// What is wrong with it and what would be right.
+        reason: String,
+    },
+    /// No device answers for the backend that was asked for.
+    #[error("{0}")]
+    Device(String),
+    /// A file cannot be read or written.
+    #[error("{path}: {reason}")]
+    File {
+        /// The file.
+        path: String,
+        /// What is wrong with it and what would mend it.
+        reason: String,
+    },
+}
+
+/// Result with this crate's [`Error`].
+pub type Result<T> = std::result::Result<T, Error>;
+
+impl Error {
+    /// An [`Error::Argument`] in one call.
+    pub fn argument(argument: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self::Argument { argument: argument.into(), reason: reason.into() }
+    }
+
+    /// An [`Error::File`] in one call.
+    pub fn file(path: impl AsRef<std::path::Path>, reason: impl Into<String>) -> Self {
+        Self::File { path: path.as_ref().display().to_string(), reason: reason.into() }
+    }
+}

@@ -1,0 +1,146 @@
+//! project: splats and camera to 2D splats.
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+
+use crate::camera::Camera;
+use crate::constants::{ALPHA_MIN, QUAT_NORM2_MIN};
+use crate::sh;
+use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
+
+/// What both directions of the stage need of one splat.
+pub(super) struct Geometry {
+    /// Camera-space centre.
+    pub t: DVec3,
+    /// Splat axes in the world.
+    pub axes: DMat3,
+    /// Norm of the quaternion as given.
+    pub quat_norm: f64,
+    /// Normalised quaternion (w, x, y, z).
+    pub quat: [f64; 4],
+    /// Standard deviations along the axes.
+    pub scales: DVec3,
+    /// x/z and y/z within the Jacobian's limits.
+    pub xz: f64,
+    pub yz: f64,
+    /// Whether x/z, y/z were inside the limits.
+    pub inside: [bool; 2],
+    /// Rows of J times the camera's rotation.
+    pub a: [DVec3; 2],
+    /// Rows of J R A S, so that the 2D covariance is m m^T + blur.
+    pub m: [DVec3; 2],
+}
+
+pub(super) fn opacity(splats: &SplatParams<'_, f64>, i: usize) -> f64 {
+    let o = splats.opacities[i];
+    if splats.raw { 1.0 / (1.0 + (-o).exp()) } else { o }
+}
+
+/// None if the splat is culled for its own values or its depth.
+pub(super) fn geometry(
+    splats: &SplatParams<'_, f64>,
+    camera: &Camera,
+    options: &ProjectOptions,
+    i: usize,
+) -> Option<Geometry> {
+    let rotation = camera.rotation();
+    let t = rotation * DVec3::from(splats.means[i]) + camera.translation();
+    // Written so that NaN is culled.
+    if !(t.is_finite() && t.z >= f64::from(options.near) && t.z <= f64::from(options.far)) {
+        return None;
+    }
+    let [w, x, y, z] = splats.quats[i];
+    let norm2 = w * w + x * x + y * y + z * z;
+    if !(norm2.is_finite() && norm2 >= f64::from(QUAT_NORM2_MIN)) {
+        return None;
+    }
+    let quat_norm = norm2.sqrt();
+    let quat = [w / quat_norm, x / quat_norm, y / quat_norm, z / quat_norm];
+    let axes = DMat3::from_quat(DQuat::from_xyzw(quat[1], quat[2], quat[3], quat[0]));
+    let given = DVec3::from(splats.scales[i]);
+    let scales = if splats.raw { given.exp() } else { given };
+    if !(scales.is_finite() && scales.min_element() >= 0.0) {
+        return None;
+    }
+    let [x_low, x_high, y_low, y_high] = camera.jacobian_limits();
+    let (xz, yz) = ((t.x / t.z).clamp(x_low, x_high), (t.y / t.z).clamp(y_low, y_high));
+    let inside = [t.x / t.z == xz, t.y / t.z == yz];
+    let rows = rotation.transpose();
+    let a = [
+        rows.x_axis * (camera.fx / t.z) - rows.z_axis * (camera.fx * xz / t.z),
+        rows.y_axis * (camera.fy / t.z) - rows.z_axis * (camera.fy * yz / t.z),
+    ];
+    let m = a.map(|row| axes.transpose() * row * scales);
+    Some(Geometry { t, axes, quat_norm, quat, scales, xz, yz, inside, a, m })
+}
+
+/// Unit view direction in the world and the length it was normalised by.
+pub(super) fn direction(camera: &Camera, t: DVec3) -> (DVec3, f64) {
+    // R^T t is the vector from the camera's centre to the mean, without the cancellation of
+    // subtracting two far-away points.
+    let along = camera.rotation().transpose() * t;
+    (along / along.length(), along.length())
+}
+
+/// SH colour before the cut at zero.
+pub(super) fn sh_color(degree: u32, coeffs: &[[f64; 3]], dir: DVec3) -> DVec3 {
+    let basis = sh::basis(degree, dir.to_array());
+    (0..sh::coeffs(degree)).map(|k| basis[k] * DVec3::from(coeffs[k])).sum::<DVec3>() + 0.5
+}
+
+pub(super) fn project(
+    splats: &SplatParams<'_, f64>,
+    camera: &Camera,
+    options: &ProjectOptions,
+) -> Projected<f64> {
+    let mut out = Projected::culled(splats.len(), camera.width, camera.height);
+    for i in 0..splats.len() {
+        let Some(g) = geometry(splats, camera, options, i) else { continue };
+        let blur = f64::from(options.blur);
+        let (sxx, sxy, syy) = (g.m[0].dot(g.m[0]), g.m[0].dot(g.m[1]), g.m[1].dot(g.m[1]));
+        let (cxx, cyy) = (sxx + blur, syy + blur);
+        // Cauchy-Binet: the determinant as a sum of positive terms.
+        let det = g.m[0].cross(g.m[1]).length_squared() + blur * (sxx + syy) + blur * blur;
+        let p = (cyy / det).sqrt();
+        let factor = [p, -sxy / cyy * p, cyy.sqrt().recip()];
+        let opacity = opacity(splats, i);
+        let reach = 2.0 * (opacity / f64::from(ALPHA_MIN)).ln();
+        if !(reach.is_finite() && reach > 0.0) {
+            continue;
+        }
+        let radii = DVec2::new((reach * cxx).sqrt(), (reach * cyy).sqrt());
+        let center = DVec2::new(
+            camera.fx * g.t.x / g.t.z + camera.cx,
+            camera.fy * g.t.y / g.t.z + camera.cy,
+        );
+        let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
+        // No pixel centre can be reached.
+        if (center + radii).cmplt(DVec2::ZERO).any() || (center - radii).cmpgt(size).any() {
+            continue;
+        }
+        let color = match splats.colors {
+            Colors::Direct(colors) => DVec3::from(colors[i]),
+            Colors::Sh { degree, stride, coeffs } => {
+                let dir = direction(camera, g.t).0;
+                // `f64::max` would turn a poisoned coefficient into a black splat.
+                let color = sh_color(degree, &coeffs[i * stride..], dir);
+                if color.is_nan() { color } else { color.max(DVec3::ZERO) }
+            }
+        };
+        let finite = color.is_finite()
+            && center.is_finite()
+            && radii.is_finite()
+            && det.is_finite()
+            && factor.iter().all(|f| f.is_finite());
+        if !finite {
+            continue;
+        }
+        out.means2d[i] = center.to_array();
+        out.factors[i] = factor;
+        out.covars2d[i] = [cxx, sxy, cyy];
+        out.depths[i] = g.t.z;
+        out.colors[i] = color.to_array();
+        out.opacities[i] = opacity;
+        out.radii[i] = radii.to_array();
+    }
+    out
+}

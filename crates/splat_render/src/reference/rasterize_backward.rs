@@ -1,0 +1,68 @@
+//! rasterize_backward: gradients of the picture to gradients of the 2D splats.
+
+use super::rasterize::{order, pair};
+use crate::constants::TRANSMITTANCE_MIN;
+use crate::stages::{ImageGradients, Projected, ProjectedGradients};
+
+fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+pub(super) fn rasterize_backward(
+    projected: &Projected<f64>,
+    background: [f64; 3],
+    v_image: &ImageGradients<f64>,
+) -> ProjectedGradients<f64> {
+    let (w, h) = (projected.width, projected.height);
+    let ids = order(projected);
+    let mut out = ProjectedGradients::zeros(projected.len());
+    for y in 0..h {
+        for x in 0..w {
+            let pixel = y as usize * w as usize + x as usize;
+            let v_color = v_image.v_color[pixel];
+            let (v_alpha_out, v_depth) = (v_image.v_alpha[pixel], v_image.v_depth[pixel]);
+            // Contributors with the transmittance in front of each.
+            let mut t = 1.0f64;
+            let mut pairs = Vec::new();
+            for &i in &ids {
+                let Some(pair) = pair(projected, i, x, y) else { continue };
+                let next = t * (1.0 - pair.alpha);
+                if next < f64::from(TRANSMITTANCE_MIN) {
+                    break;
+                }
+                pairs.push((i, t, pair));
+                t = next;
+            }
+            for c in 0..3 {
+                out.v_background[c] += t * v_color[c];
+            }
+            // Back to front: what lies behind the current splat, dotted with the gradients.
+            let mut behind = t * (dot(background, v_color) - v_alpha_out);
+            for (i, t, pair) in pairs.into_iter().rev() {
+                let weight = t * pair.alpha;
+                let own = dot(projected.colors[i], v_color) + projected.depths[i] * v_depth;
+                for c in 0..3 {
+                    out.v_colors[i][c] += weight * v_color[c];
+                }
+                out.v_depths[i] += weight * v_depth;
+                let v_alpha = t * own - behind / (1.0 - pair.alpha);
+                behind += weight * own;
+                if pair.capped {
+                    continue;
+                }
+                out.v_opacities[i] += pair.gaussian * v_alpha;
+                // sigma = (u^2 + v^2) / 2 = d^T C^-1 d / 2 with C^-1 = F^T F:
+                // d sigma / d mean = -F^T (u, v); d sigma / d C = -(F^T (u, v)) (F^T (u, v))^T / 2.
+                let v_sigma = -pair.alpha * v_alpha;
+                let [p, q, r] = projected.factors[i];
+                let e = [p * pair.u, q * pair.u + r * pair.v];
+                out.v_means2d[i][0] -= v_sigma * e[0];
+                out.v_means2d[i][1] -= v_sigma * e[1];
+                out.v_covars2d[i][0] -= 0.5 * v_sigma * e[0] * e[0];
+                out.v_covars2d[i][1] -= v_sigma * e[0] * e[1];
+                out.v_covars2d[i][2] -= 0.5 * v_sigma * e[1] * e[1];
+            }
+        }
+    }
+    out
+}
