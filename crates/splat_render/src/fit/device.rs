@@ -2,7 +2,7 @@
 
 use super::params::FitState;
 use crate::camera::Camera;
-use crate::error::Result;
+use crate::error::{Error, Result};
 
 /// One photo to fit to.
 #[derive(Debug, Clone)]
@@ -17,6 +17,54 @@ pub struct Target {
     pub pixels: Vec<u8>,
     /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere.
     pub weights: Option<Vec<f32>>,
+}
+
+impl Target {
+    /// Checks sizes; `index` names the photo in the error.
+    pub fn validate(&self, index: usize) -> Result<()> {
+        let pixels = self.width as usize * self.height as usize;
+        let bad = |reason: String| Err(Error::argument(format!("images[{index}]"), reason));
+        if pixels == 0 {
+            return bad("has no pixels".into());
+        }
+        if !matches!(self.channels, 3 | 4) {
+            return bad(format!("has {} channels; give RGB or RGBA", self.channels));
+        }
+        if self.pixels.len() != pixels * self.channels as usize {
+            return bad("does not hold width x height pixels".into());
+        }
+        if let Some(weights) = &self.weights {
+            if weights.len() != pixels {
+                return bad("its weights do not have the image's size".into());
+            }
+            if !weights.iter().all(|w| w.is_finite() && *w >= 0.0) {
+                return bad("has a weight that is negative or not finite".into());
+            }
+        }
+        Ok(())
+    }
+
+    /// The photo over `background` as three planes in 0..1.
+    pub fn composite(&self, background: [f32; 3], planes: &mut [Vec<f32>; 3]) {
+        let pixels = self.width as usize * self.height as usize;
+        for plane in planes.iter_mut() {
+            plane.resize(pixels, 0.0);
+        }
+        let unit = 1.0 / 255.0;
+        for (c, plane) in planes.iter_mut().enumerate() {
+            let rows = self.pixels.chunks_exact(self.channels as usize);
+            for (out, pixel) in plane.iter_mut().zip(rows) {
+                let value = f32::from(pixel[c]) * unit;
+                *out = match pixel.get(3) {
+                    None => value,
+                    Some(&alpha) => {
+                        let alpha = f32::from(alpha) * unit;
+                        value * alpha + background[c] * (1.0 - alpha)
+                    }
+                };
+            }
+        }
+    }
 }
 
 /// Adam's step sizes per kind of parameter.

@@ -153,4 +153,22 @@ impl FitState {
             stats: DensityStats::zeros(n),
         }
     }
+
+    /// Checks that all arrays belong to the same splats.
+    pub fn validate(&self) -> Result<()> {
+        let n = self.splats.len();
+        for (name, arrays) in
+            [("splats", &self.splats), ("first", &self.first), ("second", &self.second)]
+        {
+            arrays.validate()?;
+            if arrays.len() != n || arrays.sh_degree != self.splats.sh_degree {
+                return Err(Error::argument(name, "does not belong to the same splats"));
+            }
+        }
+        let DensityStats { grad_sum, seen, radius } = &self.stats;
+        if [grad_sum.len(), seen.len(), radius.len()] != [n; 3] {
+            return Err(Error::argument("stats", "do not belong to the same splats"));
+        }
+        Ok(())
+    }
 }
