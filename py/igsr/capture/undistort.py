@@ -43,6 +43,7 @@ class Lens:
         """True where the lens bends nothing."""
         return not self.fisheye and not any(self.radial + self.denominator + self.tangential)
 
+    @np.errstate(all="ignore")  # absurd coefficients overflow; what comes of it is not valid
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the lens puts a ray.
 
@@ -71,21 +72,21 @@ class Lens:
             factor = np.where(tiny, 1.0, angle / np.where(tiny, 1.0, r)) * numerator(angle_squared)
             return x * factor, y * factor, angle_squared < fold
         valid = s < fold
-        with np.errstate(all="ignore"):
-            n, d = numerator(s), denominator(s)
-            factor = n / d
-            factor_slope = (numerator.deriv()(s) * d - n * denominator.deriv()(s)) / (d * d)
-            p1, p2 = self.tangential
-            # Tangential terms can fold earlier than the radial ones: the Jacobian tells.
-            mixed = 2.0 * (x * y * factor_slope + p1 * x + p2 * y)
-            along_x = factor + 2.0 * x * x * factor_slope + 2.0 * p1 * y + 6.0 * p2 * x
-            along_y = factor + 2.0 * y * y * factor_slope + 2.0 * p2 * x + 6.0 * p1 * y
-            valid &= along_x * along_y - mixed * mixed > 0.0
-            return (
-                x * factor + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
-                y * factor + 2.0 * p2 * x * y + p1 * (s + 2.0 * y * y),
-                valid,
-            )
+        n, d = numerator(s), denominator(s)
+        factor = n / d
+        factor_slope = (numerator.deriv()(s) * d - n * denominator.deriv()(s)) / (d * d)
+        p1, p2 = self.tangential
+        # Tangential terms can fold earlier than the radial ones: the Jacobian, which is
+        # symmetric, stays positive definite up to there.
+        mixed = 2.0 * (x * y * factor_slope + p1 * x + p2 * y)
+        along_x = factor + 2.0 * x * x * factor_slope + 2.0 * p1 * y + 6.0 * p2 * x
+        along_y = factor + 2.0 * y * y * factor_slope + 2.0 * p2 * x + 6.0 * p1 * y
+        valid &= (along_x > 0.0) & (along_x * along_y - mixed * mixed > 0.0)
+        return (
+            x * factor + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
+            y * factor + 2.0 * p2 * x * y + p1 * (s + 2.0 * y * y),
+            valid,
+        )
 
 
 def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
@@ -115,6 +116,7 @@ class Undistorter:
         IgsrError: no pixel is valid.
     """
 
+    @np.errstate(all="ignore")  # as in Lens.distort
     def __init__(self, lens: Lens, K: np.ndarray, width: int, height: int) -> None:
         """Map every pixel of the pinhole picture."""
         self._shape = (height, width)
@@ -130,11 +132,10 @@ class Undistorter:
             band = slice(top, min(top + rows, height))
             y = (np.arange(band.start, band.stop) + 0.5 - cy) / fy
             xd, yd, valid = lens.distort(*np.meshgrid(x, y))
-            with np.errstate(invalid="ignore", over="ignore"):
-                u, v = fx * xd + cx, fy * yd + cy
-                # The photo covers [0, width] x [0, height]; in its outer half pixels, sampling
-                # clamps to the outermost centres. NaN compares False.
-                valid &= (u >= 0.0) & (u <= width) & (v >= 0.0) & (v <= height)
+            u, v = fx * xd + cx, fy * yd + cy
+            # The photo covers [0, width] x [0, height]; in its outer half pixels, sampling
+            # clamps to the outermost centres. NaN compares False.
+            valid &= (u >= 0.0) & (u <= width) & (v >= 0.0) & (v <= height)
             self.valid[band] = valid
             column = np.clip(np.where(valid, u, 0.5) - 0.5, 0.0, width - 1)
             row = np.clip(np.where(valid, v, 0.5) - 0.5, 0.0, height - 1)
