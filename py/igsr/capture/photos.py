@@ -70,6 +70,7 @@ def _open(path: Path) -> Image.Image:
             f"{path} cannot be read as an image; save it as PNG, JPEG, WebP or TIFF again"
         ) from error
     if image.width * image.height > file_size * _MOST_PIXELS_PER_BYTE:
+        image.close()
         raise IgsrError(
             f"{path} claims {image.width}x{image.height} pixels but has only {file_size} bytes; "
             "save it again"
