@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import HEIGHT, WIDTH, photo, save, write_transforms
+from capture_files import HEIGHT, WIDTH, photo, save, write_json, write_transforms
 from PIL import Image
 
 from igsr.capture import load_capture
@@ -42,8 +42,6 @@ def loaded(folder: Path, image: Image.Image, name: str = "0.png") -> np.ndarray:
 
 
 def load_named(folder: Path, document: dict, name: str) -> np.ndarray:  # type: ignore[type-arg]
-    from capture_files import write_json
-
     document["frames"][0]["file_path"] = f"images/{name}"
     write_json(folder / "transforms.json", document)
     return load_capture(folder).views[0].image

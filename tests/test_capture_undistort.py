@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from capture_files import HEIGHT, MODEL_PARAMS, WIDTH, photo, save, write_colmap
 
-from igsr.capture import load_capture
+from igsr.capture import colmap, load_capture
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
 
@@ -79,8 +79,6 @@ def test_lens_agrees_with_colmap_to_rounding(model: str, tmp_path: Path) -> None
 
 
 def loaded_lens(folder: Path) -> tuple[Lens, np.ndarray]:
-    from igsr.capture import colmap
-
     cameras = colmap._binary_cameras(folder / "sparse/0/cameras.bin")
     K, lens = colmap._intrinsics(cameras[7])
     return lens, K
