@@ -11,8 +11,11 @@ EXAMPLE := examples/tea_table
 VENV := .venv
 BIN := $(VENV)/bin
 
-# One profile everywhere, so that each dependency is compiled once.
+# One profile everywhere, so that each dependency is compiled once; our own crate's tests run with
+# its assertions and overflow checks on.
 PROFILE := --release
+CHECKED := --config profile.release.package.splat_render.debug-assertions=true \
+	--config profile.release.package.splat_render.overflow-checks=true
 # The interpreter that maturin builds against: with another one, pyo3 would be compiled twice.
 export PYO3_PYTHON := $(CURDIR)/$(BIN)/python
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -54,7 +57,7 @@ test: check-rust check-python
 check-rust: build vulkan
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy $(PROFILE) --locked --workspace --all-targets -- -D warnings
-	$(CARGO) test $(PROFILE) --locked --workspace
+	$(CARGO) test $(PROFILE) $(CHECKED) --locked --workspace
 
 check-python: build vulkan $(VENV)/.dev-ready
 	$(BIN)/ruff check .
