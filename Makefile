@@ -70,7 +70,7 @@ VULKAN_ANSWERS := $(BIN)/python -c 'from igsr import _core; print("GPU tests run
 
 vulkan: build
 	@$(VULKAN_ANSWERS) 2>/dev/null || { \
-		$(call apt_install,mesa-vulkan-drivers libvulkan1,no Vulkan device answers) && $(VULKAN_ANSWERS); \
+		$(call apt_install,mesa-vulkan-drivers libvulkan1,no GPU or software Vulkan driver answers) && $(VULKAN_ANSWERS); \
 	}
 
 # ---- setting up --------------------------------------------------------------------------------
@@ -104,6 +104,6 @@ if command -v apt-get >/dev/null && $$as_root true 2>/dev/null; then \
 	$$as_root apt-get update -qq && \
 	$$as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(1); \
 else \
-	echo "$(2), and it cannot be mended from here without apt and root: install $(1), or what your system calls them, and run make again." >&2; exit 1; \
+	echo "make: $(2), and apt cannot be used from here to mend it: install $(1), or what your system calls them, and run make again." >&2; exit 1; \
 fi
 endef

@@ -577,7 +577,7 @@ def build_scene() -> mi.Scene:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "tea_table")
-    parser.add_argument("--samples", type=int, default=128, help="light paths per pixel")
+    parser.add_argument("--samples", type=int, default=121, help="light paths per pixel, a square")
     parser.add_argument("--only", type=int, help="take only the first so many photos of each split")
     arguments = parser.parse_args()
 
