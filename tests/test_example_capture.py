@@ -5,29 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from igsr.capture import Capture, View, load_capture
+from igsr.capture import Capture, load_capture
+
+# Where examples/make_capture.py lays the glazed marble: the only teal thing in the scene.
+MARBLE = np.array([0.82, -0.22, 0.085])
 
 
 @pytest.fixture(scope="module")
 def example(example_path: Path) -> Capture:
     return load_capture(example_path)
-
-
-def seen_at(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """For world points [N,3]: which project onto the object in this photo (bool [N]), and the
-    object's outline that those points cast, thickened by one pixel (bool [H,W])."""
-    camera = view.camera
-    in_camera = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    on_image = in_camera @ camera.K.T
-    columns, rows = np.floor(on_image[:, :2] / on_image[:, 2:]).astype(int).T
-    inside = (in_camera[:, 2] > 0) & (rows >= 0) & (columns >= 0)
-    inside &= (rows < camera.height) & (columns < camera.width)
-    cast = np.zeros((camera.height + 2, camera.width + 2), dtype=bool)
-    for down in range(3):
-        for right in range(3):
-            cast[rows[inside] + down, columns[inside] + right] = True
-    inside[inside] = view.image[rows[inside], columns[inside], 3] > 0
-    return inside, cast[1:-1, 1:-1]
 
 
 def test_size_and_splits(example: Capture, example_path: Path) -> None:
@@ -45,15 +31,16 @@ def test_size_and_splits(example: Capture, example_path: Path) -> None:
     assert size <= 3_000_000
 
 
-def test_hull_of_the_train_silhouettes_casts_the_test_silhouettes(example: Capture) -> None:
-    """Space carved by the train photos must cast the test photos' outlines: cameras that are turned
-    or mirrored would carve the object away."""
-    across, up = np.linspace(-1.3, 1.3, 131), np.linspace(-0.5, 0.8, 66)
-    points = np.stack(np.meshgrid(across, across, up, indexing="ij"), axis=-1).reshape(-1, 3)
-    for view in example.train_views:
-        points = points[seen_at(points, view)[0]]
-    for view in example.test_views:
-        _, cast = seen_at(points, view)
-        seen = view.image[..., 3] > 0
-        overlap = (cast & seen).sum() / (cast | seen).sum()
-        assert overlap > 0.93, f"{view.name}: {overlap:.3f}"
+def test_marble_is_seen_where_it_stands(example: Capture) -> None:
+    views_from_above = example.train_views[20:]  # nothing stands before the marble there
+    for view in views_from_above:
+        in_camera = view.camera.viewmat[:3, :3] @ MARBLE + view.camera.viewmat[:3, 3]
+        on_image = view.camera.K @ in_camera
+        expected = on_image[:2] / on_image[2]
+        red, green, blue, alpha = np.moveaxis(view.image.astype(int), -1, 0)
+        teal = (green - red > 30) & (abs(green - blue) < 35) & (alpha == 255)
+        rows, columns = np.nonzero(teal)
+        assert len(rows) > 40
+        seen = np.array([np.median(columns), np.median(rows)]) + 0.5
+        # Its lit side is seen better than its shaded side, hence the pixels of tolerance.
+        assert np.linalg.norm(seen - expected) < 3.0, view.name
