@@ -46,7 +46,7 @@ clean:
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 # Renders the committed example capture again, from nothing.
-example-capture: $(VENV)/.venv-ready
+example-capture: build
 	$(BIN)/python -m pip install --quiet --requirement examples/requirements.txt
 	$(BIN)/python examples/make_capture.py --out $(EXAMPLE)
 

@@ -1,6 +1,9 @@
 """Renders the example capture: a small table laid for tea, photographed from all around.
 
-    pip install -r examples/requirements.txt
+    make example-capture
+
+or, where igsr and ``examples/requirements.txt`` are installed,
+
     python examples/make_capture.py --out examples/tea_table
 
 Everything in the scene is made here: the meshes and textures with numpy, the light and the photos
