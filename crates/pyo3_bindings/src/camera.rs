@@ -1,0 +1,25 @@
+//! Cameras from Python's viewmat and intrinsics.
+
+use glam::DMat4;
+use pyo3::prelude::*;
+use splat_render::Camera;
+
+use crate::arrays::{array, row, rows};
+
+/// A camera from `viewmat` f64 [4, 4], `intrinsics` f64 [4] (fx, fy, cx, cy) and a size.
+pub fn camera(
+    viewmat: &Bound<'_, PyAny>,
+    intrinsics: &Bound<'_, PyAny>,
+    width: u32,
+    height: u32,
+) -> PyResult<Camera> {
+    let viewmat = array::<f64>("viewmat", viewmat)?;
+    let matrix: [[f64; 4]; 4] = {
+        let rows = rows::<f64, 4>("viewmat", &viewmat, &[4])?;
+        [rows[0], rows[1], rows[2], rows[3]]
+    };
+    let [fx, fy, cx, cy] = row::<f64, 4>("intrinsics", intrinsics)?;
+    // numpy is row-major, glam column-major.
+    let viewmat = DMat4::from_cols_array_2d(&matrix).transpose();
+    Ok(Camera { viewmat, fx, fy, cx, cy, width, height })
+}

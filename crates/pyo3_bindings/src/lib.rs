@@ -1,0 +1,23 @@
+//! The Python module `igsr._core`: numpy arrays in, numpy arrays out, nothing else.
+//!
+//! Arrays are C-contiguous and float32, for the backend "reference" float64; what is wrong with an
+//! argument is a ValueError that begins with its name. `_core.pyi` describes every function.
+
+mod arrays;
+mod backend;
+mod camera;
+mod error;
+mod splat_files;
+mod stages;
+
+use pyo3::prelude::*;
+
+#[pymodule]
+mod _core {
+    #[pymodule_export]
+    use crate::backend::{backend_info, resolve_backend};
+    #[pymodule_export]
+    use crate::splat_files::{read_ply, write_ply};
+    #[pymodule_export]
+    use crate::stages::{project, project_backward, rasterize, rasterize_backward};
+}
