@@ -11,10 +11,12 @@ Source of the formats and camera models: https://colmap.github.io/format.html an
 from __future__ import annotations
 
 import math
+import posixpath
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,23 +25,43 @@ from igsr.capture.types import Camera, Capture, Points, intrinsic_matrix
 from igsr.capture.undistort import Lens
 from igsr.errors import IgsrError
 
-# COLMAP's model numbers, names and parameter counts; those it has beyond are refused by name.
-_MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+# COLMAP's model numbers, so that what is refused has a name.
+_NAMES = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EUCM",
+    "EQUIRECTANGULAR",
+)
+# How many parameters each supported model has.
+_PARAMETER_COUNTS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
 }
-_PARAMETER_COUNTS = dict(_MODELS.values())
-_ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") + (
+_ONE_FOCAL_LENGTH = (
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
 )
@@ -62,7 +84,7 @@ class _ColmapImage:
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of the COLMAP model of a capture: ``sparse/0``, ``sparse`` or the capture itself."""
+    """The folder of a capture's model: ``sparse/0``, ``sparse`` or the capture itself, or None."""
     for folder in (path / "sparse" / "0", path / "sparse", path):
         if any(is_file(folder / f"cameras.{kind}") for kind in ("bin", "txt")):
             return folder
@@ -73,7 +95,7 @@ def load_colmap(path: Path, model: Path) -> Capture:
     """Load a COLMAP capture; all its views are for training.
 
     Args:
-        path: the capture; its photos are in ``images/`` or, where that is missing, beside the model.
+        path: the capture; its photos are in ``images/`` or, where that is missing, in itself.
         model: the folder with cameras, images and points3D, all ``.bin`` or all ``.txt``.
 
     Raises:
@@ -93,13 +115,8 @@ def load_colmap(path: Path, model: Path) -> Capture:
     if not images:
         raise IgsrError(f"{images_path} lists no images; give a model with registered images")
     images_folder = path / "images" if (path / "images").is_dir() else path
-    prefix = "images/" if images_folder != path else ""
     shots = []
-    seen: set[str] = set()
     for image in sorted(images, key=lambda image: image.name):
-        if image.name in seen:
-            raise IgsrError(f"{images_path} lists the image {image.name} twice; remove one")
-        seen.add(image.name)
         if image.camera_id not in cameras:
             raise IgsrError(
                 f"{images_path}: {image.name} refers to camera {image.camera_id}, which "
@@ -108,16 +125,18 @@ def load_colmap(path: Path, model: Path) -> Capture:
         photo = images_folder / image.name
         if not is_file(photo):
             raise IgsrError(
-                f"{images_path.name} has a camera for {image.name} but {photo} is missing; "
-                "put the photo there"
+                f"{images_path} has a camera for {image.name} but {photo} is missing; put the "
+                "photo there"
             )
+        viewmat = _viewmat(image, images_path)
         colmap_camera = cameras[image.camera_id]
         try:
             K, lens = _intrinsics(colmap_camera)
-            camera = Camera(_viewmat(image), K, colmap_camera.width, colmap_camera.height)
+            camera = Camera(viewmat, K, colmap_camera.width, colmap_camera.height)
         except IgsrError as error:
-            raise IgsrError(f"{model}, image {image.name}: {error}") from error
-        shots.append(Shot(prefix + image.name, photo, camera, lens, "train", None, cameras_path))
+            raise IgsrError(f"{cameras_path}, camera {image.camera_id}: {error}") from error
+        name = posixpath.normpath((images_folder.relative_to(path) / image.name).as_posix())
+        shots.append(Shot(name, photo, camera, lens, "train", None, images_path))
     points = None
     if is_file(points_path):
         points = (_binary_points if binary else _text_points)(points_path)
@@ -137,10 +156,13 @@ def _intrinsics(camera: _ColmapCamera) -> tuple[np.ndarray, Lens]:
     return K, Lens("FISHEYE" in camera.model, tuple(extra))
 
 
-def _viewmat(image: _ColmapImage) -> np.ndarray:
+def _viewmat(image: _ColmapImage, path: Path) -> np.ndarray:
     norm = math.hypot(*image.quat)
     if not (math.isfinite(norm) and norm > 1e-6 and all(map(math.isfinite, image.translation))):
-        raise IgsrError("its pose is NaN, infinite or has a zero quaternion; register it again")
+        raise IgsrError(
+            f"{path}: the pose of {image.name} has a NaN or infinite entry or a zero quaternion; "
+            "run COLMAP again"
+        )
     w, x, y, z = (value / norm for value in image.quat)
     viewmat = np.eye(4)
     viewmat[:3, :3] = [
@@ -152,15 +174,13 @@ def _viewmat(image: _ColmapImage) -> np.ndarray:
     return viewmat
 
 
-def _checked_camera(
-    path: Path, camera_id: int, model: str, width: int, height: int, params: tuple[float, ...]
-) -> _ColmapCamera:
-    if model in ("FOV", "THIN_PRISM_FISHEYE") or model not in _PARAMETER_COUNTS:
+def _parameter_count(path: Path, camera_id: int, model: str) -> int:
+    if model not in _PARAMETER_COUNTS:
         raise IgsrError(
             f"{path}: camera {camera_id} has the model {model}, which is not supported; undistort "
             "the photos with COLMAP's image_undistorter or use an OPENCV model"
         )
-    return _ColmapCamera(model, width, height, params)
+    return _PARAMETER_COUNTS[model]
 
 
 # --- binary ---------------------------------------------------------------------------------------
@@ -174,7 +194,7 @@ class _Bytes:
         self.data = _read(path)
         self.offset = 0
 
-    def unpack(self, layout: struct.Struct) -> tuple:
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
         self.need(layout.size)
         values = layout.unpack_from(self.data, self.offset)
         self.offset += layout.size
@@ -222,10 +242,9 @@ def _binary_cameras(path: Path) -> dict[int, _ColmapCamera]:
     cameras = {}
     for _ in range(_count(file)):
         camera_id, number, width, height = file.unpack(_CAMERA)
-        model, count = _MODELS.get(number, (f"number {number}", 0))
-        # An unknown model's length is unknown too, so it must be refused before reading on.
-        params = file.unpack(struct.Struct(f"<{count}d"))
-        cameras[camera_id] = _checked_camera(path, camera_id, model, width, height, params)
+        model = _NAMES[number] if 0 <= number < len(_NAMES) else f"number {number}"
+        params = file.unpack(struct.Struct(f"<{_parameter_count(path, camera_id, model)}d"))
+        cameras[camera_id] = _ColmapCamera(model, width, height, params)
     file.finish()
     return cameras
 
@@ -252,7 +271,8 @@ def _binary_images(path: Path) -> list[_ColmapImage]:
 
 def _binary_points(path: Path) -> Points | None:
     file = _Bytes(path)
-    xyz, rgb = [], []
+    xyz: list[tuple[float, ...]] = []
+    rgb: list[tuple[int, ...]] = []
     for _ in range(_count(file)):
         _, x, y, z, r, g, b, _, track_length = file.unpack(_POINT)
         file.skip(8 * track_length)
@@ -287,19 +307,17 @@ def _text_cameras(path: Path) -> dict[int, _ColmapCamera]:
             continue
         try:
             identity, model, width, height, *params = line.split()
-            camera = _checked_camera(
-                path, int(identity), model, int(width), int(height), tuple(map(float, params))
-            )
-        except IgsrError:
-            raise
+            camera = _ColmapCamera(model, int(width), int(height), tuple(map(float, params)))
+            camera_id = int(identity)
         except ValueError as error:
             raise _damaged(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from error
-        if len(params) != _PARAMETER_COUNTS[model]:
+        count = _parameter_count(path, camera_id, model)
+        if len(params) != count:
             raise IgsrError(
-                f"{path}, line {number}: {model} has {_PARAMETER_COUNTS[model]} parameters, not "
-                f"{len(params)}; export the model again"
+                f"{path}, line {number}: {model} has {count} parameters, not {len(params)}; "
+                "export the model again"
             )
-        cameras[int(identity)] = camera
+        cameras[camera_id] = camera
     return cameras
 
 
@@ -321,7 +339,8 @@ def _text_images(path: Path) -> list[_ColmapImage]:
 
 
 def _text_points(path: Path) -> Points | None:
-    xyz, rgb = [], []
+    xyz: list[tuple[float, ...]] = []
+    rgb: list[tuple[int, ...]] = []
     for number, line in _lines(path):
         if not line:
             continue
@@ -336,7 +355,7 @@ def _text_points(path: Path) -> Points | None:
     return _points(path, xyz, rgb)
 
 
-def _points(path: Path, xyz: list, rgb: list) -> Points | None:
+def _points(path: Path, xyz: list[tuple[float, ...]], rgb: list[tuple[int, ...]]) -> Points | None:
     if not xyz:
         return None
     points = Points(np.array(xyz, dtype=np.float64), np.array(rgb, dtype=np.uint8))

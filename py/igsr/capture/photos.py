@@ -168,9 +168,10 @@ class _Undistorters:
     """One resampling map per distinct camera, freed after its last photo: maps outweigh photos."""
 
     def __init__(self, shots: list[Shot]) -> None:
-        self._lock = threading.Lock()
         self._maps: dict[object, Undistorter] = {}
         self._uses = Counter(self._key(shot) for shot in shots)
+        # A lock for each camera, so that different cameras are mapped side by side.
+        self._locks = {key: threading.Lock() for key in self._uses}
 
     @staticmethod
     def _key(shot: Shot) -> object:
@@ -178,7 +179,7 @@ class _Undistorters:
 
     def take(self, shot: Shot) -> Undistorter:
         key = self._key(shot)
-        with self._lock:
+        with self._locks[key]:
             if key not in self._maps:
                 camera = shot.camera
                 try:
@@ -192,12 +193,25 @@ class _Undistorters:
         return undistorter
 
 
+def _refuse_duplicates(shots: list[Shot]) -> None:
+    source_from_name: dict[str, Path] = {}
+    for shot in shots:
+        if shot.name in source_from_name:
+            sources = dict.fromkeys([source_from_name[shot.name].name, shot.source.name])
+            raise IgsrError(
+                f"{shot.source.parent} has two cameras for the image {shot.name} "
+                f"({' and '.join(sources)}); remove one"
+            )
+        source_from_name[shot.name] = shot.source
+
+
 def load_views(shots: list[Shot]) -> list[View]:
     """All photos of a capture, decoded on all cores, in the order given.
 
     Raises:
         IgsrError: about the first photo, in that order, that cannot be used.
     """
+    _refuse_duplicates(shots)
     undistorters = _Undistorters([shot for shot in shots if not shot.lens.is_pinhole])
 
     def load(shot: Shot) -> View:

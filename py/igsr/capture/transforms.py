@@ -48,7 +48,6 @@ def load_transforms(path: Path) -> Capture:
         split = "train" if split_from_name is None else split_from_name.get(name)
         if split is not None:
             shots.append(_shot(document, frame, path, index, split))
-    _refuse_duplicates(shots)
     points = None
     if "ply_file_path" in document:
         name = _text(document, "ply_file_path", str(path))
@@ -69,7 +68,6 @@ def load_split_transforms(folder: Path) -> Capture:
             document = _read_json(path)
             for index, frame in enumerate(_frames(document, path)):
                 shots.append(_shot(document, frame, path, index, split))
-    _refuse_duplicates(shots)
     return Capture(folder, load_views(shots))
 
 
@@ -157,6 +155,8 @@ def _shot(
     mask_path = None
     if "mask_path" in frame:
         mask_path = path.parent / _text(frame, "mask_path", where)
+        if not is_file(mask_path):
+            raise IgsrError(f"{where}: the mask {mask_path} is missing; put it there")
     fields = {**document, **frame}
     width, height = _size(fields, photo, where)
     K, lens = _intrinsics(fields, width, height, where)
@@ -302,15 +302,3 @@ def _named_splits(
         for name in known - left_out:
             split_from_name.setdefault(name, "train")
     return split_from_name
-
-
-def _refuse_duplicates(shots: list[Shot]) -> None:
-    seen: dict[str, Path] = {}
-    for shot in shots:
-        if shot.name in seen:
-            raise IgsrError(
-                f"{shot.source} names the image {shot.name} twice"
-                + (f" (also in {seen[shot.name].name})" if seen[shot.name] != shot.source else "")
-                + "; remove one"
-            )
-        seen[shot.name] = shot.source

@@ -14,7 +14,7 @@ from igsr.errors import IgsrError
 RIGID_TOLERANCE = 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays have no single truth to compare by
 class Camera:
     """A pinhole camera in OpenCV axes: x right, y down, z forward.
 
@@ -38,6 +38,7 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
+        """Check and normalise the fields."""
         object.__setattr__(self, "viewmat", nearest_rigid(self.viewmat, "viewmat"))
         object.__setattr__(self, "K", _checked_intrinsics(self.K))
         for name in ("width", "height"):
@@ -49,10 +50,10 @@ class Camera:
     @property
     def centre(self) -> np.ndarray:
         """float64 [3]: where the camera stands, in world units."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+        return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
 
-@dataclass
+@dataclass(eq=False)
 class View:
     """One photo with its camera.
 
@@ -73,7 +74,7 @@ class View:
     mask: np.ndarray | None = None
 
 
-@dataclass
+@dataclass(eq=False)
 class Points:
     """A point cloud in the world frame.
 
@@ -86,7 +87,7 @@ class Points:
     rgb: np.ndarray
 
 
-@dataclass
+@dataclass(eq=False)
 class Capture:
     """Photos, their cameras and, where the capture has them, points.
 
@@ -140,7 +141,7 @@ class Capture:
     @property
     def scene_centre(self) -> np.ndarray:
         """float64 [3]: the mean of the training cameras' centres, in world units."""
-        return self._centres().mean(axis=0)
+        return np.asarray(self._centres().mean(axis=0))
 
     @property
     def scene_extent(self) -> float:

@@ -116,6 +116,7 @@ class Undistorter:
     """
 
     def __init__(self, lens: Lens, K: np.ndarray, width: int, height: int) -> None:
+        """Map every pixel of the pinhole picture."""
         self._shape = (height, width)
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
         self.valid = np.empty((height, width), dtype=bool)
@@ -175,9 +176,9 @@ class Undistorter:
             out = self._sample(premultiplied)
             out[..., :3] *= 255.0 / np.maximum(out[..., 3:], 1e-6)
         out[~self.valid] = 0.0
-        return np.clip(np.rint(out), 0.0, 255.0).astype(np.uint8)
+        return np.asarray(np.clip(np.rint(out), 0.0, 255.0), dtype=np.uint8)
 
     def mask(self, mask: np.ndarray) -> np.ndarray:
-        """bool [H, W] carried along: True where valid and no masked pixel has part in the sample."""
+        """bool [H, W]: True where valid and no pixel that is masked out has part in the sample."""
         share = self._sample(mask.astype(np.float32)[..., None])[..., 0]
-        return self.valid & (share > 1.0 - 1e-3)
+        return np.asarray(self.valid & (share > 1.0 - 1e-3))
