@@ -1,0 +1,235 @@
+"""Photos and masks decoded, checked against their cameras, and undistorted."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from igsr.capture.types import Camera, View
+from igsr.capture.undistort import Lens, Undistorter
+from igsr.errors import IgsrError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".gif")
+
+# Pillow knows more, but some of those (EPS) hand the file to another program.
+_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM", "GIF")
+
+# No photo is packed tighter; a file that claims more is a decompression bomb or a torn header.
+_MOST_PIXELS_PER_BYTE = 10_000
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photo to load: what a reader found out about one view.
+
+    Attributes:
+        name: the view's name.
+        path: the photo's file.
+        camera: its pinhole camera; ``K`` and the size are the distorted photo's too.
+        lens: its distortion.
+        split: "train" or "test".
+        mask_path: or None.
+        source: the file that describes the camera, for error messages.
+    """
+
+    name: str
+    path: Path
+    camera: Camera
+    lens: Lens
+    split: str
+    mask_path: Path | None
+    source: Path
+
+
+def is_file(path: Path) -> bool:
+    """Whether the path is a file; False for paths that no file can have (an embedded NUL)."""
+    try:
+        return path.is_file()
+    except (ValueError, OSError):
+        return False
+
+
+def _open(path: Path) -> Image.Image:
+    """The image behind a path, its pixels not yet decoded."""
+    try:
+        file_size = path.stat().st_size
+        image = Image.open(path, formats=_FORMATS)
+    except FileNotFoundError as error:
+        raise IgsrError(f"{path} does not exist; put the image there") from error
+    except Image.DecompressionBombError as error:
+        raise IgsrError(f"{path} claims too many pixels for a photo; shrink it") from error
+    except Exception as error:  # Pillow's plugins raise anything at all on broken files.
+        raise IgsrError(
+            f"{path} cannot be read as an image; save it as PNG, JPEG, WebP or TIFF again"
+        ) from error
+    if image.width * image.height > file_size * _MOST_PIXELS_PER_BYTE:
+        raise IgsrError(
+            f"{path} claims {image.width}x{image.height} pixels but has only {file_size} bytes; "
+            "save it again"
+        )
+    return image
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels as stored (EXIF orientation not applied), from the header alone.
+
+    Raises:
+        IgsrError: the file is missing or no image.
+    """
+    with _open(path) as image:
+        return image.size
+
+
+def _decode(path: Path, width: int, height: int, source: Path, what: str) -> Image.Image:
+    with _open(path) as image:
+        if image.size != (width, height):
+            turned = (
+                " (an EXIF orientation is never applied)"
+                if what == "image" and image.size == (height, width)
+                else ""
+            )
+            raise IgsrError(
+                f"{path} is {image.width}x{image.height} pixels but its camera in {source.name} "
+                f"is {width}x{height}{turned}; resize the {what} or correct the camera"
+            )
+        try:
+            image.load()
+        except Exception as error:  # as above
+            raise IgsrError(f"{path} is truncated or damaged; copy it again") from error
+        return image
+
+
+def _eight_bit(image: Image.Image, path: Path) -> Image.Image:
+    """16-bit greys as 8-bit greys; any other image as it is."""
+    if image.mode.startswith("I"):
+        grey = np.asarray(image)
+        if grey.min() < 0 or grey.max() > 65535:
+            raise IgsrError(f"{path} has 32-bit pixels; save it with 8 or 16 bits")
+        return Image.fromarray(np.rint(grey / 257.0).astype(np.uint8))
+    if image.mode == "F":
+        raise IgsrError(f"{path} has floating-point pixels; save it with 8 or 16 bits")
+    return image
+
+
+def read_image(path: Path, width: int, height: int, source: Path) -> np.ndarray:
+    """A photo's pixels as stored: its EXIF orientation is not applied.
+
+    Palettes, greys, 16 bits, CMYK and the like are converted.
+
+    Args:
+        path: the photo.
+        width, height: its camera's size, pixels.
+        source: the file that gave the camera, for error messages.
+
+    Returns:
+        uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha where the file has transparency.
+
+    Raises:
+        IgsrError: missing, unreadable, truncated, or of another size.
+    """
+    image = _eight_bit(_decode(path, width, height, source, "image"), path)
+    transparent = "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
+    mode = "RGBA" if transparent else "RGB"
+    if image.mode == "La":
+        image = image.convert("LA")
+    try:
+        return np.array(image if image.mode == mode else image.convert(mode))
+    except Exception as error:
+        raise IgsrError(
+            f"{path} has pixels of the unsupported kind {image.mode}; save it as RGB or RGBA"
+        ) from error
+
+
+def read_mask(path: Path, width: int, height: int, source: Path) -> np.ndarray:
+    """A mask's pixels: bool [H, W], True where brighter than half of its brightest pixel.
+
+    So masks of 0 and 1 and of 0 and 255 mean the same; black pixels are left out.
+
+    Raises:
+        IgsrError: as ``read_image``.
+    """
+    image = _eight_bit(_decode(path, width, height, source, "mask"), path)
+    try:
+        # convert("L") of transparent images keeps the grey and drops the alpha.
+        grey = np.array(image.convert("L")).astype(np.int32)
+    except Exception as error:
+        raise IgsrError(f"{path} has pixels of the unsupported kind {image.mode}") from error
+    return 2 * grey > max(int(grey.max()), 1)
+
+
+class _Undistorters:
+    """One resampling map per distinct camera, freed after its last photo: maps outweigh photos."""
+
+    def __init__(self, shots: list[Shot]) -> None:
+        self._maps: dict[object, Undistorter] = {}
+        self._uses = Counter(self._key(shot) for shot in shots)
+        # A lock for each camera, so that different cameras are mapped side by side.
+        self._locks = {key: threading.Lock() for key in self._uses}
+
+    @staticmethod
+    def _key(shot: Shot) -> object:
+        return shot.lens, shot.camera.K.tobytes(), shot.camera.width, shot.camera.height
+
+    def take(self, shot: Shot) -> Undistorter:
+        key = self._key(shot)
+        with self._locks[key]:
+            if key not in self._maps:
+                camera = shot.camera
+                try:
+                    self._maps[key] = Undistorter(shot.lens, camera.K, camera.width, camera.height)
+                except IgsrError as error:
+                    raise IgsrError(f"{shot.source}: the camera of {shot.name}: {error}") from error
+            undistorter = self._maps[key]
+            self._uses[key] -= 1
+            if self._uses[key] == 0:
+                del self._maps[key]
+        return undistorter
+
+
+def _refuse_duplicates(shots: list[Shot]) -> None:
+    source_from_name: dict[str, Path] = {}
+    for shot in shots:
+        if shot.name in source_from_name:
+            sources = dict.fromkeys([source_from_name[shot.name].name, shot.source.name])
+            raise IgsrError(
+                f"{shot.source.parent} has two cameras for the image {shot.name} "
+                f"({' and '.join(sources)}); remove one"
+            )
+        source_from_name[shot.name] = shot.source
+
+
+def load_views(shots: list[Shot]) -> list[View]:
+    """All photos of a capture, decoded on all cores, in the order given.
+
+    Raises:
+        IgsrError: about the first photo, in that order, that cannot be used.
+    """
+    _refuse_duplicates(shots)
+    undistorters = _Undistorters([shot for shot in shots if not shot.lens.is_pinhole])
+
+    def load(shot: Shot) -> View:
+        size = (shot.camera.width, shot.camera.height, shot.source)
+        image = read_image(shot.path, *size)
+        mask = read_mask(shot.mask_path, *size) if shot.mask_path is not None else None
+        if not shot.lens.is_pinhole:
+            undistorter = undistorters.take(shot)
+            image = undistorter.image(image)
+            mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
+            if mask.all():
+                mask = None
+        return View(shot.name, shot.camera, shot.split, image, mask)
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        futures = [pool.submit(load, shot) for shot in shots]
+        try:
+            return [future.result() for future in futures]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise

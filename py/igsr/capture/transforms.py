@@ -1,0 +1,304 @@
+"""Captures described by ``transforms.json``: NeRF Synthetic, nerfstudio and instant-ngp.
+
+The three share one layout, a list of frames with a camera-to-world matrix each, and differ in which
+fields they use; every camera field may stand in the frame or, for all frames, beside the list.
+
+This is the one place where OpenGL cameras (x right, y up, z back) become OpenCV cameras.
+
+Sources: https://docs.nerf.studio/quickstart/data_conventions.html, the NeRF Synthetic data, and
+instant-ngp's ``docs/nerf_dataset_tips.md``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import posixpath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from igsr.capture.photos import Shot, image_size, is_file, load_views
+from igsr.capture.point_cloud import read_point_cloud
+from igsr.capture.types import Camera, Capture, intrinsic_matrix, nearest_rigid
+from igsr.capture.undistort import Lens
+from igsr.errors import IgsrError
+
+# nerfstudio draws no line between these: the coefficients say what the lens does.
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYE = ("OPENCV_FISHEYE",)
+
+# NeRF Synthetic leaves the suffix away.
+_OMITTED_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+def load_transforms(path: Path) -> Capture:
+    """Load a ``transforms.json``; paths in it are relative to its folder.
+
+    Raises:
+        IgsrError: a field is missing, malformed or out of range, or a file it names is unusable.
+    """
+    document = _read_json(path)
+    frames = _frames(document, path)
+    split_from_name = _named_splits(document, path, frames)
+    shots = []
+    for index, frame in enumerate(frames):
+        name = _frame_name(frame, path, index)
+        split = "train" if split_from_name is None else split_from_name.get(name)
+        if split is not None:
+            shots.append(_shot(document, frame, path, index, split))
+    points = None
+    if "ply_file_path" in document:
+        name = _text(document, "ply_file_path", str(path))
+        points = read_point_cloud(path.parent / name)
+    return Capture(path.parent, load_views(shots), points)
+
+
+def load_split_transforms(folder: Path) -> Capture:
+    """Load ``transforms_train.json`` and, where it exists, ``transforms_test.json`` of a folder.
+
+    Raises:
+        IgsrError: as ``load_transforms``.
+    """
+    shots = []
+    for split in ("train", "test"):
+        path = folder / f"transforms_{split}.json"
+        if split == "train" or is_file(path):
+            document = _read_json(path)
+            for index, frame in enumerate(_frames(document, path)):
+                shots.append(_shot(document, frame, path, index, split))
+    return Capture(folder, load_views(shots))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_bytes())
+    except OSError as error:
+        raise IgsrError(f"{path} cannot be read ({error.strerror}); check it") from error
+    except (ValueError, RecursionError) as error:
+        where = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+        raise IgsrError(f"{path} is not valid JSON{where}; write it again") from error
+    if not isinstance(document, dict):
+        raise IgsrError(f"{path} is not a JSON object with frames; write it again")
+    return document
+
+
+def _frames(document: dict[str, Any], path: Path) -> list[dict[str, Any]]:
+    frames = _required(document, "frames", str(path))
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise IgsrError(f"{path}: frames must be a list of objects; correct it")
+    if not frames:
+        raise IgsrError(f"{path}: frames is empty, so there are no images; add some")
+    return frames
+
+
+def _required(fields: dict[str, Any], key: str, where: str) -> Any:
+    if key not in fields:
+        raise IgsrError(f"{where}: {key} is missing; add it")
+    return fields[key]
+
+
+def _text(fields: dict[str, Any], key: str, where: str) -> str:
+    value = _required(fields, key, where)
+    if not isinstance(value, str) or not value or "\0" in value or not _is_unicode(value):
+        raise IgsrError(f"{where}: {key} must be a file's path, not {_shown(value)}; correct it")
+    return value
+
+
+def _is_unicode(text: str) -> bool:
+    # JSON can spell half a surrogate pair, which no file name and no terminal takes.
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _shown(value: Any) -> str:
+    text = ascii(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _number(fields: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+    if key not in fields and default is not None:
+        return default
+    value = _required(fields, key, where)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise IgsrError(f"{where}: {key} must be a number, not {_shown(value)}; correct it")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise IgsrError(f"{where}: {key} is not finite; give a finite number")
+    return number
+
+
+def _frame_name(frame: dict[str, Any], path: Path, index: int) -> str:
+    """``file_path`` in one spelling, so that "./a.png" and "a.png" are the same frame."""
+    return posixpath.normpath(_text(frame, "file_path", f"{path}, frame {index}"))
+
+
+def _shot(
+    document: dict[str, Any], frame: dict[str, Any], path: Path, index: int, split: str
+) -> Shot:
+    name = _frame_name(frame, path, index)
+    where = f"{path}, frame {index} ({name})"
+    for suffix in ("", *_OMITTED_SUFFIXES):
+        if is_file(path.parent / (name + suffix)):
+            name += suffix
+            break
+    else:
+        raise IgsrError(f"{where}: the image {path.parent / name} is missing; put it there")
+    photo = path.parent / name
+    mask_path = None
+    if "mask_path" in frame:
+        mask_path = path.parent / _text(frame, "mask_path", where)
+        if not is_file(mask_path):
+            raise IgsrError(f"{where}: the mask {mask_path} is missing; put it there")
+    fields = {**document, **frame}
+    width, height = _size(fields, photo, where)
+    K, lens = _intrinsics(fields, width, height, where)
+    viewmat = _viewmat(_required(frame, "transform_matrix", where), where)
+    try:
+        camera = Camera(viewmat, K, width, height)
+    except IgsrError as error:
+        raise IgsrError(f"{where}: {error}") from error
+    return Shot(name, photo, camera, lens, split, mask_path, path)
+
+
+def _size(fields: dict[str, Any], photo: Path, where: str) -> tuple[int, int]:
+    if "w" not in fields and "h" not in fields:
+        return image_size(photo)
+    size = []
+    for key in ("w", "h"):
+        value = _number(fields, key, where)
+        if value < 1 or value != int(value):
+            raise IgsrError(f"{where}: {key} is {value:g}; give a whole number of pixels")
+        size.append(int(value))
+    return size[0], size[1]
+
+
+def _intrinsics(
+    fields: dict[str, Any], width: int, height: int, where: str
+) -> tuple[np.ndarray, Lens]:
+    if "fl_x" in fields:
+        fx = _number(fields, "fl_x", where)
+    elif "camera_angle_x" in fields:
+        fx = _focal_length(fields, "camera_angle_x", width, where)
+    else:
+        raise IgsrError(f"{where}: fl_x or camera_angle_x is missing; add one of them")
+    if "fl_y" in fields:
+        fy = _number(fields, "fl_y", where)
+    elif "camera_angle_y" in fields and "fl_x" not in fields:
+        fy = _focal_length(fields, "camera_angle_y", height, where)
+    else:
+        fy = fx
+    cx = _number(fields, "cx", where, width / 2)
+    cy = _number(fields, "cy", where, height / 2)
+    for key, value in (("fl_x", fx), ("fl_y", fy)):
+        if value <= 0.0:
+            raise IgsrError(
+                f"{where}: {key} is {value:g}, so the intrinsics are singular; give a positive "
+                "focal length in pixels"
+            )
+    return intrinsic_matrix(fx, fy, cx, cy), _lens(fields, where)
+
+
+def _focal_length(fields: dict[str, Any], key: str, size: int, where: str) -> float:
+    angle = _number(fields, key, where)
+    if not 0.0 < angle < math.pi:
+        raise IgsrError(f"{where}: {key} is {angle:g}; give an angle between 0 and pi radians")
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+def _lens(fields: dict[str, Any], where: str) -> Lens:
+    model = fields.get("camera_model", "OPENCV")
+    if model not in _PERSPECTIVE + _FISHEYE:
+        raise IgsrError(
+            f"{where}: the camera_model {_shown(model)} is not supported; undistort the images to "
+            "PINHOLE or use OPENCV or OPENCV_FISHEYE"
+        )
+    fisheye = model in _FISHEYE or fields.get("is_fisheye") is True
+    k1, k2, k3, k4, p1, p2 = (
+        _number(fields, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
+    )
+    # A coefficient that is left out silently would bend the scene, so each must have a meaning.
+    unused = {key: _number(fields, key, where, 0.0) for key in ("k5", "k6")}
+    unused.update({"p1": p1, "p2": p2} if fisheye else {"k4": k4})
+    for key, value in unused.items():
+        if value != 0.0:
+            kind = "fisheye" if fisheye else "perspective"
+            raise IgsrError(
+                f"{where}: {key} is {value:g}, which has no agreed meaning for a {kind} lens here; "
+                "undistort the images to PINHOLE first"
+            )
+    if fisheye:
+        return Lens(True, (k1, k2, k3, k4))
+    return Lens(False, (k1, k2, k3), (), (p1, p2))
+
+
+def _viewmat(matrix: Any, where: str) -> np.ndarray:
+    """World to camera in OpenCV axes, from camera to world in OpenGL axes (3 or 4 rows of 4)."""
+    rows_are_lists = isinstance(matrix, list) and all(isinstance(row, list) for row in matrix)
+    if (
+        not rows_are_lists
+        or [len(row) for row in matrix] not in ([4] * 3, [4] * 4)
+        or any(
+            isinstance(entry, bool) or not isinstance(entry, (int, float))
+            for row in matrix
+            for entry in row
+        )
+    ):
+        raise IgsrError(f"{where}: transform_matrix must be 4 rows of 4 numbers; correct it")
+    rows = matrix if len(matrix) == 4 else [*matrix, [0.0, 0.0, 0.0, 1.0]]
+    try:
+        world_from_camera = nearest_rigid(np.array(rows, dtype=object), "transform_matrix")
+    except IgsrError as error:
+        raise IgsrError(f"{where}: {error}") from error
+    world_from_camera[:3, 1:3] *= -1.0
+    rotation = world_from_camera[:3, :3].T
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ world_from_camera[:3, 3]
+    return viewmat
+
+
+def _named_splits(
+    document: dict[str, Any], path: Path, frames: list[dict[str, Any]]
+) -> dict[str, str] | None:
+    """nerfstudio's lists as {frame name: split}, or None where the file has no such lists.
+
+    Frames that ``val_filenames`` alone names are left out, as a ``transforms_val.json`` is. Frames
+    that no list names are for training if there is no ``train_filenames``, and left out otherwise.
+    """
+    split_from_name: dict[str, str] = {}
+    if "train_filenames" not in document and "test_filenames" not in document:
+        return None
+    known = {_frame_name(frame, path, index) for index, frame in enumerate(frames)}
+    for split in ("train", "test"):
+        listed = document.get(f"{split}_filenames", [])
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise IgsrError(f"{path}: {split}_filenames must be a list of paths; correct it")
+        for name in map(posixpath.normpath, listed):
+            if name not in known:
+                raise IgsrError(
+                    f"{path}: {split}_filenames names {_shown(name)}, which is no frame's "
+                    "file_path; correct it"
+                )
+            if split_from_name.setdefault(name, split) != split:
+                raise IgsrError(
+                    f"{path}: {_shown(name)} is both in train_filenames and in "
+                    "test_filenames; remove one"
+                )
+    if "train_filenames" not in document:
+        validation = document.get("val_filenames", [])
+        left_out = {
+            posixpath.normpath(name)
+            for name in (validation if isinstance(validation, list) else [])
+            if isinstance(name, str)
+        }
+        for name in known - left_out:
+            split_from_name.setdefault(name, "train")
+    return split_from_name

@@ -1,0 +1,220 @@
+"""What a capture is: cameras, views and points, as every other part of igsr sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from igsr.errors import IgsrError
+
+# Files written with four or five decimals are this far from a rotation; anything further is not a
+# rounding but a scale, a shear or a wrong field.
+RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)  # arrays have no single truth to compare by
+class Camera:
+    """A pinhole camera in OpenCV axes: x right, y down, z forward.
+
+    The point (x, y, z) of the camera frame falls on the pixel coordinates
+    (fx x / z + cx, fy y / z + cy); pixel (column i, row j) has its centre at (i + 0.5, j + 0.5).
+
+    Attributes:
+        viewmat: float64 [4, 4], world to camera, in world units. Rigid within 1e-3; stored with its
+            rotation replaced by the nearest exact one.
+        K: float64 [3, 3], pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive.
+        width: columns of the image, at least 1.
+        height: rows of the image, at least 1.
+
+    Raises:
+        IgsrError: a field has another shape, is not finite, is singular or is not rigid.
+    """
+
+    viewmat: np.ndarray
+    K: np.ndarray
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        """Check and normalise the fields."""
+        object.__setattr__(self, "viewmat", nearest_rigid(self.viewmat, "viewmat"))
+        object.__setattr__(self, "K", _checked_intrinsics(self.K))
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+                raise IgsrError(f"{name} is {value!r} where a whole number of at least 1 belongs")
+            object.__setattr__(self, name, int(value))
+
+    @property
+    def centre(self) -> np.ndarray:
+        """float64 [3]: where the camera stands, in world units."""
+        return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
+
+
+@dataclass(eq=False)
+class View:
+    """One photo with its camera.
+
+    Attributes:
+        name: the photo's posix path relative to the capture; unique within it.
+        camera: the pinhole camera of ``image``.
+        split: "train" or "test".
+        image: uint8 [H, W, 3] RGB, or [H, W, 4] RGB with straight (not premultiplied) alpha, with
+            lens distortion already undone.
+        mask: bool [H, W], True where the pixel may be used, or None where all may: the given mask
+            and what undistortion could fill, joined.
+    """
+
+    name: str
+    camera: Camera
+    split: str
+    image: np.ndarray
+    mask: np.ndarray | None = None
+
+
+@dataclass(eq=False)
+class Points:
+    """A point cloud in the world frame.
+
+    Attributes:
+        xyz: float64 [P, 3], world units.
+        rgb: uint8 [P, 3].
+    """
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+
+
+@dataclass(eq=False)
+class Capture:
+    """Photos, their cameras and, where the capture has them, points.
+
+    Attributes:
+        path: the folder or file the capture was loaded from.
+        views: in the order of the file (``transforms.json``) or of the names (COLMAP).
+        points: or None.
+    """
+
+    path: Path
+    views: list[View]
+    points: Points | None = None
+
+    @property
+    def train_views(self) -> list[View]:
+        """The views to fit."""
+        return [view for view in self.views if view.split == "train"]
+
+    @property
+    def test_views(self) -> list[View]:
+        """The views to score and never to fit."""
+        return [view for view in self.views if view.split == "test"]
+
+    def with_holdout(self, every: int) -> Capture:
+        """The same capture with a new split; images are shared, not copied.
+
+        Args:
+            every: of the views in the order of their names, those whose index is a multiple of
+                this become "test", all others "train" (the protocol of LLFF and 3DGS uses 8).
+
+        Raises:
+            IgsrError: the split would leave no view to fit.
+        """
+        if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 2:
+            raise IgsrError(f"holdout is {every!r}; give a whole number of at least 2, such as 8")
+        if len(self.views) < 2:
+            raise IgsrError(
+                f"{self.path} has one view only, so none can be held out; leave holdout away"
+            )
+        by_name = sorted(view.name for view in self.views)
+        held_out = set(by_name[::every])
+        views = [
+            replace(view, split="test" if view.name in held_out else "train") for view in self.views
+        ]
+        return Capture(self.path, views, self.points)
+
+    def _centres(self) -> np.ndarray:
+        views = self.train_views or self.views
+        return np.stack([view.camera.centre for view in views])
+
+    @property
+    def scene_centre(self) -> np.ndarray:
+        """float64 [3]: the mean of the training cameras' centres, in world units."""
+        return np.asarray(self._centres().mean(axis=0))
+
+    @property
+    def scene_extent(self) -> float:
+        """1.1 times the largest distance of a training camera from ``scene_centre``, world units.
+
+        This is the length by which 3DGS scales its learning rates and thresholds (Kerbl et al.
+        2023). Where all cameras stand on one spot it would be 0 and freeze every fit: it is 1 then.
+        """
+        centres = self._centres()
+        extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+        return extent if extent > 0.0 else 1.0
+
+
+def nearest_rigid(matrix: np.ndarray, name: str) -> np.ndarray:
+    """The rigid 4x4 float64 matrix nearest to a given one that is rigid up to rounding.
+
+    Raises:
+        IgsrError: not [4, 4], not finite, or further than 1e-3 from rigid; ``name`` leads the
+            sentence.
+    """
+    try:
+        matrix = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise IgsrError(f"{name} is not a matrix of numbers; give 4 rows of 4") from error
+    if matrix.shape != (4, 4):
+        raise IgsrError(f"{name} has shape {list(matrix.shape)}; give [4, 4]")
+    if not np.isfinite(matrix).all():
+        raise IgsrError(f"{name} holds a NaN or infinite entry; give a finite pose")
+    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        raise IgsrError(f"{name} ends in the row {matrix[3].tolist()}; it must be [0, 0, 0, 1]")
+    # Huge entries would overflow the products below and say no more than "not rigid" either.
+    block = np.clip(matrix[:3, :3], -1e100, 1e100)
+    scale = float(np.cbrt(abs(np.linalg.det(block))))
+    deviation = float(np.abs(block @ block.T - np.eye(3)).max())
+    if deviation > RIGID_TOLERANCE:
+        unscaled = block / scale if scale > 0.0 else block
+        hint = "remove scale and shear from it"
+        if np.abs(unscaled @ unscaled.T - np.eye(3)).max() <= RIGID_TOLERANCE:
+            hint = f"divide its 3x3 block by the uniform scale {scale:.6g}"
+        raise IgsrError(
+            f"{name} is not rigid: R R^T differs from the identity by {deviation:.3g} "
+            f"(at most {RIGID_TOLERANCE:g} passes as rounding); {hint}"
+        )
+    if np.linalg.det(block) < 0.0:
+        raise IgsrError(f"{name} is a reflection (determinant -1); flip one axis of its rotation")
+    u, _, vt = np.linalg.svd(block)
+    rigid = np.eye(4)
+    rigid[:3, :3] = u @ vt
+    rigid[:3, 3] = matrix[:3, 3]
+    return rigid
+
+
+def _checked_intrinsics(K: np.ndarray) -> np.ndarray:
+    try:
+        K = np.array(K, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise IgsrError("K is not a matrix of numbers; give 3 rows of 3") from error
+    if K.shape != (3, 3):
+        raise IgsrError(f"K has shape {list(K.shape)}; give [3, 3]")
+    for name, value in (("fx", K[0, 0]), ("fy", K[1, 1])):
+        if not (np.isfinite(value) and value > 0.0):
+            raise IgsrError(
+                f"the focal length {name} is {value:g} pixels, so the intrinsics are singular; "
+                "give a positive one"
+            )
+    for name, value in (("cx", K[0, 2]), ("cy", K[1, 2])):
+        if not np.isfinite(value):
+            raise IgsrError(f"the principal point {name} is {value:g}; give it in pixels")
+    if (K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != [0.0, 0.0, 0.0, 0.0, 1.0]).any():
+        raise IgsrError("K is not of the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; remove skew")
+    return K
+
+
+def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """float64 [3, 3], pixels."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

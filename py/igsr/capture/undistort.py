@@ -1,0 +1,184 @@
+"""Lens distortion undone at load: a distorted photo becomes a pinhole photo and a validity mask.
+
+The pinhole camera keeps the distorted camera's own focal lengths, principal point and size. So the
+picture's middle keeps its resolution and no crop has to be chosen; what the lens saw outside this
+frame is dropped, and pixels of the frame that the lens did not see are masked.
+
+Each pixel of the pinhole picture is sent through the lens model, which is explicit in this
+direction, and the photo is sampled there: no iteration, so no failure to converge.
+
+Sources of the models: OpenCV ``calib3d`` (Brown-Conrady, rational and equidistant fisheye) and
+COLMAP's camera models, which agree with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from igsr.errors import IgsrError
+
+# Rows mapped at a time: bounds the float64 temporaries at a few MB whatever the photo's size.
+_BAND_PIXELS = 1 << 17
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The distortion of a lens, acting on normalised coordinates x / z, y / z.
+
+    Perspective: radial factor (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), with
+    ``radial`` = (k1, k2, k3), ``denominator`` = (k4, k5, k6), plus the tangential p1, p2.
+    Fisheye: the angle t from the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + ...), with
+    ``radial`` = (k1, k2, k3, k4). Missing trailing coefficients are 0.
+    """
+
+    fisheye: bool = False
+    radial: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True where the lens bends nothing."""
+        return not self.fisheye and not any(self.radial + self.denominator + self.tangential)
+
+    def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the lens puts a ray.
+
+        Args:
+            x, y: float64 arrays of one shape, normalised pinhole coordinates.
+
+        Returns:
+            x, y: float64, distorted normalised coordinates.
+            valid: bool, False beyond the radius where the model folds back on itself. There two
+                rays share a pixel and the polynomial says nothing of the real lens.
+        """
+        s = x * x + y * y
+        numerator = np.polynomial.Polynomial((1.0, *self.radial))
+        denominator = np.polynomial.Polynomial((1.0, *self.denominator))
+        # d/dr of r N(r^2) / D(r^2), times D^2: its first positive root in r^2 is the fold.
+        s_poly = np.polynomial.Polynomial((0.0, 2.0))
+        slope = (
+            numerator + s_poly * numerator.deriv()
+        ) * denominator - s_poly * numerator * denominator.deriv()
+        fold = min(_first_positive_root(slope), _first_positive_root(denominator))
+        if self.fisheye:
+            r = np.sqrt(s)
+            angle = np.arctan(r)
+            angle_squared = angle * angle
+            tiny = r < 1e-12
+            factor = np.where(tiny, 1.0, angle / np.where(tiny, 1.0, r)) * numerator(angle_squared)
+            return x * factor, y * factor, angle_squared < fold
+        valid = s < fold
+        with np.errstate(all="ignore"):
+            n, d = numerator(s), denominator(s)
+            factor = n / d
+            factor_slope = (numerator.deriv()(s) * d - n * denominator.deriv()(s)) / (d * d)
+            p1, p2 = self.tangential
+            # Tangential terms can fold earlier than the radial ones: the Jacobian tells.
+            mixed = 2.0 * (x * y * factor_slope + p1 * x + p2 * y)
+            along_x = factor + 2.0 * x * x * factor_slope + 2.0 * p1 * y + 6.0 * p2 * x
+            along_y = factor + 2.0 * y * y * factor_slope + 2.0 * p2 * x + 6.0 * p1 * y
+            valid &= along_x * along_y - mixed * mixed > 0.0
+            return (
+                x * factor + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
+                y * factor + 2.0 * p2 * x * y + p1 * (s + 2.0 * y * y),
+                valid,
+            )
+
+
+def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
+    coefficients = np.trim_zeros(polynomial.coef, "b")
+    if len(coefficients) < 2:
+        return np.inf
+    try:
+        roots = np.polynomial.Polynomial(coefficients).roots()
+    except np.linalg.LinAlgError:
+        return 0.0
+    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+    return float(real.min()) if real.size else np.inf
+
+
+class Undistorter:
+    """Resamples photos of one distorted camera to its pinhole camera.
+
+    Args:
+        lens: the distortion.
+        K: float64 [3, 3], pixels; kept as the pinhole camera's intrinsics.
+        width, height: the photo's size, pixels; kept.
+
+    Attributes:
+        valid: bool [H, W], True where the pinhole pixel's centre lies within the photo.
+
+    Raises:
+        IgsrError: no pixel is valid.
+    """
+
+    def __init__(self, lens: Lens, K: np.ndarray, width: int, height: int) -> None:
+        """Map every pixel of the pinhole picture."""
+        self._shape = (height, width)
+        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        self.valid = np.empty((height, width), dtype=bool)
+        # Nearest upper-left photo pixel and the position between it and its neighbours.
+        self._index = np.empty((height, width), dtype=np.int64)
+        self._right = np.empty((height, width), dtype=np.float32)
+        self._down = np.empty((height, width), dtype=np.float32)
+        x = (np.arange(width) + 0.5 - cx) / fx
+        rows = max(1, _BAND_PIXELS // width)
+        for top in range(0, height, rows):
+            band = slice(top, min(top + rows, height))
+            y = (np.arange(band.start, band.stop) + 0.5 - cy) / fy
+            xd, yd, valid = lens.distort(*np.meshgrid(x, y))
+            with np.errstate(invalid="ignore", over="ignore"):
+                u, v = fx * xd + cx, fy * yd + cy
+                # The photo covers [0, width] x [0, height]; in its outer half pixels, sampling
+                # clamps to the outermost centres. NaN compares False.
+                valid &= (u >= 0.0) & (u <= width) & (v >= 0.0) & (v <= height)
+            self.valid[band] = valid
+            column = np.clip(np.where(valid, u, 0.5) - 0.5, 0.0, width - 1)
+            row = np.clip(np.where(valid, v, 0.5) - 0.5, 0.0, height - 1)
+            left = np.minimum(column.astype(np.int64), max(width - 2, 0))
+            up = np.minimum(row.astype(np.int64), max(height - 2, 0))
+            self._index[band] = up * width + left
+            self._right[band] = column - left
+            self._down[band] = row - up
+        if not self.valid.any():
+            raise IgsrError("its distortion leaves no pixel of the photo; correct k1 .. p2")
+
+    def _sample(self, channels: np.ndarray) -> np.ndarray:
+        """Bilinear samples of float32 [H, W, C]; invalid pixels hold the clamped sample."""
+        height, width = self._shape
+        flat = channels.reshape(height * width, -1)
+        step_right = 1 if width > 1 else 0
+        step_down = width if height > 1 else 0
+        out = np.empty((height, width, flat.shape[1]), dtype=np.float32)
+        rows = max(1, _BAND_PIXELS // width)
+        for top in range(0, height, rows):
+            band = slice(top, min(top + rows, height))
+            index = self._index[band]
+            right = self._right[band][..., None]
+            down = self._down[band][..., None]
+            upper = flat[index] * (1.0 - right) + flat[index + step_right] * right
+            index = index + step_down
+            lower = flat[index] * (1.0 - right) + flat[index + step_right] * right
+            out[band] = upper * (1.0 - down) + lower * down
+        return out
+
+    def image(self, image: np.ndarray) -> np.ndarray:
+        """The pinhole picture of uint8 [H, W, 3 or 4]; 0 where it is not valid."""
+        if image.shape[2] == 3:
+            out = self._sample(image.astype(np.float32))
+        else:
+            # Straight colours of transparent pixels mean nothing: weigh each colour by its alpha.
+            premultiplied = image.astype(np.float32)
+            premultiplied[..., :3] *= premultiplied[..., 3:] / 255.0
+            out = self._sample(premultiplied)
+            out[..., :3] *= 255.0 / np.maximum(out[..., 3:], 1e-6)
+        out[~self.valid] = 0.0
+        return np.asarray(np.clip(np.rint(out), 0.0, 255.0), dtype=np.uint8)
+
+    def mask(self, mask: np.ndarray) -> np.ndarray:
+        """bool [H, W]: True where valid and no pixel that is masked out has part in the sample."""
+        share = self._sample(mask.astype(np.float32)[..., None])[..., 0]
+        return np.asarray(self.valid & (share > 1.0 - 1e-3))
