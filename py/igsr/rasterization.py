@@ -27,10 +27,16 @@ from . import _core
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
-#: A rotation in float32 is orthonormal to about 1e-6; a scaled or sheared pose is far outside.
-RIGID_TOLERANCE = 1e-2
+#: A rotation in float32 is orthonormal to about 1e-6; a scaled or sheared pose is far outside (the
+#: renderer itself draws the same line).
+RIGID_TOLERANCE = 1e-3
 #: The tile's side in pixels; it shows in ``meta`` only, no picture depends on it.
 TILE_SIZE = 16
+
+#: What passes from ``_Project`` to ``_Rasterize``; the last two carry no gradient.
+DIFFERENTIABLE = ("means2d", "covars2d", "depths", "colors", "opacities")
+PROJECTED = (*DIFFERENTIABLE, "factors", "radii")
+IMAGE = ("color", "alpha", "depth")
 
 #: gsplat arguments that exist to be refused by name, with the only value accepted.
 _UNSUPPORTED_DEFAULTS: dict[str, Any] = {
@@ -67,19 +73,15 @@ class _Settings:
     backend: str
 
 
-def _array(tensor: Tensor) -> npt.NDArray[np.float32]:
-    return np.ascontiguousarray(tensor.detach().cpu().numpy())
-
-
-def _array64(tensor: Tensor) -> npt.NDArray[np.float64]:
-    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float64)
+def _array(tensor: Tensor, dtype: Any) -> npt.NDArray[Any]:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=dtype)
 
 
 class _Project(torch.autograd.Function):
     """Splats and one camera to 2D Gaussians."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         means: Tensor,
         quats: Tensor,
@@ -90,108 +92,89 @@ class _Project(torch.autograd.Function):
         K: Tensor,
         settings: _Settings,
     ) -> tuple[Tensor, ...]:
-        K_array = _array64(K)
-        inputs = [_array(t) for t in (means, quats, scales, opacities, colors)]
+        dtype = _core.working_dtype(settings.backend)
+        inputs = [_array(t, dtype) for t in (means, quats, scales, opacities, colors)]
         options: dict[str, Any] = {
             "sh_degree": settings.sh_degree,
-            "viewmat": _array64(viewmat),
-            "intrinsics": K_array[[0, 1, 0, 1], [0, 1, 2, 2]],
+            "raw_parameters": False,
+            "viewmat": _array(viewmat, np.float64),
+            "intrinsics": _array(K, np.float64)[[0, 1, 0, 1], [0, 1, 2, 2]],
             "width": settings.width,
             "height": settings.height,
             "near": settings.near,
             "far": settings.far,
             "eps2d": settings.eps2d,
-            "raw_parameters": False,
             "backend": settings.backend,
         }
         projected = _core.project(*inputs, **options)
-        ctx.inputs, ctx.options = inputs, options
-        ctx.device = means.device
-        ctx.camera_dtypes = viewmat.dtype, K.dtype
-        outputs = tuple(
-            torch.from_numpy(projected[name]).to(means.device)
-            for name in ("means2d", "covars2d", "depths", "colors", "opacities", "factors", "radii")
-        )
-        ctx.mark_non_differentiable(*outputs[5:])
+        ctx.inputs, ctx.options, ctx.projected = inputs, options, projected
+        ctx.like, ctx.camera_dtypes = means, (viewmat.dtype, K.dtype)
+        outputs = tuple(torch.from_numpy(projected[name]).to(means) for name in PROJECTED)
+        ctx.mark_non_differentiable(*outputs[len(DIFFERENTIABLE) :])
         return outputs
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(  # type: ignore[override]
-        ctx: Any, *v_outputs: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        v_means2d, v_covars2d, v_depths, v_colors, v_opacities = map(_array, v_outputs[:5])
+    def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        dtype = _core.working_dtype(ctx.options["backend"])
+        v_projected = {
+            f"v_{name}": _array(v, dtype)
+            for name, v in zip(DIFFERENTIABLE, v_outputs, strict=False)
+        }
+        means, quats, scales, opacities, colors = ctx.inputs
         v = _core.project_backward(
-            *ctx.inputs,
-            **ctx.options,
-            v_means2d=v_means2d,
-            v_covars2d=v_covars2d,
-            v_depths=v_depths,
-            v_colors=v_colors,
-            v_opacities=v_opacities,
+            means, quats, scales, opacities, colors, ctx.projected, v_projected, **ctx.options
         )
-        viewmat_dtype, K_dtype = ctx.camera_dtypes
+        like, (viewmat_dtype, K_dtype) = ctx.like, ctx.camera_dtypes
         v_fx, v_fy, v_cx, v_cy = v["v_intrinsics"]
-        v_K = torch.tensor(
-            [[v_fx, 0.0, v_cx], [0.0, v_fy, v_cy], [0.0, 0.0, 0.0]], dtype=torch.float64
+        v_K = np.array([[v_fx, 0.0, v_cx], [0.0, v_fy, v_cy], [0.0, 0.0, 0.0]])
+        names = ("v_means", "v_quats", "v_scales", "v_opacities", "v_colors")
+        return (
+            *(torch.from_numpy(v[name]).to(like) for name in names),
+            torch.from_numpy(v["v_viewmat"]).to(like.device, viewmat_dtype),
+            torch.from_numpy(v_K).to(like.device, K_dtype),
+            None,
         )
-        v_splats = tuple(
-            torch.from_numpy(v[name]).to(ctx.device)
-            for name in ("v_means", "v_quats", "v_scales", "v_opacities", "v_colors")
-        )
-        v_viewmat = torch.from_numpy(v["v_viewmat"]).to(ctx.device, viewmat_dtype)
-        return (*v_splats, v_viewmat, v_K.to(ctx.device, K_dtype), None)
 
 
 class _Rasterize(torch.autograd.Function):
     """2D Gaussians to one picture."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any,
-        means2d: Tensor,
-        covars2d: Tensor,
-        depths: Tensor,
-        colors: Tensor,
-        opacities: Tensor,
-        background: Tensor,
-        factors: Tensor,
-        radii: Tensor,
-        settings: _Settings,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = [_array(t) for t in (means2d, factors, depths, colors, opacities, radii)]
-        options: dict[str, Any] = {
-            "width": settings.width,
-            "height": settings.height,
-            "background": _array(background),
-            "backend": settings.backend,
-        }
-        image = _core.rasterize(*inputs, **options)
-        ctx.inputs, ctx.options, ctx.image = inputs, options, image
-        ctx.device = means2d.device
-        color, alpha, depth = (
-            torch.from_numpy(image[name]).to(ctx.device) for name in ("color", "alpha", "depth")
+    def forward(
+        ctx: Any, background: Tensor, settings: _Settings, *projected: Tensor
+    ) -> tuple[Tensor, ...]:
+        dtype = _core.working_dtype(settings.backend)
+        arrays = {name: _array(t, dtype) for name, t in zip(PROJECTED, projected, strict=True)}
+        ctx.projected, ctx.backend = arrays, settings.backend
+        ctx.background, ctx.like = _array(background, dtype), background
+        ctx.image = _core.rasterize(
+            arrays,
+            width=settings.width,
+            height=settings.height,
+            background=ctx.background,
+            backend=settings.backend,
         )
-        return color, alpha, depth
+        return tuple(torch.from_numpy(ctx.image[name]).to(background) for name in IMAGE)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(  # type: ignore[override]
+    def backward(
         ctx: Any, v_color: Tensor, v_alpha: Tensor, v_depth: Tensor
     ) -> tuple[Tensor | None, ...]:
+        dtype = _core.working_dtype(ctx.backend)
         v = _core.rasterize_backward(
-            *ctx.inputs,
-            **ctx.options,
-            color=ctx.image["color"],
-            depth=ctx.image["depth"],
-            transmittance=ctx.image["transmittance"],
-            v_color=_array(v_color),
-            v_alpha=_array(v_alpha),
-            v_depth=_array(v_depth),
+            ctx.projected,
+            ctx.image,
+            v_color=_array(v_color, dtype),
+            v_alpha=_array(v_alpha, dtype),
+            v_depth=_array(v_depth, dtype),
+            background=ctx.background,
+            backend=ctx.backend,
         )
-        names = ("v_means2d", "v_covars2d", "v_depths", "v_colors", "v_opacities", "v_background")
-        gradients = (torch.from_numpy(v[name]).to(ctx.device) for name in names)
-        return (*gradients, None, None, None)
+        v_background = torch.from_numpy(v["v_background"]).to(ctx.like)
+        v_projected = (torch.from_numpy(v[f"v_{name}"]).to(ctx.like) for name in DIFFERENTIABLE)
+        return (v_background, None, *v_projected, None, None)
 
 
 def rasterization(
@@ -235,7 +218,8 @@ def rasterization(
 
     Gradients reach ``means``, ``quats``, ``scales``, ``opacities``, ``colors``, ``viewmats``,
     ``Ks`` (fx, fy, cx, cy) and ``backgrounds``. Tensors may lie on any torch device (all on one);
-    the result lies there too. Splat tensors are float32; cameras float32 or float64.
+    the result lies there too. Splat tensors are float32; with backend "reference" they may all be
+    float64, and then everything is computed and returned in it. Cameras are float32 or float64.
 
     Args:
         means: [N, 3] centres, world frame.
@@ -285,12 +269,12 @@ def rasterization(
     _check_settings(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, render_mode
     )
+    dtypes = (torch.float32, torch.float64) if backend == "reference" else (torch.float32,)
     _check_tensors(
-        means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, width, height, sh_degree
+        means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, sh_degree, dtypes
     )
-    settings = _Settings(
-        width, height, near_plane, far_plane, eps2d, sh_degree, _core.resolve_backend(backend)
-    )
+    backend = _core.resolve_backend(backend)
+    settings = _Settings(width, height, near_plane, far_plane, eps2d, sh_degree, backend)
     cameras = len(viewmats)
     per_camera_colors = colors.dim() == (3 if sh_degree is None else 4)
 
@@ -307,39 +291,27 @@ def rasterization(
         )
         for c in range(cameras)
     ]
-    means2d, covars2d, depths, colors2d, opacities2d, factors, radii = map(
-        torch.stack, zip(*projected, strict=True)
-    )
+    # Each [C, N, ...]: the strategies read the gradient of the stacked means2d.
+    stacked = dict(zip(PROJECTED, map(torch.stack, zip(*projected, strict=True)), strict=True))
     if radius_clip > 0.0:
-        radii = radii * (radii > radius_clip).any(dim=-1, keepdim=True)
+        radii = stacked["radii"]
+        stacked["radii"] = radii * (radii > radius_clip).any(dim=-1, keepdim=True)
 
     camera_ids: Tensor | None = None
     gaussian_ids: Tensor | None = None
-    segments: list[Any] = list(range(cameras))
+    segments: list[int | slice] = list(range(cameras))
     if packed:
-        visible = (radii > 0).all(dim=-1)
+        visible = (stacked["radii"] > 0).all(dim=-1)
         camera_ids, gaussian_ids = torch.where(visible)
-        means2d, covars2d, depths, colors2d, opacities2d, factors, radii = (
-            per_splat[visible]
-            for per_splat in (means2d, covars2d, depths, colors2d, opacities2d, factors, radii)
-        )
+        stacked = {name: per_splat[visible] for name, per_splat in stacked.items()}
         ends = torch.cumsum(visible.sum(dim=1), dim=0).tolist()
         segments = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
 
     colors_out, alphas_out = [], []
     for c, segment in enumerate(segments):
         background = means.new_zeros(3) if backgrounds is None else backgrounds[c]
-        color, alpha, depth = _Rasterize.apply(
-            means2d[segment],
-            covars2d[segment],
-            depths[segment],
-            colors2d[segment],
-            opacities2d[segment],
-            background,
-            factors[segment],
-            radii[segment],
-            settings,
-        )
+        per_camera = (per_splat[segment] for per_splat in stacked.values())
+        color, alpha, depth = _Rasterize.apply(background, settings, *per_camera)
         alpha = alpha[..., None]
         depth = depth[..., None]
         if render_mode.endswith("ED"):
@@ -352,17 +324,17 @@ def rasterization(
             colors_out.append(depth)
         alphas_out.append(alpha)
 
-    p, q, r = factors.unbind(dim=-1)
+    p, q, r = stacked["factors"].unbind(dim=-1)
     meta = {
         "batch_ids": None if camera_ids is None else torch.zeros_like(camera_ids),
         "camera_ids": camera_ids,
         "gaussian_ids": gaussian_ids,
         # Nothing that exceeds int32 is a useful radius, and the cast of inf is undefined.
-        "radii": torch.ceil(radii).clamp(max=2.0**30).to(torch.int32),
-        "means2d": means2d,
-        "depths": depths,
+        "radii": torch.ceil(stacked["radii"]).clamp(max=2.0**30).to(torch.int32),
+        "means2d": stacked["means2d"],
+        "depths": stacked["depths"],
         "conics": torch.stack([p * p, p * q, q * q + r * r], dim=-1),
-        "opacities": opacities2d,
+        "opacities": stacked["opacities"],
         "width": width,
         "height": height,
         "tile_size": tile_size,
@@ -415,15 +387,14 @@ def _check_tensors(
     viewmats: Tensor,
     Ks: Tensor,
     backgrounds: Tensor | None,
-    width: int,
-    height: int,
     sh_degree: int | None,
+    dtypes: tuple[torch.dtype, ...],
 ) -> None:
-    _check_tensor("means", means, [("N", 3)], torch.float32)
-    count, device = len(means), means.device
-    _check_tensor("quats", quats, [(count, 4)], torch.float32, device)
-    _check_tensor("scales", scales, [(count, 3)], torch.float32, device)
-    _check_tensor("opacities", opacities, [(count,)], torch.float32, device)
+    _check_tensor("means", means, [("N", 3)], dtypes)
+    count, device, dtypes = len(means), means.device, (means.dtype,)
+    _check_tensor("quats", quats, [(count, 4)], dtypes, device)
+    _check_tensor("scales", scales, [(count, 3)], dtypes, device)
+    _check_tensor("opacities", opacities, [(count,)], dtypes, device)
     camera_dtypes = (torch.float32, torch.float64)
     _check_tensor("viewmats", viewmats, [("C", 4, 4)], camera_dtypes, device)
     cameras = len(viewmats)
@@ -434,18 +405,19 @@ def _check_tensors(
         shapes: list[tuple[int | str, ...]] = [(count, 3), (cameras, count, 3)]
     else:
         shapes = [(count, "K", 3), (cameras, count, "K", 3)]
-    _check_tensor("colors", colors, shapes, torch.float32, device)
+    _check_tensor("colors", colors, shapes, dtypes, device)
     if sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
         raise ValueError(
             f"colors: sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, "
             f"not {colors.shape[-2]}"
         )
     if backgrounds is not None:
-        _check_tensor("backgrounds", backgrounds, [(cameras, 3)], torch.float32, device)
+        _check_tensor("backgrounds", backgrounds, [(cameras, 3)], dtypes, device)
         if not torch.isfinite(backgrounds).all():
             raise ValueError("backgrounds: must be finite")
-    for c, (viewmat, K) in enumerate(zip(_array64(viewmats), _array64(Ks), strict=True)):
+    for c, viewmat in enumerate(_array(viewmats, np.float64)):
         _check_viewmat(f"viewmats[{c}]", viewmat)
+    for c, K in enumerate(_array(Ks, np.float64)):
         _check_intrinsics(f"Ks[{c}]", K)
 
 
@@ -453,13 +425,12 @@ def _check_tensor(
     name: str,
     tensor: object,
     shapes: list[tuple[int | str, ...]],
-    dtypes: torch.dtype | tuple[torch.dtype, ...],
+    dtypes: tuple[torch.dtype, ...],
     device: torch.device | None = None,
 ) -> None:
     """Letters in ``shapes`` stand for any size."""
     if not isinstance(tensor, Tensor):
         raise ValueError(f"{name}: must be a torch tensor, not {type(tensor).__name__}")
-    dtypes = dtypes if isinstance(dtypes, tuple) else (dtypes,)
     if tensor.dtype not in dtypes:
         wanted = " or ".join(str(dtype) for dtype in dtypes)
         raise ValueError(f"{name}: must be {wanted}, not {tensor.dtype}")
@@ -481,7 +452,7 @@ def _check_viewmat(name: str, viewmat: npt.NDArray[np.float64]) -> None:
     rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_TOLERANCE
     if not rigid or np.linalg.det(rotation) < 0:
         raise ValueError(f"{name}: its 3 x 3 part is not a rotation")
-    if np.abs(viewmat[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
+    if np.abs(viewmat[3] - (0.0, 0.0, 0.0, 1.0)).max() > RIGID_TOLERANCE:
         raise ValueError(f"{name}: its last row must be 0 0 0 1")
 
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from . import _core
 from .capture import Camera
+from .errors import IgsrError
 from .splats import FloatArray, Splats
 
 #: What lies nearer than this, in world units, is not drawn (gsplat's default).
@@ -61,20 +62,27 @@ def render(
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu" or "reference".
 
     Raises:
-        ValueError: an argument is unusable; the message names it.
+        IgsrError: an argument is unusable; the message names it.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
-    background_color = np.asarray(background, dtype=np.float32)
+    background_color = np.asarray(background, dtype=np.float64)
     if background_color.shape != (3,) or not np.isfinite(background_color).all():
-        raise ValueError("background must be three finite numbers")
+        raise IgsrError("background must be three finite numbers")
     backend = _core.resolve_backend(backend)
+    dtype = _core.working_dtype(backend)
     projected = _core.project(
-        splats.means,
-        splats.quats,
-        splats.scales,
-        splats.opacities,
-        splats.sh,
+        *(
+            parameter.astype(dtype, order="C", copy=False)
+            for parameter in (
+                splats.means,
+                splats.quats,
+                splats.scales,
+                splats.opacities,
+                splats.sh,
+            )
+        ),
         sh_degree=splats.sh_degree,
+        raw_parameters=True,
         viewmat=viewmat_about(splats.origin, camera.viewmat),
         intrinsics=intrinsics_of(camera.K),
         width=camera.width,
@@ -82,24 +90,21 @@ def render(
         near=NEAR_PLANE,
         far=FAR_PLANE,
         eps2d=EPS2D,
-        raw_parameters=True,
         backend=backend,
     )
     image = _core.rasterize(
-        projected["means2d"],
-        projected["factors"],
-        projected["depths"],
-        projected["colors"],
-        projected["opacities"],
-        projected["radii"],
+        projected,
         width=camera.width,
         height=camera.height,
-        background=background_color,
+        background=background_color.astype(dtype),
         backend=backend,
     )
-    alpha, depth = image["alpha"], image["depth"]
+    color, alpha, depth, transmittance = (
+        image[name].astype(np.float32, copy=False)
+        for name in ("color", "alpha", "depth", "transmittance")
+    )
     expected = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
-    return Render(image["color"], alpha, depth, expected, image["transmittance"])
+    return Render(color, alpha, depth, expected, transmittance)
 
 
 def viewmat_about(

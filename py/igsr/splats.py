@@ -1,4 +1,4 @@
-"""Splats: the Gaussians of one scene, as numpy arrays, and the INRIA ``.ply`` they are stored in."""
+"""Splats: the Gaussians of one scene as numpy arrays, and the INRIA ``.ply`` that stores them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Splats:
             from zero (map coordinates) precise in float32.
 
     Raises:
-        ValueError: an array has the wrong shape or dtype; the message names it.
+        IgsrError: an array has the wrong shape or dtype; the message names it.
     """
 
     means: FloatArray
@@ -50,18 +50,18 @@ class Splats:
             self._check(name, getattr(self, name), (count, *tail))
         bands = self.sh.shape[1] if isinstance(self.sh, np.ndarray) and self.sh.ndim == 3 else 0
         if bands not in [(degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1)]:
-            raise ValueError("sh must be float32 [N, K, 3] with K one of 1, 4, 9, 16, 25")
+            raise IgsrError("sh must be float32 [N, K, 3] with K one of 1, 4, 9, 16, 25")
         self._check("sh", self.sh, (count, bands, 3))
         self.origin = np.asarray(self.origin, dtype=np.float64)
         if self.origin.shape != (3,) or not np.isfinite(self.origin).all():
-            raise ValueError("origin must be three finite numbers")
+            raise IgsrError("origin must be three finite numbers")
 
     @staticmethod
     def _check(name: str, array: object, shape: tuple[int, ...]) -> None:
         if not isinstance(array, np.ndarray):
-            raise ValueError(f"{name} must be a numpy array, not {type(array).__name__}")
+            raise IgsrError(f"{name} must be a numpy array, not {type(array).__name__}")
         if array.dtype != np.float32 or array.shape != shape:
-            raise ValueError(
+            raise IgsrError(
                 f"{name} must be float32 {list(shape)}, not {array.dtype} {list(array.shape)}"
             )
 
@@ -71,7 +71,7 @@ class Splats:
     @property
     def sh_degree(self) -> int:
         """Degree of the stored spherical harmonics, 0-4."""
-        return int(round(self.sh.shape[1] ** 0.5)) - 1
+        return round(self.sh.shape[1] ** 0.5) - 1
 
     def bounds(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
         """Lowest and highest corner [3] of the centres, world frame; None without splats."""

@@ -15,9 +15,10 @@ use pyo3::prelude::*;
 #[pymodule]
 mod _core {
     #[pymodule_export]
-    use crate::backend::{backend_info, resolve_backend};
+    #[expect(non_upper_case_globals, reason = "Python's name for it")]
+    const __version__: &str = env!("CARGO_PKG_VERSION");
     #[pymodule_export]
-    use crate::splat_files::{read_ply, write_ply};
+    use crate::backend::{backend_info, resolve_backend, working_dtype};
     #[pymodule_export]
     use crate::stages::{project, project_backward, rasterize, rasterize_backward};
 }

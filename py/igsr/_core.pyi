@@ -1,0 +1,130 @@
+"""Types of the Rust module: numpy arrays in, numpy arrays out.
+
+Arrays are C-contiguous. ``Real`` is float32, or float64 for the backend "reference" (see
+``working_dtype``). N is the number of splats, K of SH coefficients per splat, H x W the picture.
+"""
+
+from typing import Any, TypedDict
+
+import numpy as np
+import numpy.typing as npt
+
+__version__: str
+
+Real = npt.NDArray[Any]
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+class SplatArrays(TypedDict):
+    """Splat parameters as fitted and stored: log-scales, opacity logits."""
+
+    means: Float32  # [N, 3] relative to origin
+    quats: Float32  # [N, 4] wxyz
+    scales: Float32  # [N, 3]
+    opacities: Float32  # [N]
+    sh: Float32  # [N, K, 3]
+    origin: Float64  # [3]
+
+def resolve_backend(name: str) -> str:
+    """The backend that "auto", "cpu", "gpu" or "reference" stands for.
+
+    Raises ValueError for another name, RuntimeError where "gpu" has no adapter.
+    """
+
+def backend_info(name: str) -> dict[str, str]:
+    """``backend``, ``device`` and ``instruction_set`` of a resolved backend."""
+
+def working_dtype(backend: str) -> type[np.floating[Any]]:
+    """The dtype of every Real array of a resolved backend."""
+
+def project(
+    means: Real,
+    quats: Real,
+    scales: Real,
+    opacities: Real,
+    colors: Real,
+    *,
+    sh_degree: int | None,
+    raw_parameters: bool,
+    viewmat: Float64,
+    intrinsics: Float64,
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    eps2d: float,
+    backend: str,
+) -> dict[str, Real]:
+    """Splats and one camera to 2D splats.
+
+    ``colors`` is [N, 3], or [N, K, 3] SH coefficients with ``sh_degree``; ``raw_parameters`` says
+    that scales are logs and opacities logits. ``viewmat`` [4, 4] is world-to-camera,
+    ``intrinsics`` [4] fx, fy, cx, cy.
+
+    Returns means2d [N, 2], factors [N, 3], covars2d [N, 3], depths [N], colors [N, 3],
+    opacities [N], radii [N, 2]; a culled splat has zeros.
+    """
+
+def rasterize(
+    projected: dict[str, Real],
+    *,
+    width: int,
+    height: int,
+    background: Real,
+    backend: str,
+) -> dict[str, Real]:
+    """2D splats to color [H, W, 3], alpha, depth and transmittance [H, W]."""
+
+def rasterize_backward(
+    projected: dict[str, Real],
+    image: dict[str, Real],
+    *,
+    v_color: Real,
+    v_alpha: Real,
+    v_depth: Real,
+    background: Real,
+    backend: str,
+) -> dict[str, Real]:
+    """Gradients v_means2d, v_covars2d, v_depths, v_colors, v_opacities and v_background [3].
+
+    ``image`` is what ``rasterize`` returned for the same arguments.
+    """
+
+def project_backward(
+    means: Real,
+    quats: Real,
+    scales: Real,
+    opacities: Real,
+    colors: Real,
+    projected: dict[str, Real],
+    v_projected: dict[str, Real],
+    *,
+    sh_degree: int | None,
+    raw_parameters: bool,
+    viewmat: Float64,
+    intrinsics: Float64,
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    eps2d: float,
+    backend: str,
+) -> dict[str, Real]:
+    """Gradients v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmat, v_intrinsics.
+
+    The last two are float64 for every backend.
+    """
+
+def read_ply(path: str) -> SplatArrays:
+    """Read an INRIA .ply; OSError says what is wrong with the file."""
+
+def write_ply(
+    path: str,
+    means: Float32,
+    quats: Float32,
+    scales: Float32,
+    opacities: Float32,
+    sh: Float32,
+    origin: Float64,
+) -> None:
+    """Write an INRIA .ply; OSError where that fails."""
