@@ -1,11 +1,13 @@
 //! The oracle: f64, short, plain, no tiles, no tricks. Every other implementation is tested
 //! against it, stage by stage.
 
+mod kinks;
 mod project;
 mod project_backward;
 mod rasterize;
 mod rasterize_backward;
 
+pub use kinks::decisions;
 pub use rasterize::band_pixels;
 
 use crate::camera::Camera;

@@ -1,0 +1,202 @@
+//! bin: extents to splat ids ordered by (tile, depth, index).
+
+use rayon::prelude::*;
+
+use super::project::Splat2d;
+use crate::constants::{ALPHA_MIN, TILE};
+
+/// Splats per parallel task.
+pub(super) const CHUNK: usize = 1024;
+
+/// Tiles that splats touch, in splat order, one chunk of [`CHUNK`] splats each.
+#[derive(Debug, Default, Clone)]
+pub(super) struct ChunkTiles {
+    /// Tile ids, splat-major: a splat's ids are contiguous.
+    tiles: Vec<u32>,
+    /// Number of tiles of each splat of the chunk.
+    counts: Vec<u32>,
+}
+
+impl ChunkTiles {
+    /// Appends a splat that touches nothing.
+    pub fn push_culled(&mut self) {
+        self.counts.push(0);
+    }
+
+    /// Appends the tiles that a visible splat touches: per row of tiles, the exact span of its
+    /// ellipse {alpha >= ALPHA_MIN} within the band of that row's pixel centres, a little widened
+    /// against rounding.
+    pub fn push(&mut self, splat: &Splat2d, width: u32, height: u32) {
+        let before = self.tiles.len();
+        let tile = TILE as f32;
+        let (columns, rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
+        let [mx, my] = splat.mean;
+        let [p, q, r] = splat.factor;
+        let [rx, ry] = splat.radii;
+        let reach = 2.0 * (splat.opacity / ALPHA_MIN).ln() * (1.0 + 1e-5) + 1e-5;
+        let slack = 1e-2 + 4e-6 * (rx + mx.abs());
+        // First and last row of tiles whose band of pixel centres meets the box.
+        let row_of = |y: f32| (y / tile).floor().clamp(0.0, (rows - 1) as f32) as u32;
+        let (first, last) = (row_of(my - ry - slack - 0.5), row_of(my + ry + slack - 0.5));
+        // Height at which the ellipse is widest to the right; to the left it is the opposite.
+        let widest = -q * reach.sqrt() / (r * (q * q + r * r).sqrt());
+        for row in first..=last {
+            let low = (row * TILE) as f32 + 0.5 - my;
+            let high = low + (tile - 1.0);
+            let at = |dy: f32, side: f32| {
+                let dy = dy.clamp(low, high);
+                let rest = (reach - (r * dy) * (r * dy)).max(0.0).sqrt();
+                (-q * dy + side * rest) / p
+            };
+            // The whole band lies above or below the ellipse.
+            let nearest = 0.0f32.clamp(low, high);
+            if (r * nearest) * (r * nearest) > reach {
+                continue;
+            }
+            let right = mx + at(widest, 1.0) + slack;
+            let left = mx + at(-widest, -1.0) - slack;
+            if !(right >= 0.5 && left <= width as f32 - 0.5) {
+                continue;
+            }
+            let column_of = |x: f32| (x / tile).floor().clamp(0.0, (columns - 1) as f32) as u32;
+            // A tile's last pixel centre lies half a pixel before its right edge, hence the -0.5
+            // on the right and, on the left, the +0.5 on the tile that ends there.
+            let from = column_of(left + 0.5);
+            let to = column_of(right - 0.5);
+            for column in from..=to {
+                self.tiles.push(row * columns + column);
+            }
+        }
+        self.counts.push((self.tiles.len() - before) as u32);
+    }
+}
+
+/// Splats sorted into tiles.
+#[derive(Debug, Default, Clone)]
+pub(super) struct Bins {
+    /// `[tiles + 1]` start of each tile's list.
+    pub starts: Vec<u32>,
+    /// Splat ids by (tile, depth, index).
+    pub splats: Vec<u32>,
+    /// `[N + 1]` start of each splat's slots, splat-major.
+    pub slots: Vec<u32>,
+    /// Position in `splats` of each slot.
+    pub position_from_slot: Vec<u32>,
+    keys: Vec<u64>,
+    spare: Vec<u64>,
+}
+
+impl Bins {
+    /// Sorts the chunks' tiles. `depth(i)` is asked only for splats that touch a tile.
+    pub fn fill(&mut self, chunks: &[ChunkTiles], tiles: usize, depth: impl Fn(usize) -> f32) {
+        self.starts.clear();
+        self.starts.resize(tiles + 1, 0);
+        self.slots.clear();
+        self.slots.push(0);
+        self.keys.clear();
+        let mut total = 0u32;
+        let mut i = 0usize;
+        for chunk in chunks {
+            for &tile in &chunk.tiles {
+                self.starts[tile as usize + 1] += 1;
+            }
+            for &count in &chunk.counts {
+                if count > 0 {
+                    // Depths are positive, so their bits order as they do; the index breaks ties.
+                    self.keys.push(u64::from(depth(i).to_bits()) << 32 | i as u64);
+                }
+                total += count;
+                self.slots.push(total);
+                i += 1;
+            }
+        }
+        for tile in 0..tiles {
+            self.starts[tile + 1] += self.starts[tile];
+        }
+        sort_by_depth(&mut self.keys, &mut self.spare);
+
+        self.splats.resize(total as usize, 0);
+        self.position_from_slot.resize(total as usize, 0);
+        let mut cursors = self.starts.clone();
+        for &key in &self.keys {
+            let i = (key & 0xffff_ffff) as usize;
+            let chunk = &chunks[i / CHUNK];
+            let base = self.slots[i / CHUNK * CHUNK] as usize;
+            for slot in self.slots[i] as usize..self.slots[i + 1] as usize {
+                let cursor = &mut cursors[chunk.tiles[slot - base] as usize];
+                self.splats[*cursor as usize] = i as u32;
+                self.position_from_slot[slot] = *cursor;
+                *cursor += 1;
+            }
+        }
+    }
+
+    /// Positions in `splats` of a tile's list.
+    pub fn range(&self, tile: usize) -> std::ops::Range<usize> {
+        self.starts[tile] as usize..self.starts[tile + 1] as usize
+    }
+}
+
+/// Stable least-significant-digit radix sort by the upper 32 bits: three passes of 11 bits.
+fn sort_by_depth(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
+    const BITS: u32 = 11;
+    const SIZE: usize = 1 << BITS;
+    spare.resize(keys.len(), 0);
+    let mut counts = vec![[0u32; SIZE]; 3];
+    for &key in keys.iter() {
+        for (pass, counts) in counts.iter_mut().enumerate() {
+            counts[(key >> (32 + BITS * pass as u32)) as usize & (SIZE - 1)] += 1;
+        }
+    }
+    for (pass, counts) in counts.iter_mut().enumerate() {
+        let mut sum = 0;
+        for count in counts.iter_mut() {
+            sum += std::mem::replace(count, sum);
+        }
+        for &key in keys.iter() {
+            let cursor = &mut counts[(key >> (32 + BITS * pass as u32)) as usize & (SIZE - 1)];
+            spare[*cursor as usize] = key;
+            *cursor += 1;
+        }
+        std::mem::swap(keys, spare);
+    }
+}
+
+/// Tiles of all splats, in parallel over chunks.
+pub(super) fn touched_tiles(
+    splats: &[Option<Splat2d>],
+    width: u32,
+    height: u32,
+) -> Vec<ChunkTiles> {
+    splats
+        .par_chunks(CHUNK)
+        .map(|chunk| {
+            let mut tiles = ChunkTiles::default();
+            for splat in chunk {
+                match splat {
+                    Some(splat) => tiles.push(splat, width, height),
+                    None => tiles.push_culled(),
+                }
+            }
+            tiles
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn radix_sort_orders_by_depth_then_index() {
+        let depths = [3.0f32, 1.0, 2.0, 1.0, 1e-3, 1e9, 2.0];
+        let mut keys: Vec<u64> = depths
+            .iter()
+            .enumerate()
+            .map(|(i, d)| u64::from(d.to_bits()) << 32 | i as u64)
+            .collect();
+        sort_by_depth(&mut keys, &mut Vec::new());
+        let ids: Vec<u64> = keys.iter().map(|k| k & 0xffff_ffff).collect();
+        assert_eq!(ids, [4, 1, 3, 2, 6, 0, 5]);
+    }
+}

@@ -1,0 +1,195 @@
+//! project_backward: gradients of the 2D splats to gradients of the splats and the camera, f32.
+
+use glam::{Mat3, Vec3};
+
+use super::project::{Splat, View, direction, geometry, sh_color};
+use crate::sh;
+use crate::stages::Colors;
+
+/// Gradients of one 2D splat.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct V2d {
+    pub v_mean: [f32; 2],
+    pub v_covar: [f32; 3],
+    pub v_depth: f32,
+    pub v_color: [f32; 3],
+    pub v_opacity: f32,
+}
+
+/// Gradients of one splat's parameters, colours apart.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct VSplat {
+    pub v_mean: [f32; 3],
+    pub v_quat: [f32; 4],
+    pub v_scales: [f32; 3],
+    pub v_opacity: f32,
+}
+
+/// Gradients of the camera, summed in f64: they gather from every splat.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct VCamera {
+    /// Rows of the upper 3x4 block of the viewmat.
+    pub v_viewmat: [[f64; 4]; 3],
+    /// (fx, fy, cx, cy)
+    pub v_intrinsics: [f64; 4],
+}
+
+impl VCamera {
+    pub fn add(&mut self, other: &Self) {
+        for (row, other) in self.v_viewmat.iter_mut().zip(&other.v_viewmat) {
+            for (sum, value) in row.iter_mut().zip(other) {
+                *sum += value;
+            }
+        }
+        for (sum, value) in self.v_intrinsics.iter_mut().zip(other.v_intrinsics) {
+            *sum += value;
+        }
+    }
+
+    fn add_rotation(&mut self, rows: [Vec3; 3]) {
+        for (sum, row) in self.v_viewmat.iter_mut().zip(rows) {
+            for (s, v) in sum.iter_mut().zip(row.to_array()) {
+                *s += f64::from(v);
+            }
+        }
+    }
+}
+
+/// Gradient of a unit quaternion's rotation matrix, as (w, x, y, z).
+#[inline(always)]
+fn quat_gradient([w, x, y, z]: [f32; 4], v: Mat3) -> [f32; 4] {
+    let (vx, vy, vz) = (v.x_axis, v.y_axis, v.z_axis);
+    [
+        2.0 * (x * (vy.z - vz.y) + y * (vz.x - vx.z) + z * (vx.y - vy.x)),
+        2.0 * (-2.0 * x * (vy.y + vz.z)
+            + y * (vy.x + vx.y)
+            + z * (vz.x + vx.z)
+            + w * (vy.z - vz.y)),
+        2.0 * (x * (vy.x + vx.y) - 2.0 * y * (vx.x + vz.z) + z * (vz.y + vy.z) + w * (vz.x - vx.z)),
+        2.0 * (x * (vz.x + vx.z) + y * (vz.y + vy.z) - 2.0 * z * (vx.x + vy.y) + w * (vx.y - vy.x)),
+    ]
+}
+
+/// Gradients of one visible splat. `v_sh` receives the coefficients' gradients (or the direct
+/// colour's); `v_camera`, where wanted, is added to.
+#[inline(always)]
+pub(super) fn splat_backward(
+    view: &View,
+    splat: &Splat,
+    raw: bool,
+    colors: &Colors<'_, f32>,
+    i: usize,
+    v: &V2d,
+    v_sh: &mut [[f32; 3]],
+    mut v_camera: Option<&mut VCamera>,
+) -> VSplat {
+    let Some(g) = geometry(view, splat) else { return VSplat::default() };
+    let mut out = VSplat::default();
+    let (fx, fy) = (view.focal.x, view.focal.y);
+    let inverse_z = g.t.z.recip();
+    let mut v_t = Vec3::ZERO;
+
+    // Colour and, through the view direction, t and the rotation.
+    let mut v_color = Vec3::from(v.v_color);
+    match *colors {
+        Colors::Direct(_) => v_sh[0] = v.v_color,
+        Colors::Sh { degree, stride, coeffs } => {
+            let coeffs = &coeffs[i * stride..(i + 1) * stride];
+            let (dir, length) = direction(view, g.t);
+            let basis = sh::basis(degree, dir.to_array());
+            let color = sh_color(degree, &basis, coeffs);
+            v_color = Vec3::select(color.cmpgt(Vec3::ZERO), v_color, Vec3::ZERO);
+            for (v_coeff, b) in v_sh.iter_mut().zip(basis).take(sh::coeffs(degree)) {
+                *v_coeff = (b * v_color).to_array();
+            }
+            if degree > 0 {
+                let slopes = sh::basis_gradient(degree, dir.to_array());
+                let mut v_dir = Vec3::ZERO;
+                for (slope, coeff) in slopes.iter().zip(coeffs).take(sh::coeffs(degree)) {
+                    v_dir += Vec3::from(*slope) * v_color.dot(Vec3::from(*coeff));
+                }
+                let v_along = (v_dir - dir * dir.dot(v_dir)) / length;
+                v_t += view.rotation * v_along;
+                if let Some(camera) = v_camera.as_deref_mut() {
+                    camera.add_rotation([v_along * g.t.x, v_along * g.t.y, v_along * g.t.z]);
+                }
+            }
+        }
+    }
+
+    let o = splat.opacity;
+    out.v_opacity = if raw { v.v_opacity * (o * (1.0 - o)) } else { v.v_opacity };
+
+    // 2D covariance -> M = J R A S.
+    let [v_xx, v_xy, v_yy] = v.v_covar;
+    let v_m = [2.0 * v_xx * g.m[0] + v_xy * g.m[1], 2.0 * v_yy * g.m[1] + v_xy * g.m[0]];
+    let v_scales = v_m[0] * g.b[0] + v_m[1] * g.b[1];
+    out.v_scales = if raw { v_scales * splat.scales } else { v_scales }.to_array();
+    let v_b = v_m.map(|v| v * splat.scales);
+
+    // Axes -> quaternion, through its normalisation.
+    let v_axes = Mat3::from_cols(
+        g.a[0] * v_b[0].x + g.a[1] * v_b[1].x,
+        g.a[0] * v_b[0].y + g.a[1] * v_b[1].y,
+        g.a[0] * v_b[0].z + g.a[1] * v_b[1].z,
+    );
+    let v_unit = quat_gradient(g.quat, v_axes);
+    let along = v_unit[0] * g.quat[0]
+        + v_unit[1] * g.quat[1]
+        + v_unit[2] * g.quat[2]
+        + v_unit[3] * g.quat[3];
+    out.v_quat = std::array::from_fn(|k| (v_unit[k] - along * g.quat[k]) / g.quat_norm);
+
+    // a = J R, with x/z and y/z held where they are limited.
+    let v_a = v_b.map(|v| g.axes * v);
+    let (jx, jy) = (fx * inverse_z, fy * inverse_z);
+    let (v_j00, v_j02) = (v_a[0].dot(view.rows[0]), v_a[0].dot(view.rows[2]));
+    let (v_j11, v_j12) = (v_a[1].dot(view.rows[1]), v_a[1].dot(view.rows[2]));
+    v_t.z -= ((v_j00 - v_j02 * g.xz) * jx + (v_j11 - v_j12 * g.yz) * jy) * inverse_z;
+    let (v_xz, v_yz) = (-v_j02 * jx, -v_j12 * jy);
+    if g.inside[0] {
+        v_t.x += v_xz * inverse_z;
+        v_t.z -= v_xz * g.xz * inverse_z;
+    }
+    if g.inside[1] {
+        v_t.y += v_yz * inverse_z;
+        v_t.z -= v_yz * g.yz * inverse_z;
+    }
+
+    // Centre and depth.
+    let [v_u, v_v] = v.v_mean;
+    let (x_z, y_z) = (g.t.x * inverse_z, g.t.y * inverse_z);
+    v_t += Vec3::new(v_u * jx, v_v * jy, v.v_depth - (v_u * jx * x_z + v_v * jy * y_z));
+
+    out.v_mean = (view.rows[0] * v_t.x + view.rows[1] * v_t.y + view.rows[2] * v_t.z).to_array();
+    if let Some(camera) = v_camera {
+        let mean = splat.mean;
+        camera.add_rotation([
+            v_a[0] * jx + mean * v_t.x,
+            v_a[1] * jy + mean * v_t.y,
+            -v_a[0] * (jx * g.xz) - v_a[1] * (jy * g.yz) + mean * v_t.z,
+        ]);
+        for (row, v) in camera.v_viewmat.iter_mut().zip(v_t.to_array()) {
+            row[3] += f64::from(v);
+        }
+        let mut intrinsics = [
+            (v_j00 - v_j02 * g.xz) * inverse_z + v_u * x_z,
+            (v_j11 - v_j12 * g.yz) * inverse_z + v_v * y_z,
+            v_u,
+            v_v,
+        ];
+        // The limits are affine functions of the principal point, over the focal length.
+        if !g.inside[0] {
+            intrinsics[0] -= v_xz * g.xz / fx;
+            intrinsics[2] -= v_xz / fx;
+        }
+        if !g.inside[1] {
+            intrinsics[1] -= v_yz * g.yz / fy;
+            intrinsics[3] -= v_yz / fy;
+        }
+        for (sum, value) in camera.v_intrinsics.iter_mut().zip(intrinsics) {
+            *sum += f64::from(value);
+        }
+    }
+    out
+}

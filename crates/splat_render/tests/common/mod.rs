@@ -1,0 +1,433 @@
+//! Seeded random scenes, f32/f64 conversions and comparators, shared by the tests of all backends.
+#![allow(dead_code)] // Each test binary uses its own part.
+
+use glam::{DMat3, DMat4, DQuat, DVec3};
+use rand::{Rng, SeedableRng};
+use rand_pcg::Pcg64;
+use splat_render::constants::BLUR;
+use splat_render::stages::{Colors, Image, ImageGradients, Projected, ProjectedGradients};
+use splat_render::{Camera, SplatGradients, SplatParams};
+
+/// A seeded generator.
+pub fn rng(seed: u64) -> Pcg64 {
+    Pcg64::seed_from_u64(seed)
+}
+
+/// A standard normal draw (Box-Muller).
+pub fn normal(rng: &mut Pcg64) -> f64 {
+    let u: f64 = 1.0 - rng.random::<f64>();
+    (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * rng.random::<f64>()).cos()
+}
+
+/// Splat parameters that own their arrays.
+#[derive(Debug, Clone, Default)]
+pub struct Scene<T> {
+    pub means: Vec<[T; 3]>,
+    pub quats: Vec<[T; 4]>,
+    pub scales: Vec<[T; 3]>,
+    pub opacities: Vec<T>,
+    /// `[N * sh_stride]`, or `[N]` where `sh_stride` is 0 (direct colours).
+    pub colors: Vec<[T; 3]>,
+    pub sh_degree: u32,
+    pub sh_stride: usize,
+    pub raw: bool,
+}
+
+impl<T> Scene<T> {
+    pub fn params(&self) -> SplatParams<'_, T> {
+        SplatParams {
+            means: &self.means,
+            quats: &self.quats,
+            scales: &self.scales,
+            opacities: &self.opacities,
+            colors: if self.sh_stride == 0 {
+                Colors::Direct(&self.colors)
+            } else {
+                Colors::Sh {
+                    degree: self.sh_degree,
+                    stride: self.sh_stride,
+                    coeffs: &self.colors,
+                }
+            },
+            raw: self.raw,
+        }
+    }
+}
+
+impl Scene<f32> {
+    pub fn widen(&self) -> Scene<f64> {
+        Scene {
+            means: widen(&self.means),
+            quats: widen(&self.quats),
+            scales: widen(&self.scales),
+            opacities: widen1(&self.opacities),
+            colors: widen(&self.colors),
+            sh_degree: self.sh_degree,
+            sh_stride: self.sh_stride,
+            raw: self.raw,
+        }
+    }
+}
+
+pub fn widen<const K: usize>(rows: &[[f32; K]]) -> Vec<[f64; K]> {
+    rows.iter().map(|row| row.map(f64::from)).collect()
+}
+
+pub fn widen1(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&v| f64::from(v)).collect()
+}
+
+pub fn narrow<const K: usize>(rows: &[[f64; K]]) -> Vec<[f32; K]> {
+    rows.iter().map(|row| row.map(|v| v as f32)).collect()
+}
+
+pub fn narrow1(values: &[f64]) -> Vec<f32> {
+    values.iter().map(|&v| v as f32).collect()
+}
+
+pub fn widen_projected(p: &Projected<f32>) -> Projected<f64> {
+    Projected {
+        width: p.width,
+        height: p.height,
+        means2d: widen(&p.means2d),
+        factors: widen(&p.factors),
+        covars2d: widen(&p.covars2d),
+        depths: widen1(&p.depths),
+        colors: widen(&p.colors),
+        opacities: widen1(&p.opacities),
+        radii: widen(&p.radii),
+    }
+}
+
+pub fn narrow_projected(p: &Projected<f64>) -> Projected<f32> {
+    Projected {
+        width: p.width,
+        height: p.height,
+        means2d: narrow(&p.means2d),
+        factors: narrow(&p.factors),
+        covars2d: narrow(&p.covars2d),
+        depths: narrow1(&p.depths),
+        colors: narrow(&p.colors),
+        opacities: narrow1(&p.opacities),
+        radii: narrow(&p.radii),
+    }
+}
+
+pub fn widen_image(i: &Image<f32>) -> Image<f64> {
+    Image {
+        width: i.width,
+        height: i.height,
+        color: widen(&i.color),
+        alpha: widen1(&i.alpha),
+        depth: widen1(&i.depth),
+        transmittance: widen1(&i.transmittance),
+    }
+}
+
+pub fn widen_image_gradients(g: &ImageGradients<f32>) -> ImageGradients<f64> {
+    ImageGradients {
+        v_color: widen(&g.v_color),
+        v_alpha: widen1(&g.v_alpha),
+        v_depth: widen1(&g.v_depth),
+    }
+}
+
+pub fn widen_projected_gradients(g: &ProjectedGradients<f32>) -> ProjectedGradients<f64> {
+    ProjectedGradients {
+        v_means2d: widen(&g.v_means2d),
+        v_covars2d: widen(&g.v_covars2d),
+        v_depths: widen1(&g.v_depths),
+        v_colors: widen(&g.v_colors),
+        v_opacities: widen1(&g.v_opacities),
+        v_background: g.v_background.map(f64::from),
+    }
+}
+
+/// A camera 4 units from the world's origin, looking at it from a random side, with its principal
+/// point off the centre.
+pub fn random_camera(rng: &mut Pcg64, width: u32, height: u32) -> Camera {
+    let axis = DVec3::new(normal(rng), normal(rng), normal(rng)).normalize();
+    let rotation =
+        DMat3::from_quat(DQuat::from_axis_angle(axis, rng.random_range(0.0..std::f64::consts::PI)));
+    let translation = DVec3::new(0.2 * normal(rng), 0.2 * normal(rng), 4.0);
+    let mut viewmat = DMat4::from_mat3(rotation);
+    viewmat.w_axis = translation.extend(1.0);
+    let (w, h) = (f64::from(width), f64::from(height));
+    let focal = w.max(h) * rng.random_range(0.7..1.3);
+    Camera {
+        viewmat,
+        fx: focal,
+        fy: focal * rng.random_range(0.9..1.1),
+        cx: w * rng.random_range(0.4..0.6),
+        cy: h * rng.random_range(0.4..0.6),
+        width,
+        height,
+    }
+}
+
+/// N splats around the world's origin, most of them in view of [`random_camera`]. `sh_degree`
+/// None gives direct colours. Parameters are raw (log-scales, opacity logits).
+pub fn random_scene(rng: &mut Pcg64, n: usize, sh_degree: Option<u32>) -> Scene<f32> {
+    let mut scene = Scene::<f32> { raw: true, ..Scene::default() };
+    if let Some(degree) = sh_degree {
+        scene.sh_degree = degree;
+        scene.sh_stride = (degree as usize + 1).pow(2);
+    }
+    // Sizes shrink with the count, so that pictures stay layered but not opaque at once.
+    let size = (0.5 / (n.max(1) as f64).cbrt()).ln();
+    for _ in 0..n {
+        scene.means.push(std::array::from_fn(|_| (0.8 * normal(rng)) as f32));
+        scene.quats.push(std::array::from_fn(|_| normal(rng) as f32));
+        scene.scales.push(std::array::from_fn(|_| (size + 0.7 * normal(rng)) as f32));
+        scene.opacities.push((1.5 * normal(rng)) as f32);
+        if sh_degree.is_some() {
+            for k in 0..scene.sh_stride {
+                let spread = if k == 0 { 1.0 } else { 0.3 };
+                scene.colors.push(std::array::from_fn(|_| (spread * normal(rng)) as f32));
+            }
+        } else {
+            scene.colors.push(std::array::from_fn(|_| rng.random::<f32>()));
+        }
+    }
+    scene
+}
+
+/// N 2D splats uniform over the image: standard deviations exp(N(ln `sigma`, 0.6)) px per axis at
+/// a uniform angle plus the blur, opacities U(0.1, 0.9). With `sigma` 3, 400 x 400 and 20 000
+/// splats this is the benchmark's workload W1.
+pub fn random_projected(
+    rng: &mut Pcg64,
+    n: usize,
+    width: u32,
+    height: u32,
+    sigma: f64,
+) -> Projected<f32> {
+    let mut out = Projected::<f32>::culled(n, width, height);
+    for i in 0..n {
+        let center = [
+            rng.random_range(0.0..f64::from(width)) as f32,
+            rng.random_range(0.0..f64::from(height)) as f32,
+        ];
+        let deviations = [(); 2].map(|()| (sigma.ln() + 0.6 * normal(rng)).exp());
+        let angle = rng.random_range(0.0..std::f64::consts::PI);
+        let opacity = rng.random_range(0.1f32..0.9);
+        place(&mut out, i, center, deviations, angle, opacity);
+        out.depths[i] = rng.random_range(1.0f32..10.0);
+        out.colors[i] = std::array::from_fn(|_| rng.random::<f32>());
+    }
+    out
+}
+
+/// Gives splat `i` a 2D Gaussian (standard deviations in px before the blur) and its extent.
+pub fn place(
+    out: &mut Projected<f32>,
+    i: usize,
+    center: [f32; 2],
+    deviations: [f64; 2],
+    angle: f64,
+    opacity: f32,
+) {
+    let (s, c) = angle.sin_cos();
+    let [a, b] = deviations.map(|d| d * d);
+    let blur = f64::from(BLUR);
+    let (xx, yy) = (c * c * a + s * s * b + blur, s * s * a + c * c * b + blur);
+    let xy = c * s * (a - b);
+    let det = (a + blur) * (b + blur);
+    let p = (yy / det).sqrt();
+    let reach = 2.0 * (255.0 * f64::from(opacity)).ln();
+    out.means2d[i] = center;
+    out.factors[i] = [p as f32, (-xy / yy * p) as f32, yy.sqrt().recip() as f32];
+    out.covars2d[i] = [xx as f32, xy as f32, yy as f32];
+    out.opacities[i] = opacity;
+    out.depths[i] = 1.0;
+    if reach > 0.0 {
+        out.radii[i] = [(reach * xx).sqrt() as f32, (reach * yy).sqrt() as f32];
+    }
+}
+
+/// Random gradients of a picture: N(0, 1) colours, smaller alpha and depth parts.
+pub fn random_image_gradients(rng: &mut Pcg64, pixels: usize) -> ImageGradients<f32> {
+    ImageGradients {
+        v_color: (0..pixels).map(|_| std::array::from_fn(|_| normal(rng) as f32)).collect(),
+        v_alpha: (0..pixels).map(|_| 0.5 * normal(rng) as f32).collect(),
+        v_depth: (0..pixels).map(|_| 0.1 * normal(rng) as f32).collect(),
+    }
+}
+
+/// Random gradients of N projected splats, zero where culled.
+pub fn random_projected_gradients(
+    rng: &mut Pcg64,
+    projected: &Projected<f32>,
+) -> ProjectedGradients<f32> {
+    let mut out = ProjectedGradients::<f32>::zeros(projected.len());
+    for i in 0..projected.len() {
+        if projected.radii[i] == [0.0; 2] {
+            continue;
+        }
+        out.v_means2d[i] = std::array::from_fn(|_| normal(rng) as f32);
+        out.v_covars2d[i] = std::array::from_fn(|_| 0.1 * normal(rng) as f32);
+        out.v_depths[i] = normal(rng) as f32;
+        out.v_colors[i] = std::array::from_fn(|_| normal(rng) as f32);
+        out.v_opacities[i] = normal(rng) as f32;
+    }
+    out
+}
+
+/// How far two arrays are apart.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Difference {
+    /// Largest absolute difference; NaN in either array makes it infinite.
+    pub max: f64,
+    /// Mean absolute difference over what was compared.
+    pub mean: f64,
+    /// Largest magnitude in the expected array.
+    pub scale: f64,
+    /// Elements compared.
+    pub count: usize,
+}
+
+impl Difference {
+    /// Largest difference as a part of the largest expected value (0 where both vanish).
+    pub fn relative(&self) -> f64 {
+        if self.max == 0.0 { 0.0 } else { self.max / self.scale }
+    }
+
+    /// Of both.
+    pub fn join(self, other: Self) -> Self {
+        let count = self.count + other.count;
+        let total = self.mean * self.count as f64 + other.mean * other.count as f64;
+        Self {
+            max: self.max.max(other.max),
+            mean: if count == 0 { 0.0 } else { total / count as f64 },
+            scale: self.scale.max(other.scale),
+            count,
+        }
+    }
+}
+
+/// Compares rows; rows with `skip` are left out (an empty `skip` leaves out none).
+pub fn difference<const K: usize>(
+    got: &[[f32; K]],
+    expected: &[[f64; K]],
+    skip: &[bool],
+) -> Difference {
+    assert_eq!(got.len(), expected.len(), "arrays of different lengths");
+    let mut out = Difference::default();
+    let mut total = 0.0;
+    for (row, (g, e)) in got.iter().zip(expected).enumerate() {
+        if skip.get(row).copied().unwrap_or(false) {
+            continue;
+        }
+        for (g, e) in g.iter().zip(e) {
+            let off = (f64::from(*g) - e).abs();
+            let off = if off.is_nan() { f64::INFINITY } else { off };
+            out.max = out.max.max(off);
+            out.scale = out.scale.max(e.abs());
+            total += off;
+            out.count += 1;
+        }
+    }
+    out.mean = if out.count == 0 { 0.0 } else { total / out.count as f64 };
+    out
+}
+
+/// [`difference`] of scalars.
+pub fn difference1(got: &[f32], expected: &[f64], skip: &[bool]) -> Difference {
+    difference(bytemuck_rows(got), expected.as_chunks::<1>().0, skip)
+}
+
+fn bytemuck_rows(values: &[f32]) -> &[[f32; 1]] {
+    values.as_chunks::<1>().0
+}
+
+/// Difference of two pictures (colour, alpha, transmittance; depth as a part of the largest),
+/// pixels in `band` left out.
+pub fn image_difference(got: &Image<f32>, expected: &Image<f64>, band: &[bool]) -> Difference {
+    assert_eq!((got.width, got.height), (expected.width, expected.height));
+    let mut depth = difference1(&got.depth, &expected.depth, band);
+    let scale = depth.scale.max(1.0);
+    depth.max /= scale;
+    depth.mean /= scale;
+    difference(&got.color, &expected.color, band)
+        .join(difference1(&got.alpha, &expected.alpha, band))
+        .join(difference1(&got.transmittance, &expected.transmittance, band))
+        .join(depth)
+}
+
+/// Asserts that at most 0.1 % of the pixels (or one, in pictures of under 1 000) are in the band.
+pub fn assert_band_is_small(band: &[bool]) {
+    let count = band.iter().filter(|&&b| b).count();
+    assert!(
+        count <= (band.len() / 1000).max(1),
+        "{count} of {} pixels are in the band",
+        band.len()
+    );
+}
+
+/// Gradients of the 2D splats, kind by kind.
+pub fn projected_gradient_differences(
+    got: &ProjectedGradients<f32>,
+    expected: &ProjectedGradients<f64>,
+) -> Vec<(&'static str, Difference)> {
+    vec![
+        ("v_means2d", difference(&got.v_means2d, &expected.v_means2d, &[])),
+        ("v_covars2d", difference(&got.v_covars2d, &expected.v_covars2d, &[])),
+        ("v_depths", difference1(&got.v_depths, &expected.v_depths, &[])),
+        ("v_colors", difference(&got.v_colors, &expected.v_colors, &[])),
+        ("v_opacities", difference1(&got.v_opacities, &expected.v_opacities, &[])),
+        ("v_background", difference(&[got.v_background], &[expected.v_background], &[])),
+    ]
+}
+
+/// Gradients of the splats and the camera, kind by kind.
+pub fn splat_gradient_differences(
+    got: &SplatGradients<f32>,
+    expected: &SplatGradients<f64>,
+) -> Vec<(&'static str, Difference)> {
+    let camera = |g: &[f64], e: &[f64]| {
+        let got: Vec<f32> = g.iter().map(|&v| v as f32).collect();
+        difference1(&got, e, &[])
+    };
+    let focal = (&got.v_intrinsics[..2], &expected.v_intrinsics[..2]);
+    let center = (&got.v_intrinsics[2..], &expected.v_intrinsics[2..]);
+    vec![
+        ("v_means", difference(&got.v_means, &expected.v_means, &[])),
+        ("v_quats", difference(&got.v_quats, &expected.v_quats, &[])),
+        ("v_scales", difference(&got.v_scales, &expected.v_scales, &[])),
+        ("v_opacities", difference1(&got.v_opacities, &expected.v_opacities, &[])),
+        ("v_colors", difference(&got.v_colors, &expected.v_colors, &[])),
+        (
+            "v_viewmat",
+            camera(got.v_viewmat.as_flattened(), expected.v_viewmat.as_flattened()),
+        ),
+        ("v_fx_fy", camera(focal.0, focal.1)),
+        ("v_cx_cy", camera(center.0, center.1)),
+    ]
+}
+
+/// Asserts each kind's largest difference to be at most `bound` of its largest value.
+pub fn assert_gradients(differences: &[(&'static str, Difference)], bound: f64, what: &str) {
+    for (name, difference) in differences {
+        assert!(
+            difference.relative() <= bound,
+            "{what}: {name} is off by {:.2e} of its largest value {:.2e}, more than {bound:.0e}",
+            difference.relative(),
+            difference.scale
+        );
+    }
+}
+
+/// Bits of every gradient, for exact comparisons.
+pub fn splat_gradient_bits(g: &SplatGradients<f32>) -> Vec<u64> {
+    let singles = g
+        .v_means
+        .as_flattened()
+        .iter()
+        .chain(g.v_quats.as_flattened())
+        .chain(g.v_scales.as_flattened())
+        .chain(&g.v_opacities)
+        .chain(g.v_colors.as_flattened())
+        .map(|v| u64::from(v.to_bits()));
+    let doubles = g.v_viewmat.as_flattened().iter().chain(&g.v_intrinsics).map(|v| v.to_bits());
+    singles.chain(doubles).collect()
+}

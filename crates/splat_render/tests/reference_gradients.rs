@@ -1,0 +1,238 @@
+//! The reference's gradients against central differences, for every kind of parameter and the
+//! camera, on random small scenes. Samples within a step of a kink are redrawn and counted.
+
+use glam::{DMat4, DQuat, DVec3};
+use rand::{Rng, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use splat_render::reference::{Reference, decisions};
+use splat_render::{
+    Camera, Colors, ImageGradients, ProjectOptions, SplatGradients, SplatParams, Stages,
+};
+
+const SCENES: u64 = 240;
+const SAMPLES_PER_KIND: usize = 3;
+const STEP: f64 = 2e-6;
+const BOUND: f64 = 1e-6;
+const KINDS: [&str; 9] = [
+    "means",
+    "quats",
+    "scales",
+    "opacities",
+    "colors",
+    "background",
+    "viewmat",
+    "intrinsics xy",
+    "intrinsics c",
+];
+
+#[derive(Clone)]
+struct Scene {
+    means: Vec<[f64; 3]>,
+    quats: Vec<[f64; 4]>,
+    scales: Vec<[f64; 3]>,
+    opacities: Vec<f64>,
+    colors: Vec<[f64; 3]>,
+    /// None: direct colours.
+    degree: Option<u32>,
+    raw: bool,
+    background: [f64; 3],
+    camera: Camera,
+    v_image: ImageGradients<f64>,
+}
+
+impl Scene {
+    fn random(seed: u64) -> Self {
+        let mut rng = Pcg64Mcg::seed_from_u64(seed);
+        let n = rng.random_range(3..9usize);
+        let (width, height) = (rng.random_range(6..14u32), rng.random_range(6..14u32));
+        let degree = [None, Some(0), Some(1), Some(2), Some(3), Some(4)][(seed % 6) as usize];
+        let raw = seed % 2 == 0;
+        let mut f = |low: f64, high: f64| rng.random_range(low..high);
+        let rows = degree.map_or(n, |d| n * splat_render::sh::coeffs(d));
+        let fov = f(0.5, 1.6);
+        let focal = 0.5 * f64::from(width) / (0.5 * fov).tan();
+        // Wide offsets, so that some splats lie beyond the Jacobian's limits.
+        let means = (0..n).map(|_| [f(-1.6, 1.6), f(-1.6, 1.6), f(-1.0, 1.5)]).collect();
+        let quats = (0..n).map(|_| std::array::from_fn(|_| f(-1.0, 1.0))).collect();
+        let scales = (0..n)
+            .map(|_| {
+                std::array::from_fn(|_| {
+                    let s = f(-2.5, 0.3);
+                    if raw { s } else { s.exp() }
+                })
+            })
+            .collect();
+        // Some saturate the cap.
+        let opacities = (0..n).map(|_| if raw { f(-2.0, 7.0) } else { f(0.05, 1.0) }).collect();
+        let colors = (0..rows).map(|_| std::array::from_fn(|_| f(-0.7, 0.9))).collect();
+        let rotation =
+            DQuat::from_euler(glam::EulerRot::XYZ, f(-0.3, 0.3), f(-0.3, 0.3), f(-3.0, 3.0));
+        let translation = DVec3::new(f(-0.2, 0.2), f(-0.2, 0.2), f(1.4, 3.0));
+        let camera = Camera {
+            viewmat: DMat4::from_rotation_translation(rotation, translation),
+            fx: focal * f(0.9, 1.1),
+            fy: focal * f(0.9, 1.1),
+            cx: f64::from(width) * f(0.3, 0.7),
+            cy: f64::from(height) * f(0.3, 0.7),
+            width,
+            height,
+        };
+        let pixels = (width * height) as usize;
+        Self {
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            degree,
+            raw,
+            background: std::array::from_fn(|_| f(0.0, 1.0)),
+            camera,
+            v_image: ImageGradients {
+                v_color: (0..pixels).map(|_| std::array::from_fn(|_| f(-1.0, 1.0))).collect(),
+                v_alpha: (0..pixels).map(|_| f(-1.0, 1.0)).collect(),
+                v_depth: (0..pixels).map(|_| f(-0.3, 0.3)).collect(),
+            },
+        }
+    }
+
+    fn params(&self) -> SplatParams<'_, f64> {
+        SplatParams {
+            means: &self.means,
+            quats: &self.quats,
+            scales: &self.scales,
+            opacities: &self.opacities,
+            colors: match self.degree {
+                None => Colors::Direct(&self.colors),
+                Some(degree) => Colors::Sh {
+                    degree,
+                    stride: splat_render::sh::coeffs(degree),
+                    coeffs: &self.colors,
+                },
+            },
+            raw: self.raw,
+        }
+    }
+
+    /// The loss, a fixed linear function of the picture, and the decisions taken.
+    fn loss(&self) -> (f64, u64) {
+        let options = ProjectOptions::default();
+        let projected = Reference.project(&self.params(), &self.camera, &options).unwrap();
+        let image = Reference.rasterize(&projected, self.background).unwrap();
+        let mut loss = 0.0;
+        for pixel in 0..image.alpha.len() {
+            for c in 0..3 {
+                loss += image.color[pixel][c] * self.v_image.v_color[pixel][c];
+            }
+            loss += image.alpha[pixel] * self.v_image.v_alpha[pixel];
+            loss += image.depth[pixel] * self.v_image.v_depth[pixel];
+        }
+        (loss, decisions(&self.params(), &self.camera, &options, &projected))
+    }
+
+    fn gradients(&self) -> (SplatGradients<f64>, [f64; 3]) {
+        let options = ProjectOptions::default();
+        let projected = Reference.project(&self.params(), &self.camera, &options).unwrap();
+        let image = Reference.rasterize(&projected, self.background).unwrap();
+        let v_projected = Reference
+            .rasterize_backward(&projected, self.background, &image, &self.v_image)
+            .unwrap();
+        let gradients = Reference
+            .project_backward(&self.params(), &self.camera, &options, &projected, &v_projected)
+            .unwrap();
+        (gradients, v_projected.v_background)
+    }
+
+    fn entry(&mut self, kind: usize, index: usize) -> &mut f64 {
+        match kind {
+            0 => &mut self.means[index / 3][index % 3],
+            1 => &mut self.quats[index / 4][index % 4],
+            2 => &mut self.scales[index / 3][index % 3],
+            3 => &mut self.opacities[index],
+            4 => &mut self.colors[index / 3][index % 3],
+            5 => &mut self.background[index],
+            6 => {
+                let column = index % 4;
+                let axis = match column {
+                    0 => &mut self.camera.viewmat.x_axis,
+                    1 => &mut self.camera.viewmat.y_axis,
+                    2 => &mut self.camera.viewmat.z_axis,
+                    _ => &mut self.camera.viewmat.w_axis,
+                };
+                &mut axis[index / 4]
+            }
+            7 if index == 0 => &mut self.camera.fx,
+            7 => &mut self.camera.fy,
+            _ if index == 0 => &mut self.camera.cx,
+            _ => &mut self.camera.cy,
+        }
+    }
+
+    fn flat(&self, kind: usize, gradients: &(SplatGradients<f64>, [f64; 3])) -> Vec<f64> {
+        let (g, v_background) = gradients;
+        match kind {
+            0 => g.v_means.as_flattened().to_vec(),
+            1 => g.v_quats.as_flattened().to_vec(),
+            2 => g.v_scales.as_flattened().to_vec(),
+            3 => g.v_opacities.clone(),
+            4 => g.v_colors.as_flattened().to_vec(),
+            5 => v_background.to_vec(),
+            6 => g.v_viewmat.as_flattened().to_vec(),
+            7 => g.v_intrinsics[..2].to_vec(),
+            _ => g.v_intrinsics[2..].to_vec(),
+        }
+    }
+}
+
+#[test]
+fn gradients_match_central_differences() {
+    let mut worst = [0.0f64; KINDS.len()];
+    let (mut samples, mut redrawn) = (0usize, 0usize);
+    for seed in 0..SCENES {
+        let mut scene = Scene::random(seed);
+        let gradients = scene.gradients();
+        let (_, at) = scene.loss();
+        let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0x5eed);
+        for kind in 0..KINDS.len() {
+            let analytic = scene.flat(kind, &gradients);
+            let largest = analytic.iter().fold(0.0f64, |a, v| a.max(v.abs()));
+            assert!(largest.is_finite(), "{} of scene {seed} is not finite", KINDS[kind]);
+            if largest == 0.0 {
+                continue;
+            }
+            let mut done = 0;
+            for _ in 0..SAMPLES_PER_KIND * 10 {
+                if done == SAMPLES_PER_KIND {
+                    break;
+                }
+                let index = rng.random_range(0..analytic.len());
+                let value = *scene.entry(kind, index);
+                *scene.entry(kind, index) = value + STEP;
+                let (high, above) = scene.loss();
+                *scene.entry(kind, index) = value - STEP;
+                let (low, below) = scene.loss();
+                *scene.entry(kind, index) = value;
+                if above != at || below != at {
+                    redrawn += 1;
+                    continue;
+                }
+                let numeric = (high - low) / (2.0 * STEP);
+                let error = (numeric - analytic[index]).abs() / largest;
+                assert!(
+                    error <= BOUND,
+                    "scene {seed}, {}[{index}]: {} analytic, {numeric} numeric, {error:.1e} of the largest",
+                    KINDS[kind],
+                    analytic[index],
+                );
+                worst[kind] = worst[kind].max(error);
+                done += 1;
+                samples += 1;
+            }
+        }
+    }
+    println!("{SCENES} scenes, {samples} samples, {redrawn} redrawn at kinks");
+    for (kind, error) in KINDS.iter().zip(worst) {
+        println!("{kind:>14}: worst {error:.1e} of the largest of its kind");
+    }
+    assert!(samples > SCENES as usize * KINDS.len() * 2, "too few samples away from kinks");
+}
