@@ -128,3 +128,6 @@ def write_ply(
     origin: Float64,
 ) -> None:
     """Write an INRIA .ply; OSError where that fails."""
+
+def write_exr(path: str, color: Float32, alpha: Float32, depth: Float32) -> None:
+    """Write channels R, G, B, A, Z in 32-bit float; OSError where that fails."""

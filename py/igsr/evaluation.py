@@ -46,7 +46,7 @@ def default_background(capture: Capture) -> tuple[float, float, float]:
 
 
 def default_split(capture: Capture) -> str:
-    """"test" if the capture has test views, else "train"."""
+    """ "test" if the capture has test views, else "train"."""
     return "test" if capture.test_views else "train"
 
 

@@ -130,3 +130,102 @@ def fingerprint(views: list[View]) -> str:
                 digest.update(str((array.dtype.str, array.shape)).encode())
                 digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
+
+
+def _check_arguments(
+    steps: object,
+    seed: object,
+    max_splats: object,
+    sh_degree: object,
+    checkpoint: object,
+    resume: bool,
+) -> None:
+    limits: list[tuple[str, object, int, int]] = [
+        ("steps", steps, 1, 10_000_000),
+        ("seed", seed, 0, 2**63 - 1),
+        ("sh_degree", sh_degree, 0, MAX_SH_DEGREE),
+    ]
+    if max_splats is not None:
+        limits.append(("max_splats", max_splats, 1, 100_000_000))
+    for name, value, low, high in limits:
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise IgsrError(f"{name} must be a whole number, not {value!r}.")
+        if not low <= value <= high:
+            raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
+    if resume and checkpoint is None:
+        raise IgsrError("resume needs checkpoint, the file to continue from.")
+
+
+def _check_same_settings(path: Path, saved: dict[str, Any], settings: dict[str, Any]) -> None:
+    for name, value in settings.items():
+        if saved.get(name) != value:
+            if name == "capture":
+                raise IgsrError(
+                    f"{path} was made from other photos, masks, cameras or another split; "
+                    "resume with the same or leave --resume out."
+                )
+            raise IgsrError(
+                f"{path} was made with {name} {saved.get(name)!r}, not {value!r}; "
+                "resume with the same or leave --resume out."
+            )
+
+
+def _fitter_views(views: list[View]) -> dict[str, Any]:
+    """The train views as the Rust side takes them."""
+    return {
+        "images": [np.ascontiguousarray(view.image) for view in views],
+        "masks": [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
+        "intrinsics": np.stack([intrinsics_of(view.camera.K) for view in views]),
+    }
+
+
+def _run(
+    fitter: _core.Fitter,
+    settings: dict[str, Any],
+    info: dict[str, str],
+    seconds_before: float,
+    progress: Callable[[Progress], bool | None] | None,
+    path: Path | None,
+) -> Splats:
+    """Step in chunks until done or told to stop, saving on the way."""
+    steps = settings["steps"]
+    started = time.perf_counter()
+    step = saved_step = fitter.step_count
+    saved_at = started
+    chunk = 1
+
+    def save() -> None:
+        if path is not None:
+            seconds = seconds_before + time.perf_counter() - started
+            save_checkpoint(path, fitter.state(), {**settings, "seconds": seconds})
+
+    try:
+        while step < steps:
+            chunk_started = time.perf_counter()
+            done = fitter.step(min(chunk, steps - step))
+            now = time.perf_counter()
+            advanced, step = done["step"] - step, done["step"]
+            speed = advanced / max(now - chunk_started, 1e-9)
+            # A step's time changes with the number of splats: follow it, a factor two at a time.
+            chunk = max(1, min(2 * chunk, int(speed * CHUNK_SECONDS)))
+            go_on = progress is None or progress(
+                Progress(
+                    step=step,
+                    steps=steps,
+                    loss=done["loss"],
+                    splats=done["splats"],
+                    seconds=seconds_before + now - started,
+                    steps_per_second=speed,
+                    backend=info,
+                )
+            )
+            if go_on is False:
+                break
+            if step - saved_step >= CHECKPOINT_STEPS or now - saved_at >= CHECKPOINT_SECONDS:
+                save()
+                saved_step, saved_at = step, time.perf_counter()
+    except KeyboardInterrupt:
+        save()
+        raise
+    save()
+    return Splats(**fitter.splats())

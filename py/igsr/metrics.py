@@ -21,8 +21,8 @@ Mask = npt.NDArray[np.bool_]
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 #: The five scales of MS-SSIM (Wang et al. 2003) halve the picture four times, and the window must
-#: still fit: the shorter side must exceed (11 - 1) * 2**4.
-MS_SSIM_MIN_SIDE = (SSIM_WINDOW - 1) * 2**4 + 1
+#: still fit into the smallest.
+MS_SSIM_MIN_SIDE = SSIM_WINDOW * 2**4
 #: PSNR of identical 8-bit pictures is infinite, which JSON cannot hold and a mean cannot use.
 PSNR_CAP = 100.0
 
@@ -107,7 +107,7 @@ def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float | No
     blackens both pictures outside; the black part counts as equal.
 
     Returns:
-        The score, or None where the shorter side is under 161 pixels: the smallest scale would
+        The score, or None where the shorter side is under 176 pixels: the smallest scale would
         no longer hold the window.
     """
     import torch

@@ -1,8 +1,10 @@
 //! Which implementation of the stages runs.
 
-use pyo3::exceptions::PyValueError;
 use numpy::PyArrayDescrMethods;
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyType};
+use splat_render::cpu;
 
 /// A backend by its resolved name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,31 +31,48 @@ impl Backend {
     }
 }
 
-/// The numpy scalar type of a resolved backend's arrays.
-#[pyfunction]
-pub fn working_dtype<'py>(
-    py: Python<'py>,
-    backend: &str,
-) -> PyResult<Bound<'py, pyo3::types::PyType>> {
-    Ok(match Backend::named(backend)? {
-        Backend::Reference => numpy::dtype::<f64>(py).typeobj(),
-        Backend::Cpu | Backend::Gpu => numpy::dtype::<f32>(py).typeobj(),
-    })
+/// The GPU backend, opened once per process.
+pub fn gpu() -> PyResult<&'static cpu::Cpu> {
+    Err(pyo3::exceptions::PyRuntimeError::new_err("No GPU backend in this build yet."))
 }
 
-/// The name that `name` stands for.
+/// The name that `name` stands for: "auto" is a real GPU if one answers, else the CPU.
 #[pyfunction]
 pub fn resolve_backend(name: &str) -> PyResult<&str> {
     if name == "auto" {
         return Ok("cpu");
     }
-    Backend::named(name)?;
+    if Backend::named(name)? == Backend::Gpu {
+        gpu()?;
+    }
     Ok(name)
 }
 
 /// What a resolved backend runs on.
 #[pyfunction]
-pub fn backend_info<'py>(py: Python<'py>, name: &str) -> PyResult<Bound<'py, pyo3::types::PyDict>> {
-    let _ = name;
-    Ok(pyo3::types::PyDict::new(py))
+pub fn backend_info<'py>(py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyDict>> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let host = format!("{} CPU, {threads} threads", std::env::consts::ARCH);
+    let (device, instruction_set) = match Backend::named(name)? {
+        Backend::Cpu => (host, cpu::instruction_set()),
+        Backend::Reference => (host, "scalar f64"),
+        Backend::Gpu => {
+            gpu()?;
+            (String::new(), "WGSL")
+        }
+    };
+    let info = PyDict::new(py);
+    info.set_item("backend", name)?;
+    info.set_item("device", device)?;
+    info.set_item("instruction_set", instruction_set)?;
+    Ok(info)
+}
+
+/// The numpy scalar type of a resolved backend's arrays.
+#[pyfunction]
+pub fn working_dtype<'py>(py: Python<'py>, backend: &str) -> PyResult<Bound<'py, PyType>> {
+    Ok(match Backend::named(backend)? {
+        Backend::Reference => numpy::dtype::<f64>(py).typeobj(),
+        Backend::Cpu | Backend::Gpu => numpy::dtype::<f32>(py).typeobj(),
+    })
 }

@@ -7,6 +7,7 @@ mod arrays;
 mod backend;
 mod camera;
 mod error;
+mod exr_files;
 mod splat_files;
 mod stages;
 
@@ -19,6 +20,8 @@ mod _core {
     const __version__: &str = env!("CARGO_PKG_VERSION");
     #[pymodule_export]
     use crate::backend::{backend_info, resolve_backend, working_dtype};
+    #[pymodule_export]
+    use crate::exr_files::write_exr;
     #[pymodule_export]
     use crate::stages::{project, project_backward, rasterize, rasterize_backward};
 }

@@ -4,6 +4,7 @@ use numpy::{Element, PyReadonlyArrayDyn};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use splat_render::cpu::Cpu;
 use splat_render::reference::Reference;
 use splat_render::{
     Colors, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, SplatGradients,
@@ -24,7 +25,8 @@ impl Real for f64 {}
 macro_rules! with_stages {
     ($backend:expr, $function:ident($($argument:expr),* $(,)?)) => {
         match Backend::named($backend)? {
-            Backend::Cpu | Backend::Gpu => Err(pyo3::exceptions::PyRuntimeError::new_err("not yet")),
+            Backend::Cpu => $function::<f32>(&Cpu, $($argument),*),
+            Backend::Gpu => Err(pyo3::exceptions::PyRuntimeError::new_err("not yet")),
             Backend::Reference => $function::<f64>(&Reference, $($argument),*),
         }
     };
