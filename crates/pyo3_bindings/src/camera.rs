@@ -23,3 +23,30 @@ pub fn camera(
     let viewmat = DMat4::from_cols_array_2d(&matrix).transpose();
     Ok(Camera { viewmat, fx, fy, cx, cy, width, height })
 }
+
+/// Cameras from `viewmats` f64 [V, 4, 4], `intrinsics` f64 [V, 4] and V sizes.
+pub fn cameras(
+    viewmats: &Bound<'_, PyAny>,
+    intrinsics: &Bound<'_, PyAny>,
+    sizes: &[(u32, u32)],
+) -> PyResult<Vec<Camera>> {
+    let count = sizes.len() as isize;
+    let viewmats = array::<f64>("viewmats", viewmats)?;
+    let viewmats = rows::<f64, 4>("viewmats", &viewmats, &[count, 4])?.as_chunks::<4>().0;
+    let intrinsics = array::<f64>("intrinsics", intrinsics)?;
+    let intrinsics = rows::<f64, 4>("intrinsics", &intrinsics, &[count])?;
+    Ok(viewmats
+        .iter()
+        .zip(intrinsics)
+        .zip(sizes)
+        .map(|((viewmat, &[fx, fy, cx, cy]), &(width, height))| Camera {
+            viewmat: DMat4::from_cols_array_2d(viewmat).transpose(),
+            fx,
+            fy,
+            cx,
+            cy,
+            width,
+            height,
+        })
+        .collect())
+}
