@@ -100,8 +100,10 @@ def test_packed_is_the_same_picture_and_the_same_gradients():
         assert torch.equal(a, b)
     visible = (meta["radii"] > 0).all(dim=-1)
     assert 0 < visible.sum() < visible.numel()
-    assert torch.equal(torch.stack(torch.where(visible)),
-                       torch.stack([meta_p["camera_ids"], meta_p["gaussian_ids"]]))
+    assert torch.equal(
+        torch.stack(torch.where(visible)),
+        torch.stack([meta_p["camera_ids"], meta_p["gaussian_ids"]]),
+    )
     for name in ("means2d", "radii", "depths", "conics", "opacities"):
         assert torch.equal(meta[name][visible], meta_p[name])
     assert torch.equal(meta["means2d"].grad[visible], meta_p["means2d"].grad)

@@ -115,6 +115,50 @@ def project_backward(
     The last two are float64 for every backend.
     """
 
+DEFAULT_MAX_SPLATS: int
+
+def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict[str, Float32]:
+    """One round splat per point [P, 3] with colours [P, 3] in 0..1.
+
+    Returns means, quats, scales (logs of the mean distance to the three nearest neighbours),
+    opacities (logits of 0.1) and sh, as ``SplatArrays`` has them.
+    """
+
+class Fitter:
+    """A fit in progress; parameters and optimiser state stay where the kernels run."""
+
+    def __init__(
+        self,
+        images: list[npt.NDArray[np.uint8]],
+        masks: list[npt.NDArray[np.bool_] | None],
+        viewmats: Float64,
+        intrinsics: Float64,
+        state: dict[str, Any],
+        config: dict[str, Any],
+        backend: str,
+    ) -> None:
+        """A fit to V photos.
+
+        ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
+        ``viewmats`` [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4]. ``state`` is
+        either the parameters to start from (``SplatArrays`` without origin) or what ``state()``
+        returned. ``config``: steps, seed, sh_degree, max_splats, density, background; an absent
+        or None entry takes the default.
+        """
+
+    def step(self, count: int) -> dict[str, Any]:
+        """Do ``count`` steps; ``step`` and ``splats`` afterwards and ``loss`` of the last one."""
+
+    @property
+    def steps_done(self) -> int:
+        """Steps done, those of resumed runs included."""
+
+    def splats(self) -> dict[str, Float32]:
+        """The parameters as they are now, without origin."""
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Everything needed to go on bit for bit."""
+
 def read_ply(path: str) -> SplatArrays:
     """Read an INRIA .ply; OSError says what is wrong with the file."""
 

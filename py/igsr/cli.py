@@ -21,7 +21,7 @@ from . import _core
 from .capture import Camera, Capture, load_capture
 from .errors import IgsrError
 from .evaluation import METRICS, ScoredView, default_background, default_split, evaluate
-from .fitting import Progress, fit
+from .fitting import DEFAULT_MAX_SPLATS, Progress, fit
 from .orbit import orbit
 from .rendering import render
 from .report import sheet_names, write_contact_sheet, write_report
@@ -47,6 +47,14 @@ class BackendChoice(str, enum.Enum):
     cpu = "cpu"
     gpu = "gpu"
     reference = "reference"
+
+
+class DensityChoice(str, enum.Enum):
+    """How splats are added and removed."""
+
+    mcmc = "mcmc"
+    original = "original"
+    fixed = "fixed"
 
 
 class SplitChoice(str, enum.Enum):
@@ -180,11 +188,19 @@ def fit_command(
     backend: BackendOption = BackendChoice.auto,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
     max_splats: Annotated[
-        int | None, typer.Option("--max-splats", help="Most splats there may be.")
-    ] = None,
+        int, typer.Option("--max-splats", help="Most splats there may be.")
+    ] = DEFAULT_MAX_SPLATS,
     sh_degree: Annotated[
         int, typer.Option("--sh-degree", help="Degree of view-dependent colour, 0 to 4.")
     ] = 3,
+    density: Annotated[
+        DensityChoice,
+        typer.Option(
+            "--density",
+            help="How splats are added and removed: mcmc (relocation under a cap), original "
+            "(clone, split, prune), fixed.",
+        ),
+    ] = DensityChoice.mcmc,
     background: BackgroundOption = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")
@@ -206,6 +222,8 @@ def fit_command(
         name = _resolved(backend)
         capture = _load(capture_path, holdout)
         color = _color(background) or default_background(capture)
+        # Photos with alpha are fitted over random colours, so that no background is learnt.
+        has_alpha = any(view.image.shape[2] == 4 for view in capture.train_views)
         with _fit_bar(steps, shown=not as_json) as show:
 
             def progress(now: Progress) -> None:
@@ -220,7 +238,8 @@ def fit_command(
                 seed,
                 max_splats=max_splats,
                 sh_degree=sh_degree,
-                background=color,
+                density=density.value,
+                background=None if has_alpha else color,
                 checkpoint=out / "checkpoint.npz",
                 resume=resume,
             )
@@ -238,6 +257,8 @@ def fit_command(
             **info,
             "seed": seed,
             "sh_degree": splats.sh_degree,
+            "max_splats": max_splats,
+            "density": density.value,
             "version": _core.__version__,
             "capture": str(capture_path),
             "protocol": scores["protocol"],

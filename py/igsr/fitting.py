@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from . import _core
 from .capture import Capture, View
-from .checkpoint import State, load_checkpoint, save_checkpoint
+from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
 from .initialization import initial_splats
 from .rendering import intrinsics_of, viewmat_about
@@ -23,6 +24,10 @@ from .splats import MAX_SH_DEGREE, Splats
 #: A killed run loses at most this much work.
 CHECKPOINT_STEPS = 500
 CHECKPOINT_SECONDS = 20.0
+#: Ways to control the number of splats.
+DENSITIES = ("mcmc", "original", "fixed")
+#: Most splats where the caller names no number.
+DEFAULT_MAX_SPLATS = _core.DEFAULT_MAX_SPLATS
 #: How long the Rust side runs before Python may look at Ctrl-C and the progress callback.
 CHUNK_SECONDS = 0.2
 
@@ -59,7 +64,8 @@ def fit(
     *,
     max_splats: int | None = None,
     sh_degree: int = 3,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    density: str = "mcmc",
+    background: tuple[float, float, float] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
 ) -> Splats:
@@ -69,16 +75,18 @@ def fit(
     instruction set; a resumed fit ends with the same bits as one that was never interrupted.
 
     Args:
-        capture: photos and cameras; masked pixels do not count, photos with alpha are fitted over
-            a random background that changes with every step.
+        capture: photos and cameras; masked pixels do not count.
         steps: optimiser steps, each on one photo.
         progress: called about five times a second; returning False ends the fit early, with the
             splats as they are then.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu".
         seed: of everything random.
-        max_splats: most splats there may be; None takes the fitter's default.
+        max_splats: most splats there may be; None is ``DEFAULT_MAX_SPLATS``.
         sh_degree: degree of the colours' spherical harmonics, 0-4.
-        background: RGB in [0, 1] behind photos without alpha.
+        density: how splats are added and removed: "mcmc" (relocation and growth under the cap,
+            Kheradmand et al. 2024), "original" (clone, split, prune, Kerbl et al. 2023), "fixed".
+        background: RGB in [0, 1] behind the splats and photos with alpha; None is a new random
+            colour in every step for photos with alpha and black for photos without.
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
             Ctrl-C (KeyboardInterrupt, which is raised again).
         resume: continue the fit that ``checkpoint`` holds.
@@ -88,13 +96,17 @@ def fit(
             another capture or other settings.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
-    _check_arguments(steps, seed, max_splats, sh_degree, checkpoint, resume)
+    if max_splats is None:
+        max_splats = DEFAULT_MAX_SPLATS
+    _check_arguments(steps, seed, max_splats, sh_degree, density, checkpoint, resume)
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
     for view in views:
         if view.mask is not None and not view.mask.any():
             raise IgsrError(f"{view.name}: its mask leaves no pixel to fit; leave the photo out.")
+    if backend == "reference":
+        raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
     info = _core.backend_info(_core.resolve_backend(backend))
     path = None if checkpoint is None else Path(checkpoint)
     settings: dict[str, Any] = {
@@ -102,7 +114,8 @@ def fit(
         "seed": int(seed),
         "max_splats": max_splats,
         "sh_degree": sh_degree,
-        "background": [float(channel) for channel in background],
+        "density": density,
+        "background": None if background is None else [float(channel) for channel in background],
         "backend": info["backend"],
         "instruction_set": info["instruction_set"],
         "igsr": _core.__version__,
@@ -114,10 +127,27 @@ def fit(
         state, saved = load_checkpoint(path)
         seconds_before = float(saved.pop("seconds", 0.0))
         _check_same_settings(path, saved, settings)
-        fitter = _restored(views, settings, state, path)
     else:
-        fitter = _started(capture, views, settings)
-    return _run(fitter, settings, info, seconds_before, progress, path)
+        splats = initial_splats(capture, seed, max_splats, sh_degree)
+        state = dict(vars(splats))
+    origin = state.pop("origin", np.zeros(0))
+    try:
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise ValueError("origin: must be three finite numbers")
+        fitter = _core.Fitter(
+            [np.ascontiguousarray(view.image) for view in views],
+            [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
+            np.stack([viewmat_about(origin, view.camera.viewmat) for view in views]),
+            np.stack([intrinsics_of(view.camera.K) for view in views]),
+            state,
+            settings,
+            info["backend"],
+        )
+    except ValueError as error:
+        if resume:
+            raise IgsrError(f"The checkpoint {path} cannot be used: {error}.") from error
+        raise IgsrError(f"{error}.") from error
+    return _run(fitter, origin, settings, info, seconds_before, progress, path)
 
 
 def fingerprint(views: list[View]) -> str:
@@ -137,6 +167,7 @@ def _check_arguments(
     seed: object,
     max_splats: object,
     sh_degree: object,
+    density: object,
     checkpoint: object,
     resume: bool,
 ) -> None:
@@ -144,14 +175,15 @@ def _check_arguments(
         ("steps", steps, 1, 10_000_000),
         ("seed", seed, 0, 2**63 - 1),
         ("sh_degree", sh_degree, 0, MAX_SH_DEGREE),
+        ("max_splats", max_splats, 1, 2**27),
     ]
-    if max_splats is not None:
-        limits.append(("max_splats", max_splats, 1, 100_000_000))
     for name, value, low, high in limits:
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise IgsrError(f"{name} must be a whole number, not {value!r}.")
         if not low <= value <= high:
             raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
+    if density not in DENSITIES:
+        raise IgsrError(f"density must be one of {', '.join(DENSITIES)}, not {density!r}.")
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
 
@@ -170,17 +202,9 @@ def _check_same_settings(path: Path, saved: dict[str, Any], settings: dict[str, 
             )
 
 
-def _fitter_views(views: list[View]) -> dict[str, Any]:
-    """The train views as the Rust side takes them."""
-    return {
-        "images": [np.ascontiguousarray(view.image) for view in views],
-        "masks": [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
-        "intrinsics": np.stack([intrinsics_of(view.camera.K) for view in views]),
-    }
-
-
 def _run(
     fitter: _core.Fitter,
+    origin: npt.NDArray[np.float64],
     settings: dict[str, Any],
     info: dict[str, str],
     seconds_before: float,
@@ -190,14 +214,15 @@ def _run(
     """Step in chunks until done or told to stop, saving on the way."""
     steps = settings["steps"]
     started = time.perf_counter()
-    step = saved_step = fitter.step_count
+    step = saved_step = fitter.steps_done
     saved_at = started
     chunk = 1
 
     def save() -> None:
         if path is not None:
             seconds = seconds_before + time.perf_counter() - started
-            save_checkpoint(path, fitter.state(), {**settings, "seconds": seconds})
+            state = {**fitter.state(), "origin": origin}
+            save_checkpoint(path, state, {**settings, "seconds": seconds})
 
     try:
         while step < steps:
@@ -228,4 +253,4 @@ def _run(
         save()
         raise
     save()
-    return Splats(**fitter.splats())
+    return Splats(**fitter.splats(), origin=origin)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from . import _core
 from .capture import Camera, Capture, View
 from .splats import Splats
 
@@ -20,12 +21,6 @@ Generator = np.random.Generator
 MADE_UP_SPLATS = 20_000
 #: Fewer points than this say too little of a scene's surface to start from them alone.
 MIN_POINTS = 100
-#: Starting opacity, as in 3DGS: low, so that gradients reach what lies behind.
-INITIAL_OPACITY = 0.1
-#: SH basis function of degree 0, 1 / (2 sqrt(pi)).
-SH_0 = 0.28209479177387814
-#: Neighbour distances are measured against at most this many points (the cost is quadratic).
-NEIGHBOUR_SAMPLE = 20_000
 #: Depths tried per ray, and their range in units of the distance to what the cameras look at.
 RAY_DEPTHS = 32
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 8.0
@@ -33,7 +28,7 @@ NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 8.0
 COMPARED_VIEWS = 24
 
 
-def initial_splats(capture: Capture, seed: int, max_splats: int | None, sh_degree: int) -> Splats:
+def initial_splats(capture: Capture, seed: int, max_splats: int, sh_degree: int) -> Splats:
     """Splats to start a fit from; the same arguments give the same splats.
 
     Args:
@@ -44,33 +39,24 @@ def initial_splats(capture: Capture, seed: int, max_splats: int | None, sh_degre
     """
     random = np.random.default_rng([seed, 0x1617])
     points = capture.points
-    limit = max_splats or 2**31
     if points is not None and len(points.xyz) >= MIN_POINTS:
         xyz, colors = points.xyz, points.rgb.astype(np.float64) / 255.0
-        if len(xyz) > limit:
-            chosen = np.sort(random.choice(len(xyz), size=limit, replace=False))
+        if len(xyz) > max_splats:
+            chosen = np.sort(random.choice(len(xyz), size=max_splats, replace=False))
             xyz, colors = xyz[chosen], colors[chosen]
     else:
-        count = min(MADE_UP_SPLATS, limit)
+        count = min(MADE_UP_SPLATS, max_splats)
         views = capture.train_views
         if all(view.image.shape[2] == 4 for view in views):
             xyz, colors = _inside_hull(views, count, random)
         else:
             xyz, colors = _along_rays(views, count, random)
+    # Relative to the middle, so that float32 is precise where the scene is.
     origin = np.median(xyz, axis=0)
-    means = (xyz - origin).astype(np.float32)
-    scales = np.log(_neighbour_distances(means, random))
-    sh = np.zeros((len(means), (sh_degree + 1) ** 2, 3), dtype=np.float32)
-    sh[:, 0] = (colors - 0.5) / SH_0
-    quats = np.zeros((len(means), 4), dtype=np.float32)
-    quats[:, 0] = 1.0
-    logit = np.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))
     return Splats(
-        means=means,
-        quats=quats,
-        scales=np.repeat(scales[:, None], 3, axis=1).astype(np.float32),
-        opacities=np.full(len(means), logit, dtype=np.float32),
-        sh=sh,
+        **_core.splats_from_points(
+            (xyz - origin).astype(np.float32), colors.astype(np.float32), sh_degree
+        ),
         origin=origin,
     )
 
@@ -227,36 +213,3 @@ def _softened(view: View) -> npt.NDArray[np.float32]:
             [np.take(padded, range(i, i + length), axis=axis) for i in range(5)], axis=0
         )
     return image.reshape(-1, 3)
-
-
-def _neighbour_distances(means: npt.NDArray[np.float32], random: Generator) -> Float64:
-    """Root mean square distance [N] to the three nearest points, as 3DGS starts its scales."""
-    import torch
-
-    count = len(means)
-    if count < 2:
-        return np.full(count, 0.1)
-    points = torch.from_numpy(means)
-    sample = points
-    thinning = 1.0
-    if count > NEIGHBOUR_SAMPLE:
-        sample = points[random.choice(count, size=NEIGHBOUR_SAMPLE, replace=False)]
-        # On a surface, distances grow with the square root of the area per point.
-        thinning = float(np.sqrt(NEIGHBOUR_SAMPLE / count))
-    nearest = min(4, len(sample))
-    squared = torch.cat(
-        [
-            torch.cdist(chunk, sample, compute_mode="donot_use_mm_for_euclid_dist")
-            .topk(nearest, dim=1, largest=False)
-            .values[:, 1:]
-            .square()
-            .mean(dim=1)
-            for chunk in points.split(1024)
-        ]
-    )
-    distance: Float64 = squared.to(torch.float64).sqrt().numpy() * thinning
-    # Doubled points have no distance, far outliers a huge one; neither is a useful size.
-    usual = float(np.median(distance))
-    if usual <= 0.0:
-        usual = max(float(np.abs(means).max()) * 1e-2, 1e-6)
-    return np.clip(distance, 0.05 * usual, 10.0 * usual)

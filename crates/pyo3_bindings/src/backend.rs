@@ -5,6 +5,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
 use splat_render::cpu;
+use splat_render::fit::FitDevice;
 
 /// A backend by its resolved name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,6 +29,17 @@ impl Backend {
                 "backend: must be auto, cpu, gpu or reference, not {name:?}"
             ))),
         }
+    }
+}
+
+/// A device for a fit on a resolved backend.
+pub fn fit_device(name: &str) -> PyResult<Box<dyn FitDevice>> {
+    match Backend::named(name)? {
+        Backend::Cpu => Ok(Box::new(cpu::CpuFit::default())),
+        Backend::Gpu => Err(PyValueError::new_err("not yet")),
+        Backend::Reference => Err(PyValueError::new_err(
+            "backend: reference renders and differentiates but does not fit; use cpu or gpu",
+        )),
     }
 }
 

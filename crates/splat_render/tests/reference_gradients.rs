@@ -46,7 +46,7 @@ impl Scene {
         let n = rng.random_range(3..9usize);
         let (width, height) = (rng.random_range(6..14u32), rng.random_range(6..14u32));
         let degree = [None, Some(0), Some(1), Some(2), Some(3), Some(4)][(seed % 6) as usize];
-        let raw = seed % 2 == 0;
+        let raw = seed.is_multiple_of(2);
         let mut f = |low: f64, high: f64| rng.random_range(low..high);
         let rows = degree.map_or(n, |d| n * splat_render::sh::coeffs(d));
         let fov = f(0.5, 1.6);

@@ -18,6 +18,11 @@ pub(super) struct ChunkTiles {
 }
 
 impl ChunkTiles {
+    pub fn clear(&mut self) {
+        self.tiles.clear();
+        self.counts.clear();
+    }
+
     /// Appends a splat that touches nothing.
     pub fn push_culled(&mut self) {
         self.counts.push(0);

@@ -2,7 +2,10 @@
 //!
 //! Results do not depend on the number of threads: every sum has a fixed order.
 
+mod adam;
 mod bin;
+mod fit;
+mod loss;
 mod project;
 mod project_backward;
 mod rasterize;
@@ -22,6 +25,7 @@ use project::{Splat, Splat2d, View, project_splat};
 use project_backward::{V2d, VCamera, splat_backward};
 use rasterize::{Planes, TileSplat};
 
+pub use fit::CpuFit;
 pub use simd::instruction_set;
 
 /// The CPU implementation.

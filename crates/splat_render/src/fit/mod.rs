@@ -1,1 +1,14 @@
-//! Under construction.
+//! Fitting splats to photos with known cameras.
+
+mod config;
+mod density;
+mod device;
+mod fitter;
+mod initial;
+mod params;
+
+pub use config::{Background, DensityControl, FitConfig};
+pub use device::{ADAM, FitDevice, Rates, SSIM_C, SSIM_WINDOW, StepInput, Target, noise_normal};
+pub use fitter::{Fitter, scene_extent};
+pub use initial::splats_from_points;
+pub use params::{DensityStats, FitState, SplatArrays};

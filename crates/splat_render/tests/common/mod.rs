@@ -1,6 +1,8 @@
 //! Seeded random scenes, f32/f64 conversions and comparators, shared by the tests of all backends.
 #![allow(dead_code)] // Each test binary uses its own part.
 
+pub mod conformance;
+
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
@@ -43,11 +45,7 @@ impl<T> Scene<T> {
             colors: if self.sh_stride == 0 {
                 Colors::Direct(&self.colors)
             } else {
-                Colors::Sh {
-                    degree: self.sh_degree,
-                    stride: self.sh_stride,
-                    coeffs: &self.colors,
-                }
+                Colors::Sh { degree: self.sh_degree, stride: self.sh_stride, coeffs: &self.colors }
             },
             raw: self.raw,
         }
@@ -396,10 +394,7 @@ pub fn splat_gradient_differences(
         ("v_scales", difference(&got.v_scales, &expected.v_scales, &[])),
         ("v_opacities", difference1(&got.v_opacities, &expected.v_opacities, &[])),
         ("v_colors", difference(&got.v_colors, &expected.v_colors, &[])),
-        (
-            "v_viewmat",
-            camera(got.v_viewmat.as_flattened(), expected.v_viewmat.as_flattened()),
-        ),
+        ("v_viewmat", camera(got.v_viewmat.as_flattened(), expected.v_viewmat.as_flattened())),
         ("v_fx_fy", camera(focal.0, focal.1)),
         ("v_cx_cy", camera(center.0, center.1)),
     ]

@@ -1,0 +1,114 @@
+//! Settings of a fit.
+
+use super::device::Rates;
+use crate::constants::SH_DEGREE_MAX;
+use crate::error::{Error, Result};
+
+/// How the number of splats is controlled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DensityControl {
+    /// Relocation and growth under a cap (Kheradmand et al., "3D Gaussian Splatting as Markov Chain
+    /// Monte Carlo", 2024).
+    Mcmc,
+    /// Clone, split and prune (Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field
+    /// Rendering", 2023).
+    Original,
+    /// The splats given stay as many as they are.
+    Fixed,
+}
+
+/// Background of renders and of photos with alpha.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Background {
+    /// A new colour in every step for photos with alpha; black for photos without.
+    Random,
+    /// One colour, RGB in 0..1.
+    Color([f32; 3]),
+}
+
+/// Settings of a fit. Rates are those of 3DGS unless said otherwise.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FitConfig {
+    /// Number of steps of the whole fit; the centres' rate decays over it.
+    pub steps: u32,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Degree of SH fitted, 0..=4.
+    pub sh_degree: u32,
+    /// Steps after which the degree in use grows by one.
+    pub sh_interval: u32,
+    /// Most splats there may be.
+    pub max_splats: usize,
+    /// How splats are added and removed.
+    pub density: DensityControl,
+    /// Background.
+    pub background: Background,
+    /// Weight of D-SSIM in the loss.
+    pub ssim_weight: f32,
+    /// Adam's rates at the start; that of the centres in units of the scene's extent.
+    pub rates: Rates,
+    /// What the centres' rate has decayed to at the end, as a part of the start's.
+    pub means_decay: f32,
+}
+
+impl Default for FitConfig {
+    fn default() -> Self {
+        Self {
+            steps: 5000,
+            seed: 0,
+            sh_degree: 3,
+            sh_interval: 1000,
+            max_splats: 30_000,
+            density: DensityControl::Mcmc,
+            background: Background::Random,
+            ssim_weight: 0.2,
+            rates: Rates {
+                means: 1.6e-4,
+                quats: 1e-3,
+                scales: 5e-3,
+                opacities: 5e-2,
+                sh0: 2.5e-3,
+                sh_rest: 2.5e-3 / 20.0,
+            },
+            means_decay: 0.01,
+        }
+    }
+}
+
+impl FitConfig {
+    /// Checks every setting.
+    pub fn validate(&self) -> Result<()> {
+        if self.steps == 0 {
+            return Err(Error::argument("steps", "must be at least 1"));
+        }
+        if self.sh_degree > SH_DEGREE_MAX {
+            return Err(Error::argument(
+                "sh_degree",
+                format!("must lie in 0..={SH_DEGREE_MAX}, got {}", self.sh_degree),
+            ));
+        }
+        if self.sh_interval == 0 {
+            return Err(Error::argument("sh_interval", "must be at least 1"));
+        }
+        if self.max_splats == 0 || self.max_splats > 1 << 27 {
+            return Err(Error::argument("max_splats", "must lie in 1..=134217728"));
+        }
+        if !(0.0..=1.0).contains(&self.ssim_weight) {
+            return Err(Error::argument("ssim_weight", "must lie in 0..=1"));
+        }
+        let Rates { means, quats, scales, opacities, sh0, sh_rest } = self.rates;
+        let rates = [means, quats, scales, opacities, sh0, sh_rest];
+        if !rates.iter().all(|r| r.is_finite() && *r >= 0.0) {
+            return Err(Error::argument("rates", "must be finite and not negative"));
+        }
+        if !(self.means_decay > 0.0 && self.means_decay <= 1.0) {
+            return Err(Error::argument("means_decay", "must lie above 0 and at most at 1"));
+        }
+        if let Background::Color(color) = self.background
+            && !color.iter().all(|c| (0.0..=1.0).contains(c))
+        {
+            return Err(Error::argument("background", "must lie in 0..=1"));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,214 @@
+//! The fitting loop: which photo, which rates, which background, when density control runs.
+//!
+//! Nothing random carries over from step to step: every draw comes from the seed and the step's
+//! number, so a fit resumed from a saved state goes on with the same bits.
+
+use rand::Rng;
+use rand::seq::SliceRandom;
+use rand_pcg::Pcg64;
+
+use super::config::{Background, DensityControl, FitConfig};
+use super::density;
+use super::device::{FitDevice, Rates, StepInput, Target};
+use super::params::FitState;
+use crate::camera::Camera;
+use crate::error::{Error, Result};
+
+/// Density control starts after this many steps and then runs every so many.
+const REFINE: (u32, u32) = (300, 100);
+/// Part of all steps after which it runs no more (MCMC; original).
+const REFINE_STOP: (f64, f64) = (0.85, 0.5);
+/// Steps between two opacity resets of the original control.
+const RESET_EVERY: u32 = 3000;
+/// MCMC's pull on opacities and scales and its noise in units of the centres' rate (the paper's).
+const MCMC: (f32, f32, f32) = (0.01, 0.01, 5e5);
+
+/// What a draw is for; part of its seed.
+#[derive(Clone, Copy)]
+enum Draw {
+    Order = 1,
+    Background = 2,
+    Noise = 3,
+    Density = 4,
+}
+
+/// A fit in progress.
+pub struct Fitter {
+    device: Box<dyn FitDevice>,
+    config: FitConfig,
+    cameras: Vec<Camera>,
+    has_alpha: Vec<bool>,
+    extent: f32,
+    order: Vec<usize>,
+    splats: usize,
+    step: u32,
+}
+
+/// 1.1 times the largest distance of a camera's centre from their mean (3DGS); 1 where all cameras
+/// stand at one place.
+pub fn scene_extent(cameras: &[Camera]) -> f64 {
+    let mean = cameras.iter().map(Camera::center).sum::<glam::DVec3>() / cameras.len() as f64;
+    let radius = cameras.iter().map(|c| (c.center() - mean).length()).fold(0.0, f64::max);
+    if radius > 1e-9 { 1.1 * radius } else { 1.0 }
+}
+
+impl Fitter {
+    /// A fit of `state` to `targets`, whose cameras are relative to the scene's origin; `step` steps
+    /// have been done already.
+    pub fn new(
+        mut device: Box<dyn FitDevice>,
+        targets: Vec<Target>,
+        cameras: Vec<Camera>,
+        state: &FitState,
+        step: u32,
+        config: FitConfig,
+    ) -> Result<Self> {
+        config.validate()?;
+        state.validate()?;
+        if targets.is_empty() {
+            return Err(Error::argument("images", "is empty; give at least one photo"));
+        }
+        if cameras.len() != targets.len() {
+            return Err(Error::argument(
+                "viewmats",
+                format!("has {} cameras for {} images", cameras.len(), targets.len()),
+            ));
+        }
+        for (k, (camera, target)) in cameras.iter().zip(&targets).enumerate() {
+            camera.validate()?;
+            if (camera.width, camera.height) != (target.width, target.height) {
+                return Err(Error::argument(
+                    format!("images[{k}]"),
+                    format!(
+                        "is {} x {} where its camera is {} x {}",
+                        target.width, target.height, camera.width, camera.height
+                    ),
+                ));
+            }
+        }
+        if state.splats.is_empty() {
+            return Err(Error::argument("splats", "is empty; a fit starts from at least one"));
+        }
+        if state.splats.sh_degree != config.sh_degree {
+            return Err(Error::argument(
+                "splats",
+                "do not store the SH degree that is to be fitted",
+            ));
+        }
+        let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
+        device.set_targets(targets)?;
+        device.upload(state)?;
+        Ok(Self {
+            device,
+            extent: scene_extent(&cameras) as f32,
+            config,
+            cameras,
+            has_alpha,
+            order: Vec::new(),
+            splats: state.splats.len(),
+            step,
+        })
+    }
+
+    fn rng(&self, draw: Draw, number: u64) -> Pcg64 {
+        Pcg64::new(u128::from(self.config.seed) << 64 | u128::from(number), u128::from(draw as u32))
+    }
+
+    /// Steps done.
+    pub fn steps_done(&self) -> u32 {
+        self.step
+    }
+
+    /// Splats there are.
+    pub fn splat_count(&self) -> usize {
+        self.splats
+    }
+
+    /// Loss of the last step.
+    pub fn loss(&mut self) -> Result<f32> {
+        self.device.loss()
+    }
+
+    /// Everything needed to go on bit for bit, with [`Fitter::steps_done`].
+    pub fn state(&mut self) -> Result<FitState> {
+        self.device.download()
+    }
+
+    /// The photo of step `step` (from 0): every photo once per round, in a new order each round.
+    fn view(&mut self, step: u32) -> usize {
+        let n = self.cameras.len() as u32;
+        if self.order.is_empty() || step.is_multiple_of(n) {
+            let mut rng = self.rng(Draw::Order, u64::from(step / n));
+            self.order = (0..n as usize).collect();
+            self.order.shuffle(&mut rng);
+        }
+        self.order[(step % n) as usize]
+    }
+
+    /// One step, density control included where it is due.
+    pub fn step(&mut self) -> Result<()> {
+        let step = self.step;
+        let view = self.view(step);
+        let config = &self.config;
+        let background = match config.background {
+            Background::Color(color) => color,
+            Background::Random if !self.has_alpha[view] => [0.0; 3],
+            Background::Random => {
+                let mut rng = self.rng(Draw::Background, u64::from(step));
+                std::array::from_fn(|_| rng.random::<f32>())
+            }
+        };
+        let progress = f64::from(step) / f64::from(config.steps);
+        let decay = f64::from(config.means_decay).powf(progress) as f32;
+        let rates = Rates { means: config.rates.means * self.extent * decay, ..config.rates };
+        let mcmc = config.density == DensityControl::Mcmc;
+        let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();
+        let input = StepInput {
+            view,
+            camera: &self.cameras[view],
+            background,
+            sh_degree: (step / config.sh_interval).min(config.sh_degree),
+            rates,
+            step: step + 1,
+            ssim_weight: config.ssim_weight,
+            opacity_regularizer: if mcmc { MCMC.0 } else { 0.0 },
+            scale_regularizer: if mcmc { MCMC.1 } else { 0.0 },
+            noise: if mcmc { MCMC.2 * rates.means } else { 0.0 },
+            noise_seed,
+        };
+        self.device.step(&input)?;
+        self.step += 1;
+        self.control_density()
+    }
+
+    fn control_density(&mut self) -> Result<()> {
+        let (step, config) = (self.step, &self.config);
+        let (start, every) = REFINE;
+        let stop = match config.density {
+            DensityControl::Mcmc => REFINE_STOP.0,
+            DensityControl::Original => REFINE_STOP.1,
+            DensityControl::Fixed => return Ok(()),
+        };
+        let active = f64::from(step) < stop * f64::from(config.steps);
+        let refine = active && step >= start && step.is_multiple_of(every);
+        let reset = active
+            && config.density == DensityControl::Original
+            && step.is_multiple_of(RESET_EVERY);
+        if !refine && !reset {
+            return Ok(());
+        }
+        let mut state = self.device.download()?;
+        let mut rng = self.rng(Draw::Density, u64::from(step));
+        if refine && config.density == DensityControl::Mcmc {
+            density::mcmc(&mut state, config.max_splats, &mut rng);
+        } else if refine {
+            let huge = step > RESET_EVERY;
+            density::original(&mut state, config.max_splats, self.extent, huge, &mut rng);
+        }
+        if reset {
+            density::reset_opacities(&mut state);
+        }
+        self.splats = state.splats.len();
+        self.device.upload(&state)
+    }
+}

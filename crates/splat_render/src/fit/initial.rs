@@ -1,0 +1,72 @@
+//! Splats to start from.
+
+use rayon::prelude::*;
+
+use super::params::SplatArrays;
+use crate::error::{Error, Result};
+use crate::sh;
+
+/// Opacity of a splat that stands for a point (3DGS).
+const OPACITY: f32 = 0.1;
+/// Neighbours whose mean distance sets a point's size (3DGS).
+const NEIGHBOURS: usize = 3;
+
+/// One round splat per point, as large as the mean distance to its three nearest neighbours.
+///
+/// `points` `[P]` world frame less the scene's origin; `colors` `[P]` in 0..1.
+pub fn splats_from_points(
+    points: &[[f32; 3]],
+    colors: &[[f32; 3]],
+    sh_degree: u32,
+) -> Result<SplatArrays> {
+    if points.len() != colors.len() {
+        return Err(Error::argument(
+            "colors",
+            format!("has {} rows where points has {}", colors.len(), points.len()),
+        ));
+    }
+    if !points.iter().chain(colors).flatten().all(|v| v.is_finite()) {
+        return Err(Error::argument("points", "hold a value that is not finite"));
+    }
+    let mut out = SplatArrays::zeros(points.len(), sh_degree);
+    out.means.copy_from_slice(points);
+    out.quats.fill([1.0, 0.0, 0.0, 0.0]);
+    out.opacities.fill((OPACITY / (1.0 - OPACITY)).ln());
+    let stride = out.stride();
+    for (i, color) in colors.iter().enumerate() {
+        out.sh[i * stride] = color.map(|c| (c - 0.5) / sh::C0 as f32);
+    }
+    if points.len() < 2 {
+        return Ok(out);
+    }
+    let tree = rstar::RTree::bulk_load(points.to_vec());
+    out.scales.par_iter_mut().zip(points).for_each(|(scale, point)| {
+        // The nearest is the point itself.
+        let near = tree.nearest_neighbor_iter_with_distance_2(point).skip(1).take(NEIGHBOURS);
+        let (sum, count) = near.fold((0.0, 0.0), |(sum, n), (_, d2)| (sum + d2.sqrt(), n + 1.0));
+        // Coincident points must not give a size of zero.
+        *scale = [(sum / f32::max(count, 1.0)).max(1e-7).ln(); 3];
+    });
+    Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn size_is_the_mean_distance_to_three_neighbours() {
+        let points = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]];
+        let splats = splats_from_points(&points, &[[0.5; 3]; 4], 2).unwrap();
+        assert!((splats.scales[0][0] - 2.0f32.ln()).abs() < 1e-6);
+        assert_eq!(splats.sh[0], [0.0; 3]);
+        splats.validate().unwrap();
+        for count in 0..4 {
+            let splats = splats_from_points(&points[..count], &[[0.5; 3]; 4][..count], 0).unwrap();
+            assert!(splats.scales.iter().flatten().all(|s| s.is_finite()));
+        }
+        let same = splats_from_points(&[[1.0; 3]; 5], &[[0.5; 3]; 5], 0).unwrap();
+        assert!(same.scales.iter().flatten().all(|s| s.is_finite()));
+        assert!(splats_from_points(&[[f32::NAN; 3]], &[[0.5; 3]], 0).is_err());
+    }
+}

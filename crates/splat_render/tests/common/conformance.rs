@@ -1,0 +1,192 @@
+//! What every f32 implementation must show against the f64 reference, stage by stage and end to
+//! end. Each check prints its figures.
+
+use splat_render::reference::{Reference, band_pixels};
+use splat_render::{Camera, Image, ImageGradients, ProjectOptions, Projected, Stages};
+
+use super::*;
+
+/// Bounds of `docs/numerics.md`.
+#[derive(Debug, Clone, Copy)]
+pub struct Bounds {
+    /// Largest difference of a picture, given identical 2D splats.
+    pub picture: f64,
+    /// Largest difference of a gradient as a part of the largest of its kind.
+    pub gradient: f64,
+}
+
+/// Largest and mean difference of a picture rendered from splats.
+const END_TO_END: (f64, f64) = (1e-4, 1e-6);
+/// Relative distance to the alpha threshold that counts as the band, per stage and end to end.
+const BAND: (f64, f64) = (1e-4, 2e-2);
+
+/// Pictures whose sides are and are not multiples of a tile, down to one pixel.
+pub const SIZES: [(u32, u32); 5] = [(64, 64), (1, 1), (17, 33), (100, 31), (130, 7)];
+
+/// Pixels of `band` where the pictures differ by more than `bound`: only these are left out, and at
+/// most 0.1 % of all (or one, in pictures of under 1 000 pixels).
+fn left_out(got: &Image<f32>, expected: &Image<f64>, band: &[bool], bound: f64) -> Vec<bool> {
+    let far = |pixel: usize| {
+        let color = (0..3)
+            .any(|c| (f64::from(got.color[pixel][c]) - expected.color[pixel][c]).abs() > bound);
+        let t = f64::from(got.transmittance[pixel]) - expected.transmittance[pixel];
+        color || t.abs() > bound
+    };
+    let out: Vec<bool> = (0..band.len()).map(|pixel| band[pixel] && far(pixel)).collect();
+    assert_band_is_small(&out);
+    out
+}
+
+fn masked(v_image: &ImageGradients<f32>, band: &[bool]) -> ImageGradients<f32> {
+    let mut out = v_image.clone();
+    for (pixel, &in_band) in band.iter().enumerate() {
+        if in_band {
+            out.v_color[pixel] = [0.0; 3];
+            (out.v_alpha[pixel], out.v_depth[pixel]) = (0.0, 0.0);
+        }
+    }
+    out
+}
+
+/// rasterize and rasterize_backward on identical 2D splats.
+pub fn rasterize_stages(
+    stages: &dyn Stages<f32>,
+    projected: &Projected<f32>,
+    seed: u64,
+    bounds: Bounds,
+    what: &str,
+) {
+    let mut rng = rng(seed);
+    let background = [0.2f32, 0.5, 0.9];
+    let wide = widen_projected(projected);
+    let image = stages.rasterize(projected, background).unwrap();
+    let expected = Reference.rasterize(&wide, background.map(f64::from)).unwrap();
+    let band = left_out(&image, &expected, &band_pixels(&wide, BAND.0), bounds.picture);
+    let difference = image_difference(&image, &expected, &band);
+    println!("{what}: picture max {:.1e} mean {:.1e}", difference.max, difference.mean);
+    assert!(difference.max <= bounds.picture, "{what}: picture is off by {:.2e}", difference.max);
+
+    let v_image = masked(&random_image_gradients(&mut rng, image.alpha.len()), &band);
+    let v = stages.rasterize_backward(projected, background, &image, &v_image).unwrap();
+    let expected = Reference
+        .rasterize_backward(
+            &wide,
+            background.map(f64::from),
+            &expected,
+            &widen_image_gradients(&v_image),
+        )
+        .unwrap();
+    let differences = projected_gradient_differences(&v, &expected);
+    for (name, d) in &differences {
+        println!("{what}: {name} {:.1e} of the largest", d.relative());
+    }
+    assert_gradients(&differences, bounds.gradient, what);
+}
+
+/// project and project_backward on identical splats.
+pub fn project_stages(
+    stages: &dyn Stages<f32>,
+    scene: &Scene<f32>,
+    camera: &Camera,
+    seed: u64,
+    bounds: Bounds,
+    what: &str,
+) {
+    let mut rng = rng(seed);
+    let camera = &rounded(camera);
+    let options = ProjectOptions::default();
+    let got = stages.project(&scene.params(), camera, &options).unwrap();
+    let wide_scene = scene.widen();
+    let expected = Reference.project(&wide_scene.params(), camera, &options).unwrap();
+    let v = random_projected_gradients(&mut rng, &narrow_projected(&expected));
+    let gradients = stages.project_backward(&scene.params(), camera, &options, &got, &v).unwrap();
+    let expected_gradients = Reference
+        .project_backward(
+            &wide_scene.params(),
+            camera,
+            &options,
+            &expected,
+            &widen_projected_gradients(&v),
+        )
+        .unwrap();
+    let visible = |radii: &[f64]| radii != [0.0; 2];
+    let same = (0..got.len())
+        .filter(|&i| visible(&got.radii[i].map(f64::from)) == visible(&expected.radii[i]))
+        .count();
+    assert_eq!(same, got.len(), "{what}: different splats are culled");
+    let differences = splat_gradient_differences(&gradients, &expected_gradients);
+    for (name, d) in &differences {
+        println!("{what}: {name} {:.1e} of the largest", d.relative());
+    }
+    assert_gradients(&differences, bounds.gradient, what);
+}
+
+/// The camera with values that f32 holds exactly, so that all implementations get the same.
+pub fn rounded(camera: &Camera) -> Camera {
+    let f = |v: f64| f64::from(v as f32);
+    Camera {
+        viewmat: glam::DMat4::from_cols_array(&camera.viewmat.to_cols_array().map(f)),
+        fx: f(camera.fx),
+        fy: f(camera.fy),
+        cx: f(camera.cx),
+        cy: f(camera.cy),
+        ..*camera
+    }
+}
+
+/// From splats to picture and back, with identical f32 inputs.
+pub fn end_to_end(
+    stages: &dyn Stages<f32>,
+    scene: &Scene<f32>,
+    camera: &Camera,
+    seed: u64,
+    bounds: Bounds,
+    what: &str,
+) {
+    let mut rng = rng(seed);
+    let camera = &rounded(camera);
+    let options = ProjectOptions::default();
+    let background = [0.2f32, 0.5, 0.9];
+    let wide_scene = scene.widen();
+    let wide_background = background.map(f64::from);
+    let expected_projected = Reference.project(&wide_scene.params(), camera, &options).unwrap();
+    let band = band_pixels(&expected_projected, BAND.1);
+    let expected = Reference.rasterize(&expected_projected, wide_background).unwrap();
+
+    let projected = stages.project(&scene.params(), camera, &options).unwrap();
+    let image = stages.rasterize(&projected, background).unwrap();
+    let all = image_difference(&image, &expected, &[]);
+    let band = left_out(&image, &expected, &band, END_TO_END.0);
+    let outside = image_difference(&image, &expected, &band);
+    let count = band.iter().filter(|&&b| b).count();
+    println!(
+        "{what}: picture max {:.1e} mean {:.1e}; {count} of {} pixels left out (max with them {:.1e})",
+        outside.max,
+        outside.mean,
+        band.len(),
+        all.max
+    );
+    assert!(outside.max <= END_TO_END.0, "{what}: picture is off by {:.2e}", outside.max);
+    assert!(outside.mean <= END_TO_END.1, "{what}: mean is off by {:.2e}", outside.mean);
+
+    let v_image = masked(&random_image_gradients(&mut rng, image.alpha.len()), &band);
+    let v = stages.rasterize_backward(&projected, background, &image, &v_image).unwrap();
+    let gradients =
+        stages.project_backward(&scene.params(), camera, &options, &projected, &v).unwrap();
+    let expected_v = Reference
+        .rasterize_backward(
+            &expected_projected,
+            wide_background,
+            &expected,
+            &widen_image_gradients(&v_image),
+        )
+        .unwrap();
+    let expected_gradients = Reference
+        .project_backward(&wide_scene.params(), camera, &options, &expected_projected, &expected_v)
+        .unwrap();
+    let differences = splat_gradient_differences(&gradients, &expected_gradients);
+    for (name, d) in &differences {
+        println!("{what}: {name} {:.1e} of the largest", d.relative());
+    }
+    assert_gradients(&differences, bounds.gradient, what);
+}

@@ -1,0 +1,47 @@
+//! The CPU implementation against the reference, stage by stage and end to end.
+
+mod common;
+
+use common::conformance::{Bounds, SIZES, end_to_end, project_stages, rasterize_stages};
+use common::{random_camera, random_projected, random_scene, rng};
+use splat_render::cpu::Cpu;
+
+const BOUNDS: Bounds = Bounds { picture: 2e-6, gradient: 1e-4 };
+
+#[test]
+fn rasterize_matches_the_reference() {
+    for (k, (width, height)) in SIZES.into_iter().enumerate() {
+        for (n, sigma) in [(0, 3.0), (1, 8.0), (300, 3.0), (60, 30.0)] {
+            let seed = (k * 10 + n) as u64;
+            let projected = random_projected(&mut rng(seed), n, width, height, sigma);
+            let what = format!("{width}x{height}, {n} splats of {sigma} px");
+            rasterize_stages(&Cpu, &projected, seed, BOUNDS, &what);
+        }
+    }
+}
+
+#[test]
+fn project_matches_the_reference() {
+    for (seed, degree) in
+        [None, Some(0), Some(1), Some(2), Some(3), Some(4)].into_iter().enumerate()
+    {
+        let mut rng = rng(seed as u64);
+        let camera = random_camera(&mut rng, 96, 64);
+        let scene = random_scene(&mut rng, 2500, degree);
+        project_stages(&Cpu, &scene, &camera, seed as u64, BOUNDS, &format!("SH {degree:?}"));
+    }
+}
+
+#[test]
+fn end_to_end_matches_the_reference() {
+    for (k, (width, height)) in SIZES.into_iter().enumerate() {
+        for (n, degree) in [(1, None), (200, Some(3)), (2000, Some(1))] {
+            let seed = (k * 7 + n) as u64;
+            let mut rng = rng(seed);
+            let camera = random_camera(&mut rng, width, height);
+            let scene = random_scene(&mut rng, n, degree);
+            let what = format!("{width}x{height}, {n} splats, SH {degree:?}");
+            end_to_end(&Cpu, &scene, &camera, seed, BOUNDS, &what);
+        }
+    }
+}
