@@ -19,7 +19,7 @@ from igsr.errors import IgsrError
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".gif")
 
 # Pillow knows more, but some of those (EPS) hand the file to another program.
-_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM", "GIF")
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "GIF")
 
 # No photo is packed tighter; a file that claims more is a decompression bomb or a torn header.
 _MOST_PIXELS_PER_BYTE = 10_000
@@ -70,6 +70,7 @@ def _open(path: Path) -> Image.Image:
             f"{path} cannot be read as an image; save it as PNG, JPEG, WebP or TIFF again"
         ) from error
     if image.width * image.height > file_size * _MOST_PIXELS_PER_BYTE:
+        image.close()
         raise IgsrError(
             f"{path} claims {image.width}x{image.height} pixels but has only {file_size} bytes; "
             "save it again"
