@@ -162,16 +162,8 @@ class Fitter:
 def read_ply(path: str) -> SplatArrays:
     """Read an INRIA .ply; OSError says what is wrong with the file."""
 
-def write_ply(
-    path: str,
-    means: Float32,
-    quats: Float32,
-    scales: Float32,
-    opacities: Float32,
-    sh: Float32,
-    origin: Float64,
-) -> None:
-    """Write an INRIA .ply; OSError where that fails."""
+def write_ply(path: str, splats: dict[str, Any]) -> None:
+    """Write ``SplatArrays`` as an INRIA .ply, whole or not at all; OSError where that fails."""
 
 def write_exr(path: str, color: Float32, alpha: Float32, depth: Float32) -> None:
     """Write channels R, G, B, A, Z in 32-bit float; OSError where that fails."""

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
-from .atomic_write import atomic_write
 from .errors import IgsrError
 
 FloatArray = npt.NDArray[np.float32]
@@ -88,16 +87,11 @@ class Splats:
         Raises:
             IgsrError: the file cannot be written.
         """
-        with atomic_write(path) as temporary:
-            _core.write_ply(
-                str(temporary),
-                self.means,
-                self.quats,
-                self.scales,
-                self.opacities,
-                self.sh,
-                self.origin,
-            )
+        try:
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            _core.write_ply(os.fspath(path), vars(self))
+        except OSError as error:
+            raise IgsrError(f"{error}.") from error
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Splats:
@@ -109,6 +103,6 @@ class Splats:
         if not Path(path).is_file():
             raise IgsrError(f"There is no splat file {path}.")
         try:
-            return Splats(**_core.read_ply(str(path)))
-        except (OSError, ValueError) as error:
-            raise IgsrError(f"Cannot read {path}: {error}") from error
+            return Splats(**_core.read_ply(os.fspath(path)))
+        except OSError as error:
+            raise IgsrError(f"{error}.") from error

@@ -1,11 +1,14 @@
 //! Which implementation of the stages runs.
 
+use std::sync::{Arc, OnceLock};
+
 use numpy::PyArrayDescrMethods;
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
-use splat_render::cpu;
+use splat_render::cpu::{self, CpuFit};
 use splat_render::fit::FitDevice;
+use splat_render::gpu::{Gpu, GpuFit};
 
 /// A backend by its resolved name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -32,30 +35,36 @@ impl Backend {
     }
 }
 
+/// The best adapter, opened once per process; the error is kept as its sentence.
+pub fn gpu() -> PyResult<&'static Arc<Gpu>> {
+    static GPU: OnceLock<Result<Arc<Gpu>, String>> = OnceLock::new();
+    GPU.get_or_init(|| Gpu::new(true).map(Arc::new).map_err(|error| error.to_string()))
+        .as_ref()
+        .map_err(|sentence| PyRuntimeError::new_err(sentence.clone()))
+}
+
 /// A device for a fit on a resolved backend.
 pub fn fit_device(name: &str) -> PyResult<Box<dyn FitDevice>> {
     match Backend::named(name)? {
-        Backend::Cpu => Ok(Box::new(cpu::CpuFit::default())),
-        Backend::Gpu => Err(PyValueError::new_err("not yet")),
+        Backend::Cpu => Ok(Box::new(CpuFit::default())),
+        Backend::Gpu => Ok(Box::new(GpuFit::new(Arc::clone(gpu()?)))),
         Backend::Reference => Err(PyValueError::new_err(
             "backend: reference renders and differentiates but does not fit; use cpu or gpu",
         )),
     }
 }
 
-/// The GPU backend, opened once per process.
-pub fn gpu() -> PyResult<&'static cpu::Cpu> {
-    Err(pyo3::exceptions::PyRuntimeError::new_err("No GPU backend in this build yet."))
-}
-
 /// The name that `name` stands for: "auto" is a real GPU if one answers, else the CPU.
+///
+/// A software adapter runs only when "gpu" is asked for by name: the CPU backend is faster.
 #[pyfunction]
-pub fn resolve_backend(name: &str) -> PyResult<&str> {
+pub fn resolve_backend<'a>(py: Python<'_>, name: &'a str) -> PyResult<&'a str> {
     if name == "auto" {
-        return Ok("cpu");
+        let real = py.detach(|| gpu().is_ok_and(|gpu| !gpu.is_software()));
+        return Ok(if real { "gpu" } else { "cpu" });
     }
     if Backend::named(name)? == Backend::Gpu {
-        gpu()?;
+        py.detach(gpu)?;
     }
     Ok(name)
 }
@@ -68,10 +77,7 @@ pub fn backend_info<'py>(py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyD
     let (device, instruction_set) = match Backend::named(name)? {
         Backend::Cpu => (host, cpu::instruction_set()),
         Backend::Reference => (host, "scalar f64"),
-        Backend::Gpu => {
-            gpu()?;
-            (String::new(), "WGSL")
-        }
+        Backend::Gpu => (py.detach(gpu)?.name(), "WGSL"),
     };
     let info = PyDict::new(py);
     info.set_item("backend", name)?;

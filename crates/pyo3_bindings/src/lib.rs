@@ -33,5 +33,7 @@ mod _core {
     #[pymodule_export]
     use crate::fitter::{Fitter, splats_from_points};
     #[pymodule_export]
+    use crate::splat_files::{read_ply, write_ply};
+    #[pymodule_export]
     use crate::stages::{project, project_backward, rasterize, rasterize_backward};
 }

@@ -12,7 +12,7 @@ use splat_render::{
 };
 
 use crate::arrays::{array, elements, entry, row, rows, shaped, shaped_rows};
-use crate::backend::Backend;
+use crate::backend::{Backend, gpu};
 use crate::camera::camera;
 use crate::error::to_python;
 
@@ -26,7 +26,7 @@ macro_rules! with_stages {
     ($backend:expr, $function:ident($($argument:expr),* $(,)?)) => {
         match Backend::named($backend)? {
             Backend::Cpu => $function::<f32>(&Cpu, $($argument),*),
-            Backend::Gpu => Err(pyo3::exceptions::PyRuntimeError::new_err("not yet")),
+            Backend::Gpu => $function::<f32>(&**gpu()?, $($argument),*),
             Backend::Reference => $function::<f64>(&Reference, $($argument),*),
         }
     };
