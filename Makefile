@@ -1,0 +1,109 @@
+# make demo   sets everything up and fits the example capture
+# make test   sets everything up and runs every check
+#
+# Needs a Python (3.10 or newer), a Rust toolchain, a C linker and a package manager. Everything
+# Python goes into .venv; what a rerun need not repeat is remembered in .venv/.*-ready.
+
+PYTHON ?= python3
+CARGO ?= cargo
+EXAMPLE := examples/tea_table
+
+VENV := .venv
+BIN := $(VENV)/bin
+
+# One profile everywhere, so that each dependency is compiled once; our own crate's tests run with
+# its assertions and overflow checks on.
+PROFILE := --release
+CHECKED := --config profile.release.package.splat_render.debug-assertions=true \
+	--config profile.release.package.splat_render.overflow-checks=true
+# The interpreter that maturin builds against: with another one, pyo3 would be compiled twice.
+export PYO3_PYTHON := $(CURDIR)/$(BIN)/python
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
+	Cargo.toml Cargo.lock
+
+.PHONY: demo test build wheel check-rust check-python vulkan example-capture clean
+.DELETE_ON_ERROR:
+
+# ---- what a user runs --------------------------------------------------------------------------
+
+demo: build
+	$(BIN)/igsr fit $(EXAMPLE) --out out/demo
+	@printf '%s\n' '' 'The demo wrote' \
+		'  out/demo/scene.ply    the splats: any splat viewer opens it' \
+		'  out/demo/report.json  the scores on the held-out views' \
+		'  out/demo/views.png    photo, render and error side by side'
+
+build: $(VENV)/.build-ready
+
+wheel: $(VENV)/.venv-ready
+	$(BIN)/maturin build $(PROFILE) --locked --out dist
+
+clean:
+	rm -rf $(VENV) target dist out py/igsr/_core*.so py/igsr/_core*.pyd
+	find py tests examples -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+# Renders the committed example capture again, from nothing.
+example-capture: build
+	$(BIN)/python -m pip install --quiet --requirement examples/requirements.txt
+	$(BIN)/python examples/make_capture.py --out $(EXAMPLE)
+
+# ---- the checks --------------------------------------------------------------------------------
+
+test: check-rust check-python
+
+check-rust: build vulkan
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy $(PROFILE) --locked --workspace --all-targets -- -D warnings
+	$(CARGO) test $(PROFILE) $(CHECKED) --locked --workspace
+
+check-python: build vulkan $(VENV)/.dev-ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+# The GPU kernels are tested on whatever device answers; where none does, on Mesa's software one.
+VULKAN_ANSWERS := $(BIN)/python -c 'from igsr import _core; print("GPU tests run on", _core.backend_info("gpu")["device"])'
+
+vulkan: build
+	@$(VULKAN_ANSWERS) 2>/dev/null || { \
+		$(call apt_install,mesa-vulkan-drivers libvulkan1,no GPU or software Vulkan driver answers) && $(VULKAN_ANSWERS); \
+	}
+
+# ---- setting up --------------------------------------------------------------------------------
+
+$(VENV)/.venv-ready: requirements-dev.txt
+	@command -v $(PYTHON) >/dev/null || { \
+		echo "igsr needs Python 3.10 or newer, and '$(PYTHON)' is not on the PATH: install it, or name one with 'make PYTHON=...'." >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+		echo "igsr needs Python 3.10 or newer, and '$(PYTHON)' is $$($(PYTHON) -V): name a newer one with 'make PYTHON=...'." >&2; exit 1; }
+	@command -v $(CARGO) >/dev/null || { \
+		echo "igsr needs a Rust toolchain, and 'cargo' is not on the PATH: install Rust with rustup." >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+		$(call apt_install,python3-venv,Python's venv module is missing); }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet "$$(grep '^maturin==' requirements-dev.txt)"
+	@touch $@
+
+$(VENV)/.build-ready: $(VENV)/.venv-ready pyproject.toml $(RUST_SOURCES)
+	$(BIN)/maturin develop $(PROFILE) --locked
+	@touch $@
+
+$(VENV)/.dev-ready: $(VENV)/.venv-ready requirements-dev.txt
+	$(BIN)/python -m pip install --quiet --requirement requirements-dev.txt
+	@touch $@
+
+# $(call apt_install,packages,why): installs with apt, as root or through sudo, or says what to do.
+define apt_install
+as_root=; [ "$$(id -u)" = 0 ] || as_root="sudo -n"; \
+if command -v apt-get >/dev/null && $$as_root true 2>/dev/null; then \
+	echo "Installing $(1), since $(2)."; \
+	$$as_root apt-get update -qq && \
+	$$as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(1); \
+else \
+	echo "make: $(2), and apt cannot be used from here to mend it: install $(1), or what your system calls them, and run make again." >&2; exit 1; \
+fi
+endef
