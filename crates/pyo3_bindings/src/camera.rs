@@ -1,0 +1,52 @@
+//! Cameras from Python's viewmat and intrinsics.
+
+use glam::DMat4;
+use pyo3::prelude::*;
+use splat_render::Camera;
+
+use crate::arrays::{array, row, rows};
+
+/// A camera from `viewmat` f64 [4, 4], `intrinsics` f64 [4] (fx, fy, cx, cy) and a size.
+pub fn camera(
+    viewmat: &Bound<'_, PyAny>,
+    intrinsics: &Bound<'_, PyAny>,
+    width: u32,
+    height: u32,
+) -> PyResult<Camera> {
+    let viewmat = array::<f64>("viewmat", viewmat)?;
+    let matrix: [[f64; 4]; 4] = {
+        let rows = rows::<f64, 4>("viewmat", &viewmat, &[4])?;
+        [rows[0], rows[1], rows[2], rows[3]]
+    };
+    let [fx, fy, cx, cy] = row::<f64, 4>("intrinsics", intrinsics)?;
+    // numpy is row-major, glam column-major.
+    let viewmat = DMat4::from_cols_array_2d(&matrix).transpose();
+    Ok(Camera { viewmat, fx, fy, cx, cy, width, height })
+}
+
+/// Cameras from `viewmats` f64 [V, 4, 4], `intrinsics` f64 [V, 4] and V sizes.
+pub fn cameras(
+    viewmats: &Bound<'_, PyAny>,
+    intrinsics: &Bound<'_, PyAny>,
+    sizes: &[(u32, u32)],
+) -> PyResult<Vec<Camera>> {
+    let count = sizes.len() as isize;
+    let viewmats = array::<f64>("viewmats", viewmats)?;
+    let viewmats = rows::<f64, 4>("viewmats", &viewmats, &[count, 4])?.as_chunks::<4>().0;
+    let intrinsics = array::<f64>("intrinsics", intrinsics)?;
+    let intrinsics = rows::<f64, 4>("intrinsics", &intrinsics, &[count])?;
+    Ok(viewmats
+        .iter()
+        .zip(intrinsics)
+        .zip(sizes)
+        .map(|((viewmat, &[fx, fy, cx, cy]), &(width, height))| Camera {
+            viewmat: DMat4::from_cols_array_2d(viewmat).transpose(),
+            fx,
+            fy,
+            cx,
+            cy,
+            width,
+            height,
+        })
+        .collect())
+}

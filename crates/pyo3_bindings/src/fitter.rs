@@ -1,0 +1,282 @@
+//! A fit in progress, stepped from Python.
+
+use std::sync::{Mutex, MutexGuard};
+
+use numpy::PyUntypedArrayMethods;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList};
+use splat_render::fit::{
+    Background, DensityControl, DensityStats, FitConfig, FitState, SplatArrays, Target,
+};
+
+use crate::arrays::{array, elements, entry, rows, shaped, shaped_rows};
+use crate::backend::fit_device;
+use crate::camera::cameras;
+use crate::error::to_python;
+
+/// A fit in progress.
+#[pyclass]
+pub struct Fitter(Mutex<splat_render::fit::Fitter>);
+
+/// The setting `name`, or None where it is absent or None.
+fn setting<'py, T>(config: &Bound<'py, PyDict>, name: &str) -> PyResult<Option<T>>
+where
+    T: for<'a> FromPyObject<'a, 'py>,
+{
+    let Some(value) = config.get_item(name)?.filter(|value| !value.is_none()) else {
+        return Ok(None);
+    };
+    match value.extract() {
+        Ok(value) => Ok(Some(value)),
+        Err(_) => Err(PyValueError::new_err(format!("{name}: cannot be {}", value.repr()?))),
+    }
+}
+
+fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
+    let default = FitConfig::default();
+    let density = match setting::<String>(config, "density")?.as_deref() {
+        None => default.density,
+        Some("mcmc") => DensityControl::Mcmc,
+        Some("original") => DensityControl::Original,
+        Some("fixed") => DensityControl::Fixed,
+        Some(other) => {
+            return Err(PyValueError::new_err(format!(
+                "density: must be mcmc, original or fixed, not {other:?}"
+            )));
+        }
+    };
+    let background =
+        setting::<[f32; 3]>(config, "background")?.map_or(Background::Random, Background::Color);
+    Ok(FitConfig {
+        steps: setting(config, "steps")?.unwrap_or(default.steps),
+        seed: setting(config, "seed")?.unwrap_or(default.seed),
+        sh_degree: setting(config, "sh_degree")?.unwrap_or(default.sh_degree),
+        max_splats: setting(config, "max_splats")?.unwrap_or(default.max_splats),
+        density,
+        background,
+        ..default
+    })
+}
+
+/// Parameters of the splats, or moments under a prefix.
+pub fn splat_arrays_from(dict: &Bound<'_, PyDict>, prefix: &str) -> PyResult<SplatArrays> {
+    fn copied<const N: usize>(
+        dict: &Bound<'_, PyDict>,
+        name: &str,
+        leading: &[isize],
+    ) -> PyResult<Vec<[f32; N]>> {
+        Ok(rows(name, &entry::<f32>(dict, name)?, leading)?.to_vec())
+    }
+    let means = copied(dict, &format!("{prefix}means"), &[-1])?;
+    let n = means.len() as isize;
+    let sh_name = format!("{prefix}sh");
+    let sh = entry::<f32>(dict, &sh_name)?;
+    let coeffs = rows::<f32, 3>(&sh_name, &sh, &[n, -1])?.to_vec();
+    let stride = sh.shape()[1];
+    let Some(sh_degree) = (0..=splat_render::constants::SH_DEGREE_MAX)
+        .find(|&degree| splat_render::sh::coeffs(degree) == stride)
+    else {
+        return Err(PyValueError::new_err(format!(
+            "{sh_name}: must have 1, 4, 9, 16 or 25 coefficients, not {stride}"
+        )));
+    };
+    let opacities_name = format!("{prefix}opacities");
+    let opacities = entry::<f32>(dict, &opacities_name)?;
+    Ok(SplatArrays {
+        means,
+        quats: copied(dict, &format!("{prefix}quats"), &[n])?,
+        scales: copied(dict, &format!("{prefix}scales"), &[n])?,
+        opacities: elements(&opacities_name, &opacities, &[n])?.to_vec(),
+        sh: coeffs,
+        sh_degree,
+    })
+}
+
+/// The reverse of [`splat_arrays_from`].
+pub fn set_splat_arrays(
+    dict: &Bound<'_, PyDict>,
+    prefix: &str,
+    splats: SplatArrays,
+) -> PyResult<()> {
+    let py = dict.py();
+    let (n, stride) = (splats.len(), splats.stride());
+    dict.set_item(format!("{prefix}means"), shaped_rows(py, splats.means, &[n])?)?;
+    dict.set_item(format!("{prefix}quats"), shaped_rows(py, splats.quats, &[n])?)?;
+    dict.set_item(format!("{prefix}scales"), shaped_rows(py, splats.scales, &[n])?)?;
+    dict.set_item(format!("{prefix}opacities"), shaped(py, splats.opacities, &[n])?)?;
+    dict.set_item(format!("{prefix}sh"), shaped_rows(py, splats.sh, &[n, stride])?)
+}
+
+/// The state in `dict`, fresh where it holds no moments, and the steps done.
+fn state_from(dict: &Bound<'_, PyDict>) -> PyResult<(FitState, u32)> {
+    let splats = splat_arrays_from(dict, "")?;
+    if !dict.contains("step")? {
+        return Ok((FitState::new(splats), 0));
+    }
+    let n = splats.len() as isize;
+    let stat = |name: &str| -> PyResult<Vec<f32>> {
+        Ok(elements(name, &entry(dict, name)?, &[n])?.to_vec())
+    };
+    let step = entry::<u32>(dict, "step")?;
+    let state = FitState {
+        splats,
+        first: splat_arrays_from(dict, "first_")?,
+        second: splat_arrays_from(dict, "second_")?,
+        stats: DensityStats {
+            grad_sum: stat("stats_grad_sum")?,
+            seen: stat("stats_seen")?,
+            radius: stat("stats_radius")?,
+        },
+    };
+    Ok((state, elements("step", &step, &[1])?[0]))
+}
+
+fn targets_from(
+    images: &Bound<'_, PyList>,
+    masks: &Bound<'_, PyList>,
+) -> PyResult<Vec<Target>> {
+    if images.len() != masks.len() {
+        return Err(PyValueError::new_err(format!(
+            "masks: has {} entries for {} images",
+            masks.len(),
+            images.len()
+        )));
+    }
+    let mut targets = Vec::with_capacity(images.len());
+    for (i, (image, mask)) in images.iter().zip(masks.iter()).enumerate() {
+        let name = format!("images[{i}]");
+        let image = array::<u8>(&name, &image)?;
+        let pixels = elements(&name, &image, &[-1, -1, -1])?;
+        let &[height, width, channels] = image.shape() else {
+            return Err(PyValueError::new_err(format!("{name}: must have shape [H, W, C]")));
+        };
+        let weights = if mask.is_none() {
+            None
+        } else {
+            let name = format!("masks[{i}]");
+            let mask = array::<bool>(&name, &mask)?;
+            let mask = elements(&name, &mask, &[height as isize, width as isize])?;
+            Some(mask.iter().map(|&counts| if counts { 1.0 } else { 0.0 }).collect())
+        };
+        let target = Target {
+            width: width as u32,
+            height: height as u32,
+            channels: channels as u32,
+            pixels: pixels.to_vec(),
+            weights,
+        };
+        target.validate(i).map_err(to_python)?;
+        targets.push(target);
+    }
+    Ok(targets)
+}
+
+impl Fitter {
+    fn lock(&self) -> PyResult<MutexGuard<'_, splat_render::fit::Fitter>> {
+        self.0
+            .lock()
+            .map_err(|_| PyRuntimeError::new_err("The fit failed earlier and cannot go on."))
+    }
+}
+
+#[pymethods]
+impl Fitter {
+    /// A fit of `state` to photos.
+    #[new]
+    #[pyo3(signature = (images, masks, viewmats, intrinsics, state, config, backend))]
+    fn new<'py>(
+        py: Python<'py>,
+        images: &Bound<'py, PyList>,
+        masks: &Bound<'py, PyList>,
+        viewmats: &Bound<'py, PyAny>,
+        intrinsics: &Bound<'py, PyAny>,
+        state: &Bound<'py, PyDict>,
+        config: &Bound<'py, PyDict>,
+        backend: &str,
+    ) -> PyResult<Self> {
+        let config = config_from(config)?;
+        let targets = targets_from(images, masks)?;
+        let sizes: Vec<(u32, u32)> = targets.iter().map(|t| (t.width, t.height)).collect();
+        let cameras = cameras(viewmats, intrinsics, &sizes)?;
+        let (state, step) = state_from(state)?;
+        let device = fit_device(backend)?;
+        py.detach(|| {
+            splat_render::fit::Fitter::new(device, targets, cameras, &state, step, config)
+        })
+        .map(|fitter| Self(Mutex::new(fitter)))
+        .map_err(to_python)
+    }
+
+    /// Does `count` steps; returns `step`, `loss` (of the last one) and `splats`.
+    fn step<'py>(&self, py: Python<'py>, count: u32) -> PyResult<Bound<'py, PyDict>> {
+        let (step, loss, splats) = py.detach(|| {
+            let mut fitter = self.lock()?;
+            for _ in 0..count {
+                fitter.step().map_err(to_python)?;
+            }
+            let loss = fitter.loss().map_err(to_python)?;
+            PyResult::Ok((fitter.steps_done(), loss, fitter.splat_count()))
+        })?;
+        let done = PyDict::new(py);
+        done.set_item("step", step)?;
+        done.set_item("loss", loss)?;
+        done.set_item("splats", splats)?;
+        Ok(done)
+    }
+
+    /// Steps done.
+    #[getter]
+    fn steps_done(&self, py: Python<'_>) -> PyResult<u32> {
+        py.detach(|| Ok(self.lock()?.steps_done()))
+    }
+
+    /// The parameters as they are now.
+    fn splats<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let state = py.detach(|| self.lock()?.state().map_err(to_python))?;
+        let dict = PyDict::new(py);
+        set_splat_arrays(&dict, "", state.splats)?;
+        Ok(dict)
+    }
+
+    /// Everything needed to go on bit for bit: the constructor's `state`.
+    fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let (state, step) = py.detach(|| {
+            let mut fitter = self.lock()?;
+            PyResult::Ok((fitter.state().map_err(to_python)?, fitter.steps_done()))
+        })?;
+        let n = state.splats.len();
+        let dict = PyDict::new(py);
+        set_splat_arrays(&dict, "", state.splats)?;
+        set_splat_arrays(&dict, "first_", state.first)?;
+        set_splat_arrays(&dict, "second_", state.second)?;
+        dict.set_item("stats_grad_sum", shaped(py, state.stats.grad_sum, &[n])?)?;
+        dict.set_item("stats_seen", shaped(py, state.stats.seen, &[n])?)?;
+        dict.set_item("stats_radius", shaped(py, state.stats.radius, &[n])?)?;
+        dict.set_item("step", shaped(py, vec![step], &[1])?)?;
+        Ok(dict)
+    }
+}
+
+/// One round splat per point, as large as the mean distance to its three nearest neighbours.
+#[pyfunction]
+pub fn splats_from_points<'py>(
+    py: Python<'py>,
+    points: &Bound<'py, PyAny>,
+    colors: &Bound<'py, PyAny>,
+    sh_degree: u32,
+) -> PyResult<Bound<'py, PyDict>> {
+    if sh_degree > splat_render::constants::SH_DEGREE_MAX {
+        return Err(PyValueError::new_err(format!("sh_degree: must be 0 to 4, not {sh_degree}")));
+    }
+    let points = array::<f32>("points", points)?;
+    let points = rows::<f32, 3>("points", &points, &[-1])?;
+    let colors = array::<f32>("colors", colors)?;
+    let colors = rows::<f32, 3>("colors", &colors, &[points.len() as isize])?;
+    let splats = py
+        .detach(|| splat_render::fit::splats_from_points(points, colors, sh_degree))
+        .map_err(to_python)?;
+    let dict = PyDict::new(py);
+    set_splat_arrays(&dict, "", splats)?;
+    Ok(dict)
+}

@@ -1,0 +1,39 @@
+//! The Python module `igsr._core`: numpy arrays in, numpy arrays out, nothing else.
+//!
+//! Arrays are C-contiguous and float32, for the backend "reference" float64; what is wrong with an
+//! argument is a ValueError that begins with its name. `_core.pyi` describes every function.
+
+mod arrays;
+mod backend;
+mod camera;
+mod error;
+mod exr_files;
+mod fitter;
+mod splat_files;
+mod stages;
+
+use pyo3::prelude::*;
+
+#[pymodule]
+mod _core {
+    use pyo3::prelude::*;
+    use splat_render::fit::FitConfig;
+
+    #[pymodule_export]
+    #[expect(non_upper_case_globals, reason = "Python's name for it")]
+    const __version__: &str = env!("CARGO_PKG_VERSION");
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        module.add("DEFAULT_MAX_SPLATS", FitConfig::default().max_splats)
+    }
+    #[pymodule_export]
+    use crate::backend::{backend_info, resolve_backend, working_dtype};
+    #[pymodule_export]
+    use crate::exr_files::write_exr;
+    #[pymodule_export]
+    use crate::fitter::{Fitter, splats_from_points};
+    #[pymodule_export]
+    use crate::splat_files::{read_ply, write_ply};
+    #[pymodule_export]
+    use crate::stages::{project, project_backward, rasterize, rasterize_backward};
+}

@@ -1,0 +1,36 @@
+"""igsr: from a handful of photos with known cameras to a Gaussian-splat scene.
+
+>>> import igsr
+>>> capture = igsr.load_capture("photos").with_holdout(8)
+>>> splats = igsr.fit(capture, steps=5000)
+>>> igsr.evaluate(splats, capture)["psnr"]
+>>> splats.save("scene.ply")
+"""
+
+from __future__ import annotations
+
+from ._core import __version__
+from .capture import Camera, Capture, Points, View, load_capture
+from .errors import IgsrError
+from .evaluation import evaluate
+from .fitting import Progress, fit
+from .rasterization import rasterization
+from .rendering import Render, render
+from .splats import Splats
+
+__all__ = [
+    "Camera",
+    "Capture",
+    "IgsrError",
+    "Points",
+    "Progress",
+    "Render",
+    "Splats",
+    "View",
+    "__version__",
+    "evaluate",
+    "fit",
+    "load_capture",
+    "rasterization",
+    "render",
+]

@@ -1,0 +1,169 @@
+"""Types of the Rust module: numpy arrays in, numpy arrays out.
+
+Arrays are C-contiguous. ``Real`` is float32, or float64 for the backend "reference" (see
+``working_dtype``). N is the number of splats, K of SH coefficients per splat, H x W the picture.
+"""
+
+from typing import Any, TypedDict
+
+import numpy as np
+import numpy.typing as npt
+
+__version__: str
+
+Real = npt.NDArray[Any]
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+class SplatArrays(TypedDict):
+    """Splat parameters as fitted and stored: log-scales, opacity logits."""
+
+    means: Float32  # [N, 3] relative to origin
+    quats: Float32  # [N, 4] wxyz
+    scales: Float32  # [N, 3]
+    opacities: Float32  # [N]
+    sh: Float32  # [N, K, 3]
+    origin: Float64  # [3]
+
+def resolve_backend(name: str) -> str:
+    """The backend that "auto", "cpu", "gpu" or "reference" stands for.
+
+    Raises ValueError for another name, RuntimeError where "gpu" has no adapter.
+    """
+
+def backend_info(name: str) -> dict[str, str]:
+    """``backend``, ``device`` and ``instruction_set`` of a resolved backend."""
+
+def working_dtype(backend: str) -> type[np.floating[Any]]:
+    """The dtype of every Real array of a resolved backend."""
+
+def project(
+    means: Real,
+    quats: Real,
+    scales: Real,
+    opacities: Real,
+    colors: Real,
+    *,
+    sh_degree: int | None,
+    raw_parameters: bool,
+    viewmat: Float64,
+    intrinsics: Float64,
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    eps2d: float,
+    backend: str,
+) -> dict[str, Real]:
+    """Splats and one camera to 2D splats.
+
+    ``colors`` is [N, 3], or [N, K, 3] SH coefficients with ``sh_degree``; ``raw_parameters`` says
+    that scales are logs and opacities logits. ``viewmat`` [4, 4] is world-to-camera,
+    ``intrinsics`` [4] fx, fy, cx, cy.
+
+    Returns means2d [N, 2], factors [N, 3], covars2d [N, 3], depths [N], colors [N, 3],
+    opacities [N], radii [N, 2]; a culled splat has zeros.
+    """
+
+def rasterize(
+    projected: dict[str, Real],
+    *,
+    width: int,
+    height: int,
+    background: Real,
+    backend: str,
+) -> dict[str, Real]:
+    """2D splats to color [H, W, 3], alpha, depth and transmittance [H, W]."""
+
+def rasterize_backward(
+    projected: dict[str, Real],
+    image: dict[str, Real],
+    *,
+    v_color: Real,
+    v_alpha: Real,
+    v_depth: Real,
+    background: Real,
+    backend: str,
+) -> dict[str, Real]:
+    """Gradients v_means2d, v_covars2d, v_depths, v_colors, v_opacities and v_background [3].
+
+    ``image`` is what ``rasterize`` returned for the same arguments.
+    """
+
+def project_backward(
+    means: Real,
+    quats: Real,
+    scales: Real,
+    opacities: Real,
+    colors: Real,
+    projected: dict[str, Real],
+    v_projected: dict[str, Real],
+    *,
+    sh_degree: int | None,
+    raw_parameters: bool,
+    viewmat: Float64,
+    intrinsics: Float64,
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    eps2d: float,
+    backend: str,
+) -> dict[str, Real]:
+    """Gradients v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmat, v_intrinsics.
+
+    The last two are float64 for every backend.
+    """
+
+DEFAULT_MAX_SPLATS: int
+
+def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict[str, Float32]:
+    """One round splat per point [P, 3] with colours [P, 3] in 0..1.
+
+    Returns means, quats, scales (logs of the mean distance to the three nearest neighbours),
+    opacities (logits of 0.1) and sh, as ``SplatArrays`` has them.
+    """
+
+class Fitter:
+    """A fit in progress; parameters and optimiser state stay where the kernels run."""
+
+    def __init__(
+        self,
+        images: list[npt.NDArray[np.uint8]],
+        masks: list[npt.NDArray[np.bool_] | None],
+        viewmats: Float64,
+        intrinsics: Float64,
+        state: dict[str, Any],
+        config: dict[str, Any],
+        backend: str,
+    ) -> None:
+        """A fit to V photos.
+
+        ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
+        ``viewmats`` [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4]. ``state`` is
+        either the parameters to start from (``SplatArrays`` without origin) or what ``state()``
+        returned. ``config``: steps, seed, sh_degree, max_splats, density, background; an absent
+        or None entry takes the default.
+        """
+
+    def step(self, count: int) -> dict[str, Any]:
+        """Do ``count`` steps; ``step`` and ``splats`` afterwards and ``loss`` of the last one."""
+
+    @property
+    def steps_done(self) -> int:
+        """Steps done, those of resumed runs included."""
+
+    def splats(self) -> dict[str, Float32]:
+        """The parameters as they are now, without origin."""
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Everything needed to go on bit for bit."""
+
+def read_ply(path: str) -> SplatArrays:
+    """Read an INRIA .ply; OSError says what is wrong with the file."""
+
+def write_ply(path: str, splats: dict[str, Any]) -> None:
+    """Write ``SplatArrays`` as an INRIA .ply, whole or not at all; OSError where that fails."""
+
+def write_exr(path: str, color: Float32, alpha: Float32, depth: Float32) -> None:
+    """Write channels R, G, B, A, Z in 32-bit float; OSError where that fails."""

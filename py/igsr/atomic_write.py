@@ -1,0 +1,65 @@
+"""Write a file whole or not at all.
+
+A file that someone may be reading, or may need after a crash, is never opened for writing: the
+new content goes to a temporary name in the same folder and takes the old name in one rename.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from .errors import IgsrError
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path to write to; on success it replaces ``path``, on failure it goes.
+
+    The temporary file keeps the suffix of ``path`` (image and video writers choose their format
+    by it) and lies beside it, because a rename is only atomic within one file system.
+
+    Args:
+        path: where the finished file shall lie. Its folder is made if it is missing.
+
+    Yields:
+        The path to write to.
+
+    Raises:
+        IgsrError: the folder cannot be made or the file not be written (disk full, no
+            permission); what lay at ``path`` before is still there.
+    """
+    target = Path(path)
+    temporary: Path | None = None
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{target.stem}-", suffix=f".unfinished{target.suffix}", dir=target.parent
+        )
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        # mkstemp makes files private; a result is as readable as any other new file.
+        os.chmod(temporary, 0o666 & ~_umask())
+        with open(temporary, "rb") as written:
+            # Without this a power cut can leave the new name with no content.
+            os.fsync(written.fileno())
+        os.replace(temporary, target)
+        temporary = None
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise IgsrError(f"Cannot write {target}: {reason}.") from error
+    finally:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+
+
+def _umask() -> int:
+    """The process's umask (it can only be read by setting it)."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,570 @@
+"""The ``igsr`` command: fit, render, eval, info."""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBar
+from rich.table import Table
+
+from . import _core
+from .capture import Camera, Capture, load_capture
+from .errors import IgsrError
+from .evaluation import METRICS, ScoredView, default_background, default_split, evaluate
+from .fitting import DEFAULT_MAX_SPLATS, Progress, fit
+from .orbit import orbit
+from .rendering import render
+from .report import sheet_names, write_contact_sheet, write_report
+from .splats import Splats
+
+app = typer.Typer(
+    help="Fit a Gaussian-splat scene from photos with known cameras.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+#: Exit status after Ctrl-C: 128 + SIGINT, as shells report it.
+INTERRUPTED = 130
+
+NAMED_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
+
+
+class BackendChoice(str, enum.Enum):
+    """What computes."""
+
+    auto = "auto"
+    cpu = "cpu"
+    gpu = "gpu"
+    reference = "reference"
+
+
+class DensityChoice(str, enum.Enum):
+    """How splats are added and removed."""
+
+    mcmc = "mcmc"
+    original = "original"
+    fixed = "fixed"
+
+
+class SplitChoice(str, enum.Enum):
+    """Which views of a capture."""
+
+    train = "train"
+    test = "test"
+
+
+BackendOption = Annotated[
+    BackendChoice,
+    typer.Option("--backend", help="auto: a real GPU if one answers, else the CPU."),
+]
+BackgroundOption = Annotated[
+    str | None,
+    typer.Option(
+        "--background",
+        metavar="COLOR",
+        help="white, black, grey or R,G,B in 0..1, behind renders and photos with alpha. "
+        "Default: white where photos have alpha, else black.",
+    ),
+]
+HoldoutOption = Annotated[
+    int | None,
+    typer.Option("--holdout", help="Every how many views one is held out and scored, such as 8."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, for machines.")]
+CaptureArgument = Annotated[
+    Path, typer.Argument(metavar="CAPTURE", help="Folder or file that holds photos and cameras.")
+]
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A splat .ply file.")]
+
+
+def main() -> None:
+    """Run the ``igsr`` command."""
+    app()
+
+
+@contextlib.contextmanager
+def one_sentence(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Iterator[None]:
+    """Turn what a user can mend into one sentence on stderr and a non-zero exit."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _complain(interrupted())
+        raise typer.Exit(INTERRUPTED) from None
+    except IgsrError as error:
+        _complain(str(error))
+        raise typer.Exit(1) from None
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _complain(f"{where}{error.strerror or error}")
+        raise typer.Exit(1) from None
+    except MemoryError:
+        _complain("There is not enough memory for this; use fewer or smaller photos or splats")
+        raise typer.Exit(1) from None
+
+
+def _complain(sentence: str) -> None:
+    sentence = " ".join(sentence.split())
+    print(sentence if sentence.endswith((".", "!", "?")) else sentence + ".", file=sys.stderr)
+
+
+def _resolved(backend: BackendChoice) -> str:
+    """The backend that runs; a missing adapter is found before any work."""
+    try:
+        return _core.resolve_backend(backend.value)
+    except RuntimeError as error:
+        raise IgsrError(str(error)) from error
+
+
+def _color(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    if text in NAMED_COLORS:
+        return NAMED_COLORS[text]
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+        if all(0.0 <= channel <= 1.0 for channel in (red, green, blue)):
+            return red, green, blue
+    except ValueError:
+        pass
+    raise IgsrError(
+        f"--background must be {', '.join(NAMED_COLORS)} or three numbers in 0..1 such as "
+        f"0.2,0.2,0.2, not {text!r}."
+    )
+
+
+def _load(path: Path, holdout: int | None) -> Capture:
+    capture = load_capture(path)
+    return capture if holdout is None else capture.with_holdout(holdout)
+
+
+def _console() -> Console:
+    return Console(file=sys.stdout, highlight=False)
+
+
+def _print_json(value: dict[str, Any]) -> None:
+    print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def _score_line(scores: dict[str, Any]) -> str:
+    parts = [
+        f"PSNR {scores['psnr']:.2f} dB",
+        f"SSIM {scores['ssim']:.4f}",
+        "MS-SSIM " + (f"{scores['ms_ssim']:.4f}" if scores["ms_ssim"] is not None else "-"),
+        f"FLIP {scores['flip']:.4f}",
+    ]
+    return "   ".join(parts)
+
+
+def _protocol_line(protocol: dict[str, Any]) -> str:
+    background = tuple(protocol["background"])
+    names = {color: name for name, color in NAMED_COLORS.items()}
+    behind = names.get(background) or ",".join(f"{channel:g}" for channel in background)
+    return (
+        f"scored on {protocol['views']} {protocol['split']} view"
+        f"{'' if protocol['views'] == 1 else 's'} over {behind}, {protocol['pixels']}"
+    )
+
+
+@app.command("fit")
+def fit_command(
+    capture_path: CaptureArgument,
+    out: Annotated[
+        Path,
+        typer.Option("--out", help="Folder for scene.ply, report.json, views.png, checkpoint.npz."),
+    ],
+    holdout: HoldoutOption = None,
+    steps: Annotated[int, typer.Option("--steps", help="Optimiser steps.")] = 5000,
+    backend: BackendOption = BackendChoice.auto,
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    max_splats: Annotated[
+        int, typer.Option("--max-splats", help="Most splats there may be.")
+    ] = DEFAULT_MAX_SPLATS,
+    sh_degree: Annotated[
+        int, typer.Option("--sh-degree", help="Degree of view-dependent colour, 0 to 4.")
+    ] = 3,
+    density: Annotated[
+        DensityChoice,
+        typer.Option(
+            "--density",
+            help="How splats are added and removed: mcmc (relocation under a cap), original "
+            "(clone, split, prune), fixed.",
+        ),
+    ] = DensityChoice.mcmc,
+    background: BackgroundOption = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit splats to the photos of CAPTURE and score them."""
+    last: list[Progress] = []
+
+    def interrupted() -> str:
+        if not last:
+            return "Interrupted before the first step."
+        return (
+            f"Interrupted at step {last[-1].step}; the checkpoint is saved, "
+            "the same command with --resume continues."
+        )
+
+    with one_sentence(interrupted):
+        name = _resolved(backend)
+        capture = _load(capture_path, holdout)
+        color = _color(background) or default_background(capture)
+        # Photos with alpha are fitted over random colours, so that no background is learnt.
+        has_alpha = any(view.image.shape[2] == 4 for view in capture.train_views)
+        with _fit_bar(steps, shown=not as_json) as show:
+
+            def progress(now: Progress) -> None:
+                last[:] = [now]
+                show(now)
+
+            splats = fit(
+                capture,
+                steps,
+                progress,
+                name,
+                seed,
+                max_splats=max_splats,
+                sh_degree=sh_degree,
+                density=density.value,
+                background=None if has_alpha else color,
+                checkpoint=out / "checkpoint.npz",
+                resume=resume,
+            )
+        splats.save(out / "scene.ply")
+        info = _core.backend_info(name)
+        scores, sheet = _scored(
+            splats, capture, default_split(capture), color, name, shown=not as_json
+        )
+        scores["protocol"]["holdout"] = holdout
+        report = {
+            **{metric: scores[metric] for metric in METRICS},
+            "splats": len(splats),
+            "steps": steps,
+            "seconds": round(last[-1].seconds, 3) if last else _checkpoint_seconds(out),
+            **info,
+            "seed": seed,
+            "sh_degree": splats.sh_degree,
+            "max_splats": max_splats,
+            "density": density.value,
+            "version": _core.__version__,
+            "capture": str(capture_path),
+            "protocol": scores["protocol"],
+            "views": scores["views"],
+        }
+        write_contact_sheet(out / "views.png", sheet)
+        write_report(out / "report.json", report)
+    if as_json:
+        _print_json(report)
+        return
+    console = _console()
+    console.print(
+        f"{report['splats']} splats in {report['seconds']:.1f} s on {name} "
+        f"({info['instruction_set']}), seed {seed}"
+    )
+    console.print(_score_line(report))
+    console.print(_protocol_line(report["protocol"]), style="dim")
+    console.print(f"{out / 'scene.ply'}  {out / 'report.json'}  {out / 'views.png'}", style="dim")
+
+
+def _checkpoint_seconds(out: Path) -> float:
+    """Fitting time of a resumed run that was already complete."""
+    from .checkpoint import load_checkpoint
+
+    _, settings = load_checkpoint(out / "checkpoint.npz")
+    return round(float(settings["seconds"]), 3)
+
+
+@contextlib.contextmanager
+def _fit_bar(steps: int, shown: bool) -> Iterator[Callable[[Progress], None]]:
+    """A progress bar on stderr with loss, splat count, steps/s and time left."""
+    bar = ProgressBar(
+        TextColumn("fit {task.completed}/{task.total}"),
+        BarColumn(bar_width=30),
+        TextColumn("loss {task.fields[loss]}  {task.fields[splats]} splats"),
+        TextColumn("{task.fields[speed]} steps/s"),
+        TimeRemainingColumn(compact=True),
+        console=Console(file=sys.stderr, highlight=False),
+        disable=not shown,
+    )
+    with bar:
+        task = bar.add_task("fit", total=steps, loss="-", splats=0, speed="-")
+
+        def show(now: Progress) -> None:
+            bar.update(
+                task,
+                completed=now.step,
+                loss=f"{now.loss:.4f}",
+                splats=now.splats,
+                speed=f"{now.steps_per_second:.0f}",
+            )
+
+        yield show
+
+
+def _scored(
+    splats: Splats,
+    capture: Capture,
+    split: str,
+    background: tuple[float, float, float],
+    backend: str,
+    shown: bool,
+) -> tuple[dict[str, Any], list[ScoredView]]:
+    """The scores, and the views that go on a contact sheet."""
+    views = capture.test_views if split == "test" else capture.train_views
+    wanted = sheet_names([view.name for view in views])
+    sheet: list[ScoredView] = []
+    bar = ProgressBar(
+        TextColumn("score {task.completed}/{task.total}"),
+        BarColumn(bar_width=30),
+        console=Console(file=sys.stderr, highlight=False),
+        disable=not shown,
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task("score", total=len(views))
+
+        def on_view(scored: ScoredView) -> None:
+            bar.advance(task)
+            if scored.name in wanted:
+                sheet.append(scored)
+
+        scores = evaluate(splats, capture, split, background, backend, on_view)
+    return scores, sheet
+
+
+@app.command("eval")
+def eval_command(
+    scene: SceneArgument,
+    capture_path: CaptureArgument,
+    holdout: HoldoutOption = None,
+    split: Annotated[
+        SplitChoice | None, typer.Option("--split", help="Default: test views if there are any.")
+    ] = None,
+    background: BackgroundOption = None,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Score SCENE against the photos of CAPTURE."""
+    with one_sentence():
+        name = _resolved(backend)
+        splats = Splats.load(scene)
+        capture = _load(capture_path, holdout)
+        color = _color(background) or default_background(capture)
+        chosen = split.value if split is not None else default_split(capture)
+        scores, _ = _scored(splats, capture, chosen, color, name, shown=not as_json)
+        scores["protocol"]["holdout"] = holdout
+    report = {**scores, "splats": len(splats), **_core.backend_info(name)}
+    if as_json:
+        _print_json(report)
+        return
+    table = Table(box=None, pad_edge=False)
+    for heading in ("view", "PSNR", "SSIM", "MS-SSIM", "FLIP"):
+        table.add_column(heading, justify="left" if heading == "view" else "right")
+    for row in scores["views"]:
+        table.add_row(
+            row["name"],
+            f"{row['psnr']:.2f}",
+            f"{row['ssim']:.4f}",
+            "-" if row["ms_ssim"] is None else f"{row['ms_ssim']:.4f}",
+            f"{row['flip']:.4f}",
+        )
+    console = _console()
+    console.print(table)
+    console.print(_score_line(scores))
+    console.print(_protocol_line(scores["protocol"]), style="dim")
+
+
+@app.command("render")
+def render_command(
+    scene: SceneArgument,
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for pictures, or .mp4 file with --orbit.")
+    ],
+    cameras: Annotated[
+        Path | None,
+        typer.Option("--cameras", metavar="CAPTURE", help="Render from the cameras of a capture."),
+    ] = None,
+    orbit_frames: Annotated[
+        int | None,
+        typer.Option(
+            "--orbit",
+            metavar="FRAMES",
+            help="Write a video once around the scene; with --cameras, at their distance.",
+        ),
+    ] = None,
+    exr: Annotated[
+        bool,
+        typer.Option(
+            "--exr", help="EXR in 32-bit float: R, G, B, A and Z (expected depth) instead of PNG."
+        ),
+    ] = False,
+    background: BackgroundOption = None,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Render SCENE to PNG or EXR pictures, or to a video around it."""
+    with one_sentence():
+        name = _resolved(backend)
+        splats = Splats.load(scene)
+        capture = None if cameras is None else load_capture(cameras)
+        color = _color(background) or (
+            NAMED_COLORS["black"] if capture is None else default_background(capture)
+        )
+        if orbit_frames is not None:
+            if exr:
+                raise IgsrError("--exr writes pictures and --orbit a video; leave one out.")
+            if out.suffix.lower() not in (".mp4", ".mkv", ".mov"):
+                raise IgsrError(f"--out {out} must be a video file such as orbit.mp4 with --orbit.")
+            files = [_write_orbit(splats, orbit(splats, capture, orbit_frames), out, color, name)]
+        elif capture is not None:
+            files = _write_pictures(splats, capture, out, color, name, exr)
+        else:
+            raise IgsrError("Say where from: --cameras CAPTURE, --orbit FRAMES, or both.")
+    if as_json:
+        _print_json({"files": [str(file) for file in files], **_core.backend_info(name)})
+    else:
+        _console().print(str(files[0]) if len(files) == 1 else f"{len(files)} pictures in {out}")
+
+
+def _write_orbit(
+    splats: Splats,
+    path_cameras: list[Camera],
+    out: Path,
+    background: tuple[float, float, float],
+    backend: str,
+) -> Path:
+    from .video import write_video
+
+    frames = (render(splats, camera, background, backend).to_uint8() for camera in path_cameras)
+    write_video(out, frames)
+    return out
+
+
+def _write_pictures(
+    splats: Splats,
+    capture: Capture,
+    out: Path,
+    background: tuple[float, float, float],
+    backend: str,
+    exr: bool,
+) -> list[Path]:
+    from PIL import Image
+
+    from .atomic_write import atomic_write
+
+    suffix = ".exr" if exr else ".png"
+    files: list[Path] = []
+    for view in capture.views:
+        path = out / _picture_name(view.name, suffix)
+        if path in files:
+            path = out / _picture_name(view.name + suffix, suffix)
+        picture = render(splats, view.camera, background, backend)
+        with atomic_write(path) as temporary:
+            if exr:
+                _core.write_exr(
+                    str(temporary), picture.color, picture.alpha, picture.expected_depth
+                )
+            else:
+                Image.fromarray(picture.to_uint8()).save(temporary, format="PNG")
+        files.append(path)
+    return files
+
+
+def _picture_name(view_name: str, suffix: str) -> Path:
+    """A view's name as a relative path that cannot leave the folder it is joined to."""
+    parts = [part for part in PurePosixPath(view_name).parts if part not in ("/", "..", ".")]
+    relative = Path(*parts) if parts else Path("view")
+    return relative.with_suffix(suffix)
+
+
+@app.command("info")
+def info_command(
+    path: Annotated[Path, typer.Argument(metavar="SCENE|CAPTURE", help="What to describe.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Describe a scene or a capture, and the backends of this machine."""
+    with one_sentence():
+        report = _scene_info(path) if path.suffix.lower() == ".ply" else _capture_info(path)
+        report["backends"] = _backends()
+    if as_json:
+        _print_json(report)
+        return
+    console = _console()
+    for key, value in report.items():
+        if key == "backends":
+            for name, what in value.items():
+                console.print(f"backend {name}: {what}")
+        else:
+            console.print(f"{key.replace('_', ' ')}: {_plain(value)}")
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list):
+        return "  ".join(_plain(item) for item in value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _scene_info(path: Path) -> dict[str, Any]:
+    splats = Splats.load(path)
+    bounds = splats.bounds()
+    opacity = 1.0 / (1.0 + np.exp(-splats.opacities.astype(np.float64)))
+    return {
+        "kind": "scene",
+        "path": str(path),
+        "splats": len(splats),
+        "sh_degree": splats.sh_degree,
+        "lowest_corner": None if bounds is None else bounds[0].tolist(),
+        "highest_corner": None if bounds is None else bounds[1].tolist(),
+        "origin": splats.origin.tolist(),
+        "median_opacity": None if bounds is None else float(np.median(opacity)),
+        "bytes": path.stat().st_size,
+    }
+
+
+def _capture_info(path: Path) -> dict[str, Any]:
+    capture = load_capture(path)
+    sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in capture.views})
+    points = None if capture.points is None else len(capture.points.xyz)
+    return {
+        "kind": "capture",
+        "path": str(path),
+        "views": len(capture.views),
+        "train_views": len(capture.train_views),
+        "test_views": len(capture.test_views),
+        "sizes": sizes,
+        "views_with_alpha": sum(view.image.shape[2] == 4 for view in capture.views),
+        "views_with_mask": sum(view.mask is not None for view in capture.views),
+        "points": points,
+        "scene_centre": [float(x) for x in capture.scene_centre],
+        "scene_extent": float(capture.scene_extent),
+    }
+
+
+def _backends() -> dict[str, str]:
+    """Each backend with what it runs on, or why it does not."""
+    found = {}
+    for name in ("cpu", "gpu", "reference"):
+        try:
+            info = _core.backend_info(_core.resolve_backend(name))
+            found[name] = f"{info['device']}, {info['instruction_set']}"
+        except RuntimeError as error:
+            found[name] = f"not available: {error}"
+    found["auto"] = _core.resolve_backend("auto")
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""``fit``: splats from the photos of a capture."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _core
+from .capture import Capture, View
+from .checkpoint import load_checkpoint, save_checkpoint
+from .errors import IgsrError
+from .initialization import initial_splats
+from .rendering import intrinsics_of, viewmat_about
+from .splats import MAX_SH_DEGREE, Splats
+
+#: A killed run loses at most this much work.
+CHECKPOINT_STEPS = 500
+CHECKPOINT_SECONDS = 20.0
+#: Ways to control the number of splats.
+DENSITIES = ("mcmc", "original", "fixed")
+#: Most splats where the caller names no number.
+DEFAULT_MAX_SPLATS = _core.DEFAULT_MAX_SPLATS
+#: How long the Rust side runs before Python may look at Ctrl-C and the progress callback.
+CHUNK_SECONDS = 0.2
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit stands.
+
+    Attributes:
+        step: steps done, of ``steps``.
+        steps: steps in all.
+        loss: 0.8 L1 + 0.2 D-SSIM, averaged over the last chunk of steps.
+        splats: number of splats now.
+        seconds: time spent fitting, earlier runs that were resumed included.
+        steps_per_second: of the last chunk of steps.
+        backend: what runs: "backend", "device" and "instruction_set".
+    """
+
+    step: int
+    steps: int
+    loss: float
+    splats: int
+    seconds: float
+    steps_per_second: float
+    backend: dict[str, str]
+
+
+def fit(
+    capture: Capture,
+    steps: int = 5000,
+    progress: Callable[[Progress], bool | None] | None = None,
+    backend: str = "auto",
+    seed: int = 0,
+    *,
+    max_splats: int | None = None,
+    sh_degree: int = 3,
+    density: str = "mcmc",
+    background: tuple[float, float, float] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+) -> Splats:
+    """Fit splats to the train views of ``capture``.
+
+    The same capture, settings and seed give the same splats, bit for bit, on one backend and
+    instruction set; a resumed fit ends with the same bits as one that was never interrupted.
+
+    Args:
+        capture: photos and cameras; masked pixels do not count.
+        steps: optimiser steps, each on one photo.
+        progress: called about five times a second; returning False ends the fit early, with the
+            splats as they are then.
+        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu".
+        seed: of everything random.
+        max_splats: most splats there may be; None is ``DEFAULT_MAX_SPLATS``.
+        sh_degree: degree of the colours' spherical harmonics, 0-4.
+        density: how splats are added and removed: "mcmc" (relocation and growth under the cap,
+            Kheradmand et al. 2024), "original" (clone, split, prune, Kerbl et al. 2023), "fixed".
+        background: RGB in [0, 1] behind the splats and photos with alpha; None is a new random
+            colour in every step for photos with alpha and black for photos without.
+        checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
+            Ctrl-C (KeyboardInterrupt, which is raised again).
+        resume: continue the fit that ``checkpoint`` holds.
+
+    Raises:
+        IgsrError: an argument cannot be used, the checkpoint cannot be written or belongs to
+            another capture or other settings.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    if max_splats is None:
+        max_splats = DEFAULT_MAX_SPLATS
+    _check_arguments(steps, seed, max_splats, sh_degree, density, checkpoint, resume)
+    views = capture.train_views
+    if not views:
+        raise IgsrError(f"{capture.path} has no train views to fit.")
+    for view in views:
+        if view.mask is not None and not view.mask.any():
+            raise IgsrError(f"{view.name}: its mask leaves no pixel to fit; leave the photo out.")
+    if backend == "reference":
+        raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
+    info = _core.backend_info(_core.resolve_backend(backend))
+    path = None if checkpoint is None else Path(checkpoint)
+    settings: dict[str, Any] = {
+        "steps": int(steps),
+        "seed": int(seed),
+        "max_splats": max_splats,
+        "sh_degree": sh_degree,
+        "density": density,
+        "background": None if background is None else [float(channel) for channel in background],
+        "backend": info["backend"],
+        "instruction_set": info["instruction_set"],
+        "igsr": _core.__version__,
+        "capture": fingerprint(views),
+    }
+
+    seconds_before = 0.0
+    if resume and path is not None:
+        state, saved = load_checkpoint(path)
+        seconds_before = float(saved.pop("seconds", 0.0))
+        _check_same_settings(path, saved, settings)
+    else:
+        splats = initial_splats(capture, seed, max_splats, sh_degree)
+        state = dict(vars(splats))
+    origin = state.pop("origin", np.zeros(0))
+    try:
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise ValueError("origin: must be three finite numbers")
+        fitter = _core.Fitter(
+            [np.ascontiguousarray(view.image) for view in views],
+            [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
+            np.stack([viewmat_about(origin, view.camera.viewmat) for view in views]),
+            np.stack([intrinsics_of(view.camera.K) for view in views]),
+            state,
+            settings,
+            info["backend"],
+        )
+    except ValueError as error:
+        if resume:
+            raise IgsrError(f"The checkpoint {path} cannot be used: {error}.") from error
+        raise IgsrError(f"{error}.") from error
+    return _run(fitter, origin, settings, info, seconds_before, progress, path)
+
+
+def fingerprint(views: list[View]) -> str:
+    """SHA-256 over the photos, masks and cameras: a fit may only go on with the same ones."""
+    digest = hashlib.sha256()
+    for view in views:
+        camera = view.camera
+        for array in (camera.viewmat, camera.K, view.image, view.mask):
+            if array is not None:
+                digest.update(str((array.dtype.str, array.shape)).encode())
+                digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def _check_arguments(
+    steps: object,
+    seed: object,
+    max_splats: object,
+    sh_degree: object,
+    density: object,
+    checkpoint: object,
+    resume: bool,
+) -> None:
+    limits: list[tuple[str, object, int, int]] = [
+        ("steps", steps, 1, 10_000_000),
+        ("seed", seed, 0, 2**63 - 1),
+        ("sh_degree", sh_degree, 0, MAX_SH_DEGREE),
+        ("max_splats", max_splats, 1, 2**27),
+    ]
+    for name, value, low, high in limits:
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise IgsrError(f"{name} must be a whole number, not {value!r}.")
+        if not low <= value <= high:
+            raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
+    if density not in DENSITIES:
+        raise IgsrError(f"density must be one of {', '.join(DENSITIES)}, not {density!r}.")
+    if resume and checkpoint is None:
+        raise IgsrError("resume needs checkpoint, the file to continue from.")
+
+
+def _check_same_settings(path: Path, saved: dict[str, Any], settings: dict[str, Any]) -> None:
+    for name, value in settings.items():
+        if saved.get(name) != value:
+            if name == "capture":
+                raise IgsrError(
+                    f"{path} was made from other photos, masks, cameras or another split; "
+                    "resume with the same or leave --resume out."
+                )
+            raise IgsrError(
+                f"{path} was made with {name} {saved.get(name)!r}, not {value!r}; "
+                "resume with the same or leave --resume out."
+            )
+
+
+def _run(
+    fitter: _core.Fitter,
+    origin: npt.NDArray[np.float64],
+    settings: dict[str, Any],
+    info: dict[str, str],
+    seconds_before: float,
+    progress: Callable[[Progress], bool | None] | None,
+    path: Path | None,
+) -> Splats:
+    """Step in chunks until done or told to stop, saving on the way."""
+    steps = settings["steps"]
+    started = time.perf_counter()
+    step = saved_step = fitter.steps_done
+    saved_at = started
+    chunk = 1
+
+    def save() -> None:
+        if path is not None:
+            seconds = seconds_before + time.perf_counter() - started
+            state = {**fitter.state(), "origin": origin}
+            save_checkpoint(path, state, {**settings, "seconds": seconds})
+
+    try:
+        while step < steps:
+            chunk_started = time.perf_counter()
+            done = fitter.step(min(chunk, steps - step))
+            now = time.perf_counter()
+            advanced, step = done["step"] - step, done["step"]
+            speed = advanced / max(now - chunk_started, 1e-9)
+            # A step's time changes with the number of splats: follow it, a factor two at a time.
+            chunk = max(1, min(2 * chunk, int(speed * CHUNK_SECONDS)))
+            go_on = progress is None or progress(
+                Progress(
+                    step=step,
+                    steps=steps,
+                    loss=done["loss"],
+                    splats=done["splats"],
+                    seconds=seconds_before + now - started,
+                    steps_per_second=speed,
+                    backend=info,
+                )
+            )
+            if go_on is False:
+                break
+            if step - saved_step >= CHECKPOINT_STEPS or now - saved_at >= CHECKPOINT_SECONDS:
+                save()
+                saved_step, saved_at = step, time.perf_counter()
+    except KeyboardInterrupt:
+        save()
+        raise
+    save()
+    return Splats(**fitter.splats(), origin=origin)

@@ -1,0 +1,215 @@
+"""The splats that a fit starts from.
+
+Where the capture has points (COLMAP), one splat per point. Where it has none, points are made up:
+inside the visual hull where photos have alpha, else along the rays of photo pixels at the depth
+where the other photos agree best with the pixel's colour.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _core
+from .capture import Camera, Capture, View
+from .splats import Splats
+
+Float64 = npt.NDArray[np.float64]
+Generator = np.random.Generator
+
+#: Splats made up where a capture has no points. Density control adds more where they are needed.
+MADE_UP_SPLATS = 20_000
+#: Fewer points than this say too little of a scene's surface to start from them alone.
+MIN_POINTS = 100
+#: Depths tried per ray, and their range in units of the distance to what the cameras look at.
+RAY_DEPTHS = 32
+NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 8.0
+#: Photos compared with per ray: more cost time and see other sides of the scene.
+COMPARED_VIEWS = 24
+
+
+def initial_splats(capture: Capture, seed: int, max_splats: int, sh_degree: int) -> Splats:
+    """Splats to start a fit from; the same arguments give the same splats.
+
+    Args:
+        capture: its train views and points are used.
+        seed: of the random choices.
+        max_splats: at most so many.
+        sh_degree: 0-4; coefficients above degree 0 start at zero.
+    """
+    random = np.random.default_rng([seed, 0x1617])
+    points = capture.points
+    if points is not None and len(points.xyz) >= MIN_POINTS:
+        xyz, colors = points.xyz, points.rgb.astype(np.float64) / 255.0
+        if len(xyz) > max_splats:
+            chosen = np.sort(random.choice(len(xyz), size=max_splats, replace=False))
+            xyz, colors = xyz[chosen], colors[chosen]
+    else:
+        count = min(MADE_UP_SPLATS, max_splats)
+        views = capture.train_views
+        if all(view.image.shape[2] == 4 for view in views):
+            xyz, colors = _inside_hull(views, count, random)
+        else:
+            xyz, colors = _along_rays(views, count, random)
+    # Relative to the middle, so that float32 is precise where the scene is.
+    origin = np.median(xyz, axis=0)
+    return Splats(
+        **_core.splats_from_points(
+            (xyz - origin).astype(np.float32), colors.astype(np.float32), sh_degree
+        ),
+        origin=origin,
+    )
+
+
+def looked_at(cameras: list[Camera]) -> Float64:
+    """The point [3] nearest to all optical axes, in the least-squares sense.
+
+    A small pull towards a point in front of the cameras keeps parallel axes solvable.
+    """
+    centres = np.stack([camera.centre for camera in cameras])
+    axes = np.stack([camera.viewmat[2, :3] for camera in cameras])
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or 1.0
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    in_front = (centres + spread * axes).mean(axis=0)
+    pull = 1e-3
+    matrix = across.mean(axis=0) + pull * np.eye(3)
+    right = np.einsum("nij,nj->i", across, centres) / len(cameras) + pull * in_front
+    point: Float64 = np.linalg.solve(matrix, right)
+    # Axes that part ways meet behind the cameras; the scene is still in front of them.
+    if np.mean((point - centres) @ axes.mean(axis=0)) <= 0:
+        point = in_front
+    return point
+
+
+def _pixels(view: View, xyz: Float64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Flat pixel index [P] of world points in a view, and which of them fall into it."""
+    camera = view.camera
+    local = xyz @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = np.maximum(local[:, 2], 1e-9)
+    x = np.floor(camera.K[0, 0] * local[:, 0] / z + camera.K[0, 2])
+    y = np.floor(camera.K[1, 1] * local[:, 1] / z + camera.K[1, 2])
+    inside = (local[:, 2] > 1e-9) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    index = np.where(inside, y * camera.width + x, 0).astype(np.int64)
+    if view.mask is not None:
+        inside &= view.mask.reshape(-1)[index]
+    return index, inside
+
+
+def _inside_hull(views: list[View], count: int, random: Generator) -> tuple[Float64, Float64]:
+    """Points whose pixel has alpha in every photo that sees them, coloured by those photos."""
+    cameras = [view.camera for view in views]
+    target = looked_at(cameras)
+    distances = [float(np.linalg.norm(camera.centre - target)) for camera in cameras]
+    tangents = [0.5 * max(c.width / c.K[0, 0], c.height / c.K[1, 1]) for c in cameras]
+    half_side = float(np.median(distances) * np.median(tangents))
+    # Thin objects fill little of the box: shrink it to what survives and draw again.
+    low, high = target - half_side, target + half_side
+    found, colors = np.zeros((0, 3)), np.zeros((0, 3))
+    for _ in range(8):
+        candidates = random.uniform(low, high, size=(4 * count, 3))
+        inside_hull = np.ones(len(candidates), dtype=bool)
+        total = np.zeros((len(candidates), 3))
+        seen = np.zeros(len(candidates))
+        for view in views:
+            alive = np.flatnonzero(inside_hull)
+            index, in_view = _pixels(view, candidates[alive])
+            pixels = view.image.reshape(-1, 4)[index]
+            inside_hull[alive[in_view & (pixels[:, 3] == 0)]] = False
+            kept = alive[in_view]
+            total[kept] += pixels[in_view, :3] / 255.0
+            seen[kept] += 1
+        inside_hull &= seen > 0
+        found = np.concatenate([found, candidates[inside_hull]])
+        colors = np.concatenate([colors, total[inside_hull] / seen[inside_hull, None]])
+        if len(found) >= count:
+            break
+        if inside_hull.any():
+            margin = 0.1 * (high - low)
+            survivors = candidates[inside_hull]
+            low = np.maximum(low, survivors.min(axis=0) - margin)
+            high = np.minimum(high, survivors.max(axis=0) + margin)
+    if len(found) < MIN_POINTS:
+        # The cameras do not agree on any hull; a box to start from is better than nothing.
+        return random.uniform(low, high, size=(count, 3)), np.full((count, 3), 0.5)
+    return found[:count], colors[:count]
+
+
+def _along_rays(views: list[View], count: int, random: Generator) -> tuple[Float64, Float64]:
+    """Points on the rays of random pixels, at the depth where other photos agree best."""
+    target = looked_at([view.camera for view in views])
+    depths = np.geomspace(NEAREST_DEPTH, FARTHEST_DEPTH, RAY_DEPTHS)
+    compared = [_softened(view) for view in views]
+    centres = np.stack([view.camera.centre for view in views])
+    per_view = np.bincount(random.integers(len(views), size=count), minlength=len(views))
+    points, colors = [], []
+    for v, (view, rays) in enumerate(zip(views, per_view, strict=True)):
+        usable = np.arange(view.camera.width * view.camera.height)
+        if view.mask is not None:
+            usable = np.flatnonzero(view.mask)
+        pixel = random.choice(usable, size=rays)
+        camera = view.camera
+        columns, rows = pixel % camera.width + 0.5, pixel // camera.width + 0.5
+        directions = np.stack(
+            [
+                (columns - camera.K[0, 2]) / camera.K[0, 0],
+                (rows - camera.K[1, 2]) / camera.K[1, 1],
+                np.ones(rays),
+            ],
+            axis=1,
+        )
+        reach = float(np.linalg.norm(target - camera.centre))
+        # Jitter each ray's depths, or all points would lie on a few shells.
+        jitter = np.exp(random.uniform(-0.5, 0.5, size=rays) * np.log(depths[1] / depths[0]))
+        z = reach * depths[None, :] * jitter[:, None]
+        local = directions[:, None, :] * z[..., None] - camera.viewmat[:3, 3]
+        world = (local @ camera.viewmat[:3, :3]).reshape(-1, 3)
+        own = compared[v][pixel]
+        near = np.argsort(np.linalg.norm(centres - centres[v], axis=1), kind="stable")
+        errors = []
+        for other in near[1 : COMPARED_VIEWS + 1]:
+            index, inside = _pixels(views[other], world)
+            difference = np.abs(
+                compared[other][index].reshape(rays, RAY_DEPTHS, 3) - own[:, None, :]
+            ).mean(axis=2)
+            errors.append(np.where(inside.reshape(rays, RAY_DEPTHS), difference, np.nan))
+        best = (
+            _most_agreed(np.stack(errors), random)
+            if errors
+            else random.integers(RAY_DEPTHS, size=rays)
+        )
+        points.append(world.reshape(rays, RAY_DEPTHS, 3)[np.arange(rays), best])
+        colors.append(view.image.reshape(-1, view.image.shape[2])[pixel, :3] / 255.0)
+    return np.concatenate(points), np.concatenate(colors)
+
+
+def _most_agreed(errors: Float64, random: Generator) -> npt.NDArray[np.int64]:
+    """Per ray the depth whose median error over the views is lowest.
+
+    Args:
+        errors: [views, rays, depths], NaN where a view does not see the point.
+    """
+    seen = np.isfinite(errors).sum(axis=0)
+    ordered = np.sort(np.where(np.isfinite(errors), errors, np.inf), axis=0)
+    # The lower median over those that see it: the rest may be hidden behind something.
+    middle = np.maximum(seen - 1, 0) // 2
+    cost = np.take_along_axis(ordered, middle[None], axis=0)[0]
+    # What a single view sees agrees with it by chance, at any depth.
+    cost = np.where(seen >= min(3, len(errors)), cost, 2.0)
+    # Ties (flat colour, nothing seen) must not all fall to the nearest depth.
+    cost = cost + 1e-3 * random.uniform(size=cost.shape)
+    return np.asarray(cost.argmin(axis=1))
+
+
+def _softened(view: View) -> npt.NDArray[np.float32]:
+    """The photo's colours [H * W, 3] in 0..1, blurred by 5 x 5 pixels: poses are not that exact."""
+    image = view.image[..., :3].astype(np.float32) / 255.0
+    for axis in (0, 1):
+        padded = np.concatenate(
+            [np.take(image, [0, 0], axis=axis), image, np.take(image, [-1, -1], axis=axis)],
+            axis=axis,
+        )
+        length = image.shape[axis]
+        image = np.mean(
+            [np.take(padded, range(i, i + length), axis=axis) for i in range(5)], axis=0
+        )
+    return image.reshape(-1, 3)

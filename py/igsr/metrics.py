@@ -1,0 +1,160 @@
+"""Image metrics: PSNR, SSIM, MS-SSIM and FLIP between a render and its photo.
+
+Every function takes two uint8 pictures [H, W, 3], sRGB-encoded, as a user would see them: scores
+are of the 8-bit image, not of the renderer's floats. ``mask`` ([H, W] bool, True = counts) limits
+the score to a part of the picture; both pictures are set to black outside it first, so that
+windows reaching over its edge see the same there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+#: The Gaussian window of SSIM (Wang et al. 2004), as the 3DGS papers use it.
+SSIM_WINDOW = 11
+SSIM_SIGMA = 1.5
+#: The five scales of MS-SSIM (Wang et al. 2003) halve the picture four times, and the window must
+#: still fit into the smallest.
+MS_SSIM_MIN_SIDE = SSIM_WINDOW * 2**4
+#: PSNR of identical 8-bit pictures is infinite, which JSON cannot hold and a mean cannot use.
+PSNR_CAP = 100.0
+
+
+def _checked(render: Image, photo: Image, mask: Mask | None) -> tuple[Image, Image, Mask | None]:
+    for name, picture in (("render", render), ("photo", photo)):
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+            raise ValueError(
+                f"{name} must be uint8 [H, W, 3], not {picture.dtype} {list(picture.shape)}"
+            )
+    if render.shape != photo.shape:
+        raise ValueError(
+            f"render {list(render.shape)} and photo {list(photo.shape)} differ in size"
+        )
+    if mask is None:
+        return render, photo, None
+    if mask.dtype != np.bool_ or mask.shape != photo.shape[:2]:
+        raise ValueError(
+            f"mask must be bool {list(photo.shape[:2])}, not {mask.dtype} {list(mask.shape)}"
+        )
+    if not mask.any():
+        raise ValueError("mask has no pixel that counts")
+    outside = ~mask
+    render, photo = render.copy(), photo.copy()
+    render[outside] = 0
+    photo[outside] = 0
+    return render, photo, mask
+
+
+def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, -10 log10 of the mean squared error on [0, 1].
+
+    The mean runs over the three channels and the pixels that count. Equal pictures give 100 dB.
+    """
+    render, photo, mask = _checked(render, photo, mask)
+    difference = (render.astype(np.float64) - photo) / 255.0
+    squared = difference**2
+    error = float(squared.mean() if mask is None else squared[mask].mean())
+    return PSNR_CAP if error == 0.0 else min(PSNR_CAP, -10.0 * math.log10(error))
+
+
+def ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
+    """Structural similarity (Wang et al. 2004) in the convention of the 3DGS papers.
+
+    11 x 11 Gaussian window with sigma 1.5, per channel on [0, 1], C1 = 0.01^2, C2 = 0.03^2, the
+    border padded with zeros, the map averaged over channels and the pixels that count.
+    """
+    import torch
+
+    render, photo, mask = _checked(render, photo, mask)
+    offset = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    window = torch.exp(-(offset**2) / (2.0 * SSIM_SIGMA**2))
+    window /= window.sum()
+    rows, columns = window.view(1, 1, -1, 1), window.view(1, 1, 1, -1)
+    pad = SSIM_WINDOW // 2
+
+    def planes(picture: Image) -> torch.Tensor:
+        channels_first = np.ascontiguousarray(picture.transpose(2, 0, 1))[:, None]
+        return torch.from_numpy(channels_first).to(torch.float64) / 255.0
+
+    def blur(x: torch.Tensor) -> torch.Tensor:
+        x = torch.nn.functional.conv2d(x, rows, padding=(pad, 0))
+        return torch.nn.functional.conv2d(x, columns, padding=(0, pad))
+
+    x, y = planes(render), planes(photo)
+    mean_x, mean_y = blur(x), blur(y)
+    variance_x = blur(x * x) - mean_x**2
+    variance_y = blur(y * y) - mean_y**2
+    covariance = blur(x * y) - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)) / (
+        (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
+    )
+    per_pixel = similarity[:, 0].mean(dim=0).numpy()
+    return float(per_pixel.mean() if mask is None else per_pixel[mask].mean())
+
+
+def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float | None:
+    """Multi-scale SSIM (Wang et al. 2003) with torchmetrics' defaults on [0, 1].
+
+    Five scales, 11 x 11 Gaussian window with sigma 1.5. It has no per-pixel map, so a mask only
+    blackens both pictures outside; the black part counts as equal.
+
+    Returns:
+        The score, or None where the shorter side is under 176 pixels: the smallest scale would
+        no longer hold the window.
+    """
+    import torch
+    from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
+
+    render, photo, _ = _checked(render, photo, mask)
+    if min(photo.shape[:2]) < MS_SSIM_MIN_SIDE:
+        return None
+
+    def batch(picture: Image) -> torch.Tensor:
+        channels_first = np.ascontiguousarray(picture.transpose(2, 0, 1))[None]
+        return torch.from_numpy(channels_first).to(torch.float64) / 255.0
+
+    # relu: far-off renders reach negative contrast terms, whose fractional power is NaN.
+    score: Any = multiscale_structural_similarity_index_measure(
+        batch(render), batch(photo), data_range=1.0, normalize="relu"
+    )
+    return float(score)
+
+
+def flip(render: Image, photo: Image, mask: Mask | None = None) -> float:
+    """Mean LDR-FLIP error (Andersson et al. 2020), 0 = equal, 1 = worst.
+
+    flip-evaluator's defaults: sRGB pictures seen at 67 pixels per degree (0.7 m from a 0.7 m
+    wide 4K monitor). With a mask, the mean of the error map over the pixels that count.
+    """
+    import flip_evaluator
+
+    render, photo, mask = _checked(render, photo, mask)
+    error_map, mean, _ = flip_evaluator.evaluate(
+        photo.astype(np.float32) / 255.0,
+        render.astype(np.float32) / 255.0,
+        "LDR",
+        inputsRGB=True,
+        applyMagma=False,
+        computeMeanError=True,
+    )
+    if mask is None:
+        return float(mean)
+    return float(np.asarray(error_map).reshape(photo.shape[0], photo.shape[1], -1)[mask].mean())
+
+
+def score(render: Image, photo: Image, mask: Mask | None = None) -> dict[str, float | None]:
+    """All four metrics of one picture: ``psnr``, ``ssim``, ``ms_ssim`` (or None), ``flip``."""
+    return {
+        "psnr": psnr(render, photo, mask),
+        "ssim": ssim(render, photo, mask),
+        "ms_ssim": ms_ssim(render, photo, mask),
+        "flip": flip(render, photo, mask),
+    }

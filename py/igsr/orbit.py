@@ -1,0 +1,86 @@
+"""Cameras on a circle around a scene, for turntable videos."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from .capture import Camera, Capture
+from .errors import IgsrError
+from .initialization import looked_at
+from .splats import Splats
+
+Vector = npt.NDArray[np.float64]
+
+#: Picture and vertical field of view where no capture says them.
+DEFAULT_SIZE = (800, 600)
+DEFAULT_FOV_DEGREES = 45.0
+#: Elevation above the horizon where no capture says it.
+DEFAULT_ELEVATION_DEGREES = 20.0
+
+
+def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
+    """``frames`` cameras once around the scene.
+
+    With a capture, the circle is fitted to its cameras: around the point they look at, at their
+    median distance and height, with their up direction, and with the first camera's lens. Without
+    one it goes around the middle of the splats, z up.
+
+    Raises:
+        IgsrError: ``frames`` is under 1, or there are no splats to look at.
+    """
+    if frames < 1:
+        raise IgsrError(f"orbit must have at least 1 frame, not {frames}.")
+    if capture is None:
+        if len(splats) == 0:
+            raise IgsrError("The scene has no splats to orbit around.")
+        points = splats.means.astype(np.float64) + splats.origin
+        weights = 1.0 / (1.0 + np.exp(-splats.opacities.astype(np.float64)))
+        solid = points[weights >= np.median(weights)]
+        target = np.median(solid, axis=0)
+        up = np.array([0.0, 0.0, 1.0])
+        start = np.array([0.0, -1.0, 0.0])
+        reach = np.quantile(np.linalg.norm(solid - target, axis=1), 0.9)
+        distance = max(float(reach), 1e-6) / np.tan(np.radians(DEFAULT_FOV_DEGREES / 2)) * 1.2
+        elevation = np.radians(DEFAULT_ELEVATION_DEGREES)
+        radius, height = distance * np.cos(elevation), distance * np.sin(elevation)
+        columns, rows = DEFAULT_SIZE
+        focal = rows / 2 / np.tan(np.radians(DEFAULT_FOV_DEGREES / 2))
+        K = np.array([[focal, 0.0, columns / 2], [0.0, focal, rows / 2], [0.0, 0.0, 1.0]])
+    else:
+        cameras = [view.camera for view in capture.views]
+        centres = np.stack([camera.centre for camera in cameras])
+        target = looked_at(cameras)
+        up = _unit(-np.mean([camera.viewmat[1, :3] for camera in cameras], axis=0))
+        offsets = centres - target
+        heights = offsets @ up
+        flat = offsets - heights[:, None] * up
+        radius = float(np.median(np.linalg.norm(flat, axis=1)))
+        height = float(np.median(heights))
+        start = flat[0] if np.linalg.norm(flat[0]) > 1e-9 else np.cross(up, [1.0, 0.3, 0.2])
+        K, columns, rows = cameras[0].K, cameras[0].width, cameras[0].height
+
+    forward = _unit(start - (start @ up) * up)
+    side = np.cross(up, forward)
+    result = []
+    for angle in np.linspace(0.0, 2.0 * np.pi, frames, endpoint=False):
+        ring = radius * (np.cos(angle) * forward + np.sin(angle) * side)
+        viewmat = look_at(target + ring + height * up, target, up)
+        result.append(Camera(viewmat, K, columns, rows))
+    return result
+
+
+def look_at(position: Vector, target: Vector, up: Vector) -> Vector:
+    """World-to-camera [4, 4], OpenCV axes, at ``position`` looking at ``target``."""
+    z = _unit(target - position)
+    x = _unit(np.cross(z, up))
+    y = np.cross(z, x)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([x, y, z])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    return viewmat
+
+
+def _unit(vector: Vector) -> Vector:
+    length = float(np.linalg.norm(vector))
+    return np.asarray(vector / length) if length > 1e-12 else np.array([0.0, 0.0, 1.0])

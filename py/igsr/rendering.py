@@ -1,0 +1,121 @@
+"""Render splats from one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _core
+from .capture import Camera
+from .errors import IgsrError
+from .splats import FloatArray, Splats
+
+#: What lies nearer than this, in world units, is not drawn (gsplat's default).
+NEAR_PLANE = 0.01
+#: What lies farther than this, in world units, is not drawn (gsplat's default).
+FAR_PLANE = 1e10
+#: Variance in square pixels added to every projected Gaussian (EWA low-pass).
+EPS2D = 0.3
+
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
+
+
+@dataclass(frozen=True)
+class Render:
+    """What one camera sees. All float32.
+
+    Attributes:
+        color: [H, W, 3], not clamped: SH may exceed 1.
+        alpha: [H, W], accumulated opacity in [0, 1].
+        depth: [H, W], accumulated camera-space z, sum of weight * z.
+        expected_depth: [H, W], depth / alpha, 0 where alpha is 0.
+        transmittance: [H, W], the share of background that shows, stored rather than 1 - alpha.
+    """
+
+    color: FloatArray
+    alpha: FloatArray
+    depth: FloatArray
+    expected_depth: FloatArray
+    transmittance: FloatArray
+
+    def to_uint8(self) -> npt.NDArray[np.uint8]:
+        """The picture a user sees, uint8 [H, W, 3]: clamped to [0, 1] and rounded."""
+        finite = np.nan_to_num(self.color, nan=0.0, posinf=1.0, neginf=0.0)
+        return (np.clip(finite, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def render(
+    splats: Splats,
+    camera: Camera,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    backend: str = "auto",
+) -> Render:
+    """Render ``splats`` as ``camera`` sees them.
+
+    Args:
+        splats: the scene.
+        camera: pinhole camera, OpenCV axes, pixel centres at +0.5, world frame of the capture.
+        background: RGB in [0, 1] behind the splats.
+        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu" or "reference".
+
+    Raises:
+        IgsrError: an argument is unusable; the message names it.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    background_color = np.asarray(background, dtype=np.float64)
+    if background_color.shape != (3,) or not np.isfinite(background_color).all():
+        raise IgsrError("background must be three finite numbers")
+    backend = _core.resolve_backend(backend)
+    dtype = _core.working_dtype(backend)
+    projected = _core.project(
+        *(
+            parameter.astype(dtype, order="C", copy=False)
+            for parameter in (
+                splats.means,
+                splats.quats,
+                splats.scales,
+                splats.opacities,
+                splats.sh,
+            )
+        ),
+        sh_degree=splats.sh_degree,
+        raw_parameters=True,
+        viewmat=viewmat_about(splats.origin, camera.viewmat),
+        intrinsics=intrinsics_of(camera.K),
+        width=camera.width,
+        height=camera.height,
+        near=NEAR_PLANE,
+        far=FAR_PLANE,
+        eps2d=EPS2D,
+        backend=backend,
+    )
+    image = _core.rasterize(
+        projected,
+        width=camera.width,
+        height=camera.height,
+        background=background_color.astype(dtype),
+        backend=backend,
+    )
+    color, alpha, depth, transmittance = (
+        image[name].astype(np.float32, copy=False)
+        for name in ("color", "alpha", "depth", "transmittance")
+    )
+    expected = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
+    return Render(color, alpha, depth, expected, transmittance)
+
+
+def viewmat_about(
+    origin: npt.NDArray[np.float64], viewmat: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """World-to-camera [4, 4] for points given relative to ``origin``, composed in float64."""
+    composed = np.array(viewmat, dtype=np.float64)
+    composed[:3, 3] += composed[:3, :3] @ origin
+    return composed
+
+
+def intrinsics_of(K: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """fx, fy, cx, cy [4] float64 of a pinhole matrix [3, 3]."""
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64)

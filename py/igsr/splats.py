@@ -1,0 +1,108 @@
+"""Splats: the Gaussians of one scene as numpy arrays, and the INRIA ``.ply`` that stores them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _core
+from .errors import IgsrError
+
+FloatArray = npt.NDArray[np.float32]
+
+#: Highest spherical-harmonics degree there is code for.
+MAX_SH_DEGREE = 4
+
+
+@dataclass
+class Splats:
+    """N Gaussians with unbounded parameters, as the optimiser sees them.
+
+    Attributes:
+        means: [N, 3] float32, centres relative to ``origin``, in the capture's world units.
+        quats: [N, 4] float32, rotations w x y z, not necessarily normalised.
+        scales: [N, 3] float32, natural logarithms of the standard deviations.
+        opacities: [N] float32, logits.
+        sh: [N, K, 3] float32, spherical-harmonics coefficients, K = (degree + 1)^2, degree 0-4;
+            colour = max(0, 0.5 + SH(direction from camera to mean)).
+        origin: [3] float64, world position that ``means`` are relative to. It keeps scenes far
+            from zero (map coordinates) precise in float32.
+
+    Raises:
+        IgsrError: an array has the wrong shape or dtype; the message names it.
+    """
+
+    means: FloatArray
+    quats: FloatArray
+    scales: FloatArray
+    opacities: FloatArray
+    sh: FloatArray
+    origin: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        count = len(self.means)
+        for name, tail in (("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ())):
+            self._check(name, getattr(self, name), (count, *tail))
+        bands = self.sh.shape[1] if isinstance(self.sh, np.ndarray) and self.sh.ndim == 3 else 0
+        if bands not in [(degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1)]:
+            raise IgsrError("sh must be float32 [N, K, 3] with K one of 1, 4, 9, 16, 25")
+        self._check("sh", self.sh, (count, bands, 3))
+        self.origin = np.asarray(self.origin, dtype=np.float64)
+        if self.origin.shape != (3,) or not np.isfinite(self.origin).all():
+            raise IgsrError("origin must be three finite numbers")
+
+    @staticmethod
+    def _check(name: str, array: object, shape: tuple[int, ...]) -> None:
+        if not isinstance(array, np.ndarray):
+            raise IgsrError(f"{name} must be a numpy array, not {type(array).__name__}")
+        if array.dtype != np.float32 or array.shape != shape:
+            raise IgsrError(
+                f"{name} must be float32 {list(shape)}, not {array.dtype} {list(array.shape)}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the stored spherical harmonics, 0-4."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    def bounds(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
+        """Lowest and highest corner [3] of the centres, world frame; None without splats."""
+        if len(self) == 0:
+            return None
+        world = self.means.astype(np.float64) + self.origin
+        return world.min(axis=0), world.max(axis=0)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an INRIA ``.ply``, the format 3D Gaussian Splatting viewers open.
+
+        The file appears whole or not at all: an older one of that name survives a failure.
+
+        Raises:
+            IgsrError: the file cannot be written.
+        """
+        try:
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            _core.write_ply(os.fspath(path), vars(self))
+        except OSError as error:
+            raise IgsrError(f"{error}.") from error
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Splats:
+        """Read an INRIA ``.ply`` of SH degree 0-4.
+
+        Raises:
+            IgsrError: there is no such file, or it is not a splat ``.ply``; the message says why.
+        """
+        if not Path(path).is_file():
+            raise IgsrError(f"There is no splat file {path}.")
+        try:
+            return Splats(**_core.read_ply(os.fspath(path)))
+        except OSError as error:
+            raise IgsrError(f"{error}.") from error

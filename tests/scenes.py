@@ -1,0 +1,109 @@
+"""Small seeded scenes that several tests share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from igsr.capture import Camera, Capture, View
+from igsr.rendering import render
+from igsr.splats import Splats
+
+
+def torch_scene(count=12, cameras=2, degree=2, seed=0, dtype=torch.float32):
+    """Arguments of ``rasterization`` up to Ks, for a 24 x 20 picture, and backgrounds."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
+    viewmats[:, 0, 3] = torch.linspace(0.0, 0.2, cameras)
+    K = torch.tensor([[30.0, 0, 12], [0, 31, 10], [0, 0, 1]], dtype=torch.float64)
+    scene = {
+        "means": normal(count, 3) * 0.5 + torch.tensor([0.0, 0.0, 4.0]),
+        "quats": normal(count, 4),
+        "scales": torch.exp(normal(count, 3) * 0.3 - 1.4),
+        "opacities": torch.sigmoid(normal(count)),
+        "colors": normal(count, (degree + 1) ** 2, 3) * 0.3,
+        "viewmats": viewmats,
+        "Ks": K.repeat(cameras, 1, 1),
+        "backgrounds": torch.rand(cameras, 3, generator=generator, dtype=torch.float64),
+    }
+    return {name: tensor.to(dtype) for name, tensor in scene.items()}
+
+
+def splats(count=40, degree=1, seed=0, origin=(0.0, 0.0, 0.0)):
+    """A ball of opaque coloured splats around ``origin``."""
+    random = np.random.default_rng(seed)
+    quats = random.normal(size=(count, 4))
+    return Splats(
+        means=random.normal(scale=0.35, size=(count, 3)).astype(np.float32),
+        quats=quats.astype(np.float32),
+        scales=random.uniform(-2.3, -1.4, size=(count, 3)).astype(np.float32),
+        opacities=random.uniform(0.0, 3.0, size=count).astype(np.float32),
+        sh=random.normal(scale=0.7, size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
+        origin=np.asarray(origin, dtype=np.float64),
+    )
+
+
+def ring_camera(angle, size=48, distance=4.0, centre=(0.0, 0.0, 0.0)):
+    """A camera on a ring in the x-z plane, y down, looking at ``centre``."""
+    back = np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    z = -back
+    y = np.array([0.0, 1.0, 0.0])
+    x = np.cross(y, z)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([x, y, z])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (np.asarray(centre) + distance * back)
+    K = np.array([[1.5 * size, 0.0, size / 2], [0.0, 1.5 * size, size / 2], [0.0, 0.0, 1.0]])
+    return Camera(viewmat, K, size, size)
+
+
+def capture(views=8, size=48, alpha=False, scene=None):
+    """Photos rendered from a scene by the reference; every fourth is a test view."""
+    scene = splats() if scene is None else scene
+    result = []
+    for i in range(views):
+        camera = ring_camera(2.0 * np.pi * i / views, size)
+        picture = render(scene, camera, backend="reference")
+        image = picture.to_uint8()
+        if alpha:
+            coverage = np.clip(picture.alpha, 1e-6, 1.0)
+            straight = np.clip(picture.color / coverage[..., None], 0.0, 1.0)
+            rgba = np.concatenate([straight, picture.alpha[..., None]], axis=-1)
+            image = np.floor(rgba * 255.0 + 0.5).astype(np.uint8)
+        split = "test" if i % 4 == 0 else "train"
+        result.append(View(f"photos/{i:02d}.png", camera, split, image))
+    return Capture(Path("made-up"), result)
+
+
+def write_capture(folder, made):
+    """A made-up capture as transforms.json and PNG files; returns the folder."""
+    import json
+
+    from PIL import Image
+
+    frames = []
+    for view in made.views:
+        path = folder / view.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(view.image).save(path)
+        pose = np.linalg.inv(view.camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        K = view.camera.K
+        frames.append(
+            {
+                "file_path": view.name,
+                "transform_matrix": pose.tolist(),
+                "fl_x": K[0, 0],
+                "fl_y": K[1, 1],
+                "cx": K[0, 2],
+                "cy": K[1, 2],
+                "w": view.camera.width,
+                "h": view.camera.height,
+            }
+        )
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
+    return folder

@@ -1,0 +1,286 @@
+"""``fit``: it learns, repeats itself, resumes with the same bits, stops when told to."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import igsr
+import scenes
+from igsr.checkpoint import load_checkpoint, save_checkpoint
+
+STEPS = 420  # density control runs at 300 and every 100 from then on
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return scenes.capture(views=8, size=40)
+
+
+def same(a, b):
+    return all(
+        np.array_equal(getattr(a, field.name), getattr(b, field.name))
+        for field in dataclasses.fields(a)
+    )
+
+
+def small_fit(capture, **options):
+    arguments = {"steps": STEPS, "backend": "cpu", "max_splats": 400, "sh_degree": 1, **options}
+    return igsr.fit(capture, **arguments)
+
+
+@pytest.mark.parametrize("density", ["mcmc", "original", "fixed"])
+def test_fit_learns_the_scene(capture, density):
+    losses = []
+    splats = small_fit(capture, density=density, progress=lambda now: losses.append(now.loss))
+    assert len(splats) <= 400
+    assert np.mean(losses[-3:]) < 0.5 * np.mean(losses[:3])
+    scores = igsr.evaluate(splats, capture, backend="cpu")
+    flat = np.full_like(capture.test_views[0].image, 0)
+    from igsr import metrics
+
+    black = np.mean([metrics.psnr(flat, view.image) for view in capture.test_views])
+    assert scores["psnr"] > black + 5
+
+
+def test_fit_repeats_itself_bit_for_bit(capture):
+    first, second = small_fit(capture), small_fit(capture)
+    assert same(first, second)
+    assert not same(first, small_fit(capture, seed=1))
+
+
+@pytest.mark.parametrize("stop_at", [1, 137, 350])
+def test_resumed_fit_ends_with_the_same_bits(capture, tmp_path, stop_at):
+    whole = small_fit(capture, checkpoint=tmp_path / "whole.npz")
+    checkpoint = tmp_path / "part.npz"
+    stopped = []
+
+    def stop(now):
+        stopped.append(now.step)
+        return now.step < stop_at
+
+    part = small_fit(capture, checkpoint=checkpoint, progress=stop)
+    assert stop_at <= stopped[-1] < STEPS
+    assert not same(part, whole)
+    resumed = small_fit(capture, checkpoint=checkpoint, resume=True)
+    assert same(resumed, whole)
+    ours, _ = load_checkpoint(checkpoint)
+    theirs, _ = load_checkpoint(tmp_path / "whole.npz")
+    assert ours.keys() == theirs.keys()
+    for name in ours:
+        assert np.array_equal(ours[name], theirs[name]), name
+
+
+def test_interrupt_saves_a_checkpoint(capture, tmp_path):
+    checkpoint = tmp_path / "checkpoint.npz"
+    seen = []
+
+    def interrupt(now):
+        seen.append(now.step)
+        if now.step >= 50:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        small_fit(capture, checkpoint=checkpoint, progress=interrupt)
+    state, settings = load_checkpoint(checkpoint)
+    assert state["step"] == [seen[-1]]
+    assert settings["steps"] == STEPS
+    assert same(small_fit(capture, checkpoint=checkpoint, resume=True), small_fit(capture))
+
+
+def test_masked_pixels_do_not_reach_the_fit(capture):
+    def masked(spoil):
+        views = []
+        for view in capture.views:
+            mask = np.ones(view.image.shape[:2], dtype=bool)
+            mask[:, 30:] = False
+            image = view.image.copy()
+            image[~mask] = spoil
+            views.append(dataclasses.replace(view, image=image, mask=mask))
+        return igsr.Capture(capture.path, views)
+
+    # The photo's own surroundings reach the fit through nothing but SSIM's window.
+    start = small_fit(masked(0), steps=30, density="fixed")
+    other = small_fit(masked(255), steps=30, density="fixed")
+    unmasked = [dataclasses.replace(view, mask=None) for view in masked(255).views]
+    spoiled = small_fit(igsr.Capture(capture.path, unmasked), steps=30, density="fixed")
+    inside = np.abs(start.means - other.means).max()
+    assert inside < 0.2 * np.abs(start.means - spoiled.means).max()
+
+
+def test_points_are_where_splats_start(capture):
+    random = np.random.default_rng(0)
+    far = np.array([1e6, 0.0, 0.0])
+    points = igsr.Points(
+        random.normal(scale=0.3, size=(500, 3)) + far,
+        random.integers(0, 256, size=(500, 3), dtype=np.uint8),
+    )
+    moved = []
+    for view in capture.views:
+        viewmat = view.camera.viewmat.copy()
+        viewmat[:3, 3] -= viewmat[:3, :3] @ far
+        moved.append(
+            dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat))
+        )
+    splats = small_fit(igsr.Capture(capture.path, moved, points), density="fixed")
+    assert len(splats) == 400  # the cap
+    # A million units away, float32 alone could not place a splat within a 1/16 unit.
+    assert np.linalg.norm(splats.origin - far) < 1
+    near = [dataclasses.replace(view) for view in capture.views]
+    close = igsr.Points(points.xyz - far, points.rgb)
+    at_zero = small_fit(igsr.Capture(capture.path, near, close), density="fixed")
+    scores = [
+        igsr.evaluate(s, c)["psnr"]
+        for s, c in (
+            (splats, igsr.Capture(capture.path, moved)),
+            (at_zero, igsr.Capture(capture.path, near)),
+        )
+    ]
+    assert abs(scores[0] - scores[1]) < 0.3
+
+
+FIT_FOREVER = """
+import sys
+sys.path[:0] = {path!r}
+import igsr, scenes
+from igsr import fitting
+fitting.CHECKPOINT_STEPS = 20
+capture = scenes.capture(views=4, size=40)
+igsr.fit(capture, steps=1_000_000, backend="cpu", max_splats=400, sh_degree=1,
+         checkpoint=sys.argv[1], progress=lambda now: print(now.step, flush=True))
+"""
+
+
+def test_killed_fit_leaves_a_whole_checkpoint(tmp_path):
+    checkpoint = tmp_path / "checkpoint.npz"
+    script = FIT_FOREVER.format(path=sys.path)
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(checkpoint)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 120
+        while not checkpoint.exists():
+            assert process.poll() is None, "the fit ended by itself"
+            assert time.monotonic() < deadline, "no checkpoint appeared"
+            time.sleep(0.05)
+        first_write = checkpoint.stat().st_mtime_ns
+        while checkpoint.stat().st_mtime_ns == first_write:
+            assert time.monotonic() < deadline, "the checkpoint was never renewed"
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    state, settings = load_checkpoint(checkpoint)
+    assert state["step"][0] >= 20
+    assert settings["steps"] == 1_000_000
+    resumed = []
+    igsr.fit(
+        scenes.capture(views=4, size=40),
+        steps=1_000_000,
+        backend="cpu",
+        max_splats=400,
+        sh_degree=1,
+        checkpoint=checkpoint,
+        resume=True,
+        progress=lambda now: bool(resumed.append(now.step)),
+    )
+    assert resumed[0] > state["step"][0]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"steps": 0}, "steps must be from 1"),
+        ({"steps": 2.5}, "steps must be a whole number"),
+        ({"seed": -1}, "seed must be from 0"),
+        ({"sh_degree": 5}, "sh_degree must be from 0 to 4"),
+        ({"max_splats": 0}, "max_splats must be from 1"),
+        ({"density": "magic"}, "density must be one of"),
+        ({"backend": "reference"}, "reference renders but does not fit"),
+        ({"backend": "abacus"}, "backend"),
+        ({"background": (2.0, 0.0, 0.0)}, "background"),
+        ({"resume": True}, "resume needs checkpoint"),
+    ],
+)
+def test_bad_settings_are_named(capture, options, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        small_fit(capture, **options)
+
+
+def test_resume_refuses_other_settings_and_other_photos(capture, tmp_path):
+    checkpoint = tmp_path / "checkpoint.npz"
+    small_fit(capture, steps=20, checkpoint=checkpoint)
+    for options in ({"seed": 3}, {"steps": 21}, {"max_splats": 399}, {"density": "fixed"}):
+        name = next(iter(options))
+        with pytest.raises(igsr.IgsrError, match=f"was made with {name}"):
+            small_fit(capture, **{"steps": 20, "checkpoint": checkpoint, "resume": True, **options})
+    views = [dataclasses.replace(view) for view in capture.views]
+    views[1].image = views[1].image.copy()
+    views[1].image[0, 0] ^= 1
+    with pytest.raises(igsr.IgsrError, match="made from other photos"):
+        changed = igsr.Capture(capture.path, views)
+        small_fit(changed, steps=20, checkpoint=checkpoint, resume=True)
+    with pytest.raises(igsr.IgsrError, match="no checkpoint"):
+        small_fit(capture, steps=20, checkpoint=tmp_path / "none.npz", resume=True)
+
+
+def test_damaged_checkpoints_are_refused(capture, tmp_path):
+    good = tmp_path / "good.npz"
+    small_fit(capture, steps=20, checkpoint=good)
+    content = good.read_bytes()
+    state, settings = load_checkpoint(good)
+
+    def resumed(path):
+        return small_fit(capture, steps=20, checkpoint=path, resume=True)
+
+    bad = tmp_path / "bad.npz"
+    for damaged in (b"", b"not a zip", content[: len(content) // 2], content[:-30]):
+        bad.write_bytes(damaged)
+        with pytest.raises(igsr.IgsrError, match="cannot be"):
+            resumed(bad)
+    for name, array in (
+        ("means", state["means"][:-1]),
+        ("first_sh", state["first_sh"].astype(np.float64)),
+        ("step", np.array([0], dtype=np.int64)),
+        ("origin", np.array([np.nan, 0, 0])),
+    ):
+        save_checkpoint(bad, {**state, name: array}, settings)
+        with pytest.raises(igsr.IgsrError, match="cannot be used"):
+            resumed(bad)
+    without = {name: array for name, array in state.items() if name != "second_quats"}
+    save_checkpoint(bad, without, settings)
+    with pytest.raises(igsr.IgsrError, match="second_quats"):
+        resumed(bad)
+    np.savez(bad, means=np.array([{"a": "pickle"}], dtype=object))
+    with pytest.raises(igsr.IgsrError, match="cannot be read"):
+        resumed(bad)
+    np.savez_compressed(bad, means=np.zeros(1_000_000))
+    with pytest.raises(igsr.IgsrError, match="cannot be read"):
+        resumed(bad)
+    assert good.read_bytes() == content
+
+
+def test_array_that_claims_more_than_the_file_holds(tmp_path):
+    import io
+    import zipfile
+
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": (2**40, 2**20)}
+    )
+    path = tmp_path / "huge.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("means.npy", header.getvalue() + b"\0" * 16)
+    with pytest.raises(igsr.IgsrError, match="another size than its header says"):
+        load_checkpoint(path)
+
+
+def test_fit_needs_train_views(capture):
+    only_test = [dataclasses.replace(view, split="test") for view in capture.views]
+    with pytest.raises(igsr.IgsrError, match="no train views"):
+        small_fit(igsr.Capture(capture.path, only_test))

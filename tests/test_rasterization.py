@@ -1,0 +1,300 @@
+"""``rasterization``: gradients, gsplat's conventions, backends, and gsplat's own strategies."""
+
+from __future__ import annotations
+
+import math
+
+import gsplat
+import pytest
+import torch
+from gsplat.utils import normalized_quat_to_rotmat
+
+from igsr import rasterization
+from scenes import torch_scene
+
+WIDTH, HEIGHT = 24, 20
+MODES = ["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+
+
+def run(scene, **options):
+    arguments = {"sh_degree": 2, "backend": "cpu", **options}
+    return rasterization(**scene, width=WIDTH, height=HEIGHT, **arguments)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED", "D"])
+def test_reference_gradients_match_finite_differences(packed, render_mode):
+    scene = torch_scene(count=6, dtype=torch.float64)
+    # The camera's free numbers: gradcheck would also move the fixed rows, which no camera has.
+    poses = scene["viewmats"][:, :3].clone()
+    lenses = scene["Ks"][:, [0, 1, 0, 1], [0, 1, 2, 2]].clone()
+    names = ["means", "quats", "scales", "opacities", "colors", "backgrounds"]
+    inputs = [scene[name] for name in names] + [poses, lenses]
+
+    def render(*tensors):
+        arguments = dict(zip(names, tensors, strict=False))
+        fixed_row = scene["viewmats"][:, 3:].detach()
+        arguments["viewmats"] = torch.cat([tensors[-2], fixed_row], dim=1)
+        fx, fy, cx, cy = tensors[-1].unbind(dim=1)
+        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+        K = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=1)
+        arguments["Ks"] = K.reshape(-1, 3, 3)
+        options = {"backend": "reference", "packed": packed, "render_mode": render_mode}
+        color, alpha, _ = run(arguments, **options)
+        # One number from all pixels: every input is still checked one by one.
+        weights = torch.linspace(-1.0, 1.0, color.numel(), dtype=torch.float64)
+        return (color.flatten() * weights).sum() + alpha.square().sum()
+
+    for tensor in inputs:
+        tensor.requires_grad_()
+    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("render_mode", MODES)
+@pytest.mark.parametrize("sh_degree", [None, 0, 2])
+def test_cpu_matches_reference(render_mode, sh_degree):
+    results = {}
+    for backend, dtype in (("cpu", torch.float32), ("reference", torch.float64)):
+        scene = {name: tensor.to(dtype) for name, tensor in torch_scene(count=30).items()}
+        if sh_degree is None:
+            scene["colors"] = scene["colors"][:, 0].abs()
+        for tensor in scene.values():
+            tensor.requires_grad_()
+        color, alpha, _ = run(
+            scene, backend=backend, sh_degree=sh_degree, render_mode=render_mode, packed=False
+        )
+        weights = torch.linspace(-1.0, 1.0, color.numel(), dtype=dtype).reshape(color.shape)
+        ((color * weights).sum() + alpha.square().sum()).backward()
+        gradients = {name: tensor.grad for name, tensor in scene.items()}
+        results[backend] = (color.detach(), alpha.detach(), gradients)
+    color, alpha, gradients = results["cpu"]
+    exact_color, exact_alpha, exact_gradients = results["reference"]
+    assert color.dtype == torch.float32
+    assert exact_color.dtype == torch.float64
+    # Depths are in world units, about 4 here, so the bound for pictures scales with them.
+    assert (color - exact_color).abs().max() <= 1e-4 * (4 if "D" in render_mode else 1)
+    assert (alpha - exact_alpha).abs().max() <= 1e-4
+    for name, exact in exact_gradients.items():
+        if exact is None:
+            assert gradients[name] is None
+            continue
+        bound = 1e-4 * exact.abs().max().clamp(min=1e-6)
+        assert (gradients[name] - exact).abs().max() <= bound, name
+
+
+def test_packed_is_the_same_picture_and_the_same_gradients():
+    outcomes = []
+    for packed in (False, True):
+        scene = torch_scene(count=30)
+        scene["means"][:5, 2] = -3.0  # behind the cameras
+        for tensor in scene.values():
+            tensor.requires_grad_()
+        color, alpha, meta = run(scene, packed=packed, render_mode="RGB+ED")
+        meta["means2d"].retain_grad()
+        color.square().sum().backward()
+        outcomes.append((color, alpha, meta, [tensor.grad for tensor in scene.values()]))
+    (color, alpha, meta, gradients), (color_p, alpha_p, meta_p, gradients_p) = outcomes
+    assert torch.equal(color, color_p)
+    assert torch.equal(alpha, alpha_p)
+    for a, b in zip(gradients, gradients_p, strict=True):
+        assert torch.equal(a, b)
+    visible = (meta["radii"] > 0).all(dim=-1)
+    assert 0 < visible.sum() < visible.numel()
+    assert torch.equal(
+        torch.stack(torch.where(visible)),
+        torch.stack([meta_p["camera_ids"], meta_p["gaussian_ids"]]),
+    )
+    for name in ("means2d", "radii", "depths", "conics", "opacities"):
+        assert torch.equal(meta[name][visible], meta_p[name])
+    assert torch.equal(meta["means2d"].grad[visible], meta_p["means2d"].grad)
+    assert not visible[:, :5].any()
+
+
+def test_repeats_bit_for_bit():
+    runs = []
+    for _ in range(2):
+        scene = torch_scene(count=200)
+        for tensor in scene.values():
+            tensor.requires_grad_()
+        color, _, _ = run(scene)
+        color.square().sum().backward()
+        runs.append([color] + [tensor.grad for tensor in scene.values()])
+    for a, b in zip(*runs, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_shapes_and_meta_follow_gsplat():
+    scene = torch_scene(count=9, cameras=3)
+    for mode, channels in zip(MODES, (3, 1, 1, 4, 4), strict=True):
+        color, alpha, _ = run(scene, render_mode=mode)
+        assert color.shape == (3, HEIGHT, WIDTH, channels)
+        assert alpha.shape == (3, HEIGHT, WIDTH, 1)
+    _, _, meta = run(scene, packed=False)
+    assert meta["means2d"].shape == (3, 9, 2)
+    assert meta["radii"].shape == (3, 9, 2)
+    assert meta["radii"].dtype == torch.int32
+    assert meta["conics"].shape == (3, 9, 3)
+    assert meta["depths"].shape == meta["opacities"].shape == (3, 9)
+    assert (meta["width"], meta["height"], meta["n_cameras"]) == (WIDTH, HEIGHT, 3)
+
+
+def test_conics_invert_the_projected_covariance():
+    # A splat straight ahead: covariance (f s / z)^2 + eps2d on both axes, no correlation.
+    scene = torch_scene(count=1, cameras=1)
+    scene["means"] = torch.tensor([[0.0, 0.0, 5.0]])
+    scene["scales"] = torch.full((1, 3), 0.5)
+    _, _, meta = run(scene, packed=False, eps2d=0.3)
+    variances = torch.tensor([(30 * 0.5 / 5) ** 2 + 0.3, (31 * 0.5 / 5) ** 2 + 0.3])
+    xx, xy, yy = meta["conics"][0, 0]
+    assert torch.allclose(torch.stack([xx, yy]), 1 / variances, rtol=1e-5)
+    assert abs(xy) < 1e-7
+    assert torch.allclose(meta["means2d"][0, 0], torch.tensor([12.0, 10.0]), atol=1e-5)
+
+
+def test_one_splat_by_hand():
+    scene = torch_scene(count=1, cameras=1)
+    scene["means"] = torch.tensor([[0.5 * 4 / 30, 0.5 * 4 / 31, 4.0]])  # on a pixel's centre
+    scene["opacities"] = torch.tensor([0.5])
+    scene["colors"] = torch.tensor([[0.2, 0.4, 0.6]])
+    scene["backgrounds"] = torch.tensor([[1.0, 0.0, 0.5]])
+    color, alpha, _ = run(scene, sh_degree=None, render_mode="RGB+D")
+    expected = 0.5 * scene["colors"] + 0.5 * scene["backgrounds"]
+    assert torch.allclose(color[0, 10, 12, :3], expected[0], atol=1e-6)
+    assert color[0, 10, 12, 3] == pytest.approx(2.0, abs=1e-5)
+    assert alpha[0, 10, 12, 0] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_no_splats_show_the_background():
+    scene = torch_scene(count=1)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        scene[name] = scene[name][:0].requires_grad_()
+    for packed in (False, True):
+        color, alpha, _ = run(scene, packed=packed)
+        assert torch.equal(color, scene["backgrounds"][:, None, None].expand_as(color))
+        assert not alpha.any()
+        color.sum().backward()
+
+
+def test_radius_clip_drops_small_splats():
+    scene = torch_scene(count=20)
+    _, _, meta = run(scene, packed=False)
+    largest = meta["radii"].max(dim=-1).values
+    limit = float(largest.float().median())
+    _, _, clipped = run(scene, packed=False, radius_clip=limit)
+    kept = (clipped["radii"] > 0).all(dim=-1)
+    assert torch.equal(kept, largest > limit)
+
+
+def optimisable(count=60):
+    """Parameters and optimisers as gsplat's examples lay them out, and a target to fit."""
+    truth = torch_scene(count=count, cameras=3, seed=3)
+    with torch.no_grad():
+        target, _, _ = run(truth, packed=False)
+    start = torch_scene(count=count, cameras=3, seed=4)
+    params = torch.nn.ParameterDict(
+        {
+            "means": torch.nn.Parameter(start["means"]),
+            "quats": torch.nn.Parameter(start["quats"]),
+            "scales": torch.nn.Parameter(start["scales"].log()),
+            "opacities": torch.nn.Parameter(torch.logit(start["opacities"])),
+            "sh": torch.nn.Parameter(start["colors"]),
+        }
+    )
+    rates = {"means": 2e-3, "quats": 1e-2, "scales": 1e-2, "opacities": 3e-2, "sh": 1e-2}
+    optimizers = {name: torch.optim.Adam([params[name]], lr=rate) for name, rate in rates.items()}
+    return params, optimizers, truth, target
+
+
+def train(strategy, state, params, optimizers, truth, target, steps, packed, post):
+    """gsplat's documented training loop with only the import of rasterization changed."""
+    losses, counts = [], []
+    for step in range(steps):
+        color, _, info = rasterization(
+            params["means"],
+            params["quats"],
+            torch.exp(params["scales"]),
+            torch.sigmoid(params["opacities"]),
+            params["sh"],
+            truth["viewmats"],
+            truth["Ks"],
+            WIDTH,
+            HEIGHT,
+            sh_degree=2,
+            packed=packed,
+            backgrounds=truth["backgrounds"],
+            backend="cpu",
+        )
+        if hasattr(strategy, "step_pre_backward"):
+            strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss = (color - target).abs().mean()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        strategy.step_post_backward(params, optimizers, state, step, info, **post)
+        losses.append(loss.item())
+        counts.append(len(params["means"]))
+    return losses, counts
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_gsplat_default_strategy_runs_unchanged(packed):
+    torch.manual_seed(0)
+    params, optimizers, truth, target = optimisable()
+    strategy = gsplat.DefaultStrategy(
+        refine_start_iter=5, refine_every=10, grow_grad2d=1e-3, reset_every=1000
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state(scene_scale=1.0)
+    losses, counts = train(
+        strategy, state, params, optimizers, truth, target, 45, packed, {"packed": packed}
+    )
+    assert max(counts) > 60  # it did grow
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def relocation_in_torch(opacities, scales, ratios, binoms):
+    """Equation 9 of "3DGS as Markov Chain Monte Carlo" (Kheradmand et al. 2024)."""
+    n_max = len(binoms)
+    ratios = ratios.clamp(1, n_max)
+    new_opacities = 1 - (1 - opacities) ** (1 / ratios)
+    new_scales = torch.empty_like(scales)
+    for row, (opacity, new, n) in enumerate(
+        zip(opacities.tolist(), new_opacities.tolist(), ratios.tolist(), strict=True)
+    ):
+        denominator = sum(
+            math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
+            for i in range(1, n + 1)
+            for k in range(i)
+        )
+        new_scales[row] = opacity / denominator * scales[row]
+    return new_opacities, new_scales
+
+
+def covariance_in_torch(quats, scales, compute_covar, compute_preci, triu):
+    assert compute_covar
+    assert not compute_preci
+    assert not triu
+    rotations = normalized_quat_to_rotmat(torch.nn.functional.normalize(quats, dim=-1))
+    factor = rotations * scales[:, None, :]
+    return factor @ factor.transpose(1, 2), None
+
+
+def test_gsplat_mcmc_strategy_runs_unchanged(monkeypatch):
+    # gsplat computes these two in CUDA only, whatever renders: plain torch stands in for them.
+    # The strategy itself, its sampling and its noise are gsplat's own code.
+    monkeypatch.setattr(gsplat.strategy.ops, "compute_relocation", relocation_in_torch)
+    monkeypatch.setattr(gsplat.strategy.ops, "quat_scale_to_covar_preci", covariance_in_torch)
+    torch.manual_seed(0)
+    params, optimizers, truth, target = optimisable()
+    with torch.no_grad():
+        params["opacities"][:7] = -8.0  # dead: there is something to relocate
+    strategy = gsplat.MCMCStrategy(cap_max=70, refine_start_iter=5, refine_every=10, noise_lr=1.0)
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state()
+    losses, counts = train(
+        strategy, state, params, optimizers, truth, target, 45, True, {"lr": 2e-3}
+    )
+    assert counts[-1] == 70
+    assert torch.sigmoid(params["opacities"]).min() > 0.001
+    assert losses[-1] < 0.6 * losses[0]
