@@ -52,31 +52,59 @@ impl Rows {
     }
 }
 
+#[inline(always)]
+fn load<S: Simd>(values: &[f32], at: usize) -> S::f32s {
+    S::as_simd_f32s(&values[at..at + S::F32_LANES]).0[0]
+}
+
 /// `out[x] = sum_k window[k] padded[x + k + PAD - HALF]`, the window being symmetric.
 #[inline(always)]
 fn filter_row<S: Simd>(s: S, padded: &[f32], out: &mut [f32]) {
-    let taps: [S::f32s; HALF + 1] = std::array::from_fn(|k| s.splat_f32s(SSIM_WINDOW[k]));
+    let mut taps = [s.splat_f32s(0.0); HALF + 1];
+    for (tap, weight) in taps.iter_mut().zip(SSIM_WINDOW) {
+        *tap = s.splat_f32s(weight);
+    }
     let (out, _) = S::as_mut_simd_f32s(out);
     let lanes = S::F32_LANES;
-    let load = |at: usize| S::as_simd_f32s(&padded[at..at + lanes]).0[0];
     for (v, out) in out.iter_mut().enumerate() {
         let at = v * lanes + PAD - HALF;
-        let mut sum = s.mul_f32s(taps[HALF], load(at + HALF));
+        let mut sum = s.mul_f32s(taps[HALF], load::<S>(padded, at + HALF));
         for k in 0..HALF {
-            let pair = s.add_f32s(load(at + k), load(at + 2 * HALF - k));
+            let pair = s.add_f32s(load::<S>(padded, at + k), load::<S>(padded, at + 2 * HALF - k));
             sum = s.mul_add_e_f32s(taps[k], pair, sum);
         }
         *out = sum;
     }
 }
 
-/// Vertical pass at vector `v` of the row whose window starts at `first` (rows outside count zero).
+/// The rows that a vertical window covers; None where it leaves the picture.
+type Window<'a, S> = [Option<&'a [<S as Simd>::f32s]>; 2 * HALF + 1];
+
+/// Gathers the rows around `row` of the map that starts at row `base` of `filtered`, which holds
+/// the picture's rows `held`.
 #[inline(always)]
-fn filter_column<S: Simd>(s: S, rows: &[Option<&[S::f32s]>; 2 * HALF + 1], v: usize) -> S::f32s {
+fn fill_window<'a, S: Simd>(
+    window: &mut Window<'a, S>,
+    filtered: &'a Rows,
+    base: usize,
+    held: std::ops::Range<usize>,
+    row: usize,
+) {
+    for (k, slot) in window.iter_mut().enumerate() {
+        // Compared without subtracting first: rows count from zero.
+        if row + k >= HALF + held.start && row + k < HALF + held.end {
+            *slot = Some(S::as_simd_f32s(filtered.row(base + row + k - HALF - held.start)).0);
+        }
+    }
+}
+
+/// Vertical pass at vector `v`; rows outside the picture count zero.
+#[inline(always)]
+fn filter_column<S: Simd>(s: S, rows: &Window<'_, S>, v: usize) -> S::f32s {
     let mut sum = s.splat_f32s(0.0);
-    for (k, row) in rows.iter().enumerate() {
+    for (row, weight) in rows.iter().zip(SSIM_WINDOW) {
         if let Some(row) = row {
-            sum = s.mul_add_e_f32s(s.splat_f32s(SSIM_WINDOW[k]), row[v], sum);
+            sum = s.mul_add_e_f32s(s.splat_f32s(weight), row[v], sum);
         }
     }
     sum
@@ -118,19 +146,20 @@ impl WithSimd for Slopes<'_> {
         let (c1, c2) = (s.splat_f32s(SSIM_C.0), s.splat_f32s(SSIM_C.1));
         let two = s.splat_f32s(2.0);
         let vectors = filtered.stride / S::F32_LANES;
-        let mut lines = [0; 4].map(|_| vec![s.splat_f32s(0.0); vectors]);
+        let mut lines = [(); 4].map(|()| vec![s.splat_f32s(0.0); vectors]);
         let mut total = 0.0f64;
         let [out_mu, out_xx, out_xy] = self.out;
         for row in self.rows.clone() {
-            let windows: [[Option<&[S::f32s]>; 2 * HALF + 1]; 5] = std::array::from_fn(|map| {
-                std::array::from_fn(|k| {
-                    let at = (row + k).checked_sub(HALF).filter(|r| (first..last).contains(r))?;
-                    Some(S::as_simd_f32s(filtered.row(map * count + at - first)).0)
-                })
-            });
+            let mut windows: [Window<'_, S>; 5] = [[None; 2 * HALF + 1]; 5];
+            for (map, window) in windows.iter_mut().enumerate() {
+                fill_window::<S>(window, &filtered, map * count, first..last, row);
+            }
             for v in 0..vectors {
-                let [mu_x, mu_y, xx, yy, xy] =
-                    std::array::from_fn(|map| filter_column(s, &windows[map], v));
+                let mu_x = filter_column(s, &windows[0], v);
+                let mu_y = filter_column(s, &windows[1], v);
+                let xx = filter_column(s, &windows[2], v);
+                let yy = filter_column(s, &windows[3], v);
+                let xy = filter_column(s, &windows[4], v);
                 let mu_xy = s.mul_f32s(mu_x, mu_y);
                 let (mu_xx, mu_yy) = (s.mul_f32s(mu_x, mu_x), s.mul_f32s(mu_y, mu_y));
                 let s_xy = s.sub_f32s(xy, mu_xy);
@@ -213,14 +242,12 @@ impl WithSimd for Gradient<'_> {
             }
         }
         let vectors = filtered.stride / S::F32_LANES;
-        let mut lines = [0; 3].map(|_| vec![s.splat_f32s(0.0); vectors]);
+        let mut lines = [(); 3].map(|()| vec![s.splat_f32s(0.0); vectors]);
         let mut total = 0.0f64;
         for row in self.rows.clone() {
             for (map, line) in lines.iter_mut().enumerate() {
-                let window: [Option<&[S::f32s]>; 2 * HALF + 1] = std::array::from_fn(|k| {
-                    let at = (row + k).checked_sub(HALF).filter(|r| (first..last).contains(r))?;
-                    Some(S::as_simd_f32s(filtered.row(map * count + at - first)).0)
-                });
+                let mut window: Window<'_, S> = [None; 2 * HALF + 1];
+                fill_window::<S>(&mut window, &filtered, map * count, first..last, row);
                 for (v, out) in line.iter_mut().enumerate() {
                     *out = filter_column(s, &window, v);
                 }

@@ -119,7 +119,8 @@ impl WithSimd for Tile<'_> {
             let [p, q, v_scale] = splat.factor;
             let (p, opacity) = (s.splat_f32s(p), s.splat_f32s(splat.opacity));
             let mx = s.splat_f32s(splat.mean[0]);
-            let color = splat.color.map(|c| s.splat_f32s(c));
+            let [red, green, blue] = splat.color;
+            let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
             let depth = s.splat_f32s(splat.depth);
             for row in splat.rows(self.top) {
                 let dy = self.top + row as f32 + 0.5 - splat.mean[1];
@@ -164,7 +165,10 @@ pub(super) fn any<S: Simd>(s: S, mask: S::m32s) -> bool {
 /// Whether every pixel of a tile has stopped.
 #[inline(always)]
 pub(super) fn all_stopped<S: Simd>(s: S, t: &[S::f32s]) -> bool {
-    let most = t.iter().fold(s.splat_f32s(-1.0), |a, &b| s.max_f32s(a, b));
+    let mut most = s.splat_f32s(-1.0);
+    for &t in t {
+        most = s.max_f32s(most, t);
+    }
     s.reduce_max_f32s(most) < 0.0
 }
 

@@ -58,7 +58,8 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
             let [p, q, v_scale] = splat.factor;
             let (p, opacity) = (s.splat_f32s(p), s.splat_f32s(splat.opacity));
             let mx = s.splat_f32s(splat.mean[0]);
-            let color = splat.color.map(|c| s.splat_f32s(c));
+            let [red, green, blue] = splat.color;
+            let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
             let depth = s.splat_f32s(splat.depth);
             let mut acc = [zero; 10];
             let mut touched = false;
@@ -118,7 +119,9 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
                 }
             }
             if touched {
-                self.sums[k] = acc.map(|a| s.reduce_sum_f32s(a));
+                for (sum, acc) in self.sums[k].iter_mut().zip(acc) {
+                    *sum = s.reduce_sum_f32s(acc);
+                }
             }
         }
     }

@@ -1,4 +1,8 @@
 //! Vector helpers on top of `pulp`, which picks the instruction set at run time.
+//!
+//! Code that runs inside `with_simd` must use plain loops where vectors are touched: a closure, and
+//! so `array::map` or `fold`, is compiled without the instruction set and turns every vector
+//! operation into a call.
 
 use pulp::Simd;
 

@@ -1,0 +1,310 @@
+//! bin: 2D splats to lists of splats per tile, ordered by depth and index.
+//!
+//! All splats are sorted by depth first; each then emits its tiles in that order, and a stable
+//! sort by tile alone leaves every tile's list in depth order.
+
+use std::ops::Range;
+
+use super::device::{Gpu, Op};
+use super::layout::{ALL_SPLATS, Chunk, ChunkCount, GRADIENT, SortPass, StatusHead};
+use super::shaders::Kernel;
+use crate::constants::TILE;
+use crate::error::{Error, Result};
+
+/// Bits that one pass of the radix sort takes.
+const BITS_PER_PASS: u32 = 4;
+
+/// Buffers that grow with the splats.
+#[derive(Debug)]
+pub(super) struct SplatBins {
+    splats: u32,
+    keys: [wgpu::Buffer; 2],
+    order: [wgpu::Buffer; 2],
+    /// Where each rank's pairs begin, and the total.
+    pub offsets: wgpu::Buffer,
+    segment_sums: wgpu::Buffer,
+    histogram: wgpu::Buffer,
+    /// Counts that only the device knows.
+    pub status: wgpu::Buffer,
+}
+
+/// Buffers that grow with the pairs and tiles.
+#[derive(Debug)]
+pub(super) struct PairBins {
+    capacity: u32,
+    keys: [wgpu::Buffer; 2],
+    slots: [wgpu::Buffer; 2],
+    splat_from_slot: wgpu::Buffer,
+    /// The splat of each pair in tile order.
+    pub splat_from_pair: wgpu::Buffer,
+    /// Where each tile's pairs begin, and their number.
+    pub tile_begin: wgpu::Buffer,
+}
+
+/// A contiguous run of tiles whose pairs fit the buffers.
+#[derive(Debug)]
+pub(super) struct TileChunk {
+    pub chunk: Chunk,
+    /// `chunk` as the kernels read it.
+    pub uniform: wgpu::Buffer,
+}
+
+impl TileChunk {
+    /// Of the given tiles.
+    pub fn new(gpu: &Gpu, chunk: Chunk) -> Self {
+        Self { chunk, uniform: gpu.uniform(&chunk) }
+    }
+
+    /// Number of tiles.
+    pub fn tiles(&self) -> u32 {
+        self.chunk.tile_end - self.chunk.tile_begin
+    }
+}
+
+/// Tiles of a picture.
+pub(super) fn tile_count(width: u32, height: u32) -> u32 {
+    width.div_ceil(TILE) * height.div_ceil(TILE)
+}
+
+/// Most pairs whose gradient slots can be bound at once.
+pub(super) fn pair_limit(gpu: &Gpu) -> u32 {
+    (gpu.binding_limit / (GRADIENT as u64 * 4)).min(u64::from(u32::MAX / 2)) as u32
+}
+
+impl SplatBins {
+    /// For `splats` splats and `chunks` chunks.
+    pub fn new(gpu: &Gpu, splats: u32, chunks: u32) -> Result<Self> {
+        let words = |n: u32| u64::from(n) * 4;
+        let pair = |label| -> Result<[wgpu::Buffer; 2]> {
+            Ok([gpu.bindable(label, words(splats))?, gpu.bindable(label, words(splats))?])
+        };
+        let bytes = size_of::<StatusHead>() as u64
+            + u64::from(chunks.max(1)) * size_of::<ChunkCount>() as u64;
+        let status = gpu.bindable("status", bytes)?;
+        let head = StatusHead { splats, overflow: 0 };
+        gpu.queue.write_buffer(&status, 0, bytemuck::bytes_of(&head));
+        Ok(Self {
+            splats,
+            keys: pair("depth keys")?,
+            order: pair("depth order")?,
+            offsets: gpu.bindable("offsets", words(splats) + 4)?,
+            segment_sums: gpu.buffer("segment sums", words(gpu.segments))?,
+            histogram: gpu.buffer("histogram", words(gpu.segments << BITS_PER_PASS))?,
+            status,
+        })
+    }
+
+    /// Splats by depth; what the sort leaves here, after an even number of passes.
+    pub fn order(&self) -> &wgpu::Buffer {
+        &self.order[0]
+    }
+
+    /// Sorts the splats by depth.
+    pub fn depth_ops(
+        &self,
+        gpu: &Gpu,
+        view: &wgpu::Buffer,
+        chunk: &TileChunk,
+        splats2d: &wgpu::Buffer,
+    ) -> Vec<Op> {
+        let keys = gpu.op(
+            Kernel::DepthKeys,
+            &[
+                view.into(),
+                (&chunk.uniform).into(),
+                splats2d.into(),
+                (&self.keys[0]).into(),
+                (&self.order[0]).into(),
+                (&self.offsets).into(),
+            ],
+            Gpu::groups(self.splats, 256),
+        );
+        let mut ops = vec![keys];
+        let passes = u32::BITS / BITS_PER_PASS;
+        ops.extend(self.sort_ops(gpu, ALL_SPLATS, passes, &self.keys, &self.order));
+        ops
+    }
+
+    /// Counts the pairs of a chunk: [`Self::offsets`] and the chunk's entry in [`Self::status`].
+    pub fn count_ops(
+        &self,
+        gpu: &Gpu,
+        view: &wgpu::Buffer,
+        chunk: &TileChunk,
+        splats2d: &wgpu::Buffer,
+    ) -> Vec<Op> {
+        let scan = [
+            (&chunk.uniform).into(),
+            (&self.offsets).into(),
+            (&self.segment_sums).into(),
+            (&self.status).into(),
+        ];
+        vec![
+            gpu.op(
+                Kernel::TileCounts,
+                &[
+                    view.into(),
+                    (&chunk.uniform).into(),
+                    splats2d.into(),
+                    (&self.keys[0]).into(),
+                    self.order().into(),
+                    (&self.offsets).into(),
+                ],
+                Gpu::groups(self.splats, 256),
+            ),
+            gpu.op(Kernel::ScanSums, &scan, [gpu.segments, 1]),
+            gpu.op(Kernel::ScanApply, &scan, [gpu.segments, 1]),
+        ]
+    }
+
+    /// Emits a counted chunk's pairs and sorts them by tile.
+    pub fn pair_ops(
+        &self,
+        gpu: &Gpu,
+        view: &wgpu::Buffer,
+        chunk: &TileChunk,
+        splats2d: &wgpu::Buffer,
+        pairs: &PairBins,
+    ) -> Vec<Op> {
+        let mut ops = vec![gpu.op(
+            Kernel::Emit,
+            &[
+                view.into(),
+                (&chunk.uniform).into(),
+                splats2d.into(),
+                (&self.status).into(),
+                self.order().into(),
+                (&self.offsets).into(),
+                (&pairs.keys[0]).into(),
+                (&pairs.slots[0]).into(),
+                (&pairs.splat_from_slot).into(),
+            ],
+            Gpu::groups(self.splats, 64),
+        )];
+        let passes = sort_passes(chunk.tiles());
+        let index = chunk.chunk.index;
+        ops.extend(self.sort_ops(gpu, index, passes, &pairs.keys, &pairs.slots));
+        let last = (passes % 2) as usize;
+        // Enough workgroups to fill a device; each walks on by the number of all threads.
+        let groups = pairs.capacity.div_ceil(64).clamp(1, 4 * gpu.segments);
+        ops.push(gpu.op(
+            Kernel::Ranges,
+            &[
+                (&chunk.uniform).into(),
+                (&self.status).into(),
+                (&pairs.keys[last]).into(),
+                (&pairs.slots[last]).into(),
+                (&pairs.splat_from_slot).into(),
+                (&pairs.splat_from_pair).into(),
+                (&pairs.tile_begin).into(),
+            ],
+            [groups, 1],
+        ));
+        ops
+    }
+
+    fn sort_ops(
+        &self,
+        gpu: &Gpu,
+        chunk: u32,
+        passes: u32,
+        keys: &[wgpu::Buffer; 2],
+        values: &[wgpu::Buffer; 2],
+    ) -> Vec<Op> {
+        let mut ops = Vec::new();
+        for pass in 0..passes {
+            let uniform = gpu.uniform(&SortPass { shift: pass * BITS_PER_PASS, chunk });
+            let (from, to) = ((pass % 2) as usize, ((pass + 1) % 2) as usize);
+            let bindings = [
+                (&uniform).into(),
+                (&self.status).into(),
+                (&keys[from]).into(),
+                (&values[from]).into(),
+                (&self.histogram).into(),
+                (&keys[to]).into(),
+                (&values[to]).into(),
+            ];
+            ops.push(gpu.op(Kernel::SortHistogram, &bindings, [gpu.segments, 1]));
+            ops.push(gpu.op(Kernel::SortScan, &bindings, [1, 1]));
+            ops.push(gpu.op(Kernel::SortScatter, &bindings, [gpu.segments, 1]));
+        }
+        ops
+    }
+
+    /// Cuts a picture's tiles into chunks whose pairs fit; reads the counts back. The depth order
+    /// must be there.
+    pub fn plan(
+        &self,
+        gpu: &Gpu,
+        view: &wgpu::Buffer,
+        splats2d: &wgpu::Buffer,
+        tiles: u32,
+    ) -> Result<(Vec<Range<u32>>, u32)> {
+        let limit = pair_limit(gpu);
+        let (mut open, mut done) = (vec![0..tiles], Vec::new());
+        let mut capacity = 0;
+        while let Some(range) = open.pop() {
+            let chunk = TileChunk::new(
+                gpu,
+                Chunk {
+                    tile_begin: range.start,
+                    tile_end: range.end,
+                    capacity: u32::MAX,
+                    splats: self.splats,
+                    index: 0,
+                    is_first: 1,
+                    is_last: 1,
+                },
+            );
+            let ops = self.count_ops(gpu, view, &chunk, splats2d);
+            let bytes = size_of::<StatusHead>() + size_of::<ChunkCount>();
+            let status = gpu.download(&ops, &[(&self.status, bytes as u64)])?;
+            let count: ChunkCount =
+                bytemuck::pod_read_unaligned(&status[0][size_of::<StatusHead>()..]);
+            if count.total <= limit {
+                capacity = capacity.max(count.total);
+                done.push(range);
+            } else if range.len() == 1 {
+                return Err(Error::argument(
+                    "means",
+                    format!(
+                        "{} splats lie in one 16x16 tile, the device takes {limit}; use fewer \
+                         splats or backend cpu",
+                        count.total
+                    ),
+                ));
+            } else {
+                let middle = range.start + range.len() as u32 / 2;
+                open.push(middle..range.end);
+                open.push(range.start..middle);
+            }
+        }
+        Ok((done, capacity))
+    }
+}
+
+/// Passes that order the ids of `tiles` tiles and the one behind them.
+fn sort_passes(tiles: u32) -> u32 {
+    (u32::BITS - tiles.leading_zeros()).div_ceil(BITS_PER_PASS).max(1)
+}
+
+impl PairBins {
+    /// For at most `capacity` pairs and `tiles` tiles in a chunk.
+    pub fn new(gpu: &Gpu, capacity: u32, tiles: u32) -> Result<Self> {
+        let words = |n: u32| u64::from(n) * 4;
+        let buffer = |label| gpu.bindable(label, words(capacity));
+        Ok(Self {
+            capacity,
+            keys: [buffer("tile keys")?, buffer("tile keys")?],
+            slots: [buffer("slots")?, buffer("slots")?],
+            splat_from_slot: buffer("splat_from_slot")?,
+            splat_from_pair: buffer("splat_from_pair")?,
+            tile_begin: gpu.bindable("tile_begin", words(tiles) + 4)?,
+        })
+    }
+
+    /// Slots in tile order, after a chunk of so many tiles was sorted.
+    pub fn slot_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
+        &self.slots[(sort_passes(tiles) % 2) as usize]
+    }
+}

@@ -1,0 +1,136 @@
+//! Structs shared with WGSL (`shared.wgsl`) and the row lengths of the flat buffers. A test holds
+//! offsets and sizes against naga's reflection of the shaders.
+
+use bytemuck::{Pod, Zeroable};
+
+use crate::camera::Camera;
+use crate::constants::TILE;
+use crate::stages::{Colors, ProjectOptions, SplatParams};
+
+/// Floats per splat in the geometry buffer: mean 3, scales 3, quaternion 4 (wxyz), opacity 1.
+pub(super) const GEOMETRY: usize = 11;
+
+/// Floats per splat or slot in a buffer of 2D gradients: mean 2 (moments of order 1 in a slot),
+/// covariance 3 (order 2), depth, colour 3, opacity.
+pub(super) const GRADIENT: usize = 10;
+
+/// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.
+pub(super) const CAMERA: usize = 16;
+
+/// Splats per workgroup of the per-splat kernels; windows are multiples of it, which also keeps
+/// every per-splat buffer's offset a multiple of 256 bytes.
+pub(super) const SPLATS_PER_GROUP: u32 = 64;
+
+/// Camera, background and how colours and parameters are stored.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(super) struct View {
+    pub world_to_camera: [[f32; 4]; 3],
+    pub jacobian_limits: [f32; 4],
+    pub focal: [f32; 2],
+    pub principal: [f32; 2],
+    pub background: [f32; 3],
+    pub near: f32,
+    pub far: f32,
+    pub blur: f32,
+    pub width: u32,
+    pub height: u32,
+    pub tiles_x: u32,
+    pub sh_degree: u32,
+    pub sh_stride: u32,
+    pub raw: u32,
+}
+
+impl View {
+    /// What the rasterize stages need.
+    pub fn of_picture(width: u32, height: u32, background: [f32; 3]) -> Self {
+        Self { background, width, height, tiles_x: width.div_ceil(TILE), ..Self::zeroed() }
+    }
+
+    /// What the project stages need.
+    pub fn of_camera(
+        camera: &Camera,
+        options: &ProjectOptions,
+        splats: &SplatParams<'_, f32>,
+    ) -> Self {
+        let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
+        let (sh_degree, sh_stride) = match splats.colors {
+            Colors::Direct(_) => (0, 0),
+            Colors::Sh { degree, stride, .. } => (degree, stride as u32),
+        };
+        Self {
+            world_to_camera: [row(0), row(1), row(2)],
+            jacobian_limits: camera.jacobian_limits().map(|v| v as f32),
+            focal: [camera.fx as f32, camera.fy as f32],
+            principal: [camera.cx as f32, camera.cy as f32],
+            near: options.near,
+            far: options.far,
+            blur: options.blur,
+            sh_degree,
+            sh_stride,
+            raw: u32::from(splats.raw),
+            ..Self::of_picture(camera.width, camera.height, [0.0; 3])
+        }
+    }
+}
+
+/// The splats of one dispatch.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Window {
+    pub first: u32,
+    pub count: u32,
+}
+
+/// The tiles of one dispatch and where their pairs are counted.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Chunk {
+    pub tile_begin: u32,
+    pub tile_end: u32,
+    pub capacity: u32,
+    pub splats: u32,
+    pub index: u32,
+    pub is_first: u32,
+    pub is_last: u32,
+}
+
+/// One pass of the radix sort.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct SortPass {
+    pub shift: u32,
+    pub chunk: u32,
+}
+
+/// `SortPass::chunk` for the sort of all splats by depth.
+pub(super) const ALL_SPLATS: u32 = u32::MAX;
+
+/// A projected splat as the rasterize kernels read it.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(super) struct Splat2d {
+    pub mean: [f32; 2],
+    pub pq: [f32; 2],
+    pub color: [f32; 3],
+    pub r: f32,
+    pub depth: f32,
+    pub opacity: f32,
+    pub radii: [f32; 2],
+}
+
+/// Pairs of one chunk, as counted on the device.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct ChunkCount {
+    pub pairs: u32,
+    pub total: u32,
+}
+
+/// What precedes the chunk counts in the status buffer.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct StatusHead {
+    pub splats: u32,
+    pub overflow: u32,
+}

@@ -1,0 +1,129 @@
+//! project: splats and camera to 2D splats.
+
+use std::ops::Range;
+
+use super::device::{Bound, Gpu, Op};
+use super::layout::{GEOMETRY, GRADIENT, SPLATS_PER_GROUP, Splat2d, View, Window};
+use super::shaders::Kernel;
+use crate::camera::Camera;
+use crate::error::{Error, Result};
+use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
+
+/// Splat parameters on the device.
+#[derive(Debug)]
+pub(super) struct SplatBuffers {
+    /// Number of splats.
+    pub splats: u32,
+    /// Floats of colour per splat.
+    pub color_floats: u64,
+    /// `[N * GEOMETRY]`
+    pub geometry: wgpu::Buffer,
+    /// `[N * color_floats]`
+    pub colors: wgpu::Buffer,
+}
+
+/// The number of splats as the kernels count them.
+pub(super) fn count(splats: usize) -> Result<u32> {
+    // Far above what fits any device, and low enough that no index overflows.
+    u32::try_from(splats).ok().filter(|&n| n < 1 << 26).ok_or_else(|| {
+        Error::argument("means", format!("has {splats} rows; backend gpu takes at most 67 million"))
+    })
+}
+
+/// Rows of the geometry buffer.
+pub(super) fn geometry_rows(splats: &SplatParams<'_, f32>) -> Vec<[f32; GEOMETRY]> {
+    (0..splats.len())
+        .map(|i| {
+            let mut row = [0.0; GEOMETRY];
+            row[0..3].copy_from_slice(&splats.means[i]);
+            row[3..6].copy_from_slice(&splats.scales[i]);
+            row[6..10].copy_from_slice(&splats.quats[i]);
+            row[10] = splats.opacities[i];
+            row
+        })
+        .collect()
+}
+
+impl SplatBuffers {
+    /// Copies the parameters to the device.
+    pub fn upload(gpu: &Gpu, splats: &SplatParams<'_, f32>) -> Result<Self> {
+        let (stride, colors) = match splats.colors {
+            Colors::Direct(colors) => (1, colors),
+            Colors::Sh { stride, coeffs, .. } => (stride, coeffs),
+        };
+        Ok(Self {
+            splats: count(splats.len())?,
+            color_floats: 3 * stride as u64,
+            geometry: gpu.upload("geometry", &geometry_rows(splats))?,
+            colors: gpu.upload("colors", colors)?,
+        })
+    }
+
+    /// Windows of splats whose widest rows can be bound at once.
+    pub fn windows(&self, gpu: &Gpu) -> Vec<Range<u32>> {
+        let floats = self.color_floats.max((GEOMETRY.max(GRADIENT).max(12)) as u64);
+        gpu.windows(self.splats, 4 * floats)
+    }
+}
+
+/// The part of a per-splat buffer that belongs to a window; rows of `floats` f32.
+pub(super) fn rows<'a>(buffer: &'a wgpu::Buffer, window: &Range<u32>, floats: u64) -> Bound<'a> {
+    let bytes = u64::from(window.start) * floats * 4..u64::from(window.end) * floats * 4;
+    Bound::part(buffer, bytes)
+}
+
+/// Projects all splats.
+pub(super) fn project_ops(
+    gpu: &Gpu,
+    view: &wgpu::Buffer,
+    splats: &SplatBuffers,
+    splats2d: &wgpu::Buffer,
+    covars2d: &wgpu::Buffer,
+) -> Vec<Op> {
+    let mut ops = Vec::new();
+    for window in splats.windows(gpu) {
+        let count = window.len() as u32;
+        let uniform = gpu.uniform(&Window { first: window.start, count });
+        ops.push(gpu.op(
+            Kernel::Project,
+            &[
+                view.into(),
+                (&uniform).into(),
+                rows(&splats.geometry, &window, GEOMETRY as u64),
+                rows(&splats.colors, &window, splats.color_floats),
+                rows(splats2d, &window, 12),
+                rows(covars2d, &window, 3),
+            ],
+            Gpu::groups(count, SPLATS_PER_GROUP),
+        ));
+    }
+    ops
+}
+
+pub(super) fn project(
+    gpu: &Gpu,
+    splats: &SplatParams<'_, f32>,
+    camera: &Camera,
+    options: &ProjectOptions,
+) -> Result<Projected<f32>> {
+    let n = splats.len();
+    let buffers = SplatBuffers::upload(gpu, splats)?;
+    let view = gpu.uniform(&View::of_camera(camera, options, splats));
+    let bytes = (n * size_of::<Splat2d>()) as u64;
+    let splats2d = gpu.buffer("splats2d", bytes)?;
+    let covars2d = gpu.buffer("covars2d", 12 * n as u64)?;
+    let ops = project_ops(gpu, &view, &buffers, &splats2d, &covars2d);
+    let data = gpu.download(&ops, &[(&splats2d, bytes), (&covars2d, 12 * n as u64)])?;
+    let mut out = Projected::culled(n, camera.width, camera.height);
+    for (i, bytes) in data[0].chunks_exact(size_of::<Splat2d>()).enumerate() {
+        let splat: Splat2d = bytemuck::pod_read_unaligned(bytes);
+        out.means2d[i] = splat.mean;
+        out.factors[i] = [splat.pq[0], splat.pq[1], splat.r];
+        out.depths[i] = splat.depth;
+        out.colors[i] = splat.color;
+        out.opacities[i] = splat.opacity;
+        out.radii[i] = splat.radii;
+    }
+    out.covars2d = bytemuck::pod_collect_to_vec(&data[1]);
+    Ok(out)
+}

@@ -1,0 +1,77 @@
+// project: splats and camera to 2D splats. Follows shared.wgsl and geometry.wgsl.
+
+@group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;
+// (xx, xy, yy), blur included.
+@group(0) @binding(5) var<storage, read_write> covars2d: array<f32>;
+
+@compute @workgroup_size(64)
+fn project(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let i = linear_index(workgroup, groups, local, 64u);
+    if i >= window.count {
+        return;
+    }
+    var out: Splat2d;
+    var covar = vec3(0.0);
+    let g = load_geometry(i);
+    // ALPHA_MIN also stops opacities that are zero, negative or underflown.
+    if g.visible && g.opacity > ALPHA_MIN {
+        let sxx = dot(g.m0, g.m0);
+        let sxy = dot(g.m0, g.m1);
+        let syy = dot(g.m1, g.m1);
+        let cxx = sxx + view.blur;
+        let cyy = syy + view.blur;
+        // det = |m0 x m1|^2 + blur (sxx + syy) + blur^2 (Cauchy-Binet: a sum of positive terms).
+        // The cross product of J's rows is (x/z, y/z, 1) fx fy / z^2, which leaves no cancellation
+        // to needles seen along any direction; the root is taken without squaring large values.
+        let normal = to_world(vec3(g.ratio, 1.0)) * g.axes
+            * (view.focal.x / g.t.z) * (view.focal.y / g.t.z);
+        let area = normal * vec3(
+            g.scales.y * g.scales.z,
+            g.scales.x * g.scales.z,
+            g.scales.x * g.scales.y,
+        );
+        let rest = sqrt(view.blur * (sxx + syy) + view.blur * view.blur);
+        let largest = max(max(abs(area.x), abs(area.y)), max(abs(area.z), rest));
+        let root_det = largest * length(vec4(area, rest) / largest);
+        let root_cyy = sqrt(cyy);
+        let p = root_cyy / root_det;
+        let q = -(sxy / root_cyy) / root_det;
+        let r = 1.0 / root_cyy;
+        let reach = 2.0 * log(g.opacity / ALPHA_MIN);
+        let radii = vec2(sqrt(reach * cxx), sqrt(reach * cyy));
+        let center = view.focal * (g.t.xy / g.t.z) + view.principal;
+        let size = vec2(f32(view.width), f32(view.height));
+        var color = vec3(0.0);
+        if view.sh_stride == 0u {
+            color = coefficient(i);
+        } else {
+            color = sh_color(i, view_direction(g.t).xyz);
+        }
+        // Tested before max(), which may turn NaN into 0.
+        let finite = is_finite3(color) && is_finite(center.x) && is_finite(center.y)
+            && is_finite(radii.x) && is_finite(radii.y) && is_finite(p) && is_finite(q)
+            && is_finite(r) && is_finite(root_det) && is_finite(sxy);
+        let in_picture = all(center + radii >= vec2(0.0)) && all(center - radii <= size);
+        if finite && in_picture && all(radii > vec2(0.0)) {
+            if view.sh_stride != 0u {
+                color = max(color, vec3(0.0));
+            }
+            out.mean = center;
+            out.pq = vec2(p, q);
+            out.color = color;
+            out.r = r;
+            out.depth = g.t.z;
+            out.opacity = g.opacity;
+            out.radii = radii;
+            covar = vec3(cxx, sxy, cyy);
+        }
+    }
+    splats2d[i] = out;
+    covars2d[3u * i] = covar.x;
+    covars2d[3u * i + 1u] = covar.y;
+    covars2d[3u * i + 2u] = covar.z;
+}

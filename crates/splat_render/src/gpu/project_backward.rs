@@ -1,0 +1,134 @@
+//! project_backward: gradients of the 2D splats to gradients of the splats and the camera.
+
+use super::device::{Gpu, Op};
+use super::layout::{CAMERA, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, View, Window};
+use super::project::{SplatBuffers, rows};
+use super::rasterize::splats2d;
+use super::shaders::Kernel;
+use crate::camera::Camera;
+use crate::error::Result;
+use crate::stages::{ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams};
+
+/// Workgroups of one pass over all splats, which is also the number of camera sums.
+pub(super) fn camera_sums(splats: u32) -> u32 {
+    splats.div_ceil(SPLATS_PER_GROUP)
+}
+
+/// Gradient buffers of the parameters, laid out as [`SplatBuffers`].
+#[derive(Debug)]
+pub(super) struct GradientBuffers {
+    /// `[N * GEOMETRY]`
+    pub geometry: wgpu::Buffer,
+    /// `[N * color_floats]`
+    pub colors: wgpu::Buffer,
+    /// `[camera_sums(N) * CAMERA]`
+    pub camera: wgpu::Buffer,
+}
+
+impl GradientBuffers {
+    /// For these splats.
+    pub fn new(gpu: &Gpu, splats: &SplatBuffers) -> Result<Self> {
+        let n = u64::from(splats.splats);
+        let sums = u64::from(camera_sums(splats.splats));
+        Ok(Self {
+            geometry: gpu.buffer("v_geometry", n * GEOMETRY as u64 * 4)?,
+            colors: gpu.buffer("v_colors", n * splats.color_floats * 4)?,
+            camera: gpu.bindable("v_camera", sums * CAMERA as u64 * 4)?,
+        })
+    }
+}
+
+/// Differentiates the projection of all splats.
+pub(super) fn project_backward_ops(
+    gpu: &Gpu,
+    view: &wgpu::Buffer,
+    splats: &SplatBuffers,
+    splats2d: &wgpu::Buffer,
+    v_splats2d: &wgpu::Buffer,
+    gradients: &GradientBuffers,
+) -> Vec<Op> {
+    let mut ops = Vec::new();
+    for window in splats.windows(gpu) {
+        let count = window.len() as u32;
+        let uniform = gpu.uniform(&Window { first: window.start, count });
+        ops.push(gpu.op(
+            Kernel::ProjectBackward,
+            &[
+                view.into(),
+                (&uniform).into(),
+                rows(&splats.geometry, &window, GEOMETRY as u64),
+                rows(&splats.colors, &window, splats.color_floats),
+                rows(splats2d, &window, 12),
+                rows(v_splats2d, &window, GRADIENT as u64),
+                rows(&gradients.geometry, &window, GEOMETRY as u64),
+                rows(&gradients.colors, &window, splats.color_floats),
+                (&gradients.camera).into(),
+            ],
+            Gpu::groups(count, SPLATS_PER_GROUP),
+        ));
+    }
+    ops
+}
+
+/// Rows of a 2D gradient buffer.
+fn gradient_rows(v: &ProjectedGradients<f32>) -> Vec<[f32; GRADIENT]> {
+    (0..v.v_means2d.len())
+        .map(|i| {
+            let mut row = [0.0; GRADIENT];
+            row[0..2].copy_from_slice(&v.v_means2d[i]);
+            row[2..5].copy_from_slice(&v.v_covars2d[i]);
+            row[5] = v.v_depths[i];
+            row[6..9].copy_from_slice(&v.v_colors[i]);
+            row[9] = v.v_opacities[i];
+            row
+        })
+        .collect()
+}
+
+pub(super) fn project_backward(
+    gpu: &Gpu,
+    splats: &SplatParams<'_, f32>,
+    camera: &Camera,
+    options: &ProjectOptions,
+    projected: &Projected<f32>,
+    v_projected: &ProjectedGradients<f32>,
+) -> Result<SplatGradients<f32>> {
+    let n = splats.len() as u64;
+    let buffers = SplatBuffers::upload(gpu, splats)?;
+    let view = gpu.uniform(&View::of_camera(camera, options, splats));
+    let splats2d = gpu.upload("splats2d", &splats2d(projected))?;
+    let v_splats2d = gpu.upload("v_splats2d", &gradient_rows(v_projected))?;
+    let gradients = GradientBuffers::new(gpu, &buffers)?;
+    let ops = project_backward_ops(gpu, &view, &buffers, &splats2d, &v_splats2d, &gradients);
+    let sums = u64::from(camera_sums(buffers.splats));
+    let data = gpu.download(
+        &ops,
+        &[
+            (&gradients.geometry, n * GEOMETRY as u64 * 4),
+            (&gradients.colors, n * buffers.color_floats * 4),
+            (&gradients.camera, sums * CAMERA as u64 * 4),
+        ],
+    )?;
+    let mut out = SplatGradients {
+        v_colors: bytemuck::pod_collect_to_vec(&data[1]),
+        ..SplatGradients::default()
+    };
+    for row in data[0].chunks_exact(GEOMETRY * 4) {
+        let row: [f32; GEOMETRY] = bytemuck::pod_read_unaligned(row);
+        out.v_means.push([row[0], row[1], row[2]]);
+        out.v_scales.push([row[3], row[4], row[5]]);
+        out.v_quats.push([row[6], row[7], row[8], row[9]]);
+        out.v_opacities.push(row[10]);
+    }
+    // Few enough to be summed in f64, in their order.
+    let mut camera_sum = [0.0f64; CAMERA];
+    for row in data[2].chunks_exact(CAMERA * 4) {
+        let row: [f32; CAMERA] = bytemuck::pod_read_unaligned(row);
+        for (sum, v) in camera_sum.iter_mut().zip(row) {
+            *sum += f64::from(v);
+        }
+    }
+    out.v_viewmat = std::array::from_fn(|r| std::array::from_fn(|c| camera_sum[4 * r + c]));
+    out.v_intrinsics = std::array::from_fn(|k| camera_sum[12 + k]);
+    Ok(out)
+}

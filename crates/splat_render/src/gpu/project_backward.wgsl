@@ -1,0 +1,218 @@
+// project_backward: gradients of the 2D splats to gradients of the splats and the camera. Follows
+// shared.wgsl and geometry.wgsl; formulas and names as in reference/project_backward.rs.
+
+@group(0) @binding(4) var<storage, read> splats2d: array<Splat2d>;
+// GRADIENT floats per splat: mean 2, covariance 3, depth, colour 3, opacity.
+@group(0) @binding(5) var<storage, read> v_splats2d: array<f32>;
+@group(0) @binding(6) var<storage, read_write> v_geometry: array<f32>;
+@group(0) @binding(7) var<storage, read_write> v_colors: array<f32>;
+// CAMERA floats per workgroup: rows of the 3x4 viewmat, fx, fy, cx, cy.
+@group(0) @binding(8) var<storage, read_write> v_camera: array<f32>;
+
+var<workgroup> camera_sums: array<array<f32, 64>, CAMERA>;
+
+fn quat_gradient(quat: vec4<f32>, v: mat3x3<f32>) -> vec4<f32> {
+    let w = quat.x;
+    let x = quat.y;
+    let y = quat.z;
+    let z = quat.w;
+    // v[c][r] is the gradient of R[r][c].
+    return 2.0 * vec4(
+        x * (v[1].z - v[2].y) + y * (v[2].x - v[0].z) + z * (v[0].y - v[1].x),
+        -2.0 * x * (v[1].y + v[2].z) + y * (v[1].x + v[0].y) + z * (v[2].x + v[0].z)
+            + w * (v[1].z - v[2].y),
+        x * (v[1].x + v[0].y) - 2.0 * y * (v[0].x + v[2].z) + z * (v[2].y + v[1].z)
+            + w * (v[2].x - v[0].z),
+        x * (v[2].x + v[0].z) + y * (v[2].y + v[1].z) - 2.0 * z * (v[0].x + v[1].y)
+            + w * (v[0].y - v[1].x),
+    );
+}
+
+// a b^T
+fn outer(a: vec3<f32>, b: vec3<f32>) -> mat3x3<f32> {
+    return mat3x3(a * b.x, a * b.y, a * b.z);
+}
+
+fn write_zeros(i: u32) {
+    for (var k = 0u; k < GEOMETRY; k++) {
+        v_geometry[i * GEOMETRY + k] = 0.0;
+    }
+    let rows = max(view.sh_stride, 1u);
+    for (var k = 0u; k < 3u * rows; k++) {
+        v_colors[3u * i * rows + k] = 0.0;
+    }
+}
+
+fn splat_backward(i: u32) -> array<f32, CAMERA> {
+    var camera: array<f32, CAMERA>;
+    if all(splats2d[i].radii == vec2(0.0)) {
+        write_zeros(i);
+        return camera;
+    }
+    let g = load_geometry(i);
+    if !g.visible {
+        write_zeros(i);
+        return camera;
+    }
+    let at = i * GRADIENT;
+    let v_center = vec2(v_splats2d[at], v_splats2d[at + 1u]);
+    let v_xx = v_splats2d[at + 2u];
+    let v_xy = v_splats2d[at + 3u];
+    let v_yy = v_splats2d[at + 4u];
+    let v_depth = v_splats2d[at + 5u];
+    var v_color = vec3(v_splats2d[at + 6u], v_splats2d[at + 7u], v_splats2d[at + 8u]);
+    let v_opacity = v_splats2d[at + 9u];
+    let z = g.t.z;
+    let xy = g.t.xy / z;
+    let per_z = view.focal / z;
+    var v_t = vec3(0.0);
+    var v_rotation = mat3x3<f32>();
+    var finite = true;
+
+    // Colour and, through the view direction, t and the rotation.
+    if view.sh_stride == 0u {
+        v_colors[3u * i] = v_color.x;
+        v_colors[3u * i + 1u] = v_color.y;
+        v_colors[3u * i + 2u] = v_color.z;
+    } else {
+        let direction = view_direction(g.t);
+        v_color = select(vec3(0.0), v_color, sh_color(i, direction.xyz) > vec3(0.0));
+        var v_direction = vec3(0.0);
+        let count = (view.sh_degree + 1u) * (view.sh_degree + 1u);
+        for (var k = 0u; k < view.sh_stride; k++) {
+            var v_coefficient = vec3(0.0);
+            let row = i * view.sh_stride + k;
+            if k < count {
+                let term = sh_term(k, direction.xyz);
+                v_coefficient = term.value * v_color;
+                v_direction += term.derivative * dot(v_color, coefficient(row));
+            }
+            v_colors[3u * row] = v_coefficient.x;
+            v_colors[3u * row + 1u] = v_coefficient.y;
+            v_colors[3u * row + 2u] = v_coefficient.z;
+        }
+        let v_along =
+            (v_direction - direction.xyz * dot(direction.xyz, v_direction)) / direction.w;
+        v_t += to_camera(v_along);
+        v_rotation += outer(g.t, v_along);
+    }
+
+    // 2D covariance -> M = J R A S.
+    let v_m0 = 2.0 * v_xx * g.m0 + v_xy * g.m1;
+    let v_m1 = 2.0 * v_yy * g.m1 + v_xy * g.m0;
+    var v_scales = v_m0 * g.b0 + v_m1 * g.b1;
+    let v_b0 = v_m0 * g.scales;
+    let v_b1 = v_m1 * g.scales;
+
+    // Axes -> quaternion, through its normalisation.
+    let v_unit = quat_gradient(g.quat, outer(g.a0, v_b0) + outer(g.a1, v_b1));
+    let v_quat = (v_unit - dot(v_unit, g.quat) * g.quat) / g.quat_norm;
+
+    // a = J R.
+    let v_a0 = g.axes * v_b0;
+    let v_a1 = g.axes * v_b1;
+    let v_j00 = dot(v_a0, rotation_row(0u));
+    let v_j02 = dot(v_a0, rotation_row(2u));
+    let v_j11 = dot(v_a1, rotation_row(1u));
+    let v_j12 = dot(v_a1, rotation_row(2u));
+    v_rotation += transpose(mat3x3(
+        v_a0 * per_z.x,
+        v_a1 * per_z.y,
+        -(v_a0 * (per_z.x * g.ratio.x)) - v_a1 * (per_z.y * g.ratio.y),
+    ));
+
+    // J, with x/z and y/z held where they are limited.
+    var v_focal = vec2(v_j00 - v_j02 * g.ratio.x, v_j11 - v_j12 * g.ratio.y) / z;
+    var v_principal = vec2(0.0);
+    v_t.z += (per_z.x * (v_j02 * g.ratio.x - v_j00) + per_z.y * (v_j12 * g.ratio.y - v_j11)) / z;
+    let v_ratio = -vec2(v_j02, v_j12) * per_z;
+    if g.inside.x {
+        v_t.x += v_ratio.x / z;
+        v_t.z -= v_ratio.x * xy.x / z;
+    } else {
+        // The limit is an affine function of cx, over fx.
+        v_focal.x -= v_ratio.x * g.ratio.x / view.focal.x;
+        v_principal.x -= v_ratio.x / view.focal.x;
+    }
+    if g.inside.y {
+        v_t.y += v_ratio.y / z;
+        v_t.z -= v_ratio.y * xy.y / z;
+    } else {
+        v_focal.y -= v_ratio.y * g.ratio.y / view.focal.y;
+        v_principal.y -= v_ratio.y / view.focal.y;
+    }
+
+    // Centre and depth.
+    v_focal += v_center * xy;
+    v_principal += v_center;
+    v_t += vec3(v_center * per_z, v_depth - dot(v_center * per_z, xy));
+
+    // t = R mean + translation.
+    let base = i * GEOMETRY;
+    let mean = vec3(geometry[base], geometry[base + 1u], geometry[base + 2u]);
+    let v_mean = to_world(v_t);
+    v_rotation += outer(v_t, mean);
+
+    var v_given_opacity = v_opacity;
+    if view.raw == 1u {
+        v_scales *= g.scales;
+        v_given_opacity *= g.opacity * (1.0 - g.opacity);
+    }
+    var row = array<f32, GEOMETRY>(
+        v_mean.x, v_mean.y, v_mean.z,
+        v_scales.x, v_scales.y, v_scales.z,
+        v_quat.x, v_quat.y, v_quat.z, v_quat.w,
+        v_given_opacity,
+    );
+    for (var r = 0u; r < 3u; r++) {
+        for (var c = 0u; c < 3u; c++) {
+            camera[4u * r + c] = v_rotation[c][r];
+        }
+        camera[4u * r + 3u] = v_t[r];
+    }
+    camera[12] = v_focal.x;
+    camera[13] = v_focal.y;
+    camera[14] = v_principal.x;
+    camera[15] = v_principal.y;
+    // A gradient that leaves f32 says nothing of where to go; as zero it harms nothing.
+    for (var k = 0u; k < GEOMETRY; k++) {
+        finite = finite && is_finite(row[k]);
+    }
+    for (var k = 0u; k < CAMERA; k++) {
+        finite = finite && is_finite(camera[k]);
+    }
+    if !finite {
+        write_zeros(i);
+        return array<f32, CAMERA>();
+    }
+    for (var k = 0u; k < GEOMETRY; k++) {
+        v_geometry[base + k] = row[k];
+    }
+    return camera;
+}
+
+@compute @workgroup_size(64)
+fn project_backward(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let i = linear_index(workgroup, groups, local, 64u);
+    var camera: array<f32, CAMERA>;
+    if i < window.count {
+        camera = splat_backward(i);
+    }
+    for (var k = 0u; k < CAMERA; k++) {
+        camera_sums[k][local] = camera[k];
+    }
+    workgroupBarrier();
+    // One thread per entry adds the workgroup's splats in their order.
+    if local < CAMERA {
+        var sum = 0.0;
+        for (var k = 0u; k < 64u; k++) {
+            sum += camera_sums[local][k];
+        }
+        let first_group = window.first / 64u;
+        v_camera[(first_group + workgroup.y * groups.x + workgroup.x) * CAMERA + local] = sum;
+    }
+}

@@ -1,0 +1,128 @@
+//! rasterize_backward: gradients of the picture to gradients of the 2D splats.
+
+use super::bin::{PairBins, SplatBins, TileChunk};
+use super::device::{Gpu, Op};
+use super::layout::GRADIENT;
+use super::rasterize::Binned;
+use super::shaders::Kernel;
+use crate::error::Result;
+use crate::stages::{Image, ImageGradients, Projected, ProjectedGradients};
+
+/// What the kernels read and write.
+#[derive(Debug)]
+pub(super) struct BackwardBuffers {
+    /// `[H * W]` gradients of colour and accumulated depth.
+    pub v_picture: wgpu::Buffer,
+    /// `[H * W]` colour . v_color + depth v_depth - transmittance v_alpha.
+    pub totals: wgpu::Buffer,
+    /// `[pairs * GRADIENT]`
+    pub slots: wgpu::Buffer,
+    /// `[N * GRADIENT]`
+    pub v_splats2d: wgpu::Buffer,
+}
+
+/// Differentiates a chunk's tiles, whose pair lists are filled, and adds to the splats' gradients.
+pub(super) fn rasterize_backward_ops(
+    gpu: &Gpu,
+    view: &wgpu::Buffer,
+    chunk: &TileChunk,
+    splats2d: &wgpu::Buffer,
+    bins: &SplatBins,
+    pairs: &PairBins,
+    buffers: &BackwardBuffers,
+) -> Vec<Op> {
+    vec![
+        // Slots behind a tile's early stop are never written.
+        Op::Clear(buffers.slots.clone()),
+        gpu.op(
+            Kernel::RasterizeBackward,
+            &[
+                view.into(),
+                (&chunk.uniform).into(),
+                splats2d.into(),
+                (&pairs.tile_begin).into(),
+                (&pairs.splat_from_pair).into(),
+                pairs.slot_from_pair(chunk.tiles()).into(),
+                (&buffers.v_picture).into(),
+                (&buffers.totals).into(),
+                (&buffers.slots).into(),
+            ],
+            Gpu::groups(chunk.tiles(), 1),
+        ),
+        gpu.op(
+            Kernel::RasterizeBackwardSum,
+            &[
+                (&chunk.uniform).into(),
+                (&bins.status).into(),
+                splats2d.into(),
+                bins.order().into(),
+                (&bins.offsets).into(),
+                (&buffers.slots).into(),
+                (&buffers.v_splats2d).into(),
+            ],
+            Gpu::groups(chunk.chunk.splats, 64),
+        ),
+    ]
+}
+
+pub(super) fn rasterize_backward(
+    gpu: &Gpu,
+    projected: &Projected<f32>,
+    background: [f32; 3],
+    image: &Image<f32>,
+    v_image: &ImageGradients<f32>,
+) -> Result<ProjectedGradients<f32>> {
+    let pixels = image.color.len();
+    let mut v_picture = Vec::with_capacity(pixels);
+    let mut totals = Vec::with_capacity(pixels);
+    let mut v_background = [0.0f64; 3];
+    for i in 0..pixels {
+        let [r, g, b] = v_image.v_color[i];
+        v_picture.push([r, g, b, v_image.v_depth[i]]);
+        let transmittance = f64::from(image.transmittance[i]);
+        let mut total = f64::from(image.depth[i]) * f64::from(v_image.v_depth[i])
+            - transmittance * f64::from(v_image.v_alpha[i]);
+        for c in 0..3 {
+            let v = f64::from(v_image.v_color[i][c]);
+            total += f64::from(image.color[i][c]) * v;
+            v_background[c] += transmittance * v;
+        }
+        totals.push(total as f32);
+    }
+    let row = GRADIENT as u64 * 4;
+    gpu.bindable_bytes("v_picture", 16 * pixels as u64)?;
+    let binned = Binned::new(gpu, projected, background)?;
+    let buffers = BackwardBuffers {
+        v_picture: gpu.upload("v_picture", &v_picture)?,
+        totals: gpu.upload("totals", &totals)?,
+        slots: gpu.bindable("gradient slots", row * u64::from(binned.capacity))?,
+        v_splats2d: gpu.bindable("v_splats2d", row * u64::from(binned.splats))?,
+    };
+    let mut ops = Vec::new();
+    for chunk in &binned.chunks {
+        ops.extend(binned.chunk_ops(gpu, chunk));
+        ops.extend(rasterize_backward_ops(
+            gpu,
+            &binned.view,
+            chunk,
+            &binned.splats2d,
+            &binned.bins,
+            &binned.pairs,
+            &buffers,
+        ));
+    }
+    let data = gpu.download(&ops, &[(&buffers.v_splats2d, row * u64::from(binned.splats))])?;
+    let mut out = ProjectedGradients {
+        v_background: v_background.map(|v| v as f32),
+        ..ProjectedGradients::default()
+    };
+    for bytes in data[0].chunks_exact(GRADIENT * 4) {
+        let row: [f32; GRADIENT] = bytemuck::pod_read_unaligned(bytes);
+        out.v_means2d.push([row[0], row[1]]);
+        out.v_covars2d.push([row[2], row[3], row[4]]);
+        out.v_depths.push(row[5]);
+        out.v_colors.push([row[6], row[7], row[8]]);
+        out.v_opacities.push(row[9]);
+    }
+    Ok(out)
+}

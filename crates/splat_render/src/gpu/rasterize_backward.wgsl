@@ -1,0 +1,177 @@
+// rasterize_backward: gradients of the picture to a gradient per (splat, tile) pair, each in its
+// own slot. Walks front to back like rasterize, so that both round and stop alike; what lies
+// behind the current splat is what is left of the pixel's total. Follows shared.wgsl.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> chunk: Chunk;
+@group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
+@group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
+@group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
+@group(0) @binding(5) var<storage, read> slot_from_pair: array<u32>;
+// Gradients of colour (xyz) and accumulated depth (w).
+@group(0) @binding(6) var<storage, read> v_picture: array<vec4<f32>>;
+// Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included.
+@group(0) @binding(7) var<storage, read> totals: array<f32>;
+// GRADIENT floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma,
+// then depth, colour 3, opacity.
+@group(0) @binding(8) var<storage, read_write> slots: array<f32>;
+
+const THREADS = 32u;
+// Splats between two barriers: 60 sums occupy 32 threads almost twice.
+const BATCH = 6u;
+// One more than the threads, so that a column's entries lie in different memory banks.
+const STRIDE = 33u;
+
+// [splat of the batch][entry][thread]
+var<workgroup> partials: array<f32, 1980>; // BATCH * GRADIENT * STRIDE
+var<workgroup> any_live: u32;
+
+// Four neighbouring pixels.
+struct Quad {
+    center_x: vec4<f32>,
+    center_y: f32,
+    live: vec4<bool>,
+    transmittance: vec4<f32>,
+    // Sum over what is still to come, of weight times value times gradient.
+    remaining: vec4<f32>,
+    v_red: vec4<f32>,
+    v_green: vec4<f32>,
+    v_blue: vec4<f32>,
+    v_depth: vec4<f32>,
+}
+
+struct Sums {
+    u: vec4<f32>,
+    v: vec4<f32>,
+    uu: vec4<f32>,
+    uv: vec4<f32>,
+    vv: vec4<f32>,
+    depth: vec4<f32>,
+    red: vec4<f32>,
+    green: vec4<f32>,
+    blue: vec4<f32>,
+    opacity: vec4<f32>,
+}
+
+fn load_quad(x: u32, y: u32) -> Quad {
+    var quad: Quad;
+    quad.center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
+    quad.center_y = f32(y) + 0.5;
+    quad.transmittance = vec4(1.0);
+    for (var k = 0u; k < 4u; k++) {
+        if x + k < view.width && y < view.height {
+            let pixel = y * view.width + x + k;
+            let gradient = v_picture[pixel];
+            quad.live[k] = true;
+            quad.remaining[k] = totals[pixel];
+            quad.v_red[k] = gradient.x;
+            quad.v_green[k] = gradient.y;
+            quad.v_blue[k] = gradient.z;
+            quad.v_depth[k] = gradient.w;
+        }
+    }
+    return quad;
+}
+
+fn accumulate(quad: ptr<function, Quad>, splat: Splat2d, sums: ptr<function, Sums>) {
+    let dy = (*quad).center_y - splat.mean.y;
+    let u = splat.pq.x * ((*quad).center_x - splat.mean.x) + splat.pq.y * dy;
+    let v = splat.r * dy;
+    let exponent = max(-0.5 * (u * u + v * v), vec4(-80.0));
+    let gaussian = exp_accurate4(exponent);
+    let uncapped = splat.opacity * gaussian;
+    let alpha = min(uncapped, vec4(ALPHA_MAX));
+    let transmittance = (*quad).transmittance;
+    let next = transmittance * (1.0 - alpha);
+    let hit = (*quad).live & (alpha >= vec4(ALPHA_MIN));
+    let stops = hit & (next < vec4(TRANSMITTANCE_MIN));
+    let live = (*quad).live & !stops;
+    let adds = hit & live;
+    let weight = select(vec4(0.0), transmittance * alpha, adds);
+    let own = splat.color.x * (*quad).v_red + splat.color.y * (*quad).v_green
+        + splat.color.z * (*quad).v_blue + splat.depth * (*quad).v_depth;
+    let remaining = (*quad).remaining - weight * own;
+    // The cap has no slope.
+    let differs = adds & (uncapped <= vec4(ALPHA_MAX));
+    let v_alpha = select(
+        vec4(0.0),
+        transmittance * own - remaining / (1.0 - alpha),
+        differs,
+    );
+    let g = -alpha * v_alpha;
+    let gu = g * u;
+    let gv = g * v;
+    (*sums).u += gu;
+    (*sums).v += gv;
+    (*sums).uu += gu * u;
+    (*sums).uv += gu * v;
+    (*sums).vv += gv * v;
+    (*sums).depth += weight * (*quad).v_depth;
+    (*sums).red += weight * (*quad).v_red;
+    (*sums).green += weight * (*quad).v_green;
+    (*sums).blue += weight * (*quad).v_blue;
+    (*sums).opacity += gaussian * v_alpha;
+    (*quad).live = live;
+    (*quad).remaining = remaining;
+    (*quad).transmittance = select(transmittance, next, adds);
+}
+
+fn total(x: vec4<f32>) -> f32 {
+    return (x.x + x.y) + (x.z + x.w);
+}
+
+@compute @workgroup_size(4, 8)
+fn rasterize_backward(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_id) local: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let relative = workgroup.y * groups.x + workgroup.x;
+    let tile = chunk.tile_begin + relative;
+    if tile >= chunk.tile_end {
+        return;
+    }
+    let x = (tile % view.tiles_x) * TILE + 4u * local.x;
+    let y = (tile / view.tiles_x) * TILE + 2u * local.y;
+    var upper = load_quad(x, y);
+    var lower = load_quad(x, y + 1u);
+    let begin = tile_begin[relative];
+    let end = tile_begin[relative + 1u];
+    for (var batch = begin; batch < end; batch += BATCH) {
+        let count = min(BATCH, end - batch);
+        for (var b = 0u; b < count; b++) {
+            let splat = splats2d[splat_from_pair[batch + b]];
+            var sums = Sums();
+            accumulate(&upper, splat, &sums);
+            accumulate(&lower, splat, &sums);
+            let at = b * GRADIENT * STRIDE + thread;
+            partials[at] = total(sums.u);
+            partials[at + STRIDE] = total(sums.v);
+            partials[at + 2u * STRIDE] = total(sums.uu);
+            partials[at + 3u * STRIDE] = total(sums.uv);
+            partials[at + 4u * STRIDE] = total(sums.vv);
+            partials[at + 5u * STRIDE] = total(sums.depth);
+            partials[at + 6u * STRIDE] = total(sums.red);
+            partials[at + 7u * STRIDE] = total(sums.green);
+            partials[at + 8u * STRIDE] = total(sums.blue);
+            partials[at + 9u * STRIDE] = total(sums.opacity);
+        }
+        if any(upper.live | lower.live) {
+            any_live = 1u;
+        }
+        let goes_on = workgroupUniformLoad(&any_live);
+        for (var entry = thread; entry < count * GRADIENT; entry += THREADS) {
+            var sum = 0.0;
+            for (var k = 0u; k < THREADS; k++) {
+                sum += partials[entry * STRIDE + k];
+            }
+            slots[slot_from_pair[batch + entry / GRADIENT] * GRADIENT + entry % GRADIENT] = sum;
+        }
+        if goes_on == 0u {
+            break;
+        }
+        any_live = 0u;
+        workgroupBarrier();
+    }
+}

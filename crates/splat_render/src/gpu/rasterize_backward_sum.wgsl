@@ -1,0 +1,58 @@
+// rasterize_backward_sum: adds a splat's slots in their order and finishes the moments to the
+// gradients of its centre and covariance. Follows shared.wgsl.
+
+@group(0) @binding(0) var<uniform> chunk: Chunk;
+@group(0) @binding(1) var<storage, read> status: Status;
+@group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
+@group(0) @binding(3) var<storage, read> order: array<u32>;
+@group(0) @binding(4) var<storage, read> offsets: array<u32>;
+@group(0) @binding(5) var<storage, read> slots: array<f32>;
+// GRADIENT floats per splat: mean 2, covariance 3, depth, colour 3, opacity; raw sums until the
+// picture's last chunk.
+@group(0) @binding(6) var<storage, read_write> v_splats2d: array<f32>;
+
+@compute @workgroup_size(64)
+fn rasterize_backward_sum(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let rank = linear_index(workgroup, groups, local, 64u);
+    if rank >= chunk.splats || status.overflow != 0u {
+        return;
+    }
+    let i = order[rank];
+    var sums: array<f32, GRADIENT>;
+    if chunk.is_first == 0u {
+        for (var k = 0u; k < GRADIENT; k++) {
+            sums[k] = v_splats2d[i * GRADIENT + k];
+        }
+    }
+    let end = offsets[rank + 1u];
+    for (var slot = offsets[rank]; slot < end; slot++) {
+        for (var k = 0u; k < GRADIENT; k++) {
+            sums[k] += slots[slot * GRADIENT + k];
+        }
+    }
+    if chunk.is_last == 1u {
+        let splat = splats2d[i];
+        let p = splat.pq.x;
+        let q = splat.pq.y;
+        let r = splat.r;
+        // sigma = |F d|^2 / 2 and C^-1 = F^T F: d sigma / d mean = -F^T (u, v) and
+        // d sigma / d C = -F^T (u, v) (u, v)^T F / 2.
+        let u = sums[0];
+        let v = sums[1];
+        let uu = sums[2];
+        let uv = sums[3];
+        let vv = sums[4];
+        sums[0] = -p * u;
+        sums[1] = -(q * u + r * v);
+        sums[2] = -0.5 * p * p * uu;
+        sums[3] = -p * (q * uu + r * uv);
+        sums[4] = -0.5 * (q * q * uu + 2.0 * q * r * uv + r * r * vv);
+    }
+    for (var k = 0u; k < GRADIENT; k++) {
+        v_splats2d[i * GRADIENT + k] = select(0.0, sums[k], is_finite(sums[k]));
+    }
+}

@@ -1,0 +1,355 @@
+//! The WGSL sources with their bindings, and the constants that are written into them.
+
+use std::fmt::Write;
+
+use super::layout::{CAMERA, GEOMETRY, GRADIENT};
+use crate::constants::{ALPHA_MAX, ALPHA_MIN, QUAT_NORM2_MIN, TILE, TRANSMITTANCE_MIN};
+use crate::sh;
+
+/// What a binding is to a shader.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Access {
+    Uniform,
+    Read,
+    Write,
+}
+
+use Access::{Read, Uniform, Write as ReadWrite};
+
+/// A WGSL file: its text and the kinds of its bindings, in the order of their numbers.
+#[derive(Debug)]
+pub(super) struct Source {
+    pub name: &'static str,
+    pub parts: &'static [&'static str],
+    pub bindings: &'static [Access],
+    /// Whether the file has the override `SEGMENTS`.
+    pub segmented: bool,
+}
+
+const SHARED: &str = include_str!("shared.wgsl");
+const GEOMETRY_WGSL: &str = include_str!("geometry.wgsl");
+const BIN_TILES: &str = include_str!("bin_tiles.wgsl");
+
+/// All shader files.
+pub(super) static SOURCES: [Source; 10] = [
+    Source {
+        name: "project",
+        parts: &[SHARED, GEOMETRY_WGSL, include_str!("project.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "project_backward",
+        parts: &[SHARED, GEOMETRY_WGSL, include_str!("project_backward.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "bin_count",
+        parts: &[SHARED, BIN_TILES, include_str!("bin_count.wgsl")],
+        bindings: &[Uniform, Uniform, Read, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "bin_scan",
+        parts: &[SHARED, include_str!("bin_scan.wgsl")],
+        bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite],
+        segmented: true,
+    },
+    Source {
+        name: "bin_emit",
+        parts: &[SHARED, BIN_TILES, include_str!("bin_emit.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "bin_sort",
+        parts: &[SHARED, include_str!("bin_sort.wgsl")],
+        bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+        segmented: true,
+    },
+    Source {
+        name: "bin_ranges",
+        parts: &[SHARED, include_str!("bin_ranges.wgsl")],
+        bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "rasterize",
+        parts: &[SHARED, include_str!("rasterize.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "rasterize_backward",
+        parts: &[SHARED, include_str!("rasterize_backward.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, Read, Read, Read, Read, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "rasterize_backward_sum",
+        parts: &[SHARED, include_str!("rasterize_backward_sum.wgsl")],
+        bindings: &[Uniform, Read, Read, Read, Read, Read, ReadWrite],
+        segmented: false,
+    },
+];
+
+/// The kernels: entry points of [`SOURCES`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kernel {
+    Project,
+    ProjectBackward,
+    DepthKeys,
+    TileCounts,
+    ScanSums,
+    ScanApply,
+    Emit,
+    SortHistogram,
+    SortScan,
+    SortScatter,
+    Ranges,
+    Rasterize,
+    RasterizeBackward,
+    RasterizeBackwardSum,
+}
+
+impl Kernel {
+    /// Every kernel, in the order of their numbers.
+    pub const ALL: [Self; 14] = [
+        Self::Project,
+        Self::ProjectBackward,
+        Self::DepthKeys,
+        Self::TileCounts,
+        Self::ScanSums,
+        Self::ScanApply,
+        Self::Emit,
+        Self::SortHistogram,
+        Self::SortScan,
+        Self::SortScatter,
+        Self::Ranges,
+        Self::Rasterize,
+        Self::RasterizeBackward,
+        Self::RasterizeBackwardSum,
+    ];
+
+    /// (file, entry point)
+    pub fn entry(self) -> (&'static str, &'static str) {
+        match self {
+            Self::Project => ("project", "project"),
+            Self::ProjectBackward => ("project_backward", "project_backward"),
+            Self::DepthKeys => ("bin_count", "depth_keys"),
+            Self::TileCounts => ("bin_count", "tile_counts"),
+            Self::ScanSums => ("bin_scan", "scan_sums"),
+            Self::ScanApply => ("bin_scan", "scan_apply"),
+            Self::Emit => ("bin_emit", "emit"),
+            Self::SortHistogram => ("bin_sort", "sort_histogram"),
+            Self::SortScan => ("bin_sort", "sort_scan"),
+            Self::SortScatter => ("bin_sort", "sort_scatter"),
+            Self::Ranges => ("bin_ranges", "ranges"),
+            Self::Rasterize => ("rasterize", "rasterize"),
+            Self::RasterizeBackward => ("rasterize_backward", "rasterize_backward"),
+            Self::RasterizeBackwardSum => ("rasterize_backward_sum", "rasterize_backward_sum"),
+        }
+    }
+}
+
+/// Constants of the crate as WGSL, so that no shader repeats a value by hand.
+fn constants() -> String {
+    let mut out = String::new();
+    for (name, value) in [("TILE", TILE), ("GEOMETRY", GEOMETRY as u32)]
+        .into_iter()
+        .chain([("GRADIENT", GRADIENT as u32), ("CAMERA", CAMERA as u32)])
+    {
+        let _ = writeln!(out, "const {name} = {value}u;");
+    }
+    let floats = [
+        ("ALPHA_MIN", ALPHA_MIN),
+        ("ALPHA_MAX", ALPHA_MAX),
+        ("TRANSMITTANCE_MIN", TRANSMITTANCE_MIN),
+        ("QUAT_NORM2_MIN", QUAT_NORM2_MIN),
+        ("SH_C0", sh::C0 as f32),
+        ("SH_C1", sh::C1 as f32),
+        ("SH_C4_HALF", sh::C4_HALF as f32),
+    ];
+    for (name, value) in floats {
+        // `{:e}` prints the shortest decimal that reads back as the same f32.
+        let _ = writeln!(out, "const {name} = {value:e}f;");
+    }
+    let tables = [("SH_C2", &sh::C2[..]), ("SH_C3", &sh::C3[..]), ("SH_C4", &sh::C4[..])];
+    for (name, values) in tables {
+        for (i, value) in values.iter().enumerate() {
+            let _ = writeln!(out, "const {name}_{i} = {:e}f;", *value as f32);
+        }
+    }
+    out
+}
+
+impl Source {
+    /// The whole text that is compiled.
+    pub fn text(&self) -> String {
+        let mut text = constants();
+        for part in self.parts {
+            text.push_str(part);
+        }
+        text
+    }
+
+    /// The file of that name.
+    pub fn named(name: &str) -> &'static Self {
+        SOURCES.iter().find(|source| source.name == name).unwrap_or(&SOURCES[0])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::mem::offset_of;
+
+    use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+    use super::*;
+    use crate::gpu::layout::{Chunk, ChunkCount, SortPass, Splat2d, StatusHead, View, Window};
+
+    fn parse(source: &Source) -> naga::Module {
+        naga::front::wgsl::parse_str(&source.text())
+            .unwrap_or_else(|e| panic!("{}: {}", source.name, e.emit_to_string(&source.text())))
+    }
+
+    #[test]
+    fn every_shader_is_valid_without_optional_capabilities() {
+        for source in &SOURCES {
+            let module = parse(source);
+            let result =
+                Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module);
+            if let Err(error) = result {
+                panic!("{}: {}", source.name, error.emit_to_string(&source.text()));
+            }
+        }
+    }
+
+    #[test]
+    fn kernels_name_entry_points_and_stay_within_default_limits() {
+        for kernel in Kernel::ALL {
+            let (file, entry) = kernel.entry();
+            let source = Source::named(file);
+            assert_eq!(source.name, file);
+            let module = parse(source);
+            let found = module.entry_points.iter().find(|e| e.name == entry);
+            let size = found.unwrap_or_else(|| panic!("{file} has no {entry}")).workgroup_size;
+            assert!(size.iter().product::<u32>() <= 256, "{file}: {size:?} invocations");
+        }
+        for source in &SOURCES {
+            let storage = source.bindings.iter().filter(|&&b| b != Uniform).count();
+            assert!(storage <= 8, "{} has {storage} storage buffers", source.name);
+            let module = parse(source);
+            let mut layouter = naga::proc::Layouter::default();
+            layouter.update(module.to_ctx()).expect("layout");
+            let workgroup: u32 = module
+                .global_variables
+                .iter()
+                .filter(|(_, v)| v.space == naga::AddressSpace::WorkGroup)
+                .map(|(_, v)| layouter[v.ty].size)
+                .sum();
+            assert!(workgroup <= 16_384, "{} uses {workgroup} bytes per workgroup", source.name);
+        }
+    }
+
+    #[test]
+    fn bindings_are_declared_as_bound() {
+        for source in &SOURCES {
+            let module = parse(source);
+            let mut declared = vec![None; source.bindings.len()];
+            for (_, variable) in module.global_variables.iter() {
+                let Some(binding) = &variable.binding else { continue };
+                declared[binding.binding as usize] = Some(match variable.space {
+                    naga::AddressSpace::Uniform => Uniform,
+                    naga::AddressSpace::Storage { access }
+                        if access.contains(naga::StorageAccess::STORE) =>
+                    {
+                        ReadWrite
+                    }
+                    _ => Read,
+                });
+            }
+            let expected: Vec<_> = source.bindings.iter().copied().map(Some).collect();
+            assert_eq!(declared, expected, "{}", source.name);
+        }
+    }
+
+    /// Asserts a struct's members and size against naga's layout of the WGSL struct.
+    fn assert_layout(file: &str, name: &str, size: usize, members: &[(&str, usize)]) {
+        let module = parse(Source::named(file));
+        let (_, ty) = module
+            .types
+            .iter()
+            .find(|(_, t)| t.name.as_deref() == Some(name))
+            .unwrap_or_else(|| panic!("{file} has no struct {name}"));
+        let naga::TypeInner::Struct { members: found, span } = &ty.inner else {
+            panic!("{name} is no struct")
+        };
+        let found: Vec<_> = found
+            .iter()
+            .map(|m| (m.name.as_deref().unwrap_or_default(), m.offset as usize))
+            .collect();
+        assert_eq!(found, members, "{name}");
+        assert_eq!(*span as usize, size, "{name}");
+    }
+
+    macro_rules! layout {
+        ($file:literal, $type:ident, $($member:ident),+) => {
+            assert_layout(
+                $file,
+                stringify!($type),
+                size_of::<$type>(),
+                &[$((stringify!($member), offset_of!($type, $member))),+],
+            )
+        };
+    }
+
+    #[test]
+    fn rust_and_wgsl_agree_on_layouts() {
+        layout!(
+            "project",
+            View,
+            world_to_camera,
+            jacobian_limits,
+            focal,
+            principal,
+            background,
+            near,
+            far,
+            blur,
+            width,
+            height,
+            tiles_x,
+            sh_degree,
+            sh_stride,
+            raw
+        );
+        layout!("project", Window, first, count);
+        layout!(
+            "bin_count",
+            Chunk,
+            tile_begin,
+            tile_end,
+            capacity,
+            splats,
+            index,
+            is_first,
+            is_last
+        );
+        layout!("bin_sort", SortPass, shift, chunk);
+        layout!("project", Splat2d, mean, pq, color, r, depth, opacity, radii);
+        layout!("bin_scan", ChunkCount, pairs, total);
+        assert_layout(
+            "bin_scan",
+            "Status",
+            // A trailing runtime array counts as one element.
+            size_of::<StatusHead>() + size_of::<ChunkCount>(),
+            &[
+                ("splats", offset_of!(StatusHead, splats)),
+                ("overflow", offset_of!(StatusHead, overflow)),
+                ("chunks", size_of::<StatusHead>()),
+            ],
+        );
+    }
+}
