@@ -149,7 +149,8 @@ def _load(path: Path, holdout: int | None) -> Capture:
 
 
 def _console() -> Console:
-    return Console(file=sys.stdout, highlight=False)
+    # Paths stay whole: a terminal breaks long lines by itself.
+    return Console(file=sys.stdout, highlight=False, soft_wrap=True)
 
 
 def _print_json(value: dict[str, Any]) -> None:

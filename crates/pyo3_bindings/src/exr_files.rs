@@ -45,7 +45,7 @@ pub fn write_exr(
     let layer = Layer::new(
         (width, height),
         LayerAttributes::default(),
-        Encoding::FAST_LOSSLESS,
+        Encoding::SMALL_LOSSLESS,
         AnyChannels::sort(channels),
     );
     py.detach(|| Image::from_layer(layer).write().to_file(path))
