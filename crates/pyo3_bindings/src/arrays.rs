@@ -51,10 +51,8 @@ pub fn elements<'a, T: Element>(
     let fits = found.len() == shape.len()
         && found.iter().zip(shape).all(|(&f, &s)| s < 0 || usize::try_from(s) == Ok(f));
     if !fits {
-        let wanted: Vec<String> = shape
-            .iter()
-            .map(|&s| if s < 0 { "*".to_owned() } else { s.to_string() })
-            .collect();
+        let wanted: Vec<String> =
+            shape.iter().map(|&s| if s < 0 { "*".to_owned() } else { s.to_string() }).collect();
         return Err(PyValueError::new_err(format!(
             "{name}: must have shape [{}], not {found:?}",
             wanted.join(", ")

@@ -132,10 +132,7 @@ fn state_from(dict: &Bound<'_, PyDict>) -> PyResult<(FitState, u32)> {
     Ok((state, elements("step", &step, &[1])?[0]))
 }
 
-fn targets_from(
-    images: &Bound<'_, PyList>,
-    masks: &Bound<'_, PyList>,
-) -> PyResult<Vec<Target>> {
+fn targets_from(images: &Bound<'_, PyList>, masks: &Bound<'_, PyList>) -> PyResult<Vec<Target>> {
     if images.len() != masks.len() {
         return Err(PyValueError::new_err(format!(
             "masks: has {} entries for {} images",
@@ -201,11 +198,9 @@ impl Fitter {
         let cameras = cameras(viewmats, intrinsics, &sizes)?;
         let (state, step) = state_from(state)?;
         let device = fit_device(backend)?;
-        py.detach(|| {
-            splat_render::fit::Fitter::new(device, targets, cameras, &state, step, config)
-        })
-        .map(|fitter| Self(Mutex::new(fitter)))
-        .map_err(to_python)
+        py.detach(|| splat_render::fit::Fitter::new(device, targets, cameras, &state, step, config))
+            .map(|fitter| Self(Mutex::new(fitter)))
+            .map_err(to_python)
     }
 
     /// Does `count` steps; returns `step`, `loss` (of the last one) and `splats`.

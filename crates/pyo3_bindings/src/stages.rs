@@ -163,8 +163,7 @@ fn project_with<'py, T: Real>(
     let arrays = SplatArrays::<T>::borrow(arguments)?;
     let params = arrays.params(arguments.sh_degree, arguments.raw_parameters)?;
     let (camera, options) = (&arguments.camera, &arguments.options);
-    let projected =
-        py.detach(|| stages.project(&params, camera, options)).map_err(to_python)?;
+    let projected = py.detach(|| stages.project(&params, camera, options)).map_err(to_python)?;
     let n = [projected.len()];
     let dict = PyDict::new(py);
     dict.set_item("means2d", shaped_rows(py, projected.means2d, &n)?)?;
@@ -201,8 +200,7 @@ fn rasterize_with<'py, T: Real>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let projected = projected_from::<T>(projected, width, height)?;
     let background = row::<T, 3>("background", background)?;
-    let image =
-        py.detach(|| stages.rasterize(&projected, background)).map_err(to_python)?;
+    let image = py.detach(|| stages.rasterize(&projected, background)).map_err(to_python)?;
     let size = [height as usize, width as usize];
     let dict = PyDict::new(py);
     dict.set_item("color", shaped_rows(py, image.color, &size)?)?;

@@ -1,5 +1,7 @@
 //! adam: one optimiser step of a run of values.
 
+use pulp::{Simd, WithSimd};
+
 use crate::fit::ADAM;
 
 /// Bias corrections of one step, shared by all parameters.
@@ -17,22 +19,34 @@ impl Bias {
     }
 }
 
-/// Adam (Kingma and Ba, 2015, algorithm 1).
-#[inline(always)]
-pub(super) fn adam<const K: usize>(
-    values: &mut [f32; K],
-    first: &mut [f32; K],
-    second: &mut [f32; K],
-    gradient: [f32; K],
-    rate: f32,
-    bias: Bias,
-) {
-    let (beta1, beta2, epsilon) = ADAM;
-    for k in 0..K {
-        let g = gradient[k];
-        first[k] = beta1 * first[k] + (1.0 - beta1) * g;
-        second[k] = beta2 * second[k] + (1.0 - beta2) * g * g;
-        let size = (second[k] * bias.second).sqrt() + epsilon;
-        values[k] -= rate * (first[k] * bias.first) / size;
+/// Adam (Kingma and Ba, 2015, algorithm 1) on a run of values, each with its own rate. All slices
+/// have one length.
+pub(super) struct Adam<'a> {
+    pub values: &'a mut [f32],
+    pub first: &'a mut [f32],
+    pub second: &'a mut [f32],
+    pub gradient: &'a [f32],
+    pub rates: &'a [f32],
+    pub bias: Bias,
+}
+
+impl WithSimd for Adam<'_> {
+    type Output = ();
+
+    // A plain loop: the compiler turns it into vectors of whatever `dispatch` found.
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let (beta1, beta2, epsilon) = ADAM;
+        let n = self.values.len();
+        let (first, second) = (&mut self.first[..n], &mut self.second[..n]);
+        let (gradient, rates) = (&self.gradient[..n], &self.rates[..n]);
+        for k in 0..n {
+            let g = gradient[k];
+            let m = beta1 * first[k] + (1.0 - beta1) * g;
+            let v = beta2 * second[k] + (1.0 - beta2) * g * g;
+            let size = (v * self.bias.second).sqrt() + epsilon;
+            self.values[k] -= rates[k] * (m * self.bias.first) / size;
+            (first[k], second[k]) = (m, v);
+        }
     }
 }

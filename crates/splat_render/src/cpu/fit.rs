@@ -4,16 +4,16 @@
 use glam::{Mat3, Quat, Vec3};
 use rayon::prelude::*;
 
-use super::adam::{Bias, adam};
+use super::adam::{Adam, Bias};
 use super::bin::{Bins, CHUNK, ChunkTiles};
 use super::loss::Loss;
 use super::project::{Splat, Splat2d, View, project_splat};
-use super::project_backward::{V2d, splat_backward};
+use super::project_backward::{VSplat, splat_backward};
 use super::rasterize::{Planes, TileSplat, rasterize};
 use super::rasterize_backward::{PairSums, gather, rasterize_backward};
-use crate::constants::{SH_COEFFS_MAX, TILE};
+use crate::constants::TILE;
 use crate::error::{Error, Result};
-use crate::fit::{FitDevice, FitState, StepInput, Target, noise_normal};
+use crate::fit::{FitDevice, FitState, Rates, StepInput, Target, noise_normal};
 use crate::sh;
 use crate::stages::{Colors, ProjectOptions, SplatParams};
 
@@ -125,6 +125,58 @@ fn extent(splat: &Splat2d, width: u32, height: u32) -> f32 {
     splat.radii[0].max(splat.radii[1]) / width.max(height) as f32
 }
 
+/// Splats whose gradients are gathered before Adam runs over them: they stay in the cache.
+const BLOCK: usize = 64;
+
+/// One task's block of gradients, laid out as the parameters are.
+struct Block {
+    means: Vec<[f32; 3]>,
+    quats: Vec<[f32; 4]>,
+    scales: Vec<[f32; 3]>,
+    opacities: Vec<f32>,
+    sh: Vec<[f32; 3]>,
+}
+
+impl Block {
+    fn new(stride: usize) -> Self {
+        Self {
+            means: vec![[0.0; 3]; BLOCK],
+            quats: vec![[0.0; 4]; BLOCK],
+            scales: vec![[0.0; 3]; BLOCK],
+            opacities: vec![0.0; BLOCK],
+            sh: vec![[0.0; 3]; BLOCK * stride],
+        }
+    }
+}
+
+/// The same rates for every splat of a block, laid out as the parameters are.
+struct BlockRates {
+    means: Vec<f32>,
+    quats: Vec<f32>,
+    scales: Vec<f32>,
+    opacities: Vec<f32>,
+    sh: Vec<f32>,
+}
+
+impl BlockRates {
+    fn new(rates: &Rates, stride: usize, active: usize) -> Self {
+        let row: Vec<f32> = (0..3 * stride)
+            .map(|k| match k / 3 {
+                0 => rates.sh0,
+                c if c < active => rates.sh_rest,
+                _ => 0.0,
+            })
+            .collect();
+        Self {
+            means: vec![rates.means; 3 * BLOCK],
+            quats: vec![rates.quats; 4 * BLOCK],
+            scales: vec![rates.scales; 3 * BLOCK],
+            opacities: vec![rates.opacities; BLOCK],
+            sh: row.repeat(BLOCK),
+        }
+    }
+}
+
 impl CpuFit {
     /// project_backward, Adam, noise and density statistics.
     fn update(&mut self, view: &View, input: &StepInput<'_>, size: [f32; 2]) {
@@ -136,30 +188,31 @@ impl CpuFit {
         let (bins, tile_splats, sums) = (&self.bins, &self.splats, &self.sums);
         let opacity_pull = input.opacity_regularizer / n as f32;
         let scale_pull = input.scale_regularizer / (3 * n) as f32;
-        let rates = &input.rates;
+        let rates = BlockRates::new(&input.rates, stride, sh::coeffs(degree));
+        let arch = pulp::Arch::new();
 
-        macro_rules! chunks {
+        macro_rules! blocks {
             ($arrays:expr) => {
                 $arrays
                     .means
-                    .par_chunks_mut(CHUNK)
-                    .zip($arrays.quats.par_chunks_mut(CHUNK))
-                    .zip($arrays.scales.par_chunks_mut(CHUNK))
-                    .zip($arrays.opacities.par_chunks_mut(CHUNK))
-                    .zip($arrays.sh.par_chunks_mut(CHUNK * stride))
+                    .par_chunks_mut(BLOCK)
+                    .zip($arrays.quats.par_chunks_mut(BLOCK))
+                    .zip($arrays.scales.par_chunks_mut(BLOCK))
+                    .zip($arrays.opacities.par_chunks_mut(BLOCK))
+                    .zip($arrays.sh.par_chunks_mut(BLOCK * stride))
             };
         }
-        chunks!(values)
-            .zip(chunks!(first))
-            .zip(chunks!(second))
-            .zip(stats.grad_sum.par_chunks_mut(CHUNK))
+        blocks!(values)
+            .zip(blocks!(first))
+            .zip(blocks!(second))
+            .zip(stats.grad_sum.par_chunks_mut(BLOCK))
             .enumerate()
-            .for_each(|(chunk, (((value, first), second), grad_sum))| {
-                let ((((means, quats), scales), opacities), coeffs) = value;
-                let ((((means1, quats1), scales1), opacities1), coeffs1) = first;
-                let ((((means2, quats2), scales2), opacities2), coeffs2) = second;
-                for k in 0..means.len() {
-                    let i = chunk * CHUNK + k;
+            .for_each_init(
+                || Block::new(stride),
+                |v_block, (block, (((value, first), second), grad_sum))| {
+                    let ((((means, quats), scales), opacities), coeffs) = value;
+                    let ((((means1, quats1), scales1), opacities1), coeffs1) = first;
+                    let ((((means2, quats2), scales2), opacities2), coeffs2) = second;
                     let params = SplatParams {
                         means,
                         quats,
@@ -168,88 +221,73 @@ impl CpuFit {
                         colors: Colors::Sh { degree, stride, coeffs },
                         raw: true,
                     };
-                    let splat = Splat::load(&params, k);
-                    let mut v = Default::default();
-                    let mut v_sh = [[0.0f32; 3]; SH_COEFFS_MAX];
-                    if bins.slots[i + 1] > bins.slots[i] {
-                        let v2d: V2d = gather(i, &tile_splats[i], bins, sums);
-                        let [x, y] = v2d.v_mean;
-                        grad_sum[k] += (0.5 * size[0] * x).hypot(0.5 * size[1] * y);
-                        v = splat_backward(
-                            view,
-                            &splat,
-                            true,
-                            &params.colors,
-                            k,
-                            &v2d,
-                            &mut v_sh,
-                            None,
-                        );
+                    for k in 0..params.len() {
+                        let i = block * BLOCK + k;
+                        let splat = Splat::load(&params, k);
+                        let v_sh = &mut v_block.sh[k * stride..(k + 1) * stride];
+                        let mut v = VSplat::default();
+                        if bins.slots[i + 1] > bins.slots[i] {
+                            let v2d = gather(i, &tile_splats[i], bins, sums);
+                            let [x, y] = v2d.v_mean;
+                            let (x, y) = (0.5 * size[0] * x, 0.5 * size[1] * y);
+                            grad_sum[k] += (x * x + y * y).sqrt();
+                            v = splat_backward(
+                                view,
+                                &splat,
+                                true,
+                                &params.colors,
+                                k,
+                                &v2d,
+                                v_sh,
+                                None,
+                            );
+                        } else {
+                            v_sh.fill([0.0; 3]);
+                        }
+                        v.v_opacity += opacity_pull * splat.opacity * (1.0 - splat.opacity);
+                        for (v, scale) in v.v_scales.iter_mut().zip(splat.scales.to_array()) {
+                            *v += scale_pull * scale;
+                        }
+                        v_block.means[k] = v.v_mean;
+                        v_block.quats[k] = v.v_quat;
+                        v_block.scales[k] = v.v_scales;
+                        v_block.opacities[k] = v.v_opacity;
                     }
-                    v.v_opacity += opacity_pull * splat.opacity * (1.0 - splat.opacity);
-                    for (v, scale) in v.v_scales.iter_mut().zip(splat.scales.to_array()) {
-                        *v += scale_pull * scale;
+                    macro_rules! adam {
+                        ($values:expr, $first:expr, $second:expr, $name:ident) => {
+                            arch.dispatch(Adam {
+                                values: bytemuck::cast_slice_mut($values),
+                                first: bytemuck::cast_slice_mut($first),
+                                second: bytemuck::cast_slice_mut($second),
+                                gradient: bytemuck::cast_slice(&v_block.$name),
+                                rates: &rates.$name,
+                                bias,
+                            })
+                        };
                     }
-                    adam(
-                        &mut means[k],
-                        &mut means1[k],
-                        &mut means2[k],
-                        v.v_mean,
-                        rates.means,
-                        bias,
-                    );
-                    adam(
-                        &mut quats[k],
-                        &mut quats1[k],
-                        &mut quats2[k],
-                        v.v_quat,
-                        rates.quats,
-                        bias,
-                    );
-                    adam(
-                        &mut scales[k],
-                        &mut scales1[k],
-                        &mut scales2[k],
-                        v.v_scales,
-                        rates.scales,
-                        bias,
-                    );
-                    adam(
-                        std::array::from_mut(&mut opacities[k]),
-                        std::array::from_mut(&mut opacities1[k]),
-                        std::array::from_mut(&mut opacities2[k]),
-                        [v.v_opacity],
-                        rates.opacities,
-                        bias,
-                    );
-                    for c in 0..sh::coeffs(degree) {
-                        let rate = if c == 0 { rates.sh0 } else { rates.sh_rest };
-                        let at = k * stride + c;
-                        adam(
-                            &mut coeffs[at],
-                            &mut coeffs1[at],
-                            &mut coeffs2[at],
-                            v_sh[c],
-                            rate,
-                            bias,
-                        );
-                    }
+                    adam!(means, means1, means2, means);
+                    adam!(quats, quats1, quats2, quats);
+                    adam!(scales, scales1, scales2, scales);
+                    adam!(opacities, opacities1, opacities2, opacities);
+                    adam!(coeffs, coeffs1, coeffs2, sh);
                     if input.noise > 0.0 {
-                        let moved =
-                            explore(&means[k], &quats[k], &scales[k], opacities[k], input, i);
-                        means[k] = moved;
+                        for k in 0..means.len() {
+                            let i = block * BLOCK + k;
+                            means[k] =
+                                explore(means[k], quats[k], scales[k], opacities[k], input, i);
+                        }
                     }
-                }
-            });
+                },
+            );
     }
 }
 
 /// 3DGS-MCMC's exploration: nearly transparent splats take a random step shaped by their covariance.
 #[inline(always)]
 fn explore(
-    mean: &[f32; 3],
-    quat: &[f32; 4],
-    log_scales: &[f32; 3],
+    mean: [f32; 3],
+    quat: [f32; 4],
+    log_scales: [f32; 3],
     logit: f32,
     input: &StepInput<'_>,
     i: usize,
@@ -258,13 +296,13 @@ fn explore(
     let gate = 1.0 / (1.0 + (-100.0 * (0.005 - opacity)).exp());
     // Beyond this the step is under 1e-7 of the splat's size times the rate.
     if gate < 1e-7 {
-        return *mean;
+        return mean;
     }
-    let [w, x, y, z] = *quat;
+    let [w, x, y, z] = quat;
     let axes = Mat3::from_quat(Quat::from_xyzw(x, y, z, w).normalize());
-    let scales = Vec3::from(*log_scales).exp();
+    let scales = Vec3::from(log_scales).exp();
     let z = Vec3::from(noise_normal(input.noise_seed, i as u32));
     let moved = axes * (scales * scales * (axes.transpose() * z)) * (gate * input.noise);
-    let out = Vec3::from(*mean) + moved;
-    if out.is_finite() { out.to_array() } else { *mean }
+    let out = Vec3::from(mean) + moved;
+    if out.is_finite() { out.to_array() } else { mean }
 }

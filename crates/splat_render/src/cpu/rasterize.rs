@@ -25,8 +25,8 @@ pub(super) struct TileSplat {
     pub opacity: f32,
     pub color: [f32; 3],
     pub depth: f32,
-    /// Reach along y in px, a little widened.
-    pub radius_y: f32,
+    /// Reach along x and y in px, a little widened.
+    pub radii: [f32; 2],
 }
 
 impl TileSplat {
@@ -37,17 +37,25 @@ impl TileSplat {
             opacity: splat.opacity,
             color: splat.color,
             depth: splat.depth,
-            radius_y: splat.radii[1] * (1.0 + 1e-5) + 1e-2,
+            radii: splat.radii.map(|r| r * (1.0 + 1e-5) + 1e-2),
         }
     }
 
-    /// Rows of the tile at `top` that the splat reaches.
+    /// Rows (`axis` 1) or columns (`axis` 0) that the splat reaches, of the tile that starts at
+    /// pixel `start`.
     #[inline(always)]
-    pub fn rows(&self, top: f32) -> std::ops::Range<usize> {
-        let y = self.mean[1] - top - 0.5;
-        let first = (y - self.radius_y).ceil().clamp(0.0, SIDE as f32) as usize;
-        let last = (y + self.radius_y).floor().clamp(-1.0, (SIDE - 1) as f32) as i32;
-        first..(last + 1) as usize
+    pub fn reach(&self, axis: usize, start: f32) -> std::ops::Range<usize> {
+        let middle = self.mean[axis] - start - 0.5;
+        let first = (middle - self.radii[axis]).ceil().clamp(0.0, SIDE as f32) as i32;
+        let last = (middle + self.radii[axis]).floor().clamp(-1.0, (SIDE - 1) as f32) as i32;
+        first as usize..(last + 1) as usize
+    }
+
+    /// The same in vectors of `lanes` columns.
+    #[inline(always)]
+    pub fn vectors(&self, left: f32, lanes: usize) -> std::ops::Range<usize> {
+        let columns = self.reach(0, left);
+        columns.start / lanes..columns.end.div_ceil(lanes)
     }
 }
 
@@ -122,11 +130,13 @@ impl WithSimd for Tile<'_> {
             let [red, green, blue] = splat.color;
             let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
             let depth = s.splat_f32s(splat.depth);
-            for row in splat.rows(self.top) {
+            let vectors = splat.vectors(self.left, S::F32_LANES);
+            for row in splat.reach(1, self.top) {
                 let dy = self.top + row as f32 + 0.5 - splat.mean[1];
                 let v = v_scale * dy;
                 let (vv, shift) = (s.splat_f32s(v * v), s.splat_f32s(q * dy));
-                for (h, &x) in columns.iter().enumerate() {
+                for h in vectors.clone() {
+                    let x = columns[h];
                     let at = row * per_row + h;
                     let u = s.mul_add_e_f32s(p, s.sub_f32s(x, mx), shift);
                     let power = s.neg_f32s(s.mul_add_e_f32s(u, u, vv));

@@ -63,12 +63,14 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
             let depth = s.splat_f32s(splat.depth);
             let mut acc = [zero; 10];
             let mut touched = false;
-            for row in splat.rows(self.top) {
+            let vectors = splat.vectors(self.left, S::F32_LANES);
+            for row in splat.reach(1, self.top) {
                 let dy = self.top + row as f32 + 0.5 - splat.mean[1];
                 let v = v_scale * dy;
                 let (vv, shift) = (s.splat_f32s(v * v), s.splat_f32s(q * dy));
                 let v = s.splat_f32s(v);
-                for (h, &x) in columns.iter().enumerate() {
+                for h in vectors.clone() {
+                    let x = columns[h];
                     let at = row * per_row + h;
                     let u = s.mul_add_e_f32s(p, s.sub_f32s(x, mx), shift);
                     let power = s.neg_f32s(s.mul_add_e_f32s(u, u, vv));

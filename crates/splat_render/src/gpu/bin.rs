@@ -81,7 +81,7 @@ impl SplatBins {
         let bytes = size_of::<StatusHead>() as u64
             + u64::from(chunks.max(1)) * size_of::<ChunkCount>() as u64;
         let status = gpu.bindable("status", bytes)?;
-        let head = StatusHead { splats, overflow: 0 };
+        let head = StatusHead { splats, step: 1, overflow: 0, unused: 0 };
         gpu.queue.write_buffer(&status, 0, bytemuck::bytes_of(&head));
         Ok(Self {
             splats,

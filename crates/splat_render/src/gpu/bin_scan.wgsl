@@ -73,8 +73,8 @@ fn scan_apply(
         let fits = sum <= chunk.capacity;
         status.chunks[chunk.index].total = sum;
         status.chunks[chunk.index].pairs = select(0u, sum, fits);
-        if !fits {
-            status.overflow = 1u;
+        if !fits && status.overflow == 0u {
+            status.overflow = status.step;
         }
     }
 }

@@ -61,6 +61,8 @@ pub(super) enum Op {
     Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2] },
     /// Fills a buffer with zeros.
     Clear(wgpu::Buffer),
+    /// Copies so many bytes from the first buffer to the second.
+    Copy(wgpu::Buffer, wgpu::Buffer, u64),
 }
 
 /// Futures of wgpu's native backends are ready at once or after `poll`.
@@ -343,12 +345,18 @@ impl Gpu {
     pub(super) fn record(encoder: &mut wgpu::CommandEncoder, ops: &[Op]) {
         let mut rest = ops;
         while let Some(first) = rest.first() {
-            if let Op::Clear(buffer) = first {
-                encoder.clear_buffer(buffer, 0, None);
+            match first {
+                Op::Dispatch { .. } => {}
+                Op::Clear(buffer) => encoder.clear_buffer(buffer, 0, None),
+                Op::Copy(from, to, bytes) => {
+                    encoder.copy_buffer_to_buffer(from, 0, to, 0, *bytes);
+                }
+            }
+            let run = rest.iter().take_while(|op| matches!(op, Op::Dispatch { .. })).count();
+            if run == 0 {
                 rest = &rest[1..];
                 continue;
             }
-            let run = rest.iter().take_while(|op| matches!(op, Op::Dispatch { .. })).count();
             let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
             for op in &rest[..run] {
                 if let Op::Dispatch { pipeline, bind_group, groups } = op {
@@ -362,10 +370,12 @@ impl Gpu {
         }
     }
 
-    /// Runs prepared commands.
-    pub(super) fn submit(&self, ops: &[Op]) -> Result<()> {
+    /// Runs lists of prepared commands, without waiting for them.
+    pub(super) fn submit(&self, lists: &[&[Op]]) -> Result<()> {
         let mut encoder = self.device.create_command_encoder(&Default::default());
-        Self::record(&mut encoder, ops);
+        for ops in lists {
+            Self::record(&mut encoder, ops);
+        }
         self.queue.submit([encoder.finish()]);
         self.check()
     }

@@ -17,6 +17,10 @@ pub(super) const GRADIENT: usize = 10;
 /// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.
 pub(super) const CAMERA: usize = 16;
 
+/// Floats per splat of what density control watches: sum of gradient lengths, steps seen, largest
+/// extent.
+pub(super) const STATS: usize = 3;
+
 /// Splats per workgroup of the per-splat kernels; windows are multiples of it, which also keeps
 /// every per-splat buffer's offset a multiple of 256 bytes.
 pub(super) const SPLATS_PER_GROUP: u32 = 64;
@@ -47,17 +51,27 @@ impl View {
         Self { background, width, height, tiles_x: width.div_ceil(TILE), ..Self::zeroed() }
     }
 
-    /// What the project stages need.
+    /// What the project stages need for these splats.
     pub fn of_camera(
         camera: &Camera,
         options: &ProjectOptions,
         splats: &SplatParams<'_, f32>,
     ) -> Self {
-        let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
         let (sh_degree, sh_stride) = match splats.colors {
             Colors::Direct(_) => (0, 0),
             Colors::Sh { degree, stride, .. } => (degree, stride as u32),
         };
+        Self {
+            sh_degree,
+            sh_stride,
+            raw: u32::from(splats.raw),
+            ..Self::of_view(camera, options, [0.0; 3])
+        }
+    }
+
+    /// Camera and background alone.
+    pub fn of_view(camera: &Camera, options: &ProjectOptions, background: [f32; 3]) -> Self {
+        let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
         Self {
             world_to_camera: [row(0), row(1), row(2)],
             jacobian_limits: camera.jacobian_limits().map(|v| v as f32),
@@ -66,10 +80,7 @@ impl View {
             near: options.near,
             far: options.far,
             blur: options.blur,
-            sh_degree,
-            sh_stride,
-            raw: u32::from(splats.raw),
-            ..Self::of_picture(camera.width, camera.height, [0.0; 3])
+            ..Self::of_picture(camera.width, camera.height, background)
         }
     }
 }
@@ -132,5 +143,28 @@ pub(super) struct ChunkCount {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct StatusHead {
     pub splats: u32,
+    pub step: u32,
     pub overflow: u32,
+    pub unused: u32,
+}
+
+/// What one step of a fit is to do.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(super) struct Step {
+    pub means: f32,
+    pub quats: f32,
+    pub scales: f32,
+    pub opacities: f32,
+    pub sh0: f32,
+    pub sh_rest: f32,
+    pub bias_first: f32,
+    pub bias_second: f32,
+    pub opacity_pull: f32,
+    pub scale_pull: f32,
+    pub noise: f32,
+    pub noise_seed: u32,
+    pub l1: f32,
+    pub ssim: f32,
+    pub has_weights: u32,
 }

@@ -7,7 +7,9 @@
 
 mod bin;
 mod device;
+mod fit;
 mod layout;
+mod loss;
 mod project;
 mod project_backward;
 mod rasterize;
@@ -15,6 +17,7 @@ mod rasterize_backward;
 mod shaders;
 
 pub use device::Gpu;
+pub use fit::GpuFit;
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};

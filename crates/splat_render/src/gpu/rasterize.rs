@@ -55,7 +55,7 @@ impl Binned {
             is_first: 1,
             is_last: 1,
         };
-        gpu.submit(&bins.depth_ops(gpu, &view, &TileChunk::new(gpu, all), &splats2d))?;
+        gpu.submit(&[&bins.depth_ops(gpu, &view, &TileChunk::new(gpu, all), &splats2d)])?;
         let (ranges, capacity) = bins.plan(gpu, &view, &splats2d, tiles)?;
         let pairs = PairBins::new(gpu, capacity, tiles)?;
         let last = ranges.len() - 1;

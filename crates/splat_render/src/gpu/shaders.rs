@@ -2,8 +2,9 @@
 
 use std::fmt::Write;
 
-use super::layout::{CAMERA, GEOMETRY, GRADIENT};
+use super::layout::{CAMERA, GEOMETRY, GRADIENT, STATS};
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, QUAT_NORM2_MIN, TILE, TRANSMITTANCE_MIN};
+use crate::fit::{ADAM, SSIM_C, SSIM_WINDOW};
 use crate::sh;
 
 /// What a binding is to a shader.
@@ -31,7 +32,7 @@ const GEOMETRY_WGSL: &str = include_str!("geometry.wgsl");
 const BIN_TILES: &str = include_str!("bin_tiles.wgsl");
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 10] = [
+pub(super) static SOURCES: [Source; 12] = [
     Source {
         name: "project",
         parts: &[SHARED, GEOMETRY_WGSL, include_str!("project.wgsl")],
@@ -92,6 +93,21 @@ pub(super) static SOURCES: [Source; 10] = [
         bindings: &[Uniform, Read, Read, Read, Read, Read, ReadWrite],
         segmented: false,
     },
+    Source {
+        name: "loss",
+        parts: &[SHARED, include_str!("loss.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "adam",
+        parts: &[SHARED, include_str!("adam.wgsl")],
+        bindings: &[
+            Uniform, Uniform, Uniform, Read, ReadWrite, Read, ReadWrite, ReadWrite, Read, Read,
+            ReadWrite,
+        ],
+        segmented: false,
+    },
 ];
 
 /// The kernels: entry points of [`SOURCES`].
@@ -111,11 +127,15 @@ pub(super) enum Kernel {
     Rasterize,
     RasterizeBackward,
     RasterizeBackwardSum,
+    LossSlopes,
+    LossGradient,
+    AdamGeometry,
+    AdamColors,
 }
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 18] = [
         Self::Project,
         Self::ProjectBackward,
         Self::DepthKeys,
@@ -130,6 +150,10 @@ impl Kernel {
         Self::Rasterize,
         Self::RasterizeBackward,
         Self::RasterizeBackwardSum,
+        Self::LossSlopes,
+        Self::LossGradient,
+        Self::AdamGeometry,
+        Self::AdamColors,
     ];
 
     /// (file, entry point)
@@ -149,6 +173,10 @@ impl Kernel {
             Self::Rasterize => ("rasterize", "rasterize"),
             Self::RasterizeBackward => ("rasterize_backward", "rasterize_backward"),
             Self::RasterizeBackwardSum => ("rasterize_backward_sum", "rasterize_backward_sum"),
+            Self::LossSlopes => ("loss", "loss_slopes"),
+            Self::LossGradient => ("loss", "loss_gradient"),
+            Self::AdamGeometry => ("adam", "adam_geometry"),
+            Self::AdamColors => ("adam", "adam_colors"),
         }
     }
 }
@@ -156,10 +184,11 @@ impl Kernel {
 /// Constants of the crate as WGSL, so that no shader repeats a value by hand.
 fn constants() -> String {
     let mut out = String::new();
-    for (name, value) in [("TILE", TILE), ("GEOMETRY", GEOMETRY as u32)]
-        .into_iter()
-        .chain([("GRADIENT", GRADIENT as u32), ("CAMERA", CAMERA as u32)])
-    {
+    for (name, value) in [("TILE", TILE), ("GEOMETRY", GEOMETRY as u32)].into_iter().chain([
+        ("GRADIENT", GRADIENT as u32),
+        ("CAMERA", CAMERA as u32),
+        ("STATS", STATS as u32),
+    ]) {
         let _ = writeln!(out, "const {name} = {value}u;");
     }
     let floats = [
@@ -170,6 +199,11 @@ fn constants() -> String {
         ("SH_C0", sh::C0 as f32),
         ("SH_C1", sh::C1 as f32),
         ("SH_C4_HALF", sh::C4_HALF as f32),
+        ("ADAM_BETA1", ADAM.0),
+        ("ADAM_BETA2", ADAM.1),
+        ("ADAM_EPSILON", ADAM.2),
+        ("SSIM_C1", SSIM_C.0),
+        ("SSIM_C2", SSIM_C.1),
     ];
     for (name, value) in floats {
         // `{:e}` prints the shortest decimal that reads back as the same f32.
@@ -181,6 +215,8 @@ fn constants() -> String {
             let _ = writeln!(out, "const {name}_{i} = {:e}f;", *value as f32);
         }
     }
+    let taps = SSIM_WINDOW.map(|tap| format!("{tap:e}f")).join(", ");
+    let _ = writeln!(out, "const SSIM_WINDOW = array({taps});");
     out
 }
 
@@ -207,7 +243,9 @@ mod tests {
     use naga::valid::{Capabilities, ValidationFlags, Validator};
 
     use super::*;
-    use crate::gpu::layout::{Chunk, ChunkCount, SortPass, Splat2d, StatusHead, View, Window};
+    use crate::gpu::layout::{
+        Chunk, ChunkCount, SortPass, Splat2d, StatusHead, Step, View, Window,
+    };
 
     fn parse(source: &Source) -> naga::Module {
         naga::front::wgsl::parse_str(&source.text())
@@ -340,6 +378,25 @@ mod tests {
         layout!("bin_sort", SortPass, shift, chunk);
         layout!("project", Splat2d, mean, pq, color, r, depth, opacity, radii);
         layout!("bin_scan", ChunkCount, pairs, total);
+        layout!(
+            "adam",
+            Step,
+            means,
+            quats,
+            scales,
+            opacities,
+            sh0,
+            sh_rest,
+            bias_first,
+            bias_second,
+            opacity_pull,
+            scale_pull,
+            noise,
+            noise_seed,
+            l1,
+            ssim,
+            has_weights
+        );
         assert_layout(
             "bin_scan",
             "Status",
@@ -347,7 +404,9 @@ mod tests {
             size_of::<StatusHead>() + size_of::<ChunkCount>(),
             &[
                 ("splats", offset_of!(StatusHead, splats)),
+                ("step", offset_of!(StatusHead, step)),
                 ("overflow", offset_of!(StatusHead, overflow)),
+                ("unused", offset_of!(StatusHead, unused)),
                 ("chunks", size_of::<StatusHead>()),
             ],
         );

@@ -53,9 +53,34 @@ struct ChunkCount {
 
 struct Status {
     splats: u32,
-    // Set where a chunk's pairs did not fit; stays set, and stops every later update.
+    // Number of the step at hand, from 1.
+    step: u32,
+    // The first step at which a chunk's pairs did not fit; stops every later update. 0 for none.
     overflow: u32,
+    unused: u32,
     chunks: array<ChunkCount>,
+}
+
+// What one step of a fit is to do.
+struct Step {
+    // Adam's rates, then its bias corrections.
+    means: f32,
+    quats: f32,
+    scales: f32,
+    opacities: f32,
+    sh0: f32,
+    sh_rest: f32,
+    bias_first: f32,
+    bias_second: f32,
+    // Gradients of the regularisers by one opacity and one scale.
+    opacity_pull: f32,
+    scale_pull: f32,
+    noise: f32,
+    noise_seed: u32,
+    // What one unit of |x - y| and of SSIM weighs in the loss.
+    l1: f32,
+    ssim: f32,
+    has_weights: u32,
 }
 
 struct Splat2d {

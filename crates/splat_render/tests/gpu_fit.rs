@@ -1,0 +1,219 @@
+//! Fitting on the GPU against fitting on the CPU, from the same start with the same draws.
+
+mod common;
+
+use std::sync::Arc;
+
+use common::*;
+use rand::Rng;
+use splat_render::cpu::CpuFit;
+use splat_render::fit::{FitDevice, FitState, Rates, SplatArrays, StepInput, Target};
+use splat_render::gpu::{Gpu, GpuFit};
+use splat_render::reference::Reference;
+use splat_render::stages::ProjectOptions;
+use splat_render::{Camera, Stages};
+
+/// Photos of a random scene, their cameras, and another random scene to start from.
+struct Capture {
+    targets: Vec<Target>,
+    cameras: Vec<Camera>,
+    start: FitState,
+}
+
+fn arrays(scene: Scene<f32>) -> SplatArrays {
+    SplatArrays {
+        means: scene.means,
+        quats: scene.quats,
+        scales: scene.scales,
+        opacities: scene.opacities,
+        sh: scene.colors,
+        sh_degree: scene.sh_degree,
+    }
+}
+
+fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
+    let mut rng = rng(seed);
+    let truth = random_scene(&mut rng, 60, Some(1)).widen();
+    let (mut targets, mut cameras) = (Vec::new(), Vec::new());
+    for (k, &(width, height)) in sizes.iter().enumerate() {
+        let camera = random_camera(&mut rng, width, height);
+        let projected =
+            Reference.project(&truth.params(), &camera, &ProjectOptions::default()).unwrap();
+        let image = Reference.rasterize(&projected, [0.0; 3]).unwrap();
+        let byte = |v: f64| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+        let rgba = k % 2 == 0;
+        let mut pixels = Vec::new();
+        for (color, &alpha) in image.color.iter().zip(&image.alpha) {
+            if rgba {
+                pixels.extend(color.map(|c| byte(c / alpha.max(1e-6))));
+                pixels.push(byte(alpha));
+            } else {
+                pixels.extend(color.map(byte));
+            }
+        }
+        let weights = (k % 3 == 2).then(|| {
+            (0..width * height).map(|_| if rng.random::<f32>() < 0.2 { 0.0 } else { 1.0 }).collect()
+        });
+        let channels = if rgba { 4 } else { 3 };
+        targets.push(Target { width, height, channels, pixels, weights });
+        cameras.push(camera);
+    }
+    let start = FitState::new(arrays(random_scene(&mut rng, splats, Some(1))));
+    Capture { targets, cameras, start }
+}
+
+fn input(capture: &Capture, step: u32, noise: f32) -> StepInput<'_> {
+    let view = step as usize % capture.cameras.len();
+    let t = step as f32 * 0.37;
+    StepInput {
+        view,
+        camera: &capture.cameras[view],
+        // Photos with alpha stand on a background that moves, the others on black.
+        background: if view % 2 == 0 { [t.fract(), (2.0 * t).fract(), 0.5] } else { [0.0; 3] },
+        sh_degree: u32::from(step > 20),
+        rates: Rates {
+            means: 1e-3,
+            quats: 1e-3,
+            scales: 5e-3,
+            opacities: 5e-2,
+            sh0: 5e-3,
+            sh_rest: 2.5e-4,
+        },
+        step,
+        ssim_weight: 0.2,
+        opacity_regularizer: 0.01,
+        scale_regularizer: 0.01,
+        noise,
+        noise_seed: step.wrapping_mul(2_654_435_761),
+    }
+}
+
+fn run(
+    device: &mut dyn FitDevice,
+    capture: &Capture,
+    steps: u32,
+    noise: f32,
+) -> (FitState, Vec<f32>) {
+    device.set_targets(capture.targets.clone()).unwrap();
+    device.upload(&capture.start).unwrap();
+    let mut losses = Vec::new();
+    for step in 1..=steps {
+        device.step(&input(capture, step, noise)).unwrap();
+        if step == 1 || step % 50 == 0 {
+            losses.push(device.loss().unwrap());
+        }
+    }
+    (device.download().unwrap(), losses)
+}
+
+fn gpu_fit(gpu: Gpu) -> GpuFit {
+    GpuFit::new(Arc::new(gpu))
+}
+
+fn gpu() -> Gpu {
+    Gpu::new(true).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// PSNR over all photos, rendered by the reference on black.
+fn psnr(capture: &Capture, state: &FitState) -> f64 {
+    let splats = &state.splats;
+    let wide = Scene::<f32> {
+        means: splats.means.clone(),
+        quats: splats.quats.clone(),
+        scales: splats.scales.clone(),
+        opacities: splats.opacities.clone(),
+        colors: splats.sh.clone(),
+        sh_degree: splats.sh_degree,
+        sh_stride: splats.stride(),
+        raw: true,
+    }
+    .widen();
+    let (mut total, mut count) = (0.0, 0);
+    for (target, camera) in capture.targets.iter().zip(&capture.cameras) {
+        let projected =
+            Reference.project(&wide.params(), camera, &ProjectOptions::default()).unwrap();
+        let image = Reference.rasterize(&projected, [0.0; 3]).unwrap();
+        let mut photo: [Vec<f32>; 3] = Default::default();
+        target.composite([0.0; 3], &mut photo);
+        for (pixel, color) in image.color.iter().enumerate() {
+            for c in 0..3 {
+                total += (color[c].clamp(0.0, 1.0) - f64::from(photo[c][pixel])).powi(2);
+                count += 1;
+            }
+        }
+    }
+    -10.0 * (total / f64::from(count)).log10()
+}
+
+#[test]
+fn one_step_changes_the_state_as_on_the_cpu() {
+    let capture = capture(1, &[(37, 29), (20, 50), (33, 16)], 80);
+    for (steps, noise) in [(1, 0.0), (2, 500.0), (3, 0.0)] {
+        let (expected, expected_loss) = run(&mut CpuFit::default(), &capture, steps, noise);
+        let (got, loss) = run(&mut gpu_fit(gpu()), &capture, steps, noise);
+        assert!((loss[0] - expected_loss[0]).abs() < 1e-5, "{loss:?} vs {expected_loss:?}");
+        let close = |what: &str, got: &[f32], expected: &[f32], bound: f64| {
+            let off = difference1(got, &widen1(expected), &[]);
+            assert!(off.relative() <= bound, "{steps} steps, {what}: {off:?}");
+        };
+        // Moments follow the gradients; Adam turns a gradient near zero into a whole step, so the
+        // parameters themselves are compared by the mean.
+        for (name, got, expected) in
+            [("first", &got.first, &expected.first), ("second", &got.second, &expected.second)]
+        {
+            close(name, got.means.as_flattened(), expected.means.as_flattened(), 2e-3);
+            close(name, got.quats.as_flattened(), expected.quats.as_flattened(), 2e-3);
+            close(name, got.scales.as_flattened(), expected.scales.as_flattened(), 2e-3);
+            close(name, &got.opacities, &expected.opacities, 2e-3);
+            close(name, got.sh.as_flattened(), expected.sh.as_flattened(), 2e-3);
+        }
+        let off = difference(&got.splats.means, &widen(&expected.splats.means), &[]);
+        assert!(off.mean <= 1e-5, "{steps} steps, means: {off:?}");
+        let off = difference(&got.splats.sh, &widen(&expected.splats.sh), &[]);
+        assert!(off.mean <= 1e-5, "{steps} steps, sh: {off:?}");
+        close("grad_sum", &got.stats.grad_sum, &expected.stats.grad_sum, 2e-3);
+        assert_eq!(got.stats.seen, expected.stats.seen);
+        close("radius", &got.stats.radius, &expected.stats.radius, 1e-4);
+    }
+}
+
+#[test]
+fn a_fit_ends_as_on_the_cpu_and_repeats_itself() {
+    let capture = capture(2, &[(64, 64); 6], 150);
+    let before = psnr(&capture, &capture.start);
+    let (expected, expected_losses) = run(&mut CpuFit::default(), &capture, 200, 0.0);
+    let (got, losses) = run(&mut gpu_fit(gpu()), &capture, 200, 0.0);
+    let (cpu_psnr, gpu_psnr) = (psnr(&capture, &expected), psnr(&capture, &got));
+    println!("start {before:.3} dB, cpu {cpu_psnr:.3} dB, gpu {gpu_psnr:.3} dB");
+    println!("losses: cpu {expected_losses:?}, gpu {losses:?}");
+    assert!(cpu_psnr > before + 3.0, "the fit must improve the picture");
+    assert!((cpu_psnr - gpu_psnr).abs() <= 0.1);
+    let (again, losses_again) = run(&mut gpu_fit(gpu()), &capture, 200, 0.0);
+    assert!(got == again && losses == losses_again, "the same fit twice gave other bits");
+}
+
+#[test]
+fn running_out_of_room_for_pairs_changes_nothing() {
+    let mut capture = capture(3, &[(128, 96), (90, 100)], 400);
+    // Large splats: over 8 pairs each, so that a small device has to grow and to cut into chunks.
+    for scale in capture.start.splats.scales.as_flattened_mut() {
+        *scale += 1.6;
+    }
+    let (whole, losses) = run(&mut gpu_fit(gpu()), &capture, 20, 100.0);
+    let small = gpu().with_binding_limit(128 * 96 * 36);
+    let (parts, losses_parts) = run(&mut gpu_fit(small), &capture, 20, 100.0);
+    assert!(whole == parts && losses == losses_parts, "a smaller device gave other bits");
+}
+
+#[test]
+fn missing_splats_photos_and_sizes_are_named() {
+    let capture = capture(4, &[(20, 20)], 5);
+    let mut device = gpu_fit(gpu());
+    device.set_targets(capture.targets.clone()).unwrap();
+    let error = device.step(&input(&capture, 1, 0.0)).unwrap_err().to_string();
+    assert!(error.starts_with("splats: "), "{error}");
+    device.upload(&capture.start).unwrap();
+    let wrong = StepInput { view: 3, ..input(&capture, 1, 0.0) };
+    let error = device.step(&wrong).unwrap_err().to_string();
+    assert!(error.starts_with("view: "), "{error}");
+}
