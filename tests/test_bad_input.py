@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scenes
 import torch
 
 import igsr
-import scenes
 from igsr import _core, rasterization
 
 

@@ -7,10 +7,10 @@ import json
 
 import numpy as np
 import pytest
+import scenes
 from PIL import Image
 
 import igsr
-import scenes
 from igsr import metrics
 from igsr.atomic_write import atomic_write
 from igsr.evaluation import ScoredView, over_background
@@ -63,7 +63,7 @@ def test_masks_reach_the_scores():
     unmasked = [dataclasses.replace(view, mask=None) for view in views]
     assert igsr.evaluate(scene, igsr.Capture(capture.path, unmasked))["psnr"] < 25
     views[0].mask = np.zeros_like(views[0].mask)
-    with pytest.raises(igsr.IgsrError, match="00.png"):
+    with pytest.raises(igsr.IgsrError, match=r"00\.png"):
         igsr.evaluate(scene, capture)
 
 
@@ -115,9 +115,14 @@ def test_report_is_strict_json(tmp_path):
 def test_atomic_write_keeps_the_old_file_on_any_failure(tmp_path):
     path = tmp_path / "picture.png"
     path.write_bytes(b"old")
-    with pytest.raises(KeyError), atomic_write(path) as temporary:
-        temporary.write_bytes(b"half of the ne")
-        raise KeyError
+
+    def fail_half_way():
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(b"half of the ne")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail_half_way()
     with pytest.raises(igsr.IgsrError, match=r"picture\.png"), atomic_write(path):
         raise OSError(28, "No space left on device")
     assert path.read_bytes() == b"old"

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scenes
 
 import igsr
-import scenes
 
 
 @pytest.mark.parametrize("degree", range(5))

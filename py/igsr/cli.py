@@ -290,7 +290,7 @@ def _checkpoint_seconds(out: Path) -> float:
 
 @contextlib.contextmanager
 def _stopped(bar: ProgressBar) -> Iterator[None]:
-    """Stop a bar at the end. It starts when there is progress: a mistake found before is one line."""
+    """Stop a bar at the end. It starts with the first progress: a mistake before is one line."""
     try:
         yield
     finally:

@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
 use splat_render::cpu::{self, CpuFit};
 use splat_render::fit::FitDevice;
-use splat_render::gpu::Gpu;
+use splat_render::gpu::{Gpu, GpuFit};
 
 /// A backend by its resolved name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,9 +47,7 @@ pub fn gpu() -> PyResult<&'static Arc<Gpu>> {
 pub fn fit_device(name: &str) -> PyResult<Box<dyn FitDevice>> {
     match Backend::named(name)? {
         Backend::Cpu => Ok(Box::new(CpuFit::default())),
-        Backend::Gpu => Err(PyRuntimeError::new_err(
-            "backend: fitting on the GPU is not part of this build; use cpu",
-        )),
+        Backend::Gpu => Ok(Box::new(GpuFit::new(Arc::clone(gpu()?)))),
         Backend::Reference => Err(PyValueError::new_err(
             "backend: reference renders and differentiates but does not fit; use cpu or gpu",
         )),
