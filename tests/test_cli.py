@@ -14,10 +14,10 @@ import zlib
 import av
 import numpy as np
 import pytest
+import scenes
 from PIL import Image
 
 import igsr
-import scenes
 from igsr import cli
 
 COMMAND = [sys.executable, "-m", "igsr.cli"]

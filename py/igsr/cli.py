@@ -289,6 +289,16 @@ def _checkpoint_seconds(out: Path) -> float:
 
 
 @contextlib.contextmanager
+def _stopped(bar: ProgressBar) -> Iterator[None]:
+    """Stop a bar at the end. It starts with the first progress: a mistake before is one line."""
+    try:
+        yield
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+@contextlib.contextmanager
 def _fit_bar(steps: int, shown: bool) -> Iterator[Callable[[Progress], None]]:
     """A progress bar on stderr with loss, splat count, steps/s and time left."""
     bar = ProgressBar(
@@ -300,10 +310,11 @@ def _fit_bar(steps: int, shown: bool) -> Iterator[Callable[[Progress], None]]:
         console=Console(file=sys.stderr, highlight=False),
         disable=not shown,
     )
-    with bar:
-        task = bar.add_task("fit", total=steps, loss="-", splats=0, speed="-")
+    task = bar.add_task("fit", total=steps, loss="-", splats=0, speed="-")
+    with _stopped(bar):
 
         def show(now: Progress) -> None:
+            bar.start()
             bar.update(
                 task,
                 completed=now.step,
@@ -334,10 +345,11 @@ def _scored(
         disable=not shown,
         transient=True,
     )
-    with bar:
-        task = bar.add_task("score", total=len(views))
+    task = bar.add_task("score", total=len(views))
+    with _stopped(bar):
 
         def on_view(scored: ScoredView) -> None:
+            bar.start()
             bar.advance(task)
             if scored.name in wanted:
                 sheet.append(scored)

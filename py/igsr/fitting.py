@@ -39,7 +39,7 @@ class Progress:
     Attributes:
         step: steps done, of ``steps``.
         steps: steps in all.
-        loss: 0.8 L1 + 0.2 D-SSIM, averaged over the last chunk of steps.
+        loss: 0.8 L1 + 0.2 D-SSIM of the last step's photo, before that step.
         splats: number of splats now.
         seconds: time spent fitting, earlier runs that were resumed included.
         steps_per_second: of the last chunk of steps.

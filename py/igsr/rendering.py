@@ -65,7 +65,10 @@ def render(
         IgsrError: an argument is unusable; the message names it.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
-    background_color = np.asarray(background, dtype=np.float64)
+    try:
+        background_color = np.asarray(background, dtype=np.float64)
+    except (TypeError, ValueError):
+        background_color = np.zeros(0)
     if background_color.shape != (3,) or not np.isfinite(background_color).all():
         raise IgsrError("background must be three finite numbers")
     backend = _core.resolve_backend(backend)

@@ -72,8 +72,41 @@ fn quat_gradient([w, x, y, z]: [f32; 4], v: Mat3) -> [f32; 4] {
 
 /// Gradients of one visible splat. `v_sh` receives the coefficients' gradients (or the direct
 /// colour's); `v_camera`, where wanted, is added to.
+///
+/// A finite picture can still have gradients that overflow (a coefficient of 1e38, or -inf behind
+/// the clamp of the colour). All of that splat's are zero then: they must not reach the camera or,
+/// through Adam's moments, later steps.
 #[inline(always)]
+#[expect(clippy::too_many_arguments, reason = "one per stage input")]
 pub(super) fn splat_backward(
+    view: &View,
+    splat: &Splat,
+    raw: bool,
+    colors: &Colors<'_, f32>,
+    i: usize,
+    v: &V2d,
+    v_sh: &mut [[f32; 3]],
+    v_camera: Option<&mut VCamera>,
+) -> VSplat {
+    let mut v_own = v_camera.is_some().then(VCamera::default);
+    let out = gradients(view, splat, raw, colors, i, v, v_sh, v_own.as_mut());
+    // A sum is finite only where every term is; one that overflows by itself is as useless.
+    let mut sum = out.v_opacity;
+    sum += out.v_mean.iter().chain(&out.v_quat).chain(&out.v_scales).sum::<f32>();
+    sum += v_sh.as_flattened().iter().sum::<f32>();
+    if !sum.is_finite() {
+        v_sh.fill([0.0; 3]);
+        return VSplat::default();
+    }
+    if let (Some(sum), Some(own)) = (v_camera, v_own) {
+        sum.add(&own);
+    }
+    out
+}
+
+#[inline(always)]
+#[expect(clippy::too_many_arguments, reason = "one per stage input")]
+fn gradients(
     view: &View,
     splat: &Splat,
     raw: bool,

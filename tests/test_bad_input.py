@@ -1,0 +1,189 @@
+"""What ``rasterization`` and ``render`` refuse, and that the message begins with the name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+import igsr
+from igsr import _core, rasterization
+
+
+def call(changes):
+    scene = scenes.torch_scene(count=5)
+    arguments = {**scene, "width": 24, "height": 20, "sh_degree": 2, "backend": "cpu", **changes}
+    return rasterization(**arguments)
+
+
+def broken(name, change):
+    return {name: change(scenes.torch_scene(count=5)[name].clone())}
+
+
+def with_entry(index, value):
+    def change(tensor):
+        tensor[index] = value
+        return tensor
+
+    return change
+
+
+BAD = {
+    "means dtype": broken("means", lambda t: t.double()),
+    "means half": broken("means", lambda t: t.half()),
+    "means shape": broken("means", lambda t: t[:, :2]),
+    "means batch": broken("means", lambda t: t[None]),
+    "means numpy": broken("means", lambda t: t.numpy()),
+    "means None": {"means": None},
+    "quats count": broken("quats", lambda t: t[:-1]),
+    "quats width": broken("quats", lambda t: t[:, :3]),
+    "scales dtype": broken("scales", lambda t: t.int()),
+    "scales shape": broken("scales", lambda t: t[:, 0]),
+    "opacities shape": broken("opacities", lambda t: t[:, None]),
+    "opacities device": broken("opacities", lambda t: t.to("meta")),
+    "colors sh": broken("colors", lambda t: t[:, :4]),
+    "colors rank": broken("colors", lambda t: t[:, 0]),
+    "colors channels": broken("colors", lambda t: t[..., :1]),
+    "colors cameras": broken("colors", lambda t: t.repeat(3, 1, 1, 1)),
+    "viewmats shape": broken("viewmats", lambda t: t[0]),
+    "viewmats none": broken("viewmats", lambda t: t[:0]),
+    "viewmats dtype": broken("viewmats", lambda t: t.int()),
+    "viewmats nan": broken("viewmats", with_entry((0, 1, 3), float("nan"))),
+    "viewmats scale": broken("viewmats", lambda t: t * 2),
+    "viewmats mirror": broken("viewmats", with_entry((0, 0, 0), -1.0)),
+    "viewmats row": broken("viewmats", with_entry((1, 3, 0), 1.0)),
+    "Ks count": broken("Ks", lambda t: t[:1]),
+    "Ks singular": broken("Ks", with_entry((0, 0, 0), 0.0)),
+    "Ks infinite": broken("Ks", with_entry((0, 0, 2), float("inf"))),
+    "Ks skew": broken("Ks", with_entry((1, 0, 1), 0.5)),
+    "backgrounds shape": broken("backgrounds", lambda t: t[0]),
+    "backgrounds nan": broken("backgrounds", lambda t: t * float("nan")),
+    "width negative": {"width": -24},
+    "width zero": {"width": 0},
+    "height float": {"height": 20.0},
+    "width huge": {"width": 1_000_000},
+    "near_plane negative": {"near_plane": -1.0},
+    "far_plane near": {"far_plane": 0.001},
+    "radius_clip nan": {"radius_clip": float("nan")},
+    "eps2d text": {"eps2d": "0.3"},
+    "sh_degree high": {"sh_degree": 5},
+    "render_mode unknown": {"render_mode": "normals"},
+    "packed text": {"packed": "yes"},
+    "backend unknown": {"backend": "abacus"},
+    # gsplat's arguments that this renderer does not implement
+    "tile_size": {"tile_size": 8},
+    "sparse_grad": {"sparse_grad": True},
+    "absgrad": {"absgrad": True},
+    "rasterize_mode": {"rasterize_mode": "antialiased"},
+    "channel_chunk": {"channel_chunk": 16},
+    "distributed": {"distributed": True},
+    "camera_model": {"camera_model": "fisheye"},
+    "segmented": {"segmented": True},
+    "covars": {"covars": torch.eye(3).repeat(5, 1, 1)},
+    "with_ut": {"with_ut": True},
+    "with_eval3d": {"with_eval3d": True},
+    "radial_coeffs": {"radial_coeffs": torch.zeros(2, 6)},
+    "tangential_coeffs": {"tangential_coeffs": torch.zeros(2, 2)},
+    "thin_prism_coeffs": {"thin_prism_coeffs": torch.zeros(2, 4)},
+    "ftheta_coeffs": {"ftheta_coeffs": object()},
+    "rolling_shutter": {"rolling_shutter": 1},
+    "viewmats_rs": {"viewmats_rs": torch.eye(4).repeat(2, 1, 1)},
+}
+
+
+def test_the_scene_that_is_broken_below_renders():
+    color, _, _ = call({})
+    assert color.shape == (2, 20, 24, 3)
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_argument_is_named_first(case):
+    with pytest.raises(ValueError) as raised:  # noqa: PT011 - the message is checked below
+        call(BAD[case])
+    name = case.split()[0]
+    assert str(raised.value).startswith(name), raised.value
+
+
+def test_gsplats_own_defaults_are_accepted():
+    import inspect
+
+    import gsplat
+
+    ours = inspect.signature(rasterization).parameters
+    theirs = inspect.signature(gsplat.rasterization).parameters
+    assert list(theirs) == list(ours)[: len(theirs)]
+    defaults = {
+        name: parameter.default
+        for name, parameter in theirs.items()
+        if parameter.default is not inspect.Parameter.empty
+    }
+    for name, default in defaults.items():
+        if name != "rolling_shutter":  # gsplat's own enum
+            assert ours[name].default == default, name
+    color, _, _ = call({**defaults, "sh_degree": 2})
+    assert torch.equal(color, call({"backgrounds": None})[0])
+
+
+@pytest.mark.parametrize("slot", ["means", "quats", "scales", "opacities", "colors"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e38])
+def test_one_poisoned_splat_spoils_nothing_else(slot, value):
+    scene = scenes.torch_scene(count=8)
+    kept = [0, 1, 2, 4, 5, 6, 7]
+    poisoned = {name: tensor.clone() for name, tensor in scene.items()}
+    poisoned[slot].view(8, -1)[3, 0] = value
+    for tensor in poisoned.values():
+        tensor.requires_grad_()
+    color, alpha, _ = call({**poisoned, "render_mode": "RGB+ED"})
+    assert torch.isfinite(color).all()
+    (color.sum() + alpha.sum()).backward()
+    for name, tensor in poisoned.items():
+        assert torch.isfinite(tensor.grad).all(), name
+    # An infinitely dark splat is black, a splat with any other infinity is not drawn at all.
+    if not np.isfinite(value) and (slot, value) != ("colors", -float("inf")):
+        without = {
+            name: tensor[kept] if len(tensor) == 8 else tensor for name, tensor in scene.items()
+        }
+        clean, _, _ = call({**without, "render_mode": "RGB+ED"})
+        assert torch.equal(color, clean)
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0), (0.0, float("nan"), 0.0), "white"])
+def test_render_names_a_bad_background(background):
+    with pytest.raises(ValueError, match="background"):
+        igsr.render(scenes.splats(), scenes.ring_camera(0.0), background, "cpu")
+
+
+def test_core_names_arrays_of_the_wrong_kind():
+    splats = scenes.splats()
+    camera = scenes.ring_camera(0.0)
+    good = {
+        "means": splats.means,
+        "quats": splats.quats,
+        "scales": splats.scales,
+        "opacities": splats.opacities,
+        "colors": splats.sh,
+        "sh_degree": 1,
+        "raw_parameters": True,
+        "viewmat": camera.viewmat,
+        "intrinsics": np.array([72.0, 72.0, 24.0, 24.0]),
+        "width": 48,
+        "height": 48,
+        "near": 0.01,
+        "far": 100.0,
+        "eps2d": 0.3,
+        "backend": "cpu",
+    }
+    assert len(_core.project(**good)["means2d"]) == len(splats)
+    for name, wrong in (
+        ("means", splats.means.astype(np.float64)),
+        ("quats", splats.quats[:, ::-1]),
+        ("scales", splats.scales[:-1]),
+        ("opacities", [0.0] * len(splats)),
+        ("colors", splats.sh[..., :2].copy()),
+        ("viewmat", camera.viewmat[:3].copy()),
+        ("intrinsics", np.zeros(3)),
+        ("backend", "auto"),
+    ):
+        with pytest.raises(ValueError, match=name):
+            _core.project(**{**good, name: wrong})
