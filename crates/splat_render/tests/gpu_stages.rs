@@ -344,20 +344,22 @@ fn poison_in_any_slot_culls_one_splat_at_most() {
 #[test]
 fn many_splats_in_one_tile_and_a_wide_picture() {
     let mut rng = rng(11);
-    let n = 100_000;
+    // 70 000 splats over the left of the tile, then 300 over its right: a list that is cut off
+    // anywhere (some drivers stop loops after 65 535 rounds) loses those.
+    let n = 70_300;
     let mut crowd = Projected::<f32>::culled(n, 16, 16);
     for i in 0..n {
-        let center = [rng.random_range(0.0f32..16.0), rng.random_range(0.0f32..16.0)];
-        place(&mut crowd, i, center, [0.5, 0.5], 0.0, 0.02);
-        crowd.depths[i] = 1.0;
-        crowd.colors[i] = [0.5; 3];
+        let left = if i < 70_000 { 0.0 } else { 10.0 };
+        let center = [left + rng.random_range(0.0f32..4.0), rng.random_range(0.0f32..16.0)];
+        place(&mut crowd, i, center, [0.5, 0.5], 0.0, 0.3);
+        crowd.depths[i] = if i < 70_000 { 1.0 } else { 2.0 };
+        crowd.colors[i] = std::array::from_fn(|_| rng.random::<f32>());
     }
     let image = gpu().rasterize(&crowd, [0.0; 3]).unwrap();
     let expected = Reference.rasterize(&widen_projected(&crowd), [0.0; 3]).unwrap();
     let band = band_pixels(&widen_projected(&crowd), 1e-4);
-    // So many faint pairs put nearly every pixel in the band; what it holds is still close.
-    let off = image_difference(&image, &expected, &vec![false; band.len()]);
-    assert!(off.max <= 5e-3, "{off:?}");
+    let off = image_difference(&image, &expected, &band);
+    assert!(off.max <= 2e-5, "{off:?}");
 
     let mut wide = random_projected(&mut rng, 300, 16_384, 2, 6.0);
     place(&mut wide, 0, [8000.0, 1.0], [9000.0, 2.0], 0.0, 0.5);

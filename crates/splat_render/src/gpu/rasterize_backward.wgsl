@@ -16,14 +16,14 @@
 // then depth, colour 3, opacity.
 @group(0) @binding(8) var<storage, read_write> slots: array<f32>;
 
-const THREADS = 32u;
+const THREADS = 64u / ROWS;
 // Splats between two barriers: 60 sums occupy 32 threads almost twice.
 const BATCH = 6u;
 // One more than the threads, so that a column's entries lie in different memory banks.
-const STRIDE = 33u;
+const STRIDE = THREADS + 1u;
 
 // [splat of the batch][entry][thread]
-var<workgroup> partials: array<f32, 1980>; // BATCH * GRADIENT * STRIDE
+var<workgroup> partials: array<f32, BATCH * GRADIENT * STRIDE>;
 var<workgroup> any_live: u32;
 
 // Four neighbouring pixels.
@@ -120,7 +120,7 @@ fn total(x: vec4<f32>) -> f32 {
     return (x.x + x.y) + (x.z + x.w);
 }
 
-@compute @workgroup_size(4, 8)
+@compute @workgroup_size(4, TILE / ROWS)
 fn rasterize_backward(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
@@ -133,9 +133,29 @@ fn rasterize_backward(
         return;
     }
     let x = (tile % view.tiles_x) * TILE + 4u * local.x;
-    let y = (tile / view.tiles_x) * TILE + 2u * local.y;
-    var upper = load_quad(x, y);
-    var lower = load_quad(x, y + 1u);
+    let y = (tile / view.tiles_x) * TILE + ROWS * local.y;
+    // As in rasterize: ROWS is a constant and unused rows cost nothing.
+    var q0 = load_quad(x, y);
+    var q1: Quad;
+    var q2: Quad;
+    var q3: Quad;
+    var q4: Quad;
+    var q5: Quad;
+    var q6: Quad;
+    var q7: Quad;
+    if ROWS > 1u {
+        q1 = load_quad(x, y + 1u);
+    }
+    if ROWS > 2u {
+        q2 = load_quad(x, y + 2u);
+        q3 = load_quad(x, y + 3u);
+    }
+    if ROWS > 4u {
+        q4 = load_quad(x, y + 4u);
+        q5 = load_quad(x, y + 5u);
+        q6 = load_quad(x, y + 6u);
+        q7 = load_quad(x, y + 7u);
+    }
     let begin = tile_begin[relative];
     let end = tile_begin[relative + 1u];
     for (var batch = begin; batch < end; batch += BATCH) {
@@ -143,8 +163,20 @@ fn rasterize_backward(
         for (var b = 0u; b < count; b++) {
             let splat = splats2d[splat_from_pair[batch + b]];
             var sums = Sums();
-            accumulate(&upper, splat, &sums);
-            accumulate(&lower, splat, &sums);
+            accumulate(&q0, splat, &sums);
+            if ROWS > 1u {
+                accumulate(&q1, splat, &sums);
+            }
+            if ROWS > 2u {
+                accumulate(&q2, splat, &sums);
+                accumulate(&q3, splat, &sums);
+            }
+            if ROWS > 4u {
+                accumulate(&q4, splat, &sums);
+                accumulate(&q5, splat, &sums);
+                accumulate(&q6, splat, &sums);
+                accumulate(&q7, splat, &sums);
+            }
             let at = b * GRADIENT * STRIDE + thread;
             partials[at] = total(sums.u);
             partials[at + STRIDE] = total(sums.v);
@@ -157,7 +189,17 @@ fn rasterize_backward(
             partials[at + 8u * STRIDE] = total(sums.blue);
             partials[at + 9u * STRIDE] = total(sums.opacity);
         }
-        if any(upper.live | lower.live) {
+        var live = q0.live;
+        if ROWS > 1u {
+            live = live | q1.live;
+        }
+        if ROWS > 2u {
+            live = live | q2.live | q3.live;
+        }
+        if ROWS > 4u {
+            live = live | q4.live | q5.live | q6.live | q7.live;
+        }
+        if any(live) {
             any_live = 1u;
         }
         let goes_on = workgroupUniformLoad(&any_live);
