@@ -38,6 +38,8 @@ pub struct Gpu {
     pub(super) segments: u32,
     /// One of [`ROWS`].
     rows: u32,
+    /// Pairs of a tile that one dispatch of the rasterize kernels walks.
+    pub(super) list_limit: u32,
 }
 
 /// A binding of a kernel.
@@ -177,6 +179,9 @@ impl Gpu {
             // A few segments per core keep a CPU busy; a GPU needs many workgroups.
             segments: if software { 16 } else { 256 },
             rows: ROWS[usize::from(software)],
+            // llvmpipe leaves every loop once an invocation has done 65 535 rounds of all its loops
+            // together; rasterize_backward does up to 13 per pair.
+            list_limit: if software { 4096 } else { u32::MAX },
         };
         gpu.check()?;
         Ok(gpu)

@@ -8,7 +8,8 @@
 @group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
 @group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
-// Colour over the background and final transmittance, row-major.
+// Colour over the background and final transmittance, row-major. Where a tile's list goes on in the
+// next dispatch: colour so far and transmittance, negative where the pixel has stopped.
 @group(0) @binding(5) var<storage, read_write> picture: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> depths: array<f32>;
 
@@ -27,6 +28,20 @@ fn start(x: u32, y: u32) -> Quad {
     var quad: Quad;
     quad.live = exists & vec4(y < view.height);
     quad.transmittance = vec4(1.0);
+    if chunk.list_begin > 0u {
+        for (var k = 0u; k < 4u; k++) {
+            if x + k < view.width && y < view.height {
+                let pixel = y * view.width + x + k;
+                let last = picture[pixel];
+                quad.red[k] = last.x;
+                quad.green[k] = last.y;
+                quad.blue[k] = last.z;
+                quad.transmittance[k] = abs(last.w);
+                quad.live[k] = last.w > 0.0;
+                quad.depth[k] = depths[pixel];
+            }
+        }
+    }
     return quad;
 }
 
@@ -52,14 +67,17 @@ fn blend(quad: Quad, splat: Splat2d, p_dx: vec4<f32>, center_y: f32) -> Quad {
     );
 }
 
-fn finish(quad: Quad, x: u32, y: u32) {
-    let red = quad.red + quad.transmittance * view.background.x;
-    let green = quad.green + quad.transmittance * view.background.y;
-    let blue = quad.blue + quad.transmittance * view.background.z;
+fn finish(quad: Quad, x: u32, y: u32, goes_on: bool) {
+    let behind = select(quad.transmittance, vec4(0.0), goes_on);
+    let red = quad.red + behind * view.background.x;
+    let green = quad.green + behind * view.background.y;
+    let blue = quad.blue + behind * view.background.z;
+    let stopped = vec4(goes_on) & !quad.live;
+    let transmittance = select(quad.transmittance, -quad.transmittance, stopped);
     for (var k = 0u; k < 4u; k++) {
         if x + k < view.width && y < view.height {
             let pixel = y * view.width + x + k;
-            picture[pixel] = vec4(red[k], green[k], blue[k], quad.transmittance[k]);
+            picture[pixel] = vec4(red[k], green[k], blue[k], transmittance[k]);
             depths[pixel] = quad.depth[k];
         }
     }
@@ -76,6 +94,13 @@ fn rasterize(
     if tile >= chunk.tile_end {
         return;
     }
+    let list = tile_begin[relative];
+    let length = tile_begin[relative + 1u] - list;
+    if chunk.list_begin > 0u && chunk.list_begin >= length {
+        return;
+    }
+    let end = list + min(chunk.list_end, length);
+    let goes_on = length > chunk.list_end;
     let x = (tile % view.tiles_x) * TILE + 4u * local.x;
     let y = (tile / view.tiles_x) * TILE + ROWS * local.y;
     let center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
@@ -90,8 +115,7 @@ fn rasterize(
     var q5 = start(x, y + 5u);
     var q6 = start(x, y + 6u);
     var q7 = start(x, y + 7u);
-    let end = tile_begin[relative + 1u];
-    for (var pair = tile_begin[relative]; pair < end; pair++) {
+    for (var pair = list + chunk.list_begin; pair < end; pair++) {
         let splat = splats2d[splat_from_pair[pair]];
         let p_dx = splat.pq.x * (center_x - splat.mean.x);
         q0 = blend(q0, splat, p_dx, center_y);
@@ -122,18 +146,18 @@ fn rasterize(
             break;
         }
     }
-    finish(q0, x, y);
+    finish(q0, x, y, goes_on);
     if ROWS > 1u {
-        finish(q1, x, y + 1u);
+        finish(q1, x, y + 1u, goes_on);
     }
     if ROWS > 2u {
-        finish(q2, x, y + 2u);
-        finish(q3, x, y + 3u);
+        finish(q2, x, y + 2u, goes_on);
+        finish(q3, x, y + 3u, goes_on);
     }
     if ROWS > 4u {
-        finish(q4, x, y + 4u);
-        finish(q5, x, y + 5u);
-        finish(q6, x, y + 6u);
-        finish(q7, x, y + 7u);
+        finish(q4, x, y + 4u, goes_on);
+        finish(q5, x, y + 5u, goes_on);
+        finish(q6, x, y + 6u, goes_on);
+        finish(q7, x, y + 7u, goes_on);
     }
 }

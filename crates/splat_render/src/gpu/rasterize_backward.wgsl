@@ -10,11 +10,14 @@
 @group(0) @binding(5) var<storage, read> slot_from_pair: array<u32>;
 // Gradients of colour (xyz) and accumulated depth (w).
 @group(0) @binding(6) var<storage, read> v_picture: array<vec4<f32>>;
-// Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included.
-@group(0) @binding(7) var<storage, read> totals: array<f32>;
+// Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included; less
+// what has been walked where a tile's list goes on in the next dispatch.
+@group(0) @binding(7) var<storage, read_write> totals: array<f32>;
 // GRADIENT floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma,
 // then depth, colour 3, opacity.
 @group(0) @binding(8) var<storage, read_write> slots: array<f32>;
+// Between such dispatches: transmittance, negative where the pixel has stopped.
+@group(0) @binding(9) var<storage, read_write> transmittances: array<f32>;
 
 const THREADS = 64u / ROWS;
 // Splats between two barriers: 60 sums occupy 32 threads almost twice.
@@ -68,6 +71,10 @@ fn load_quad(x: u32, y: u32) -> Quad {
             quad.v_green[k] = gradient.y;
             quad.v_blue[k] = gradient.z;
             quad.v_depth[k] = gradient.w;
+            if chunk.list_begin > 0u {
+                quad.transmittance[k] = abs(transmittances[pixel]);
+                quad.live[k] = transmittances[pixel] > 0.0;
+            }
         }
     }
     return quad;
@@ -116,6 +123,18 @@ fn accumulate(quad: ptr<function, Quad>, splat: Splat2d, sums: ptr<function, Sum
     (*quad).transmittance = select(transmittance, next, adds);
 }
 
+// For the dispatch that goes on with the list.
+fn keep(quad: Quad, x: u32, y: u32) {
+    for (var k = 0u; k < 4u; k++) {
+        if x + k < view.width && y < view.height {
+            let pixel = y * view.width + x + k;
+            totals[pixel] = quad.remaining[k];
+            transmittances[pixel] =
+                select(-quad.transmittance[k], quad.transmittance[k], quad.live[k]);
+        }
+    }
+}
+
 fn total(x: vec4<f32>) -> f32 {
     return (x.x + x.y) + (x.z + x.w);
 }
@@ -132,6 +151,13 @@ fn rasterize_backward(
     if tile >= chunk.tile_end {
         return;
     }
+    let list = tile_begin[relative];
+    let length = tile_begin[relative + 1u] - list;
+    if chunk.list_begin > 0u && chunk.list_begin >= length {
+        return;
+    }
+    let begin = list + chunk.list_begin;
+    let end = list + min(chunk.list_end, length);
     let x = (tile % view.tiles_x) * TILE + 4u * local.x;
     let y = (tile / view.tiles_x) * TILE + ROWS * local.y;
     // As in rasterize: ROWS is a constant and unused rows cost nothing.
@@ -156,8 +182,6 @@ fn rasterize_backward(
         q6 = load_quad(x, y + 6u);
         q7 = load_quad(x, y + 7u);
     }
-    let begin = tile_begin[relative];
-    let end = tile_begin[relative + 1u];
     for (var batch = begin; batch < end; batch += BATCH) {
         let count = min(BATCH, end - batch);
         for (var b = 0u; b < count; b++) {
@@ -215,5 +239,21 @@ fn rasterize_backward(
         }
         any_live = 0u;
         workgroupBarrier();
+    }
+    if length > chunk.list_end {
+        keep(q0, x, y);
+        if ROWS > 1u {
+            keep(q1, x, y + 1u);
+        }
+        if ROWS > 2u {
+            keep(q2, x, y + 2u);
+            keep(q3, x, y + 3u);
+        }
+        if ROWS > 4u {
+            keep(q4, x, y + 4u);
+            keep(q5, x, y + 5u);
+            keep(q6, x, y + 6u);
+            keep(q7, x, y + 7u);
+        }
     }
 }

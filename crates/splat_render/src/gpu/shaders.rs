@@ -84,7 +84,9 @@ pub(super) static SOURCES: [Source; 12] = [
     Source {
         name: "rasterize_backward",
         parts: &[SHARED, include_str!("rasterize_backward.wgsl")],
-        bindings: &[Uniform, Uniform, Read, Read, Read, Read, Read, Read, ReadWrite],
+        bindings: &[
+            Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite,
+        ],
         segmented: false,
     },
     Source {
@@ -380,7 +382,9 @@ mod tests {
             splats,
             index,
             is_first,
-            is_last
+            is_last,
+            list_begin,
+            list_end
         );
         layout!("bin_sort", SortPass, shift, chunk);
         layout!("project", Splat2d, mean, pq, color, r, depth, opacity, radii);
