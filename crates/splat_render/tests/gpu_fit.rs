@@ -69,7 +69,11 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput<'_> {
         view,
         camera: &capture.cameras[view],
         // Photos with alpha stand on a background that moves, the others on black.
-        background: if view % 2 == 0 { [t.fract(), (2.0 * t).fract(), 0.5] } else { [0.0; 3] },
+        background: if view.is_multiple_of(2) {
+            [t.fract(), (2.0 * t).fract(), 0.5]
+        } else {
+            [0.0; 3]
+        },
         sh_degree: u32::from(step > 20),
         rates: Rates {
             means: 1e-3,
@@ -197,7 +201,7 @@ fn running_out_of_room_for_pairs_changes_nothing() {
     let mut capture = capture(3, &[(128, 96), (90, 100)], 400);
     // Large splats: over 8 pairs each, so that a small device has to grow and to cut into chunks.
     for scale in capture.start.splats.scales.as_flattened_mut() {
-        *scale += 1.6;
+        *scale += 2.6;
     }
     let (whole, losses) = run(&mut gpu_fit(gpu()), &capture, 20, 100.0);
     let small = gpu().with_binding_limit(128 * 96 * 36);

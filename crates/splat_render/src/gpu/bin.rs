@@ -47,12 +47,23 @@ pub(super) struct TileChunk {
     pub chunk: Chunk,
     /// `chunk` as the kernels read it.
     pub uniform: wgpu::Buffer,
+    /// The same for each dispatch of the rasterize kernels, which walk a part of all lists each.
+    pub passes: Vec<wgpu::Buffer>,
 }
 
 impl TileChunk {
     /// Of the given tiles.
     pub fn new(gpu: &Gpu, chunk: Chunk) -> Self {
-        Self { chunk, uniform: gpu.uniform(&chunk) }
+        // A splat is in a tile's list once at most.
+        let longest = chunk.splats.min(chunk.capacity).max(1);
+        let passes = (0..longest)
+            .step_by(gpu.list_limit as usize)
+            .map(|list_begin| {
+                let list_end = list_begin.saturating_add(gpu.list_limit);
+                gpu.uniform(&Chunk { list_begin, list_end, ..chunk })
+            })
+            .collect();
+        Self { chunk, uniform: gpu.uniform(&chunk), passes }
     }
 
     /// Number of tiles.
@@ -241,7 +252,7 @@ impl SplatBins {
         tiles: u32,
     ) -> Result<(Vec<Range<u32>>, u32)> {
         let limit = pair_limit(gpu);
-        let (mut open, mut done) = (vec![0..tiles], Vec::new());
+        let (mut open, mut done) = (Vec::from([0..tiles]), Vec::new());
         let mut capacity = 0;
         while let Some(range) = open.pop() {
             let chunk = TileChunk::new(
@@ -254,6 +265,8 @@ impl SplatBins {
                     index: 0,
                     is_first: 1,
                     is_last: 1,
+                    list_begin: 0,
+                    list_end: u32::MAX,
                 },
             );
             let ops = self.count_ops(gpu, view, &chunk, splats2d);

@@ -18,6 +18,10 @@ const GROUPS_MAX: u32 = 65_535;
 /// Smallest buffer: large enough for one element of any binding.
 const BUFFER_MIN: u64 = 256;
 
+/// Rows of pixels that a thread of the rasterize kernels owns: on real GPUs, and on software ones,
+/// where reading a splat costs more than blending it and a tile's eight threads are one subgroup.
+pub(super) const ROWS: [u32; 2] = [2, 8];
+
 /// wgpu on one adapter, with this crate's kernels.
 #[derive(Debug)]
 pub struct Gpu {
@@ -32,6 +36,10 @@ pub struct Gpu {
     pub(super) binding_limit: u64,
     /// Workgroups that scans and sorts are cut into.
     pub(super) segments: u32,
+    /// One of [`ROWS`].
+    rows: u32,
+    /// Pairs of a tile that one dispatch of the rasterize kernels walks.
+    pub(super) list_limit: u32,
 }
 
 /// A binding of a kernel.
@@ -159,8 +167,7 @@ impl Gpu {
             }
         });
         let layouts = SOURCES.iter().map(|source| bind_group_layout(&device, source)).collect();
-        // A few segments per core keep a CPU busy; a GPU needs many workgroups.
-        let segments = if info.device_type == wgpu::DeviceType::Cpu { 16 } else { 256 };
+        let software = info.device_type == wgpu::DeviceType::Cpu;
         let gpu = Self {
             device,
             queue,
@@ -169,7 +176,12 @@ impl Gpu {
             layouts,
             failure,
             binding_limit,
-            segments,
+            // A few segments per core keep a CPU busy; a GPU needs many workgroups.
+            segments: if software { 16 } else { 256 },
+            rows: ROWS[usize::from(software)],
+            // llvmpipe leaves every loop once an invocation has done 65 535 rounds of all its loops
+            // together; rasterize_backward does up to 13 per pair.
+            list_limit: if software { 4096 } else { u32::MAX },
         };
         gpu.check()?;
         Ok(gpu)
@@ -276,7 +288,7 @@ impl Gpu {
             let source = Source::named(file);
             let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(file),
-                source: wgpu::ShaderSource::Wgsl(source.text().into()),
+                source: wgpu::ShaderSource::Wgsl(source.text(self.rows).into()),
             });
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(file),

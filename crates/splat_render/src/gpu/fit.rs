@@ -17,7 +17,7 @@ use super::layout::{
 use super::loss::LossBuffers;
 use super::project::{SplatBuffers, project_ops, rows};
 use super::project_backward::{GradientBuffers, project_backward_ops};
-use super::rasterize::rasterize_op;
+use super::rasterize::rasterize_ops;
 use super::rasterize_backward::{BackwardBuffers, rasterize_backward_ops};
 use super::shaders::Kernel;
 use crate::camera::Camera;
@@ -68,6 +68,7 @@ struct Frame {
     depths: wgpu::Buffer,
     v_picture: wgpu::Buffer,
     totals: wgpu::Buffer,
+    transmittances: wgpu::Buffer,
     loss: LossBuffers,
     /// Tiles of each chunk; more than one only where the pairs of all do not fit one binding.
     chunks: Vec<Range<u32>>,
@@ -253,6 +254,7 @@ impl Frame {
             depths: gpu.bindable("depths", 4 * pixels)?,
             v_picture: gpu.bindable("v_picture", 16 * pixels)?,
             totals: gpu.bindable("totals", 4 * pixels)?,
+            transmittances: gpu.bindable("transmittances", 4 * pixels)?,
             loss: LossBuffers::new(gpu, width, height)?,
             chunks: std::iter::once(0..tile_count(width, height)).collect(),
             ops: Vec::new(),
@@ -281,6 +283,8 @@ impl Frame {
                     index: i as u32,
                     is_first: u32::from(i == 0),
                     is_last: u32::from(i == last),
+                    list_begin: 0,
+                    list_end: u32::MAX,
                 };
                 TileChunk::new(gpu, chunk)
             })
@@ -293,6 +297,7 @@ impl Frame {
         let backward = BackwardBuffers {
             v_picture: self.v_picture.clone(),
             totals: self.totals.clone(),
+            transmittances: self.transmittances.clone(),
             slots: scene.slots.clone(),
             v_splats2d: scene.v_splats2d.clone(),
         };
@@ -300,7 +305,15 @@ impl Frame {
         ops.extend(bins.depth_ops(gpu, view, &chunks[0], splats2d));
         for chunk in &chunks {
             bin(&mut ops, chunk);
-            ops.push(rasterize_op(gpu, view, chunk, splats2d, pairs, &self.picture, &self.depths));
+            ops.extend(rasterize_ops(
+                gpu,
+                view,
+                chunk,
+                splats2d,
+                pairs,
+                &self.picture,
+                &self.depths,
+            ));
         }
         ops.extend(self.loss.ops(gpu, view, step, &self.picture, &self.v_picture, &self.totals));
         for chunk in &chunks {

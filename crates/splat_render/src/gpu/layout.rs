@@ -104,6 +104,8 @@ pub(super) struct Chunk {
     pub index: u32,
     pub is_first: u32,
     pub is_last: u32,
+    pub list_begin: u32,
+    pub list_end: u32,
 }
 
 /// One pass of the radix sort.

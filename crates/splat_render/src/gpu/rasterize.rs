@@ -54,6 +54,8 @@ impl Binned {
             index: 0,
             is_first: 1,
             is_last: 1,
+            list_begin: 0,
+            list_end: u32::MAX,
         };
         gpu.submit(&[&bins.depth_ops(gpu, &view, &TileChunk::new(gpu, all), &splats2d)])?;
         let (ranges, capacity) = bins.plan(gpu, &view, &splats2d, tiles)?;
@@ -86,7 +88,7 @@ impl Binned {
 }
 
 /// Rasterizes a chunk's tiles.
-pub(super) fn rasterize_op(
+pub(super) fn rasterize_ops(
     gpu: &Gpu,
     view: &wgpu::Buffer,
     chunk: &TileChunk,
@@ -94,20 +96,23 @@ pub(super) fn rasterize_op(
     pairs: &PairBins,
     picture: &wgpu::Buffer,
     depths: &wgpu::Buffer,
-) -> Op {
-    gpu.op(
-        Kernel::Rasterize,
-        &[
-            view.into(),
-            (&chunk.uniform).into(),
-            splats2d.into(),
-            (&pairs.tile_begin).into(),
-            (&pairs.splat_from_pair).into(),
-            picture.into(),
-            depths.into(),
-        ],
-        Gpu::groups(chunk.tiles(), 1),
-    )
+) -> Vec<Op> {
+    let op = |pass: &wgpu::Buffer| {
+        gpu.op(
+            Kernel::Rasterize,
+            &[
+                view.into(),
+                pass.into(),
+                splats2d.into(),
+                (&pairs.tile_begin).into(),
+                (&pairs.splat_from_pair).into(),
+                picture.into(),
+                depths.into(),
+            ],
+            Gpu::groups(chunk.tiles(), 1),
+        )
+    };
+    chunk.passes.iter().map(op).collect()
 }
 
 pub(super) fn rasterize(
@@ -123,7 +128,7 @@ pub(super) fn rasterize(
     let mut ops = Vec::new();
     for chunk in &binned.chunks {
         ops.extend(binned.chunk_ops(gpu, chunk));
-        ops.push(rasterize_op(
+        ops.extend(rasterize_ops(
             gpu,
             &binned.view,
             chunk,

@@ -1,17 +1,89 @@
 // rasterize: every tile's splats, front to back, to colours, depth and final transmittance. A
-// thread owns four neighbouring pixels, so that a splat is read once for the four; splats are read
-// straight from storage (staging them in workgroup memory was slower). Follows shared.wgsl.
+// thread owns four neighbouring pixels of each of ROWS rows, so that a splat is read once for all of
+// them; splats are read straight from storage (staging them in workgroup memory was slower). Follows
+// shared.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;
 @group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
 @group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
-// Colour over the background and final transmittance, row-major.
+// Colour over the background and final transmittance, row-major. Where a tile's list goes on in the
+// next dispatch: colour so far and transmittance, negative where the pixel has stopped.
 @group(0) @binding(5) var<storage, read_write> picture: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> depths: array<f32>;
 
-@compute @workgroup_size(4, 16)
+// Four neighbouring pixels.
+struct Quad {
+    live: vec4<bool>,
+    transmittance: vec4<f32>,
+    red: vec4<f32>,
+    green: vec4<f32>,
+    blue: vec4<f32>,
+    depth: vec4<f32>,
+}
+
+fn start(x: u32, y: u32) -> Quad {
+    let exists = vec4(x, x + 1u, x + 2u, x + 3u) < vec4(view.width);
+    var quad: Quad;
+    quad.live = exists & vec4(y < view.height);
+    quad.transmittance = vec4(1.0);
+    if chunk.list_begin > 0u {
+        for (var k = 0u; k < 4u; k++) {
+            if x + k < view.width && y < view.height {
+                let pixel = y * view.width + x + k;
+                let last = picture[pixel];
+                quad.red[k] = last.x;
+                quad.green[k] = last.y;
+                quad.blue[k] = last.z;
+                quad.transmittance[k] = abs(last.w);
+                quad.live[k] = last.w > 0.0;
+                quad.depth[k] = depths[pixel];
+            }
+        }
+    }
+    return quad;
+}
+
+fn blend(quad: Quad, splat: Splat2d, p_dx: vec4<f32>, center_y: f32) -> Quad {
+    let dy = center_y - splat.mean.y;
+    let u = p_dx + splat.pq.y * dy;
+    let v = splat.r * dy;
+    let exponent = max(-0.5 * (u * u + v * v), vec4(-80.0));
+    let alpha = min(splat.opacity * exp_accurate4(exponent), vec4(ALPHA_MAX));
+    let next = quad.transmittance * (1.0 - alpha);
+    let hit = quad.live & (alpha >= vec4(ALPHA_MIN));
+    let stops = hit & (next < vec4(TRANSMITTANCE_MIN));
+    let live = quad.live & !stops;
+    let adds = hit & live;
+    let weight = select(vec4(0.0), quad.transmittance * alpha, adds);
+    return Quad(
+        live,
+        select(quad.transmittance, next, adds),
+        quad.red + weight * splat.color.x,
+        quad.green + weight * splat.color.y,
+        quad.blue + weight * splat.color.z,
+        quad.depth + weight * splat.depth,
+    );
+}
+
+fn finish(quad: Quad, x: u32, y: u32, goes_on: bool) {
+    let behind = select(quad.transmittance, vec4(0.0), goes_on);
+    let red = quad.red + behind * view.background.x;
+    let green = quad.green + behind * view.background.y;
+    let blue = quad.blue + behind * view.background.z;
+    let stopped = vec4(goes_on) & !quad.live;
+    let transmittance = select(quad.transmittance, -quad.transmittance, stopped);
+    for (var k = 0u; k < 4u; k++) {
+        if x + k < view.width && y < view.height {
+            let pixel = y * view.width + x + k;
+            picture[pixel] = vec4(red[k], green[k], blue[k], transmittance[k]);
+            depths[pixel] = quad.depth[k];
+        }
+    }
+}
+
+@compute @workgroup_size(4, TILE / ROWS)
 fn rasterize(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
@@ -22,51 +94,70 @@ fn rasterize(
     if tile >= chunk.tile_end {
         return;
     }
+    let list = tile_begin[relative];
+    let length = tile_begin[relative + 1u] - list;
+    if chunk.list_begin > 0u && chunk.list_begin >= length {
+        return;
+    }
+    let end = list + min(chunk.list_end, length);
+    let goes_on = length > chunk.list_end;
     let x = (tile % view.tiles_x) * TILE + 4u * local.x;
-    let y = (tile / view.tiles_x) * TILE + local.y;
+    let y = (tile / view.tiles_x) * TILE + ROWS * local.y;
     let center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
     let center_y = f32(y) + 0.5;
-    let exists = vec4(x, x + 1u, x + 2u, x + 3u) < vec4(view.width);
-    var live = exists & vec4(y < view.height);
-    var transmittance = vec4(1.0);
-    var red = vec4(0.0);
-    var green = vec4(0.0);
-    var blue = vec4(0.0);
-    var depth = vec4(0.0);
-    let end = tile_begin[relative + 1u];
-    for (var pair = tile_begin[relative]; pair < end; pair++) {
+    // ROWS is a constant, so that unused rows cost nothing; a loop over an array of rows is not
+    // unrolled by every driver, and then lives in memory.
+    var q0 = start(x, y + 0u);
+    var q1 = start(x, y + 1u);
+    var q2 = start(x, y + 2u);
+    var q3 = start(x, y + 3u);
+    var q4 = start(x, y + 4u);
+    var q5 = start(x, y + 5u);
+    var q6 = start(x, y + 6u);
+    var q7 = start(x, y + 7u);
+    for (var pair = list + chunk.list_begin; pair < end; pair++) {
         let splat = splats2d[splat_from_pair[pair]];
-        let dy = center_y - splat.mean.y;
-        let u = splat.pq.x * (center_x - splat.mean.x) + splat.pq.y * dy;
-        let v = splat.r * dy;
-        let exponent = max(-0.5 * (u * u + v * v), vec4(-80.0));
-        let alpha = min(splat.opacity * exp_accurate4(exponent), vec4(ALPHA_MAX));
-        let next = transmittance * (1.0 - alpha);
-        let hit = live & (alpha >= vec4(ALPHA_MIN));
-        let stops = hit & (next < vec4(TRANSMITTANCE_MIN));
-        live = live & !stops;
-        let adds = hit & live;
-        let weight = select(vec4(0.0), transmittance * alpha, adds);
-        red += weight * splat.color.x;
-        green += weight * splat.color.y;
-        blue += weight * splat.color.z;
-        depth += weight * splat.depth;
-        transmittance = select(transmittance, next, adds);
+        let p_dx = splat.pq.x * (center_x - splat.mean.x);
+        q0 = blend(q0, splat, p_dx, center_y);
+        if ROWS > 1u {
+            q1 = blend(q1, splat, p_dx, center_y + 1.0);
+        }
+        if ROWS > 2u {
+            q2 = blend(q2, splat, p_dx, center_y + 2.0);
+            q3 = blend(q3, splat, p_dx, center_y + 3.0);
+        }
+        if ROWS > 4u {
+            q4 = blend(q4, splat, p_dx, center_y + 4.0);
+            q5 = blend(q5, splat, p_dx, center_y + 5.0);
+            q6 = blend(q6, splat, p_dx, center_y + 6.0);
+            q7 = blend(q7, splat, p_dx, center_y + 7.0);
+        }
+        var live = q0.live;
+        if ROWS > 1u {
+            live = live | q1.live;
+        }
+        if ROWS > 2u {
+            live = live | q2.live | q3.live;
+        }
+        if ROWS > 4u {
+            live = live | q4.live | q5.live | q6.live | q7.live;
+        }
         if !any(live) {
             break;
         }
     }
-    if y >= view.height {
-        return;
+    finish(q0, x, y, goes_on);
+    if ROWS > 1u {
+        finish(q1, x, y + 1u, goes_on);
     }
-    red += transmittance * view.background.x;
-    green += transmittance * view.background.y;
-    blue += transmittance * view.background.z;
-    for (var k = 0u; k < 4u; k++) {
-        if x + k < view.width {
-            let pixel = y * view.width + x + k;
-            picture[pixel] = vec4(red[k], green[k], blue[k], transmittance[k]);
-            depths[pixel] = depth[k];
-        }
+    if ROWS > 2u {
+        finish(q2, x, y + 2u, goes_on);
+        finish(q3, x, y + 3u, goes_on);
+    }
+    if ROWS > 4u {
+        finish(q4, x, y + 4u, goes_on);
+        finish(q5, x, y + 5u, goes_on);
+        finish(q6, x, y + 6u, goes_on);
+        finish(q7, x, y + 7u, goes_on);
     }
 }

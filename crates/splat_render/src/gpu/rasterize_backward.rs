@@ -15,6 +15,8 @@ pub(super) struct BackwardBuffers {
     pub v_picture: wgpu::Buffer,
     /// `[H * W]` colour . v_color + depth v_depth - transmittance v_alpha.
     pub totals: wgpu::Buffer,
+    /// `[H * W]`, for lists that take more than one dispatch.
+    pub transmittances: wgpu::Buffer,
     /// `[pairs * GRADIENT]`
     pub slots: wgpu::Buffer,
     /// `[N * GRADIENT]`
@@ -31,14 +33,14 @@ pub(super) fn rasterize_backward_ops(
     pairs: &PairBins,
     buffers: &BackwardBuffers,
 ) -> Vec<Op> {
-    vec![
-        // Slots behind a tile's early stop are never written.
-        Op::Clear(buffers.slots.clone()),
+    // Slots behind a tile's early stop are never written.
+    let mut ops = vec![Op::Clear(buffers.slots.clone())];
+    ops.extend(chunk.passes.iter().map(|pass| {
         gpu.op(
             Kernel::RasterizeBackward,
             &[
                 view.into(),
-                (&chunk.uniform).into(),
+                pass.into(),
                 splats2d.into(),
                 (&pairs.tile_begin).into(),
                 (&pairs.splat_from_pair).into(),
@@ -46,23 +48,25 @@ pub(super) fn rasterize_backward_ops(
                 (&buffers.v_picture).into(),
                 (&buffers.totals).into(),
                 (&buffers.slots).into(),
+                (&buffers.transmittances).into(),
             ],
             Gpu::groups(chunk.tiles(), 1),
-        ),
-        gpu.op(
-            Kernel::RasterizeBackwardSum,
-            &[
-                (&chunk.uniform).into(),
-                (&bins.status).into(),
-                splats2d.into(),
-                bins.order().into(),
-                (&bins.offsets).into(),
-                (&buffers.slots).into(),
-                (&buffers.v_splats2d).into(),
-            ],
-            Gpu::groups(chunk.chunk.splats, 64),
-        ),
-    ]
+        )
+    }));
+    ops.push(gpu.op(
+        Kernel::RasterizeBackwardSum,
+        &[
+            (&chunk.uniform).into(),
+            (&bins.status).into(),
+            splats2d.into(),
+            bins.order().into(),
+            (&bins.offsets).into(),
+            (&buffers.slots).into(),
+            (&buffers.v_splats2d).into(),
+        ],
+        Gpu::groups(chunk.chunk.splats, 64),
+    ));
+    ops
 }
 
 pub(super) fn rasterize_backward(
@@ -95,6 +99,7 @@ pub(super) fn rasterize_backward(
     let buffers = BackwardBuffers {
         v_picture: gpu.upload("v_picture", &v_picture)?,
         totals: gpu.upload("totals", &totals)?,
+        transmittances: gpu.buffer("transmittances", 4 * pixels as u64)?,
         slots: gpu.bindable("gradient slots", row * u64::from(binned.capacity))?,
         v_splats2d: gpu.bindable("v_splats2d", row * u64::from(binned.splats))?,
     };

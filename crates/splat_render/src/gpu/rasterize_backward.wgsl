@@ -10,20 +10,23 @@
 @group(0) @binding(5) var<storage, read> slot_from_pair: array<u32>;
 // Gradients of colour (xyz) and accumulated depth (w).
 @group(0) @binding(6) var<storage, read> v_picture: array<vec4<f32>>;
-// Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included.
-@group(0) @binding(7) var<storage, read> totals: array<f32>;
+// Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included; less
+// what has been walked where a tile's list goes on in the next dispatch.
+@group(0) @binding(7) var<storage, read_write> totals: array<f32>;
 // GRADIENT floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma,
 // then depth, colour 3, opacity.
 @group(0) @binding(8) var<storage, read_write> slots: array<f32>;
+// Between such dispatches: transmittance, negative where the pixel has stopped.
+@group(0) @binding(9) var<storage, read_write> transmittances: array<f32>;
 
-const THREADS = 32u;
+const THREADS = 64u / ROWS;
 // Splats between two barriers: 60 sums occupy 32 threads almost twice.
 const BATCH = 6u;
 // One more than the threads, so that a column's entries lie in different memory banks.
-const STRIDE = 33u;
+const STRIDE = THREADS + 1u;
 
 // [splat of the batch][entry][thread]
-var<workgroup> partials: array<f32, 1980>; // BATCH * GRADIENT * STRIDE
+var<workgroup> partials: array<f32, BATCH * GRADIENT * STRIDE>;
 var<workgroup> any_live: u32;
 
 // Four neighbouring pixels.
@@ -68,6 +71,10 @@ fn load_quad(x: u32, y: u32) -> Quad {
             quad.v_green[k] = gradient.y;
             quad.v_blue[k] = gradient.z;
             quad.v_depth[k] = gradient.w;
+            if chunk.list_begin > 0u {
+                quad.transmittance[k] = abs(transmittances[pixel]);
+                quad.live[k] = transmittances[pixel] > 0.0;
+            }
         }
     }
     return quad;
@@ -116,11 +123,23 @@ fn accumulate(quad: ptr<function, Quad>, splat: Splat2d, sums: ptr<function, Sum
     (*quad).transmittance = select(transmittance, next, adds);
 }
 
+// For the dispatch that goes on with the list.
+fn keep(quad: Quad, x: u32, y: u32) {
+    for (var k = 0u; k < 4u; k++) {
+        if x + k < view.width && y < view.height {
+            let pixel = y * view.width + x + k;
+            totals[pixel] = quad.remaining[k];
+            transmittances[pixel] =
+                select(-quad.transmittance[k], quad.transmittance[k], quad.live[k]);
+        }
+    }
+}
+
 fn total(x: vec4<f32>) -> f32 {
     return (x.x + x.y) + (x.z + x.w);
 }
 
-@compute @workgroup_size(4, 8)
+@compute @workgroup_size(4, TILE / ROWS)
 fn rasterize_backward(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
@@ -132,19 +151,56 @@ fn rasterize_backward(
     if tile >= chunk.tile_end {
         return;
     }
+    let list = tile_begin[relative];
+    let length = tile_begin[relative + 1u] - list;
+    if chunk.list_begin > 0u && chunk.list_begin >= length {
+        return;
+    }
+    let begin = list + chunk.list_begin;
+    let end = list + min(chunk.list_end, length);
     let x = (tile % view.tiles_x) * TILE + 4u * local.x;
-    let y = (tile / view.tiles_x) * TILE + 2u * local.y;
-    var upper = load_quad(x, y);
-    var lower = load_quad(x, y + 1u);
-    let begin = tile_begin[relative];
-    let end = tile_begin[relative + 1u];
+    let y = (tile / view.tiles_x) * TILE + ROWS * local.y;
+    // As in rasterize: ROWS is a constant and unused rows cost nothing.
+    var q0 = load_quad(x, y);
+    var q1: Quad;
+    var q2: Quad;
+    var q3: Quad;
+    var q4: Quad;
+    var q5: Quad;
+    var q6: Quad;
+    var q7: Quad;
+    if ROWS > 1u {
+        q1 = load_quad(x, y + 1u);
+    }
+    if ROWS > 2u {
+        q2 = load_quad(x, y + 2u);
+        q3 = load_quad(x, y + 3u);
+    }
+    if ROWS > 4u {
+        q4 = load_quad(x, y + 4u);
+        q5 = load_quad(x, y + 5u);
+        q6 = load_quad(x, y + 6u);
+        q7 = load_quad(x, y + 7u);
+    }
     for (var batch = begin; batch < end; batch += BATCH) {
         let count = min(BATCH, end - batch);
         for (var b = 0u; b < count; b++) {
             let splat = splats2d[splat_from_pair[batch + b]];
             var sums = Sums();
-            accumulate(&upper, splat, &sums);
-            accumulate(&lower, splat, &sums);
+            accumulate(&q0, splat, &sums);
+            if ROWS > 1u {
+                accumulate(&q1, splat, &sums);
+            }
+            if ROWS > 2u {
+                accumulate(&q2, splat, &sums);
+                accumulate(&q3, splat, &sums);
+            }
+            if ROWS > 4u {
+                accumulate(&q4, splat, &sums);
+                accumulate(&q5, splat, &sums);
+                accumulate(&q6, splat, &sums);
+                accumulate(&q7, splat, &sums);
+            }
             let at = b * GRADIENT * STRIDE + thread;
             partials[at] = total(sums.u);
             partials[at + STRIDE] = total(sums.v);
@@ -157,7 +213,17 @@ fn rasterize_backward(
             partials[at + 8u * STRIDE] = total(sums.blue);
             partials[at + 9u * STRIDE] = total(sums.opacity);
         }
-        if any(upper.live | lower.live) {
+        var live = q0.live;
+        if ROWS > 1u {
+            live = live | q1.live;
+        }
+        if ROWS > 2u {
+            live = live | q2.live | q3.live;
+        }
+        if ROWS > 4u {
+            live = live | q4.live | q5.live | q6.live | q7.live;
+        }
+        if any(live) {
             any_live = 1u;
         }
         let goes_on = workgroupUniformLoad(&any_live);
@@ -173,5 +239,21 @@ fn rasterize_backward(
         }
         any_live = 0u;
         workgroupBarrier();
+    }
+    if length > chunk.list_end {
+        keep(q0, x, y);
+        if ROWS > 1u {
+            keep(q1, x, y + 1u);
+        }
+        if ROWS > 2u {
+            keep(q2, x, y + 2u);
+            keep(q3, x, y + 3u);
+        }
+        if ROWS > 4u {
+            keep(q4, x, y + 4u);
+            keep(q5, x, y + 5u);
+            keep(q6, x, y + 6u);
+            keep(q7, x, y + 7u);
+        }
     }
 }

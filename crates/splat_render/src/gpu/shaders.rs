@@ -84,7 +84,9 @@ pub(super) static SOURCES: [Source; 12] = [
     Source {
         name: "rasterize_backward",
         parts: &[SHARED, include_str!("rasterize_backward.wgsl")],
-        bindings: &[Uniform, Uniform, Read, Read, Read, Read, Read, Read, ReadWrite],
+        bindings: &[
+            Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite,
+        ],
         segmented: false,
     },
     Source {
@@ -182,8 +184,9 @@ impl Kernel {
 }
 
 /// Constants of the crate as WGSL, so that no shader repeats a value by hand.
-fn constants() -> String {
+fn constants(rows: u32) -> String {
     let mut out = String::new();
+    let _ = writeln!(out, "const ROWS = {rows}u;");
     for (name, value) in [("TILE", TILE), ("GEOMETRY", GEOMETRY as u32)].into_iter().chain([
         ("GRADIENT", GRADIENT as u32),
         ("CAMERA", CAMERA as u32),
@@ -221,9 +224,9 @@ fn constants() -> String {
 }
 
 impl Source {
-    /// The whole text that is compiled.
-    pub fn text(&self) -> String {
-        let mut text = constants();
+    /// The whole text that is compiled, with threads that own so many rows of pixels.
+    pub fn text(&self, rows: u32) -> String {
+        let mut text = constants(rows);
         for part in self.parts {
             text.push_str(part);
         }
@@ -243,23 +246,29 @@ mod tests {
     use naga::valid::{Capabilities, ValidationFlags, Validator};
 
     use super::*;
+    use crate::gpu::device::ROWS;
     use crate::gpu::layout::{
         Chunk, ChunkCount, SortPass, Splat2d, StatusHead, Step, View, Window,
     };
 
+    fn parse_with(source: &Source, rows: u32) -> naga::Module {
+        let text = source.text(rows);
+        naga::front::wgsl::parse_str(&text)
+            .unwrap_or_else(|e| panic!("{}: {}", source.name, e.emit_to_string(&text)))
+    }
+
     fn parse(source: &Source) -> naga::Module {
-        naga::front::wgsl::parse_str(&source.text())
-            .unwrap_or_else(|e| panic!("{}: {}", source.name, e.emit_to_string(&source.text())))
+        parse_with(source, ROWS[0])
     }
 
     #[test]
     fn every_shader_is_valid_without_optional_capabilities() {
-        for source in &SOURCES {
-            let module = parse(source);
+        for (source, rows) in SOURCES.iter().flat_map(|s| ROWS.map(|rows| (s, rows))) {
+            let module = parse_with(source, rows);
             let result =
                 Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module);
             if let Err(error) = result {
-                panic!("{}: {}", source.name, error.emit_to_string(&source.text()));
+                panic!("{}: {}", source.name, error.emit_to_string(&source.text(rows)));
             }
         }
     }
@@ -373,7 +382,9 @@ mod tests {
             splats,
             index,
             is_first,
-            is_last
+            is_last,
+            list_begin,
+            list_end
         );
         layout!("bin_sort", SortPass, shift, chunk);
         layout!("project", Splat2d, mean, pq, color, r, depth, opacity, radii);

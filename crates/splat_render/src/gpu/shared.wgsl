@@ -41,6 +41,9 @@ struct Chunk {
     // 1 for the first and the last chunk of a picture.
     is_first: u32,
     is_last: u32,
+    // The part of every tile's list that a dispatch of the rasterize kernels walks.
+    list_begin: u32,
+    list_end: u32,
 }
 
 // Counts that only the device knows.
