@@ -77,7 +77,6 @@ fn quat_gradient([w, x, y, z]: [f32; 4], v: Mat3) -> [f32; 4] {
 /// the clamp of the colour). All of that splat's are zero then: they must not reach the camera or,
 /// through Adam's moments, later steps.
 #[inline(always)]
-#[expect(clippy::too_many_arguments, reason = "one per stage input")]
 pub(super) fn splat_backward(
     view: &View,
     splat: &Splat,
@@ -105,7 +104,6 @@ pub(super) fn splat_backward(
 }
 
 #[inline(always)]
-#[expect(clippy::too_many_arguments, reason = "one per stage input")]
 fn gradients(
     view: &View,
     splat: &Splat,
