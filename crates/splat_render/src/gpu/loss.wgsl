@@ -1,6 +1,7 @@
 // loss: L1 and D-SSIM of the picture against a photo, with the picture's gradient. Two passes with
-// the window's filter, which is separable and done in workgroup memory: first to the slopes of SSIM
-// by the filtered maps, then back through the same filter. Follows shared.wgsl.
+// the window's filter, which is separable: first to the slopes of SSIM by the filtered maps, then
+// back through the same filter. A thread filters four neighbours at once, so that each value is read
+// once for the four. Follows shared.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> step: Step;
@@ -15,16 +16,18 @@
 // Per workgroup: weighted sums of SSIM and of |x - y|.
 @group(0) @binding(8) var<storage, read_write> sums: array<vec2<f32>>;
 
-const HALF = 5u;
-const SPAN = 26u; // TILE + 2 HALF
-const AREA = 676u; // SPAN * SPAN
-const STRIP = 416u; // SPAN * TILE
+const THREADS = 64u;
+// Taps on each side of the window's centre.
+const HALF = 5;
+// Values that four neighbouring outputs need.
+const SPAN = 14u;
+// Rows of a tile with the window's margin.
+const ROWS_FILTERED = 26u;
+const STRIP = 416u; // ROWS_FILTERED * TILE
 
-// Maps with their margin (AREA each), then maps filtered along rows (STRIP each): two and five in
-// loss_slopes, three and three in loss_gradient.
-var<workgroup> tile: array<f32, 3432>;
-const FILTERED_SLOPES = 1352u; // 2 AREA
-const FILTERED_GRADIENT = 2028u; // 3 AREA
+// Maps filtered along rows.
+var<workgroup> filtered: array<f32, 2080>; // 5 STRIP
+var<workgroup> partial_sums: array<f32, THREADS>;
 
 fn photo_color(pixel: u32) -> vec3<f32> {
     let rgba = unpack4x8unorm(photo[pixel]);
@@ -38,110 +41,108 @@ fn weight(pixel: u32) -> f32 {
     return 1.0;
 }
 
-// The pixel of an entry of `maps`, and whether it lies in the picture; outside counts as zero.
-fn pixel_of(workgroup: vec3<u32>, entry: u32) -> vec2<u32> {
-    let x = i32(workgroup.x * TILE + entry % SPAN) - i32(HALF);
-    let y = i32(workgroup.y * TILE + entry / SPAN) - i32(HALF);
-    let inside = x >= 0 && y >= 0 && x < i32(view.width) && y < i32(view.height);
-    return select(vec2(0u), vec2(u32(y * i32(view.width) + x), 1u), inside);
+fn exists(x: i32, y: i32) -> bool {
+    return x >= 0 && y >= 0 && x < i32(view.width) && y < i32(view.height);
 }
 
-// Sum over the workgroup in a fixed order; valid in thread 0. Overwrites the first map, which no
-// thread reads any more once all have filtered it.
+// Four rows of a filtered map at a column, filtered along the column.
+fn column(map: u32, x: u32, y: u32) -> vec4<f32> {
+    var sum = vec4(0.0);
+    for (var k = 0u; k < SPAN; k++) {
+        sum += SSIM_FOUR[k] * filtered[map * STRIP + (y + k) * TILE + x];
+    }
+    return sum;
+}
+
+fn store(map: u32, at: u32, values: vec4<f32>) {
+    for (var k = 0u; k < 4u; k++) {
+        filtered[map * STRIP + at + k] = values[k];
+    }
+}
+
+// Sum over the workgroup in a fixed order; valid in thread 0.
 fn workgroup_sum(local: u32, value: f32) -> f32 {
-    tile[local] = value;
+    partial_sums[local] = value;
     workgroupBarrier();
     var sum = 0.0;
-    if local < 16u {
-        for (var k = 0u; k < 16u; k++) {
-            sum += tile[local * 16u + k];
-        }
-    }
-    workgroupBarrier();
-    tile[local] = sum;
-    workgroupBarrier();
-    sum = 0.0;
     if local == 0u {
-        for (var k = 0u; k < 16u; k++) {
-            sum += tile[k];
+        for (var k = 0u; k < THREADS; k++) {
+            sum += partial_sums[k];
         }
     }
     return sum;
 }
 
-@compute @workgroup_size(16, 16)
+@compute @workgroup_size(THREADS)
 fn loss_slopes(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_id) id: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let x = workgroup.x * TILE + id.x;
-    let y = workgroup.y * TILE + id.y;
-    let exists = x < view.width && y < view.height;
-    let pixel = select(0u, y * view.width + x, exists);
     let pixels = view.width * view.height;
-    let w = weight(pixel);
+    let corner = vec2<i32>(workgroup.xy * TILE);
+    let in_tile = vec2(local % TILE, local / TILE * 4u);
     var ssim_sum = 0.0;
     for (var channel = 0u; channel < 3u; channel++) {
-        for (var entry = local; entry < AREA; entry += 256u) {
-            let at = pixel_of(workgroup, entry);
-            let inside = at.y == 1u;
-            tile[entry] = select(0.0, picture[at.x][channel], inside);
-            tile[AREA + entry] = select(0.0, photo_color(at.x)[channel], inside);
+        for (var task = local; task < ROWS_FILTERED * 4u; task += THREADS) {
+            let x = corner.x + i32(task % 4u) * 4 - HALF;
+            let y = corner.y + i32(task / 4u) - HALF;
+            var mu_x = vec4(0.0);
+            var mu_y = vec4(0.0);
+            var xx = vec4(0.0);
+            var yy = vec4(0.0);
+            var xy = vec4(0.0);
+            for (var k = 0u; k < SPAN; k++) {
+                // Outside counts as zero.
+                if exists(x + i32(k), y) {
+                    let pixel = u32(y) * view.width + u32(x + i32(k));
+                    let a = picture[pixel][channel];
+                    let b = photo_color(pixel)[channel];
+                    let tap = SSIM_FOUR[k];
+                    mu_x += tap * a;
+                    mu_y += tap * b;
+                    xx += tap * (a * a);
+                    yy += tap * (b * b);
+                    xy += tap * (a * b);
+                }
+            }
+            store(0u, task * 4u, mu_x);
+            store(1u, task * 4u, mu_y);
+            store(2u, task * 4u, xx);
+            store(3u, task * 4u, yy);
+            store(4u, task * 4u, xy);
         }
         workgroupBarrier();
-        for (var entry = local; entry < STRIP; entry += 256u) {
-            let begin = (entry / TILE) * SPAN + entry % TILE;
-            var mu_x = 0.0;
-            var mu_y = 0.0;
-            var xx = 0.0;
-            var yy = 0.0;
-            var xy = 0.0;
-            for (var k = 0u; k < 11u; k++) {
-                let tap = SSIM_WINDOW[k];
-                let a = tile[begin + k];
-                let b = tile[AREA + begin + k];
-                mu_x += tap * a;
-                mu_y += tap * b;
-                xx += tap * (a * a);
-                yy += tap * (b * b);
-                xy += tap * (a * b);
-            }
-            tile[FILTERED_SLOPES + entry] = mu_x;
-            tile[FILTERED_SLOPES + STRIP + entry] = mu_y;
-            tile[FILTERED_SLOPES + 2u * STRIP + entry] = xx;
-            tile[FILTERED_SLOPES + 3u * STRIP + entry] = yy;
-            tile[FILTERED_SLOPES + 4u * STRIP + entry] = xy;
-        }
-        workgroupBarrier();
-        var f: array<f32, 5>;
-        for (var map = 0u; map < 5u; map++) {
-            for (var k = 0u; k < 11u; k++) {
-                let entry = map * STRIP + (id.y + k) * TILE + id.x;
-                f[map] += SSIM_WINDOW[k] * tile[FILTERED_SLOPES + entry];
-            }
-        }
-        let mu_x = f[0];
-        let mu_y = f[1];
+        let mu_x = column(0u, in_tile.x, in_tile.y);
+        let mu_y = column(1u, in_tile.x, in_tile.y);
+        let xx = column(2u, in_tile.x, in_tile.y);
+        let yy = column(3u, in_tile.x, in_tile.y);
+        let xy = column(4u, in_tile.x, in_tile.y);
         let squares = mu_x * mu_x + mu_y * mu_y;
         let a1 = 2.0 * mu_x * mu_y + SSIM_C1;
-        let a2 = 2.0 * (f[4] - mu_x * mu_y) + SSIM_C2;
+        let a2 = 2.0 * (xy - mu_x * mu_y) + SSIM_C2;
         let b1 = squares + SSIM_C1;
-        let b2 = f[2] + f[3] - squares + SSIM_C2;
+        let b2 = xx + yy - squares + SSIM_C2;
         let inverse = 1.0 / (b1 * b2);
         let ssim = a1 * a2 * inverse;
         let v_xx = -ssim * inverse * b1;
         let v_xy = 2.0 * a1 * inverse;
         // Directly, and through s_xx = xx - mu_x^2 and s_xy = xy - mu_x mu_y.
         let direct = mu_y * a2 * inverse - mu_x * ssim * inverse * b2;
-        let through = 2.0 * v_xx * mu_x + v_xy * mu_y;
-        if exists {
-            slopes[(3u * channel) * pixels + pixel] = w * (2.0 * direct - through);
-            slopes[(3u * channel + 1u) * pixels + pixel] = w * v_xx;
-            slopes[(3u * channel + 2u) * pixels + pixel] = w * v_xy;
-            ssim_sum += w * ssim;
+        let v_mu = 2.0 * direct - (2.0 * v_xx * mu_x + v_xy * mu_y);
+        for (var k = 0u; k < 4u; k++) {
+            let x = u32(corner.x) + in_tile.x;
+            let y = u32(corner.y) + in_tile.y + k;
+            if x < view.width && y < view.height {
+                let pixel = y * view.width + x;
+                let w = weight(pixel);
+                slopes[(3u * channel) * pixels + pixel] = w * v_mu[k];
+                slopes[(3u * channel + 1u) * pixels + pixel] = w * v_xx[k];
+                slopes[(3u * channel + 2u) * pixels + pixel] = w * v_xy[k];
+                ssim_sum += w * ssim[k];
+            }
         }
+        workgroupBarrier();
     }
     let sum = workgroup_sum(local, ssim_sum);
     if local == 0u {
@@ -149,59 +150,63 @@ fn loss_slopes(
     }
 }
 
-@compute @workgroup_size(16, 16)
+@compute @workgroup_size(THREADS)
 fn loss_gradient(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_id) id: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let x = workgroup.x * TILE + id.x;
-    let y = workgroup.y * TILE + id.y;
-    let exists = x < view.width && y < view.height;
-    let pixel = select(0u, y * view.width + x, exists);
     let pixels = view.width * view.height;
-    let w = weight(pixel);
-    let color = picture[pixel].xyz;
-    let wanted = photo_color(pixel);
-    var v_color = vec3(0.0);
+    let corner = vec2<i32>(workgroup.xy * TILE);
+    let in_tile = vec2(local % TILE, local / TILE * 4u);
+    // Per channel: gradient through SSIM of the filtered maps, four rows each.
+    var v_mu: array<vec4<f32>, 3>;
+    var v_xx: array<vec4<f32>, 3>;
+    var v_xy: array<vec4<f32>, 3>;
     for (var channel = 0u; channel < 3u; channel++) {
-        for (var entry = local; entry < AREA; entry += 256u) {
-            let at = pixel_of(workgroup, entry);
-            for (var map = 0u; map < 3u; map++) {
-                let slope = slopes[(3u * channel + map) * pixels + at.x];
-                tile[map * AREA + entry] = select(0.0, slope, at.y == 1u);
-            }
-        }
-        workgroupBarrier();
-        for (var entry = local; entry < STRIP; entry += 256u) {
-            let begin = (entry / TILE) * SPAN + entry % TILE;
-            for (var map = 0u; map < 3u; map++) {
-                var sum = 0.0;
-                for (var k = 0u; k < 11u; k++) {
-                    sum += SSIM_WINDOW[k] * tile[map * AREA + begin + k];
+        for (var task = local; task < ROWS_FILTERED * 4u; task += THREADS) {
+            let x = corner.x + i32(task % 4u) * 4 - HALF;
+            let y = corner.y + i32(task / 4u) - HALF;
+            var mu = vec4(0.0);
+            var xx = vec4(0.0);
+            var xy = vec4(0.0);
+            for (var k = 0u; k < SPAN; k++) {
+                if exists(x + i32(k), y) {
+                    let at = (3u * channel) * pixels + u32(y) * view.width + u32(x + i32(k));
+                    let tap = SSIM_FOUR[k];
+                    mu += tap * slopes[at];
+                    xx += tap * slopes[at + pixels];
+                    xy += tap * slopes[at + 2u * pixels];
                 }
-                tile[FILTERED_GRADIENT + map * STRIP + entry] = sum;
             }
+            store(0u, task * 4u, mu);
+            store(1u, task * 4u, xx);
+            store(2u, task * 4u, xy);
         }
         workgroupBarrier();
-        var f: array<f32, 3>;
-        for (var map = 0u; map < 3u; map++) {
-            for (var k = 0u; k < 11u; k++) {
-                let entry = map * STRIP + (id.y + k) * TILE + id.x;
-                f[map] += SSIM_WINDOW[k] * tile[FILTERED_GRADIENT + entry];
-            }
-        }
-        let v_ssim = f[0] + 2.0 * color[channel] * f[1] + wanted[channel] * f[2];
-        v_color[channel] =
-            step.l1 * w * sign(color[channel] - wanted[channel]) - step.ssim * v_ssim;
+        v_mu[channel] = column(0u, in_tile.x, in_tile.y);
+        v_xx[channel] = column(1u, in_tile.x, in_tile.y);
+        v_xy[channel] = column(2u, in_tile.x, in_tile.y);
+        workgroupBarrier();
     }
     var l1_sum = 0.0;
-    if exists {
-        v_picture[pixel] = vec4(v_color, 0.0);
-        totals[pixel] = dot(color, v_color);
-        let off = abs(color - wanted);
-        l1_sum = w * (off.x + off.y + off.z);
+    for (var k = 0u; k < 4u; k++) {
+        let x = u32(corner.x) + in_tile.x;
+        let y = u32(corner.y) + in_tile.y + k;
+        if x < view.width && y < view.height {
+            let pixel = y * view.width + x;
+            let w = weight(pixel);
+            let color = picture[pixel].xyz;
+            let wanted = photo_color(pixel);
+            let off = color - wanted;
+            let v_ssim = vec3(v_mu[0][k], v_mu[1][k], v_mu[2][k])
+                + 2.0 * color * vec3(v_xx[0][k], v_xx[1][k], v_xx[2][k])
+                + wanted * vec3(v_xy[0][k], v_xy[1][k], v_xy[2][k]);
+            let v_color = step.l1 * w * sign(off) - step.ssim * v_ssim;
+            v_picture[pixel] = vec4(v_color, 0.0);
+            totals[pixel] = dot(color, v_color);
+            l1_sum += w * (abs(off.x) + abs(off.y) + abs(off.z));
+        }
     }
     let sum = workgroup_sum(local, l1_sum);
     if local == 0u {

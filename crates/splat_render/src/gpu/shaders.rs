@@ -218,8 +218,15 @@ fn constants(rows: u32) -> String {
             let _ = writeln!(out, "const {name}_{i} = {:e}f;", *value as f32);
         }
     }
-    let taps = SSIM_WINDOW.map(|tap| format!("{tap:e}f")).join(", ");
-    let _ = writeln!(out, "const SSIM_WINDOW = array({taps});");
+    // Weights of each of the 14 values that four neighbouring outputs of SSIM's filter need.
+    let tap = |k: usize, output: usize| {
+        let weight = k.checked_sub(output).and_then(|k| SSIM_WINDOW.get(k)).unwrap_or(&0.0);
+        format!("{weight:e}f")
+    };
+    let rows: Vec<String> = (0..SSIM_WINDOW.len() + 3)
+        .map(|k| format!("vec4({})", [0, 1, 2, 3].map(|output| tap(k, output)).join(", ")))
+        .collect();
+    let _ = writeln!(out, "const SSIM_FOUR = array({});", rows.join(", "));
     out
 }
 
