@@ -245,6 +245,120 @@ fn renders_end_to_end_like_the_reference() {
     );
 }
 
+/// Hard scenes of the design's table, by name, seen by a camera at the origin that looks along z.
+fn hard_scenes() -> Vec<(&'static str, Scene<f32>)> {
+    let mut rng = rng(20);
+    let mut out = Vec::new();
+    let mut base = |n: usize| {
+        let mut scene = random_scene(&mut rng, n, Some(2));
+        for mean in &mut scene.means {
+            mean[2] += 4.0;
+        }
+        (scene, [(); 3].map(|()| rng.random::<f64>()))
+    };
+    let (mut scales, _) = base(80);
+    for (i, scale) in scales.scales.as_flattened_mut().iter_mut().enumerate() {
+        *scale = -30.0 + 45.0 * ((i * 7919) % 240) as f32 / 239.0;
+    }
+    out.push(("log-scales -30 to 15", scales));
+    let (mut needles, _) = base(60);
+    for (i, scale) in needles.scales.iter_mut().enumerate() {
+        let short = -14.0;
+        *scale = match i % 3 {
+            0 => [short + 13.8, short, short],
+            1 => [-1.0, short, -1.0],
+            _ => [2.0, -11.8, -11.8],
+        };
+    }
+    out.push(("needles and pancakes", needles));
+    let (mut near, _) = base(90);
+    for (i, mean) in near.means.iter_mut().enumerate() {
+        let z = [0.0099, 0.0101, 0.02, -0.0101, -1.0, 0.0][i % 6];
+        *mean = [mean[0] * 0.01, mean[1] * 0.01, z];
+    }
+    for scale in near.scales.as_flattened_mut() {
+        *scale -= 4.0;
+    }
+    out.push(("around the near plane", near));
+    let (mut saturated, _) = base(120);
+    for (i, opacity) in saturated.opacities.iter_mut().enumerate() {
+        *opacity = if i % 3 == 0 { -30.0 } else { 30.0 };
+    }
+    out.push(("saturated opacities", saturated));
+    let (mut outside, _) = base(40);
+    for (mean, scale) in outside.means.iter_mut().zip(&mut outside.scales) {
+        mean[0] += 30.0;
+        *scale = [2.5, 1.0, 2.0];
+    }
+    out.push(("far off the frustum", outside));
+    let (mut equal, _) = base(150);
+    for mean in &mut equal.means {
+        mean[2] = 3.0;
+    }
+    out.push(("all at one depth", equal));
+    let (mut quats, _) = base(20);
+    quats.quats[3] = [0.0; 4];
+    quats.quats[4] = [1e-7, 0.0, 0.0, 0.0];
+    quats.quats[5] = [1e-5, 0.0, 2e-5, 0.0];
+    quats.quats[6] = [1e15, 2e15, 0.0, 0.0];
+    out.push(("tiny and huge quaternions", quats));
+    out
+}
+
+#[test]
+fn hard_scenes_agree_with_the_reference() {
+    let camera = splat_render::Camera {
+        viewmat: glam::DMat4::IDENTITY,
+        fx: 70.0,
+        fy: 75.0,
+        cx: 33.0,
+        cy: 25.0,
+        width: 66,
+        height: 50,
+    };
+    let options = ProjectOptions::default();
+    let mut rng = rng(21);
+    for (name, scene) in hard_scenes() {
+        let projected = gpu().project(&scene.params(), &camera, &options).unwrap();
+        let got = gpu().rasterize(&projected, [0.2; 3]).unwrap();
+        let wide = scene.widen();
+        let expected2d = Reference.project(&wide.params(), &camera, &options).unwrap();
+        let expected = Reference.rasterize(&expected2d, [0.2; 3]).unwrap();
+        for i in 0..wide.means.len() {
+            let culled = expected2d.radii[i] == [0.0; 2];
+            assert_eq!(projected.radii[i] == [0.0; 2], culled, "{name}: splat {i}");
+        }
+        let band = band_pixels(&expected2d, 2e-2);
+        let off = image_difference(&got, &expected, &band);
+        let count = band.iter().filter(|&&b| b).count();
+        println!("{name}: {:.2e} max, {:.2e} mean, {count} in the band", off.max, off.mean);
+        assert!(off.max <= 1e-4, "{name}: {off:?}");
+
+        let mut v_image = random_image_gradients(&mut rng, band.len());
+        for (pixel, &in_band) in band.iter().enumerate() {
+            if in_band {
+                v_image.v_color[pixel] = [0.0; 3];
+                v_image.v_alpha[pixel] = 0.0;
+                v_image.v_depth[pixel] = 0.0;
+            }
+        }
+        let v2d = gpu().rasterize_backward(&projected, [0.2; 3], &got, &v_image).unwrap();
+        let v =
+            gpu().project_backward(&scene.params(), &camera, &options, &projected, &v2d).unwrap();
+        let expected_v2d = Reference
+            .rasterize_backward(&expected2d, [0.2; 3], &expected, &widen_image_gradients(&v_image))
+            .unwrap();
+        let expected_v = Reference
+            .project_backward(&wide.params(), &camera, &options, &expected2d, &expected_v2d)
+            .unwrap();
+        let differences = splat_gradient_differences(&v, &expected_v);
+        for (kind, d) in &differences {
+            println!("    {kind}: {:.2e} of {:.2e}", d.relative(), d.scale);
+        }
+        assert_gradients(&differences, 1e-3, name);
+    }
+}
+
 #[test]
 fn parts_of_the_work_give_the_same_bits() {
     let mut rng = rng(6);
@@ -401,6 +515,14 @@ fn many_splats_in_one_tile_and_a_wide_picture() {
     let band = band_pixels(&widen_projected(&wide), 1e-4);
     let off = image_difference(&image, &expected, &band);
     assert!(off.max <= 2e-5, "{off:?}");
+}
+
+#[test]
+fn software_adapters_are_used_only_when_allowed() {
+    match Gpu::new(false) {
+        Ok(gpu) => assert!(!gpu.is_software(), "{}", gpu.name()),
+        Err(error) => assert!(error.to_string().contains("backend cpu"), "{error}"),
+    }
 }
 
 #[test]

@@ -156,7 +156,9 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     var v_given_opacity = v_opacity;
     if view.raw == 1u {
         v_scales *= g.scales;
-        v_given_opacity *= g.opacity * (1.0 - g.opacity);
+        // o (1 - o), without the cancellation at saturated logits.
+        let tail = exp_accurate(-abs(geometry[base + 10u]));
+        v_given_opacity *= tail / ((1.0 + tail) * (1.0 + tail));
     }
     var row = array<f32, GEOMETRY>(
         v_mean.x, v_mean.y, v_mean.z,

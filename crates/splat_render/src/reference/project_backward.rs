@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 
-use super::project::{direction, geometry, opacity, sh_color};
+use super::project::{direction, geometry, sh_color};
 use crate::camera::Camera;
 use crate::sh;
 use crate::stages::{
@@ -80,9 +80,12 @@ pub(super) fn project_backward(
         }
 
         // Opacity.
-        let o = opacity(splats, i);
-        out.v_opacities[i] =
-            v_projected.v_opacities[i] * if splats.raw { o * (1.0 - o) } else { 1.0 };
+        out.v_opacities[i] = v_projected.v_opacities[i];
+        if splats.raw {
+            // o (1 - o), without the cancellation at saturated logits.
+            let tail = (-splats.opacities[i].abs()).exp();
+            out.v_opacities[i] *= tail / ((1.0 + tail) * (1.0 + tail));
+        }
 
         // 2D covariance -> M = J R A S.
         let [v_xx, v_xy, v_yy] = v_projected.v_covars2d[i];
