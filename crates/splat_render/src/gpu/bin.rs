@@ -252,7 +252,7 @@ impl SplatBins {
         tiles: u32,
     ) -> Result<(Vec<Range<u32>>, u32)> {
         let limit = pair_limit(gpu);
-        let (mut open, mut done) = (Vec::from([0..tiles]), Vec::new());
+        let (mut open, mut done) = (std::iter::once(0..tiles).collect::<Vec<_>>(), Vec::new());
         let mut capacity = 0;
         while let Some(range) = open.pop() {
             let chunk = TileChunk::new(
