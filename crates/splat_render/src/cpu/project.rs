@@ -180,8 +180,12 @@ pub(super) fn project_splat(
         Colors::Sh { degree, stride, coeffs } => {
             let basis = sh::basis(degree, direction(view, g.t).0.to_array());
             let color = sh_color(degree, &basis, &coeffs[i * stride..(i + 1) * stride]);
-            // `max` would turn a poisoned coefficient into a black splat.
-            if color.is_nan() { color } else { color.max(Vec3::ZERO) }
+            // Before the cut at zero, which would hide a poisoned coefficient here and let it out
+            // in the gradients.
+            if !color.is_finite() {
+                return None;
+            }
+            color.max(Vec3::ZERO)
         }
     };
     color.is_finite().then(|| Splat2d {

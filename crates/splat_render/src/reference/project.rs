@@ -121,9 +121,13 @@ pub(super) fn project(
             Colors::Direct(colors) => DVec3::from(colors[i]),
             Colors::Sh { degree, stride, coeffs } => {
                 let dir = direction(camera, g.t).0;
-                // `f64::max` would turn a poisoned coefficient into a black splat.
                 let color = sh_color(degree, &coeffs[i * stride..], dir);
-                if color.is_nan() { color } else { color.max(DVec3::ZERO) }
+                // Before the cut at zero, which would hide a poisoned coefficient here and let it
+                // out in the gradients.
+                if !color.is_finite() {
+                    continue;
+                }
+                color.max(DVec3::ZERO)
             }
         };
         let finite = color.is_finite()
