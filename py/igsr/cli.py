@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
@@ -90,6 +91,9 @@ SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A splat .p
 
 def main() -> None:
     """Run the ``igsr`` command."""
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        # Mesa's layer that asks the desktop for its GPU prints an error where there is no desktop.
+        os.environ.setdefault("NODEVICE_SELECT", "1")
     app()
 
 
