@@ -45,3 +45,18 @@ fn end_to_end_matches_the_reference() {
         }
     }
 }
+
+#[test]
+fn hard_scenes_agree_with_the_reference() {
+    common::hard_cases::hard_scenes_agree_with_the_reference(&Cpu, 1e-4);
+}
+
+#[test]
+fn no_splats_give_the_background() {
+    common::hard_cases::no_splats_give_the_background(&Cpu);
+}
+
+#[test]
+fn poison_in_any_slot_culls_one_splat_at_most() {
+    common::hard_cases::poison_in_any_slot_culls_one_splat_at_most(&Cpu);
+}

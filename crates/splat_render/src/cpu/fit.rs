@@ -244,7 +244,7 @@ impl CpuFit {
                         } else {
                             v_sh.fill([0.0; 3]);
                         }
-                        v.v_opacity += opacity_pull * splat.opacity * (1.0 - splat.opacity);
+                        v.v_opacity += opacity_pull * splat.opacity_slope;
                         for (v, scale) in v.v_scales.iter_mut().zip(splat.scales.to_array()) {
                             *v += scale_pull * scale;
                         }

@@ -46,17 +46,29 @@ pub(super) struct Splat {
     pub quat: [f32; 4],
     pub scales: Vec3,
     pub opacity: f32,
+    /// Derivative of the opacity with respect to the parameter as given.
+    pub opacity_slope: f32,
 }
 
 impl Splat {
     #[inline(always)]
     pub fn load(splats: &SplatParams<'_, f32>, i: usize) -> Self {
         let (scales, opacity) = (Vec3::from(splats.scales[i]), splats.opacities[i]);
+        // A logit of +inf is poisoned too, though its sigmoid is not.
+        let opacity = if opacity.is_finite() { opacity } else { f32::NAN };
+        // o (1 - o) would be 0 where o rounds to 1.
+        let e = (-opacity.abs()).exp();
         Self {
             mean: Vec3::from(splats.means[i]),
             quat: splats.quats[i],
-            scales: if splats.raw { scales.exp() } else { scales },
+            // A log-scale of -inf is no splat of size 0 but a poisoned one: NaN is culled.
+            scales: match (splats.raw, scales.is_finite()) {
+                (true, true) => scales.exp(),
+                (true, false) => Vec3::NAN,
+                (false, _) => scales,
+            },
             opacity: if splats.raw { 1.0 / (1.0 + (-opacity).exp()) } else { opacity },
+            opacity_slope: if splats.raw { e / ((1.0 + e) * (1.0 + e)) } else { 1.0 },
         }
     }
 }

@@ -148,8 +148,7 @@ fn gradients(
         }
     }
 
-    let o = splat.opacity;
-    out.v_opacity = if raw { v.v_opacity * (o * (1.0 - o)) } else { v.v_opacity };
+    out.v_opacity = v.v_opacity * splat.opacity_slope;
 
     // 2D covariance -> M = J R A S.
     let [v_xx, v_xy, v_yy] = v.v_covar;

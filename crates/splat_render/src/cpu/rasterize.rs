@@ -27,6 +27,8 @@ pub(super) struct TileSplat {
     pub depth: f32,
     /// Reach along x and y in px, a little widened.
     pub radii: [f32; 2],
+    /// u^2 + v^2 beyond which alpha < `ALPHA_MIN`, a little widened.
+    pub limit: f32,
 }
 
 impl TileSplat {
@@ -38,6 +40,7 @@ impl TileSplat {
             color: splat.color,
             depth: splat.depth,
             radii: splat.radii.map(|r| r * (1.0 + 1e-5) + 1e-2),
+            limit: (splat.opacity / ALPHA_MIN).log2() * (1.0 + 1e-5) + 1e-5,
         }
     }
 
@@ -118,6 +121,7 @@ impl WithSimd for Tile<'_> {
         let (r, g) = (S::as_mut_simd_f32s(r).0, S::as_mut_simd_f32s(g).0);
         let (b, d) = (S::as_mut_simd_f32s(b).0, S::as_mut_simd_f32s(d).0);
         let t = S::as_mut_simd_f32s(t).0;
+        let zero = s.splat_f32s(0.0);
 
         for (k, &id) in self.ids.iter().enumerate() {
             if k % STOP_INTERVAL == STOP_INTERVAL - 1 && all_stopped(s, t) {
@@ -127,6 +131,7 @@ impl WithSimd for Tile<'_> {
             let [p, q, v_scale] = splat.factor;
             let (p, opacity) = (s.splat_f32s(p), s.splat_f32s(splat.opacity));
             let mx = s.splat_f32s(splat.mean[0]);
+            let limit = s.splat_f32s(splat.limit);
             let [red, green, blue] = splat.color;
             let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
             let depth = s.splat_f32s(splat.depth);
@@ -139,14 +144,17 @@ impl WithSimd for Tile<'_> {
                     let x = columns[h];
                     let at = row * per_row + h;
                     let u = s.mul_add_e_f32s(p, s.sub_f32s(x, mx), shift);
-                    let power = s.neg_f32s(s.mul_add_e_f32s(u, u, vv));
-                    let alpha = s.mul_f32s(opacity, exp2_negative(s, power));
-                    let alpha = s.min_f32s(alpha, s.splat_f32s(ALPHA_MAX));
-                    let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
-                    if !any(s, seen) {
+                    let distance = s.mul_add_e_f32s(u, u, vv);
+                    // Known long before alpha is, so a wrong guess of the branch costs little.
+                    let before = t[at];
+                    let near = s.less_than_or_equal_f32s(distance, limit);
+                    if !any(s, s.and_m32s(near, s.greater_than_f32s(before, zero))) {
                         continue;
                     }
-                    let before = t[at];
+                    let gaussian = exp2_negative(s, s.neg_f32s(distance));
+                    let alpha = s.mul_f32s(opacity, gaussian);
+                    let alpha = s.min_f32s(alpha, s.splat_f32s(ALPHA_MAX));
+                    let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
                     let after = s.mul_f32s(before, s.sub_f32s(s.splat_f32s(1.0), alpha));
                     let goes_on =
                         s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
@@ -155,7 +163,7 @@ impl WithSimd for Tile<'_> {
                     let rest = s.select_f32s(seen, stopped, before);
                     t[at] = s.select_f32s(adds, after, rest);
                     let weight = s.mul_f32s(before, alpha);
-                    let weight = s.select_f32s(adds, weight, s.splat_f32s(0.0));
+                    let weight = s.select_f32s(adds, weight, zero);
                     r[at] = s.mul_add_e_f32s(weight, color[0], r[at]);
                     g[at] = s.mul_add_e_f32s(weight, color[1], g[at]);
                     b[at] = s.mul_add_e_f32s(weight, color[2], b[at]);

@@ -58,6 +58,7 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
             let [p, q, v_scale] = splat.factor;
             let (p, opacity) = (s.splat_f32s(p), s.splat_f32s(splat.opacity));
             let mx = s.splat_f32s(splat.mean[0]);
+            let limit = s.splat_f32s(splat.limit);
             let [red, green, blue] = splat.color;
             let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
             let depth = s.splat_f32s(splat.depth);
@@ -73,15 +74,16 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
                     let x = columns[h];
                     let at = row * per_row + h;
                     let u = s.mul_add_e_f32s(p, s.sub_f32s(x, mx), shift);
-                    let power = s.neg_f32s(s.mul_add_e_f32s(u, u, vv));
-                    let gaussian = exp2_negative(s, power);
+                    let distance = s.mul_add_e_f32s(u, u, vv);
+                    let before = t[at];
+                    let near = s.less_than_or_equal_f32s(distance, limit);
+                    if !any(s, s.and_m32s(near, s.greater_than_f32s(before, zero))) {
+                        continue;
+                    }
+                    let gaussian = exp2_negative(s, s.neg_f32s(distance));
                     let uncapped = s.mul_f32s(opacity, gaussian);
                     let alpha = s.min_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
                     let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
-                    if !any(s, seen) {
-                        continue;
-                    }
-                    let before = t[at];
                     let through = s.sub_f32s(one, alpha);
                     let after = s.mul_f32s(before, through);
                     let goes_on =

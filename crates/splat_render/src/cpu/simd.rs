@@ -43,10 +43,13 @@ pub fn exp2_negative<S: Simd>(s: S, x: S::f32s) -> S::f32s {
     let x = s.max_f32s(x, s.splat_f32s(-126.0));
     let shifted = s.add_f32s(x, s.splat_f32s(ROUND));
     let f = s.sub_f32s(x, s.sub_f32s(shifted, s.splat_f32s(ROUND)));
-    let mut p = s.splat_f32s(C[5]);
-    for c in [C[4], C[3], C[2], C[1], C[0], 1.0] {
-        p = s.mul_add_e_f32s(p, f, s.splat_f32s(c));
-    }
+    // Estrin's scheme: half the latency of Horner's, which the loops around wait for.
+    let f2 = s.mul_f32s(f, f);
+    let low = s.mul_add_e_f32s(s.splat_f32s(C[0]), f, s.splat_f32s(1.0));
+    let middle = s.mul_add_e_f32s(s.splat_f32s(C[2]), f, s.splat_f32s(C[1]));
+    let high = s.mul_add_e_f32s(s.splat_f32s(C[4]), f, s.splat_f32s(C[3]));
+    let high = s.mul_add_e_f32s(s.splat_f32s(C[5]), f2, high);
+    let p = s.mul_add_e_f32s(s.mul_add_e_f32s(high, f2, middle), f2, low);
     let exponent = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted), s.splat_u32s(23));
     s.transmute_f32s_u32s(s.add_u32s(s.transmute_u32s_f32s(p), exponent))
 }

@@ -56,9 +56,13 @@ pub(super) fn geometry(
     let quat_norm = norm2.sqrt();
     let quat = [w / quat_norm, x / quat_norm, y / quat_norm, z / quat_norm];
     let axes = DMat3::from_quat(DQuat::from_xyzw(quat[1], quat[2], quat[3], quat[0]));
+    // A logit of +inf or a log-scale of -inf is poisoned, though what it stands for is finite.
+    if !splats.opacities[i].is_finite() {
+        return None;
+    }
     let given = DVec3::from(splats.scales[i]);
     let scales = if splats.raw { given.exp() } else { given };
-    if !(scales.is_finite() && scales.min_element() >= 0.0) {
+    if !(given.is_finite() && scales.is_finite() && scales.min_element() >= 0.0) {
         return None;
     }
     let [x_low, x_high, y_low, y_high] = camera.jacobian_limits();

@@ -2,6 +2,7 @@
 #![allow(dead_code)] // Each test binary uses its own part.
 
 pub mod conformance;
+pub mod hard_cases;
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
