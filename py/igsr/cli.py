@@ -197,7 +197,7 @@ def fit_command(
     ] = DEFAULT_MAX_SPLATS,
     sh_degree: Annotated[
         int, typer.Option("--sh-degree", help="Degree of view-dependent colour, 0 to 4.")
-    ] = 3,
+    ] = 2,
     density: Annotated[
         DensityChoice,
         typer.Option(
@@ -205,7 +205,7 @@ def fit_command(
             help="How splats are added and removed: mcmc (relocation under a cap), original "
             "(clone, split, prune), fixed.",
         ),
-    ] = DensityChoice.mcmc,
+    ] = DensityChoice.original,
     background: BackgroundOption = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")

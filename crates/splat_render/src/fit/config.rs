@@ -56,10 +56,10 @@ impl Default for FitConfig {
         Self {
             steps: 5000,
             seed: 0,
-            sh_degree: 3,
+            sh_degree: 2,
             sh_interval: 1000,
             max_splats: 30_000,
-            density: DensityControl::Mcmc,
+            density: DensityControl::Original,
             background: Background::Random,
             ssim_weight: 0.2,
             rates: Rates {
