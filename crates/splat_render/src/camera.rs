@@ -2,11 +2,8 @@
 
 use glam::{DMat3, DMat4, DVec3};
 
-use crate::constants::{JACOBIAN_MARGIN, RIGID_TOLERANCE};
+use crate::constants::{JACOBIAN_MARGIN, RIGID_TOLERANCE, SIDE_MAX};
 use crate::error::{Error, Result};
-
-/// Largest image side in pixels: keeps every pixel index in 31 bits.
-const SIDE_MAX: u32 = 16_384;
 
 /// A pinhole camera. World units are the scene's own.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,15 +24,21 @@ pub struct Camera {
     pub height: u32,
 }
 
+/// Checks a picture's size.
+pub(crate) fn check_size(width: u32, height: u32) -> Result<()> {
+    if width == 0 || height == 0 || width > SIDE_MAX || height > SIDE_MAX {
+        return Err(Error::argument(
+            "width, height",
+            format!("must lie in 1..={SIDE_MAX}, got {width} x {height}"),
+        ));
+    }
+    Ok(())
+}
+
 impl Camera {
     /// Checks every field; the error names the argument as Python callers know it.
     pub fn validate(&self) -> Result<()> {
-        if self.width == 0 || self.height == 0 || self.width > SIDE_MAX || self.height > SIDE_MAX {
-            return Err(Error::argument(
-                "width, height",
-                format!("must lie in 1..={SIDE_MAX}, got {} x {}", self.width, self.height),
-            ));
-        }
+        check_size(self.width, self.height)?;
         if !(self.fx.is_finite() && self.fx > 0.0 && self.fy.is_finite() && self.fy > 0.0) {
             return Err(Error::argument(
                 "K",
@@ -79,12 +82,6 @@ impl Camera {
     /// Camera centre in the world frame.
     pub fn center(&self) -> DVec3 {
         -(self.rotation().transpose() * self.translation())
-    }
-
-    /// The same camera in a frame whose origin lies at `origin` (composed in f64, so that a scene
-    /// far from the world's origin renders as one at it).
-    pub fn relative_to(&self, origin: DVec3) -> Self {
-        Self { viewmat: self.viewmat * DMat4::from_translation(origin), ..*self }
     }
 
     /// Limits of x/z and y/z in the Jacobian: `[x_low, x_high, y_low, y_high]`,

@@ -4,6 +4,9 @@
 /// Side of a square tile in pixels. 16 keeps a tile's state inside the first-level cache.
 pub const TILE: u32 = 16;
 
+/// Largest image side in pixels: keeps every pixel index in 31 bits.
+pub const SIDE_MAX: u32 = 16_384;
+
 /// Pairs fainter than this contribute nothing: below it an 8-bit picture cannot change.
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
 

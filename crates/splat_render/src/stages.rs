@@ -3,9 +3,19 @@
 //! All arrays are on the host; an implementation may keep its own copies where its kernels run.
 //! `T` is f64 in the reference and f32 elsewhere.
 
-use crate::camera::Camera;
+use crate::camera::{Camera, check_size};
 use crate::constants::{BLUR, FAR, NEAR, SH_COEFFS_MAX, SH_DEGREE_MAX};
 use crate::error::{Error, Result};
+
+/// Checks that every named length is `expected`; `unit` goes between the two numbers of the error.
+fn check_lengths(lengths: &[(&str, usize)], expected: usize, unit: &str) -> Result<()> {
+    for &(name, length) in lengths {
+        if length != expected {
+            return Err(Error::argument(name, format!("has {length} {unit} {expected}")));
+        }
+    }
+    Ok(())
+}
 
 /// Colour of each splat.
 #[derive(Debug, Clone, Copy)]
@@ -150,6 +160,21 @@ impl<T: Copy + Default> Projected<T> {
         }
     }
 
+    /// Checks what a caller may have put together by hand: the size, and that all arrays are of
+    /// one length.
+    pub fn validate(&self) -> Result<()> {
+        check_size(self.width, self.height)?;
+        let lengths = [
+            ("factors", self.factors.len()),
+            ("covars2d", self.covars2d.len()),
+            ("depths", self.depths.len()),
+            ("colors", self.colors.len()),
+            ("opacities", self.opacities.len()),
+            ("radii", self.radii.len()),
+        ];
+        check_lengths(&lengths, self.len(), "rows where means2d has")
+    }
+
     /// Number of splats, culled ones included.
     pub fn len(&self) -> usize {
         self.means2d.len()
@@ -189,6 +214,22 @@ pub struct ImageGradients<T> {
     pub v_depth: Vec<T>,
 }
 
+impl<T> ImageGradients<T> {
+    /// Checks that these and `image` have as many pixels as the picture of `projected`.
+    pub fn validate(&self, projected: &Projected<T>, image: &Image<T>) -> Result<()> {
+        let lengths = [
+            ("image", image.color.len()),
+            ("image", image.depth.len()),
+            ("image", image.transmittance.len()),
+            ("v_color", self.v_color.len()),
+            ("v_alpha", self.v_alpha.len()),
+            ("v_depth", self.v_depth.len()),
+        ];
+        let pixels = projected.width as usize * projected.height as usize;
+        check_lengths(&lengths, pixels, "pixels where the picture has")
+    }
+}
+
 /// Gradients with respect to a [`Projected`] and the background.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ProjectedGradients<T> {
@@ -204,6 +245,21 @@ pub struct ProjectedGradients<T> {
     pub v_opacities: Vec<T>,
     /// Gradient of the background colour.
     pub v_background: [T; 3],
+}
+
+impl<T> ProjectedGradients<T> {
+    /// Checks that these and the `projected` splats are as many as the splats.
+    pub fn validate(&self, splats: usize, projected: usize) -> Result<()> {
+        let lengths = [
+            ("projected", projected),
+            ("v_means2d", self.v_means2d.len()),
+            ("v_covars2d", self.v_covars2d.len()),
+            ("v_depths", self.v_depths.len()),
+            ("v_colors", self.v_colors.len()),
+            ("v_opacities", self.v_opacities.len()),
+        ];
+        check_lengths(&lengths, splats, "rows where means has")
+    }
 }
 
 impl<T: Copy + Default> ProjectedGradients<T> {

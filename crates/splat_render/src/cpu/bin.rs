@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use super::project::Splat2d;
 use crate::constants::{ALPHA_MIN, TILE};
+use crate::error::{Error, Result};
 
 /// Splats per parallel task.
 pub(super) const CHUNK: usize = 1024;
@@ -39,10 +40,11 @@ impl ChunkTiles {
         let [p, q, r] = splat.factor;
         let [rx, ry] = splat.radii;
         let reach = 2.0 * (splat.opacity / ALPHA_MIN).ln() * (1.0 + 1e-5) + 1e-5;
-        let slack = 1e-2 + 4e-6 * (rx + mx.abs());
+        let slack = |radius: f32, center: f32| 1e-2 + 4e-6 * (radius + center.abs());
+        let (slack_x, slack_y) = (slack(rx, mx), slack(ry, my));
         // First and last row of tiles whose band of pixel centres meets the box.
         let row_of = |y: f32| (y / tile).floor().clamp(0.0, (rows - 1) as f32) as u32;
-        let (first, last) = (row_of(my - ry - slack - 0.5), row_of(my + ry + slack - 0.5));
+        let (first, last) = (row_of(my - ry - slack_y - 0.5), row_of(my + ry + slack_y - 0.5));
         // Height at which the ellipse is widest to the right; to the left it is the opposite.
         let widest = -q * reach.sqrt() / (r * (q * q + r * r).sqrt());
         for row in first..=last {
@@ -58,8 +60,8 @@ impl ChunkTiles {
             if (r * nearest) * (r * nearest) > reach {
                 continue;
             }
-            let right = mx + at(widest, 1.0) + slack;
-            let left = mx + at(-widest, -1.0) - slack;
+            let right = mx + at(widest, 1.0) + slack_x;
+            let left = mx + at(-widest, -1.0) - slack_x;
             if !(right >= 0.5 && left <= width as f32 - 0.5) {
                 continue;
             }
@@ -93,7 +95,12 @@ pub(super) struct Bins {
 
 impl Bins {
     /// Sorts the chunks' tiles. `depth(i)` is asked only for splats that touch a tile.
-    pub fn fill(&mut self, chunks: &[ChunkTiles], tiles: usize, depth: impl Fn(usize) -> f32) {
+    pub fn fill(
+        &mut self,
+        chunks: &[ChunkTiles],
+        tiles: usize,
+        depth: impl Fn(usize) -> f32,
+    ) -> Result<()> {
         self.starts.clear();
         self.starts.resize(tiles + 1, 0);
         self.slots.clear();
@@ -110,7 +117,10 @@ impl Bins {
                     // Depths are positive, so their bits order as they do; the index breaks ties.
                     self.keys.push(u64::from(depth(i).to_bits()) << 32 | i as u64);
                 }
-                total += count;
+                total = total.checked_add(count).ok_or_else(|| {
+                    let reason = "touch more than 2^32 tiles; render a smaller picture";
+                    Error::argument("splats", reason)
+                })?;
                 self.slots.push(total);
                 i += 1;
             }
@@ -134,6 +144,7 @@ impl Bins {
                 *cursor += 1;
             }
         }
+        Ok(())
     }
 
     /// Positions in `splats` of a tile's list.

@@ -88,7 +88,7 @@ impl FitDevice for CpuFit {
             });
         let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
         let splats = &self.splats;
-        self.bins.fill(&self.chunks, tiles as usize, |i| splats[i].depth);
+        self.bins.fill(&self.chunks, tiles as usize, |i| splats[i].depth)?;
 
         self.image.resize(width, height);
         rasterize(&self.splats, &self.bins, input.background, &mut self.image);

@@ -12,7 +12,7 @@ const BAND: usize = 32;
 /// Zeros kept before and after each row: at least the window's half, and room for a whole vector.
 const PAD: usize = 16;
 
-/// Photo and scratch memory of the loss, kept from step to step.
+/// The loss's gradient and scratch memory, kept from step to step.
 #[derive(Debug, Default, Clone)]
 pub(super) struct Loss {
     /// Derivatives of the weighted SSIM sum with respect to the filtered x, xx and xy, per channel.

@@ -32,11 +32,18 @@ pub use simd::instruction_set;
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Cpu;
 
-/// 2D splats as `project` gave them, None where culled.
+/// 2D splats, None where culled or not finite.
 fn splats2d(projected: &Projected<f32>) -> Vec<Option<Splat2d>> {
     (0..projected.len())
         .map(|i| {
-            (projected.radii[i] != [0.0; 2]).then(|| Splat2d {
+            let visible = projected.radii[i] != [0.0; 2];
+            // What `project` never gives, a caller may have.
+            let [mean, radii] = [projected.means2d[i], projected.radii[i]];
+            let shape = mean.iter().chain(&radii).chain(&projected.factors[i]);
+            let sound = shape.copied().all(f32::is_finite)
+                && projected.depths[i] > 0.0
+                && projected.opacities[i].is_finite();
+            (visible && sound).then(|| Splat2d {
                 mean: projected.means2d[i],
                 factor: projected.factors[i],
                 covar: projected.covars2d[i],
@@ -55,16 +62,16 @@ struct Binned {
     bins: Bins,
 }
 
-fn bin(projected: &Projected<f32>) -> Binned {
+fn bin(projected: &Projected<f32>) -> Result<Binned> {
     let splats = splats2d(projected);
     let chunks = touched_tiles(&splats, projected.width, projected.height);
     let tiles = projected.width.div_ceil(crate::constants::TILE)
         * projected.height.div_ceil(crate::constants::TILE);
     let mut bins = Bins::default();
-    bins.fill(&chunks, tiles as usize, |i| projected.depths[i]);
+    bins.fill(&chunks, tiles as usize, |i| projected.depths[i])?;
     let splats =
         splats.iter().map(|s| s.as_ref().map_or_else(TileSplat::default, TileSplat::new)).collect();
-    Binned { splats, bins }
+    Ok(Binned { splats, bins })
 }
 
 impl Stages<f32> for Cpu {
@@ -96,7 +103,8 @@ impl Stages<f32> for Cpu {
     }
 
     fn rasterize(&self, projected: &Projected<f32>, background: [f32; 3]) -> Result<Image<f32>> {
-        let Binned { splats, bins } = bin(projected);
+        projected.validate()?;
+        let Binned { splats, bins } = bin(projected)?;
         let mut planes = Planes::default();
         planes.resize(projected.width, projected.height);
         rasterize::rasterize(&splats, &bins, background, &mut planes);
@@ -118,7 +126,9 @@ impl Stages<f32> for Cpu {
         image: &Image<f32>,
         v_image: &ImageGradients<f32>,
     ) -> Result<ProjectedGradients<f32>> {
-        let Binned { splats, bins } = bin(projected);
+        projected.validate()?;
+        v_image.validate(projected, image)?;
+        let Binned { splats, bins } = bin(projected)?;
         let channel = |rows: &[[f32; 3]], c: usize| rows.iter().map(|p| p[c]).collect::<Vec<_>>();
         let planes = Planes {
             width: image.width as usize,
@@ -172,6 +182,7 @@ impl Stages<f32> for Cpu {
     ) -> Result<SplatGradients<f32>> {
         splats.validate()?;
         camera.validate()?;
+        v_projected.validate(splats.len(), projected.len())?;
         let view = View::new(camera, options);
         let n = splats.len();
         let (stride, rows) = match splats.colors {

@@ -20,14 +20,11 @@ pub use device::Gpu;
 pub use fit::GpuFit;
 
 use crate::camera::Camera;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::stages::{
     Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, SplatGradients,
     SplatParams, Stages,
 };
-
-/// Largest image side in pixels, as [`Camera::validate`] has it.
-const SIDE_MAX: u32 = 16_384;
 
 impl Stages<f32> for Gpu {
     fn project(
@@ -42,7 +39,7 @@ impl Stages<f32> for Gpu {
     }
 
     fn rasterize(&self, projected: &Projected<f32>, background: [f32; 3]) -> Result<Image<f32>> {
-        validate_projected(projected)?;
+        projected.validate()?;
         rasterize::rasterize(self, projected, background)
     }
 
@@ -53,22 +50,8 @@ impl Stages<f32> for Gpu {
         image: &Image<f32>,
         v_image: &ImageGradients<f32>,
     ) -> Result<ProjectedGradients<f32>> {
-        validate_projected(projected)?;
-        let pixels = projected.width as usize * projected.height as usize;
-        let lengths = [
-            ("image", image.color.len()),
-            ("image", image.depth.len()),
-            ("image", image.transmittance.len()),
-            ("v_color", v_image.v_color.len()),
-            ("v_alpha", v_image.v_alpha.len()),
-            ("v_depth", v_image.v_depth.len()),
-        ];
-        for (name, length) in lengths {
-            if length != pixels {
-                let reason = format!("has {length} pixels where the picture has {pixels}");
-                return Err(Error::argument(name, reason));
-            }
-        }
+        projected.validate()?;
+        v_image.validate(projected, image)?;
         rasterize_backward::rasterize_backward(self, projected, background, image, v_image)
     }
 
@@ -82,48 +65,8 @@ impl Stages<f32> for Gpu {
     ) -> Result<SplatGradients<f32>> {
         splats.validate()?;
         camera.validate()?;
-        validate_projected(projected)?;
-        let n = splats.len();
-        let lengths = [
-            ("projected", projected.len()),
-            ("v_means2d", v_projected.v_means2d.len()),
-            ("v_covars2d", v_projected.v_covars2d.len()),
-            ("v_depths", v_projected.v_depths.len()),
-            ("v_colors", v_projected.v_colors.len()),
-            ("v_opacities", v_projected.v_opacities.len()),
-        ];
-        for (name, length) in lengths {
-            if length != n {
-                let reason = format!("has {length} rows where means has {n}");
-                return Err(Error::argument(name, reason));
-            }
-        }
+        projected.validate()?;
+        v_projected.validate(splats.len(), projected.len())?;
         project_backward::project_backward(self, splats, camera, options, projected, v_projected)
     }
-}
-
-/// Checks what a caller may have put together by hand.
-fn validate_projected(projected: &Projected<f32>) -> Result<()> {
-    let (w, h) = (projected.width, projected.height);
-    if w == 0 || h == 0 || w > SIDE_MAX || h > SIDE_MAX {
-        return Err(Error::argument(
-            "width, height",
-            format!("must lie in 1..={SIDE_MAX}, got {w} x {h}"),
-        ));
-    }
-    let n = projected.len();
-    let lengths = [
-        ("factors", projected.factors.len()),
-        ("depths", projected.depths.len()),
-        ("colors", projected.colors.len()),
-        ("opacities", projected.opacities.len()),
-        ("radii", projected.radii.len()),
-    ];
-    for (name, length) in lengths {
-        if length != n {
-            let reason = format!("has {length} rows where means2d has {n}");
-            return Err(Error::argument(name, reason));
-        }
-    }
-    Ok(())
 }

@@ -34,6 +34,7 @@ impl Stages<f64> for Reference {
     }
 
     fn rasterize(&self, projected: &Projected<f64>, background: [f64; 3]) -> Result<Image<f64>> {
+        projected.validate()?;
         Ok(rasterize::rasterize(projected, background))
     }
 
@@ -41,9 +42,11 @@ impl Stages<f64> for Reference {
         &self,
         projected: &Projected<f64>,
         background: [f64; 3],
-        _image: &Image<f64>,
+        image: &Image<f64>,
         v_image: &ImageGradients<f64>,
     ) -> Result<ProjectedGradients<f64>> {
+        projected.validate()?;
+        v_image.validate(projected, image)?;
         Ok(rasterize_backward::rasterize_backward(projected, background, v_image))
     }
 
@@ -57,6 +60,7 @@ impl Stages<f64> for Reference {
     ) -> Result<SplatGradients<f64>> {
         splats.validate()?;
         camera.validate()?;
+        v_projected.validate(splats.len(), projected.len())?;
         Ok(project_backward::project_backward(splats, camera, options, projected, v_projected))
     }
 }
