@@ -91,7 +91,7 @@ impl FitDevice for CpuFit {
         self.bins.fill(&self.chunks, tiles as usize, |i| splats[i].depth)?;
 
         self.image.resize(width, height);
-        rasterize(&self.splats, &self.bins, input.background, &mut self.image);
+        rasterize::<false>(&self.splats, &self.bins, input.background, &mut self.image);
         target.composite(input.background, &mut self.photo);
         let [r, g, b, ..] = &self.image.planes;
         let [photo_r, photo_g, photo_b] = &self.photo;

@@ -107,7 +107,7 @@ impl Stages<f32> for Cpu {
         let Binned { splats, bins } = bin(projected)?;
         let mut planes = Planes::default();
         planes.resize(projected.width, projected.height);
-        rasterize::rasterize(&splats, &bins, background, &mut planes);
+        rasterize::rasterize::<true>(&splats, &bins, background, &mut planes);
         let [r, g, b, depth, transmittance] = planes.planes;
         Ok(Image {
             width: projected.width,

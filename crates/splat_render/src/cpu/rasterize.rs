@@ -101,7 +101,7 @@ struct State {
     t: [f32; PIXELS],
 }
 
-struct Tile<'a> {
+struct Tile<'a, const DEPTH: bool> {
     splats: &'a [TileSplat],
     ids: &'a [u32],
     left: f32,
@@ -109,7 +109,7 @@ struct Tile<'a> {
     state: &'a mut State,
 }
 
-impl WithSimd for Tile<'_> {
+impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
     type Output = ();
 
     #[inline(always)]
@@ -167,7 +167,9 @@ impl WithSimd for Tile<'_> {
                     r[at] = s.mul_add_e_f32s(weight, color[0], r[at]);
                     g[at] = s.mul_add_e_f32s(weight, color[1], g[at]);
                     b[at] = s.mul_add_e_f32s(weight, color[2], b[at]);
-                    d[at] = s.mul_add_e_f32s(weight, depth, d[at]);
+                    if DEPTH {
+                        d[at] = s.mul_add_e_f32s(weight, depth, d[at]);
+                    }
                 }
             }
         }
@@ -195,8 +197,14 @@ pub(super) fn pixel_columns(left: f32) -> [f32; SIDE] {
     std::array::from_fn(|x| left + x as f32 + 0.5)
 }
 
-/// Renders every tile into `out`, which must have the picture's size.
-pub(super) fn rasterize(splats: &[TileSplat], bins: &Bins, background: [f32; 3], out: &mut Planes) {
+/// Renders every tile into `out`, which must have the picture's size; the depth plane is zero
+/// without `DEPTH`, which a fit does not look at.
+pub(super) fn rasterize<const DEPTH: bool>(
+    splats: &[TileSplat],
+    bins: &Bins,
+    background: [f32; 3],
+    out: &mut Planes,
+) {
     let arch = pulp::Arch::new();
     let width = out.width;
     let columns = width.div_ceil(SIDE);
@@ -211,7 +219,7 @@ pub(super) fn rasterize(splats: &[TileSplat], bins: &Bins, background: [f32; 3],
                     *t = -1.0;
                 }
             }
-            arch.dispatch(Tile {
+            arch.dispatch(Tile::<DEPTH> {
                 splats,
                 ids: &bins.splats[bins.range(tile_row * columns + column)],
                 left: (column * SIDE) as f32,
