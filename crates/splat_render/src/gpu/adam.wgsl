@@ -99,8 +99,9 @@ fn adam_geometry(
         stats[i * STATS + 2u] = max(stats[i * STATS + 2u], extent);
     }
     let at = i * GEOMETRY;
-    let opacity = 1.0 / (1.0 + exp_accurate(-values[at + 10u]));
-    let v_opacity = gradient[at + 10u] + step.opacity_pull * opacity * (1.0 - opacity);
+    // opacity (1 - opacity) without the cancellation that is 0 for logits over 17.
+    let odds = exp_accurate(-abs(values[at + 10u]));
+    let pull = step.opacity_pull * odds / ((1.0 + odds) * (1.0 + odds));
     for (var k = 0u; k < 3u; k++) {
         update(at + k, gradient[at + k], step.means);
     }
@@ -111,7 +112,7 @@ fn adam_geometry(
     for (var k = 6u; k < 10u; k++) {
         update(at + k, gradient[at + k], step.quats);
     }
-    update(at + 10u, v_opacity, step.opacities);
+    update(at + 10u, gradient[at + 10u] + pull, step.opacities);
     if step.noise > 0.0 {
         explore(i, at);
     }
