@@ -14,6 +14,7 @@ carries no gradient; ``covars2d`` is its differentiable companion.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -77,6 +78,25 @@ def _array(tensor: Tensor, dtype: Any) -> npt.NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=dtype)
 
 
+def _project_options(viewmat: Tensor, K: Tensor, settings: _Settings) -> dict[str, Any]:
+    return {
+        "sh_degree": settings.sh_degree,
+        "raw_parameters": False,
+        "viewmat": _array(viewmat, np.float64),
+        "intrinsics": _array(K, np.float64)[[0, 1, 0, 1], [0, 1, 2, 2]],
+        "width": settings.width,
+        "height": settings.height,
+        "near": settings.near,
+        "far": settings.far,
+        "eps2d": settings.eps2d,
+        "backend": settings.backend,
+    }
+
+
+def _projected_arrays(projected: Iterable[Tensor], dtype: Any) -> dict[str, npt.NDArray[Any]]:
+    return {name: _array(t, dtype) for name, t in zip(PROJECTED, projected, strict=True)}
+
+
 class _Project(torch.autograd.Function):
     """Splats and one camera to 2D Gaussians."""
 
@@ -94,21 +114,11 @@ class _Project(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
         inputs = [_array(t, dtype) for t in (means, quats, scales, opacities, colors)]
-        options: dict[str, Any] = {
-            "sh_degree": settings.sh_degree,
-            "raw_parameters": False,
-            "viewmat": _array(viewmat, np.float64),
-            "intrinsics": _array(K, np.float64)[[0, 1, 0, 1], [0, 1, 2, 2]],
-            "width": settings.width,
-            "height": settings.height,
-            "near": settings.near,
-            "far": settings.far,
-            "eps2d": settings.eps2d,
-            "backend": settings.backend,
-        }
-        projected = _core.project(*inputs, **options)
-        ctx.inputs, ctx.options, ctx.projected = inputs, options, projected
-        ctx.like, ctx.camera_dtypes = means, (viewmat.dtype, K.dtype)
+        projected = _core.project(*inputs, **_project_options(viewmat, K, settings))
+        # The arrays above share memory with the caller's tensors: only what autograd saves is
+        # refused in backward() when the caller has changed it in place since.
+        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmat, K)
+        ctx.settings, ctx.projected = settings, projected
         outputs = tuple(torch.from_numpy(projected[name]).to(means) for name in PROJECTED)
         ctx.mark_non_differentiable(*outputs[len(DIFFERENTIABLE) :])
         return outputs
@@ -116,23 +126,30 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        dtype = _core.working_dtype(ctx.options["backend"])
+        dtype = _core.working_dtype(ctx.settings.backend)
+        *splats, viewmat, K = ctx.saved_tensors
         v_projected = {
             f"v_{name}": _array(v, dtype)
             for name, v in zip(DIFFERENTIABLE, v_outputs, strict=False)
         }
-        means, quats, scales, opacities, colors = ctx.inputs
+        means, quats, scales, opacities, colors = (_array(t, dtype) for t in splats)
         v = _core.project_backward(
-            means, quats, scales, opacities, colors, ctx.projected, v_projected, **ctx.options
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            ctx.projected,
+            v_projected,
+            **_project_options(viewmat, K, ctx.settings),
         )
-        like, (viewmat_dtype, K_dtype) = ctx.like, ctx.camera_dtypes
         v_fx, v_fy, v_cx, v_cy = v["v_intrinsics"]
         v_K = np.array([[v_fx, 0.0, v_cx], [0.0, v_fy, v_cy], [0.0, 0.0, 0.0]])
         names = ("v_means", "v_quats", "v_scales", "v_opacities", "v_colors")
         return (
-            *(torch.from_numpy(v[name]).to(like) for name in names),
-            torch.from_numpy(v["v_viewmat"]).to(like.device, viewmat_dtype),
-            torch.from_numpy(v_K).to(like.device, K_dtype),
+            *(torch.from_numpy(v[name]).to(splats[0]) for name in names),
+            torch.from_numpy(v["v_viewmat"]).to(viewmat),
+            torch.from_numpy(v_K).to(K),
             None,
         )
 
@@ -145,14 +162,13 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, background: Tensor, settings: _Settings, *projected: Tensor
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
-        arrays = {name: _array(t, dtype) for name, t in zip(PROJECTED, projected, strict=True)}
-        ctx.projected, ctx.backend = arrays, settings.backend
-        ctx.background, ctx.like = _array(background, dtype), background
+        ctx.save_for_backward(background, *projected)
+        ctx.backend = settings.backend
         ctx.image = _core.rasterize(
-            arrays,
+            _projected_arrays(projected, dtype),
             width=settings.width,
             height=settings.height,
-            background=ctx.background,
+            background=_array(background, dtype),
             backend=settings.backend,
         )
         return tuple(torch.from_numpy(ctx.image[name]).to(background) for name in IMAGE)
@@ -163,17 +179,18 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, v_color: Tensor, v_alpha: Tensor, v_depth: Tensor
     ) -> tuple[Tensor | None, ...]:
         dtype = _core.working_dtype(ctx.backend)
+        background, *projected = ctx.saved_tensors
         v = _core.rasterize_backward(
-            ctx.projected,
+            _projected_arrays(projected, dtype),
             ctx.image,
             v_color=_array(v_color, dtype),
             v_alpha=_array(v_alpha, dtype),
             v_depth=_array(v_depth, dtype),
-            background=ctx.background,
+            background=_array(background, dtype),
             backend=ctx.backend,
         )
-        v_background = torch.from_numpy(v["v_background"]).to(ctx.like)
-        v_projected = (torch.from_numpy(v[f"v_{name}"]).to(ctx.like) for name in DIFFERENTIABLE)
+        v_background = torch.from_numpy(v["v_background"]).to(background)
+        v_projected = (torch.from_numpy(v[f"v_{name}"]).to(background) for name in DIFFERENTIABLE)
         return (v_background, None, *v_projected, None, None)
 
 
