@@ -154,6 +154,16 @@ def test_render_names_a_bad_background(background):
         igsr.render(scenes.splats(), scenes.ring_camera(0.0), background, "cpu")
 
 
+def test_render_names_what_the_renderer_refuses():
+    K = np.array([[72.0, 0.0, 24.0], [0.0, 72.0, 24.0], [0.0, 0.0, 1.0]])
+    for camera, backend, word in (
+        (scenes.ring_camera(0.0), "abacus", "backend"),
+        (igsr.Camera(np.eye(4), K, 20_000, 8), "cpu", "width"),
+    ):
+        with pytest.raises(igsr.IgsrError, match=word):
+            igsr.render(scenes.splats(), camera, backend=backend)
+
+
 def test_core_names_arrays_of_the_wrong_kind():
     splats = scenes.splats()
     camera = scenes.ring_camera(0.0)

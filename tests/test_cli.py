@@ -347,6 +347,15 @@ def test_mistakes_get_one_sentence(
     assert [path.name for path in tmp_path.iterdir()] == ["garbage.ply"]
 
 
+def test_failing_device_is_a_sentence(fitted, capture_path, igsr_here, monkeypatch):
+    def fail(*arguments, **options):
+        raise RuntimeError("The GPU was lost")
+
+    monkeypatch.setattr(igsr._core, "rasterize", fail)
+    scene = fitted[0] / "scene.ply"
+    refused(igsr_here("eval", scene, capture_path, "--backend", "cpu", "--json"), "GPU was lost")
+
+
 @pytest.mark.parametrize(
     "arguments",
     [["fit"], ["fit", "x"], ["nonsense"], ["info", "x", "--backend", "abacus"], ["eval", "x"]],

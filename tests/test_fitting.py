@@ -216,7 +216,7 @@ def test_killed_fit_leaves_a_whole_checkpoint(tmp_path):
     ],
 )
 def test_bad_settings_are_named(capture, options, sentence):
-    with pytest.raises(ValueError, match=sentence):
+    with pytest.raises(igsr.IgsrError, match=sentence):
         small_fit(capture, **options)
 
 
@@ -286,6 +286,19 @@ def test_array_that_claims_more_than_the_file_holds(tmp_path):
         archive.writestr("means.npy", header.getvalue() + b"\0" * 16)
     with pytest.raises(igsr.IgsrError, match="another size than its header says"):
         load_checkpoint(path)
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+@pytest.mark.parametrize(("distance", "focal"), [(1e200, 60.0), (1e60, 60.0), (4.0, 1e-300)])
+def test_cameras_too_extreme_to_place_splats_are_refused(alpha, distance, focal):
+    views = []
+    for view in scenes.capture(views=4, size=16, alpha=alpha).train_views:
+        viewmat = view.camera.viewmat.copy()
+        viewmat[:3, 3] *= distance / 4.0
+        K = np.array([[focal, 0.0, 8.0], [0.0, focal, 8.0], [0.0, 0.0, 1.0]])
+        views.append(dataclasses.replace(view, camera=igsr.Camera(viewmat, K, 16, 16)))
+    with pytest.raises(igsr.IgsrError, match="check its poses"):
+        small_fit(igsr.Capture("far", views), steps=3)
 
 
 def test_fit_needs_train_views(capture):

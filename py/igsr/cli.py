@@ -105,7 +105,7 @@ def one_sentence(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Ite
     except KeyboardInterrupt:
         _complain(interrupted())
         raise typer.Exit(INTERRUPTED) from None
-    except IgsrError as error:
+    except (IgsrError, RuntimeError) as error:  # the renderer's RuntimeErrors are the GPU's
         _complain(str(error))
         raise typer.Exit(1) from None
     except OSError as error:
@@ -124,10 +124,7 @@ def _complain(sentence: str) -> None:
 
 def _resolved(backend: BackendChoice) -> str:
     """The backend that runs; a missing adapter is found before any work."""
-    try:
-        return _core.resolve_backend(backend.value)
-    except RuntimeError as error:
-        raise IgsrError(str(error)) from error
+    return _core.resolve_backend(backend.value)
 
 
 def _color(text: str | None) -> tuple[float, float, float] | None:

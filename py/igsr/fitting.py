@@ -107,7 +107,10 @@ def fit(
             raise IgsrError(f"{view.name}: its mask leaves no pixel to fit; leave the photo out.")
     if backend == "reference":
         raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
-    info = _core.backend_info(_core.resolve_backend(backend))
+    try:
+        info = _core.backend_info(_core.resolve_backend(backend))
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
     path = None if checkpoint is None else Path(checkpoint)
     settings: dict[str, Any] = {
         "steps": int(steps),
@@ -227,7 +230,10 @@ def _run(
     try:
         while step < steps:
             chunk_started = time.perf_counter()
-            done = fitter.step(min(chunk, steps - step))
+            try:
+                done = fitter.step(min(chunk, steps - step))
+            except ValueError as error:
+                raise IgsrError(f"{error}.") from error
             now = time.perf_counter()
             advanced, step = done["step"] - step, done["step"]
             speed = advanced / max(now - chunk_started, 1e-9)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +20,6 @@ NEAR_PLANE = 0.01
 FAR_PLANE = 1e10
 #: Variance in square pixels added to every projected Gaussian (EWA low-pass).
 EPS2D = 0.3
-
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
 
 
 @dataclass(frozen=True)
@@ -71,6 +70,21 @@ def render(
         background_color = np.zeros(0)
     if background_color.shape != (3,) or not np.isfinite(background_color).all():
         raise IgsrError("background must be three finite numbers")
+    try:
+        image = _render_arrays(splats, camera, background_color, backend)
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
+    color, alpha, depth, transmittance = (
+        image[name].astype(np.float32, copy=False)
+        for name in ("color", "alpha", "depth", "transmittance")
+    )
+    expected = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
+    return Render(color, alpha, depth, expected, transmittance)
+
+
+def _render_arrays(
+    splats: Splats, camera: Camera, background: npt.NDArray[np.float64], backend: str
+) -> dict[str, npt.NDArray[Any]]:
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)
     projected = _core.project(
@@ -95,19 +109,13 @@ def render(
         eps2d=EPS2D,
         backend=backend,
     )
-    image = _core.rasterize(
+    return _core.rasterize(
         projected,
         width=camera.width,
         height=camera.height,
-        background=background_color.astype(dtype),
+        background=background.astype(dtype),
         backend=backend,
     )
-    color, alpha, depth, transmittance = (
-        image[name].astype(np.float32, copy=False)
-        for name in ("color", "alpha", "depth", "transmittance")
-    )
-    expected = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
-    return Render(color, alpha, depth, expected, transmittance)
 
 
 def viewmat_about(
