@@ -288,7 +288,9 @@ def test_full_disk_is_a_sentence_and_keeps_the_old_files(fitted, capture_path, t
         "fit", capture_path, "--out", tmp_path, *FIT, "--seed", 5, "--json",
         preexec_fn=small_files_only,
     )  # fmt: skip
-    refused(result, "checkpoint.npz")
+    assert "scene.ply" in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr
+    assert result.returncode == 1
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     result = igsr_command(
         "render", out / "scene.ply", "--orbit", 4, "--out", tmp_path / "orbit.mp4",

@@ -7,6 +7,7 @@ import enum
 import json
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -115,6 +116,15 @@ def one_sentence(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Ite
     except MemoryError:
         _complain("There is not enough memory for this; use fewer or smaller photos or splats")
         raise typer.Exit(1) from None
+
+
+@contextlib.contextmanager
+def _warnings_as_sentences() -> Iterator[None]:
+    """Print the warnings of igsr itself as the command prints its errors."""
+    with warnings.catch_warnings(record=True) as caught:
+        yield
+    for warning in caught:
+        _complain(str(warning.message))
 
 
 def _complain(sentence: str) -> None:
@@ -226,7 +236,7 @@ def fit_command(
         color = _color(background) or default_background(capture)
         # Photos with alpha are fitted over random colours, so that no background is learnt.
         has_alpha = any(view.image.shape[2] == 4 for view in capture.train_views)
-        with _fit_bar(steps, shown=not as_json) as show:
+        with _fit_bar(steps, shown=not as_json) as show, _warnings_as_sentences():
 
             def progress(now: Progress) -> None:
                 last[:] = [now]
@@ -286,7 +296,7 @@ def _checkpoint_seconds(out: Path) -> float:
     from .checkpoint import load_checkpoint
 
     _, settings = load_checkpoint(out / "checkpoint.npz")
-    return round(float(settings["seconds"]), 3)
+    return round(settings["seconds"], 3)
 
 
 @contextlib.contextmanager
