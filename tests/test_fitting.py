@@ -127,6 +127,17 @@ def test_masked_pixels_do_not_reach_the_fit(capture):
     assert inside < 0.2 * np.abs(start.means - spoiled.means).max()
 
 
+def test_masks_of_any_byte_are_masks(capture):
+    def masked(mask):
+        views = [dataclasses.replace(view, mask=mask) for view in capture.views]
+        return small_fit(igsr.Capture(capture.path, views), steps=20)
+
+    mask = np.ones((40, 40), dtype=bool)
+    mask[:, 30:] = False
+    bytes_255 = (mask.view(np.uint8) * np.uint8(255)).view(bool)
+    assert same(masked(mask), masked(bytes_255))
+
+
 def test_points_are_where_splats_start(capture):
     random = np.random.default_rng(0)
     far = np.array([1e6, 0.0, 0.0])

@@ -14,13 +14,6 @@ from .capture import Camera
 from .errors import IgsrError
 from .splats import FloatArray, Splats
 
-#: What lies nearer than this, in world units, is not drawn (gsplat's default).
-NEAR_PLANE = 0.01
-#: What lies farther than this, in world units, is not drawn (gsplat's default).
-FAR_PLANE = 1e10
-#: Variance in square pixels added to every projected Gaussian (EWA low-pass).
-EPS2D = 0.3
-
 
 @dataclass(frozen=True)
 class Render:
@@ -104,9 +97,9 @@ def _render_arrays(
         intrinsics=intrinsics_of(camera.K),
         width=camera.width,
         height=camera.height,
-        near=NEAR_PLANE,
-        far=FAR_PLANE,
-        eps2d=EPS2D,
+        near=_core.NEAR_PLANE,
+        far=_core.FAR_PLANE,
+        eps2d=_core.EPS2D,
         backend=backend,
     )
     return _core.rasterize(
