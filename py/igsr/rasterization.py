@@ -14,6 +14,7 @@ carries no gradient; ``covars2d`` is its differentiable companion.
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -24,6 +25,7 @@ import torch
 from torch import Tensor
 
 from . import _core
+from .splats import MAX_SH_DEGREE
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -284,7 +286,16 @@ def rasterization(
         if value is not default and (isinstance(value, Tensor) or value != default):
             raise ValueError(f"{name}: only {default!r} is supported, not {value!r}")
     _check_settings(
-        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, render_mode
+        width,
+        height,
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        sh_degree,
+        packed,
+        render_mode,
+        backend,
     )
     dtypes = (torch.float32, torch.float64) if backend == "reference" else (torch.float32,)
     _check_tensors(
@@ -366,13 +377,14 @@ def rasterization(
 def _check_settings(
     width: object,
     height: object,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    sh_degree: object,
+    near_plane: Any,
+    far_plane: Any,
+    radius_clip: Any,
+    eps2d: Any,
+    sh_degree: Any,
     packed: object,
     render_mode: object,
+    backend: object,
 ) -> None:
     for name, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
@@ -383,16 +395,20 @@ def _check_settings(
         ("radius_clip", radius_clip),
         ("eps2d", eps2d),
     ):
-        if not isinstance(number, (int, float)) or not math.isfinite(number) or number < 0:
+        real = isinstance(number, numbers.Real) and not isinstance(number, bool)
+        if not real or not math.isfinite(number) or number < 0:
             raise ValueError(f"{name}: must be a finite number of at least 0, not {number!r}")
     if far_plane <= near_plane:
         raise ValueError(f"far_plane: must exceed near_plane ({near_plane}), not {far_plane}")
-    if sh_degree is not None and sh_degree not in range(5):
+    whole = isinstance(sh_degree, numbers.Integral) and not isinstance(sh_degree, bool)
+    if sh_degree is not None and not (whole and sh_degree in range(MAX_SH_DEGREE + 1)):
         raise ValueError(f"sh_degree: must be None or 0 to 4, not {sh_degree!r}")
     if not isinstance(packed, bool):
         raise ValueError(f"packed: must be True or False, not {packed!r}")
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode: must be one of {RENDER_MODES}, not {render_mode!r}")
+    if not isinstance(backend, str):
+        raise ValueError(f"backend: must be a name such as 'auto', not {backend!r}")
 
 
 def _check_tensors(
@@ -427,6 +443,11 @@ def _check_tensors(
         raise ValueError(
             f"colors: sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, "
             f"not {colors.shape[-2]}"
+        )
+    if sh_degree is not None and colors.shape[-2] > (MAX_SH_DEGREE + 1) ** 2:
+        raise ValueError(
+            f"colors: at most {(MAX_SH_DEGREE + 1) ** 2} coefficients (degree {MAX_SH_DEGREE}) "
+            f"are supported, not {colors.shape[-2]}"
         )
     if backgrounds is not None:
         _check_tensor("backgrounds", backgrounds, [(cameras, 3)], dtypes, device)
