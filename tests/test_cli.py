@@ -230,6 +230,18 @@ def test_info_describes_scenes_captures_and_backends(fitted, capture_path):
     assert "splats:" in igsr_command("info", out / "scene.ply").stdout
 
 
+def test_info_counts_splats_that_are_not_finite(tmp_path, igsr_here):
+    splats = scenes.splats()
+    splats.means[3] = np.nan
+    splats.opacities[4] = np.inf
+    splats.save(tmp_path / "scene.ply")
+    report = json.loads(igsr_here("info", tmp_path / "scene.ply", "--json").stdout)
+    assert report["not_finite"] == 2
+    kept = splats.means[splats.finite]
+    assert report["lowest_corner"] == kept.min(axis=0).astype(float).tolist()
+    assert 0.5 < report["median_opacity"] < 1.0
+
+
 def started_fit(capture_path, out, *options):
     """A long fit in a process of its own, once it has written a checkpoint."""
     arguments = ["fit", capture_path, "--out", out, "--steps", 200_000, "--max-splats", 300]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import json
+import math
 import os
 import sys
 import warnings
@@ -541,21 +542,33 @@ def _plain(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
+def _opacity(logit: float) -> float:
+    # tanh does not overflow for any logit, as exp does.
+    return 0.5 + 0.5 * math.tanh(0.5 * logit)
+
+
 def _scene_info(path: Path) -> dict[str, Any]:
     splats = Splats.load(path)
     bounds = splats.bounds()
-    opacity = 1.0 / (1.0 + np.exp(-splats.opacities.astype(np.float64)))
+    finite = splats.finite
+    logit = float(np.median(splats.opacities[finite])) if finite.any() else None
     return {
         "kind": "scene",
         "path": str(path),
         "splats": len(splats),
+        "not_finite": int((~finite).sum()),
         "sh_degree": splats.sh_degree,
         "lowest_corner": None if bounds is None else bounds[0].tolist(),
         "highest_corner": None if bounds is None else bounds[1].tolist(),
         "origin": splats.origin.tolist(),
-        "median_opacity": None if bounds is None else float(np.median(opacity)),
+        "median_opacity": None if logit is None else _opacity(logit),
         "bytes": path.stat().st_size,
     }
+
+
+def _known(number: float) -> float | None:
+    """None where poses so far out that their mean overflows leave no number; JSON has none."""
+    return float(number) if math.isfinite(number) else None
 
 
 def _capture_info(path: Path) -> dict[str, Any]:
@@ -572,8 +585,8 @@ def _capture_info(path: Path) -> dict[str, Any]:
         "views_with_alpha": sum(view.image.shape[2] == 4 for view in capture.views),
         "views_with_mask": sum(view.mask is not None for view in capture.views),
         "points": points,
-        "scene_centre": [float(x) for x in capture.scene_centre],
-        "scene_extent": float(capture.scene_extent),
+        "scene_centre": [_known(x) for x in capture.scene_centre],
+        "scene_extent": _known(capture.scene_extent),
     }
 
 
