@@ -67,10 +67,16 @@ BAD = {
     "far_plane near": {"far_plane": 0.001},
     "radius_clip nan": {"radius_clip": float("nan")},
     "eps2d text": {"eps2d": "0.3"},
+    "near_plane bool": {"near_plane": True},
     "sh_degree high": {"sh_degree": 5},
+    "sh_degree float": {"sh_degree": 2.0},
+    "sh_degree bool": {"sh_degree": True},
+    "colors many": broken("colors", lambda t: t.repeat(1, 4, 1)),
     "render_mode unknown": {"render_mode": "normals"},
     "packed text": {"packed": "yes"},
     "backend unknown": {"backend": "abacus"},
+    "backend None": {"backend": None},
+    "backend list": {"backend": ["cpu"]},
     # gsplat's arguments that this renderer does not implement
     "tile_size": {"tile_size": 8},
     "sparse_grad": {"sparse_grad": True},
@@ -95,6 +101,12 @@ BAD = {
 def test_the_scene_that_is_broken_below_renders():
     color, _, _ = call({})
     assert color.shape == (2, 20, 24, 3)
+
+
+def test_numpy_numbers_are_numbers():
+    numbers = {"near_plane": np.float32(0.5), "eps2d": np.float64(0.25), "sh_degree": np.int64(2)}
+    plain = {"near_plane": 0.5, "eps2d": 0.25}
+    assert torch.equal(call(numbers)[0], call(plain)[0])
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -152,6 +164,16 @@ def test_one_poisoned_splat_spoils_nothing_else(slot, value):
 def test_render_names_a_bad_background(background):
     with pytest.raises(ValueError, match="background"):
         igsr.render(scenes.splats(), scenes.ring_camera(0.0), background, "cpu")
+
+
+def test_render_names_what_the_renderer_refuses():
+    K = np.array([[72.0, 0.0, 24.0], [0.0, 72.0, 24.0], [0.0, 0.0, 1.0]])
+    for camera, backend, word in (
+        (scenes.ring_camera(0.0), "abacus", "backend"),
+        (igsr.Camera(np.eye(4), K, 20_000, 8), "cpu", "width"),
+    ):
+        with pytest.raises(igsr.IgsrError, match=word):
+            igsr.render(scenes.splats(), camera, backend=backend)
 
 
 def test_core_names_arrays_of_the_wrong_kind():

@@ -91,6 +91,24 @@ def test_bad_width_is_named(width: object) -> None:
         Camera(np.eye(4), K, width, 32)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("image", "mask", "words"),
+    [
+        (np.zeros((3, 2, 3), dtype=np.uint8), None, "image is uint8"),
+        (np.zeros((2, 3), dtype=np.uint8), None, "image is uint8"),
+        (np.zeros((2, 3, 3), dtype=np.float32), None, "image is float32"),
+        ([[0, 0, 0]], None, "image is a list"),
+        (np.zeros((2, 3, 4), dtype=np.uint8), np.ones((2, 3), dtype=np.uint8), "mask is uint8"),
+        (np.zeros((2, 3, 4), dtype=np.uint8), np.ones((2, 2), dtype=bool), "mask is bool"),
+    ],
+)
+def test_pixels_that_do_not_fit_the_camera_are_named(
+    image: object, mask: object, words: str
+) -> None:
+    with pytest.raises(IgsrError, match=rf"a\.png: its {words}"):
+        View("a.png", Camera(np.eye(4), K, 3, 2), "train", image, mask)  # type: ignore[arg-type]
+
+
 def test_holdout_goes_by_name_and_keeps_the_order() -> None:
     names = [f"{index:02d}.png" for index in (9, 3, 8, 0, 1, 2, 4, 5, 6, 7)]
     whole = capture(names)

@@ -230,6 +230,18 @@ def test_info_describes_scenes_captures_and_backends(fitted, capture_path):
     assert "splats:" in igsr_command("info", out / "scene.ply").stdout
 
 
+def test_info_counts_splats_that_are_not_finite(tmp_path, igsr_here):
+    splats = scenes.splats()
+    splats.means[3] = np.nan
+    splats.opacities[4] = np.inf
+    splats.save(tmp_path / "scene.ply")
+    report = json.loads(igsr_here("info", tmp_path / "scene.ply", "--json").stdout)
+    assert report["not_finite"] == 2
+    kept = splats.means[splats.finite]
+    assert report["lowest_corner"] == kept.min(axis=0).astype(float).tolist()
+    assert 0.5 < report["median_opacity"] < 1.0
+
+
 def started_fit(capture_path, out, *options):
     """A long fit in a process of its own, once it has written a checkpoint."""
     arguments = ["fit", capture_path, "--out", out, "--steps", 200_000, "--max-splats", 300]
@@ -288,7 +300,9 @@ def test_full_disk_is_a_sentence_and_keeps_the_old_files(fitted, capture_path, t
         "fit", capture_path, "--out", tmp_path, *FIT, "--seed", 5, "--json",
         preexec_fn=small_files_only,
     )  # fmt: skip
-    refused(result, "checkpoint.npz")
+    assert "scene.ply" in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr
+    assert result.returncode == 1
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     result = igsr_command(
         "render", out / "scene.ply", "--orbit", 4, "--out", tmp_path / "orbit.mp4",
@@ -345,6 +359,15 @@ def test_mistakes_get_one_sentence(
         arguments.append("--json")
     refused(igsr_here(*arguments), *words)
     assert [path.name for path in tmp_path.iterdir()] == ["garbage.ply"]
+
+
+def test_failing_device_is_a_sentence(fitted, capture_path, igsr_here, monkeypatch):
+    def fail(*arguments, **options):
+        raise RuntimeError("The GPU was lost")
+
+    monkeypatch.setattr(igsr._core, "rasterize", fail)
+    scene = fitted[0] / "scene.ply"
+    refused(igsr_here("eval", scene, capture_path, "--backend", "cpu", "--json"), "GPU was lost")
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
+import zipfile
 
 import numpy as np
 import pytest
@@ -123,6 +127,17 @@ def test_masked_pixels_do_not_reach_the_fit(capture):
     assert inside < 0.2 * np.abs(start.means - spoiled.means).max()
 
 
+def test_masks_of_any_byte_are_masks(capture):
+    def masked(mask):
+        views = [dataclasses.replace(view, mask=mask) for view in capture.views]
+        return small_fit(igsr.Capture(capture.path, views), steps=20)
+
+    mask = np.ones((40, 40), dtype=bool)
+    mask[:, 30:] = False
+    bytes_255 = (mask.view(np.uint8) * np.uint8(255)).view(bool)
+    assert same(masked(mask), masked(bytes_255))
+
+
 def test_points_are_where_splats_start(capture):
     random = np.random.default_rng(0)
     far = np.array([1e6, 0.0, 0.0])
@@ -211,13 +226,63 @@ def test_killed_fit_leaves_a_whole_checkpoint(tmp_path):
         ({"density": "magic"}, "density must be one of"),
         ({"backend": "reference"}, "reference renders but does not fit"),
         ({"backend": "abacus"}, "backend"),
-        ({"background": (2.0, 0.0, 0.0)}, "background"),
+        ({"background": (2.0, 0.0, 0.0)}, "background must be"),
+        ({"background": 5}, "background must be"),
+        ({"background": "red"}, "background must be"),
         ({"resume": True}, "resume needs checkpoint"),
     ],
 )
 def test_bad_settings_are_named(capture, options, sentence):
-    with pytest.raises(ValueError, match=sentence):
+    with pytest.raises(igsr.IgsrError, match=sentence):
         small_fit(capture, **options)
+
+
+def test_numpy_numbers_are_numbers(capture, tmp_path):
+    numbers = {"steps": np.int64(20), "max_splats": np.int64(40), "sh_degree": np.int64(0)}
+    splats = small_fit(
+        capture,
+        **numbers,
+        seed=np.uint8(3),
+        background=np.zeros(3, dtype=np.float32),
+        checkpoint=tmp_path / "checkpoint.npz",
+    )
+    plain = {name: int(number) for name, number in numbers.items()}
+    assert same(splats, small_fit(capture, **plain, seed=3, background=(0.0, 0.0, 0.0)))
+
+
+def test_checkpoint_that_cannot_be_written_is_found_before_the_fit(capture, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    steps = []
+    for checkpoint in (blocked / "checkpoint.npz", tmp_path):
+        with pytest.raises(igsr.IgsrError, match="Cannot write"):
+            small_fit(capture, checkpoint=checkpoint, progress=steps.append)
+    assert not steps
+
+
+def test_last_checkpoint_that_fails_does_not_cost_the_splats(capture, tmp_path, monkeypatch):
+    def full_disk(*arguments):
+        raise igsr.IgsrError("Cannot write checkpoint.npz: No space left on device.")
+
+    monkeypatch.setattr(fitting, "save_checkpoint", full_disk)
+    with pytest.warns(UserWarning, match="No space left"):
+        splats = small_fit(capture, steps=20, checkpoint=tmp_path / "checkpoint.npz")
+    assert same(splats, small_fit(capture, steps=20))
+
+
+def test_interrupt_during_the_last_save_saves_again(capture, tmp_path, monkeypatch):
+    saves = []
+
+    def interrupted_once(*arguments):
+        saves.append(len(saves))
+        if len(saves) == 1:
+            raise KeyboardInterrupt
+        save_checkpoint(*arguments)
+
+    monkeypatch.setattr(fitting, "save_checkpoint", interrupted_once)
+    with pytest.raises(KeyboardInterrupt):
+        small_fit(capture, steps=20, checkpoint=tmp_path / "checkpoint.npz")
+    assert load_checkpoint(tmp_path / "checkpoint.npz")[0]["step"] == [20]
 
 
 def test_resume_refuses_other_settings_and_other_photos(capture, tmp_path):
@@ -264,6 +329,20 @@ def test_damaged_checkpoints_are_refused(capture, tmp_path):
     save_checkpoint(bad, without, settings)
     with pytest.raises(igsr.IgsrError, match="second_quats"):
         resumed(bad)
+    for seconds in ("abc", [1.0], None, float("inf"), 1):
+        text = json.dumps({"format": 1, **settings, "seconds": seconds}).encode()
+        np.savez(bad, **state, settings=np.frombuffer(text, dtype=np.uint8))
+        with pytest.raises(igsr.IgsrError, match="seconds"):
+            resumed(bad)
+    directory = content.index(b"PK\x01\x02")
+    for offset, flipped in (
+        (directory + 6, 0xFF),  # version needed to extract
+        (directory + 8, 0x01),  # flags: encrypted
+        (directory + 10, 0x63),  # compression method
+    ):
+        bad.write_bytes(content[:offset] + bytes([flipped]) + content[offset + 1 :])
+        with pytest.raises(igsr.IgsrError, match="cannot be read"):
+            resumed(bad)
     np.savez(bad, means=np.array([{"a": "pickle"}], dtype=object))
     with pytest.raises(igsr.IgsrError, match="cannot be read"):
         resumed(bad)
@@ -273,10 +352,17 @@ def test_damaged_checkpoints_are_refused(capture, tmp_path):
     assert good.read_bytes() == content
 
 
-def test_array_that_claims_more_than_the_file_holds(tmp_path):
-    import io
-    import zipfile
+@pytest.mark.parametrize("header", ["{'descr': (", "{'shape': (0, 10**9)}", "\n  x\n y"])
+def test_array_header_that_does_not_parse(tmp_path, header):
+    path = tmp_path / "bad.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        member = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode()
+        archive.writestr("means.npy", member)
+    with pytest.raises(igsr.IgsrError, match="cannot be read"):
+        load_checkpoint(path)
 
+
+def test_array_that_claims_more_than_the_file_holds(tmp_path):
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
         header, {"descr": "<f4", "fortran_order": False, "shape": (2**40, 2**20)}
@@ -286,6 +372,19 @@ def test_array_that_claims_more_than_the_file_holds(tmp_path):
         archive.writestr("means.npy", header.getvalue() + b"\0" * 16)
     with pytest.raises(igsr.IgsrError, match="another size than its header says"):
         load_checkpoint(path)
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+@pytest.mark.parametrize(("distance", "focal"), [(1e200, 60.0), (1e60, 60.0), (4.0, 1e-300)])
+def test_cameras_too_extreme_to_place_splats_are_refused(alpha, distance, focal):
+    views = []
+    for view in scenes.capture(views=4, size=16, alpha=alpha).train_views:
+        viewmat = view.camera.viewmat.copy()
+        viewmat[:3, 3] *= distance / 4.0
+        K = np.array([[focal, 0.0, 8.0], [0.0, focal, 8.0], [0.0, 0.0, 1.0]])
+        views.append(dataclasses.replace(view, camera=igsr.Camera(viewmat, K, 16, 16)))
+    with pytest.raises(igsr.IgsrError, match="check its poses"):
+        small_fit(igsr.Capture("far", views), steps=3)
 
 
 def test_fit_needs_train_views(capture):

@@ -124,6 +124,21 @@ def test_repeats_bit_for_bit():
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize(
+    "changed",
+    ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds", "means2d"],
+)
+def test_what_is_changed_before_backward_is_refused(changed):
+    scene = torch_scene()
+    for tensor in scene.values():
+        tensor.requires_grad_()
+    color, _, meta = run(scene, packed=False)
+    with torch.no_grad():
+        {**scene, **meta}[changed].mul_(1.2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        color.sum().backward()
+
+
 def test_shapes_and_meta_follow_gsplat():
     scene = torch_scene(count=9, cameras=3)
     for mode, channels in zip(MODES, (3, 1, 1, 4, 4), strict=True):

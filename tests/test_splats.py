@@ -9,6 +9,7 @@ import pytest
 import scenes
 
 import igsr
+from igsr.orbit import orbit
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -62,6 +63,8 @@ def test_no_splats_are_a_scene_too(tmp_path):
         ("sh", lambda a: a[0]),
         ("origin", lambda a: a * np.nan),
         ("means", lambda a: a.tolist()),
+        ("means", lambda a: 5),
+        ("means", lambda a: np.float32(5).reshape(())),
     ],
 )
 def test_wrong_arrays_are_named(name, change):
@@ -94,3 +97,24 @@ def test_bounds_are_in_the_world_frame():
     low, high = splats.bounds()
     assert np.allclose(low, splats.means.min(axis=0) + [10, 20, 30], atol=1e-5)
     assert np.allclose(high, splats.means.max(axis=0) + [10, 20, 30], atol=1e-5)
+
+
+def test_bounds_and_orbit_leave_out_what_is_not_finite():
+    splats = scenes.splats()
+    splats.means[3, 1] = np.nan
+    splats.means[4, 0] = np.inf
+    splats.opacities[5] = np.nan
+    kept = splats.finite
+    assert list(np.flatnonzero(~kept)) == [3, 4, 5]
+    low, high = splats.bounds()
+    assert np.array_equal(low, splats.means[kept].min(axis=0))
+    assert np.array_equal(high, splats.means[kept].max(axis=0))
+    clean = igsr.Splats(
+        **{name: array[kept] for name, array in vars(splats).items() if name != "origin"}
+    )
+    for ours, theirs in zip(orbit(splats, None, 3), orbit(clean, None, 3), strict=True):
+        assert np.array_equal(ours.viewmat, theirs.viewmat)
+    splats.means[:] = np.nan
+    assert splats.bounds() is None
+    with pytest.raises(igsr.IgsrError, match="no finite splats"):
+        orbit(splats, None, 3)

@@ -116,6 +116,9 @@ def project_backward(
     """
 
 DEFAULT_MAX_SPLATS: int
+NEAR_PLANE: float  # what lies nearer than this, in world units, is not drawn
+FAR_PLANE: float  # what lies farther than this, in world units, is not drawn
+EPS2D: float  # variance in square pixels added to every projected Gaussian
 
 def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict[str, Float32]:
     """One round splat per point [P, 3] with colours [P, 3] in 0..1.

@@ -58,6 +58,23 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
                 temporary.unlink()
 
 
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Find out before long work whether ``atomic_write(path)`` will be able to make its file.
+
+    Raises:
+        IgsrError: the folder cannot be made or takes no new file, or ``path`` is a folder.
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise IgsrError(f"Cannot write {target}: it is a folder.")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=target.parent):
+            pass
+    except OSError as error:
+        raise IgsrError(f"Cannot write {target}: {error.strerror or error}.") from error
+
+
 def _umask() -> int:
     """The process's umask (it can only be read by setting it)."""
     mask = os.umask(0)

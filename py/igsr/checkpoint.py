@@ -8,6 +8,8 @@ size is known to be in the file.
 from __future__ import annotations
 
 import json
+import math
+import tokenize
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -23,11 +25,27 @@ FORMAT = 1
 #: Member that holds the settings, as UTF-8 JSON.
 SETTINGS = "settings"
 
+#: What zipfile, numpy and json raise on damaged files. RuntimeError: members that are encrypted, of
+#: an unknown zip version or nested too deep; the syntax errors: array headers that do not parse.
+DAMAGE = (
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+)
+
 State = dict[str, npt.NDArray[Any]]
 
 
 def save_checkpoint(path: Path, state: State, settings: dict[str, Any]) -> None:
     """Write a checkpoint, whole or not at all.
+
+    ``settings`` holds "seconds", the time spent so far, as a float.
 
     Raises:
         IgsrError: the file cannot be written; an older checkpoint is still there.
@@ -55,7 +73,10 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         settings = json.loads(state.pop(SETTINGS).tobytes())
         if not isinstance(settings, dict) or settings.pop("format", None) != FORMAT:
             raise ValueError(f"it is not of format {FORMAT}")
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, RecursionError) as error:
+        seconds = settings.get("seconds")
+        if not isinstance(seconds, float) or not math.isfinite(seconds):
+            raise ValueError(f"its seconds are {seconds!r} where a finite number belongs")
+    except DAMAGE as error:
         raise IgsrError(
             f"The checkpoint {path} cannot be read ({error}); leave --resume out to start anew."
         ) from error

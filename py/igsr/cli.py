@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import enum
 import json
+import math
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -105,7 +107,7 @@ def one_sentence(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Ite
     except KeyboardInterrupt:
         _complain(interrupted())
         raise typer.Exit(INTERRUPTED) from None
-    except IgsrError as error:
+    except (IgsrError, RuntimeError) as error:  # the renderer's RuntimeErrors are the GPU's
         _complain(str(error))
         raise typer.Exit(1) from None
     except OSError as error:
@@ -117,6 +119,15 @@ def one_sentence(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Ite
         raise typer.Exit(1) from None
 
 
+@contextlib.contextmanager
+def _warnings_as_sentences() -> Iterator[None]:
+    """Print the warnings of igsr itself as the command prints its errors."""
+    with warnings.catch_warnings(record=True) as caught:
+        yield
+    for warning in caught:
+        _complain(str(warning.message))
+
+
 def _complain(sentence: str) -> None:
     sentence = " ".join(sentence.split())
     print(sentence if sentence.endswith((".", "!", "?")) else sentence + ".", file=sys.stderr)
@@ -124,10 +135,7 @@ def _complain(sentence: str) -> None:
 
 def _resolved(backend: BackendChoice) -> str:
     """The backend that runs; a missing adapter is found before any work."""
-    try:
-        return _core.resolve_backend(backend.value)
-    except RuntimeError as error:
-        raise IgsrError(str(error)) from error
+    return _core.resolve_backend(backend.value)
 
 
 def _color(text: str | None) -> tuple[float, float, float] | None:
@@ -229,7 +237,7 @@ def fit_command(
         color = _color(background) or default_background(capture)
         # Photos with alpha are fitted over random colours, so that no background is learnt.
         has_alpha = any(view.image.shape[2] == 4 for view in capture.train_views)
-        with _fit_bar(steps, shown=not as_json) as show:
+        with _fit_bar(steps, shown=not as_json) as show, _warnings_as_sentences():
 
             def progress(now: Progress) -> None:
                 last[:] = [now]
@@ -289,7 +297,7 @@ def _checkpoint_seconds(out: Path) -> float:
     from .checkpoint import load_checkpoint
 
     _, settings = load_checkpoint(out / "checkpoint.npz")
-    return round(float(settings["seconds"]), 3)
+    return round(settings["seconds"], 3)
 
 
 @contextlib.contextmanager
@@ -534,21 +542,33 @@ def _plain(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
+def _opacity(logit: float) -> float:
+    # tanh does not overflow for any logit, as exp does.
+    return 0.5 + 0.5 * math.tanh(0.5 * logit)
+
+
 def _scene_info(path: Path) -> dict[str, Any]:
     splats = Splats.load(path)
     bounds = splats.bounds()
-    opacity = 1.0 / (1.0 + np.exp(-splats.opacities.astype(np.float64)))
+    finite = splats.finite
+    logit = float(np.median(splats.opacities[finite])) if finite.any() else None
     return {
         "kind": "scene",
         "path": str(path),
         "splats": len(splats),
+        "not_finite": int((~finite).sum()),
         "sh_degree": splats.sh_degree,
         "lowest_corner": None if bounds is None else bounds[0].tolist(),
         "highest_corner": None if bounds is None else bounds[1].tolist(),
         "origin": splats.origin.tolist(),
-        "median_opacity": None if bounds is None else float(np.median(opacity)),
+        "median_opacity": None if logit is None else _opacity(logit),
         "bytes": path.stat().st_size,
     }
+
+
+def _known(number: float) -> float | None:
+    """None where poses so far out that their mean overflows leave no number; JSON has none."""
+    return float(number) if math.isfinite(number) else None
 
 
 def _capture_info(path: Path) -> dict[str, Any]:
@@ -565,8 +585,8 @@ def _capture_info(path: Path) -> dict[str, Any]:
         "views_with_alpha": sum(view.image.shape[2] == 4 for view in capture.views),
         "views_with_mask": sum(view.mask is not None for view in capture.views),
         "points": points,
-        "scene_centre": [float(x) for x in capture.scene_centre],
-        "scene_extent": float(capture.scene_extent),
+        "scene_centre": [_known(x) for x in capture.scene_centre],
+        "scene_extent": _known(capture.scene_extent),
     }
 
 

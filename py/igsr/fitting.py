@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
+from .atomic_write import check_writable
 from .capture import Capture, View
 from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
@@ -94,11 +96,12 @@ def fit(
     Raises:
         IgsrError: an argument cannot be used, the checkpoint cannot be written or belongs to
             another capture or other settings.
+        UserWarning: the last checkpoint cannot be written; the splats are returned all the same.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     if max_splats is None:
         max_splats = DEFAULT_MAX_SPLATS
-    _check_arguments(steps, seed, max_splats, sh_degree, density, checkpoint, resume)
+    _check_arguments(steps, seed, max_splats, sh_degree, density, background, checkpoint, resume)
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
@@ -107,13 +110,16 @@ def fit(
             raise IgsrError(f"{view.name}: its mask leaves no pixel to fit; leave the photo out.")
     if backend == "reference":
         raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
-    info = _core.backend_info(_core.resolve_backend(backend))
+    try:
+        info = _core.backend_info(_core.resolve_backend(backend))
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
     path = None if checkpoint is None else Path(checkpoint)
     settings: dict[str, Any] = {
         "steps": int(steps),
         "seed": int(seed),
-        "max_splats": max_splats,
-        "sh_degree": sh_degree,
+        "max_splats": int(max_splats),
+        "sh_degree": int(sh_degree),
         "density": density,
         "background": None if background is None else [float(channel) for channel in background],
         "backend": info["backend"],
@@ -125,12 +131,14 @@ def fit(
     seconds_before = 0.0
     if resume and path is not None:
         state, saved = load_checkpoint(path)
-        seconds_before = float(saved.pop("seconds", 0.0))
+        seconds_before = saved.pop("seconds")
         _check_same_settings(path, saved, settings)
     else:
         splats = initial_splats(capture, seed, max_splats, sh_degree)
         state = dict(vars(splats))
     origin = state.pop("origin", np.zeros(0))
+    if path is not None:
+        check_writable(path)
     try:
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError("origin: must be three finite numbers")
@@ -168,6 +176,7 @@ def _check_arguments(
     max_splats: object,
     sh_degree: object,
     density: object,
+    background: object,
     checkpoint: object,
     resume: bool,
 ) -> None:
@@ -184,6 +193,13 @@ def _check_arguments(
             raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
     if density not in DENSITIES:
         raise IgsrError(f"density must be one of {', '.join(DENSITIES)}, not {density!r}.")
+    if background is not None:
+        try:
+            color = np.asarray(background, dtype=np.float64)
+        except (TypeError, ValueError):
+            color = np.zeros(0)
+        if color.shape != (3,) or not ((color >= 0.0) & (color <= 1.0)).all():
+            raise IgsrError(f"background must be three numbers in 0..1, not {background!r}.")
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
 
@@ -227,7 +243,10 @@ def _run(
     try:
         while step < steps:
             chunk_started = time.perf_counter()
-            done = fitter.step(min(chunk, steps - step))
+            try:
+                done = fitter.step(min(chunk, steps - step))
+            except ValueError as error:
+                raise IgsrError(f"{error}.") from error
             now = time.perf_counter()
             advanced, step = done["step"] - step, done["step"]
             speed = advanced / max(now - chunk_started, 1e-9)
@@ -249,8 +268,12 @@ def _run(
             if step - saved_step >= CHECKPOINT_STEPS or now - saved_at >= CHECKPOINT_SECONDS:
                 save()
                 saved_step, saved_at = step, time.perf_counter()
+        try:
+            save()
+        except IgsrError as error:
+            # The splats are finished: losing them to a full disk would be the greater harm.
+            warnings.warn(str(error), stacklevel=3)
     except KeyboardInterrupt:
         save()
         raise
-    save()
     return Splats(**fitter.splats(), origin=origin)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from . import _core
 from .capture import Camera, Capture, View
+from .errors import IgsrError
 from .splats import Splats
 
 Float64 = npt.NDArray[np.float64]
@@ -36,7 +37,22 @@ def initial_splats(capture: Capture, seed: int, max_splats: int, sh_degree: int)
         seed: of the random choices.
         max_splats: at most so many.
         sh_degree: 0-4; coefficients above degree 0 start at zero.
+
+    Raises:
+        IgsrError: no points can be placed: the poses, points or focal lengths are too extreme.
     """
+    try:
+        # What overflows is found by the check of the points; numpy's warnings would say less.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            return _placed_splats(capture, seed, max_splats, sh_degree)
+    except (ValueError, OverflowError) as error:  # numpy's LinAlgError is a ValueError
+        raise IgsrError(
+            f"{capture.path}: no splats can be placed before its cameras ({error}); check its "
+            "poses, focal lengths and points."
+        ) from error
+
+
+def _placed_splats(capture: Capture, seed: int, max_splats: int, sh_degree: int) -> Splats:
     random = np.random.default_rng([seed, 0x1617])
     points = capture.points
     if points is not None and len(points.xyz) >= MIN_POINTS:

@@ -27,16 +27,17 @@ def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
     one it goes around the middle of the splats, z up.
 
     Raises:
-        IgsrError: ``frames`` is under 1, or there are no splats to look at.
+        IgsrError: ``frames`` is under 1, or there are no finite splats to look at.
     """
     if frames < 1:
         raise IgsrError(f"orbit must have at least 1 frame, not {frames}.")
     if capture is None:
-        if len(splats) == 0:
-            raise IgsrError("The scene has no splats to orbit around.")
-        points = splats.means.astype(np.float64) + splats.origin
-        weights = 1.0 / (1.0 + np.exp(-splats.opacities.astype(np.float64)))
-        solid = points[weights >= np.median(weights)]
+        finite = splats.finite
+        if not finite.any():
+            raise IgsrError("The scene has no finite splats to orbit around.")
+        points = splats.means[finite].astype(np.float64) + splats.origin
+        logits = splats.opacities[finite]
+        solid = points[logits >= np.median(logits)]
         target = np.median(solid, axis=0)
         up = np.array([0.0, 0.0, 1.0])
         start = np.array([0.0, -1.0, 0.0])

@@ -14,6 +14,8 @@ carries no gradient; ``covars2d`` is its differentiable companion.
 from __future__ import annotations
 
 import math
+import numbers
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,6 +25,7 @@ import torch
 from torch import Tensor
 
 from . import _core
+from .splats import MAX_SH_DEGREE
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -77,6 +80,25 @@ def _array(tensor: Tensor, dtype: Any) -> npt.NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=dtype)
 
 
+def _project_options(viewmat: Tensor, K: Tensor, settings: _Settings) -> dict[str, Any]:
+    return {
+        "sh_degree": settings.sh_degree,
+        "raw_parameters": False,
+        "viewmat": _array(viewmat, np.float64),
+        "intrinsics": _array(K, np.float64)[[0, 1, 0, 1], [0, 1, 2, 2]],
+        "width": settings.width,
+        "height": settings.height,
+        "near": settings.near,
+        "far": settings.far,
+        "eps2d": settings.eps2d,
+        "backend": settings.backend,
+    }
+
+
+def _projected_arrays(projected: Iterable[Tensor], dtype: Any) -> dict[str, npt.NDArray[Any]]:
+    return {name: _array(t, dtype) for name, t in zip(PROJECTED, projected, strict=True)}
+
+
 class _Project(torch.autograd.Function):
     """Splats and one camera to 2D Gaussians."""
 
@@ -94,21 +116,11 @@ class _Project(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
         inputs = [_array(t, dtype) for t in (means, quats, scales, opacities, colors)]
-        options: dict[str, Any] = {
-            "sh_degree": settings.sh_degree,
-            "raw_parameters": False,
-            "viewmat": _array(viewmat, np.float64),
-            "intrinsics": _array(K, np.float64)[[0, 1, 0, 1], [0, 1, 2, 2]],
-            "width": settings.width,
-            "height": settings.height,
-            "near": settings.near,
-            "far": settings.far,
-            "eps2d": settings.eps2d,
-            "backend": settings.backend,
-        }
-        projected = _core.project(*inputs, **options)
-        ctx.inputs, ctx.options, ctx.projected = inputs, options, projected
-        ctx.like, ctx.camera_dtypes = means, (viewmat.dtype, K.dtype)
+        projected = _core.project(*inputs, **_project_options(viewmat, K, settings))
+        # The arrays above share memory with the caller's tensors: only what autograd saves is
+        # refused in backward() when the caller has changed it in place since.
+        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmat, K)
+        ctx.settings, ctx.projected = settings, projected
         outputs = tuple(torch.from_numpy(projected[name]).to(means) for name in PROJECTED)
         ctx.mark_non_differentiable(*outputs[len(DIFFERENTIABLE) :])
         return outputs
@@ -116,23 +128,30 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        dtype = _core.working_dtype(ctx.options["backend"])
+        dtype = _core.working_dtype(ctx.settings.backend)
+        *splats, viewmat, K = ctx.saved_tensors
         v_projected = {
             f"v_{name}": _array(v, dtype)
             for name, v in zip(DIFFERENTIABLE, v_outputs, strict=False)
         }
-        means, quats, scales, opacities, colors = ctx.inputs
+        means, quats, scales, opacities, colors = (_array(t, dtype) for t in splats)
         v = _core.project_backward(
-            means, quats, scales, opacities, colors, ctx.projected, v_projected, **ctx.options
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            ctx.projected,
+            v_projected,
+            **_project_options(viewmat, K, ctx.settings),
         )
-        like, (viewmat_dtype, K_dtype) = ctx.like, ctx.camera_dtypes
         v_fx, v_fy, v_cx, v_cy = v["v_intrinsics"]
         v_K = np.array([[v_fx, 0.0, v_cx], [0.0, v_fy, v_cy], [0.0, 0.0, 0.0]])
         names = ("v_means", "v_quats", "v_scales", "v_opacities", "v_colors")
         return (
-            *(torch.from_numpy(v[name]).to(like) for name in names),
-            torch.from_numpy(v["v_viewmat"]).to(like.device, viewmat_dtype),
-            torch.from_numpy(v_K).to(like.device, K_dtype),
+            *(torch.from_numpy(v[name]).to(splats[0]) for name in names),
+            torch.from_numpy(v["v_viewmat"]).to(viewmat),
+            torch.from_numpy(v_K).to(K),
             None,
         )
 
@@ -145,14 +164,13 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, background: Tensor, settings: _Settings, *projected: Tensor
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
-        arrays = {name: _array(t, dtype) for name, t in zip(PROJECTED, projected, strict=True)}
-        ctx.projected, ctx.backend = arrays, settings.backend
-        ctx.background, ctx.like = _array(background, dtype), background
+        ctx.save_for_backward(background, *projected)
+        ctx.backend = settings.backend
         ctx.image = _core.rasterize(
-            arrays,
+            _projected_arrays(projected, dtype),
             width=settings.width,
             height=settings.height,
-            background=ctx.background,
+            background=_array(background, dtype),
             backend=settings.backend,
         )
         return tuple(torch.from_numpy(ctx.image[name]).to(background) for name in IMAGE)
@@ -163,17 +181,18 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, v_color: Tensor, v_alpha: Tensor, v_depth: Tensor
     ) -> tuple[Tensor | None, ...]:
         dtype = _core.working_dtype(ctx.backend)
+        background, *projected = ctx.saved_tensors
         v = _core.rasterize_backward(
-            ctx.projected,
+            _projected_arrays(projected, dtype),
             ctx.image,
             v_color=_array(v_color, dtype),
             v_alpha=_array(v_alpha, dtype),
             v_depth=_array(v_depth, dtype),
-            background=ctx.background,
+            background=_array(background, dtype),
             backend=ctx.backend,
         )
-        v_background = torch.from_numpy(v["v_background"]).to(ctx.like)
-        v_projected = (torch.from_numpy(v[f"v_{name}"]).to(ctx.like) for name in DIFFERENTIABLE)
+        v_background = torch.from_numpy(v["v_background"]).to(background)
+        v_projected = (torch.from_numpy(v[f"v_{name}"]).to(background) for name in DIFFERENTIABLE)
         return (v_background, None, *v_projected, None, None)
 
 
@@ -267,7 +286,16 @@ def rasterization(
         if value is not default and (isinstance(value, Tensor) or value != default):
             raise ValueError(f"{name}: only {default!r} is supported, not {value!r}")
     _check_settings(
-        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, render_mode
+        width,
+        height,
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        sh_degree,
+        packed,
+        render_mode,
+        backend,
     )
     dtypes = (torch.float32, torch.float64) if backend == "reference" else (torch.float32,)
     _check_tensors(
@@ -349,13 +377,14 @@ def rasterization(
 def _check_settings(
     width: object,
     height: object,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    sh_degree: object,
+    near_plane: Any,
+    far_plane: Any,
+    radius_clip: Any,
+    eps2d: Any,
+    sh_degree: Any,
     packed: object,
     render_mode: object,
+    backend: object,
 ) -> None:
     for name, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
@@ -366,16 +395,20 @@ def _check_settings(
         ("radius_clip", radius_clip),
         ("eps2d", eps2d),
     ):
-        if not isinstance(number, (int, float)) or not math.isfinite(number) or number < 0:
+        real = isinstance(number, numbers.Real) and not isinstance(number, bool)
+        if not real or not math.isfinite(number) or number < 0:
             raise ValueError(f"{name}: must be a finite number of at least 0, not {number!r}")
     if far_plane <= near_plane:
         raise ValueError(f"far_plane: must exceed near_plane ({near_plane}), not {far_plane}")
-    if sh_degree is not None and sh_degree not in range(5):
+    whole = isinstance(sh_degree, numbers.Integral) and not isinstance(sh_degree, bool)
+    if sh_degree is not None and not (whole and sh_degree in range(MAX_SH_DEGREE + 1)):
         raise ValueError(f"sh_degree: must be None or 0 to 4, not {sh_degree!r}")
     if not isinstance(packed, bool):
         raise ValueError(f"packed: must be True or False, not {packed!r}")
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode: must be one of {RENDER_MODES}, not {render_mode!r}")
+    if not isinstance(backend, str):
+        raise ValueError(f"backend: must be a name such as 'auto', not {backend!r}")
 
 
 def _check_tensors(
@@ -410,6 +443,11 @@ def _check_tensors(
         raise ValueError(
             f"colors: sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, "
             f"not {colors.shape[-2]}"
+        )
+    if sh_degree is not None and colors.shape[-2] > (MAX_SH_DEGREE + 1) ** 2:
+        raise ValueError(
+            f"colors: at most {(MAX_SH_DEGREE + 1) ** 2} coefficients (degree {MAX_SH_DEGREE}) "
+            f"are supported, not {colors.shape[-2]}"
         )
     if backgrounds is not None:
         _check_tensor("backgrounds", backgrounds, [(cameras, 3)], dtypes, device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,15 +13,6 @@ from . import _core
 from .capture import Camera
 from .errors import IgsrError
 from .splats import FloatArray, Splats
-
-#: What lies nearer than this, in world units, is not drawn (gsplat's default).
-NEAR_PLANE = 0.01
-#: What lies farther than this, in world units, is not drawn (gsplat's default).
-FAR_PLANE = 1e10
-#: Variance in square pixels added to every projected Gaussian (EWA low-pass).
-EPS2D = 0.3
-
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
 
 
 @dataclass(frozen=True)
@@ -71,6 +63,21 @@ def render(
         background_color = np.zeros(0)
     if background_color.shape != (3,) or not np.isfinite(background_color).all():
         raise IgsrError("background must be three finite numbers")
+    try:
+        image = _render_arrays(splats, camera, background_color, backend)
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
+    color, alpha, depth, transmittance = (
+        image[name].astype(np.float32, copy=False)
+        for name in ("color", "alpha", "depth", "transmittance")
+    )
+    expected = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
+    return Render(color, alpha, depth, expected, transmittance)
+
+
+def _render_arrays(
+    splats: Splats, camera: Camera, background: npt.NDArray[np.float64], backend: str
+) -> dict[str, npt.NDArray[Any]]:
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)
     projected = _core.project(
@@ -90,24 +97,18 @@ def render(
         intrinsics=intrinsics_of(camera.K),
         width=camera.width,
         height=camera.height,
-        near=NEAR_PLANE,
-        far=FAR_PLANE,
-        eps2d=EPS2D,
+        near=_core.NEAR_PLANE,
+        far=_core.FAR_PLANE,
+        eps2d=_core.EPS2D,
         backend=backend,
     )
-    image = _core.rasterize(
+    return _core.rasterize(
         projected,
         width=camera.width,
         height=camera.height,
-        background=background_color.astype(dtype),
+        background=background.astype(dtype),
         backend=backend,
     )
-    color, alpha, depth, transmittance = (
-        image[name].astype(np.float32, copy=False)
-        for name in ("color", "alpha", "depth", "transmittance")
-    )
-    expected = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
-    return Render(color, alpha, depth, expected, transmittance)
 
 
 def viewmat_about(

@@ -44,7 +44,7 @@ class Splats:
     origin: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        count = len(self.means)
+        count = self.means.shape[0] if isinstance(self.means, np.ndarray) and self.means.ndim else 0
         for name, tail in (("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ())):
             self._check(name, getattr(self, name), (count, *tail))
         bands = self.sh.shape[1] if isinstance(self.sh, np.ndarray) and self.sh.ndim == 3 else 0
@@ -72,11 +72,20 @@ class Splats:
         """Degree of the stored spherical harmonics, 0-4."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
+    @property
+    def finite(self) -> npt.NDArray[np.bool_]:
+        """bool [N]: which splats have only finite parameters; no other is drawn."""
+        finite: npt.NDArray[np.bool_] = np.isfinite(self.opacities)
+        for rows in (self.means, self.quats, self.scales):
+            finite &= np.isfinite(rows).all(axis=1)
+        finite &= np.isfinite(self.sh).all(axis=(1, 2))
+        return finite
+
     def bounds(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
-        """Lowest and highest corner [3] of the centres, world frame; None without splats."""
-        if len(self) == 0:
+        """Lowest and highest corner [3] of the finite splats' centres, world frame, or None."""
+        world = self.means[self.finite].astype(np.float64) + self.origin
+        if len(world) == 0:
             return None
-        world = self.means.astype(np.float64) + self.origin
         return world.min(axis=0), world.max(axis=0)
 
     def save(self, path: str | os.PathLike[str]) -> None:

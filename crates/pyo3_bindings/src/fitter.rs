@@ -152,9 +152,12 @@ fn targets_from(images: &Bound<'_, PyList>, masks: &Bound<'_, PyList>) -> PyResu
             None
         } else {
             let name = format!("masks[{i}]");
-            let mask = array::<bool>(&name, &mask)?;
-            let mask = elements(&name, &mask, &[height as isize, width as isize])?;
-            Some(mask.iter().map(|&counts| if counts { 1.0 } else { 0.0 }).collect())
+            array::<bool>(&name, &mask)?;
+            // numpy lets a bool hold any byte; Rust's bool may only be read as 0 or 1.
+            let bytes = mask.call_method1("view", (numpy::dtype::<u8>(mask.py()),))?;
+            let bytes = array::<u8>(&name, &bytes)?;
+            let bytes = elements(&name, &bytes, &[height as isize, width as isize])?;
+            Some(bytes.iter().map(|&counts| if counts == 0 { 0.0 } else { 1.0 }).collect())
         };
         let target = Target {
             width: width as u32,

@@ -17,6 +17,7 @@ use pyo3::prelude::*;
 #[pymodule]
 mod _core {
     use pyo3::prelude::*;
+    use splat_render::constants;
     use splat_render::fit::FitConfig;
 
     #[pymodule_export]
@@ -24,7 +25,10 @@ mod _core {
     const __version__: &str = env!("CARGO_PKG_VERSION");
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        module.add("DEFAULT_MAX_SPLATS", FitConfig::default().max_splats)
+        module.add("DEFAULT_MAX_SPLATS", FitConfig::default().max_splats)?;
+        module.add("NEAR_PLANE", constants::NEAR)?;
+        module.add("FAR_PLANE", constants::FAR)?;
+        module.add("EPS2D", constants::BLUR)
     }
     #[pymodule_export]
     use crate::backend::{backend_info, resolve_backend, working_dtype};

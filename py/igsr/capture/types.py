@@ -65,6 +65,9 @@ class View:
             lens distortion already undone.
         mask: bool [H, W], True where the pixel may be used, or None where all may: the given mask
             and what undistortion could fill, joined.
+
+    Raises:
+        IgsrError: the image or mask has another dtype or shape than the camera's size asks for.
     """
 
     name: str
@@ -72,6 +75,27 @@ class View:
     split: str
     image: np.ndarray
     mask: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Check the pixels against the camera."""
+        size = (self.camera.height, self.camera.width)
+        self._check("image", self.image, np.uint8, [(*size, 3), (*size, 4)])
+        if self.mask is not None:
+            self._check("mask", self.mask, np.bool_, [size])
+
+    def _check(
+        self, what: str, array: object, dtype: type[np.generic], shapes: list[tuple[int, ...]]
+    ) -> None:
+        if not isinstance(array, np.ndarray):
+            raise IgsrError(
+                f"{self.name}: its {what} is a {type(array).__name__}; give a numpy array"
+            )
+        if array.dtype != dtype or array.shape not in shapes:
+            wanted = " or ".join(str(list(shape)) for shape in shapes)
+            raise IgsrError(
+                f"{self.name}: its {what} is {array.dtype} {list(array.shape)} where its camera "
+                f"needs {np.dtype(dtype)} {wanted}"
+            )
 
 
 @dataclass(eq=False)
