@@ -41,14 +41,14 @@ fn end_to_end_matches_the_reference() {
             let camera = random_camera(&mut rng, width, height);
             let scene = random_scene(&mut rng, n, degree);
             let what = format!("{width}x{height}, {n} splats, SH {degree:?}");
-            end_to_end(&Cpu, &scene, &camera, seed, BOUNDS, &what);
+            end_to_end(&Cpu, &scene, &camera, &mut rng, BOUNDS, &what);
         }
     }
 }
 
 #[test]
 fn hard_scenes_agree_with_the_reference() {
-    common::hard_cases::hard_scenes_agree_with_the_reference(&Cpu, 1e-4);
+    common::hard_cases::hard_scenes_agree_with_the_reference(&Cpu, BOUNDS.gradient);
 }
 
 #[test]
@@ -59,4 +59,14 @@ fn no_splats_give_the_background() {
 #[test]
 fn poison_in_any_slot_culls_one_splat_at_most() {
     common::hard_cases::poison_in_any_slot_culls_one_splat_at_most(&Cpu);
+}
+
+#[test]
+fn hard_splats_2d_agree_with_the_reference() {
+    common::hard_cases::hard_splats_2d_agree_with_the_reference(&Cpu, BOUNDS);
+}
+
+#[test]
+fn many_splats_in_one_tile_and_one_on_many() {
+    common::hard_cases::many_splats_in_one_tile_and_one_on_many(&Cpu, BOUNDS);
 }

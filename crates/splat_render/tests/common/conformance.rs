@@ -1,6 +1,7 @@
 //! What every f32 implementation must show against the f64 reference, stage by stage and end to
 //! end. Each check prints its figures.
 
+use rand_pcg::Pcg64;
 use splat_render::reference::{Reference, band_pixels};
 use splat_render::{Camera, Image, ImageGradients, ProjectOptions, Projected, Stages};
 
@@ -26,21 +27,25 @@ pub const SIZES: [(u32, u32); 5] = [(64, 64), (1, 1), (17, 33), (100, 31), (130,
 /// Pixels of `band` where the pictures differ by more than `bound`: only these are left out, and at
 /// most 0.1 % of all (or one, in pictures of under 1 000 pixels).
 fn left_out(got: &Image<f32>, expected: &Image<f64>, band: &[bool], bound: f64) -> Vec<bool> {
+    // Depth counts as in image_difference: as a part of the largest.
+    let depth_scale = expected.depth.iter().fold(1.0f64, |scale, d| scale.max(d.abs()));
     let far = |pixel: usize| {
         let color = (0..3)
             .any(|c| (f64::from(got.color[pixel][c]) - expected.color[pixel][c]).abs() > bound);
         let t = f64::from(got.transmittance[pixel]) - expected.transmittance[pixel];
-        color || t.abs() > bound
+        let depth = (f64::from(got.depth[pixel]) - expected.depth[pixel]) / depth_scale;
+        color || t.abs() > bound || depth.abs() > bound
     };
     let out: Vec<bool> = (0..band.len()).map(|pixel| band[pixel] && far(pixel)).collect();
     assert_band_is_small(&out);
     out
 }
 
-fn masked(v_image: &ImageGradients<f32>, band: &[bool]) -> ImageGradients<f32> {
+/// The gradients with zeros where the pictures may rightly differ.
+fn masked(v_image: &ImageGradients<f32>, left_out: &[bool]) -> ImageGradients<f32> {
     let mut out = v_image.clone();
-    for (pixel, &in_band) in band.iter().enumerate() {
-        if in_band {
+    for (pixel, &out_of_it) in left_out.iter().enumerate() {
+        if out_of_it {
             out.v_color[pixel] = [0.0; 3];
             (out.v_alpha[pixel], out.v_depth[pixel]) = (0.0, 0.0);
         }
@@ -61,13 +66,22 @@ pub fn rasterize_stages(
     let wide = widen_projected(projected);
     let image = stages.rasterize(projected, background).unwrap();
     let expected = Reference.rasterize(&wide, background.map(f64::from)).unwrap();
-    let band = left_out(&image, &expected, &band_pixels(&wide, BAND.0), bounds.picture);
-    let difference = image_difference(&image, &expected, &band);
-    println!("{what}: picture max {:.1e} mean {:.1e}", difference.max, difference.mean);
+    let left_out = left_out(&image, &expected, &band_pixels(&wide, BAND.0), bounds.picture);
+    let difference = image_difference(&image, &expected, &left_out);
+    println!(
+        "{what}: picture max {:.1e} mean {:.1e}; {} of {} pixels left out",
+        difference.max,
+        difference.mean,
+        left_out.iter().filter(|&&out| out).count(),
+        left_out.len()
+    );
     assert!(difference.max <= bounds.picture, "{what}: picture is off by {:.2e}", difference.max);
+    assert!(image == stages.rasterize(projected, background).unwrap(), "{what}: picture repeats");
 
-    let v_image = masked(&random_image_gradients(&mut rng, image.alpha.len()), &band);
+    let v_image = masked(&random_image_gradients(&mut rng, image.alpha.len()), &left_out);
     let v = stages.rasterize_backward(projected, background, &image, &v_image).unwrap();
+    let again = stages.rasterize_backward(projected, background, &image, &v_image).unwrap();
+    assert!(v == again, "{what}: gradients repeat");
     let expected = Reference
         .rasterize_backward(
             &wide,
@@ -99,7 +113,12 @@ pub fn project_stages(
     let wide_scene = scene.widen();
     let expected = Reference.project(&wide_scene.params(), camera, &options).unwrap();
     let v = random_projected_gradients(&mut rng, &narrow_projected(&expected));
-    let gradients = stages.project_backward(&scene.params(), camera, &options, &got, &v).unwrap();
+    let run = || stages.project_backward(&scene.params(), camera, &options, &got, &v).unwrap();
+    let gradients = run();
+    assert!(
+        splat_gradient_bits(&gradients) == splat_gradient_bits(&run()),
+        "{what}: gradients repeat"
+    );
     let expected_gradients = Reference
         .project_backward(
             &wide_scene.params(),
@@ -109,16 +128,19 @@ pub fn project_stages(
             &widen_projected_gradients(&v),
         )
         .unwrap();
-    let visible = |radii: &[f64]| radii != [0.0; 2];
-    let same = (0..got.len())
-        .filter(|&i| visible(&got.radii[i].map(f64::from)) == visible(&expected.radii[i]))
-        .count();
-    assert_eq!(same, got.len(), "{what}: different splats are culled");
+    assert_same_culled(&got, &expected, what);
     let differences = splat_gradient_differences(&gradients, &expected_gradients);
     for (name, d) in &differences {
         println!("{what}: {name} {:.1e} of the largest", d.relative());
     }
     assert_gradients(&differences, bounds.gradient, what);
+}
+
+fn assert_same_culled(got: &Projected<f32>, expected: &Projected<f64>, what: &str) {
+    for i in 0..expected.len() {
+        let culled = expected.radii[i] == [0.0; 2];
+        assert_eq!(got.radii[i] == [0.0; 2], culled, "{what}: splat {i} culled");
+    }
 }
 
 /// The camera with values that f32 holds exactly, so that all implementations get the same.
@@ -139,11 +161,10 @@ pub fn end_to_end(
     stages: &dyn Stages<f32>,
     scene: &Scene<f32>,
     camera: &Camera,
-    seed: u64,
+    rng: &mut Pcg64,
     bounds: Bounds,
     what: &str,
 ) {
-    let mut rng = rng(seed);
     let camera = &rounded(camera);
     let options = ProjectOptions::default();
     let background = [0.2f32, 0.5, 0.9];
@@ -154,11 +175,12 @@ pub fn end_to_end(
     let expected = Reference.rasterize(&expected_projected, wide_background).unwrap();
 
     let projected = stages.project(&scene.params(), camera, &options).unwrap();
+    assert_same_culled(&projected, &expected_projected, what);
     let image = stages.rasterize(&projected, background).unwrap();
     let all = image_difference(&image, &expected, &[]);
-    let band = left_out(&image, &expected, &band, END_TO_END.0);
-    let outside = image_difference(&image, &expected, &band);
-    let count = band.iter().filter(|&&b| b).count();
+    let left_out = left_out(&image, &expected, &band, END_TO_END.0);
+    let outside = image_difference(&image, &expected, &left_out);
+    let count = left_out.iter().filter(|&&out| out).count();
     println!(
         "{what}: picture max {:.1e} mean {:.1e}; {count} of {} pixels left out (max with them {:.1e})",
         outside.max,
@@ -169,7 +191,7 @@ pub fn end_to_end(
     assert!(outside.max <= END_TO_END.0, "{what}: picture is off by {:.2e}", outside.max);
     assert!(outside.mean <= END_TO_END.1, "{what}: mean is off by {:.2e}", outside.mean);
 
-    let v_image = masked(&random_image_gradients(&mut rng, image.alpha.len()), &band);
+    let v_image = masked(&random_image_gradients(rng, image.alpha.len()), &left_out);
     let v = stages.rasterize_backward(&projected, background, &image, &v_image).unwrap();
     let gradients =
         stages.project_backward(&scene.params(), camera, &options, &projected, &v).unwrap();

@@ -5,6 +5,7 @@ use splat_render::reference::{Reference, band_pixels};
 use splat_render::stages::{Projected, ProjectedGradients};
 use splat_render::{ProjectOptions, Stages};
 
+use super::conformance::{Bounds, rasterize_stages};
 use super::*;
 
 /// Hard scenes of the design's table, by name, seen by a camera at the origin that looks along z.
@@ -125,6 +126,77 @@ pub fn hard_scenes_agree_with_the_reference(stages: &dyn Stages<f32>, bound: f64
     }
 }
 
+/// Hard 2D splats, by name.
+fn hard_splats_2d() -> Vec<(&'static str, Projected<f32>)> {
+    let mut rng = rng(2);
+    let mut cases = Vec::new();
+    let mut equal = random_projected(&mut rng, 200, 40, 40, 4.0);
+    equal.depths.fill(2.0);
+    cases.push(("all at one depth: the index decides", equal));
+    let mut culled = random_projected(&mut rng, 50, 33, 20, 3.0);
+    culled.radii.fill([0.0; 2]);
+    cases.push(("everything culled", culled));
+    let mut outside = random_projected(&mut rng, 40, 120, 90, 60.0);
+    for mean in &mut outside.means2d {
+        mean[0] -= 150.0;
+    }
+    place(&mut outside, 0, [60.0, 45.0], [500.0, 400.0], 0.3, 0.9);
+    cases.push(("centres far outside, and one over all tiles", outside));
+    let mut opaque = random_projected(&mut rng, 1000, 20, 20, 8.0);
+    for i in 0..1000 {
+        place(&mut opaque, i, [10.0, 10.0], [9.0, 7.0], 0.5, 1.0);
+        opaque.depths[i] = 1.0 + i as f32;
+    }
+    cases.push(("1000 opaque layers: early stop and the cap", opaque));
+    let mut needles = random_projected(&mut rng, 100, 100, 80, 1.0);
+    for i in 0..100 {
+        let center = needles.means2d[i];
+        let angle = rng.random_range(0.0..std::f64::consts::PI);
+        place(&mut needles, i, center, [1e4, 1e-2], angle, 0.8);
+        needles.depths[i] = i as f32 + 1.0;
+    }
+    cases.push(("needles", needles));
+    let mut wide = random_projected(&mut rng, 300, 16_384, 2, 6.0);
+    place(&mut wide, 0, [8000.0, 1.0], [9000.0, 2.0], 0.0, 0.5);
+    cases.push(("a very wide picture", wide));
+    cases
+}
+
+/// Every hard set of 2D splats, to picture and back, against the reference.
+pub fn hard_splats_2d_agree_with_the_reference(stages: &dyn Stages<f32>, bounds: Bounds) {
+    for (k, (name, projected)) in hard_splats_2d().iter().enumerate() {
+        let mut bounds = bounds;
+        // p dx and q dy reach 180 and cancel to u of order 1: their f32 rounding, 1e-5, moves
+        // alpha by up to 0.8 exp(-1/2) 1e-5.
+        if *name == "needles" {
+            bounds.picture = bounds.picture.max(5e-6);
+        }
+        rasterize_stages(stages, projected, 30 + k as u64, bounds, name);
+    }
+}
+
+/// 100 000 splats in one tile, and one splat on 16 384 tiles.
+pub fn many_splats_in_one_tile_and_one_on_many(stages: &dyn Stages<f32>, bounds: Bounds) {
+    let mut rng = rng(11);
+    // Nearly all over the left of the tile, then 300 over its right: a list that is cut off
+    // anywhere (some drivers stop loops after 65 535 rounds) loses those.
+    let (n, left) = (100_000, 99_700);
+    let mut crowd = Projected::<f32>::culled(n, 16, 16);
+    for i in 0..n {
+        let start = if i < left { 0.0 } else { 10.0 };
+        let center = [start + rng.random_range(0.0f32..4.0), rng.random_range(0.0f32..16.0)];
+        place(&mut crowd, i, center, [0.5, 0.5], 0.0, 0.3);
+        crowd.depths[i] = if i < left { 1.0 } else { 2.0 };
+        crowd.colors[i] = std::array::from_fn(|_| rng.random::<f32>());
+    }
+    rasterize_stages(stages, &crowd, 40, bounds, "100 000 in one tile");
+
+    let mut huge = Projected::<f32>::culled(1, 2048, 2048);
+    place(&mut huge, 0, [1000.0, 1040.0], [900.0, 700.0], 0.4, 0.7);
+    huge.colors[0] = [0.3, 0.6, 0.9];
+    rasterize_stages(stages, &huge, 41, bounds, "one on 16 384 tiles");
+}
+
 /// No splats: the background, and gradients of nothing.
 pub fn no_splats_give_the_background(stages: &dyn Stages<f32>) {
     let empty = Projected::<f32>::culled(0, 21, 18);
@@ -146,13 +218,17 @@ pub fn no_splats_give_the_background(stages: &dyn Stages<f32>) {
     assert!(v.v_means.is_empty() && v.v_viewmat == [[0.0; 4]; 3]);
 }
 
-/// One poisoned value in one slot, all slots in turn: everything else keeps its bits.
+/// One poisoned value in one slot, all slots in turn: everything else keeps its bits, and so do its
+/// gradients.
 pub fn poison_in_any_slot_culls_one_splat_at_most(stages: &dyn Stages<f32>) {
     let mut rng = rng(10);
     let scene = random_scene(&mut rng, 24, Some(1));
     let camera = random_camera(&mut rng, 40, 30);
     let options = ProjectOptions::default();
     let clean = stages.project(&scene.params(), &camera, &options).unwrap();
+    let v_given = random_projected_gradients(&mut rng, &clean);
+    let v_clean =
+        stages.project_backward(&scene.params(), &camera, &options, &clean, &v_given).unwrap();
     let poisons =
         [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38, -1e38, f32::MIN_POSITIVE / 8.0, 0.0];
     // Mean 3, quaternion 4, scale 3, opacity 1, one coefficient's 3 channels and the last one's.
@@ -173,10 +249,25 @@ pub fn poison_in_any_slot_culls_one_splat_at_most(stages: &dyn Stages<f32>) {
             for k in (0..24).filter(|&k| k != i) {
                 assert_eq!(projected.means2d[k], clean.means2d[k], "{what}");
                 assert_eq!(projected.factors[k], clean.factors[k], "{what}");
+                assert_eq!(projected.covars2d[k], clean.covars2d[k], "{what}");
+                assert_eq!(projected.depths[k], clean.depths[k], "{what}");
                 assert_eq!(projected.colors[k], clean.colors[k], "{what}");
+                assert_eq!(projected.opacities[k], clean.opacities[k], "{what}");
+                assert_eq!(projected.radii[k], clean.radii[k], "{what}");
             }
             if poison.is_nan() || poison.is_infinite() {
                 assert_eq!(projected.radii[i], [0.0; 2], "{what} must be culled");
+            }
+            let v = stages
+                .project_backward(&scene.params(), &camera, &options, &projected, &v_given)
+                .unwrap();
+            for k in (0..24).filter(|&k| k != i) {
+                let colors = 4 * k..4 * k + 4;
+                assert_eq!(v.v_means[k], v_clean.v_means[k], "{what}");
+                assert_eq!(v.v_quats[k], v_clean.v_quats[k], "{what}");
+                assert_eq!(v.v_scales[k], v_clean.v_scales[k], "{what}");
+                assert_eq!(v.v_opacities[k], v_clean.v_opacities[k], "{what}");
+                assert_eq!(v.v_colors[colors.clone()], v_clean.v_colors[colors], "{what}");
             }
             let image = stages.rasterize(&projected, [0.0; 3]).unwrap();
             assert!(image.color.iter().flatten().all(|v| v.is_finite()), "{what}: picture");
@@ -190,7 +281,8 @@ pub fn poison_in_any_slot_culls_one_splat_at_most(stages: &dyn Stages<f32>) {
                 && v.v_scales.iter().flatten().all(|v| v.is_finite())
                 && v.v_opacities.iter().all(|v| v.is_finite())
                 && v.v_colors.iter().flatten().all(|v| v.is_finite())
-                && v.v_viewmat.iter().flatten().all(|v| v.is_finite());
+                && v.v_viewmat.iter().flatten().all(|v| v.is_finite())
+                && v.v_intrinsics.iter().all(|v| v.is_finite());
             assert!(finite, "{what}: gradients");
         }
     }
