@@ -42,6 +42,7 @@ def main() -> None:
         "near": 0.01,
         "far": 1e10,
         "eps2d": 0.3,
+        "antialiased": False,
         "raw_parameters": True,
         "backend": arguments.backend,
     }
@@ -64,6 +65,7 @@ def main() -> None:
         v_color=np.ascontiguousarray(v_out[..., :3]),
         v_alpha=np.ascontiguousarray(v_out[..., 3]),
         v_depth=np.zeros((HEIGHT, WIDTH), dtype),
+        absolute=False,
         **picture,
     )
     with_sh = _core.project_backward(

@@ -194,6 +194,7 @@ def test_core_names_arrays_of_the_wrong_kind():
         "near": 0.01,
         "far": 100.0,
         "eps2d": 0.3,
+        "antialiased": False,
         "backend": "cpu",
     }
     assert len(_core.project(**good)["means2d"]) == len(splats)

@@ -6,9 +6,8 @@ do raises ValueError by the argument's name.
 
 Two autograd functions do the work, one per half of the pipeline: ``_Project`` and ``_Rasterize``.
 Between them lie ``means2d`` (so that ``meta["means2d"].grad`` exists, which density control reads)
-and ``covars2d``. The picture itself is drawn from ``factors``, the upper-triangular factor of each
-conic: the same information as ``covars2d`` without its cancellation for long needles. ``factors``
-carries no gradient; ``covars2d`` is its differentiable companion.
+and ``factors``, the upper-triangular factor of each conic: the same information as a covariance
+without its cancellation for long needles.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ RIGID_TOLERANCE = 1e-3
 #: The tile's side in pixels; it shows in ``meta`` only, no picture depends on it.
 TILE_SIZE = 16
 
-#: What passes from ``_Project`` to ``_Rasterize``; the last two carry no gradient.
-DIFFERENTIABLE = ("means2d", "covars2d", "depths", "colors", "opacities")
-PROJECTED = (*DIFFERENTIABLE, "factors", "radii")
+#: What passes from ``_Project`` to ``_Rasterize``; the last carries no gradient.
+DIFFERENTIABLE = ("means2d", "factors", "depths", "colors", "opacities")
+PROJECTED = (*DIFFERENTIABLE, "radii")
 IMAGE = ("color", "alpha", "depth")
 
 #: gsplat arguments that exist to be refused by name, with the only value accepted.
@@ -91,6 +90,7 @@ def _project_options(viewmat: Tensor, K: Tensor, settings: _Settings) -> dict[st
         "near": settings.near,
         "far": settings.far,
         "eps2d": settings.eps2d,
+        "antialiased": False,
         "backend": settings.backend,
     }
 
@@ -189,11 +189,12 @@ class _Rasterize(torch.autograd.Function):
             v_alpha=_array(v_alpha, dtype),
             v_depth=_array(v_depth, dtype),
             background=_array(background, dtype),
+            absolute=False,
             backend=ctx.backend,
         )
         v_background = torch.from_numpy(v["v_background"]).to(background)
         v_projected = (torch.from_numpy(v[f"v_{name}"]).to(background) for name in DIFFERENTIABLE)
-        return (v_background, None, *v_projected, None, None)
+        return (v_background, None, *v_projected, None)
 
 
 def rasterization(

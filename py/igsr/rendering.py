@@ -100,6 +100,7 @@ def _render_arrays(
         near=_core.NEAR_PLANE,
         far=_core.FAR_PLANE,
         eps2d=_core.EPS2D,
+        antialiased=False,
         backend=backend,
     )
     return _core.rasterize(

@@ -108,7 +108,6 @@ fn projected_from<T: Real>(
         height,
         means2d,
         factors: copied(dict, "factors", n)?,
-        covars2d: copied(dict, "covars2d", n)?,
         depths: elements("depths", &depths, &[n])?.to_vec(),
         colors: copied(dict, "colors", n)?,
         opacities: elements("opacities", &opacities, &[n])?.to_vec(),
@@ -119,7 +118,7 @@ fn projected_from<T: Real>(
 /// Splats and one camera to 2D splats.
 #[pyfunction]
 #[pyo3(signature = (means, quats, scales, opacities, colors, *, sh_degree, raw_parameters, viewmat,
-    intrinsics, width, height, near, far, eps2d, backend))]
+    intrinsics, width, height, near, far, eps2d, antialiased, backend))]
 #[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
 pub fn project<'py>(
     py: Python<'py>,
@@ -137,10 +136,11 @@ pub fn project<'py>(
     near: f32,
     far: f32,
     eps2d: f32,
+    antialiased: bool,
     backend: &str,
 ) -> PyResult<Bound<'py, PyDict>> {
     let camera = camera(viewmat, intrinsics, width, height)?;
-    let options = ProjectOptions { near, far, blur: eps2d };
+    let options = ProjectOptions { near, far, blur: eps2d, antialiased };
     let arguments = ProjectArguments {
         means,
         quats,
@@ -168,7 +168,6 @@ fn project_with<'py, T: Real>(
     let dict = PyDict::new(py);
     dict.set_item("means2d", shaped_rows(py, projected.means2d, &n)?)?;
     dict.set_item("factors", shaped_rows(py, projected.factors, &n)?)?;
-    dict.set_item("covars2d", shaped_rows(py, projected.covars2d, &n)?)?;
     dict.set_item("depths", shaped(py, projected.depths, &n)?)?;
     dict.set_item("colors", shaped_rows(py, projected.colors, &n)?)?;
     dict.set_item("opacities", shaped(py, projected.opacities, &n)?)?;
@@ -212,7 +211,8 @@ fn rasterize_with<'py, T: Real>(
 
 /// Gradients of a picture to gradients of its 2D splats and background.
 #[pyfunction]
-#[pyo3(signature = (projected, image, *, v_color, v_alpha, v_depth, background, backend))]
+#[pyo3(signature = (projected, image, *, v_color, v_alpha, v_depth, background, absolute,
+    backend))]
 #[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
 pub fn rasterize_backward<'py>(
     py: Python<'py>,
@@ -222,10 +222,14 @@ pub fn rasterize_backward<'py>(
     v_alpha: &Bound<'py, PyAny>,
     v_depth: &Bound<'py, PyAny>,
     background: &Bound<'py, PyAny>,
+    absolute: bool,
     backend: &str,
 ) -> PyResult<Bound<'py, PyDict>> {
     let v_image = [v_color, v_alpha, v_depth];
-    with_stages!(backend, rasterize_backward_with(py, projected, image, v_image, background))
+    with_stages!(
+        backend,
+        rasterize_backward_with(py, projected, image, v_image, background, absolute)
+    )
 }
 
 fn rasterize_backward_with<'py, T: Real>(
@@ -235,6 +239,7 @@ fn rasterize_backward_with<'py, T: Real>(
     image: &Bound<'py, PyDict>,
     [v_color, v_alpha, v_depth]: [&Bound<'py, PyAny>; 3],
     background: &Bound<'py, PyAny>,
+    absolute: bool,
 ) -> PyResult<Bound<'py, PyDict>> {
     let alpha = entry::<T>(image, "alpha")?;
     elements("alpha", &alpha, &[-1, -1])?;
@@ -262,12 +267,15 @@ fn rasterize_backward_with<'py, T: Real>(
         v_depth: elements("v_depth", &array("v_depth", v_depth)?, &size)?.to_vec(),
     };
     let v: ProjectedGradients<T> = py
-        .detach(|| stages.rasterize_backward(&projected, background, &image, &v_image))
+        .detach(|| stages.rasterize_backward(&projected, background, &image, &v_image, absolute))
         .map_err(to_python)?;
     let n = [projected.len()];
     let dict = PyDict::new(py);
     dict.set_item("v_means2d", shaped_rows(py, v.v_means2d, &n)?)?;
-    dict.set_item("v_covars2d", shaped_rows(py, v.v_covars2d, &n)?)?;
+    dict.set_item("v_factors", shaped_rows(py, v.v_factors, &n)?)?;
+    if let Some(v_absolute) = v.v_means2d_absolute {
+        dict.set_item("v_means2d_absolute", shaped_rows(py, v_absolute, &n)?)?;
+    }
     dict.set_item("v_depths", shaped(py, v.v_depths, &n)?)?;
     dict.set_item("v_colors", shaped_rows(py, v.v_colors, &n)?)?;
     dict.set_item("v_opacities", shaped(py, v.v_opacities, &n)?)?;
@@ -278,7 +286,7 @@ fn rasterize_backward_with<'py, T: Real>(
 /// Gradients of 2D splats to gradients of the splats and the camera.
 #[pyfunction]
 #[pyo3(signature = (means, quats, scales, opacities, colors, projected, v_projected, *, sh_degree,
-    raw_parameters, viewmat, intrinsics, width, height, near, far, eps2d, backend))]
+    raw_parameters, viewmat, intrinsics, width, height, near, far, eps2d, antialiased, backend))]
 #[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
 pub fn project_backward<'py>(
     py: Python<'py>,
@@ -298,10 +306,11 @@ pub fn project_backward<'py>(
     near: f32,
     far: f32,
     eps2d: f32,
+    antialiased: bool,
     backend: &str,
 ) -> PyResult<Bound<'py, PyDict>> {
     let camera = camera(viewmat, intrinsics, width, height)?;
-    let options = ProjectOptions { near, far, blur: eps2d };
+    let options = ProjectOptions { near, far, blur: eps2d, antialiased };
     let arguments = ProjectArguments {
         means,
         quats,
@@ -331,11 +340,12 @@ fn project_backward_with<'py, T: Real>(
     let v = v_projected;
     let v_projected = ProjectedGradients {
         v_means2d: rows("v_means2d", &entry(v, "v_means2d")?, &[n])?.to_vec(),
-        v_covars2d: rows("v_covars2d", &entry(v, "v_covars2d")?, &[n])?.to_vec(),
+        v_factors: rows("v_factors", &entry(v, "v_factors")?, &[n])?.to_vec(),
         v_depths: elements("v_depths", &entry(v, "v_depths")?, &[n])?.to_vec(),
         v_colors: rows("v_colors", &entry(v, "v_colors")?, &[n])?.to_vec(),
         v_opacities: elements("v_opacities", &entry(v, "v_opacities")?, &[n])?.to_vec(),
         v_background: [T::default(); 3],
+        v_means2d_absolute: None,
     };
     if projected.len() != params.len() {
         return Err(PyValueError::new_err(format!(

@@ -111,11 +111,15 @@ pub struct ProjectOptions {
     pub far: f32,
     /// Variance in px^2 added to both axes of the 2D covariance.
     pub blur: f32,
+    /// Whether opacities are lowered by what the blur adds to a splat's area, so that a splat
+    /// seen small keeps its weight in the picture: times sqrt(det S / det(S + blur I)), S the 2D
+    /// covariance without blur (the 2D filter of Mip-Splatting, Yu et al. 2024, section 4.2).
+    pub antialiased: bool,
 }
 
 impl Default for ProjectOptions {
     fn default() -> Self {
-        Self { near: NEAR, far: FAR, blur: BLUR }
+        Self { near: NEAR, far: FAR, blur: BLUR, antialiased: false }
     }
 }
 
@@ -131,13 +135,11 @@ pub struct Projected<T> {
     /// Upper-triangular factor (p, q, r) of the conic: u = p dx + q dy, v = r dy,
     /// sigma = (u^2 + v^2) / 2, with (dx, dy) = pixel centre - mean2d.
     pub factors: Vec<[T; 3]>,
-    /// 2D covariances in px^2, blur included: (xx, xy, yy).
-    pub covars2d: Vec<[T; 3]>,
     /// Camera-space z.
     pub depths: Vec<T>,
     /// Colours.
     pub colors: Vec<[T; 3]>,
-    /// Opacities in 0..1.
+    /// Opacities in 0..1, lowered where the project stage was told to (antialiased).
     pub opacities: Vec<T>,
     /// Half-sides in px of the box outside which alpha < `ALPHA_MIN`.
     pub radii: Vec<[T; 2]>,
@@ -152,7 +154,6 @@ impl<T: Copy + Default> Projected<T> {
             height,
             means2d: vec![[z; 2]; n],
             factors: vec![[z; 3]; n],
-            covars2d: vec![[z; 3]; n],
             depths: vec![z; n],
             colors: vec![[z; 3]; n],
             opacities: vec![z; n],
@@ -166,7 +167,6 @@ impl<T: Copy + Default> Projected<T> {
         check_size(self.width, self.height)?;
         let lengths = [
             ("factors", self.factors.len()),
-            ("covars2d", self.covars2d.len()),
             ("depths", self.depths.len()),
             ("colors", self.colors.len()),
             ("opacities", self.opacities.len()),
@@ -235,8 +235,8 @@ impl<T> ImageGradients<T> {
 pub struct ProjectedGradients<T> {
     /// `[N]`
     pub v_means2d: Vec<[T; 2]>,
-    /// `[N]` of (xx, xy, yy); xy is the one shared off-diagonal entry.
-    pub v_covars2d: Vec<[T; 3]>,
+    /// `[N]`
+    pub v_factors: Vec<[T; 3]>,
     /// `[N]`
     pub v_depths: Vec<T>,
     /// `[N]`
@@ -245,6 +245,9 @@ pub struct ProjectedGradients<T> {
     pub v_opacities: Vec<T>,
     /// Gradient of the background colour.
     pub v_background: [T; 3],
+    /// `[N]` sums over pixels of the absolute value of each pixel's part of `v_means2d`, where
+    /// asked for (AbsGS, Ye et al. 2024; gsplat's `absgrad`); project_backward does not read it.
+    pub v_means2d_absolute: Option<Vec<[T; 2]>>,
 }
 
 impl<T> ProjectedGradients<T> {
@@ -253,7 +256,7 @@ impl<T> ProjectedGradients<T> {
         let lengths = [
             ("projected", projected),
             ("v_means2d", self.v_means2d.len()),
-            ("v_covars2d", self.v_covars2d.len()),
+            ("v_factors", self.v_factors.len()),
             ("v_depths", self.v_depths.len()),
             ("v_colors", self.v_colors.len()),
             ("v_opacities", self.v_opacities.len()),
@@ -268,11 +271,12 @@ impl<T: Copy + Default> ProjectedGradients<T> {
         let z = T::default();
         Self {
             v_means2d: vec![[z; 2]; n],
-            v_covars2d: vec![[z; 3]; n],
+            v_factors: vec![[z; 3]; n],
             v_depths: vec![z; n],
             v_colors: vec![[z; 3]; n],
             v_opacities: vec![z; n],
             v_background: [z; 3],
+            v_means2d_absolute: None,
         }
     }
 }
@@ -310,13 +314,15 @@ pub trait Stages<T> {
     fn rasterize(&self, projected: &Projected<T>, background: [T; 3]) -> Result<Image<T>>;
 
     /// Gradients of the picture to gradients of the 2D splats. `image` is what
-    /// [`Stages::rasterize`] returned for the same arguments.
+    /// [`Stages::rasterize`] returned for the same arguments. `absolute` asks for
+    /// [`ProjectedGradients::v_means2d_absolute`].
     fn rasterize_backward(
         &self,
         projected: &Projected<T>,
         background: [T; 3],
         image: &Image<T>,
         v_image: &ImageGradients<T>,
+        absolute: bool,
     ) -> Result<ProjectedGradients<T>>;
 
     /// Gradients of the 2D splats to gradients of the splats and the camera.

@@ -27,7 +27,8 @@ fn wrong_sizes_and_lengths_are_named() {
     }
     let image = Cpu.rasterize(&good, [0.0; 3]).unwrap();
     let none = ImageGradients::default();
-    let error = Cpu.rasterize_backward(&good, [0.0; 3], &image, &none).unwrap_err().to_string();
+    let error =
+        Cpu.rasterize_backward(&good, [0.0; 3], &image, &none, false).unwrap_err().to_string();
     assert!(error.contains("v_color"), "{error}");
 }
 

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::conformance::{Bounds, SIZES, end_to_end, project_stages, rasterize_stages};
+use common::conformance::{Bounds, OPTIONS, SIZES, end_to_end, project_stages, rasterize_stages};
 use common::{random_camera, random_projected, random_scene, rng};
 use splat_render::cpu::Cpu;
 
@@ -28,7 +28,10 @@ fn project_matches_the_reference() {
         let mut rng = rng(seed as u64);
         let camera = random_camera(&mut rng, 96, 64);
         let scene = random_scene(&mut rng, 2500, degree);
-        project_stages(&Cpu, &scene, &camera, seed as u64, BOUNDS, &format!("SH {degree:?}"));
+        for options in OPTIONS {
+            let what = format!("SH {degree:?}, antialiased {}", options.antialiased);
+            project_stages(&Cpu, &scene, &camera, &options, seed as u64, BOUNDS, &what);
+        }
     }
 }
 
@@ -40,8 +43,11 @@ fn end_to_end_matches_the_reference() {
             let mut rng = rng(seed);
             let camera = random_camera(&mut rng, width, height);
             let scene = random_scene(&mut rng, n, degree);
-            let what = format!("{width}x{height}, {n} splats, SH {degree:?}");
-            end_to_end(&Cpu, &scene, &camera, &mut rng, BOUNDS, &what);
+            for options in OPTIONS {
+                let aa = options.antialiased;
+                let what = format!("{width}x{height}, {n} splats, SH {degree:?}, antialiased {aa}");
+                end_to_end(&Cpu, &scene, &camera, &options, &mut rng, BOUNDS, &what);
+            }
         }
     }
 }

@@ -35,6 +35,7 @@ struct Scene {
     /// None: direct colours.
     degree: Option<u32>,
     raw: bool,
+    antialiased: bool,
     background: [f64; 3],
     camera: Camera,
     v_image: ImageGradients<f64>,
@@ -86,6 +87,7 @@ impl Scene {
             colors,
             degree,
             raw,
+            antialiased: (seed / 6).is_multiple_of(2),
             background: std::array::from_fn(|_| f(0.0, 1.0)),
             camera,
             v_image: ImageGradients {
@@ -114,9 +116,13 @@ impl Scene {
         }
     }
 
+    fn options(&self) -> ProjectOptions {
+        ProjectOptions { antialiased: self.antialiased, ..ProjectOptions::default() }
+    }
+
     /// The loss, a fixed linear function of the picture, and the decisions taken.
     fn loss(&self) -> (f64, u64) {
-        let options = ProjectOptions::default();
+        let options = self.options();
         let projected = Reference.project(&self.params(), &self.camera, &options).unwrap();
         let image = Reference.rasterize(&projected, self.background).unwrap();
         let mut loss = 0.0;
@@ -131,11 +137,11 @@ impl Scene {
     }
 
     fn gradients(&self) -> (SplatGradients<f64>, [f64; 3]) {
-        let options = ProjectOptions::default();
+        let options = self.options();
         let projected = Reference.project(&self.params(), &self.camera, &options).unwrap();
         let image = Reference.rasterize(&projected, self.background).unwrap();
         let v_projected = Reference
-            .rasterize_backward(&projected, self.background, &image, &self.v_image)
+            .rasterize_backward(&projected, self.background, &image, &self.v_image, false)
             .unwrap();
         let gradients = Reference
             .project_backward(&self.params(), &self.camera, &options, &projected, &v_projected)

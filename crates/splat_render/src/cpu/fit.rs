@@ -10,7 +10,7 @@ use super::loss::Loss;
 use super::project::{Splat, Splat2d, View, project_splat};
 use super::project_backward::{VSplat, splat_backward};
 use super::rasterize::{Planes, TileSplat, rasterize};
-use super::rasterize_backward::{PairSums, gather, rasterize_backward};
+use super::rasterize_backward::{COLOR_SUMS, PairSums, gather, rasterize_backward};
 use crate::constants::TILE;
 use crate::error::{Error, Result};
 use crate::fit::{FitDevice, FitState, Rates, StepInput, Target, noise_normal};
@@ -30,7 +30,7 @@ pub struct CpuFit {
     image: Planes,
     photo: [Vec<f32>; 3],
     loss: Loss,
-    sums: Vec<PairSums>,
+    sums: Vec<PairSums<COLOR_SUMS>>,
 }
 
 impl FitDevice for CpuFit {
@@ -227,7 +227,7 @@ impl CpuFit {
                         let v_sh = &mut v_block.sh[k * stride..(k + 1) * stride];
                         let mut v = VSplat::default();
                         if bins.slots[i + 1] > bins.slots[i] {
-                            let v2d = gather(i, &tile_splats[i], bins, sums);
+                            let (v2d, _) = gather(i, &tile_splats[i], bins, sums);
                             let [x, y] = v2d.v_mean;
                             let (x, y) = (0.5 * size[0] * x, 0.5 * size[1] * y);
                             grad_sum[k] += (x * x + y * y).sqrt();

@@ -24,6 +24,7 @@ use bin::{Bins, CHUNK, touched_tiles};
 use project::{Splat, Splat2d, View, project_splat};
 use project_backward::{V2d, VCamera, splat_backward};
 use rasterize::{Planes, TileSplat};
+use rasterize_backward::{ABSOLUTE_SUMS, DEPTH_SUMS, PairSums, gather, rasterize_backward};
 
 pub use fit::CpuFit;
 pub use simd::instruction_set;
@@ -46,7 +47,6 @@ fn splats2d(projected: &Projected<f32>) -> Vec<Option<Splat2d>> {
             (visible && sound).then(|| Splat2d {
                 mean: projected.means2d[i],
                 factor: projected.factors[i],
-                covar: projected.covars2d[i],
                 depth: projected.depths[i],
                 color: projected.colors[i],
                 opacity: projected.opacities[i],
@@ -74,6 +74,19 @@ fn bin(projected: &Projected<f32>) -> Result<Binned> {
     Ok(Binned { splats, bins })
 }
 
+/// Gradients of all 2D splats, each with the absolute one of its centre where `N` has it.
+fn v2d<const N: usize>(
+    Binned { splats, bins }: &Binned,
+    image: &Planes,
+    v_color: &[Vec<f32>; 3],
+    v_image: &ImageGradients<f32>,
+) -> Vec<(V2d, [f32; 2])> {
+    let (v_alpha, v_depth) = (Some(&v_image.v_alpha[..]), Some(&v_image.v_depth[..]));
+    let mut sums: Vec<PairSums<N>> = Vec::new();
+    rasterize_backward(splats, bins, image, v_color, v_alpha, v_depth, &mut sums);
+    (0..splats.len()).into_par_iter().map(|i| gather(i, &splats[i], bins, &sums)).collect()
+}
+
 impl Stages<f32> for Cpu {
     fn project(
         &self,
@@ -93,7 +106,6 @@ impl Stages<f32> for Cpu {
             let Some(splat) = splat else { continue };
             out.means2d[i] = splat.mean;
             out.factors[i] = splat.factor;
-            out.covars2d[i] = splat.covar;
             out.depths[i] = splat.depth;
             out.colors[i] = splat.color;
             out.opacities[i] = splat.opacity;
@@ -125,6 +137,7 @@ impl Stages<f32> for Cpu {
         _background: [f32; 3],
         image: &Image<f32>,
         v_image: &ImageGradients<f32>,
+        absolute: bool,
     ) -> Result<ProjectedGradients<f32>> {
         projected.validate()?;
         v_image.validate(projected, image)?;
@@ -142,20 +155,12 @@ impl Stages<f32> for Cpu {
             ],
         };
         let v_color: [Vec<f32>; 3] = std::array::from_fn(|c| channel(&v_image.v_color, c));
-        let mut sums = Vec::new();
-        rasterize_backward::rasterize_backward(
-            &splats,
-            &bins,
-            &planes,
-            &v_color,
-            Some(&v_image.v_alpha),
-            Some(&v_image.v_depth),
-            &mut sums,
-        );
-        let list: Vec<V2d> = (0..projected.len())
-            .into_par_iter()
-            .map(|i| rasterize_backward::gather(i, &splats[i], &bins, &sums))
-            .collect();
+        let binned = Binned { splats, bins };
+        let list = if absolute {
+            v2d::<ABSOLUTE_SUMS>(&binned, &planes, &v_color, v_image)
+        } else {
+            v2d::<DEPTH_SUMS>(&binned, &planes, &v_color, v_image)
+        };
         let mut v_background = [0.0f64; 3];
         for (t, v) in image.transmittance.iter().zip(&v_image.v_color) {
             for (sum, v) in v_background.iter_mut().zip(v) {
@@ -163,12 +168,18 @@ impl Stages<f32> for Cpu {
             }
         }
         Ok(ProjectedGradients {
-            v_means2d: list.iter().map(|v| v.v_mean).collect(),
-            v_covars2d: list.iter().map(|v| v.v_covar).collect(),
-            v_depths: list.iter().map(|v| v.v_depth).collect(),
-            v_colors: list.iter().map(|v| v.v_color).collect(),
-            v_opacities: list.iter().map(|v| v.v_opacity).collect(),
+            v_means2d: list.iter().map(|(v, _)| v.v_mean).collect(),
+            v_factors: list
+                .iter()
+                .zip(&projected.factors)
+                .map(|((v, _), &factor)| v.v_factor(factor))
+                .collect(),
+            v_depths: list.iter().map(|(v, _)| v.v_depth).collect(),
+            v_colors: list.iter().map(|(v, _)| v.v_color).collect(),
+            v_opacities: list.iter().map(|(v, _)| v.v_opacity).collect(),
             v_background: v_background.map(|v| v as f32),
+            v_means2d_absolute: absolute
+                .then(|| list.iter().map(|&(_, v_absolute)| v_absolute).collect()),
         })
     }
 
@@ -215,7 +226,10 @@ impl Stages<f32> for Cpu {
                     }
                     let v = V2d {
                         v_mean: v_projected.v_means2d[i],
-                        v_covar: v_projected.v_covars2d[i],
+                        v_whitened: V2d::whitened_from_factor(
+                            projected.factors[i],
+                            v_projected.v_factors[i],
+                        ),
                         v_depth: v_projected.v_depths[i],
                         v_color: v_projected.v_colors[i],
                         v_opacity: v_projected.v_opacities[i],

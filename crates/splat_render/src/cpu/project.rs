@@ -88,6 +88,8 @@ pub(super) struct Geometry {
     pub b: [Vec3; 2],
     /// The same times the scales: the 2D covariance is m m^T + blur.
     pub m: [Vec3; 2],
+    /// b0 x b1.
+    pub normal: Vec3,
 }
 
 /// None if the splat is culled for its own values or its depth. Comparisons are written so that
@@ -121,8 +123,45 @@ pub(super) fn geometry(view: &View, splat: &Splat) -> Option<Geometry> {
     let b =
         a.map(|row| Vec3::new(axes.x_axis.dot(row), axes.y_axis.dot(row), axes.z_axis.dot(row)));
     let m = b.map(|row| row * splat.scales);
+    // J's rows have the cross product (x/z, y/z, 1) fx fy / z^2: no difference of two near-equal
+    // products, so a needle seen from any side keeps its area.
+    let across = view.rows[0] * xz + view.rows[1] * yz + view.rows[2];
+    let across = across * (view.focal.x * inverse_z) * (view.focal.y * inverse_z);
+    let normal =
+        Vec3::new(axes.x_axis.dot(across), axes.y_axis.dot(across), axes.z_axis.dot(across));
     let inside = [raw[0] == xz, raw[1] == yz];
-    Some(Geometry { t, axes, quat_norm, quat, xz, yz, inside, a, b, m })
+    Some(Geometry { t, axes, quat_norm, quat, xz, yz, inside, a, b, m, normal })
+}
+
+/// A splat's outline in the picture.
+pub(super) struct Ellipse {
+    /// (p, q, r)
+    pub factor: [f32; 3],
+    /// Variances along x and y, blur included.
+    pub variances: Vec2,
+    /// m0 x m1; its length is the root of the determinant without blur.
+    pub area: Vec3,
+    /// What the opacity is multiplied by; 1 if not antialiased.
+    pub compensation: f32,
+}
+
+#[inline(always)]
+pub(super) fn ellipse(view: &View, scales: Vec3, g: &Geometry) -> Ellipse {
+    let blur = view.options.blur;
+    let (sxx, sxy, syy) = (g.m[0].length_squared(), g.m[0].dot(g.m[1]), g.m[1].length_squared());
+    let r = (syy + blur).sqrt().recip();
+    let [x, y, z] = scales.to_array();
+    // Divided by cyy early, so that nothing overflows before the covariance itself does.
+    let area_r = g.normal * Vec3::new(y * r * z, z * r * x, x * r * y);
+    // det / cyy, the variance of x given y, as a sum of positive terms (Cauchy-Binet).
+    let given = area_r.length_squared() + blur * (sxx + syy + blur) * (r * r);
+    let p = given.sqrt().recip();
+    Ellipse {
+        factor: [p, -sxy * (r * r) * p, r],
+        variances: Vec2::new(sxx + blur, syy + blur),
+        area: g.normal * Vec3::new(y * z, z * x, x * y),
+        compensation: if view.options.antialiased { area_r.length() * p } else { 1.0 },
+    }
 }
 
 /// Unit view direction in the world and the length it was normalised by.
@@ -148,7 +187,6 @@ pub(super) fn sh_color(degree: u32, basis: &[f32], coeffs: &[[f32; 3]]) -> Vec3 
 pub(super) struct Splat2d {
     pub mean: [f32; 2],
     pub factor: [f32; 3],
-    pub covar: [f32; 3],
     pub depth: f32,
     pub color: [f32; 3],
     pub opacity: f32,
@@ -163,28 +201,22 @@ pub(super) fn project_splat(
     colors: &Colors<'_, f32>,
     i: usize,
 ) -> Option<Splat2d> {
-    let reach = 2.0 * (splat.opacity / ALPHA_MIN).ln();
+    let g = geometry(view, splat)?;
+    let ellipse = ellipse(view, splat.scales, &g);
+    let opacity = splat.opacity * ellipse.compensation;
+    let reach = 2.0 * (opacity / ALPHA_MIN).ln();
     if !(reach > 0.0 && reach.is_finite()) {
         return None;
     }
-    let g = geometry(view, splat)?;
-    let blur = view.options.blur;
-    let (sxx, sxy, syy) = (g.m[0].length_squared(), g.m[0].dot(g.m[1]), g.m[1].length_squared());
-    let (cxx, cyy) = (sxx + blur, syy + blur);
-    // det / cyy, the variance of x given y, as a sum of positive terms (Cauchy-Binet), scaled so
-    // that nothing overflows before the covariance itself does.
-    let r = cyy.sqrt().recip();
-    let given = g.m[0].cross(g.m[1] * r).length_squared() + blur * (sxx + syy + blur) * (r * r);
-    let p = given.sqrt().recip();
-    let q = -sxy * (r * r) * p;
-    let radii = Vec2::new((reach * cxx).sqrt(), (reach * cyy).sqrt());
+    let [p, q, r] = ellipse.factor;
+    let radii = (ellipse.variances * reach).map(f32::sqrt);
     let center = view.focal * g.t.truncate() / g.t.z + view.center;
     // Written so that a NaN or infinity anywhere culls.
     let reaches_image = (center + radii).cmpge(Vec2::ZERO).all()
         && (center - radii).cmple(view.size).all()
         && radii.is_finite()
         && center.is_finite();
-    if !(reaches_image && p.is_finite() && q.is_finite() && r.is_finite()) {
+    if !(reaches_image && p > 0.0 && p.is_finite() && q.is_finite() && r.is_finite()) {
         return None;
     }
     let color = match *colors {
@@ -203,10 +235,9 @@ pub(super) fn project_splat(
     color.is_finite().then(|| Splat2d {
         mean: center.to_array(),
         factor: [p, q, r],
-        covar: [cxx, sxy, cyy],
         depth: g.t.z,
         color: color.to_array(),
-        opacity: splat.opacity,
+        opacity,
         radii: radii.to_array(),
     })
 }

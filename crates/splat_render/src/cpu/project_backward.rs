@@ -2,7 +2,7 @@
 
 use glam::{Mat3, Vec3};
 
-use super::project::{Splat, View, direction, geometry, sh_color};
+use super::project::{Splat, View, direction, ellipse, geometry, sh_color};
 use crate::sh;
 use crate::stages::Colors;
 
@@ -10,10 +10,30 @@ use crate::stages::Colors;
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct V2d {
     pub v_mean: [f32; 2],
-    pub v_covar: [f32; 3],
+    /// Gradient of the 2D covariance in the splat's own coordinates (u, v), where it is the
+    /// identity: (uu, uv, vv), uv being the one shared off-diagonal entry.
+    pub v_whitened: [f32; 3],
     pub v_depth: f32,
     pub v_color: [f32; 3],
     pub v_opacity: f32,
+}
+
+impl V2d {
+    /// The whitened covariance's gradient from that of a factor F: a small change E of the
+    /// covariance changes F by X F with X upper triangular and X + X^T = -E.
+    pub fn whitened_from_factor([p, q, r]: [f32; 3], [v_p, v_q, v_r]: [f32; 3]) -> [f32; 3] {
+        [-0.5 * (p * v_p + q * v_q), -r * v_q, -0.5 * r * v_r]
+    }
+
+    /// The inverse of [`V2d::whitened_from_factor`]; zero for a culled splat's zero factor.
+    pub fn v_factor(&self, [p, q, r]: [f32; 3]) -> [f32; 3] {
+        if p == 0.0 || r == 0.0 {
+            return [0.0; 3];
+        }
+        let [v_uu, v_uv, v_vv] = self.v_whitened;
+        let v_q = -v_uv / r;
+        [-(2.0 * v_uu + q * v_q) / p, v_q, -2.0 * v_vv / r]
+    }
 }
 
 /// Gradients of one splat's parameters, colours apart.
@@ -148,12 +168,33 @@ fn gradients(
         }
     }
 
-    out.v_opacity = v.v_opacity * splat.opacity_slope;
+    let ellipse = ellipse(view, splat.scales, &g);
+    out.v_opacity = v.v_opacity * ellipse.compensation * splat.opacity_slope;
 
-    // 2D covariance -> M = J R A S.
-    let [v_xx, v_xy, v_yy] = v.v_covar;
-    let v_m = [2.0 * v_xx * g.m[0] + v_xy * g.m[1], 2.0 * v_yy * g.m[1] + v_xy * g.m[0]];
-    let v_scales = v_m[0] * g.b[0] + v_m[1] * g.b[1];
+    // Whitened 2D covariance -> M = J R A S. The rows of F B and F M are of order 1 even for a
+    // needle, and found without the cancellation that F, B and M would bring to their products.
+    let [p, q, r] = ellipse.factor;
+    let [mut v_uu, v_uv, mut v_vv] = v.v_whitened;
+    let v_log = v.v_opacity * splat.opacity * ellipse.compensation;
+    if view.options.antialiased {
+        // ln compensation = ln |m0 x m1| - ln det / 2; here the latter.
+        v_uu -= 0.5 * v_log;
+        v_vv -= 0.5 * v_log;
+    }
+    let squares = splat.scales * splat.scales;
+    let fb_u = ((squares * g.b[1]).cross(g.normal) + view.options.blur * g.b[0]) * (p * r * r);
+    let fb_v = g.b[1] * r;
+    let (fm_u, fm_v) = (fb_u * splat.scales, fb_v * splat.scales);
+    let v_fm_u = 2.0 * v_uu * fm_u + v_uv * fm_v;
+    let v_fm_v = v_uv * fm_u + 2.0 * v_vv * fm_v;
+    let mut v_scales = v_fm_u * fb_u + v_fm_v * fb_v;
+    let mut v_m = [p * v_fm_u, q * v_fm_u + r * v_fm_v];
+    if view.options.antialiased {
+        let v_area = ellipse.area * (v_log / ellipse.area.length_squared());
+        let v_area_m = [g.m[1].cross(v_area), v_area.cross(g.m[0])];
+        v_scales += v_area_m[0] * g.b[0] + v_area_m[1] * g.b[1];
+        v_m = [v_m[0] + v_area_m[0], v_m[1] + v_area_m[1]];
+    }
     out.v_scales = if raw { v_scales * splat.scales } else { v_scales }.to_array();
     let v_b = v_m.map(|v| v * splat.scales);
 

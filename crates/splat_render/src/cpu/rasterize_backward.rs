@@ -13,8 +13,15 @@ use super::simd::exp2_negative;
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
 
 /// Sums over a tile's pixels for one splat: v_alpha * gaussian times (1, u, v, uu, uv, vv), then
-/// the gradients of R, G, B and depth.
-pub(super) type PairSums = [f32; 10];
+/// the gradients of R, G and B; with depth one more for it; with absolute two more, of the absolute
+/// gradients along x and y.
+pub(super) type PairSums<const N: usize> = [f32; N];
+/// Sums of a fit.
+pub(super) const COLOR_SUMS: usize = 9;
+/// Sums with depth.
+pub(super) const DEPTH_SUMS: usize = 10;
+/// Sums with depth and absolute gradients.
+pub(super) const ABSOLUTE_SUMS: usize = 12;
 
 /// Per-pixel state of a tile.
 #[repr(align(64))]
@@ -27,16 +34,16 @@ struct State {
     behind: [f32; PIXELS],
 }
 
-struct Tile<'a, const DEPTH: bool> {
+struct Tile<'a, const N: usize> {
     splats: &'a [TileSplat],
     ids: &'a [u32],
     left: f32,
     top: f32,
     state: &'a mut State,
-    sums: &'a mut [PairSums],
+    sums: &'a mut [PairSums<N>],
 }
 
-impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
+impl<const N: usize> WithSimd for Tile<'_, N> {
     type Output = ();
 
     #[inline(always)]
@@ -55,21 +62,21 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
                 break;
             }
             let splat = &self.splats[id as usize];
-            let [p, q, v_scale] = splat.factor;
+            let [p, q, r] = splat.factor;
             let (p, opacity) = (s.splat_f32s(p), s.splat_f32s(splat.opacity));
             let mx = s.splat_f32s(splat.mean[0]);
             let limit = s.splat_f32s(splat.limit);
             let [red, green, blue] = splat.color;
             let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
             let depth = s.splat_f32s(splat.depth);
-            let mut acc = [zero; 10];
+            let mut acc = [zero; N];
             let mut touched = false;
             let vectors = splat.vectors(self.left, S::F32_LANES);
             for row in splat.reach(1, self.top) {
                 let dy = self.top + row as f32 + 0.5 - splat.mean[1];
-                let v = v_scale * dy;
+                let v = r * dy;
                 let (vv, shift) = (s.splat_f32s(v * v), s.splat_f32s(q * dy));
-                let v = s.splat_f32s(v);
+                let (q, r, v) = (s.splat_f32s(q), s.splat_f32s(r), s.splat_f32s(v));
                 for h in vectors.clone() {
                     let x = columns[h];
                     let at = row * per_row + h;
@@ -99,7 +106,7 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
                     let mut own = s.mul_f32s(color[0], v_r[at]);
                     own = s.mul_add_e_f32s(color[1], v_g[at], own);
                     own = s.mul_add_e_f32s(color[2], v_b[at], own);
-                    if DEPTH {
+                    if N >= DEPTH_SUMS {
                         own = s.mul_add_e_f32s(depth, v_d[at], own);
                         acc[9] = s.mul_add_e_f32s(weight, v_d[at], acc[9]);
                     }
@@ -120,6 +127,11 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
                     acc[3] = s.mul_add_e_f32s(gu, u, acc[3]);
                     acc[4] = s.mul_add_e_f32s(gu, v, acc[4]);
                     acc[5] = s.mul_add_e_f32s(gv, v, acc[5]);
+                    if N >= ABSOLUTE_SUMS {
+                        let along_y = s.mul_add_e_f32s(q, gu, s.mul_f32s(r, gv));
+                        acc[10] = s.add_f32s(acc[10], s.abs_f32s(gu));
+                        acc[11] = s.add_f32s(acc[11], s.abs_f32s(along_y));
+                    }
                 }
             }
             if touched {
@@ -134,20 +146,20 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
 /// Fills `sums[position]` for every (tile, splat) pair of `bins`. `image` is the forward pass's
 /// picture (over its background), `v_color` and `v_depth` its gradients as planes, `v_alpha` that of
 /// alpha where there is one.
-pub(super) fn rasterize_backward(
+pub(super) fn rasterize_backward<const N: usize>(
     splats: &[TileSplat],
     bins: &Bins,
     image: &Planes,
     v_color: &[Vec<f32>; 3],
     v_alpha: Option<&[f32]>,
     v_depth: Option<&[f32]>,
-    sums: &mut Vec<PairSums>,
+    sums: &mut Vec<PairSums<N>>,
 ) {
     let arch = pulp::Arch::new();
     let (width, height) = (image.width, image.height);
     let columns = width.div_ceil(SIDE);
     sums.clear();
-    sums.resize(bins.splats.len(), [0.0; 10]);
+    sums.resize(bins.splats.len(), [0.0; N]);
 
     // One task per row of tiles, each with the part of `sums` that is its own.
     let mut bands = Vec::with_capacity(height.div_ceil(SIDE));
@@ -191,19 +203,21 @@ pub(super) fn rasterize_backward(
             }
             let (ids, left) = (&bins.splats[range], (column * SIDE) as f32);
             let (top, state) = ((tile_row * SIDE) as f32, &mut state);
-            if v_depth.is_some() {
-                arch.dispatch(Tile::<true> { splats, ids, left, top, state, sums });
-            } else {
-                arch.dispatch(Tile::<false> { splats, ids, left, top, state, sums });
-            }
+            arch.dispatch(Tile::<N> { splats, ids, left, top, state, sums });
         }
     });
 }
 
-/// Adds up splat `i`'s pairs in tile order and turns whitened moments into 2D gradients.
+/// Adds up splat `i`'s pairs in tile order and turns whitened moments into 2D gradients, with the
+/// absolute gradient of the centre where `N` has it.
 #[inline(always)]
-pub(super) fn gather(i: usize, splat: &TileSplat, bins: &Bins, sums: &[PairSums]) -> V2d {
-    let mut total = [0.0f32; 10];
+pub(super) fn gather<const N: usize>(
+    i: usize,
+    splat: &TileSplat,
+    bins: &Bins,
+    sums: &[PairSums<N>],
+) -> (V2d, [f32; 2]) {
+    let mut total = [0.0f32; N];
     for slot in bins.slots[i] as usize..bins.slots[i + 1] as usize {
         let pair = &sums[bins.position_from_slot[slot] as usize];
         for (sum, value) in total.iter_mut().zip(pair) {
@@ -211,18 +225,20 @@ pub(super) fn gather(i: usize, splat: &TileSplat, bins: &Bins, sums: &[PairSums]
         }
     }
     // sigma = ln 2 (u^2 + v^2) in the units of `TileSplat`, so its slope along the offset is
-    // e = 2 ln 2 F^T (u, v); v_mean = o g e and v_covar = o g e e^T / 2, summed over pixels.
-    let [g, gu, gv, guu, guv, gvv, r, green, b, d] = total;
-    let [p, q, r_factor] = splat.factor;
+    // 2 ln 2 F^T (u, v), and a change E of the whitened covariance changes it by
+    // -ln 2 (u, v) E (u, v)^T; both times -o g, summed over pixels.
+    let [g, gu, gv, guu, guv, gvv] = std::array::from_fn(|k| total[k]);
+    let [p, q, r] = splat.factor;
     let two_ln2 = 2.0 * std::f32::consts::LN_2;
     let k = splat.opacity * two_ln2;
-    let half = 0.5 * k * two_ln2;
-    let qu_rv = q * q * guu + 2.0 * q * r_factor * guv + r_factor * r_factor * gvv;
-    V2d {
-        v_mean: [k * p * gu, k * (q * gu + r_factor * gv)],
-        v_covar: [half * p * p * guu, 2.0 * half * p * (q * guu + r_factor * guv), half * qu_rv],
-        v_depth: d,
-        v_color: [r, green, b],
+    let v = V2d {
+        v_mean: [k * p * gu, k * (q * gu + r * gv)],
+        v_whitened: [0.5 * k * guu, k * guv, 0.5 * k * gvv],
+        v_depth: if N >= DEPTH_SUMS { total[9] } else { 0.0 },
+        v_color: std::array::from_fn(|c| total[6 + c]),
         v_opacity: g,
-    }
+    };
+    let v_mean_absolute =
+        if N >= ABSOLUTE_SUMS { [k * p * total[10], k * total[11]] } else { [0.0; 2] };
+    (v, v_mean_absolute)
 }

@@ -85,7 +85,6 @@ struct Scene {
     stats: wgpu::Buffer,
     sh_degree: u32,
     splats2d: wgpu::Buffer,
-    covars2d: wgpu::Buffer,
     v_splats2d: wgpu::Buffer,
     gradients: GradientBuffers,
     bins: SplatBins,
@@ -173,7 +172,6 @@ impl Scene {
             stats: gpu.upload("stats", &stats)?,
             sh_degree: state.splats.sh_degree,
             splats2d: gpu.bindable("splats2d", row(size_of::<Splat2d>() / 4))?,
-            covars2d: gpu.buffer("covars2d", row(3))?,
             v_splats2d: gpu.bindable("v_splats2d", row(GRADIENT))?,
             gradients: GradientBuffers::new(gpu, &splats)?,
             bins: SplatBins::new(gpu, n, chunks)?,
@@ -301,7 +299,7 @@ impl Frame {
             slots: scene.slots.clone(),
             v_splats2d: scene.v_splats2d.clone(),
         };
-        let mut ops = project_ops(gpu, view, &scene.splats, splats2d, &scene.covars2d);
+        let mut ops = project_ops(gpu, view, &scene.splats, splats2d);
         ops.extend(bins.depth_ops(gpu, view, &chunks[0], splats2d));
         for chunk in &chunks {
             bin(&mut ops, chunk);

@@ -11,7 +11,7 @@ use crate::stages::{Colors, ProjectOptions, SplatParams};
 pub(super) const GEOMETRY: usize = 11;
 
 /// Floats per splat or slot in a buffer of 2D gradients: mean 2 (moments of order 1 in a slot),
-/// covariance 3 (order 2), depth, colour 3, opacity.
+/// factor 3 (order 2), depth, colour 3, opacity.
 pub(super) const GRADIENT: usize = 10;
 
 /// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.

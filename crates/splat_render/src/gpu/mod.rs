@@ -35,6 +35,10 @@ impl Stages<f32> for Gpu {
     ) -> Result<Projected<f32>> {
         splats.validate()?;
         camera.validate()?;
+        if options.antialiased {
+            let reason = "antialiased is not there yet on backend gpu; use backend cpu";
+            return Err(crate::error::Error::argument("rasterize_mode", reason));
+        }
         project::project(self, splats, camera, options)
     }
 
@@ -49,10 +53,13 @@ impl Stages<f32> for Gpu {
         background: [f32; 3],
         image: &Image<f32>,
         v_image: &ImageGradients<f32>,
+        absolute: bool,
     ) -> Result<ProjectedGradients<f32>> {
         projected.validate()?;
         v_image.validate(projected, image)?;
-        rasterize_backward::rasterize_backward(self, projected, background, image, v_image)
+        rasterize_backward::rasterize_backward(
+            self, projected, background, image, v_image, absolute,
+        )
     }
 
     fn project_backward(

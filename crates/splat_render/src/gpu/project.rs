@@ -78,7 +78,6 @@ pub(super) fn project_ops(
     view: &wgpu::Buffer,
     splats: &SplatBuffers,
     splats2d: &wgpu::Buffer,
-    covars2d: &wgpu::Buffer,
 ) -> Vec<Op> {
     let mut ops = Vec::new();
     for window in splats.windows(gpu) {
@@ -92,7 +91,6 @@ pub(super) fn project_ops(
                 rows(&splats.geometry, &window, GEOMETRY as u64),
                 rows(&splats.colors, &window, splats.color_floats),
                 rows(splats2d, &window, 12),
-                rows(covars2d, &window, 3),
             ],
             Gpu::groups(count, SPLATS_PER_GROUP),
         ));
@@ -111,9 +109,8 @@ pub(super) fn project(
     let view = gpu.uniform(&View::of_camera(camera, options, splats));
     let bytes = (n * size_of::<Splat2d>()) as u64;
     let splats2d = gpu.buffer("splats2d", bytes)?;
-    let covars2d = gpu.buffer("covars2d", 12 * n as u64)?;
-    let ops = project_ops(gpu, &view, &buffers, &splats2d, &covars2d);
-    let data = gpu.download(&ops, &[(&splats2d, bytes), (&covars2d, 12 * n as u64)])?;
+    let ops = project_ops(gpu, &view, &buffers, &splats2d);
+    let data = gpu.download(&ops, &[(&splats2d, bytes)])?;
     let mut out = Projected::culled(n, camera.width, camera.height);
     for (i, bytes) in data[0].chunks_exact(size_of::<Splat2d>()).enumerate() {
         let splat: Splat2d = bytemuck::pod_read_unaligned(bytes);
@@ -124,6 +121,5 @@ pub(super) fn project(
         out.opacities[i] = splat.opacity;
         out.radii[i] = splat.radii;
     }
-    out.covars2d = bytemuck::pod_collect_to_vec(&data[1]);
     Ok(out)
 }

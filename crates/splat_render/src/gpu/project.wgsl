@@ -1,8 +1,6 @@
 // project: splats and camera to 2D splats. Follows shared.wgsl and geometry.wgsl.
 
 @group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;
-// (xx, xy, yy), blur included.
-@group(0) @binding(5) var<storage, read_write> covars2d: array<f32>;
 
 @compute @workgroup_size(64)
 fn project(
@@ -15,7 +13,6 @@ fn project(
         return;
     }
     var out: Splat2d;
-    var covar = vec3(0.0);
     let g = load_geometry(i);
     // ALPHA_MIN also stops opacities that are zero, negative or underflown.
     if g.visible && g.opacity > ALPHA_MIN {
@@ -67,11 +64,7 @@ fn project(
             out.depth = g.t.z;
             out.opacity = g.opacity;
             out.radii = radii;
-            covar = vec3(cxx, sxy, cyy);
         }
     }
     splats2d[i] = out;
-    covars2d[3u * i] = covar.x;
-    covars2d[3u * i + 1u] = covar.y;
-    covars2d[3u * i + 2u] = covar.z;
 }

@@ -76,7 +76,7 @@ fn gradient_rows(v: &ProjectedGradients<f32>) -> Vec<[f32; GRADIENT]> {
         .map(|i| {
             let mut row = [0.0; GRADIENT];
             row[0..2].copy_from_slice(&v.v_means2d[i]);
-            row[2..5].copy_from_slice(&v.v_covars2d[i]);
+            row[2..5].copy_from_slice(&v.v_factors[i]);
             row[5] = v.v_depths[i];
             row[6..9].copy_from_slice(&v.v_colors[i]);
             row[9] = v.v_opacities[i];

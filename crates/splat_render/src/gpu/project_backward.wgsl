@@ -2,7 +2,7 @@
 // shared.wgsl and geometry.wgsl; formulas and names as in reference/project_backward.rs.
 
 @group(0) @binding(4) var<storage, read> splats2d: array<Splat2d>;
-// GRADIENT floats per splat: mean 2, covariance 3, depth, colour 3, opacity.
+// GRADIENT floats per splat: mean 2, factor 3, depth, colour 3, opacity.
 @group(0) @binding(5) var<storage, read> v_splats2d: array<f32>;
 @group(0) @binding(6) var<storage, read_write> v_geometry: array<f32>;
 @group(0) @binding(7) var<storage, read_write> v_colors: array<f32>;
@@ -56,9 +56,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     }
     let at = i * GRADIENT;
     let v_center = vec2(v_splats2d[at], v_splats2d[at + 1u]);
-    let v_xx = v_splats2d[at + 2u];
-    let v_xy = v_splats2d[at + 3u];
-    let v_yy = v_splats2d[at + 4u];
+    let v_factor = vec3(v_splats2d[at + 2u], v_splats2d[at + 3u], v_splats2d[at + 4u]);
     let v_depth = v_splats2d[at + 5u];
     var v_color = vec3(v_splats2d[at + 6u], v_splats2d[at + 7u], v_splats2d[at + 8u]);
     let v_opacity = v_splats2d[at + 9u];
@@ -97,10 +95,23 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
         v_rotation += outer(g.t, v_along);
     }
 
-    // 2D covariance -> M = J R A S.
-    let v_m0 = 2.0 * v_xx * g.m0 + v_xy * g.m1;
-    let v_m1 = 2.0 * v_yy * g.m1 + v_xy * g.m0;
-    var v_scales = v_m0 * g.b0 + v_m1 * g.b1;
+    // Factor F -> whitened 2D covariance -> M = J R A S, as in cpu/project_backward.rs.
+    let p = splats2d[i].pq.x;
+    let q = splats2d[i].pq.y;
+    let r = splats2d[i].r;
+    let v_uu = -0.5 * (p * v_factor.x + q * v_factor.y);
+    let v_uv = -r * v_factor.y;
+    let v_vv = -0.5 * r * v_factor.z;
+    let normal = to_world(vec3(g.ratio, 1.0)) * g.axes * per_z.x * per_z.y;
+    let fb_u = (cross(g.scales * g.scales * g.b1, normal) + view.blur * g.b0) * (p * r * r);
+    let fb_v = g.b1 * r;
+    let fm_u = fb_u * g.scales;
+    let fm_v = fb_v * g.scales;
+    let v_fm_u = 2.0 * v_uu * fm_u + v_uv * fm_v;
+    let v_fm_v = v_uv * fm_u + 2.0 * v_vv * fm_v;
+    var v_scales = v_fm_u * fb_u + v_fm_v * fb_v;
+    let v_m0 = p * v_fm_u;
+    let v_m1 = q * v_fm_u + r * v_fm_v;
     let v_b0 = v_m0 * g.scales;
     let v_b1 = v_m1 * g.scales;
 

@@ -75,7 +75,12 @@ pub(super) fn rasterize_backward(
     background: [f32; 3],
     image: &Image<f32>,
     v_image: &ImageGradients<f32>,
+    absolute: bool,
 ) -> Result<ProjectedGradients<f32>> {
+    if absolute {
+        let reason = "is not there yet on backend gpu; use backend cpu";
+        return Err(crate::error::Error::argument("absgrad", reason));
+    }
     let pixels = image.color.len();
     let mut v_picture = Vec::with_capacity(pixels);
     let mut totals = Vec::with_capacity(pixels);
@@ -124,7 +129,7 @@ pub(super) fn rasterize_backward(
     for bytes in data[0].chunks_exact(GRADIENT * 4) {
         let row: [f32; GRADIENT] = bytemuck::pod_read_unaligned(bytes);
         out.v_means2d.push([row[0], row[1]]);
-        out.v_covars2d.push([row[2], row[3], row[4]]);
+        out.v_factors.push([row[2], row[3], row[4]]);
         out.v_depths.push(row[5]);
         out.v_colors.push([row[6], row[7], row[8]]);
         out.v_opacities.push(row[9]);

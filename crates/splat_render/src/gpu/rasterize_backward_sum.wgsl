@@ -1,5 +1,5 @@
 // rasterize_backward_sum: adds a splat's slots in their order and finishes the moments to the
-// gradients of its centre and covariance. Follows shared.wgsl.
+// gradients of its centre and factor. Follows shared.wgsl.
 
 @group(0) @binding(0) var<uniform> chunk: Chunk;
 @group(0) @binding(1) var<storage, read> status: Status;
@@ -7,7 +7,7 @@
 @group(0) @binding(3) var<storage, read> order: array<u32>;
 @group(0) @binding(4) var<storage, read> offsets: array<u32>;
 @group(0) @binding(5) var<storage, read> slots: array<f32>;
-// GRADIENT floats per splat: mean 2, covariance 3, depth, colour 3, opacity; raw sums until the
+// GRADIENT floats per splat: mean 2, factor 3, depth, colour 3, opacity; raw sums until the
 // picture's last chunk.
 @group(0) @binding(6) var<storage, read_write> v_splats2d: array<f32>;
 
@@ -39,8 +39,7 @@ fn rasterize_backward_sum(
         let p = splat.pq.x;
         let q = splat.pq.y;
         let r = splat.r;
-        // sigma = |F d|^2 / 2 and C^-1 = F^T F: d sigma / d mean = -F^T (u, v) and
-        // d sigma / d C = -F^T (u, v) (u, v)^T F / 2.
+        // sigma = (u^2 + v^2) / 2 with u = p dx + q dy, v = r dy.
         let u = sums[0];
         let v = sums[1];
         let uu = sums[2];
@@ -48,9 +47,9 @@ fn rasterize_backward_sum(
         let vv = sums[4];
         sums[0] = -p * u;
         sums[1] = -(q * u + r * v);
-        sums[2] = -0.5 * p * p * uu;
-        sums[3] = -p * (q * uu + r * uv);
-        sums[4] = -0.5 * (q * q * uu + 2.0 * q * r * uv + r * r * vv);
+        sums[2] = (uu - q / r * uv) / p;
+        sums[3] = uv / r;
+        sums[4] = vv / r;
     }
     for (var k = 0u; k < GRADIENT; k++) {
         v_splats2d[i * GRADIENT + k] = select(0.0, sums[k], is_finite(sums[k]));

@@ -36,7 +36,7 @@ pub(super) static SOURCES: [Source; 12] = [
     Source {
         name: "project",
         parts: &[SHARED, GEOMETRY_WGSL, include_str!("project.wgsl")],
-        bindings: &[Uniform, Uniform, Read, Read, ReadWrite, ReadWrite],
+        bindings: &[Uniform, Uniform, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {

@@ -44,10 +44,11 @@ impl Stages<f64> for Reference {
         background: [f64; 3],
         image: &Image<f64>,
         v_image: &ImageGradients<f64>,
+        absolute: bool,
     ) -> Result<ProjectedGradients<f64>> {
         projected.validate()?;
         v_image.validate(projected, image)?;
-        Ok(rasterize_backward::rasterize_backward(projected, background, v_image))
+        Ok(rasterize_backward::rasterize_backward(projected, background, v_image, absolute))
     }
 
     fn project_backward(

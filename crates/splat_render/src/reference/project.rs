@@ -28,6 +28,10 @@ pub(super) struct Geometry {
     pub a: [DVec3; 2],
     /// Rows of J R A S, so that the 2D covariance is m m^T + blur.
     pub m: [DVec3; 2],
+    /// Upper-triangular factor of the conic.
+    pub factor: [f64; 3],
+    /// What the opacity is multiplied by; 1 if not antialiased.
+    pub compensation: f64,
 }
 
 pub(super) fn opacity(splats: &SplatParams<'_, f64>, i: usize) -> f64 {
@@ -74,7 +78,16 @@ pub(super) fn geometry(
         rows.y_axis * (camera.fy / t.z) - rows.z_axis * (camera.fy * yz / t.z),
     ];
     let m = a.map(|row| axes.transpose() * row * scales);
-    Some(Geometry { t, axes, quat_norm, quat, scales, xz, yz, inside, a, m })
+    let blur = f64::from(options.blur);
+    let (sxx, sxy, syy) = (m[0].dot(m[0]), m[0].dot(m[1]), m[1].dot(m[1]));
+    let cyy = syy + blur;
+    // Cauchy-Binet: the determinants as sums of positive terms.
+    let det_sharp = m[0].cross(m[1]).length_squared();
+    let det = det_sharp + blur * (sxx + syy) + blur * blur;
+    let p = (cyy / det).sqrt();
+    let factor = [p, -sxy / cyy * p, cyy.sqrt().recip()];
+    let compensation = if options.antialiased { (det_sharp / det).sqrt() } else { 1.0 };
+    Some(Geometry { t, axes, quat_norm, quat, scales, xz, yz, inside, a, m, factor, compensation })
 }
 
 /// Unit view direction in the world and the length it was normalised by.
@@ -99,19 +112,13 @@ pub(super) fn project(
     let mut out = Projected::culled(splats.len(), camera.width, camera.height);
     for i in 0..splats.len() {
         let Some(g) = geometry(splats, camera, options, i) else { continue };
-        let blur = f64::from(options.blur);
-        let (sxx, sxy, syy) = (g.m[0].dot(g.m[0]), g.m[0].dot(g.m[1]), g.m[1].dot(g.m[1]));
-        let (cxx, cyy) = (sxx + blur, syy + blur);
-        // Cauchy-Binet: the determinant as a sum of positive terms.
-        let det = g.m[0].cross(g.m[1]).length_squared() + blur * (sxx + syy) + blur * blur;
-        let p = (cyy / det).sqrt();
-        let factor = [p, -sxy / cyy * p, cyy.sqrt().recip()];
-        let opacity = opacity(splats, i);
+        let opacity = opacity(splats, i) * g.compensation;
         let reach = 2.0 * (opacity / f64::from(ALPHA_MIN)).ln();
         if !(reach.is_finite() && reach > 0.0) {
             continue;
         }
-        let radii = DVec2::new((reach * cxx).sqrt(), (reach * cyy).sqrt());
+        let variance = |m: DVec3| m.length_squared() + f64::from(options.blur);
+        let radii = DVec2::new(variance(g.m[0]), variance(g.m[1])).map(|c| (reach * c).sqrt());
         let center = DVec2::new(
             camera.fx * g.t.x / g.t.z + camera.cx,
             camera.fy * g.t.y / g.t.z + camera.cy,
@@ -137,14 +144,12 @@ pub(super) fn project(
         let finite = color.is_finite()
             && center.is_finite()
             && radii.is_finite()
-            && det.is_finite()
-            && factor.iter().all(|f| f.is_finite());
+            && g.factor.iter().all(|f| f.is_finite());
         if !finite {
             continue;
         }
         out.means2d[i] = center.to_array();
-        out.factors[i] = factor;
-        out.covars2d[i] = [cxx, sxy, cyy];
+        out.factors[i] = g.factor;
         out.depths[i] = g.t.z;
         out.colors[i] = color.to_array();
         out.opacities[i] = opacity;

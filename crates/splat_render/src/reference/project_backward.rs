@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 
-use super::project::{direction, geometry, sh_color};
+use super::project::{direction, geometry, opacity, sh_color};
 use crate::camera::Camera;
 use crate::sh;
 use crate::stages::{
@@ -80,16 +80,35 @@ pub(super) fn project_backward(
         }
 
         // Opacity.
-        out.v_opacities[i] = v_projected.v_opacities[i];
+        out.v_opacities[i] = v_projected.v_opacities[i] * g.compensation;
         if splats.raw {
             // o (1 - o), without the cancellation at saturated logits.
             let tail = (-splats.opacities[i].abs()).exp();
             out.v_opacities[i] *= tail / ((1.0 + tail) * (1.0 + tail));
         }
 
-        // 2D covariance -> M = J R A S.
-        let [v_xx, v_xy, v_yy] = v_projected.v_covars2d[i];
-        let v_m = [2.0 * v_xx * g.m[0] + v_xy * g.m[1], 2.0 * v_yy * g.m[1] + v_xy * g.m[0]];
+        // Factor F -> 2D covariance C. F C F^T = I, so a small change F dC F^T = E of the whitened
+        // covariance changes F by X F with X upper triangular and X + X^T = -E.
+        let ([p, q, r], [v_p, v_q, v_r]) = (g.factor, v_projected.v_factors[i]);
+        let [mut v_uu, v_uv, mut v_vv] = [-0.5 * (p * v_p + q * v_q), -r * v_q, -0.5 * r * v_r];
+        // ln compensation = ln |m0 x m1| - ln det C / 2.
+        let v_log = v_projected.v_opacities[i] * opacity(splats, i) * g.compensation;
+        if options.antialiased {
+            v_uu -= 0.5 * v_log;
+            v_vv -= 0.5 * v_log;
+        }
+        let v_xx = p * p * v_uu;
+        let v_xy = 2.0 * p * q * v_uu + p * r * v_uv;
+        let v_yy = q * q * v_uu + q * r * v_uv + r * r * v_vv;
+
+        // C -> M = J R A S.
+        let mut v_m = [2.0 * v_xx * g.m[0] + v_xy * g.m[1], 2.0 * v_yy * g.m[1] + v_xy * g.m[0]];
+        if options.antialiased {
+            let normal = g.m[0].cross(g.m[1]);
+            let v_normal = normal * (v_log / normal.length_squared());
+            v_m[0] += g.m[1].cross(v_normal);
+            v_m[1] += v_normal.cross(g.m[0]);
+        }
         let v_b = v_m.map(|v| v * g.scales);
         let b = g.a.map(|row| g.axes.transpose() * row);
         let v_scales = v_m[0] * b[0] + v_m[1] * b[1];

@@ -13,7 +13,10 @@ pub(super) fn order(projected: &Projected<f64>) -> Vec<usize> {
 
 /// One splat's meeting with one pixel.
 pub(super) struct Pair {
-    /// Whitened offset from the splat's centre.
+    /// Offset of the pixel's centre from the splat's.
+    pub dx: f64,
+    pub dy: f64,
+    /// The same, whitened.
     pub u: f64,
     pub v: f64,
     /// exp(-sigma).
@@ -34,6 +37,8 @@ pub(super) fn pair(projected: &Projected<f64>, i: usize, x: u32, y: u32) -> Opti
     let raw = projected.opacities[i] * gaussian;
     let alpha = raw.min(f64::from(ALPHA_MAX));
     (alpha >= f64::from(ALPHA_MIN)).then_some(Pair {
+        dx,
+        dy,
         u,
         v,
         gaussian,

@@ -12,10 +12,12 @@ pub(super) fn rasterize_backward(
     projected: &Projected<f64>,
     background: [f64; 3],
     v_image: &ImageGradients<f64>,
+    absolute: bool,
 ) -> ProjectedGradients<f64> {
     let (w, h) = (projected.width, projected.height);
     let ids = order(projected);
     let mut out = ProjectedGradients::zeros(projected.len());
+    let mut v_absolute = vec![[0.0f64; 2]; projected.len()];
     for y in 0..h {
         for x in 0..w {
             let pixel = y as usize * w as usize + x as usize;
@@ -51,18 +53,21 @@ pub(super) fn rasterize_backward(
                     continue;
                 }
                 out.v_opacities[i] += pair.gaussian * v_alpha;
-                // sigma = (u^2 + v^2) / 2 = d^T C^-1 d / 2 with C^-1 = F^T F:
-                // d sigma / d mean = -F^T (u, v); d sigma / d C = -(F^T (u, v)) (F^T (u, v))^T / 2.
+                // sigma = (u^2 + v^2) / 2, u = p dx + q dy, v = r dy.
                 let v_sigma = -pair.alpha * v_alpha;
+                let (v_u, v_v) = (v_sigma * pair.u, v_sigma * pair.v);
                 let [p, q, r] = projected.factors[i];
-                let e = [p * pair.u, q * pair.u + r * pair.v];
-                out.v_means2d[i][0] -= v_sigma * e[0];
-                out.v_means2d[i][1] -= v_sigma * e[1];
-                out.v_covars2d[i][0] -= 0.5 * v_sigma * e[0] * e[0];
-                out.v_covars2d[i][1] -= v_sigma * e[0] * e[1];
-                out.v_covars2d[i][2] -= 0.5 * v_sigma * e[1] * e[1];
+                let v_mean = [-v_u * p, -(v_u * q + v_v * r)];
+                for axis in 0..2 {
+                    out.v_means2d[i][axis] += v_mean[axis];
+                    v_absolute[i][axis] += v_mean[axis].abs();
+                }
+                out.v_factors[i][0] += v_u * pair.dx;
+                out.v_factors[i][1] += v_u * pair.dy;
+                out.v_factors[i][2] += v_v * pair.dy;
             }
         }
     }
+    out.v_means2d_absolute = absolute.then_some(v_absolute);
     out
 }

@@ -2,8 +2,11 @@
 //! end. Each check prints its figures.
 
 use rand_pcg::Pcg64;
+use splat_render::constants::{BLUR, FAR, NEAR};
 use splat_render::reference::{Reference, band_pixels};
-use splat_render::{Camera, Image, ImageGradients, ProjectOptions, Projected, Stages};
+use splat_render::{
+    Camera, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, Stages,
+};
 
 use super::*;
 
@@ -15,6 +18,12 @@ pub struct Bounds {
     /// Largest difference of a gradient as a part of the largest of its kind.
     pub gradient: f64,
 }
+
+/// Settings of the project stage that every implementation is tested with.
+pub const OPTIONS: [ProjectOptions; 2] = [
+    ProjectOptions { near: NEAR, far: FAR, blur: BLUR, antialiased: false },
+    ProjectOptions { near: NEAR, far: FAR, blur: BLUR, antialiased: true },
+];
 
 /// Largest and mean difference of a picture rendered from splats.
 const END_TO_END: (f64, f64) = (1e-4, 1e-6);
@@ -79,15 +88,20 @@ pub fn rasterize_stages(
     assert!(image == stages.rasterize(projected, background).unwrap(), "{what}: picture repeats");
 
     let v_image = masked(&random_image_gradients(&mut rng, image.alpha.len()), &left_out);
-    let v = stages.rasterize_backward(projected, background, &image, &v_image).unwrap();
-    let again = stages.rasterize_backward(projected, background, &image, &v_image).unwrap();
-    assert!(v == again, "{what}: gradients repeat");
+    let run = |absolute: bool| {
+        stages.rasterize_backward(projected, background, &image, &v_image, absolute).unwrap()
+    };
+    let v = run(true);
+    assert!(v == run(true), "{what}: gradients repeat");
+    let without = ProjectedGradients { v_means2d_absolute: None, ..v.clone() };
+    assert!(without == run(false), "{what}: asking for absolute gradients changes the others");
     let expected = Reference
         .rasterize_backward(
             &wide,
             background.map(f64::from),
             &expected,
             &widen_image_gradients(&v_image),
+            true,
         )
         .unwrap();
     let differences = projected_gradient_differences(&v, &expected);
@@ -102,18 +116,18 @@ pub fn project_stages(
     stages: &dyn Stages<f32>,
     scene: &Scene<f32>,
     camera: &Camera,
+    options: &ProjectOptions,
     seed: u64,
     bounds: Bounds,
     what: &str,
 ) {
     let mut rng = rng(seed);
     let camera = &rounded(camera);
-    let options = ProjectOptions::default();
-    let got = stages.project(&scene.params(), camera, &options).unwrap();
+    let got = stages.project(&scene.params(), camera, options).unwrap();
     let wide_scene = scene.widen();
-    let expected = Reference.project(&wide_scene.params(), camera, &options).unwrap();
+    let expected = Reference.project(&wide_scene.params(), camera, options).unwrap();
     let v = random_projected_gradients(&mut rng, &narrow_projected(&expected));
-    let run = || stages.project_backward(&scene.params(), camera, &options, &got, &v).unwrap();
+    let run = || stages.project_backward(&scene.params(), camera, options, &got, &v).unwrap();
     let gradients = run();
     assert!(
         splat_gradient_bits(&gradients) == splat_gradient_bits(&run()),
@@ -123,7 +137,7 @@ pub fn project_stages(
         .project_backward(
             &wide_scene.params(),
             camera,
-            &options,
+            options,
             &expected,
             &widen_projected_gradients(&v),
         )
@@ -161,20 +175,20 @@ pub fn end_to_end(
     stages: &dyn Stages<f32>,
     scene: &Scene<f32>,
     camera: &Camera,
+    options: &ProjectOptions,
     rng: &mut Pcg64,
     bounds: Bounds,
     what: &str,
 ) {
     let camera = &rounded(camera);
-    let options = ProjectOptions::default();
     let background = [0.2f32, 0.5, 0.9];
     let wide_scene = scene.widen();
     let wide_background = background.map(f64::from);
-    let expected_projected = Reference.project(&wide_scene.params(), camera, &options).unwrap();
+    let expected_projected = Reference.project(&wide_scene.params(), camera, options).unwrap();
     let band = band_pixels(&expected_projected, BAND.1);
     let expected = Reference.rasterize(&expected_projected, wide_background).unwrap();
 
-    let projected = stages.project(&scene.params(), camera, &options).unwrap();
+    let projected = stages.project(&scene.params(), camera, options).unwrap();
     assert_same_culled(&projected, &expected_projected, what);
     let image = stages.rasterize(&projected, background).unwrap();
     let all = image_difference(&image, &expected, &[]);
@@ -192,19 +206,20 @@ pub fn end_to_end(
     assert!(outside.mean <= END_TO_END.1, "{what}: mean is off by {:.2e}", outside.mean);
 
     let v_image = masked(&random_image_gradients(rng, image.alpha.len()), &left_out);
-    let v = stages.rasterize_backward(&projected, background, &image, &v_image).unwrap();
+    let v = stages.rasterize_backward(&projected, background, &image, &v_image, false).unwrap();
     let gradients =
-        stages.project_backward(&scene.params(), camera, &options, &projected, &v).unwrap();
+        stages.project_backward(&scene.params(), camera, options, &projected, &v).unwrap();
     let expected_v = Reference
         .rasterize_backward(
             &expected_projected,
             wide_background,
             &expected,
             &widen_image_gradients(&v_image),
+            false,
         )
         .unwrap();
     let expected_gradients = Reference
-        .project_backward(&wide_scene.params(), camera, &options, &expected_projected, &expected_v)
+        .project_backward(&wide_scene.params(), camera, options, &expected_projected, &expected_v)
         .unwrap();
     let differences = splat_gradient_differences(&gradients, &expected_gradients);
     for (name, d) in &differences {

@@ -106,11 +106,17 @@ pub fn hard_scenes_agree_with_the_reference(stages: &dyn Stages<f32>, bound: f64
                 v_image.v_depth[pixel] = 0.0;
             }
         }
-        let v2d = stages.rasterize_backward(&projected, [0.2; 3], &got, &v_image).unwrap();
+        let v2d = stages.rasterize_backward(&projected, [0.2; 3], &got, &v_image, false).unwrap();
         let v =
             stages.project_backward(&scene.params(), &camera, &options, &projected, &v2d).unwrap();
         let expected_v2d = Reference
-            .rasterize_backward(&expected2d, [0.2; 3], &expected, &widen_image_gradients(&v_image))
+            .rasterize_backward(
+                &expected2d,
+                [0.2; 3],
+                &expected,
+                &widen_image_gradients(&v_image),
+                false,
+            )
             .unwrap();
         let expected_v = Reference
             .project_backward(&wide.params(), &camera, &options, &expected2d, &expected_v2d)
@@ -119,9 +125,6 @@ pub fn hard_scenes_agree_with_the_reference(stages: &dyn Stages<f32>, bound: f64
         for (kind, d) in &differences {
             println!("    {kind}: {:.2e} of {:.2e}", d.relative(), d.scale);
         }
-        // v_covars2d in f32 cannot hold what the long axis of a 1 : 1e6 needle needs: its quadratic
-        // form cancels by the square of the needle's length in px (docs/numerics.md).
-        let bound = if name == "needles and pancakes" { bound.max(5e-4) } else { bound };
         assert_gradients(&differences, bound, name);
     }
 }
@@ -204,7 +207,7 @@ pub fn no_splats_give_the_background(stages: &dyn Stages<f32>) {
     assert!(image.color.iter().all(|&c| c == [0.25, 0.5, 0.75]));
     assert!(image.alpha.iter().all(|&a| a == 0.0));
     let v_image = random_image_gradients(&mut rng(7), 21 * 18);
-    let v = stages.rasterize_backward(&empty, [0.25, 0.5, 0.75], &image, &v_image).unwrap();
+    let v = stages.rasterize_backward(&empty, [0.25, 0.5, 0.75], &image, &v_image, false).unwrap();
     assert!(v.v_means2d.is_empty());
     let sum: f64 = v_image.v_color.iter().map(|v| f64::from(v[0])).sum();
     assert!((f64::from(v.v_background[0]) - sum).abs() < 1e-4);
@@ -249,7 +252,6 @@ pub fn poison_in_any_slot_culls_one_splat_at_most(stages: &dyn Stages<f32>) {
             for k in (0..24).filter(|&k| k != i) {
                 assert_eq!(projected.means2d[k], clean.means2d[k], "{what}");
                 assert_eq!(projected.factors[k], clean.factors[k], "{what}");
-                assert_eq!(projected.covars2d[k], clean.covars2d[k], "{what}");
                 assert_eq!(projected.depths[k], clean.depths[k], "{what}");
                 assert_eq!(projected.colors[k], clean.colors[k], "{what}");
                 assert_eq!(projected.opacities[k], clean.opacities[k], "{what}");
@@ -272,7 +274,8 @@ pub fn poison_in_any_slot_culls_one_splat_at_most(stages: &dyn Stages<f32>) {
             let image = stages.rasterize(&projected, [0.0; 3]).unwrap();
             assert!(image.color.iter().flatten().all(|v| v.is_finite()), "{what}: picture");
             let v_image = random_image_gradients(&mut rng, image.color.len());
-            let v2d = stages.rasterize_backward(&projected, [0.0; 3], &image, &v_image).unwrap();
+            let v2d =
+                stages.rasterize_backward(&projected, [0.0; 3], &image, &v_image, false).unwrap();
             let v = stages
                 .project_backward(&scene.params(), &camera, &options, &projected, &v2d)
                 .unwrap();

@@ -90,7 +90,6 @@ pub fn widen_projected(p: &Projected<f32>) -> Projected<f64> {
         height: p.height,
         means2d: widen(&p.means2d),
         factors: widen(&p.factors),
-        covars2d: widen(&p.covars2d),
         depths: widen1(&p.depths),
         colors: widen(&p.colors),
         opacities: widen1(&p.opacities),
@@ -104,7 +103,6 @@ pub fn narrow_projected(p: &Projected<f64>) -> Projected<f32> {
         height: p.height,
         means2d: narrow(&p.means2d),
         factors: narrow(&p.factors),
-        covars2d: narrow(&p.covars2d),
         depths: narrow1(&p.depths),
         colors: narrow(&p.colors),
         opacities: narrow1(&p.opacities),
@@ -134,11 +132,12 @@ pub fn widen_image_gradients(g: &ImageGradients<f32>) -> ImageGradients<f64> {
 pub fn widen_projected_gradients(g: &ProjectedGradients<f32>) -> ProjectedGradients<f64> {
     ProjectedGradients {
         v_means2d: widen(&g.v_means2d),
-        v_covars2d: widen(&g.v_covars2d),
+        v_factors: widen(&g.v_factors),
         v_depths: widen1(&g.v_depths),
         v_colors: widen(&g.v_colors),
         v_opacities: widen1(&g.v_opacities),
         v_background: g.v_background.map(f64::from),
+        v_means2d_absolute: g.v_means2d_absolute.as_deref().map(widen),
     }
 }
 
@@ -236,7 +235,6 @@ pub fn place(
     let reach = 2.0 * (255.0 * f64::from(opacity)).ln();
     out.means2d[i] = center;
     out.factors[i] = [p as f32, (-xy / yy * p) as f32, yy.sqrt().recip() as f32];
-    out.covars2d[i] = [xx as f32, xy as f32, yy as f32];
     out.opacities[i] = opacity;
     out.depths[i] = 1.0;
     if reach > 0.0 {
@@ -264,7 +262,7 @@ pub fn random_projected_gradients(
             continue;
         }
         out.v_means2d[i] = std::array::from_fn(|_| normal(rng) as f32);
-        out.v_covars2d[i] = std::array::from_fn(|_| 0.1 * normal(rng) as f32);
+        out.v_factors[i] = std::array::from_fn(|_| 0.1 * normal(rng) as f32);
         out.v_depths[i] = normal(rng) as f32;
         out.v_colors[i] = std::array::from_fn(|_| normal(rng) as f32);
         out.v_opacities[i] = normal(rng) as f32;
@@ -370,7 +368,15 @@ pub fn projected_gradient_differences(
 ) -> Vec<(&'static str, Difference)> {
     vec![
         ("v_means2d", difference(&got.v_means2d, &expected.v_means2d, &[])),
-        ("v_covars2d", difference(&got.v_covars2d, &expected.v_covars2d, &[])),
+        ("v_factors", difference(&got.v_factors, &expected.v_factors, &[])),
+        (
+            "v_means2d_absolute",
+            difference(
+                got.v_means2d_absolute.as_deref().unwrap_or_default(),
+                expected.v_means2d_absolute.as_deref().unwrap_or_default(),
+                &[],
+            ),
+        ),
         ("v_depths", difference1(&got.v_depths, &expected.v_depths, &[])),
         ("v_colors", difference(&got.v_colors, &expected.v_colors, &[])),
         ("v_opacities", difference1(&got.v_opacities, &expected.v_opacities, &[])),
