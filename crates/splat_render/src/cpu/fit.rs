@@ -9,8 +9,11 @@ use super::bin::{Bins, CHUNK, ChunkTiles};
 use super::loss::Loss;
 use super::project::{Splat, Splat2d, View, project_splat};
 use super::project_backward::{VSplat, splat_backward};
-use super::rasterize::{Planes, TileSplat, rasterize};
-use super::rasterize_backward::{COLOR_SUMS, PairSums, gather, rasterize_backward};
+use super::rasterize::{Planes, rasterize};
+use super::rasterize_backward::{
+    COLOR_SUMS, PairSums, PictureGradients, gather, rasterize_backward,
+};
+use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
 use crate::fit::{FitDevice, FitState, Rates, StepInput, Target, noise_normal};
@@ -105,10 +108,12 @@ impl FitDevice for CpuFit {
         rasterize_backward(
             &self.splats,
             &self.bins,
-            &self.image,
-            &self.loss.v_color,
-            None,
-            None,
+            PictureGradients {
+                image: &self.image,
+                v_color: &self.loss.v_color,
+                v_alpha: None,
+                v_depth: None,
+            },
             &mut self.sums,
         );
         self.update(&view, input, [width as f32, height as f32]);

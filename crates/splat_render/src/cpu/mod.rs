@@ -11,6 +11,7 @@ mod project_backward;
 mod rasterize;
 mod rasterize_backward;
 mod simd;
+mod tile;
 
 use rayon::prelude::*;
 
@@ -23,8 +24,11 @@ use crate::stages::{
 use bin::{Bins, CHUNK, touched_tiles};
 use project::{Splat, Splat2d, View, project_splat};
 use project_backward::{V2d, VCamera, splat_backward};
-use rasterize::{Planes, TileSplat};
-use rasterize_backward::{ABSOLUTE_SUMS, DEPTH_SUMS, PairSums, gather, rasterize_backward};
+use rasterize::Planes;
+use rasterize_backward::{
+    ABSOLUTE_SUMS, DEPTH_SUMS, PairSums, PictureGradients, gather, rasterize_backward,
+};
+use tile::TileSplat;
 
 pub use fit::CpuFit;
 pub use simd::instruction_set;
@@ -82,8 +86,9 @@ fn v2d<const N: usize>(
     v_image: &ImageGradients<f32>,
 ) -> Vec<(V2d, [f32; 2])> {
     let (v_alpha, v_depth) = (Some(&v_image.v_alpha[..]), Some(&v_image.v_depth[..]));
+    let picture = PictureGradients { image, v_color, v_alpha, v_depth };
     let mut sums: Vec<PairSums<N>> = Vec::new();
-    rasterize_backward(splats, bins, image, v_color, v_alpha, v_depth, &mut sums);
+    rasterize_backward(splats, bins, picture, &mut sums);
     (0..splats.len()).into_par_iter().map(|i| gather(i, &splats[i], bins, &sums)).collect()
 }
 

@@ -4,63 +4,11 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::bin::Bins;
-use super::project::Splat2d;
-use super::simd::exp2_negative;
-use crate::constants::{ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN};
-
-pub(super) const SIDE: usize = TILE as usize;
-pub(super) const PIXELS: usize = SIDE * SIDE;
-
-/// Splats between two looks whether a tile's pixels have all stopped.
-pub(super) const STOP_INTERVAL: usize = 16;
-
-/// sqrt(log2(e) / 2): scales a factor so that exp(-sigma) = 2^-(u^2 + v^2).
-const WHITEN: f32 = 0.849_321_8;
-
-/// A 2D splat as the inner loops read it; u and v are in units of 1 / [`WHITEN`].
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct TileSplat {
-    pub mean: [f32; 2],
-    pub factor: [f32; 3],
-    pub opacity: f32,
-    pub color: [f32; 3],
-    pub depth: f32,
-    /// Reach along x and y in px, a little widened.
-    pub radii: [f32; 2],
-    /// u^2 + v^2 beyond which alpha < `ALPHA_MIN`, a little widened.
-    pub limit: f32,
-}
-
-impl TileSplat {
-    pub fn new(splat: &Splat2d) -> Self {
-        Self {
-            mean: splat.mean,
-            factor: splat.factor.map(|f| f * WHITEN),
-            opacity: splat.opacity,
-            color: splat.color,
-            depth: splat.depth,
-            radii: splat.radii.map(|r| r * (1.0 + 1e-5) + 1e-2),
-            limit: (splat.opacity / ALPHA_MIN).log2() * (1.0 + 1e-5) + 1e-5,
-        }
-    }
-
-    /// Rows (`axis` 1) or columns (`axis` 0) that the splat reaches, of the tile that starts at
-    /// pixel `start`.
-    #[inline(always)]
-    pub fn reach(&self, axis: usize, start: f32) -> std::ops::Range<usize> {
-        let middle = self.mean[axis] - start - 0.5;
-        let first = (middle - self.radii[axis]).ceil().clamp(0.0, SIDE as f32) as i32;
-        let last = (middle + self.radii[axis]).floor().clamp(-1.0, (SIDE - 1) as f32) as i32;
-        first as usize..(last + 1) as usize
-    }
-
-    /// The same in vectors of `lanes` columns.
-    #[inline(always)]
-    pub fn vectors(&self, left: f32, lanes: usize) -> std::ops::Range<usize> {
-        let columns = self.reach(0, left);
-        columns.start / lanes..columns.end.div_ceil(lanes)
-    }
-}
+use super::tile::{
+    LIVE_INTERVAL, PIXELS, Pixels, Place, Reached, SIDE, TileSplat, Vectors, centers, live_vectors,
+    take,
+};
+use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
 
 /// A picture as planes, row-major, H x W each.
 #[derive(Debug, Clone, Default)]
@@ -92,109 +40,85 @@ impl Planes {
     }
 }
 
-/// Per-pixel state of a tile.
-#[repr(align(64))]
-struct State {
-    /// R, G, B, depth.
-    sums: [[f32; PIXELS]; 4],
-    /// Transmittance; negative once the pixel has stopped.
-    t: [f32; PIXELS],
-}
-
-struct Tile<'a, const DEPTH: bool> {
+struct Tile<'a, 'b, const DEPTH: bool> {
     splats: &'a [TileSplat],
     ids: &'a [u32],
     left: f32,
     top: f32,
-    state: &'a mut State,
+    background: [f32; 3],
+    place: Place,
+    band: &'a mut [&'b mut [f32]; 5],
 }
 
-impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
+impl<const DEPTH: bool> WithSimd for Tile<'_, '_, DEPTH> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let per_row = SIDE / S::F32_LANES;
-        let columns = pixel_columns(self.left);
-        let columns = S::as_simd_f32s(&columns).0;
-        let State { sums: [r, g, b, d], t } = self.state;
-        let (r, g) = (S::as_mut_simd_f32s(r).0, S::as_mut_simd_f32s(g).0);
-        let (b, d) = (S::as_mut_simd_f32s(b).0, S::as_mut_simd_f32s(d).0);
-        let t = S::as_mut_simd_f32s(t).0;
-        let zero = s.splat_f32s(0.0);
-
-        for (k, &id) in self.ids.iter().enumerate() {
-            if k % STOP_INTERVAL == STOP_INTERVAL - 1 && all_stopped(s, t) {
-                break;
+        let mut sums = [Pixels([0.0; PIXELS]); 4];
+        // Negative once the pixel has stopped.
+        let mut t = self.place.clear(S::F32_LANES);
+        blend::<S, DEPTH>(s, &self, &mut sums, &mut t);
+        for (t, k) in t.0.iter_mut().zip(0..) {
+            *t = t.abs();
+            for c in 0..3 {
+                sums[c].0[k] += *t * self.background[c];
             }
-            let splat = &self.splats[id as usize];
-            let [p, q, v_scale] = splat.factor;
-            let (p, opacity) = (s.splat_f32s(p), s.splat_f32s(splat.opacity));
-            let mx = s.splat_f32s(splat.mean[0]);
-            let limit = s.splat_f32s(splat.limit);
+        }
+        for (plane, sums) in self.band.iter_mut().zip(&sums) {
+            self.place.store::<S>(sums, plane);
+        }
+        self.place.store::<S>(&t, self.band[4]);
+    }
+}
+
+#[inline(always)]
+fn blend<S: Simd, const DEPTH: bool>(
+    s: S,
+    tile: &Tile<'_, '_, DEPTH>,
+    [r, g, b, d]: &mut [Pixels; 4],
+    t: &mut Pixels,
+) {
+    let (columns, rows) = (centers(tile.left), centers(tile.top));
+    let (r, g) = (S::as_mut_simd_f32s(&mut r.0).0, S::as_mut_simd_f32s(&mut g.0).0);
+    let (b, d) = (S::as_mut_simd_f32s(&mut b.0).0, S::as_mut_simd_f32s(&mut d.0).0);
+    let t = S::as_mut_simd_f32s(&mut t.0).0;
+    let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
+    let (mut reached, mut live) = (Reached::new(), Vectors::default());
+    let mut batch = [TileSplat::default(); LIVE_INTERVAL];
+
+    for start in (0..tile.ids.len()).step_by(LIVE_INTERVAL) {
+        if !live_vectors(s, t, &mut live) {
+            break;
+        }
+        let taken = take(tile.splats, &tile.ids[start..], &mut batch);
+        for splat in &batch[..taken] {
+            let count = reached.find(s, splat, &columns, &rows, &live);
+            let opacity = s.splat_f32s(splat.opacity);
             let [red, green, blue] = splat.color;
             let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
             let depth = s.splat_f32s(splat.depth);
-            let vectors = splat.vectors(self.left, S::F32_LANES);
-            for row in splat.reach(1, self.top) {
-                let dy = self.top + row as f32 + 0.5 - splat.mean[1];
-                let v = v_scale * dy;
-                let (vv, shift) = (s.splat_f32s(v * v), s.splat_f32s(q * dy));
-                for h in vectors.clone() {
-                    let x = columns[h];
-                    let at = row * per_row + h;
-                    let u = s.mul_add_e_f32s(p, s.sub_f32s(x, mx), shift);
-                    let distance = s.mul_add_e_f32s(u, u, vv);
-                    // Known long before alpha is, so a wrong guess of the branch costs little.
-                    let before = t[at];
-                    let near = s.less_than_or_equal_f32s(distance, limit);
-                    if !any(s, s.and_m32s(near, s.greater_than_f32s(before, zero))) {
-                        continue;
-                    }
-                    let gaussian = exp2_negative(s, s.neg_f32s(distance));
-                    let alpha = s.mul_f32s(opacity, gaussian);
-                    let alpha = s.min_f32s(alpha, s.splat_f32s(ALPHA_MAX));
-                    let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
-                    let after = s.mul_f32s(before, s.sub_f32s(s.splat_f32s(1.0), alpha));
-                    let goes_on =
-                        s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
-                    let adds = s.and_m32s(seen, goes_on);
-                    let stopped = s.neg_f32s(s.abs_f32s(before));
-                    let rest = s.select_f32s(seen, stopped, before);
-                    t[at] = s.select_f32s(adds, after, rest);
-                    let weight = s.mul_f32s(before, alpha);
-                    let weight = s.select_f32s(adds, weight, zero);
-                    r[at] = s.mul_add_e_f32s(weight, color[0], r[at]);
-                    g[at] = s.mul_add_e_f32s(weight, color[1], g[at]);
-                    b[at] = s.mul_add_e_f32s(weight, color[2], b[at]);
-                    if DEPTH {
-                        d[at] = s.mul_add_e_f32s(weight, depth, d[at]);
-                    }
+            for k in 0..count {
+                let at = usize::from(reached.vectors[k]);
+                let gaussian = S::as_simd_f32s(&reached.gaussians.0).0[k];
+                let alpha = s.min_f32s(s.mul_f32s(opacity, gaussian), s.splat_f32s(ALPHA_MAX));
+                let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
+                let alpha = s.select_f32s(seen, alpha, zero);
+                let before = t[at];
+                let after = s.mul_f32s(before, s.sub_f32s(one, alpha));
+                // False for pixels that stop here or, negative, have stopped before.
+                let goes_on = s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
+                t[at] = s.select_f32s(goes_on, after, s.or_f32s(before, s.splat_f32s(-0.0)));
+                let weight = s.select_f32s(goes_on, s.mul_f32s(before, alpha), zero);
+                r[at] = s.mul_add_e_f32s(weight, color[0], r[at]);
+                g[at] = s.mul_add_e_f32s(weight, color[1], g[at]);
+                b[at] = s.mul_add_e_f32s(weight, color[2], b[at]);
+                if DEPTH {
+                    d[at] = s.mul_add_e_f32s(weight, depth, d[at]);
                 }
             }
         }
     }
-}
-
-/// Whether any lane is set.
-#[inline(always)]
-pub(super) fn any<S: Simd>(s: S, mask: S::m32s) -> bool {
-    s.first_true_m32s(mask) < S::F32_LANES
-}
-
-/// Whether every pixel of a tile has stopped.
-#[inline(always)]
-pub(super) fn all_stopped<S: Simd>(s: S, t: &[S::f32s]) -> bool {
-    let mut most = s.splat_f32s(-1.0);
-    for &t in t {
-        most = s.max_f32s(most, t);
-    }
-    s.reduce_max_f32s(most) < 0.0
-}
-
-/// x of the pixel centres of a tile's row.
-pub(super) fn pixel_columns(left: f32) -> [f32; SIDE] {
-    std::array::from_fn(|x| left + x as f32 + 0.5)
 }
 
 /// Renders every tile into `out`, which must have the picture's size; the depth plane is zero
@@ -208,35 +132,19 @@ pub(super) fn rasterize<const DEPTH: bool>(
     let arch = pulp::Arch::new();
     let width = out.width;
     let columns = width.div_ceil(SIDE);
-    out.bands().enumerate().for_each(|(tile_row, band)| {
+    out.bands().enumerate().for_each(|(tile_row, mut band)| {
         let rows = band[0].len() / width;
         for column in 0..columns {
-            let (x, valid) = (column * SIDE, SIDE.min(width - column * SIDE));
-            let mut state = State { sums: [[0.0; PIXELS]; 4], t: [1.0; PIXELS] };
-            // Pixels beyond the picture start as stopped.
-            for (k, t) in state.t.iter_mut().enumerate() {
-                if k / SIDE >= rows || k % SIDE >= valid {
-                    *t = -1.0;
-                }
-            }
+            let first = column * SIDE;
             arch.dispatch(Tile::<DEPTH> {
                 splats,
                 ids: &bins.splats[bins.range(tile_row * columns + column)],
-                left: (column * SIDE) as f32,
+                left: first as f32,
                 top: (tile_row * SIDE) as f32,
-                state: &mut state,
+                background,
+                place: Place { first, width, rows, columns: SIDE.min(width - first) },
+                band: &mut band,
             });
-            for row in 0..rows {
-                for k in 0..valid {
-                    let (from, to) = (row * SIDE + k, row * width + x + k);
-                    let t = state.t[from].abs();
-                    for c in 0..3 {
-                        band[c][to] = state.sums[c][from] + t * background[c];
-                    }
-                    band[3][to] = state.sums[3][from];
-                    band[4][to] = t;
-                }
-            }
         }
     });
 }

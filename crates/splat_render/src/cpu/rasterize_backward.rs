@@ -6,10 +6,11 @@ use rayon::prelude::*;
 
 use super::bin::Bins;
 use super::project_backward::V2d;
-use super::rasterize::{
-    PIXELS, Planes, SIDE, STOP_INTERVAL, TileSplat, all_stopped, any, pixel_columns,
+use super::rasterize::Planes;
+use super::tile::{
+    LIVE_INTERVAL, PIXELS, Pixels, Place, Reached, SIDE, TileSplat, Vectors, centers, live_vectors,
+    offsets, take,
 };
-use super::simd::exp2_negative;
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
 
 /// Sums over a tile's pixels for one splat: v_alpha * gaussian times (1, u, v, uu, uv, vv), then
@@ -23,15 +24,17 @@ pub(super) const DEPTH_SUMS: usize = 10;
 /// Sums with depth and absolute gradients.
 pub(super) const ABSOLUTE_SUMS: usize = 12;
 
-/// Per-pixel state of a tile.
-#[repr(align(64))]
-struct State {
-    /// Gradients of R, G, B and accumulated depth.
-    v: [[f32; PIXELS]; 4],
-    /// Transmittance; negative once the pixel has stopped.
-    t: [f32; PIXELS],
-    /// What lies behind the splats seen so far, dotted with the gradients.
-    behind: [f32; PIXELS],
+/// What a picture's gradients are taken of and with respect to.
+#[derive(Clone, Copy)]
+pub(super) struct PictureGradients<'a> {
+    /// The forward pass's picture, over its background.
+    pub image: &'a Planes,
+    /// Gradient of each colour channel, H x W.
+    pub v_color: &'a [Vec<f32>; 3],
+    /// Gradient of alpha, if there is one.
+    pub v_alpha: Option<&'a [f32]>,
+    /// Gradient of the accumulated depth, if there is one.
+    pub v_depth: Option<&'a [f32]>,
 }
 
 struct Tile<'a, const N: usize> {
@@ -39,7 +42,8 @@ struct Tile<'a, const N: usize> {
     ids: &'a [u32],
     left: f32,
     top: f32,
-    state: &'a mut State,
+    picture: PictureGradients<'a>,
+    place: Place,
     sums: &'a mut [PairSums<N>],
 }
 
@@ -48,115 +52,125 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let per_row = SIDE / S::F32_LANES;
-        let columns = pixel_columns(self.left);
-        let columns = S::as_simd_f32s(&columns).0;
-        let State { v: [v_r, v_g, v_b, v_d], t, behind } = self.state;
-        let (v_r, v_g) = (S::as_simd_f32s(v_r).0, S::as_simd_f32s(v_g).0);
-        let (v_b, v_d) = (S::as_simd_f32s(v_b).0, S::as_simd_f32s(v_d).0);
-        let (t, behind) = (S::as_mut_simd_f32s(t).0, S::as_mut_simd_f32s(behind).0);
+        let (columns, rows) = (centers(self.left), centers(self.top));
+        let zeros = Pixels([0.0; PIXELS]);
+        let PictureGradients { image, v_color, v_alpha, v_depth } = self.picture;
+        // What lies behind the splats seen so far, dotted with the gradients.
+        let mut behind = zeros;
+        if let Some(v_alpha) = v_alpha {
+            let t = self.place.load::<S>(&image.planes[4]);
+            add_product(&mut behind, -1.0, &t, &self.place.load::<S>(v_alpha));
+        }
+        // Gradients of R, G, B and accumulated depth.
+        let mut v = [zeros; 4];
+        for c in 0..3 {
+            v[c] = self.place.load::<S>(&v_color[c]);
+            add_product(&mut behind, 1.0, &self.place.load::<S>(&image.planes[c]), &v[c]);
+        }
+        if let Some(v_depth) = v_depth {
+            v[3] = self.place.load::<S>(v_depth);
+            add_product(&mut behind, 1.0, &self.place.load::<S>(&image.planes[3]), &v[3]);
+        }
+        // Negative once the pixel has stopped.
+        let mut t = self.place.clear(S::F32_LANES);
+        let [v_r, v_g, v_b, v_d] = &v;
+        let (v_r, v_g) = (S::as_simd_f32s(&v_r.0).0, S::as_simd_f32s(&v_g.0).0);
+        let (v_b, v_d) = (S::as_simd_f32s(&v_b.0).0, S::as_simd_f32s(&v_d.0).0);
+        let t = S::as_mut_simd_f32s(&mut t.0).0;
+        let behind = S::as_mut_simd_f32s(&mut behind.0).0;
         let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
+        let (mut reached, mut live) = (Reached::new(), Vectors::default());
+        let mut batch = [TileSplat::default(); LIVE_INTERVAL];
 
-        for (k, &id) in self.ids.iter().enumerate() {
-            if k % STOP_INTERVAL == STOP_INTERVAL - 1 && all_stopped(s, t) {
+        for start in (0..self.ids.len()).step_by(LIVE_INTERVAL) {
+            if !live_vectors(s, t, &mut live) {
                 break;
             }
-            let splat = &self.splats[id as usize];
-            let [p, q, r] = splat.factor;
-            let (p, opacity) = (s.splat_f32s(p), s.splat_f32s(splat.opacity));
-            let mx = s.splat_f32s(splat.mean[0]);
-            let limit = s.splat_f32s(splat.limit);
-            let [red, green, blue] = splat.color;
-            let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
-            let depth = s.splat_f32s(splat.depth);
-            let mut acc = [zero; N];
-            let mut touched = false;
-            let vectors = splat.vectors(self.left, S::F32_LANES);
-            for row in splat.reach(1, self.top) {
-                let dy = self.top + row as f32 + 0.5 - splat.mean[1];
-                let v = r * dy;
-                let (vv, shift) = (s.splat_f32s(v * v), s.splat_f32s(q * dy));
-                let (q, r, v) = (s.splat_f32s(q), s.splat_f32s(r), s.splat_f32s(v));
-                for h in vectors.clone() {
-                    let x = columns[h];
-                    let at = row * per_row + h;
-                    let u = s.mul_add_e_f32s(p, s.sub_f32s(x, mx), shift);
-                    let distance = s.mul_add_e_f32s(u, u, vv);
-                    let before = t[at];
-                    let near = s.less_than_or_equal_f32s(distance, limit);
-                    if !any(s, s.and_m32s(near, s.greater_than_f32s(before, zero))) {
-                        continue;
-                    }
-                    let gaussian = exp2_negative(s, s.neg_f32s(distance));
+            let taken = take(self.splats, &self.ids[start..], &mut batch);
+            for (splat, sums) in batch[..taken].iter().zip(&mut self.sums[start..]) {
+                let count = reached.find(s, splat, &columns, &rows, &live);
+                let (p, opacity) = (s.splat_f32s(splat.factor[0]), s.splat_f32s(splat.opacity));
+                let dx = offsets(s, splat, &columns);
+                let [red, green, blue] = splat.color;
+                let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
+                let depth = s.splat_f32s(splat.depth);
+                let mut acc = [zero; N];
+                for k in 0..count {
+                    let at = usize::from(reached.vectors[k]);
+                    let gaussian = S::as_simd_f32s(&reached.gaussians.0).0[k];
                     let uncapped = s.mul_f32s(opacity, gaussian);
                     let alpha = s.min_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
                     let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
+                    let alpha = s.select_f32s(seen, alpha, zero);
                     let through = s.sub_f32s(one, alpha);
+                    let inverse = s.div_f32s(one, through);
+                    let before = t[at];
                     let after = s.mul_f32s(before, through);
                     let goes_on =
                         s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
-                    let adds = s.and_m32s(seen, goes_on);
-                    let stopped = s.neg_f32s(s.abs_f32s(before));
-                    t[at] = s.select_f32s(adds, after, s.select_f32s(seen, stopped, before));
-                    if !any(s, adds) {
-                        continue;
-                    }
-                    touched = true;
-                    let weight = s.select_f32s(adds, s.mul_f32s(before, alpha), zero);
+                    t[at] = s.select_f32s(goes_on, after, s.or_f32s(before, s.splat_f32s(-0.0)));
+                    let weight = s.select_f32s(goes_on, s.mul_f32s(before, alpha), zero);
                     let mut own = s.mul_f32s(color[0], v_r[at]);
                     own = s.mul_add_e_f32s(color[1], v_g[at], own);
                     own = s.mul_add_e_f32s(color[2], v_b[at], own);
+                    acc[6] = s.mul_add_e_f32s(weight, v_r[at], acc[6]);
+                    acc[7] = s.mul_add_e_f32s(weight, v_g[at], acc[7]);
+                    acc[8] = s.mul_add_e_f32s(weight, v_b[at], acc[8]);
                     if N >= DEPTH_SUMS {
                         own = s.mul_add_e_f32s(depth, v_d[at], own);
                         acc[9] = s.mul_add_e_f32s(weight, v_d[at], acc[9]);
                     }
-                    acc[6] = s.mul_add_e_f32s(weight, v_r[at], acc[6]);
-                    acc[7] = s.mul_add_e_f32s(weight, v_g[at], acc[7]);
-                    acc[8] = s.mul_add_e_f32s(weight, v_b[at], acc[8]);
                     let rest = s.negate_mul_add_e_f32s(weight, own, behind[at]);
                     behind[at] = rest;
-                    // v_alpha * gaussian, zero where the cap holds alpha.
-                    let v_alpha = s.sub_f32s(s.mul_f32s(before, own), s.div_f32s(rest, through));
+                    // v_alpha * gaussian, zero where the cap holds alpha or nothing is added.
+                    let v_alpha = s.negate_mul_add_e_f32s(rest, inverse, s.mul_f32s(before, own));
                     let free = s.less_than_or_equal_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
-                    let free = s.and_m32s(free, adds);
+                    let free = s.and_m32s(free, s.and_m32s(seen, goes_on));
                     let g = s.select_f32s(free, s.mul_f32s(v_alpha, gaussian), zero);
-                    let (gu, gv) = (s.mul_f32s(g, u), s.mul_f32s(g, v));
+                    let row = at % SIDE;
+                    let shift = s.splat_f32s(reached.shift[row]);
+                    let (v, vv) = (s.splat_f32s(reached.v[row]), s.splat_f32s(reached.vv[row]));
+                    let u = s.mul_add_e_f32s(p, dx[at / SIDE % SIDE], shift);
+                    let gu = s.mul_f32s(g, u);
                     acc[0] = s.add_f32s(acc[0], g);
                     acc[1] = s.add_f32s(acc[1], gu);
-                    acc[2] = s.add_f32s(acc[2], gv);
+                    acc[2] = s.mul_add_e_f32s(g, v, acc[2]);
                     acc[3] = s.mul_add_e_f32s(gu, u, acc[3]);
                     acc[4] = s.mul_add_e_f32s(gu, v, acc[4]);
-                    acc[5] = s.mul_add_e_f32s(gv, v, acc[5]);
+                    acc[5] = s.mul_add_e_f32s(g, vv, acc[5]);
                     if N >= ABSOLUTE_SUMS {
-                        let along_y = s.mul_add_e_f32s(q, gu, s.mul_f32s(r, gv));
+                        let [_, q, r] = splat.factor;
+                        let along_y = s.mul_f32s(s.splat_f32s(r), s.mul_f32s(g, v));
+                        let along_y = s.mul_add_e_f32s(s.splat_f32s(q), gu, along_y);
                         acc[10] = s.add_f32s(acc[10], s.abs_f32s(gu));
                         acc[11] = s.add_f32s(acc[11], s.abs_f32s(along_y));
                     }
                 }
-            }
-            if touched {
-                for (sum, acc) in self.sums[k].iter_mut().zip(acc) {
-                    *sum = s.reduce_sum_f32s(acc);
+                for k in 0..N {
+                    sums[k] = s.reduce_sum_f32s(acc[k]);
                 }
             }
         }
     }
 }
 
-/// Fills `sums[position]` for every (tile, splat) pair of `bins`. `image` is the forward pass's
-/// picture (over its background), `v_color` and `v_depth` its gradients as planes, `v_alpha` that of
-/// alpha where there is one.
+/// `sum += sign a b`, pixel by pixel.
+#[inline(always)]
+fn add_product(sum: &mut Pixels, sign: f32, a: &Pixels, b: &Pixels) {
+    for k in 0..PIXELS {
+        sum.0[k] += sign * a.0[k] * b.0[k];
+    }
+}
+
+/// Fills `sums[position]` for every (tile, splat) pair of `bins`.
 pub(super) fn rasterize_backward<const N: usize>(
     splats: &[TileSplat],
     bins: &Bins,
-    image: &Planes,
-    v_color: &[Vec<f32>; 3],
-    v_alpha: Option<&[f32]>,
-    v_depth: Option<&[f32]>,
+    picture: PictureGradients<'_>,
     sums: &mut Vec<PairSums<N>>,
 ) {
     let arch = pulp::Arch::new();
-    let (width, height) = (image.width, image.height);
+    let (width, height) = (picture.image.width, picture.image.height);
     let columns = width.div_ceil(SIDE);
     sums.clear();
     sums.resize(bins.splats.len(), [0.0; N]);
@@ -179,31 +193,16 @@ pub(super) fn rasterize_backward<const N: usize>(
             if range.is_empty() {
                 continue;
             }
-            // Pixels beyond the picture start as stopped.
-            let mut state =
-                State { v: [[0.0; PIXELS]; 4], t: [-1.0; PIXELS], behind: [0.0; PIXELS] };
-            let valid = SIDE.min(width - column * SIDE);
-            for row in 0..rows {
-                for k in 0..valid {
-                    let (to, from) =
-                        (row * SIDE + k, (tile_row * SIDE + row) * width + column * SIDE + k);
-                    let t = image.planes[4][from];
-                    let mut behind = v_alpha.map_or(0.0, |v| -v[from] * t);
-                    for c in 0..3 {
-                        state.v[c][to] = v_color[c][from];
-                        behind += image.planes[c][from] * v_color[c][from];
-                    }
-                    if let Some(v) = v_depth {
-                        state.v[3][to] = v[from];
-                        behind += image.planes[3][from] * v[from];
-                    }
-                    state.behind[to] = behind;
-                    state.t[to] = 1.0;
-                }
-            }
-            let (ids, left) = (&bins.splats[range], (column * SIDE) as f32);
-            let (top, state) = ((tile_row * SIDE) as f32, &mut state);
-            arch.dispatch(Tile::<N> { splats, ids, left, top, state, sums });
+            let (x, y) = (column * SIDE, tile_row * SIDE);
+            arch.dispatch(Tile::<N> {
+                splats,
+                ids: &bins.splats[range],
+                left: x as f32,
+                top: y as f32,
+                picture,
+                place: Place { first: y * width + x, width, rows, columns: SIDE.min(width - x) },
+                sums,
+            });
         }
     });
 }
