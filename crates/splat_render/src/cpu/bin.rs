@@ -1,5 +1,7 @@
 //! bin: extents to splat ids ordered by (tile, depth, index).
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use super::project::Splat2d;
@@ -147,8 +149,23 @@ impl Bins {
         Ok(())
     }
 
+    /// Copies what belongs to the pairs of a run of splats, splat-major. Pairs lie anywhere in
+    /// memory: asked for together, they are waited for together.
+    pub fn take_pairs<T: Copy>(&self, splats: Range<usize>, from: &[T], to: &mut Vec<T>) {
+        let slots = self.slots[splats.start] as usize..self.slots[splats.end] as usize;
+        to.clear();
+        to.extend(self.position_from_slot[slots].iter().map(|&position| from[position as usize]));
+    }
+
+    /// Where splat `i`'s pairs lie in what [`Bins::take_pairs`] took of a run that begins with
+    /// splat `first`.
+    pub fn pairs_of(&self, first: usize, i: usize) -> Range<usize> {
+        let base = self.slots[first];
+        (self.slots[i] - base) as usize..(self.slots[i + 1] - base) as usize
+    }
+
     /// Positions in `splats` of a tile's list.
-    pub fn range(&self, tile: usize) -> std::ops::Range<usize> {
+    pub fn range(&self, tile: usize) -> Range<usize> {
         self.starts[tile] as usize..self.starts[tile + 1] as usize
     }
 }

@@ -140,6 +140,8 @@ struct Block {
     scales: Vec<[f32; 3]>,
     opacities: Vec<f32>,
     sh: Vec<[f32; 3]>,
+    /// What the block's pairs summed up.
+    pairs: Vec<PairSums<COLOR_SUMS>>,
 }
 
 impl Block {
@@ -150,6 +152,7 @@ impl Block {
             scales: vec![[0.0; 3]; BLOCK],
             opacities: vec![0.0; BLOCK],
             sh: vec![[0.0; 3]; BLOCK * stride],
+            pairs: Vec::new(),
         }
     }
 }
@@ -226,13 +229,16 @@ impl CpuFit {
                         colors: Colors::Sh { degree, stride, coeffs },
                         raw: true,
                     };
+                    let first = block * BLOCK;
+                    bins.take_pairs(first..first + params.len(), sums, &mut v_block.pairs);
                     for k in 0..params.len() {
-                        let i = block * BLOCK + k;
+                        let i = first + k;
                         let splat = Splat::load(&params, k);
                         let v_sh = &mut v_block.sh[k * stride..(k + 1) * stride];
                         let mut v = VSplat::default();
                         if bins.slots[i + 1] > bins.slots[i] {
-                            let (v2d, _) = gather(i, &tile_splats[i], bins, sums);
+                            let pairs = &v_block.pairs[bins.pairs_of(first, i)];
+                            let (v2d, _) = gather(&tile_splats[i], pairs);
                             let [x, y] = v2d.v_mean;
                             let (x, y) = (0.5 * size[0] * x, 0.5 * size[1] * y);
                             grad_sum[k] += (x * x + y * y).sqrt();

@@ -127,17 +127,18 @@ impl WithSimd for Slopes<'_> {
         let first = self.rows.start.saturating_sub(HALF);
         let last = (self.rows.end + HALF).min(height);
         let count = last - first;
-        let mut filtered = Rows::new(5, count, width);
+        // x, y, xx + yy and xy: SSIM takes the two variances only as a sum.
+        let mut filtered = Rows::new(4, count, width);
         let padded_len = filtered.stride + 2 * PAD;
-        let mut padded: [Vec<f32>; 5] = std::array::from_fn(|_| vec![0.0; padded_len]);
+        let mut padded: [Vec<f32>; 4] = std::array::from_fn(|_| vec![0.0; padded_len]);
         for row in first..last {
             let (x, y) = (&self.x[row * width..][..width], &self.y[row * width..][..width]);
             pad(x, &mut padded[0]);
             pad(y, &mut padded[1]);
-            let [_, _, xx, yy, xy] = &mut padded;
-            let products = xx[PAD..].iter_mut().zip(&mut yy[PAD..]).zip(&mut xy[PAD..]);
-            for (((xx, yy), xy), (x, y)) in products.zip(x.iter().zip(y)) {
-                (*xx, *yy, *xy) = (x * x, y * y, x * y);
+            let [_, _, squares, xy] = &mut padded;
+            let products = squares[PAD..].iter_mut().zip(&mut xy[PAD..]);
+            for ((squares, xy), (x, y)) in products.zip(x.iter().zip(y)) {
+                (*squares, *xy) = (x * x + y * y, x * y);
             }
             for (map, padded) in padded.iter().enumerate() {
                 filter_row(s, padded, filtered.row_mut(map * count + row - first));
@@ -150,20 +151,19 @@ impl WithSimd for Slopes<'_> {
         let mut total = 0.0f64;
         let [out_mu, out_xx, out_xy] = self.out;
         for row in self.rows.clone() {
-            let mut windows: [Window<'_, S>; 5] = [[None; 2 * HALF + 1]; 5];
+            let mut windows: [Window<'_, S>; 4] = [[None; 2 * HALF + 1]; 4];
             for (map, window) in windows.iter_mut().enumerate() {
                 fill_window::<S>(window, &filtered, map * count, first..last, row);
             }
             for v in 0..vectors {
                 let mu_x = filter_column(s, &windows[0], v);
                 let mu_y = filter_column(s, &windows[1], v);
-                let xx = filter_column(s, &windows[2], v);
-                let yy = filter_column(s, &windows[3], v);
-                let xy = filter_column(s, &windows[4], v);
+                let squares = filter_column(s, &windows[2], v);
+                let xy = filter_column(s, &windows[3], v);
                 let mu_xy = s.mul_f32s(mu_x, mu_y);
                 let (mu_xx, mu_yy) = (s.mul_f32s(mu_x, mu_x), s.mul_f32s(mu_y, mu_y));
                 let s_xy = s.sub_f32s(xy, mu_xy);
-                let s_sum = s.sub_f32s(s.add_f32s(xx, yy), s.add_f32s(mu_xx, mu_yy));
+                let s_sum = s.sub_f32s(squares, s.add_f32s(mu_xx, mu_yy));
                 let a1 = s.mul_add_e_f32s(two, mu_xy, c1);
                 let a2 = s.mul_add_e_f32s(two, s_xy, c2);
                 let b1 = s.add_f32s(s.add_f32s(mu_xx, mu_yy), c1);
@@ -198,14 +198,38 @@ impl WithSimd for Slopes<'_> {
                     }
                 }
             }
-            let sum: f32 = match weights {
-                None => line(3).iter().sum(),
-                Some(w) => line(3).iter().zip(w).map(|(v, w)| v * w).sum(),
-            };
-            total += f64::from(sum);
+            total += f64::from(weighted_sum(s, line(3), weights));
         }
         total
     }
+}
+
+/// Sum of a row's values times their weights, 1 if there are none.
+#[inline(always)]
+fn weighted_sum<S: Simd>(s: S, values: &[f32], weights: Option<&[f32]>) -> f32 {
+    let (vectors, rest) = S::as_simd_f32s(values);
+    let mut sum = s.splat_f32s(0.0);
+    let mut rest_sum = 0.0;
+    match weights {
+        None => {
+            for &v in vectors {
+                sum = s.add_f32s(sum, v);
+            }
+            for v in rest {
+                rest_sum += v;
+            }
+        }
+        Some(weights) => {
+            let (weight_vectors, rest_weights) = S::as_simd_f32s(weights);
+            for (&v, &w) in vectors.iter().zip(weight_vectors) {
+                sum = s.mul_add_e_f32s(v, w, sum);
+            }
+            for (v, w) in rest.iter().zip(rest_weights) {
+                rest_sum += v * w;
+            }
+        }
+    }
+    s.reduce_sum_f32s(sum) + rest_sum
 }
 
 /// A band of rows of one channel: second pass, from slopes to the picture's gradient.
@@ -243,6 +267,7 @@ impl WithSimd for Gradient<'_> {
         }
         let vectors = filtered.stride / S::F32_LANES;
         let mut lines = [(); 3].map(|()| vec![s.splat_f32s(0.0); vectors]);
+        let mut distances = vec![0.0f32; width];
         let mut total = 0.0f64;
         for row in self.rows.clone() {
             for (map, line) in lines.iter_mut().enumerate() {
@@ -257,22 +282,23 @@ impl WithSimd for Gradient<'_> {
             let line = |k: usize| &bytemuck::cast_slice::<S::f32s, f32>(&lines[k])[..width];
             let (mu, xx, xy) = (line(0), line(1), line(2));
             let out = &mut self.out[(row - self.rows.start) * width..][..width];
-            let mut sum = 0.0f32;
+            // Plain loops without a branch: the compiler makes vectors of them.
             for k in 0..width {
                 let difference = x[k] - y[k];
-                let weight = self.weights.map_or(1.0, |w| w[at + k]);
-                let sign = if difference > 0.0 {
-                    1.0
-                } else if difference < 0.0 {
-                    -1.0
-                } else {
-                    0.0
-                };
-                sum += weight * difference.abs();
-                let v_ssim = mu[k] + 2.0 * x[k] * xx[k] + y[k] * xy[k];
-                out[k] = self.l1 * weight * sign - self.ssim * v_ssim;
+                distances[k] = difference.abs();
+                let sign = f32::from(difference > 0.0) - f32::from(difference < 0.0);
+                out[k] = self.l1 * sign;
             }
-            total += f64::from(sum);
+            let weights = self.weights.map(|w| &w[at..at + width]);
+            if let Some(weights) = weights {
+                for (out, weight) in out.iter_mut().zip(weights) {
+                    *out *= weight;
+                }
+            }
+            for k in 0..width {
+                out[k] -= self.ssim * (mu[k] + 2.0 * x[k] * xx[k] + y[k] * xy[k]);
+            }
+            total += f64::from(weighted_sum(s, &distances, weights));
         }
         total
     }

@@ -89,7 +89,16 @@ fn v2d<const N: usize>(
     let picture = PictureGradients { image, v_color, v_alpha, v_depth };
     let mut sums: Vec<PairSums<N>> = Vec::new();
     rasterize_backward(splats, bins, picture, &mut sums);
-    (0..splats.len()).into_par_iter().map(|i| gather(i, &splats[i], bins, &sums)).collect()
+    splats
+        .par_chunks(CHUNK)
+        .enumerate()
+        .flat_map_iter(|(chunk, splats)| {
+            let (first, mut pairs) = (chunk * CHUNK, Vec::new());
+            bins.take_pairs(first..first + splats.len(), &sums, &mut pairs);
+            let gather = |(k, splat)| gather(splat, &pairs[bins.pairs_of(first, first + k)]);
+            splats.iter().enumerate().map(gather).collect::<Vec<_>>()
+        })
+        .collect()
 }
 
 impl Stages<f32> for Cpu {

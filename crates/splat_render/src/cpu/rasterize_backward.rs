@@ -84,6 +84,7 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
 
         for start in (0..self.ids.len()).step_by(LIVE_INTERVAL) {
             if !live_vectors(s, t, &mut live) {
+                self.sums[start..].fill([0.0; N]);
                 break;
             }
             let taken = take(self.splats, &self.ids[start..], &mut batch);
@@ -172,7 +173,6 @@ pub(super) fn rasterize_backward<const N: usize>(
     let arch = pulp::Arch::new();
     let (width, height) = (picture.image.width, picture.image.height);
     let columns = width.div_ceil(SIDE);
-    sums.clear();
     sums.resize(bins.splats.len(), [0.0; N]);
 
     // One task per row of tiles, each with the part of `sums` that is its own.
@@ -207,18 +207,12 @@ pub(super) fn rasterize_backward<const N: usize>(
     });
 }
 
-/// Adds up splat `i`'s pairs in tile order and turns whitened moments into 2D gradients, with the
+/// Adds up a splat's pairs in tile order and turns whitened moments into 2D gradients, with the
 /// absolute gradient of the centre where `N` has it.
 #[inline(always)]
-pub(super) fn gather<const N: usize>(
-    i: usize,
-    splat: &TileSplat,
-    bins: &Bins,
-    sums: &[PairSums<N>],
-) -> (V2d, [f32; 2]) {
+pub(super) fn gather<const N: usize>(splat: &TileSplat, pairs: &[PairSums<N>]) -> (V2d, [f32; 2]) {
     let mut total = [0.0f32; N];
-    for slot in bins.slots[i] as usize..bins.slots[i + 1] as usize {
-        let pair = &sums[bins.position_from_slot[slot] as usize];
+    for pair in pairs {
         for (sum, value) in total.iter_mut().zip(pair) {
             *sum += value;
         }

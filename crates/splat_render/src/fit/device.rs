@@ -1,5 +1,7 @@
 //! Where a fit's kernels run: the seam between the fitting loop and the backends.
 
+use rayon::prelude::*;
+
 use super::params::FitState;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
@@ -51,19 +53,18 @@ impl Target {
             plane.resize(pixels, 0.0);
         }
         let unit = 1.0 / 255.0;
-        for (c, plane) in planes.iter_mut().enumerate() {
-            let rows = self.pixels.chunks_exact(self.channels as usize);
-            for (out, pixel) in plane.iter_mut().zip(rows) {
-                let value = f32::from(pixel[c]) * unit;
-                *out = match pixel.get(3) {
-                    None => value,
-                    Some(&alpha) => {
-                        let alpha = f32::from(alpha) * unit;
-                        value * alpha + background[c] * (1.0 - alpha)
-                    }
-                };
+        planes.par_iter_mut().enumerate().for_each(|(c, plane)| {
+            if self.channels == 3 {
+                for (out, pixel) in plane.iter_mut().zip(self.pixels.chunks_exact(3)) {
+                    *out = f32::from(pixel[c]) * unit;
+                }
+            } else {
+                for (out, pixel) in plane.iter_mut().zip(self.pixels.chunks_exact(4)) {
+                    let alpha = f32::from(pixel[3]) * unit;
+                    *out = f32::from(pixel[c]) * unit * alpha + background[c] * (1.0 - alpha);
+                }
             }
-        }
+        });
     }
 }
 
