@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use super::device::{Gpu, Op};
-use super::layout::{ALL_SPLATS, Chunk, ChunkCount, GRADIENT, SortPass, StatusHead};
+use super::layout::{ALL_SPLATS, Chunk, ChunkCount, SortPass, StatusHead};
 use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
@@ -77,9 +77,9 @@ pub(super) fn tile_count(width: u32, height: u32) -> u32 {
     width.div_ceil(TILE) * height.div_ceil(TILE)
 }
 
-/// Most pairs whose gradient slots can be bound at once.
-pub(super) fn pair_limit(gpu: &Gpu) -> u32 {
-    (gpu.binding_limit / (GRADIENT as u64 * 4)).min(u64::from(u32::MAX / 2)) as u32
+/// Most pairs whose gradient slots of so many floats can be bound at once.
+pub(super) fn pair_limit(gpu: &Gpu, slot_floats: usize) -> u32 {
+    (gpu.binding_limit / (slot_floats as u64 * 4)).min(u64::from(u32::MAX / 2)) as u32
 }
 
 impl SplatBins {
@@ -250,8 +250,9 @@ impl SplatBins {
         view: &wgpu::Buffer,
         splats2d: &wgpu::Buffer,
         tiles: u32,
+        slot_floats: usize,
     ) -> Result<(Vec<Range<u32>>, u32)> {
-        let limit = pair_limit(gpu);
+        let limit = pair_limit(gpu, slot_floats);
         let (mut open, mut done) = (std::iter::once(0..tiles).collect::<Vec<_>>(), Vec::new());
         let mut capacity = 0;
         while let Some(range) = open.pop() {

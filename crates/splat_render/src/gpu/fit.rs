@@ -163,7 +163,7 @@ impl Scene {
             .map(|i| [state.stats.grad_sum[i], state.stats.seen[i], state.stats.radius[i]])
             .collect();
         let first_guess = n.saturating_mul(PAIRS_PER_SPLAT).max(4096);
-        let capacity = capacity.max(first_guess).min(pair_limit(gpu));
+        let capacity = capacity.max(first_guess).min(pair_limit(gpu, GRADIENT));
         let (pairs, slots) = pair_buffers(gpu, capacity, tiles)?;
         let row = |floats: usize| u64::from(n) * floats as u64 * 4;
         Ok(Self {
@@ -319,7 +319,9 @@ impl Frame {
             if chunks.len() > 1 {
                 bin(&mut ops, chunk);
             }
-            ops.extend(rasterize_backward_ops(gpu, view, chunk, splats2d, bins, pairs, &backward));
+            ops.extend(rasterize_backward_ops(
+                gpu, view, chunk, splats2d, bins, pairs, &backward, false,
+            ));
         }
         ops.extend(project_backward_ops(
             gpu,
@@ -452,7 +454,7 @@ impl GpuFit {
     /// Makes room for the pairs that a step needs.
     fn grow(&mut self, frame: usize, counts: &[ChunkCount]) -> Result<()> {
         let gpu = Arc::clone(&self.gpu);
-        let limit = pair_limit(&gpu);
+        let limit = pair_limit(&gpu, GRADIENT);
         let mut chunks = Vec::new();
         let mut need = 0;
         for (range, count) in self.frames[frame].chunks.iter().zip(counts) {

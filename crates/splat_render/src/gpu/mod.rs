@@ -35,10 +35,6 @@ impl Stages<f32> for Gpu {
     ) -> Result<Projected<f32>> {
         splats.validate()?;
         camera.validate()?;
-        if options.antialiased {
-            let reason = "antialiased is not there yet on backend gpu; use backend cpu";
-            return Err(crate::error::Error::argument("rasterize_mode", reason));
-        }
         project::project(self, splats, camera, options)
     }
 

@@ -13,8 +13,9 @@
 // Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included; less
 // what has been walked where a tile's list goes on in the next dispatch.
 @group(0) @binding(7) var<storage, read_write> totals: array<f32>;
-// GRADIENT floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma,
-// then depth, colour 3, opacity.
+// SUMS floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma, then
+// depth, colour 3, opacity, and where asked for the absolute gradients of the mean: |g u| (times p
+// that of x) and that of y.
 @group(0) @binding(8) var<storage, read_write> slots: array<f32>;
 // Between such dispatches: transmittance, negative where the pixel has stopped.
 @group(0) @binding(9) var<storage, read_write> transmittances: array<f32>;
@@ -26,7 +27,7 @@ const BATCH = 6u;
 const STRIDE = THREADS + 1u;
 
 // [splat of the batch][entry][thread]
-var<workgroup> partials: array<f32, BATCH * GRADIENT * STRIDE>;
+var<workgroup> partials: array<f32, BATCH * SUMS * STRIDE>;
 var<workgroup> any_live: u32;
 
 // Four neighbouring pixels.
@@ -54,6 +55,8 @@ struct Sums {
     green: vec4<f32>,
     blue: vec4<f32>,
     opacity: vec4<f32>,
+    absolute_x: vec4<f32>,
+    absolute_y: vec4<f32>,
 }
 
 fn load_quad(x: u32, y: u32) -> Quad {
@@ -118,6 +121,10 @@ fn accumulate(quad: ptr<function, Quad>, splat: Splat2d, sums: ptr<function, Sum
     (*sums).green += weight * (*quad).v_green;
     (*sums).blue += weight * (*quad).v_blue;
     (*sums).opacity += gaussian * v_alpha;
+    if SUMS == GRADIENT_ABSOLUTE {
+        (*sums).absolute_x += abs(gu);
+        (*sums).absolute_y += abs(splat.pq.y * gu + splat.r * gv);
+    }
     (*quad).live = live;
     (*quad).remaining = remaining;
     (*quad).transmittance = select(transmittance, next, adds);
@@ -201,7 +208,7 @@ fn rasterize_backward(
                 accumulate(&q6, splat, &sums);
                 accumulate(&q7, splat, &sums);
             }
-            let at = b * GRADIENT * STRIDE + thread;
+            let at = b * SUMS * STRIDE + thread;
             partials[at] = total(sums.u);
             partials[at + STRIDE] = total(sums.v);
             partials[at + 2u * STRIDE] = total(sums.uu);
@@ -212,6 +219,10 @@ fn rasterize_backward(
             partials[at + 7u * STRIDE] = total(sums.green);
             partials[at + 8u * STRIDE] = total(sums.blue);
             partials[at + 9u * STRIDE] = total(sums.opacity);
+            if SUMS == GRADIENT_ABSOLUTE {
+                partials[at + 10u * STRIDE] = total(sums.absolute_x);
+                partials[at + 11u * STRIDE] = total(sums.absolute_y);
+            }
         }
         var live = q0.live;
         if ROWS > 1u {
@@ -227,12 +238,12 @@ fn rasterize_backward(
             any_live = 1u;
         }
         let goes_on = workgroupUniformLoad(&any_live);
-        for (var entry = thread; entry < count * GRADIENT; entry += THREADS) {
+        for (var entry = thread; entry < count * SUMS; entry += THREADS) {
             var sum = 0.0;
             for (var k = 0u; k < THREADS; k++) {
                 sum += partials[entry * STRIDE + k];
             }
-            slots[slot_from_pair[batch + entry / GRADIENT] * GRADIENT + entry % GRADIENT] = sum;
+            slots[slot_from_pair[batch + entry / SUMS] * SUMS + entry % SUMS] = sum;
         }
         if goes_on == 0u {
             break;

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::layout::{CAMERA, GEOMETRY, GRADIENT, STATS};
+use super::layout::{CAMERA, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS};
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, QUAT_NORM2_MIN, TILE, TRANSMITTANCE_MIN};
 use crate::fit::{ADAM, SSIM_C, SSIM_WINDOW};
 use crate::sh;
@@ -30,9 +30,18 @@ pub(super) struct Source {
 const SHARED: &str = include_str!("shared.wgsl");
 const GEOMETRY_WGSL: &str = include_str!("geometry.wgsl");
 const BIN_TILES: &str = include_str!("bin_tiles.wgsl");
+const BACKWARD: &str = include_str!("rasterize_backward.wgsl");
+const BACKWARD_BINDINGS: [Access; 10] =
+    [Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite];
+const BACKWARD_SUM: &str = include_str!("rasterize_backward_sum.wgsl");
+const BACKWARD_SUM_BINDINGS: [Access; 7] = [Uniform, Read, Read, Read, Read, Read, ReadWrite];
+// The backward kernels once without and once with sums of absolute gradients, so that who does not
+// ask for those does not pay for them.
+const SIGNED: &str = "const SUMS = GRADIENT;\n";
+const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 12] = [
+pub(super) static SOURCES: [Source; 14] = [
     Source {
         name: "project",
         parts: &[SHARED, GEOMETRY_WGSL, include_str!("project.wgsl")],
@@ -83,16 +92,26 @@ pub(super) static SOURCES: [Source; 12] = [
     },
     Source {
         name: "rasterize_backward",
-        parts: &[SHARED, include_str!("rasterize_backward.wgsl")],
-        bindings: &[
-            Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite,
-        ],
+        parts: &[SHARED, SIGNED, BACKWARD],
+        bindings: &BACKWARD_BINDINGS,
+        segmented: false,
+    },
+    Source {
+        name: "rasterize_backward_absolute",
+        parts: &[SHARED, ABSOLUTE, BACKWARD],
+        bindings: &BACKWARD_BINDINGS,
         segmented: false,
     },
     Source {
         name: "rasterize_backward_sum",
-        parts: &[SHARED, include_str!("rasterize_backward_sum.wgsl")],
-        bindings: &[Uniform, Read, Read, Read, Read, Read, ReadWrite],
+        parts: &[SHARED, SIGNED, BACKWARD_SUM],
+        bindings: &BACKWARD_SUM_BINDINGS,
+        segmented: false,
+    },
+    Source {
+        name: "rasterize_backward_sum_absolute",
+        parts: &[SHARED, ABSOLUTE, BACKWARD_SUM],
+        bindings: &BACKWARD_SUM_BINDINGS,
         segmented: false,
     },
     Source {
@@ -129,6 +148,8 @@ pub(super) enum Kernel {
     Rasterize,
     RasterizeBackward,
     RasterizeBackwardSum,
+    RasterizeBackwardAbsolute,
+    RasterizeBackwardSumAbsolute,
     LossSlopes,
     LossGradient,
     AdamGeometry,
@@ -137,7 +158,7 @@ pub(super) enum Kernel {
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 20] = [
         Self::Project,
         Self::ProjectBackward,
         Self::DepthKeys,
@@ -152,6 +173,8 @@ impl Kernel {
         Self::Rasterize,
         Self::RasterizeBackward,
         Self::RasterizeBackwardSum,
+        Self::RasterizeBackwardAbsolute,
+        Self::RasterizeBackwardSumAbsolute,
         Self::LossSlopes,
         Self::LossGradient,
         Self::AdamGeometry,
@@ -175,6 +198,12 @@ impl Kernel {
             Self::Rasterize => ("rasterize", "rasterize"),
             Self::RasterizeBackward => ("rasterize_backward", "rasterize_backward"),
             Self::RasterizeBackwardSum => ("rasterize_backward_sum", "rasterize_backward_sum"),
+            Self::RasterizeBackwardAbsolute => {
+                ("rasterize_backward_absolute", "rasterize_backward")
+            }
+            Self::RasterizeBackwardSumAbsolute => {
+                ("rasterize_backward_sum_absolute", "rasterize_backward_sum")
+            }
             Self::LossSlopes => ("loss", "loss_slopes"),
             Self::LossGradient => ("loss", "loss_gradient"),
             Self::AdamGeometry => ("adam", "adam_geometry"),
@@ -189,6 +218,7 @@ fn constants(rows: u32) -> String {
     let _ = writeln!(out, "const ROWS = {rows}u;");
     for (name, value) in [("TILE", TILE), ("GEOMETRY", GEOMETRY as u32)].into_iter().chain([
         ("GRADIENT", GRADIENT as u32),
+        ("GRADIENT_ABSOLUTE", GRADIENT_ABSOLUTE as u32),
         ("CAMERA", CAMERA as u32),
         ("STATS", STATS as u32),
     ]) {
@@ -377,7 +407,8 @@ mod tests {
             tiles_x,
             sh_degree,
             sh_stride,
-            raw
+            raw,
+            antialiased
         );
         layout!("project", Window, first, count);
         layout!(
