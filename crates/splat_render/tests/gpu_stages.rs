@@ -18,6 +18,12 @@ fn gpu() -> &'static Gpu {
     GPU.get_or_init(|| Gpu::new(true).unwrap_or_else(|e| panic!("{e}")))
 }
 
+/// The same without subgroups, which is how every device but llvmpipe runs.
+fn plain() -> &'static Gpu {
+    static GPU: OnceLock<Gpu> = OnceLock::new();
+    GPU.get_or_init(|| Gpu::new(true).unwrap_or_else(|e| panic!("{e}")).without_subgroups())
+}
+
 const BOUNDS: Bounds = Bounds { picture: 2e-5, gradient: 1e-3 };
 
 const SIZES: [(u32, u32); 7] =
@@ -69,7 +75,9 @@ fn rasterizes_like_the_reference() {
         let sigma = [1.0, 3.0, 10.0][round % 3];
         let projected = random_projected(&mut rng, n, width, height, sigma);
         let what = format!("round {round}, {width}x{height}");
-        rasterize_stages(gpu(), &projected, round as u64, BOUNDS, &what);
+        for gpu in [gpu(), plain()] {
+            rasterize_stages(gpu, &projected, round as u64, BOUNDS, &what);
+        }
     }
 }
 
@@ -168,10 +176,14 @@ fn poison_in_any_slot_culls_one_splat_at_most() {
 
 #[test]
 fn hard_splats_2d_agree_with_the_reference() {
-    common::hard_cases::hard_splats_2d_agree_with_the_reference(gpu(), BOUNDS);
+    for gpu in [gpu(), plain()] {
+        common::hard_cases::hard_splats_2d_agree_with_the_reference(gpu, BOUNDS);
+    }
 }
 
 #[test]
 fn many_splats_in_one_tile_and_one_on_many() {
-    common::hard_cases::many_splats_in_one_tile_and_one_on_many(gpu(), BOUNDS);
+    for gpu in [gpu(), plain()] {
+        common::hard_cases::many_splats_in_one_tile_and_one_on_many(gpu, BOUNDS);
+    }
 }

@@ -10,6 +10,7 @@ use std::task::{Context, Poll, Waker};
 
 use super::layout::SPLATS_PER_GROUP;
 use super::shaders::{Access, Kernel, SOURCES, Source};
+use crate::constants::TILE;
 use crate::error::{Error, Result};
 
 /// Largest number of workgroups per dispatch dimension in WebGPU's default limits.
@@ -38,6 +39,8 @@ pub struct Gpu {
     pub(super) segments: u32,
     /// One of [`ROWS`].
     rows: u32,
+    /// Whether a tile's threads are one subgroup and may share through it.
+    subgroups: bool,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
     pub(super) list_limit: u32,
 }
@@ -96,6 +99,17 @@ fn rank(kind: wgpu::DeviceType) -> u32 {
     }
 }
 
+/// Pairs of a tile that one dispatch may walk: llvmpipe leaves every loop once an invocation has
+/// done 65 535 rounds of all its loops together. With subgroups rasterize_backward does 9 per 8 pairs,
+/// and loops over a splat's sums, should they not be unrolled; without, up to 25 per pair.
+fn list_limit(software: bool, subgroups: bool) -> u32 {
+    match (software, subgroups) {
+        (false, _) => u32::MAX,
+        (true, true) => 32_768,
+        (true, false) => 2048,
+    }
+}
+
 impl Gpu {
     /// Opens the best adapter: a real GPU where there is one, else, if `software_allowed`, a
     /// software one such as lavapipe.
@@ -130,6 +144,13 @@ impl Gpu {
         };
         let info = adapter.get_info();
         let offered = adapter.limits();
+        let software = info.device_type == wgpu::DeviceType::Cpu;
+        let rows = ROWS[usize::from(software)];
+        // Only where it was measured to pay.
+        let threads = TILE * TILE / 4 / rows;
+        let subgroups = software
+            && adapter.features().contains(wgpu::Features::SUBGROUP)
+            && (info.subgroup_min_size, info.subgroup_max_size) == (threads, threads);
         // Defaults everywhere but for the sizes, where scenes profit from what the adapter has.
         let required_limits = wgpu::Limits {
             max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
@@ -140,6 +161,11 @@ impl Gpu {
         let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("splat_render"),
             required_limits,
+            required_features: if subgroups {
+                wgpu::Features::SUBGROUP
+            } else {
+                wgpu::Features::empty()
+            },
             memory_hints: wgpu::MemoryHints::Performance,
             ..Default::default()
         }))
@@ -167,7 +193,6 @@ impl Gpu {
             }
         });
         let layouts = SOURCES.iter().map(|source| bind_group_layout(&device, source)).collect();
-        let software = info.device_type == wgpu::DeviceType::Cpu;
         let gpu = Self {
             device,
             queue,
@@ -178,10 +203,9 @@ impl Gpu {
             binding_limit,
             // A few segments per core keep a CPU busy; a GPU needs many workgroups.
             segments: if software { 16 } else { 256 },
-            rows: ROWS[usize::from(software)],
-            // llvmpipe leaves every loop once an invocation has done 65 535 rounds of all its loops
-            // together; rasterize_backward does up to 13 per pair.
-            list_limit: if software { 4096 } else { u32::MAX },
+            rows,
+            subgroups,
+            list_limit: list_limit(software, subgroups),
         };
         gpu.check()?;
         Ok(gpu)
@@ -193,6 +217,16 @@ impl Gpu {
     pub fn with_binding_limit(mut self, bytes: u64) -> Self {
         let most = self.device.limits().max_storage_buffer_binding_size;
         self.binding_limit = bytes.clamp(65_536, most);
+        self
+    }
+
+    /// Keeps tiles from sharing through subgroups, which not every device can, so that tests see
+    /// both ways.
+    #[must_use]
+    pub fn without_subgroups(mut self) -> Self {
+        self.subgroups = false;
+        self.list_limit = list_limit(self.is_software(), false);
+        self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
         self
     }
 
@@ -288,7 +322,7 @@ impl Gpu {
             let source = Source::named(file);
             let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(file),
-                source: wgpu::ShaderSource::Wgsl(source.text(self.rows).into()),
+                source: wgpu::ShaderSource::Wgsl(source.text(self.rows, self.subgroups).into()),
             });
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(file),

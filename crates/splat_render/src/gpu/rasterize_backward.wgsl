@@ -1,6 +1,7 @@
 // rasterize_backward: gradients of the picture to a gradient per (splat, tile) pair, each in its
 // own slot. Walks front to back like rasterize, so that both round and stop alike; what lies
-// behind the current splat is what is left of the pixel's total. Follows shared.wgsl.
+// behind the current splat is what is left of the pixel's total. Follows shared.wgsl and
+// tile_memory.wgsl with tile_sums_memory.wgsl, or their twins for subgroups.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;
@@ -20,15 +21,8 @@
 // Between such dispatches: transmittance, negative where the pixel has stopped.
 @group(0) @binding(9) var<storage, read_write> transmittances: array<f32>;
 
+// In one row: llvmpipe fills its vectors along x alone.
 const THREADS = 64u / ROWS;
-// Splats between two barriers: 60 sums occupy 32 threads almost twice.
-const BATCH = 6u;
-// One more than the threads, so that a column's entries lie in different memory banks.
-const STRIDE = THREADS + 1u;
-
-// [splat of the batch][entry][thread]
-var<workgroup> partials: array<f32, BATCH * SUMS * STRIDE>;
-var<workgroup> any_live: u32;
 
 // Four neighbouring pixels.
 struct Quad {
@@ -146,11 +140,30 @@ fn total(x: vec4<f32>) -> f32 {
     return (x.x + x.y) + (x.z + x.w);
 }
 
-@compute @workgroup_size(4, TILE / ROWS)
+// The sums of a thread, in the order of a slot.
+fn totals_of(sums: Sums) -> array<f32, SUMS> {
+    var out: array<f32, SUMS>;
+    out[0] = total(sums.u);
+    out[1] = total(sums.v);
+    out[2] = total(sums.uu);
+    out[3] = total(sums.uv);
+    out[4] = total(sums.vv);
+    out[5] = total(sums.depth);
+    out[6] = total(sums.red);
+    out[7] = total(sums.green);
+    out[8] = total(sums.blue);
+    out[9] = total(sums.opacity);
+    if SUMS == GRADIENT_ABSOLUTE {
+        out[SUMS - 2u] = total(sums.absolute_x);
+        out[SUMS - 1u] = total(sums.absolute_y);
+    }
+    return out;
+}
+
+@compute @workgroup_size(THREADS)
 fn rasterize_backward(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_id) local: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
     let relative = workgroup.y * groups.x + workgroup.x;
@@ -165,8 +178,8 @@ fn rasterize_backward(
     }
     let begin = list + chunk.list_begin;
     let end = list + min(chunk.list_end, length);
-    let x = (tile % view.tiles_x) * TILE + 4u * local.x;
-    let y = (tile / view.tiles_x) * TILE + ROWS * local.y;
+    let x = (tile % view.tiles_x) * TILE + 4u * (thread % 4u);
+    let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     // As in rasterize: ROWS is a constant and unused rows cost nothing.
     var q0 = load_quad(x, y);
     var q1: Quad;
@@ -191,8 +204,12 @@ fn rasterize_backward(
     }
     for (var batch = begin; batch < end; batch += BATCH) {
         let count = min(BATCH, end - batch);
+        var ahead = read_ahead(batch, end, thread);
         for (var b = 0u; b < count; b++) {
-            let splat = splats2d[splat_from_pair[batch + b]];
+            if AHEAD == 1u {
+                ahead = read_ahead(batch + b, end, thread);
+            }
+            let splat = splat_of(ahead, b);
             var sums = Sums();
             accumulate(&q0, splat, &sums);
             if ROWS > 1u {
@@ -208,21 +225,7 @@ fn rasterize_backward(
                 accumulate(&q6, splat, &sums);
                 accumulate(&q7, splat, &sums);
             }
-            let at = b * SUMS * STRIDE + thread;
-            partials[at] = total(sums.u);
-            partials[at + STRIDE] = total(sums.v);
-            partials[at + 2u * STRIDE] = total(sums.uu);
-            partials[at + 3u * STRIDE] = total(sums.uv);
-            partials[at + 4u * STRIDE] = total(sums.vv);
-            partials[at + 5u * STRIDE] = total(sums.depth);
-            partials[at + 6u * STRIDE] = total(sums.red);
-            partials[at + 7u * STRIDE] = total(sums.green);
-            partials[at + 8u * STRIDE] = total(sums.blue);
-            partials[at + 9u * STRIDE] = total(sums.opacity);
-            if SUMS == GRADIENT_ABSOLUTE {
-                partials[at + 10u * STRIDE] = total(sums.absolute_x);
-                partials[at + 11u * STRIDE] = total(sums.absolute_y);
-            }
+            keep_sums(b, totals_of(sums), thread);
         }
         var live = q0.live;
         if ROWS > 1u {
@@ -234,22 +237,9 @@ fn rasterize_backward(
         if ROWS > 4u {
             live = live | q4.live | q5.live | q6.live | q7.live;
         }
-        if any(live) {
-            any_live = 1u;
-        }
-        let goes_on = workgroupUniformLoad(&any_live);
-        for (var entry = thread; entry < count * SUMS; entry += THREADS) {
-            var sum = 0.0;
-            for (var k = 0u; k < THREADS; k++) {
-                sum += partials[entry * STRIDE + k];
-            }
-            slots[slot_from_pair[batch + entry / SUMS] * SUMS + entry % SUMS] = sum;
-        }
-        if goes_on == 0u {
+        if !write_sums(batch, count, any(live), thread) {
             break;
         }
-        any_live = 0u;
-        workgroupBarrier();
     }
     if length > chunk.list_end {
         keep(q0, x, y);

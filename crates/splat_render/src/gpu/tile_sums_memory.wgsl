@@ -1,0 +1,37 @@
+// Sums over the threads of a tile, on any device: through workgroup memory, for a batch of splats
+// between two barriers.
+
+// 60 sums occupy 32 threads almost twice.
+const BATCH = 6u;
+// One more than the threads, so that a column's entries lie in different memory banks.
+const STRIDE = THREADS + 1u;
+
+// [splat of the batch][entry][thread]
+var<workgroup> partials: array<f32, BATCH * SUMS * STRIDE>;
+var<workgroup> any_live: u32;
+
+fn keep_sums(b: u32, sums: array<f32, SUMS>, thread: u32) {
+    var own = sums;
+    for (var entry = 0u; entry < SUMS; entry++) {
+        partials[(b * SUMS + entry) * STRIDE + thread] = own[entry];
+    }
+}
+
+// Writes the sums of a batch to its slots; whether any thread is live.
+fn write_sums(batch: u32, count: u32, live: bool, thread: u32) -> bool {
+    if live {
+        any_live = 1u;
+    }
+    let goes_on = workgroupUniformLoad(&any_live);
+    for (var entry = thread; entry < count * SUMS; entry += THREADS) {
+        var sum = 0.0;
+        for (var k = 0u; k < THREADS; k++) {
+            sum += partials[entry * STRIDE + k];
+        }
+        slots[slot_from_pair[batch + entry / SUMS] * SUMS + entry % SUMS] = sum;
+    }
+    workgroupBarrier();
+    any_live = 0u;
+    workgroupBarrier();
+    return goes_on == 1u;
+}
