@@ -62,12 +62,12 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
     Capture { targets, cameras, start }
 }
 
-fn input(capture: &Capture, step: u32, noise: f32) -> StepInput<'_> {
+fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
     let view = step as usize % capture.cameras.len();
     let t = step as f32 * 0.37;
     StepInput {
         view,
-        camera: &capture.cameras[view],
+        camera: capture.cameras[view],
         // Photos with alpha stand on a background that moves, the others on black.
         background: if view.is_multiple_of(2) {
             [t.fract(), (2.0 * t).fract(), 0.5]
@@ -220,4 +220,38 @@ fn missing_splats_photos_and_sizes_are_named() {
     let wrong = StepInput { view: 3, ..input(&capture, 1, 0.0) };
     let error = device.step(&wrong).unwrap_err().to_string();
     assert!(error.starts_with("view: "), "{error}");
+}
+
+/// A step makes no buffer, bind group or pipeline, and what a fit holds per splat stays within its
+/// stated sum.
+#[test]
+fn steps_allocate_nothing_and_memory_grows_as_stated() {
+    let bytes_of = |splats: usize| {
+        let capture = capture(5, &[(64, 48), (50, 50)], splats);
+        let gpu = Arc::new(gpu());
+        let mut fit = GpuFit::new(Arc::clone(&gpu));
+        fit.set_targets(capture.targets.clone()).unwrap();
+        fit.upload(&capture.start).unwrap();
+        let (_, bytes) = gpu.made();
+        for step in 1..=10 {
+            fit.step(&input(&capture, step, 0.0)).unwrap();
+        }
+        // The state on the device is read for density control and checkpoints, not in steps.
+        fit.loss().unwrap();
+        let (made, _) = gpu.made();
+        for step in 11..=100 {
+            fit.step(&input(&capture, step, 0.0)).unwrap();
+        }
+        let (made_later, _) = gpu.made();
+        assert_eq!(made_later, made, "steps 11 to 100 made buffers, bind groups or pipelines");
+        bytes
+    };
+    let (few, many) = (2000, 6000);
+    let per_splat = (bytes_of(many) - bytes_of(few)) as f64 / (many - few) as f64;
+    // 11 floats of geometry and 12 of colour (SH 1): values, gradient and two moments; statistics,
+    // 2D splat and its gradient, depth keys, order and offsets; room for 4 pairs of 60 bytes.
+    let parameters = 4.0 * (11.0 + 12.0);
+    let stated = 4.0 * parameters + 4.0 * (3.0 + 12.0 + 10.0 + 2.0 + 2.0 + 1.0) + 4.0 * 60.0;
+    println!("{per_splat:.1} bytes per splat, stated {stated}");
+    assert!(per_splat <= stated + 2.0, "{per_splat} bytes per splat, stated {stated}");
 }

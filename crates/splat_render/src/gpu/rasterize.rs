@@ -111,11 +111,11 @@ pub(super) fn rasterize_ops(
                 pass.into(),
                 splats2d.into(),
                 (&pairs.tile_begin).into(),
-                (&pairs.splat_from_pair).into(),
+                pairs.splat_from_pair(chunk.tiles()).into(),
                 picture.into(),
                 depths.into(),
             ],
-            Gpu::groups(chunk.tiles(), 1),
+            gpu.groups(chunk.tiles(), 1),
         )
     };
     chunk.passes.iter().map(op).collect()

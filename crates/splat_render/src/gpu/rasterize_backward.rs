@@ -49,14 +49,14 @@ pub(super) fn rasterize_backward_ops(
                 pass.into(),
                 splats2d.into(),
                 (&pairs.tile_begin).into(),
-                (&pairs.splat_from_pair).into(),
+                pairs.splat_from_pair(chunk.tiles()).into(),
                 pairs.slot_from_pair(chunk.tiles()).into(),
                 (&buffers.v_picture).into(),
                 (&buffers.totals).into(),
                 (&buffers.slots).into(),
                 (&buffers.transmittances).into(),
             ],
-            Gpu::groups(chunk.tiles(), 1),
+            gpu.groups(chunk.tiles(), 1),
         )
     }));
     ops.push(gpu.op(
@@ -70,7 +70,7 @@ pub(super) fn rasterize_backward_ops(
             (&buffers.slots).into(),
             (&buffers.v_splats2d).into(),
         ],
-        Gpu::groups(chunk.chunk.splats, 64),
+        gpu.groups(chunk.chunk.splats, 64),
     ));
     ops
 }
