@@ -17,9 +17,10 @@ use crate::error::{Error, Result};
 /// Largest number of workgroups per dispatch dimension in WebGPU's default limits.
 const GROUPS_MAX: u32 = 65_535;
 
-/// What new buffers hold in builds with debug assertions: a NaN as a float, far out as an index.
+/// What new buffers hold in builds with debug assertions: 1.5e9 as a float, far out as an index. A
+/// NaN would not show in gradients, which are set to zero where they are not finite.
 #[cfg(debug_assertions)]
-const POISON: u32 = 0x7fc0_dead;
+const POISON: u32 = 0x4ead_beef;
 
 /// Smallest buffer: large enough for one element of any binding.
 const BUFFER_MIN: u64 = 256;
