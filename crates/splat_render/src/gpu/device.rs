@@ -330,6 +330,13 @@ impl Gpu {
         self.buffer(label, bytes)
     }
 
+    /// Room for what a pixel keeps between dispatches that walk a part of its tile's list each;
+    /// empty where one walks all.
+    pub(super) fn transmittances(&self, pixels: u64) -> Result<wgpu::Buffer> {
+        let floats = if self.list_limit == u32::MAX { 0 } else { pixels };
+        self.bindable("transmittances", 4 * floats)
+    }
+
     /// A buffer with the given contents.
     pub(super) fn upload<T: bytemuck::NoUninit>(
         &self,

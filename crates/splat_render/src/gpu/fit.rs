@@ -4,6 +4,12 @@
 //! Buffers for (splat, tile) pairs have a capacity. A step that needs more finds out on the device
 //! and leaves the state as it was, as do the steps after it; the host looks at that flag now and
 //! then, makes room and repeats those steps, so that no step waits for a read-back.
+//!
+//! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P, their
+//! gradient and two moments make 4 P, statistics, 2D splats, their gradients and the depth order 120
+//! bytes. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
+//! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
+//! slopes of SSIM; a photo 4 per pixel, and 4 more for weights. A test holds the sum per splat.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -216,7 +222,7 @@ impl Frame {
             depths: gpu.bindable("depths", 4 * pixels)?,
             v_picture: gpu.bindable("v_picture", 16 * pixels)?,
             totals: gpu.bindable("totals", 4 * pixels)?,
-            transmittances: gpu.bindable("transmittances", 4 * pixels)?,
+            transmittances: gpu.transmittances(pixels)?,
             loss: LossBuffers::new(gpu, width, height)?,
             chunks: std::iter::once(0..tile_count(width, height)).collect(),
             ops: Vec::new(),

@@ -107,7 +107,7 @@ pub(super) fn rasterize_backward(
     let buffers = BackwardBuffers {
         v_picture: gpu.upload("v_picture", &v_picture)?,
         totals: gpu.upload("totals", &totals)?,
-        transmittances: gpu.buffer("transmittances", 4 * pixels as u64)?,
+        transmittances: gpu.transmittances(pixels as u64)?,
         slots: gpu.bindable("gradient slots", row * u64::from(binned.capacity))?,
         v_splats2d: gpu.bindable("v_splats2d", row * u64::from(binned.splats))?,
     };

@@ -140,26 +140,6 @@ fn total(x: vec4<f32>) -> f32 {
     return (x.x + x.y) + (x.z + x.w);
 }
 
-// The sums of a thread, in the order of a slot.
-fn totals_of(sums: Sums) -> array<f32, SUMS> {
-    var out: array<f32, SUMS>;
-    out[0] = total(sums.u);
-    out[1] = total(sums.v);
-    out[2] = total(sums.uu);
-    out[3] = total(sums.uv);
-    out[4] = total(sums.vv);
-    out[5] = total(sums.depth);
-    out[6] = total(sums.red);
-    out[7] = total(sums.green);
-    out[8] = total(sums.blue);
-    out[9] = total(sums.opacity);
-    if SUMS == GRADIENT_ABSOLUTE {
-        out[SUMS - 2u] = total(sums.absolute_x);
-        out[SUMS - 1u] = total(sums.absolute_y);
-    }
-    return out;
-}
-
 @compute @workgroup_size(THREADS)
 fn rasterize_backward(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -225,7 +205,20 @@ fn rasterize_backward(
                 accumulate(&q6, splat, &sums);
                 accumulate(&q7, splat, &sums);
             }
-            keep_sums(b, totals_of(sums), thread);
+            keep_sum(b, 0u, total(sums.u), thread);
+            keep_sum(b, 1u, total(sums.v), thread);
+            keep_sum(b, 2u, total(sums.uu), thread);
+            keep_sum(b, 3u, total(sums.uv), thread);
+            keep_sum(b, 4u, total(sums.vv), thread);
+            keep_sum(b, 5u, total(sums.depth), thread);
+            keep_sum(b, 6u, total(sums.red), thread);
+            keep_sum(b, 7u, total(sums.green), thread);
+            keep_sum(b, 8u, total(sums.blue), thread);
+            keep_sum(b, 9u, total(sums.opacity), thread);
+            if SUMS == GRADIENT_ABSOLUTE {
+                keep_sum(b, 10u, total(sums.absolute_x), thread);
+                keep_sum(b, 11u, total(sums.absolute_y), thread);
+            }
         }
         var live = q0.live;
         if ROWS > 1u {

@@ -10,11 +10,9 @@ const STRIDE = THREADS + 1u;
 var<workgroup> partials: array<f32, BATCH * SUMS * STRIDE>;
 var<workgroup> any_live: u32;
 
-fn keep_sums(b: u32, sums: array<f32, SUMS>, thread: u32) {
-    var own = sums;
-    for (var entry = 0u; entry < SUMS; entry++) {
-        partials[(b * SUMS + entry) * STRIDE + thread] = own[entry];
-    }
+// Takes a thread's sum for entry `entry` of a batch's splat `b`.
+fn keep_sum(b: u32, entry: u32, sum: f32, thread: u32) {
+    partials[(b * SUMS + entry) * STRIDE + thread] = sum;
 }
 
 // Writes the sums of a batch to its slots; whether any thread is live.

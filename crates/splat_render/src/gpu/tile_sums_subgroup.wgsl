@@ -5,13 +5,11 @@ const BATCH = AHEAD;
 
 var<private> kept: array<f32, SUMS>;
 
-fn keep_sums(b: u32, sums: array<f32, SUMS>, thread: u32) {
-    var own = sums;
-    for (var entry = 0u; entry < SUMS; entry++) {
-        let sum = subgroupAdd(own[entry]);
-        if thread == b {
-            kept[entry] = sum;
-        }
+// Takes a thread's sum for entry `entry` of a batch's splat `b`.
+fn keep_sum(b: u32, entry: u32, sum: f32, thread: u32) {
+    let all = subgroupAdd(sum);
+    if thread == b {
+        kept[entry] = all;
     }
 }
 
