@@ -2,7 +2,7 @@
 
 mod common;
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use common::*;
 use rand::Rng;
@@ -62,12 +62,12 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
     Capture { targets, cameras, start }
 }
 
-fn input(capture: &Capture, step: u32, noise: f32) -> StepInput<'_> {
+fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
     let view = step as usize % capture.cameras.len();
     let t = step as f32 * 0.37;
     StepInput {
         view,
-        camera: &capture.cameras[view],
+        camera: capture.cameras[view],
         // Photos with alpha stand on a background that moves, the others on black.
         background: if view.is_multiple_of(2) {
             [t.fract(), (2.0 * t).fract(), 0.5]
@@ -110,12 +110,19 @@ fn run(
     (device.download().unwrap(), losses)
 }
 
-fn gpu_fit(gpu: Gpu) -> GpuFit {
-    GpuFit::new(Arc::new(gpu))
+fn gpu_fit() -> GpuFit {
+    GpuFit::new(shared())
 }
 
 fn gpu() -> Gpu {
     Gpu::new(true).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// One device for the tests that change nothing about it: software adapters compile kernels for
+/// seconds.
+fn shared() -> Arc<Gpu> {
+    static GPU: OnceLock<Arc<Gpu>> = OnceLock::new();
+    Arc::clone(GPU.get_or_init(|| Arc::new(gpu())))
 }
 
 /// PSNR over all photos, rendered by the reference on black.
@@ -154,7 +161,7 @@ fn one_step_changes_the_state_as_on_the_cpu() {
     let capture = capture(1, &[(37, 29), (20, 50), (33, 16)], 80);
     for (steps, noise) in [(1, 0.0), (2, 500.0), (3, 0.0)] {
         let (expected, expected_loss) = run(&mut CpuFit::default(), &capture, steps, noise);
-        let (got, loss) = run(&mut gpu_fit(gpu()), &capture, steps, noise);
+        let (got, loss) = run(&mut gpu_fit(), &capture, steps, noise);
         assert!((loss[0] - expected_loss[0]).abs() < 1e-5, "{loss:?} vs {expected_loss:?}");
         let close = |what: &str, got: &[f32], expected: &[f32], bound: f64| {
             let off = difference1(got, &widen1(expected), &[]);
@@ -186,13 +193,13 @@ fn a_fit_ends_as_on_the_cpu_and_repeats_itself() {
     let capture = capture(2, &[(64, 64); 6], 150);
     let before = psnr(&capture, &capture.start);
     let (expected, expected_losses) = run(&mut CpuFit::default(), &capture, 200, 0.0);
-    let (got, losses) = run(&mut gpu_fit(gpu()), &capture, 200, 0.0);
+    let (got, losses) = run(&mut gpu_fit(), &capture, 200, 0.0);
     let (cpu_psnr, gpu_psnr) = (psnr(&capture, &expected), psnr(&capture, &got));
     println!("start {before:.3} dB, cpu {cpu_psnr:.3} dB, gpu {gpu_psnr:.3} dB");
     println!("losses: cpu {expected_losses:?}, gpu {losses:?}");
     assert!(cpu_psnr > before + 3.0, "the fit must improve the picture");
     assert!((cpu_psnr - gpu_psnr).abs() <= 0.1);
-    let (again, losses_again) = run(&mut gpu_fit(gpu()), &capture, 200, 0.0);
+    let (again, losses_again) = run(&mut gpu_fit(), &capture, 200, 0.0);
     assert!(got == again && losses == losses_again, "the same fit twice gave other bits");
 }
 
@@ -203,16 +210,16 @@ fn running_out_of_room_for_pairs_changes_nothing() {
     for scale in capture.start.splats.scales.as_flattened_mut() {
         *scale += 2.6;
     }
-    let (whole, losses) = run(&mut gpu_fit(gpu()), &capture, 20, 100.0);
+    let (whole, losses) = run(&mut gpu_fit(), &capture, 20, 100.0);
     let small = gpu().with_binding_limit(128 * 96 * 36);
-    let (parts, losses_parts) = run(&mut gpu_fit(small), &capture, 20, 100.0);
+    let (parts, losses_parts) = run(&mut GpuFit::new(Arc::new(small)), &capture, 20, 100.0);
     assert!(whole == parts && losses == losses_parts, "a smaller device gave other bits");
 }
 
 #[test]
 fn missing_splats_photos_and_sizes_are_named() {
     let capture = capture(4, &[(20, 20)], 5);
-    let mut device = gpu_fit(gpu());
+    let mut device = gpu_fit();
     device.set_targets(capture.targets.clone()).unwrap();
     let error = device.step(&input(&capture, 1, 0.0)).unwrap_err().to_string();
     assert!(error.starts_with("splats: "), "{error}");
@@ -220,4 +227,40 @@ fn missing_splats_photos_and_sizes_are_named() {
     let wrong = StepInput { view: 3, ..input(&capture, 1, 0.0) };
     let error = device.step(&wrong).unwrap_err().to_string();
     assert!(error.starts_with("view: "), "{error}");
+}
+
+/// A step makes no buffer, bind group or pipeline, and what a fit holds per splat stays within its
+/// stated sum.
+#[test]
+fn steps_allocate_nothing_and_memory_grows_as_stated() {
+    // Its own device, since it counts what is made.
+    let gpu = Arc::new(gpu());
+    let bytes_of = |splats: usize| {
+        let capture = capture(5, &[(64, 48), (50, 50)], splats);
+        let (_, before) = gpu.made();
+        let mut fit = GpuFit::new(Arc::clone(&gpu));
+        fit.set_targets(capture.targets.clone()).unwrap();
+        fit.upload(&capture.start).unwrap();
+        let (_, bytes) = gpu.made();
+        for step in 1..=10 {
+            fit.step(&input(&capture, step, 0.0)).unwrap();
+        }
+        // The state on the device is read for density control and checkpoints, not in steps.
+        fit.loss().unwrap();
+        let (made, _) = gpu.made();
+        for step in 11..=100 {
+            fit.step(&input(&capture, step, 0.0)).unwrap();
+        }
+        let (made_later, _) = gpu.made();
+        assert_eq!(made_later, made, "steps 11 to 100 made buffers, bind groups or pipelines");
+        bytes - before
+    };
+    let (few, many) = (1500, 3000);
+    let per_splat = (bytes_of(many) - bytes_of(few)) as f64 / (many - few) as f64;
+    // 11 floats of geometry and 12 of colour (SH 1): values, gradient and two moments; statistics,
+    // 2D splat and its gradient, depth keys, order and offsets; room for 4 pairs of 60 bytes.
+    let parameters = 4.0 * (11.0 + 12.0);
+    let stated = 4.0 * parameters + 4.0 * (3.0 + 12.0 + 10.0 + 2.0 + 2.0 + 1.0) + 4.0 * 60.0;
+    println!("{per_splat:.1} bytes per splat, stated {stated}");
+    assert!(per_splat <= stated + 2.0, "{per_splat} bytes per splat, stated {stated}");
 }

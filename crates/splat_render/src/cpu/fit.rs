@@ -55,11 +55,11 @@ impl FitDevice for CpuFit {
         Ok(self.state.clone())
     }
 
-    fn step(&mut self, input: &StepInput<'_>) -> Result<()> {
+    fn step(&mut self, input: &StepInput) -> Result<()> {
         let target = self.targets.get(input.view).ok_or_else(|| {
             Error::argument("view", format!("{} is not one of the photos", input.view))
         })?;
-        let view = View::new(input.camera, &ProjectOptions::default());
+        let view = View::new(&input.camera, &ProjectOptions::default());
         let (width, height) = (target.width, target.height);
 
         // project and the first half of bin
@@ -187,7 +187,7 @@ impl BlockRates {
 
 impl CpuFit {
     /// project_backward, Adam, noise and density statistics.
-    fn update(&mut self, view: &View, input: &StepInput<'_>, size: [f32; 2]) {
+    fn update(&mut self, view: &View, input: &StepInput, size: [f32; 2]) {
         let FitState { splats: values, first, second, stats } = &mut self.state;
         let n = values.len();
         let stride = values.stride();
@@ -300,7 +300,7 @@ fn explore(
     quat: [f32; 4],
     log_scales: [f32; 3],
     logit: f32,
-    input: &StepInput<'_>,
+    input: &StepInput,
     i: usize,
 ) -> [f32; 3] {
     let opacity = 1.0 / (1.0 + (-logit).exp());

@@ -90,11 +90,11 @@ pub const ADAM: (f32, f32, f32) = (0.9, 0.999, 1e-15);
 
 /// What one step is to do.
 #[derive(Debug, Clone, Copy)]
-pub struct StepInput<'a> {
+pub struct StepInput {
     /// Which target.
     pub view: usize,
     /// Its camera, relative to the scene's origin.
-    pub camera: &'a Camera,
+    pub camera: Camera,
     /// Render background, and what a target with alpha is composited over.
     pub background: [f32; 3],
     /// SH degree in use.
@@ -151,7 +151,7 @@ pub trait FitDevice: Send {
 
     /// One step: project, bin, rasterize, loss, rasterize_backward, project_backward, Adam, noise,
     /// density statistics.
-    fn step(&mut self, input: &StepInput<'_>) -> Result<()>;
+    fn step(&mut self, input: &StepInput) -> Result<()>;
 
     /// Loss of the last step (before its update, regularisers not included).
     fn loss(&mut self) -> Result<f32>;

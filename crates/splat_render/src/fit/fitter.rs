@@ -165,7 +165,7 @@ impl Fitter {
         let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();
         let input = StepInput {
             view,
-            camera: &self.cameras[view],
+            camera: self.cameras[view],
             background,
             sh_degree: (step / config.sh_interval).min(config.sh_degree),
             rates,

@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use super::device::{Gpu, Op};
-use super::layout::{ALL_SPLATS, Chunk, ChunkCount, GRADIENT, SortPass, StatusHead};
+use super::layout::{ALL_SPLATS, Chunk, ChunkCount, SortPass, StatusHead};
 use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
@@ -35,8 +35,6 @@ pub(super) struct PairBins {
     keys: [wgpu::Buffer; 2],
     slots: [wgpu::Buffer; 2],
     splat_from_slot: wgpu::Buffer,
-    /// The splat of each pair in tile order.
-    pub splat_from_pair: wgpu::Buffer,
     /// Where each tile's pairs begin, and their number.
     pub tile_begin: wgpu::Buffer,
 }
@@ -77,9 +75,9 @@ pub(super) fn tile_count(width: u32, height: u32) -> u32 {
     width.div_ceil(TILE) * height.div_ceil(TILE)
 }
 
-/// Most pairs whose gradient slots can be bound at once.
-pub(super) fn pair_limit(gpu: &Gpu) -> u32 {
-    (gpu.binding_limit / (GRADIENT as u64 * 4)).min(u64::from(u32::MAX / 2)) as u32
+/// Most pairs whose gradient slots of so many floats can be bound at once.
+pub(super) fn pair_limit(gpu: &Gpu, slot_floats: usize) -> u32 {
+    (gpu.binding_limit / (slot_floats as u64 * 4)).min(u64::from(u32::MAX / 2)) as u32
 }
 
 impl SplatBins {
@@ -89,9 +87,7 @@ impl SplatBins {
         let pair = |label| -> Result<[wgpu::Buffer; 2]> {
             Ok([gpu.bindable(label, words(splats))?, gpu.bindable(label, words(splats))?])
         };
-        let bytes = size_of::<StatusHead>() as u64
-            + u64::from(chunks.max(1)) * size_of::<ChunkCount>() as u64;
-        let status = gpu.bindable("status", bytes)?;
+        let status = gpu.bindable("status", Self::status_bytes(chunks))?;
         let head = StatusHead { splats, step: 1, overflow: 0, unused: 0 };
         gpu.queue.write_buffer(&status, 0, bytemuck::bytes_of(&head));
         Ok(Self {
@@ -103,6 +99,11 @@ impl SplatBins {
             histogram: gpu.buffer("histogram", words(gpu.segments << BITS_PER_PASS))?,
             status,
         })
+    }
+
+    /// Bytes of [`Self::status`] for so many chunks.
+    pub fn status_bytes(chunks: u32) -> u64 {
+        size_of::<StatusHead>() as u64 + u64::from(chunks.max(1)) * size_of::<ChunkCount>() as u64
     }
 
     /// Splats by depth; what the sort leaves here, after an even number of passes.
@@ -128,7 +129,7 @@ impl SplatBins {
                 (&self.order[0]).into(),
                 (&self.offsets).into(),
             ],
-            Gpu::groups(self.splats, 256),
+            gpu.groups(self.splats, 256),
         );
         let mut ops = vec![keys];
         let passes = u32::BITS / BITS_PER_PASS;
@@ -161,7 +162,7 @@ impl SplatBins {
                     self.order().into(),
                     (&self.offsets).into(),
                 ],
-                Gpu::groups(self.splats, 256),
+                gpu.groups(self.splats, 256),
             ),
             gpu.op(Kernel::ScanSums, &scan, [gpu.segments, 1]),
             gpu.op(Kernel::ScanApply, &scan, [gpu.segments, 1]),
@@ -190,7 +191,7 @@ impl SplatBins {
                 (&pairs.slots[0]).into(),
                 (&pairs.splat_from_slot).into(),
             ],
-            Gpu::groups(self.splats, 64),
+            gpu.groups(self.splats, 64),
         )];
         let passes = sort_passes(chunk.tiles());
         let index = chunk.chunk.index;
@@ -206,7 +207,7 @@ impl SplatBins {
                 (&pairs.keys[last]).into(),
                 (&pairs.slots[last]).into(),
                 (&pairs.splat_from_slot).into(),
-                (&pairs.splat_from_pair).into(),
+                pairs.splat_from_pair(chunk.tiles()).into(),
                 (&pairs.tile_begin).into(),
             ],
             [groups, 1],
@@ -250,8 +251,9 @@ impl SplatBins {
         view: &wgpu::Buffer,
         splats2d: &wgpu::Buffer,
         tiles: u32,
+        slot_floats: usize,
     ) -> Result<(Vec<Range<u32>>, u32)> {
-        let limit = pair_limit(gpu);
+        let limit = pair_limit(gpu, slot_floats);
         let (mut open, mut done) = (std::iter::once(0..tiles).collect::<Vec<_>>(), Vec::new());
         let mut capacity = 0;
         while let Some(range) = open.pop() {
@@ -311,9 +313,14 @@ impl PairBins {
             keys: [buffer("tile keys")?, buffer("tile keys")?],
             slots: [buffer("slots")?, buffer("slots")?],
             splat_from_slot: buffer("splat_from_slot")?,
-            splat_from_pair: buffer("splat_from_pair")?,
             tile_begin: gpu.bindable("tile_begin", words(tiles) + 4)?,
         })
+    }
+
+    /// The splat of each pair in tile order, after a chunk of so many tiles was sorted: in the
+    /// buffer of keys that the sort's last pass has read and nothing needs any more.
+    pub fn splat_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
+        &self.keys[((sort_passes(tiles) + 1) % 2) as usize]
     }
 
     /// Slots in tile order, after a chunk of so many tiles was sorted.

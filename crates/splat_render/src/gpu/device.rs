@@ -5,15 +5,22 @@ use std::future::Future;
 use std::num::NonZeroU64;
 use std::ops::Range;
 use std::pin::pin;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::task::{Context, Poll, Waker};
 
 use super::layout::SPLATS_PER_GROUP;
 use super::shaders::{Access, Kernel, SOURCES, Source};
+use crate::constants::TILE;
 use crate::error::{Error, Result};
 
 /// Largest number of workgroups per dispatch dimension in WebGPU's default limits.
 const GROUPS_MAX: u32 = 65_535;
+
+/// What new buffers hold in builds with debug assertions: 1.5e9 as a float, far out as an index. A
+/// NaN would not show in gradients, which are set to zero where they are not finite.
+#[cfg(debug_assertions)]
+const POISON: u32 = 0x4ead_beef;
 
 /// Smallest buffer: large enough for one element of any binding.
 const BUFFER_MIN: u64 = 256;
@@ -32,12 +39,18 @@ pub struct Gpu {
     layouts: Vec<wgpu::BindGroupLayout>,
     /// First error that wgpu reported since the last check.
     failure: Arc<Mutex<Option<String>>>,
+    /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
+    made: [AtomicU64; 2],
     /// Most bytes that a storage binding may have.
     pub(super) binding_limit: u64,
+    /// Most workgroups in one dimension of a dispatch.
+    groups_max: u32,
     /// Workgroups that scans and sorts are cut into.
     pub(super) segments: u32,
     /// One of [`ROWS`].
     rows: u32,
+    /// Whether a tile's threads are one subgroup and may share through it.
+    subgroups: bool,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
     pub(super) list_limit: u32,
 }
@@ -96,6 +109,17 @@ fn rank(kind: wgpu::DeviceType) -> u32 {
     }
 }
 
+/// Pairs of a tile that one dispatch may walk: llvmpipe leaves every loop once an invocation has
+/// done 65 535 rounds of all its loops together. With subgroups rasterize_backward does 9 per 8 pairs,
+/// and loops over a splat's sums, should they not be unrolled; without, up to 25 per pair.
+fn list_limit(software: bool, subgroups: bool) -> u32 {
+    match (software, subgroups) {
+        (false, _) => u32::MAX,
+        (true, true) => 32_768,
+        (true, false) => 2048,
+    }
+}
+
 impl Gpu {
     /// Opens the best adapter: a real GPU where there is one, else, if `software_allowed`, a
     /// software one such as lavapipe.
@@ -130,6 +154,13 @@ impl Gpu {
         };
         let info = adapter.get_info();
         let offered = adapter.limits();
+        let software = info.device_type == wgpu::DeviceType::Cpu;
+        let rows = ROWS[usize::from(software)];
+        // Only where it was measured to pay.
+        let threads = TILE * TILE / 4 / rows;
+        let subgroups = software
+            && adapter.features().contains(wgpu::Features::SUBGROUP)
+            && (info.subgroup_min_size, info.subgroup_max_size) == (threads, threads);
         // Defaults everywhere but for the sizes, where scenes profit from what the adapter has.
         let required_limits = wgpu::Limits {
             max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
@@ -140,6 +171,11 @@ impl Gpu {
         let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("splat_render"),
             required_limits,
+            required_features: if subgroups {
+                wgpu::Features::SUBGROUP
+            } else {
+                wgpu::Features::empty()
+            },
             memory_hints: wgpu::MemoryHints::Performance,
             ..Default::default()
         }))
@@ -167,7 +203,6 @@ impl Gpu {
             }
         });
         let layouts = SOURCES.iter().map(|source| bind_group_layout(&device, source)).collect();
-        let software = info.device_type == wgpu::DeviceType::Cpu;
         let gpu = Self {
             device,
             queue,
@@ -175,13 +210,14 @@ impl Gpu {
             pipelines: Kernel::ALL.iter().map(|_| OnceLock::new()).collect(),
             layouts,
             failure,
+            made: Default::default(),
             binding_limit,
+            groups_max: GROUPS_MAX,
             // A few segments per core keep a CPU busy; a GPU needs many workgroups.
             segments: if software { 16 } else { 256 },
-            rows: ROWS[usize::from(software)],
-            // llvmpipe leaves every loop once an invocation has done 65 535 rounds of all its loops
-            // together; rasterize_backward does up to 13 per pair.
-            list_limit: if software { 4096 } else { u32::MAX },
+            rows,
+            subgroups,
+            list_limit: list_limit(software, subgroups),
         };
         gpu.check()?;
         Ok(gpu)
@@ -196,6 +232,24 @@ impl Gpu {
         self
     }
 
+    /// Lowers the number of workgroups in one dimension of a dispatch, so that tests can see
+    /// dispatches spill into the second; 65 535 splats or tiles are many for a test.
+    #[must_use]
+    pub fn with_group_limit(mut self, groups: u32) -> Self {
+        self.groups_max = groups.clamp(1, GROUPS_MAX);
+        self
+    }
+
+    /// Keeps tiles from sharing through subgroups, which not every device can, so that tests see
+    /// both ways.
+    #[must_use]
+    pub fn without_subgroups(mut self) -> Self {
+        self.subgroups = false;
+        self.list_limit = list_limit(self.is_software(), false);
+        self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
+        self
+    }
+
     /// Name of the adapter and its driver.
     pub fn name(&self) -> String {
         format!("{} ({:?}, {})", self.info.name, self.info.backend, self.info.driver_info)
@@ -204,6 +258,17 @@ impl Gpu {
     /// Whether the adapter runs on the CPU.
     pub fn is_software(&self) -> bool {
         self.info.device_type == wgpu::DeviceType::Cpu
+    }
+
+    /// How many buffers, bind groups and pipelines were made so far, and how many bytes the buffers
+    /// have, dropped ones included. A fit's step makes none.
+    pub fn made(&self) -> (u64, u64) {
+        (self.made[0].load(Ordering::Relaxed), self.made[1].load(Ordering::Relaxed))
+    }
+
+    fn count(&self, bytes: u64) {
+        self.made[0].fetch_add(1, Ordering::Relaxed);
+        self.made[1].fetch_add(bytes, Ordering::Relaxed);
     }
 
     /// The error for a device that fails while running.
@@ -220,7 +285,7 @@ impl Gpu {
         failure.map_or(Ok(()), |what| Err(self.error(&what)))
     }
 
-    /// A zeroed buffer of at least `bytes`.
+    /// A buffer of at least `bytes`, with nothing of use in it.
     pub(super) fn buffer(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
         let size = bytes.max(BUFFER_MIN).next_multiple_of(4);
         if size > self.device.limits().max_buffer_size {
@@ -232,8 +297,18 @@ impl Gpu {
             usage: wgpu::BufferUsages::STORAGE
                 | wgpu::BufferUsages::COPY_SRC
                 | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
+            mapped_at_creation: cfg!(debug_assertions),
         });
+        self.count(size);
+        // wgpu hands out zeros, which would hide a read of what no kernel has written.
+        #[cfg(debug_assertions)]
+        {
+            if let Ok(mut view) = buffer.get_mapped_range_mut(..) {
+                let words = vec![POISON; size as usize / 4];
+                view.copy_from_slice(bytemuck::cast_slice(&words));
+            }
+            buffer.unmap();
+        }
         self.check()?;
         Ok(buffer)
     }
@@ -255,6 +330,13 @@ impl Gpu {
         self.buffer(label, bytes)
     }
 
+    /// Room for what a pixel keeps between dispatches that walk a part of its tile's list each;
+    /// empty where one walks all.
+    pub(super) fn transmittances(&self, pixels: u64) -> Result<wgpu::Buffer> {
+        let floats = if self.list_limit == u32::MAX { 0 } else { pixels };
+        self.bindable("transmittances", 4 * floats)
+    }
+
     /// A buffer with the given contents.
     pub(super) fn upload<T: bytemuck::NoUninit>(
         &self,
@@ -272,9 +354,11 @@ impl Gpu {
 
     /// A uniform buffer with the given contents.
     pub(super) fn uniform<T: bytemuck::NoUninit>(&self, contents: &T) -> wgpu::Buffer {
+        let size = size_of::<T>().next_multiple_of(16) as u64;
+        self.count(size);
         let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("uniform"),
-            size: size_of::<T>().next_multiple_of(16) as u64,
+            size,
             usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
@@ -286,9 +370,10 @@ impl Gpu {
         self.pipelines[kernel as usize].get_or_init(|| {
             let (file, entry) = kernel.entry();
             let source = Source::named(file);
+            self.count(0);
             let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(file),
-                source: wgpu::ShaderSource::Wgsl(source.text(self.rows).into()),
+                source: wgpu::ShaderSource::Wgsl(source.text(self.rows, self.subgroups).into()),
             });
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(file),
@@ -330,6 +415,7 @@ impl Gpu {
             })
             .collect();
         let pipeline = self.pipeline(kernel).clone();
+        self.count(0);
         let bind_group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some(kernel.entry().1),
             layout: self.layout(kernel.entry().0),
@@ -339,16 +425,17 @@ impl Gpu {
     }
 
     /// Workgroups for `count` invocations or tiles, spilling into y past the limit of x.
-    pub(super) fn groups(count: u32, per_group: u32) -> [u32; 2] {
+    pub(super) fn groups(&self, count: u32, per_group: u32) -> [u32; 2] {
         let groups = count.div_ceil(per_group).max(1);
-        let x = groups.min(GROUPS_MAX);
+        let x = groups.min(self.groups_max);
         [x, groups.div_ceil(x)]
     }
 
     /// Splats `begin..end` of each dispatch, so that `bytes_per_splat` times their number can be
     /// bound at once.
     pub(super) fn windows(&self, splats: u32, bytes_per_splat: u64) -> Vec<Range<u32>> {
-        let fit = (self.binding_limit / bytes_per_splat).min(u64::from(GROUPS_MAX) * 64) as u32;
+        let fit =
+            (self.binding_limit / bytes_per_splat).min(u64::from(self.groups_max) * 64) as u32;
         let step = (fit / SPLATS_PER_GROUP).max(1) * SPLATS_PER_GROUP;
         (0..splats).step_by(step as usize).map(|b| b..(b + step).min(splats)).collect()
     }
@@ -408,22 +495,35 @@ impl Gpu {
         }
         let mut staging = Vec::new();
         for &(buffer, bytes) in buffers {
-            let copy = self.device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("download"),
-                size: bytes.max(4),
-                usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ,
-                mapped_at_creation: false,
-            });
+            let copy = self.readable(bytes);
             if bytes > 0 {
                 encoder.copy_buffer_to_buffer(buffer, 0, &copy, 0, bytes);
             }
-            staging.push(copy);
+            staging.push((copy, bytes));
         }
         self.queue.submit([encoder.finish()]);
         self.check()?;
-        for copy in &staging {
+        let staging: Vec<_> = staging.iter().map(|(copy, bytes)| (copy, *bytes)).collect();
+        self.read(&staging)
+    }
+
+    /// A buffer that can be copied to and read by the host.
+    pub(super) fn readable(&self, bytes: u64) -> wgpu::Buffer {
+        let size = bytes.max(4);
+        self.count(size);
+        self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("download"),
+            size,
+            usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ,
+            mapped_at_creation: false,
+        })
+    }
+
+    /// Waits for all work and brings back the first `bytes` of each [`Self::readable`] buffer.
+    pub(super) fn read(&self, buffers: &[(&wgpu::Buffer, u64)]) -> Result<Vec<Vec<u8>>> {
+        for (buffer, _) in buffers {
             let failure = Arc::clone(&self.failure);
-            copy.slice(..).map_async(wgpu::MapMode::Read, move |result| {
+            buffer.slice(..).map_async(wgpu::MapMode::Read, move |result| {
                 if let Err(error) = result {
                     note(&failure, format!("gave no results back ({error})"));
                 }
@@ -434,11 +534,13 @@ impl Gpu {
             .map_err(|e| self.error(&format!("did not finish ({e})")))?;
         self.check()?;
         let mut out = Vec::new();
-        for (copy, &(_, bytes)) in staging.iter().zip(buffers) {
-            let view = copy
+        for &(buffer, bytes) in buffers {
+            let view = buffer
                 .get_mapped_range(..)
                 .map_err(|e| self.error(&format!("gave no results back ({e})")))?;
             out.push(view[..bytes as usize].to_vec());
+            drop(view);
+            buffer.unmap();
         }
         Ok(out)
     }

@@ -4,6 +4,12 @@
 //! Buffers for (splat, tile) pairs have a capacity. A step that needs more finds out on the device
 //! and leaves the state as it was, as do the steps after it; the host looks at that flag now and
 //! then, makes room and repeats those steps, so that no step waits for a read-back.
+//!
+//! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P, their
+//! gradient and two moments make 4 P, statistics, 2D splats, their gradients and the depth order 120
+//! bytes. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
+//! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
+//! slopes of SSIM; a photo 4 per pixel, and 4 more for weights. A test holds the sum per splat.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -20,17 +26,16 @@ use super::project_backward::{GradientBuffers, project_backward_ops};
 use super::rasterize::rasterize_ops;
 use super::rasterize_backward::{BackwardBuffers, rasterize_backward_ops};
 use super::shaders::Kernel;
-use crate::camera::Camera;
 use crate::error::{Error, Result};
-use crate::fit::{ADAM, DensityStats, FitDevice, FitState, Rates, SplatArrays, StepInput, Target};
+use crate::fit::{ADAM, DensityStats, FitDevice, FitState, SplatArrays, StepInput, Target};
 use crate::sh;
 use crate::stages::ProjectOptions;
 
 /// Steps that may be under way before the host looks whether all pairs fitted.
 const STEPS_AHEAD: usize = 16;
 
-/// Pairs per splat that buffers have room for at first.
-const PAIRS_PER_SPLAT: u32 = 8;
+/// Pairs per splat that buffers have room for at first; they grow by what a step needs.
+const PAIRS_PER_SPLAT: u32 = 4;
 
 /// Fits on the GPU.
 #[derive(Debug)]
@@ -44,7 +49,7 @@ pub struct GpuFit {
     step: wgpu::Buffer,
     scene: Option<Scene>,
     /// Steps not known to have been done.
-    pending: Vec<OwnedInput>,
+    pending: Vec<StepInput>,
     /// The last step: its photo and SSIM weight.
     last: Option<(usize, f32)>,
 }
@@ -88,45 +93,13 @@ struct Scene {
     v_splats2d: wgpu::Buffer,
     gradients: GradientBuffers,
     bins: SplatBins,
+    /// What the host reads of `bins.status`.
+    status_copy: wgpu::Buffer,
     /// Chunks that `bins` has counts for.
     chunks: u32,
     pairs: PairBins,
     slots: wgpu::Buffer,
     capacity: u32,
-}
-
-/// [`StepInput`] with its own camera, kept until the step is known to be done.
-#[derive(Debug, Clone)]
-struct OwnedInput {
-    view: usize,
-    camera: Camera,
-    background: [f32; 3],
-    sh_degree: u32,
-    rates: Rates,
-    step: u32,
-    ssim_weight: f32,
-    opacity_regularizer: f32,
-    scale_regularizer: f32,
-    noise: f32,
-    noise_seed: u32,
-}
-
-impl From<&StepInput<'_>> for OwnedInput {
-    fn from(input: &StepInput<'_>) -> Self {
-        Self {
-            view: input.view,
-            camera: *input.camera,
-            background: input.background,
-            sh_degree: input.sh_degree,
-            rates: input.rates,
-            step: input.step,
-            ssim_weight: input.ssim_weight,
-            opacity_regularizer: input.opacity_regularizer,
-            scale_regularizer: input.scale_regularizer,
-            noise: input.noise,
-            noise_seed: input.noise_seed,
-        }
-    }
 }
 
 fn upload_arrays(gpu: &Gpu, arrays: &SplatArrays) -> Result<SplatBuffers> {
@@ -163,7 +136,7 @@ impl Scene {
             .map(|i| [state.stats.grad_sum[i], state.stats.seen[i], state.stats.radius[i]])
             .collect();
         let first_guess = n.saturating_mul(PAIRS_PER_SPLAT).max(4096);
-        let capacity = capacity.max(first_guess).min(pair_limit(gpu));
+        let capacity = capacity.max(first_guess).min(pair_limit(gpu, GRADIENT));
         let (pairs, slots) = pair_buffers(gpu, capacity, tiles)?;
         let row = |floats: usize| u64::from(n) * floats as u64 * 4;
         Ok(Self {
@@ -175,16 +148,13 @@ impl Scene {
             v_splats2d: gpu.bindable("v_splats2d", row(GRADIENT))?,
             gradients: GradientBuffers::new(gpu, &splats)?,
             bins: SplatBins::new(gpu, n, chunks)?,
+            status_copy: gpu.readable(SplatBins::status_bytes(chunks)),
             chunks,
             pairs,
             slots,
             capacity,
             splats,
         })
-    }
-
-    fn status_bytes(&self) -> u64 {
-        (size_of::<StatusHead>() + self.chunks as usize * size_of::<ChunkCount>()) as u64
     }
 
     fn adam_ops(&self, gpu: &Gpu, view: &wgpu::Buffer, step: &wgpu::Buffer) -> Vec<Op> {
@@ -204,7 +174,7 @@ impl Scene {
                         &self.first.geometry,
                         &self.second.geometry,
                     ],
-                    Gpu::groups(count, SPLATS_PER_GROUP),
+                    gpu.groups(count, SPLATS_PER_GROUP),
                 ),
                 (
                     Kernel::AdamColors,
@@ -215,7 +185,7 @@ impl Scene {
                         &self.first.colors,
                         &self.second.colors,
                     ],
-                    Gpu::groups(count * colors as u32, 256),
+                    gpu.groups(count * colors as u32, 256),
                 ),
             ];
             for (kernel, floats, [values, gradient, first, second], groups) in kinds {
@@ -252,7 +222,7 @@ impl Frame {
             depths: gpu.bindable("depths", 4 * pixels)?,
             v_picture: gpu.bindable("v_picture", 16 * pixels)?,
             totals: gpu.bindable("totals", 4 * pixels)?,
-            transmittances: gpu.bindable("transmittances", 4 * pixels)?,
+            transmittances: gpu.transmittances(pixels)?,
             loss: LossBuffers::new(gpu, width, height)?,
             chunks: std::iter::once(0..tile_count(width, height)).collect(),
             ops: Vec::new(),
@@ -319,7 +289,9 @@ impl Frame {
             if chunks.len() > 1 {
                 bin(&mut ops, chunk);
             }
-            ops.extend(rasterize_backward_ops(gpu, view, chunk, splats2d, bins, pairs, &backward));
+            ops.extend(rasterize_backward_ops(
+                gpu, view, chunk, splats2d, bins, pairs, &backward, false,
+            ));
         }
         ops.extend(project_backward_ops(
             gpu,
@@ -357,7 +329,7 @@ impl GpuFit {
     }
 
     /// Submits one step without waiting for it.
-    fn enqueue(&mut self, input: &OwnedInput) -> Result<()> {
+    fn enqueue(&mut self, input: &StepInput) -> Result<()> {
         let scene = self
             .scene
             .as_ref()
@@ -416,7 +388,10 @@ impl GpuFit {
     /// Reads the flag and the counts of the last step.
     fn status(&self) -> Result<(StatusHead, Vec<ChunkCount>)> {
         let scene = self.scene()?;
-        let data = self.gpu.download(&[], &[(&scene.bins.status, scene.status_bytes())])?;
+        let bytes = SplatBins::status_bytes(scene.chunks);
+        let copy = Op::Copy(scene.bins.status.clone(), scene.status_copy.clone(), bytes);
+        self.gpu.submit(&[&[copy]])?;
+        let data = self.gpu.read(&[(&scene.status_copy, bytes)])?;
         let (head, counts) = data[0].split_at(size_of::<StatusHead>());
         Ok((bytemuck::pod_read_unaligned(head), bytemuck::pod_collect_to_vec(counts)))
     }
@@ -452,7 +427,7 @@ impl GpuFit {
     /// Makes room for the pairs that a step needs.
     fn grow(&mut self, frame: usize, counts: &[ChunkCount]) -> Result<()> {
         let gpu = Arc::clone(&self.gpu);
-        let limit = pair_limit(&gpu);
+        let limit = pair_limit(&gpu, GRADIENT);
         let mut chunks = Vec::new();
         let mut need = 0;
         for (range, count) in self.frames[frame].chunks.iter().zip(counts) {
@@ -485,6 +460,7 @@ impl GpuFit {
         if chunks.len() as u32 > scene.chunks {
             scene.chunks = chunks.len() as u32;
             scene.bins = SplatBins::new(&gpu, scene.splats.splats, scene.chunks)?;
+            scene.status_copy = gpu.readable(SplatBins::status_bytes(scene.chunks));
         }
         self.frames[frame].chunks = chunks;
         for frame in &mut self.frames {
@@ -579,10 +555,9 @@ impl FitDevice for GpuFit {
         })
     }
 
-    fn step(&mut self, input: &StepInput<'_>) -> Result<()> {
-        let input = OwnedInput::from(input);
-        self.enqueue(&input)?;
-        self.pending.push(input);
+    fn step(&mut self, input: &StepInput) -> Result<()> {
+        self.enqueue(input)?;
+        self.pending.push(*input);
         if self.pending.len() >= STEPS_AHEAD { self.settle() } else { Ok(()) }
     }
 

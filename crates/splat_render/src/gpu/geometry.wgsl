@@ -29,6 +29,8 @@ struct Geometry {
     // b0 and b1 times the scales, so that the 2D covariance is m m^T + blur.
     m0: vec3<f32>,
     m1: vec3<f32>,
+    // b0 x b1.
+    normal: vec3<f32>,
 }
 
 // Rows of the camera's rotation.
@@ -114,8 +116,27 @@ fn load_geometry(local: u32) -> Geometry {
     g.b1 = g.a1 * g.axes;
     g.m0 = g.b0 * g.scales;
     g.m1 = g.b1 * g.scales;
+    // The cross product of J's rows is (x/z, y/z, 1) fx fy / z^2, which leaves no cancellation to
+    // needles seen along any direction.
+    g.normal = to_world(vec3(g.ratio, 1.0)) * g.axes * per_z.x * per_z.y;
     g.visible = true;
     return g;
+}
+
+// m0 x m1; its length is the root of the 2D covariance's determinant without blur.
+fn sharp_area(g: Geometry) -> vec3<f32> {
+    return g.normal
+        * vec3(g.scales.y * g.scales.z, g.scales.x * g.scales.z, g.scales.x * g.scales.y);
+}
+
+// (root of the determinant without blur, root of the determinant). det = |m0 x m1|^2
+// + blur (sxx + syy) + blur^2 (Cauchy-Binet: a sum of positive terms); the roots are taken without
+// squaring large values.
+fn root_dets(g: Geometry) -> vec2<f32> {
+    let area = sharp_area(g);
+    let rest = sqrt(view.blur * (dot(g.m0, g.m0) + dot(g.m1, g.m1)) + view.blur * view.blur);
+    let largest = max(max(abs(area.x), abs(area.y)), max(abs(area.z), rest));
+    return largest * vec2(length(area / largest), length(vec4(area, rest) / largest));
 }
 
 // R^T t is the vector from the camera's centre to the mean, without the cancellation of

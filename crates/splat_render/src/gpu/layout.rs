@@ -14,6 +14,9 @@ pub(super) const GEOMETRY: usize = 11;
 /// factor 3 (order 2), depth, colour 3, opacity.
 pub(super) const GRADIENT: usize = 10;
 
+/// The same with the absolute gradient of the mean, 2 floats, behind it.
+pub(super) const GRADIENT_ABSOLUTE: usize = GRADIENT + 2;
+
 /// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.
 pub(super) const CAMERA: usize = 16;
 
@@ -43,6 +46,8 @@ pub(super) struct View {
     pub sh_degree: u32,
     pub sh_stride: u32,
     pub raw: u32,
+    pub antialiased: u32,
+    pub unused: [u32; 3],
 }
 
 impl View {
@@ -80,6 +85,7 @@ impl View {
             near: options.near,
             far: options.far,
             blur: options.blur,
+            antialiased: u32::from(options.antialiased),
             ..Self::of_picture(camera.width, camera.height, background)
         }
     }

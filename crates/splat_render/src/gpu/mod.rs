@@ -1,9 +1,9 @@
 //! The stages as WGSL kernels on any Vulkan, Metal or DX12 device, through wgpu.
 //!
-//! Nothing here needs subgroups, more than 16 KiB of workgroup memory, more than eight storage
-//! buffers per kernel, or one workgroup waiting for another; sums are taken in a fixed order, so
-//! that runs repeat bit for bit on a device. What does not fit one binding is done in parts:
-//! splats in windows, tiles in chunks. Neither changes a bit of the result.
+//! Nothing here needs subgroups (only llvmpipe uses them: tile_subgroup.wgsl), more than 16 KiB of
+//! workgroup memory, more than eight storage buffers per kernel, or one workgroup waiting for another;
+//! sums are taken in a fixed order, so that runs repeat bit for bit on a device. What does not fit one
+//! binding is done in parts: splats in windows, tiles in chunks. Neither changes a bit of the result.
 
 mod bin;
 mod device;
@@ -35,10 +35,6 @@ impl Stages<f32> for Gpu {
     ) -> Result<Projected<f32>> {
         splats.validate()?;
         camera.validate()?;
-        if options.antialiased {
-            let reason = "antialiased is not there yet on backend gpu; use backend cpu";
-            return Err(crate::error::Error::argument("rasterize_mode", reason));
-        }
         project::project(self, splats, camera, options)
     }
 

@@ -92,7 +92,7 @@ pub(super) fn project_ops(
                 rows(&splats.colors, &window, splats.color_floats),
                 rows(splats2d, &window, 12),
             ],
-            Gpu::groups(count, SPLATS_PER_GROUP),
+            gpu.groups(count, SPLATS_PER_GROUP),
         ));
     }
     ops

@@ -21,24 +21,18 @@ fn project(
         let syy = dot(g.m1, g.m1);
         let cxx = sxx + view.blur;
         let cyy = syy + view.blur;
-        // det = |m0 x m1|^2 + blur (sxx + syy) + blur^2 (Cauchy-Binet: a sum of positive terms).
-        // The cross product of J's rows is (x/z, y/z, 1) fx fy / z^2, which leaves no cancellation
-        // to needles seen along any direction; the root is taken without squaring large values.
-        let normal = to_world(vec3(g.ratio, 1.0)) * g.axes
-            * (view.focal.x / g.t.z) * (view.focal.y / g.t.z);
-        let area = normal * vec3(
-            g.scales.y * g.scales.z,
-            g.scales.x * g.scales.z,
-            g.scales.x * g.scales.y,
-        );
-        let rest = sqrt(view.blur * (sxx + syy) + view.blur * view.blur);
-        let largest = max(max(abs(area.x), abs(area.y)), max(abs(area.z), rest));
-        let root_det = largest * length(vec4(area, rest) / largest);
+        let dets = root_dets(g);
+        let root_det = dets.y;
+        var opacity = g.opacity;
+        if view.antialiased == 1u {
+            opacity *= dets.x / dets.y;
+        }
         let root_cyy = sqrt(cyy);
         let p = root_cyy / root_det;
         let q = -(sxy / root_cyy) / root_det;
         let r = 1.0 / root_cyy;
-        let reach = 2.0 * log(g.opacity / ALPHA_MIN);
+        // Below 0 where the opacity was lowered under ALPHA_MIN.
+        let reach = max(2.0 * log(opacity / ALPHA_MIN), 0.0);
         let radii = vec2(sqrt(reach * cxx), sqrt(reach * cyy));
         let center = view.focal * (g.t.xy / g.t.z) + view.principal;
         let size = vec2(f32(view.width), f32(view.height));
@@ -62,7 +56,7 @@ fn project(
             out.color = color;
             out.r = r;
             out.depth = g.t.z;
-            out.opacity = g.opacity;
+            out.opacity = opacity;
             out.radii = radii;
         }
     }

@@ -64,7 +64,7 @@ pub(super) fn project_backward_ops(
                 rows(&gradients.colors, &window, splats.color_floats),
                 (&gradients.camera).into(),
             ],
-            Gpu::groups(count, SPLATS_PER_GROUP),
+            gpu.groups(count, SPLATS_PER_GROUP),
         ));
     }
     ops

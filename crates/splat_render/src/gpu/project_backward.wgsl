@@ -99,19 +99,39 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     let p = splats2d[i].pq.x;
     let q = splats2d[i].pq.y;
     let r = splats2d[i].r;
-    let v_uu = -0.5 * (p * v_factor.x + q * v_factor.y);
+    var v_uu = -0.5 * (p * v_factor.x + q * v_factor.y);
     let v_uv = -r * v_factor.y;
-    let v_vv = -0.5 * r * v_factor.z;
-    let normal = to_world(vec3(g.ratio, 1.0)) * g.axes * per_z.x * per_z.y;
-    let fb_u = (cross(g.scales * g.scales * g.b1, normal) + view.blur * g.b0) * (p * r * r);
+    var v_vv = -0.5 * r * v_factor.z;
+    var compensation = 1.0;
+    var v_log = 0.0;
+    if view.antialiased == 1u {
+        let dets = root_dets(g);
+        compensation = dets.x / dets.y;
+        // ln compensation = ln |m0 x m1| - ln det / 2; here the latter.
+        v_log = v_opacity * g.opacity * compensation;
+        v_uu -= 0.5 * v_log;
+        v_vv -= 0.5 * v_log;
+    }
+    let fb_u = (cross(g.scales * g.scales * g.b1, g.normal) + view.blur * g.b0) * (p * r * r);
     let fb_v = g.b1 * r;
     let fm_u = fb_u * g.scales;
     let fm_v = fb_v * g.scales;
     let v_fm_u = 2.0 * v_uu * fm_u + v_uv * fm_v;
     let v_fm_v = v_uv * fm_u + 2.0 * v_vv * fm_v;
     var v_scales = v_fm_u * fb_u + v_fm_v * fb_v;
-    let v_m0 = p * v_fm_u;
-    let v_m1 = q * v_fm_u + r * v_fm_v;
+    var v_m0 = p * v_fm_u;
+    var v_m1 = q * v_fm_u + r * v_fm_v;
+    if view.antialiased == 1u {
+        // Divided by the length twice: its square may underflow where it does not.
+        let area = sharp_area(g);
+        let length_area = length(area);
+        let v_area = area / length_area * (v_log / length_area);
+        let v_area_m0 = cross(g.m1, v_area);
+        let v_area_m1 = cross(v_area, g.m0);
+        v_scales += v_area_m0 * g.b0 + v_area_m1 * g.b1;
+        v_m0 += v_area_m0;
+        v_m1 += v_area_m1;
+    }
     let v_b0 = v_m0 * g.scales;
     let v_b1 = v_m1 * g.scales;
 
@@ -164,7 +184,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     let v_mean = to_world(v_t);
     v_rotation += outer(v_t, mean);
 
-    var v_given_opacity = v_opacity;
+    var v_given_opacity = v_opacity * compensation;
     if view.raw == 1u {
         v_scales *= g.scales;
         // o (1 - o), without the cancellation at saturated logits.

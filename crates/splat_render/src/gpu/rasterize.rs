@@ -2,7 +2,7 @@
 
 use super::bin::{PairBins, SplatBins, TileChunk, tile_count};
 use super::device::{Gpu, Op};
-use super::layout::{Chunk, Splat2d, View};
+use super::layout::{Chunk, GRADIENT, Splat2d, View};
 use super::project::count;
 use super::shaders::Kernel;
 use crate::error::Result;
@@ -38,8 +38,14 @@ pub(super) struct Binned {
 }
 
 impl Binned {
-    /// Uploads the splats, sorts them by depth and cuts the tiles into chunks that fit.
-    pub fn new(gpu: &Gpu, projected: &Projected<f32>, background: [f32; 3]) -> Result<Self> {
+    /// Uploads the splats, sorts them by depth and cuts the tiles into chunks that fit, also with
+    /// so many floats per pair.
+    pub fn new(
+        gpu: &Gpu,
+        projected: &Projected<f32>,
+        background: [f32; 3],
+        slot_floats: usize,
+    ) -> Result<Self> {
         let splats = count(projected.len())?;
         let view = gpu.uniform(&View::of_picture(projected.width, projected.height, background));
         gpu.bindable_bytes("splats2d", u64::from(splats) * size_of::<Splat2d>() as u64)?;
@@ -58,7 +64,7 @@ impl Binned {
             list_end: u32::MAX,
         };
         gpu.submit(&[&bins.depth_ops(gpu, &view, &TileChunk::new(gpu, all), &splats2d)])?;
-        let (ranges, capacity) = bins.plan(gpu, &view, &splats2d, tiles)?;
+        let (ranges, capacity) = bins.plan(gpu, &view, &splats2d, tiles, slot_floats)?;
         let pairs = PairBins::new(gpu, capacity, tiles)?;
         let last = ranges.len() - 1;
         let chunks = ranges
@@ -105,11 +111,11 @@ pub(super) fn rasterize_ops(
                 pass.into(),
                 splats2d.into(),
                 (&pairs.tile_begin).into(),
-                (&pairs.splat_from_pair).into(),
+                pairs.splat_from_pair(chunk.tiles()).into(),
                 picture.into(),
                 depths.into(),
             ],
-            Gpu::groups(chunk.tiles(), 1),
+            gpu.groups(chunk.tiles(), 1),
         )
     };
     chunk.passes.iter().map(op).collect()
@@ -124,7 +130,7 @@ pub(super) fn rasterize(
     let pixels = u64::from(width) * u64::from(height);
     let picture = gpu.bindable("picture", 16 * pixels)?;
     let depths = gpu.bindable("depths", 4 * pixels)?;
-    let binned = Binned::new(gpu, projected, background)?;
+    let binned = Binned::new(gpu, projected, background, GRADIENT)?;
     let mut ops = Vec::new();
     for chunk in &binned.chunks {
         ops.extend(binned.chunk_ops(gpu, chunk));

@@ -1,7 +1,6 @@
 // rasterize: every tile's splats, front to back, to colours, depth and final transmittance. A
 // thread owns four neighbouring pixels of each of ROWS rows, so that a splat is read once for all of
-// them; splats are read straight from storage (staging them in workgroup memory was slower). Follows
-// shared.wgsl.
+// them. Follows shared.wgsl and tile_memory.wgsl or tile_subgroup.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;
@@ -12,6 +11,9 @@
 // next dispatch: colour so far and transmittance, negative where the pixel has stopped.
 @group(0) @binding(5) var<storage, read_write> picture: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> depths: array<f32>;
+
+// In one row: llvmpipe fills its vectors along x alone.
+const THREADS = 64u / ROWS;
 
 // Four neighbouring pixels.
 struct Quad {
@@ -83,11 +85,11 @@ fn finish(quad: Quad, x: u32, y: u32, goes_on: bool) {
     }
 }
 
-@compute @workgroup_size(4, TILE / ROWS)
+@compute @workgroup_size(THREADS)
 fn rasterize(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_id) local: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
 ) {
     let relative = workgroup.y * groups.x + workgroup.x;
     let tile = chunk.tile_begin + relative;
@@ -101,8 +103,8 @@ fn rasterize(
     }
     let end = list + min(chunk.list_end, length);
     let goes_on = length > chunk.list_end;
-    let x = (tile % view.tiles_x) * TILE + 4u * local.x;
-    let y = (tile / view.tiles_x) * TILE + ROWS * local.y;
+    let x = (tile % view.tiles_x) * TILE + 4u * (thread % 4u);
+    let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     let center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
     let center_y = f32(y) + 0.5;
     // ROWS is a constant, so that unused rows cost nothing; a loop over an array of rows is not
@@ -115,35 +117,40 @@ fn rasterize(
     var q5 = start(x, y + 5u);
     var q6 = start(x, y + 6u);
     var q7 = start(x, y + 7u);
-    for (var pair = list + chunk.list_begin; pair < end; pair++) {
-        let splat = splats2d[splat_from_pair[pair]];
-        let p_dx = splat.pq.x * (center_x - splat.mean.x);
-        q0 = blend(q0, splat, p_dx, center_y);
-        if ROWS > 1u {
-            q1 = blend(q1, splat, p_dx, center_y + 1.0);
-        }
-        if ROWS > 2u {
-            q2 = blend(q2, splat, p_dx, center_y + 2.0);
-            q3 = blend(q3, splat, p_dx, center_y + 3.0);
-        }
-        if ROWS > 4u {
-            q4 = blend(q4, splat, p_dx, center_y + 4.0);
-            q5 = blend(q5, splat, p_dx, center_y + 5.0);
-            q6 = blend(q6, splat, p_dx, center_y + 6.0);
-            q7 = blend(q7, splat, p_dx, center_y + 7.0);
-        }
-        var live = q0.live;
-        if ROWS > 1u {
-            live = live | q1.live;
-        }
-        if ROWS > 2u {
-            live = live | q2.live | q3.live;
-        }
-        if ROWS > 4u {
-            live = live | q4.live | q5.live | q6.live | q7.live;
-        }
-        if !any(live) {
-            break;
+    var walking = true;
+    for (var batch = list + chunk.list_begin; walking && batch < end; batch += AHEAD) {
+        let ahead = read_ahead(batch, end, thread);
+        for (var k = 0u; k < AHEAD && batch + k < end; k++) {
+            let splat = splat_of(ahead, k);
+            let p_dx = splat.pq.x * (center_x - splat.mean.x);
+            q0 = blend(q0, splat, p_dx, center_y);
+            if ROWS > 1u {
+                q1 = blend(q1, splat, p_dx, center_y + 1.0);
+            }
+            if ROWS > 2u {
+                q2 = blend(q2, splat, p_dx, center_y + 2.0);
+                q3 = blend(q3, splat, p_dx, center_y + 3.0);
+            }
+            if ROWS > 4u {
+                q4 = blend(q4, splat, p_dx, center_y + 4.0);
+                q5 = blend(q5, splat, p_dx, center_y + 5.0);
+                q6 = blend(q6, splat, p_dx, center_y + 6.0);
+                q7 = blend(q7, splat, p_dx, center_y + 7.0);
+            }
+            var live = q0.live;
+            if ROWS > 1u {
+                live = live | q1.live;
+            }
+            if ROWS > 2u {
+                live = live | q2.live | q3.live;
+            }
+            if ROWS > 4u {
+                live = live | q4.live | q5.live | q6.live | q7.live;
+            }
+            walking = walks_on(any(live));
+            if !walking {
+                break;
+            }
         }
     }
     finish(q0, x, y, goes_on);

@@ -2,7 +2,7 @@
 
 use super::bin::{PairBins, SplatBins, TileChunk};
 use super::device::{Gpu, Op};
-use super::layout::GRADIENT;
+use super::layout::{GRADIENT, GRADIENT_ABSOLUTE};
 use super::rasterize::Binned;
 use super::shaders::Kernel;
 use crate::error::Result;
@@ -17,9 +17,9 @@ pub(super) struct BackwardBuffers {
     pub totals: wgpu::Buffer,
     /// `[H * W]`, for lists that take more than one dispatch.
     pub transmittances: wgpu::Buffer,
-    /// `[pairs * GRADIENT]`
+    /// `[pairs * GRADIENT]`, or GRADIENT_ABSOLUTE.
     pub slots: wgpu::Buffer,
-    /// `[N * GRADIENT]`
+    /// `[N * GRADIENT]`, or GRADIENT_ABSOLUTE.
     pub v_splats2d: wgpu::Buffer,
 }
 
@@ -32,29 +32,35 @@ pub(super) fn rasterize_backward_ops(
     bins: &SplatBins,
     pairs: &PairBins,
     buffers: &BackwardBuffers,
+    absolute: bool,
 ) -> Vec<Op> {
+    let (rasterize_backward, sum) = if absolute {
+        (Kernel::RasterizeBackwardAbsolute, Kernel::RasterizeBackwardSumAbsolute)
+    } else {
+        (Kernel::RasterizeBackward, Kernel::RasterizeBackwardSum)
+    };
     // Slots behind a tile's early stop are never written.
     let mut ops = vec![Op::Clear(buffers.slots.clone())];
     ops.extend(chunk.passes.iter().map(|pass| {
         gpu.op(
-            Kernel::RasterizeBackward,
+            rasterize_backward,
             &[
                 view.into(),
                 pass.into(),
                 splats2d.into(),
                 (&pairs.tile_begin).into(),
-                (&pairs.splat_from_pair).into(),
+                pairs.splat_from_pair(chunk.tiles()).into(),
                 pairs.slot_from_pair(chunk.tiles()).into(),
                 (&buffers.v_picture).into(),
                 (&buffers.totals).into(),
                 (&buffers.slots).into(),
                 (&buffers.transmittances).into(),
             ],
-            Gpu::groups(chunk.tiles(), 1),
+            gpu.groups(chunk.tiles(), 1),
         )
     }));
     ops.push(gpu.op(
-        Kernel::RasterizeBackwardSum,
+        sum,
         &[
             (&chunk.uniform).into(),
             (&bins.status).into(),
@@ -64,7 +70,7 @@ pub(super) fn rasterize_backward_ops(
             (&buffers.slots).into(),
             (&buffers.v_splats2d).into(),
         ],
-        Gpu::groups(chunk.chunk.splats, 64),
+        gpu.groups(chunk.chunk.splats, 64),
     ));
     ops
 }
@@ -77,10 +83,7 @@ pub(super) fn rasterize_backward(
     v_image: &ImageGradients<f32>,
     absolute: bool,
 ) -> Result<ProjectedGradients<f32>> {
-    if absolute {
-        let reason = "is not there yet on backend gpu; use backend cpu";
-        return Err(crate::error::Error::argument("absgrad", reason));
-    }
+    let floats = if absolute { GRADIENT_ABSOLUTE } else { GRADIENT };
     let pixels = image.color.len();
     let mut v_picture = Vec::with_capacity(pixels);
     let mut totals = Vec::with_capacity(pixels);
@@ -98,13 +101,13 @@ pub(super) fn rasterize_backward(
         }
         totals.push(total as f32);
     }
-    let row = GRADIENT as u64 * 4;
+    let row = floats as u64 * 4;
     gpu.bindable_bytes("v_picture", 16 * pixels as u64)?;
-    let binned = Binned::new(gpu, projected, background)?;
+    let binned = Binned::new(gpu, projected, background, floats)?;
     let buffers = BackwardBuffers {
         v_picture: gpu.upload("v_picture", &v_picture)?,
         totals: gpu.upload("totals", &totals)?,
-        transmittances: gpu.buffer("transmittances", 4 * pixels as u64)?,
+        transmittances: gpu.transmittances(pixels as u64)?,
         slots: gpu.bindable("gradient slots", row * u64::from(binned.capacity))?,
         v_splats2d: gpu.bindable("v_splats2d", row * u64::from(binned.splats))?,
     };
@@ -119,6 +122,7 @@ pub(super) fn rasterize_backward(
             &binned.bins,
             &binned.pairs,
             &buffers,
+            absolute,
         ));
     }
     let data = gpu.download(&ops, &[(&buffers.v_splats2d, row * u64::from(binned.splats))])?;
@@ -126,13 +130,18 @@ pub(super) fn rasterize_backward(
         v_background: v_background.map(|v| v as f32),
         ..ProjectedGradients::default()
     };
-    for bytes in data[0].chunks_exact(GRADIENT * 4) {
-        let row: [f32; GRADIENT] = bytemuck::pod_read_unaligned(bytes);
+    let mut v_absolute = Vec::new();
+    for bytes in data[0].chunks_exact(floats * 4) {
+        let row: Vec<f32> = bytemuck::pod_collect_to_vec(bytes);
         out.v_means2d.push([row[0], row[1]]);
         out.v_factors.push([row[2], row[3], row[4]]);
         out.v_depths.push(row[5]);
         out.v_colors.push([row[6], row[7], row[8]]);
         out.v_opacities.push(row[9]);
+        if absolute {
+            v_absolute.push([row[GRADIENT], row[GRADIENT + 1]]);
+        }
     }
+    out.v_means2d_absolute = absolute.then_some(v_absolute);
     Ok(out)
 }

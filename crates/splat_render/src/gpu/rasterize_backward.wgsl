@@ -1,6 +1,7 @@
 // rasterize_backward: gradients of the picture to a gradient per (splat, tile) pair, each in its
 // own slot. Walks front to back like rasterize, so that both round and stop alike; what lies
-// behind the current splat is what is left of the pixel's total. Follows shared.wgsl.
+// behind the current splat is what is left of the pixel's total. Follows shared.wgsl and
+// tile_memory.wgsl with tile_sums_memory.wgsl, or their twins for subgroups.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;
@@ -13,21 +14,15 @@
 // Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included; less
 // what has been walked where a tile's list goes on in the next dispatch.
 @group(0) @binding(7) var<storage, read_write> totals: array<f32>;
-// GRADIENT floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma,
-// then depth, colour 3, opacity.
+// SUMS floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma, then
+// depth, colour 3, opacity, and where asked for the absolute gradients of the mean: |g u| (times p
+// that of x) and that of y.
 @group(0) @binding(8) var<storage, read_write> slots: array<f32>;
 // Between such dispatches: transmittance, negative where the pixel has stopped.
 @group(0) @binding(9) var<storage, read_write> transmittances: array<f32>;
 
+// In one row: llvmpipe fills its vectors along x alone.
 const THREADS = 64u / ROWS;
-// Splats between two barriers: 60 sums occupy 32 threads almost twice.
-const BATCH = 6u;
-// One more than the threads, so that a column's entries lie in different memory banks.
-const STRIDE = THREADS + 1u;
-
-// [splat of the batch][entry][thread]
-var<workgroup> partials: array<f32, BATCH * GRADIENT * STRIDE>;
-var<workgroup> any_live: u32;
 
 // Four neighbouring pixels.
 struct Quad {
@@ -54,6 +49,8 @@ struct Sums {
     green: vec4<f32>,
     blue: vec4<f32>,
     opacity: vec4<f32>,
+    absolute_x: vec4<f32>,
+    absolute_y: vec4<f32>,
 }
 
 fn load_quad(x: u32, y: u32) -> Quad {
@@ -118,6 +115,10 @@ fn accumulate(quad: ptr<function, Quad>, splat: Splat2d, sums: ptr<function, Sum
     (*sums).green += weight * (*quad).v_green;
     (*sums).blue += weight * (*quad).v_blue;
     (*sums).opacity += gaussian * v_alpha;
+    if SUMS == GRADIENT_ABSOLUTE {
+        (*sums).absolute_x += abs(gu);
+        (*sums).absolute_y += abs(splat.pq.y * gu + splat.r * gv);
+    }
     (*quad).live = live;
     (*quad).remaining = remaining;
     (*quad).transmittance = select(transmittance, next, adds);
@@ -139,11 +140,10 @@ fn total(x: vec4<f32>) -> f32 {
     return (x.x + x.y) + (x.z + x.w);
 }
 
-@compute @workgroup_size(4, TILE / ROWS)
+@compute @workgroup_size(THREADS)
 fn rasterize_backward(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_id) local: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
     let relative = workgroup.y * groups.x + workgroup.x;
@@ -158,8 +158,8 @@ fn rasterize_backward(
     }
     let begin = list + chunk.list_begin;
     let end = list + min(chunk.list_end, length);
-    let x = (tile % view.tiles_x) * TILE + 4u * local.x;
-    let y = (tile / view.tiles_x) * TILE + ROWS * local.y;
+    let x = (tile % view.tiles_x) * TILE + 4u * (thread % 4u);
+    let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     // As in rasterize: ROWS is a constant and unused rows cost nothing.
     var q0 = load_quad(x, y);
     var q1: Quad;
@@ -184,8 +184,12 @@ fn rasterize_backward(
     }
     for (var batch = begin; batch < end; batch += BATCH) {
         let count = min(BATCH, end - batch);
+        var ahead = read_ahead(batch, end, thread);
         for (var b = 0u; b < count; b++) {
-            let splat = splats2d[splat_from_pair[batch + b]];
+            if AHEAD == 1u {
+                ahead = read_ahead(batch + b, end, thread);
+            }
+            let splat = splat_of(ahead, b);
             var sums = Sums();
             accumulate(&q0, splat, &sums);
             if ROWS > 1u {
@@ -201,17 +205,20 @@ fn rasterize_backward(
                 accumulate(&q6, splat, &sums);
                 accumulate(&q7, splat, &sums);
             }
-            let at = b * GRADIENT * STRIDE + thread;
-            partials[at] = total(sums.u);
-            partials[at + STRIDE] = total(sums.v);
-            partials[at + 2u * STRIDE] = total(sums.uu);
-            partials[at + 3u * STRIDE] = total(sums.uv);
-            partials[at + 4u * STRIDE] = total(sums.vv);
-            partials[at + 5u * STRIDE] = total(sums.depth);
-            partials[at + 6u * STRIDE] = total(sums.red);
-            partials[at + 7u * STRIDE] = total(sums.green);
-            partials[at + 8u * STRIDE] = total(sums.blue);
-            partials[at + 9u * STRIDE] = total(sums.opacity);
+            keep_sum(b, 0u, total(sums.u), thread);
+            keep_sum(b, 1u, total(sums.v), thread);
+            keep_sum(b, 2u, total(sums.uu), thread);
+            keep_sum(b, 3u, total(sums.uv), thread);
+            keep_sum(b, 4u, total(sums.vv), thread);
+            keep_sum(b, 5u, total(sums.depth), thread);
+            keep_sum(b, 6u, total(sums.red), thread);
+            keep_sum(b, 7u, total(sums.green), thread);
+            keep_sum(b, 8u, total(sums.blue), thread);
+            keep_sum(b, 9u, total(sums.opacity), thread);
+            if SUMS == GRADIENT_ABSOLUTE {
+                keep_sum(b, 10u, total(sums.absolute_x), thread);
+                keep_sum(b, 11u, total(sums.absolute_y), thread);
+            }
         }
         var live = q0.live;
         if ROWS > 1u {
@@ -223,22 +230,9 @@ fn rasterize_backward(
         if ROWS > 4u {
             live = live | q4.live | q5.live | q6.live | q7.live;
         }
-        if any(live) {
-            any_live = 1u;
-        }
-        let goes_on = workgroupUniformLoad(&any_live);
-        for (var entry = thread; entry < count * GRADIENT; entry += THREADS) {
-            var sum = 0.0;
-            for (var k = 0u; k < THREADS; k++) {
-                sum += partials[entry * STRIDE + k];
-            }
-            slots[slot_from_pair[batch + entry / GRADIENT] * GRADIENT + entry % GRADIENT] = sum;
-        }
-        if goes_on == 0u {
+        if !write_sums(batch, count, any(live), thread) {
             break;
         }
-        any_live = 0u;
-        workgroupBarrier();
     }
     if length > chunk.list_end {
         keep(q0, x, y);

@@ -7,8 +7,8 @@
 @group(0) @binding(3) var<storage, read> order: array<u32>;
 @group(0) @binding(4) var<storage, read> offsets: array<u32>;
 @group(0) @binding(5) var<storage, read> slots: array<f32>;
-// GRADIENT floats per splat: mean 2, factor 3, depth, colour 3, opacity; raw sums until the
-// picture's last chunk.
+// SUMS floats per splat: mean 2, factor 3, depth, colour 3, opacity, and the absolute mean 2 where
+// asked for; raw sums until the picture's last chunk.
 @group(0) @binding(6) var<storage, read_write> v_splats2d: array<f32>;
 
 @compute @workgroup_size(64)
@@ -22,16 +22,16 @@ fn rasterize_backward_sum(
         return;
     }
     let i = order[rank];
-    var sums: array<f32, GRADIENT>;
+    var sums: array<f32, SUMS>;
     if chunk.is_first == 0u {
-        for (var k = 0u; k < GRADIENT; k++) {
-            sums[k] = v_splats2d[i * GRADIENT + k];
+        for (var k = 0u; k < SUMS; k++) {
+            sums[k] = v_splats2d[i * SUMS + k];
         }
     }
     let end = offsets[rank + 1u];
     for (var slot = offsets[rank]; slot < end; slot++) {
-        for (var k = 0u; k < GRADIENT; k++) {
-            sums[k] += slots[slot * GRADIENT + k];
+        for (var k = 0u; k < SUMS; k++) {
+            sums[k] += slots[slot * SUMS + k];
         }
     }
     if chunk.is_last == 1u {
@@ -50,8 +50,11 @@ fn rasterize_backward_sum(
         sums[2] = (uu - q / r * uv) / p;
         sums[3] = uv / r;
         sums[4] = vv / r;
+        if SUMS == GRADIENT_ABSOLUTE {
+            sums[SUMS - 2u] *= p;
+        }
     }
-    for (var k = 0u; k < GRADIENT; k++) {
-        v_splats2d[i * GRADIENT + k] = select(0.0, sums[k], is_finite(sums[k]));
+    for (var k = 0u; k < SUMS; k++) {
+        v_splats2d[i * SUMS + k] = select(0.0, sums[k], is_finite(sums[k]));
     }
 }

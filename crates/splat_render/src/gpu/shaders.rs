@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::layout::{CAMERA, GEOMETRY, GRADIENT, STATS};
+use super::layout::{CAMERA, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS};
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, QUAT_NORM2_MIN, TILE, TRANSMITTANCE_MIN};
 use crate::fit::{ADAM, SSIM_C, SSIM_WINDOW};
 use crate::sh;
@@ -23,6 +23,9 @@ pub(super) struct Source {
     pub name: &'static str,
     pub parts: &'static [&'static str],
     pub bindings: &'static [Access],
+    /// Where a tile's threads work together: the texts for any device and for one whose tiles are
+    /// one subgroup each.
+    pub shared_work: Option<[&'static str; 2]>,
     /// Whether the file has the override `SEGMENTS`.
     pub segmented: bool,
 }
@@ -30,79 +33,117 @@ pub(super) struct Source {
 const SHARED: &str = include_str!("shared.wgsl");
 const GEOMETRY_WGSL: &str = include_str!("geometry.wgsl");
 const BIN_TILES: &str = include_str!("bin_tiles.wgsl");
+const BACKWARD: &str = include_str!("rasterize_backward.wgsl");
+const BACKWARD_BINDINGS: [Access; 10] =
+    [Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite];
+const BACKWARD_SUM: &str = include_str!("rasterize_backward_sum.wgsl");
+const BACKWARD_SUM_BINDINGS: [Access; 7] = [Uniform, Read, Read, Read, Read, Read, ReadWrite];
+const TILE_WORK: [&str; 2] = [include_str!("tile_memory.wgsl"), include_str!("tile_subgroup.wgsl")];
+const TILE_SUMS: [&str; 2] = [
+    concat!(include_str!("tile_memory.wgsl"), include_str!("tile_sums_memory.wgsl")),
+    concat!(include_str!("tile_subgroup.wgsl"), include_str!("tile_sums_subgroup.wgsl")),
+];
+// The backward kernels once without and once with sums of absolute gradients, so that who does not
+// ask for those does not pay for them.
+const SIGNED: &str = "const SUMS = GRADIENT;\n";
+const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 12] = [
+pub(super) static SOURCES: [Source; 14] = [
     Source {
         name: "project",
+        shared_work: None,
         parts: &[SHARED, GEOMETRY_WGSL, include_str!("project.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {
         name: "project_backward",
+        shared_work: None,
         parts: &[SHARED, GEOMETRY_WGSL, include_str!("project_backward.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_count",
+        shared_work: None,
         parts: &[SHARED, BIN_TILES, include_str!("bin_count.wgsl")],
         bindings: &[Uniform, Uniform, Read, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_scan",
+        shared_work: None,
         parts: &[SHARED, include_str!("bin_scan.wgsl")],
         bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite],
         segmented: true,
     },
     Source {
         name: "bin_emit",
+        shared_work: None,
         parts: &[SHARED, BIN_TILES, include_str!("bin_emit.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_sort",
+        shared_work: None,
         parts: &[SHARED, include_str!("bin_sort.wgsl")],
         bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
         segmented: true,
     },
     Source {
         name: "bin_ranges",
+        shared_work: None,
         parts: &[SHARED, include_str!("bin_ranges.wgsl")],
         bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "rasterize",
+        shared_work: Some(TILE_WORK),
         parts: &[SHARED, include_str!("rasterize.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "rasterize_backward",
-        parts: &[SHARED, include_str!("rasterize_backward.wgsl")],
-        bindings: &[
-            Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite,
-        ],
+        shared_work: Some(TILE_SUMS),
+        parts: &[SHARED, SIGNED, BACKWARD],
+        bindings: &BACKWARD_BINDINGS,
+        segmented: false,
+    },
+    Source {
+        name: "rasterize_backward_absolute",
+        shared_work: Some(TILE_SUMS),
+        parts: &[SHARED, ABSOLUTE, BACKWARD],
+        bindings: &BACKWARD_BINDINGS,
         segmented: false,
     },
     Source {
         name: "rasterize_backward_sum",
-        parts: &[SHARED, include_str!("rasterize_backward_sum.wgsl")],
-        bindings: &[Uniform, Read, Read, Read, Read, Read, ReadWrite],
+        shared_work: None,
+        parts: &[SHARED, SIGNED, BACKWARD_SUM],
+        bindings: &BACKWARD_SUM_BINDINGS,
+        segmented: false,
+    },
+    Source {
+        name: "rasterize_backward_sum_absolute",
+        shared_work: None,
+        parts: &[SHARED, ABSOLUTE, BACKWARD_SUM],
+        bindings: &BACKWARD_SUM_BINDINGS,
         segmented: false,
     },
     Source {
         name: "loss",
+        shared_work: None,
         parts: &[SHARED, include_str!("loss.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "adam",
+        shared_work: None,
         parts: &[SHARED, include_str!("adam.wgsl")],
         bindings: &[
             Uniform, Uniform, Uniform, Read, ReadWrite, Read, ReadWrite, ReadWrite, Read, Read,
@@ -129,6 +170,8 @@ pub(super) enum Kernel {
     Rasterize,
     RasterizeBackward,
     RasterizeBackwardSum,
+    RasterizeBackwardAbsolute,
+    RasterizeBackwardSumAbsolute,
     LossSlopes,
     LossGradient,
     AdamGeometry,
@@ -137,7 +180,7 @@ pub(super) enum Kernel {
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 20] = [
         Self::Project,
         Self::ProjectBackward,
         Self::DepthKeys,
@@ -152,6 +195,8 @@ impl Kernel {
         Self::Rasterize,
         Self::RasterizeBackward,
         Self::RasterizeBackwardSum,
+        Self::RasterizeBackwardAbsolute,
+        Self::RasterizeBackwardSumAbsolute,
         Self::LossSlopes,
         Self::LossGradient,
         Self::AdamGeometry,
@@ -175,6 +220,12 @@ impl Kernel {
             Self::Rasterize => ("rasterize", "rasterize"),
             Self::RasterizeBackward => ("rasterize_backward", "rasterize_backward"),
             Self::RasterizeBackwardSum => ("rasterize_backward_sum", "rasterize_backward_sum"),
+            Self::RasterizeBackwardAbsolute => {
+                ("rasterize_backward_absolute", "rasterize_backward")
+            }
+            Self::RasterizeBackwardSumAbsolute => {
+                ("rasterize_backward_sum_absolute", "rasterize_backward_sum")
+            }
             Self::LossSlopes => ("loss", "loss_slopes"),
             Self::LossGradient => ("loss", "loss_gradient"),
             Self::AdamGeometry => ("adam", "adam_geometry"),
@@ -189,6 +240,7 @@ fn constants(rows: u32) -> String {
     let _ = writeln!(out, "const ROWS = {rows}u;");
     for (name, value) in [("TILE", TILE), ("GEOMETRY", GEOMETRY as u32)].into_iter().chain([
         ("GRADIENT", GRADIENT as u32),
+        ("GRADIENT_ABSOLUTE", GRADIENT_ABSOLUTE as u32),
         ("CAMERA", CAMERA as u32),
         ("STATS", STATS as u32),
     ]) {
@@ -231,9 +283,13 @@ fn constants(rows: u32) -> String {
 }
 
 impl Source {
-    /// The whole text that is compiled, with threads that own so many rows of pixels.
-    pub fn text(&self, rows: u32) -> String {
+    /// The whole text that is compiled, with threads that own so many rows of pixels, and that are
+    /// one subgroup per tile or not.
+    pub fn text(&self, rows: u32, subgroups: bool) -> String {
         let mut text = constants(rows);
+        if let Some(texts) = self.shared_work {
+            text.push_str(texts[usize::from(subgroups)]);
+        }
         for part in self.parts {
             text.push_str(part);
         }
@@ -258,24 +314,31 @@ mod tests {
         Chunk, ChunkCount, SortPass, Splat2d, StatusHead, Step, View, Window,
     };
 
-    fn parse_with(source: &Source, rows: u32) -> naga::Module {
-        let text = source.text(rows);
+    fn parse_with(source: &Source, rows: u32, subgroups: bool) -> naga::Module {
+        let text = source.text(rows, subgroups);
         naga::front::wgsl::parse_str(&text)
             .unwrap_or_else(|e| panic!("{}: {}", source.name, e.emit_to_string(&text)))
     }
 
     fn parse(source: &Source) -> naga::Module {
-        parse_with(source, ROWS[0])
+        parse_with(source, ROWS[0], false)
     }
 
     #[test]
     fn every_shader_is_valid_without_optional_capabilities() {
         for (source, rows) in SOURCES.iter().flat_map(|s| ROWS.map(|rows| (s, rows))) {
-            let module = parse_with(source, rows);
-            let result =
-                Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module);
-            if let Err(error) = result {
-                panic!("{}: {}", source.name, error.emit_to_string(&source.text(rows)));
+            for subgroups in [false, true] {
+                let module = parse_with(source, rows, subgroups);
+                let needs = if subgroups { Capabilities::SUBGROUP } else { Capabilities::empty() };
+                let mut validator = Validator::new(ValidationFlags::all(), needs);
+                if subgroups {
+                    validator.subgroup_stages(naga::valid::ShaderStages::COMPUTE);
+                    validator.subgroup_operations(naga::valid::SubgroupOperationSet::all());
+                }
+                if let Err(error) = validator.validate(&module) {
+                    let text = source.text(rows, subgroups);
+                    panic!("{}: {}", source.name, error.emit_to_string(&text));
+                }
             }
         }
     }
@@ -377,7 +440,8 @@ mod tests {
             tiles_x,
             sh_degree,
             sh_stride,
-            raw
+            raw,
+            antialiased
         );
         layout!("project", Window, first, count);
         layout!(

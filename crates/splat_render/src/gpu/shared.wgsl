@@ -21,6 +21,8 @@ struct View {
     sh_stride: u32,
     // 1 where scales are logarithms and opacities logits.
     raw: u32,
+    // 1 where opacities are lowered by what the blur adds to a splat's area.
+    antialiased: u32,
 }
 
 // The splats of one dispatch; per-splat bindings begin at `first`.
