@@ -60,7 +60,14 @@ def _array(tensor: Tensor, dtype: Any) -> npt.NDArray[Any]:
 
 
 def _tensor(array: npt.NDArray[Any], like: Tensor) -> Tensor:
-    """Back to the device and dtype of ``like``; the same memory where nothing changes."""
+    """Back to the device and dtype of ``like``; the same memory where nothing changes.
+
+    What float64 holds and float32 cannot, as the gradient of a splat of 1e38 units, stays finite
+    there, and so do sums of that over a thousand cameras.
+    """
+    if array.dtype == np.float64 and like.dtype == torch.float32:
+        limit = float(np.finfo(np.float32).max) / 1024.0
+        array = array.clip(-limit, limit)
     return torch.from_numpy(array).to(like)
 
 
@@ -307,7 +314,8 @@ def rasterization(
         if radius_clip > 0.0:
             radii = view["radii"]
             view["radii"] = radii * (radii > radius_clip).any(dim=-1, keepdim=True)
-        drawn = (view["radii"] > 0).all(dim=-1)
+        if packed or render_normals or further is not None:
+            drawn = view["radii"].amin(dim=-1) > 0
         if further is not None:
             # What is not drawn may hold NaN, which no weight of 0 would hide.
             view_further = further[c] if per_camera_colors else further
@@ -444,11 +452,12 @@ def _draw(
     if in_color and channels % GROUP:
         pieces[-1] = pieces[-1][..., : channels % GROUP]
     if render_mode.endswith("ED"):
-        depth = depth / torch.where(alpha > 0.0, alpha, 1.0)
+        # 0 where nothing is drawn; where something is, alpha is at least 1/255.
+        depth = depth / alpha.clamp(min=1e-3)
     if render_mode != "RGB":
         pieces.append(depth)
     # Always a copy, which the caller may change: the backward pass needs the pieces.
-    picture = torch.cat(pieces, dim=-1)
+    picture = torch.cat(pieces, dim=-1) if len(pieces) > 1 else pieces[0].clone()
     normals = passes[-1][0] if "normals" in view else None
 
     if background is not None and in_color:
