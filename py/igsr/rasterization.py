@@ -7,7 +7,8 @@ do raises ValueError by the argument's name.
 Two autograd functions do the work, one per half of the pipeline: ``_Project`` and ``_Rasterize``.
 Between them lie ``means2d`` (so that ``meta["means2d"].grad`` exists, which density control reads)
 and ``factors``, the upper-triangular factor of each conic: the same information as a covariance
-without its cancellation for long needles.
+without its cancellation for long needles. Everything that gsplat offers around them (further
+channels, normals, backgrounds and masks per pixel) is composed of the two in torch.
 """
 
 from __future__ import annotations
@@ -249,17 +250,33 @@ def rasterization(
     """Render N Gaussians into C cameras, differentiably.
 
     Gradients reach ``means``, ``quats``, ``scales``, ``opacities``, ``colors``, ``viewmats``,
-    ``Ks`` (fx, fy, cx, cy) and ``backgrounds``. Tensors may lie on any torch device (all on one);
-    the result lies there too. Splat tensors are float32; with backend "reference" they may all be
-    float64, and then everything is computed and returned in it. Cameras are float32 or float64.
+    ``Ks`` (fx, fy, cx, cy) and ``backgrounds``. Splat tensors are float32; with backend
+    "reference" they may all be float64, and then everything is computed and returned in it.
+    Cameras are float32 or float64.
+
+    Tensors may lie on any torch device (all on one); the result lies there too. The kernels take
+    arrays in host memory (from which backend "gpu" feeds its own device). Tensors on the CPU that
+    are contiguous are used where they lie; of others, this is copied each call, for every camera,
+    in bytes in float32 with P = ceil(D / 3) passes, or one with "D" and "ED", and one more for
+    ``render_normals`` behind colours:
+
+        forward     to the host    44 + 12 K per splat (K = 1 for direct colours), and then
+                                   48 P per splat (per drawn splat if ``packed``)
+                    to the device  48 per splat, and then 24 P per pixel
+        backward    to the host    at most 20 P per pixel (color 12, alpha 4, depth 4; what the
+                                   loss does not use is not copied), and then 40 per splat
+                    to the device  40 P per splat (8 more with ``absgrad``; per drawn splat if
+                                   ``packed``), and then 44 + 12 K per splat
 
     Args:
         means: [N, 3] centres, world frame.
         quats: [N, 4] rotations w x y z, normalised inside.
         scales: [N, 3] standard deviations (not logarithms).
         opacities: [N] in [0, 1] (not logits).
-        colors: [N, 3] or [C, N, 3] colours; with ``sh_degree``, [N, K, 3] or [C, N, K, 3]
-            spherical-harmonics coefficients with K >= (sh_degree + 1)^2.
+        colors: [N, D] or [C, N, D] colours or other features, any D >= 1; with ``sh_degree``,
+            [N, K, 3] or [C, N, K, 3] spherical-harmonics coefficients with
+            K >= (sh_degree + 1)^2, and D = 3. Channels are drawn three at a time, each three at
+            the cost of a whole pass over the 2D splats.
         viewmats: [C, 4, 4] rigid world-to-camera matrices, OpenCV axes.
         Ks: [C, 3, 3] pinhole matrices in pixels without skew; pixel centres at +0.5.
         width, height: picture size in pixels.
@@ -271,25 +288,42 @@ def rasterization(
             visible (camera, splat) pairs, [nnz, ...] with ``camera_ids`` and ``gaussian_ids``;
             False returns them [C, N, ...], zero ``radii`` meaning not visible. The picture does
             not depend on it; pass the strategy's ``packed`` the same value, as with gsplat.
-        backgrounds: [C, 3] colour behind the splats; None is black.
-        render_mode: "RGB"; "D" accumulated depth; "ED" expected depth (accumulated / alpha);
-            "RGB+D", "RGB+ED" with the depth as last channel.
+        backgrounds: [C, D] colour behind the splats, or [C, height, width, D] one per pixel; None
+            is black. There is none behind depth and normals.
+        render_mode: "RGB"; "D" accumulated depth; "ED" expected depth (accumulated / alpha, 0
+            where alpha is 0); "RGB+D", "RGB+ED" with the depth as last channel.
+        absgrad: True leaves in ``meta["means2d"].absgrad``, after ``backward()``, the sum over
+            pixels of the absolute gradients of ``means2d``, shaped like it, for
+            ``DefaultStrategy(absgrad=True)``. They are absolute values of what one pass knows,
+            so with at most three channels and without ``render_normals``.
+        rasterize_mode: "classic", or "antialiased": opacities times
+            sqrt(det(S) / det(S + eps2d I)) with S the projected 2D covariance (Mip-Splatting's 2D
+            filter); ``meta["opacities"]`` are those.
+        channel_chunk: accepted as gsplat has it; nothing depends on it.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu", "reference".
+        masks: [C, height, width] bool; where False the pixel shows the background, its alpha,
+            depth and normal are 0, and it passes no gradient to the splats and the camera. What
+            gsplat's ``rasterize_to_pixels`` means by tile masks, per pixel; it saves no time.
+        render_normals: True adds ``meta["render_normals"]``.
 
         All other arguments are gsplat's and accepted at their defaults only.
 
     Returns:
-        ``render_colors`` [C, height, width, X] with X = 3, 1 or 4 by ``render_mode``,
+        ``render_colors`` [C, height, width, X] with X = D, 1 or D + 1 by ``render_mode``,
         ``render_alphas`` [C, height, width, 1], and ``meta``: ``means2d`` (in the graph: call
         ``retain_grad()`` before ``backward()``), ``radii`` (int32 pixels, x and y, rounded up),
         ``depths``, ``conics`` (xx, xy, yy), ``opacities``, ``batch_ids``, ``camera_ids``,
         ``gaussian_ids``, ``width``, ``height``, ``tile_size``, ``tile_width``, ``tile_height``,
-        ``n_batches``, ``n_cameras``.
+        ``n_batches``, ``n_cameras``; and ``render_normals`` [C, height, width, 3] if asked for:
+        each splat's shortest axis, turned to face the camera, in the world frame, accumulated
+        with the weights of the colours (so of length alpha at most), as gsplat's
+        ``rasterization_2dgs`` returns it.
 
     Raises:
         ValueError: an argument has the wrong type, dtype, shape, device or value, or is one of
             gsplat's that is not supported; the message begins with its name.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
+        RuntimeError: backend "gpu" was asked for and no adapter answers; or, in ``backward()``,
+            a tensor that it needs was changed in place since.
     """
     check_arguments(locals())
     backend = _core.resolve_backend(backend)
