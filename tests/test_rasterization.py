@@ -124,19 +124,49 @@ def test_repeats_bit_for_bit():
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize(
-    "changed",
-    ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds", "means2d"],
-)
-def test_what_is_changed_before_backward_is_refused(changed):
-    scene = torch_scene()
+INPUTS = ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"]
+
+
+def changed_before_backward(change, cameras, packed):
+    """The gradients, or None if backward() refuses to compute them."""
+    scene = torch_scene(cameras=cameras)
     for tensor in scene.values():
         tensor.requires_grad_()
-    color, _, meta = run(scene, packed=False)
+    color, alpha, meta = run(scene, packed=packed, render_mode="RGB+ED")
     with torch.no_grad():
-        {**scene, **meta}[changed].mul_(1.2)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        color.sum().backward()
+        change(scene, color, alpha, meta)
+    try:
+        (color.sum() + alpha.sum()).backward()
+    except RuntimeError as refusal:
+        assert "modified by an inplace operation" in str(refusal)
+        return None
+    return [tensor.grad for tensor in scene.values()]
+
+
+@pytest.mark.parametrize("changed", INPUTS)
+def test_what_is_changed_before_backward_is_refused(changed):
+    def change(scene, *_):
+        scene[changed].mul_(1.2)
+
+    assert changed_before_backward(change, cameras=2, packed=False) is None
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("changed", ["color", "alpha", "backgrounds", "meta"])
+def test_a_change_of_what_was_returned_is_refused_or_without_effect(changed, cameras, packed):
+    def change(scene, color, alpha, meta):
+        tensors = {"color": color, "alpha": alpha, **scene, **meta}
+        names = ("means2d", "depths", "opacities", "conics") if changed == "meta" else (changed,)
+        for name in names:
+            tensors[name].mul_(0.5)
+
+    gradients = changed_before_backward(change, cameras, packed)
+    if changed == "meta":
+        assert gradients is None  # density control reads means2d's gradient
+        return
+    untouched = changed_before_backward(lambda *_: None, cameras, packed)
+    assert all(map(torch.equal, gradients, untouched))
 
 
 def test_shapes_and_meta_follow_gsplat():

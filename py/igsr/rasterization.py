@@ -7,14 +7,15 @@ do raises ValueError by the argument's name.
 Two autograd functions do the work, one per half of the pipeline: ``_Project`` and ``_Rasterize``.
 Between them lie ``means2d`` (so that ``meta["means2d"].grad`` exists, which density control reads)
 and ``factors``, the upper-triangular factor of each conic: the same information as a covariance
-without its cancellation for long needles.
+without its cancellation for long needles. Everything that gsplat offers around them (further
+channels, normals, backgrounds and masks per pixel) is composed of the two in torch.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-import numbers
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,42 +25,20 @@ import torch
 from torch import Tensor
 
 from . import _core
-from .splats import MAX_SH_DEGREE
+from .normals import facing_normals
+from .rasterization_arguments import TILE_SIZE, check_arguments
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
-#: A rotation in float32 is orthonormal to about 1e-6; a scaled or sheared pose is far outside (the
-#: renderer itself draws the same line).
-RIGID_TOLERANCE = 1e-3
-#: The tile's side in pixels; it shows in ``meta`` only, no picture depends on it.
-TILE_SIZE = 16
+#: Colour channels that one pass of the kernels draws.
+GROUP = 3
+#: Render modes whose picture shows the colours.
+COLOR_MODES = ("RGB", "RGB+D", "RGB+ED")
 
 #: What passes from ``_Project`` to ``_Rasterize``; the last carries no gradient.
 DIFFERENTIABLE = ("means2d", "factors", "depths", "colors", "opacities")
 PROJECTED = (*DIFFERENTIABLE, "radii")
-IMAGE = ("color", "alpha", "depth")
-
-#: gsplat arguments that exist to be refused by name, with the only value accepted.
-_UNSUPPORTED_DEFAULTS: dict[str, Any] = {
-    "tile_size": TILE_SIZE,
-    "sparse_grad": False,
-    "absgrad": False,
-    "rasterize_mode": "classic",
-    "channel_chunk": 32,
-    "distributed": False,
-    "camera_model": "pinhole",
-    "segmented": False,
-    "covars": None,
-    "with_ut": False,
-    "with_eval3d": False,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
-    "ftheta_coeffs": None,
-    "rolling_shutter": None,
-    "viewmats_rs": None,
-}
+IMAGE = ("color", "alpha", "depth", "transmittance")
 
 
 @dataclass(frozen=True)
@@ -71,12 +50,26 @@ class _Settings:
     near: float
     far: float
     eps2d: float
+    antialiased: bool
     sh_degree: int | None
     backend: str
 
 
 def _array(tensor: Tensor, dtype: Any) -> npt.NDArray[Any]:
+    """To the host; for a contiguous tensor of that dtype on the CPU the same memory."""
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=dtype)
+
+
+def _tensor(array: npt.NDArray[Any], like: Tensor) -> Tensor:
+    """Back to the device and dtype of ``like``; the same memory where nothing changes.
+
+    What float64 holds and float32 cannot, as the gradient of a splat of 1e38 units, stays finite
+    there, and so do sums of that over a thousand cameras.
+    """
+    if array.dtype == np.float64 and like.dtype == torch.float32:
+        limit = float(np.finfo(np.float32).max) / 1024.0
+        array = array.clip(-limit, limit)
+    return torch.from_numpy(array).to(like)
 
 
 def _project_options(viewmat: Tensor, K: Tensor, settings: _Settings) -> dict[str, Any]:
@@ -90,7 +83,7 @@ def _project_options(viewmat: Tensor, K: Tensor, settings: _Settings) -> dict[st
         "near": settings.near,
         "far": settings.far,
         "eps2d": settings.eps2d,
-        "antialiased": False,
+        "antialiased": settings.antialiased,
         "backend": settings.backend,
     }
 
@@ -115,43 +108,42 @@ class _Project(torch.autograd.Function):
         settings: _Settings,
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
-        inputs = [_array(t, dtype) for t in (means, quats, scales, opacities, colors)]
-        projected = _core.project(*inputs, **_project_options(viewmat, K, settings))
-        # The arrays above share memory with the caller's tensors: only what autograd saves is
-        # refused in backward() when the caller has changed it in place since.
-        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmat, K)
-        ctx.settings, ctx.projected = settings, projected
-        outputs = tuple(torch.from_numpy(projected[name]).to(means) for name in PROJECTED)
+        inputs: dict[str, Any] = {
+            "means": _array(means, dtype),
+            "quats": _array(quats, dtype),
+            "scales": _array(scales, dtype),
+            "opacities": _array(opacities, dtype),
+            "colors": _array(colors, dtype),
+        }
+        options = _project_options(viewmat, K, settings)
+        projected = _core.project(**inputs, **options)
+        outputs = tuple(_tensor(projected[name], means) for name in PROJECTED)
+        # The arrays share memory with these tensors: only what autograd saves is refused in
+        # backward() when the caller has changed it in place since.
+        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmat, K, *outputs)
+        ctx.inputs, ctx.options, ctx.projected = inputs, options, projected
         ctx.mark_non_differentiable(*outputs[len(DIFFERENTIABLE) :])
         return outputs
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        dtype = _core.working_dtype(ctx.settings.backend)
-        *splats, viewmat, K = ctx.saved_tensors
+        means, _, _, _, _, viewmat, K = ctx.saved_tensors[:7]
+        dtype = ctx.inputs["means"].dtype
         v_projected = {
             f"v_{name}": _array(v, dtype)
             for name, v in zip(DIFFERENTIABLE, v_outputs, strict=False)
         }
-        means, quats, scales, opacities, colors = (_array(t, dtype) for t in splats)
         v = _core.project_backward(
-            means,
-            quats,
-            scales,
-            opacities,
-            colors,
-            ctx.projected,
-            v_projected,
-            **_project_options(viewmat, K, ctx.settings),
+            **ctx.inputs, projected=ctx.projected, v_projected=v_projected, **ctx.options
         )
         v_fx, v_fy, v_cx, v_cy = v["v_intrinsics"]
         v_K = np.array([[v_fx, 0.0, v_cx], [0.0, v_fy, v_cy], [0.0, 0.0, 0.0]])
         names = ("v_means", "v_quats", "v_scales", "v_opacities", "v_colors")
         return (
-            *(torch.from_numpy(v[name]).to(splats[0]) for name in names),
-            torch.from_numpy(v["v_viewmat"]).to(viewmat),
-            torch.from_numpy(v_K).to(K),
+            *(_tensor(v[name], means) for name in names),
+            _tensor(v["v_viewmat"], viewmat),
+            _tensor(v_K, K),
             None,
         )
 
@@ -161,40 +153,59 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, background: Tensor, settings: _Settings, *projected: Tensor
+        ctx: Any,
+        background: Tensor,
+        settings: _Settings,
+        keep_absolute: Callable[[Tensor], None] | None,
+        *projected: Tensor,
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
+        # What of the picture the loss does not use comes as None instead of as zeros.
+        ctx.set_materialize_grads(False)
         ctx.save_for_backward(background, *projected)
-        ctx.backend = settings.backend
+        ctx.projected = _projected_arrays(projected, dtype)
+        ctx.keep_absolute = keep_absolute
+        ctx.background, ctx.backend = _array(background, dtype), settings.backend
         ctx.image = _core.rasterize(
-            _projected_arrays(projected, dtype),
+            ctx.projected,
             width=settings.width,
             height=settings.height,
-            background=_array(background, dtype),
+            background=ctx.background,
             backend=settings.backend,
         )
-        return tuple(torch.from_numpy(ctx.image[name]).to(background) for name in IMAGE)
+        return tuple(_tensor(ctx.image[name], background) for name in IMAGE)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(
-        ctx: Any, v_color: Tensor, v_alpha: Tensor, v_depth: Tensor
+        ctx: Any,
+        v_color: Tensor | None,
+        v_alpha: Tensor | None,
+        v_depth: Tensor | None,
+        v_transmittance: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
-        dtype = _core.working_dtype(ctx.backend)
-        background, *projected = ctx.saved_tensors
+        background = ctx.saved_tensors[0]
+        if v_transmittance is not None:  # it is 1 - alpha
+            v_alpha = -v_transmittance if v_alpha is None else v_alpha - v_transmittance
+        v_image = {
+            f"v_{name}": np.zeros_like(ctx.image[name])
+            if v is None
+            else _array(v, ctx.image[name].dtype)
+            for name, v in (("color", v_color), ("alpha", v_alpha), ("depth", v_depth))
+        }
         v = _core.rasterize_backward(
-            _projected_arrays(projected, dtype),
+            ctx.projected,
             ctx.image,
-            v_color=_array(v_color, dtype),
-            v_alpha=_array(v_alpha, dtype),
-            v_depth=_array(v_depth, dtype),
-            background=_array(background, dtype),
-            absolute=False,
+            **v_image,
+            background=ctx.background,
+            absolute=ctx.keep_absolute is not None,
             backend=ctx.backend,
         )
-        v_background = torch.from_numpy(v["v_background"]).to(background)
-        v_projected = (torch.from_numpy(v[f"v_{name}"]).to(background) for name in DIFFERENTIABLE)
-        return (v_background, None, *v_projected, None)
+        if ctx.keep_absolute is not None:
+            ctx.keep_absolute(_tensor(v["v_means2d_absolute"], background))
+        v_background = _tensor(v["v_background"], background)
+        v_projected = (_tensor(v[f"v_{name}"], background) for name in DIFFERENTIABLE)
+        return (v_background, None, None, *v_projected, None)
 
 
 def rasterization(
@@ -233,21 +244,39 @@ def rasterization(
     rolling_shutter: Any = None,
     viewmats_rs: Tensor | None = None,
     backend: str = "auto",
+    masks: Tensor | None = None,
+    render_normals: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C cameras, differentiably.
 
     Gradients reach ``means``, ``quats``, ``scales``, ``opacities``, ``colors``, ``viewmats``,
-    ``Ks`` (fx, fy, cx, cy) and ``backgrounds``. Tensors may lie on any torch device (all on one);
-    the result lies there too. Splat tensors are float32; with backend "reference" they may all be
-    float64, and then everything is computed and returned in it. Cameras are float32 or float64.
+    ``Ks`` (fx, fy, cx, cy) and ``backgrounds``. Splat tensors are float32; with backend
+    "reference" they may all be float64, and then everything is computed and returned in it.
+    Cameras are float32 or float64.
+
+    Tensors may lie on any torch device (all on one); the result lies there too. The kernels take
+    arrays in host memory (from which backend "gpu" feeds its own device). Tensors on the CPU that
+    are contiguous are used where they lie; of others, this is copied each call, for every camera,
+    in bytes in float32 with P = ceil(D / 3) passes, or one with "D" and "ED", and one more for
+    ``render_normals`` behind colours:
+
+        forward     to the host    44 + 12 K per splat (K = 1 for direct colours), and then
+                                   48 P per splat (per drawn splat if ``packed``)
+                    to the device  48 per splat, and then 24 P per pixel
+        backward    to the host    at most 20 P per pixel (color 12, alpha 4, depth 4; what the
+                                   loss does not use is not copied), and then 40 per splat
+                    to the device  40 P per splat (8 more with ``absgrad``; per drawn splat if
+                                   ``packed``), and then 44 + 12 K per splat
 
     Args:
         means: [N, 3] centres, world frame.
         quats: [N, 4] rotations w x y z, normalised inside.
         scales: [N, 3] standard deviations (not logarithms).
         opacities: [N] in [0, 1] (not logits).
-        colors: [N, 3] or [C, N, 3] colours; with ``sh_degree``, [N, K, 3] or [C, N, K, 3]
-            spherical-harmonics coefficients with K >= (sh_degree + 1)^2.
+        colors: [N, D] or [C, N, D] colours or other features, any D >= 1; with ``sh_degree``,
+            [N, K, 3] or [C, N, K, 3] spherical-harmonics coefficients with
+            K >= (sh_degree + 1)^2, and D = 3. Channels are drawn three at a time, each three at
+            the cost of a whole pass over the 2D splats.
         viewmats: [C, 4, 4] rigid world-to-camera matrices, OpenCV axes.
         Ks: [C, 3, 3] pinhole matrices in pixels without skew; pixel centres at +0.5.
         width, height: picture size in pixels.
@@ -259,111 +288,110 @@ def rasterization(
             visible (camera, splat) pairs, [nnz, ...] with ``camera_ids`` and ``gaussian_ids``;
             False returns them [C, N, ...], zero ``radii`` meaning not visible. The picture does
             not depend on it; pass the strategy's ``packed`` the same value, as with gsplat.
-        backgrounds: [C, 3] colour behind the splats; None is black.
-        render_mode: "RGB"; "D" accumulated depth; "ED" expected depth (accumulated / alpha);
-            "RGB+D", "RGB+ED" with the depth as last channel.
+        backgrounds: [C, D] colour behind the splats, or [C, height, width, D] one per pixel; None
+            is black. There is none behind depth and normals.
+        render_mode: "RGB"; "D" accumulated depth; "ED" expected depth (accumulated / alpha, 0
+            where alpha is 0); "RGB+D", "RGB+ED" with the depth as last channel.
+        absgrad: True leaves in ``meta["means2d"].absgrad``, after ``backward()``, the sum over
+            pixels of the absolute gradients of ``means2d``, shaped like it, for
+            ``DefaultStrategy(absgrad=True)``. They are absolute values of what one pass knows,
+            so with at most three channels and without ``render_normals``.
+        rasterize_mode: "classic", or "antialiased": opacities times
+            sqrt(det(S) / det(S + eps2d I)) with S the projected 2D covariance (Mip-Splatting's 2D
+            filter); ``meta["opacities"]`` are those.
+        channel_chunk: accepted as gsplat has it; nothing depends on it.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu", "reference".
+        masks: [C, height, width] bool; where False the pixel shows the background, its alpha,
+            depth and normal are 0, and it passes no gradient to the splats and the camera. What
+            gsplat's ``rasterize_to_pixels`` means by tile masks, per pixel; it saves no time.
+        render_normals: True adds ``meta["render_normals"]``.
 
         All other arguments are gsplat's and accepted at their defaults only.
 
     Returns:
-        ``render_colors`` [C, height, width, X] with X = 3, 1 or 4 by ``render_mode``,
+        ``render_colors`` [C, height, width, X] with X = D, 1 or D + 1 by ``render_mode``,
         ``render_alphas`` [C, height, width, 1], and ``meta``: ``means2d`` (in the graph: call
         ``retain_grad()`` before ``backward()``), ``radii`` (int32 pixels, x and y, rounded up),
         ``depths``, ``conics`` (xx, xy, yy), ``opacities``, ``batch_ids``, ``camera_ids``,
         ``gaussian_ids``, ``width``, ``height``, ``tile_size``, ``tile_width``, ``tile_height``,
-        ``n_batches``, ``n_cameras``.
+        ``n_batches``, ``n_cameras``; and ``render_normals`` [C, height, width, 3] if asked for:
+        each splat's shortest axis, turned to face the camera, in the world frame, accumulated
+        with the weights of the colours (so of length alpha at most), as gsplat's
+        ``rasterization_2dgs`` returns it.
 
     Raises:
         ValueError: an argument has the wrong type, dtype, shape, device or value, or is one of
             gsplat's that is not supported; the message begins with its name.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
+        RuntimeError: backend "gpu" was asked for and no adapter answers; or, in ``backward()``,
+            a tensor that it needs was changed in place since.
     """
-    arguments = locals()
-    for name, default in _UNSUPPORTED_DEFAULTS.items():
-        value = arguments[name]
-        if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
-            continue  # gsplat's own default, an enum that is not ours to import
-        if value is not default and (isinstance(value, Tensor) or value != default):
-            raise ValueError(f"{name}: only {default!r} is supported, not {value!r}")
-    _check_settings(
-        width,
-        height,
-        near_plane,
-        far_plane,
-        radius_clip,
-        eps2d,
-        sh_degree,
-        packed,
-        render_mode,
-        backend,
-    )
-    dtypes = (torch.float32, torch.float64) if backend == "reference" else (torch.float32,)
-    _check_tensors(
-        means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, sh_degree, dtypes
-    )
+    check_arguments(locals())
     backend = _core.resolve_backend(backend)
-    settings = _Settings(width, height, near_plane, far_plane, eps2d, sh_degree, backend)
+    antialiased = rasterize_mode == "antialiased"
+    settings = _Settings(
+        width, height, near_plane, far_plane, eps2d, antialiased, sh_degree, backend
+    )
     cameras = len(viewmats)
+    channels = colors.shape[-1]
     per_camera_colors = colors.dim() == (3 if sh_degree is None else 4)
+    further: Tensor | None = None
+    if sh_degree is None and channels != GROUP:
+        colors, further = _grouped(colors)
+        if render_mode not in COLOR_MODES:
+            further = None
 
-    projected = [
-        _Project.apply(
-            means,
-            quats,
-            scales,
-            opacities,
-            colors[c] if per_camera_colors else colors,
-            viewmats[c],
-            Ks[c],
+    views, ids = [], []
+    for c in range(cameras):
+        of_camera = (means, quats, scales, opacities, colors[c] if per_camera_colors else colors)
+        outputs = _Project.apply(*of_camera, viewmats[c], Ks[c], settings)
+        view = dict(zip(PROJECTED, outputs, strict=True))
+        if radius_clip > 0.0:
+            radii = view["radii"]
+            view["radii"] = radii * (radii > radius_clip).any(dim=-1, keepdim=True)
+        if packed or render_normals or further is not None:
+            drawn = view["radii"].amin(dim=-1) > 0
+        if further is not None:
+            # What is not drawn may hold NaN, which no weight of 0 would hide.
+            view_further = further[c] if per_camera_colors else further
+            view["further"] = torch.where(drawn[:, None], view_further, 0.0)
+        if render_normals:
+            view["normals"] = facing_normals(means, quats, scales, viewmats[c], drawn)
+        if packed:
+            ids.append(drawn.nonzero().squeeze(1))
+            view = {name: per_splat.index_select(0, ids[-1]) for name, per_splat in view.items()}
+        views.append(view)
+
+    # One tensor for all cameras lies in the graph: the strategies read its gradient.
+    joined = {name: _joined([view[name] for view in views], packed) for name in PROJECTED}
+    means2d = joined["means2d"]
+    counts = [len(view["means2d"]) for view in views]
+    ends = list(itertools.accumulate(counts))
+    segments = [slice(end - n, end) for end, n in zip(ends, counts, strict=True)]
+    drawings = [
+        _draw(
+            {**view, "means2d": means2d[segments[c] if packed else c]},
+            None if backgrounds is None else backgrounds[c],
+            None if masks is None else masks[c],
+            channels,
+            render_mode,
             settings,
+            _absgrad_keeper(means2d, segments[c] if packed else c) if absgrad else None,
         )
-        for c in range(cameras)
+        for c, view in enumerate(views)
     ]
-    # Each [C, N, ...]: the strategies read the gradient of the stacked means2d.
-    stacked = dict(zip(PROJECTED, map(torch.stack, zip(*projected, strict=True)), strict=True))
-    if radius_clip > 0.0:
-        radii = stacked["radii"]
-        stacked["radii"] = radii * (radii > radius_clip).any(dim=-1, keepdim=True)
+    pictures, alphas, normals = zip(*drawings, strict=True)
 
-    camera_ids: Tensor | None = None
-    gaussian_ids: Tensor | None = None
-    segments: list[int | slice] = list(range(cameras))
-    if packed:
-        visible = (stacked["radii"] > 0).all(dim=-1)
-        camera_ids, gaussian_ids = torch.where(visible)
-        stacked = {name: per_splat[visible] for name, per_splat in stacked.items()}
-        ends = torch.cumsum(visible.sum(dim=1), dim=0).tolist()
-        segments = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
-
-    colors_out, alphas_out = [], []
-    for c, segment in enumerate(segments):
-        background = means.new_zeros(3) if backgrounds is None else backgrounds[c]
-        per_camera = (per_splat[segment] for per_splat in stacked.values())
-        color, alpha, depth = _Rasterize.apply(background, settings, *per_camera)
-        alpha = alpha[..., None]
-        depth = depth[..., None]
-        if render_mode.endswith("ED"):
-            depth = depth / alpha.clamp(min=1e-10)
-        if render_mode == "RGB":
-            colors_out.append(color)
-        elif render_mode.startswith("RGB+"):
-            colors_out.append(torch.cat([color, depth], dim=-1))
-        else:
-            colors_out.append(depth)
-        alphas_out.append(alpha)
-
-    p, q, r = stacked["factors"].unbind(dim=-1)
-    meta = {
-        "batch_ids": None if camera_ids is None else torch.zeros_like(camera_ids),
-        "camera_ids": camera_ids,
-        "gaussian_ids": gaussian_ids,
+    p, q, r = joined["factors"].unbind(dim=-1)
+    meta: dict[str, Any] = {
+        "batch_ids": None,
+        "camera_ids": None,
+        "gaussian_ids": None,
         # Nothing that exceeds int32 is a useful radius, and the cast of inf is undefined.
-        "radii": torch.ceil(stacked["radii"]).clamp(max=2.0**30).to(torch.int32),
-        "means2d": stacked["means2d"],
-        "depths": stacked["depths"],
+        "radii": torch.ceil(joined["radii"]).clamp(max=2.0**30).to(torch.int32),
+        "means2d": means2d,
+        "depths": joined["depths"],
         "conics": torch.stack([p * p, p * q, q * q + r * r], dim=-1),
-        "opacities": stacked["opacities"],
+        "opacities": joined["opacities"],
         "width": width,
         "height": height,
         "tile_size": tile_size,
@@ -372,133 +400,110 @@ def rasterization(
         "n_batches": 1,
         "n_cameras": cameras,
     }
-    return torch.stack(colors_out), torch.stack(alphas_out), meta
+    if packed:
+        meta["gaussian_ids"] = torch.cat(ids)
+        camera_ids = torch.arange(cameras, device=means.device)
+        meta["camera_ids"] = camera_ids.repeat_interleave(torch.tensor(counts).to(means.device))
+        meta["batch_ids"] = torch.zeros_like(meta["camera_ids"])
+    if render_normals:
+        meta["render_normals"] = torch.stack(normals)
+    return _joined(list(pictures), packed=False), torch.stack(alphas), meta
 
 
-def _check_settings(
-    width: object,
-    height: object,
-    near_plane: Any,
-    far_plane: Any,
-    radius_clip: Any,
-    eps2d: Any,
-    sh_degree: Any,
-    packed: object,
-    render_mode: object,
-    backend: object,
-) -> None:
-    for name, size in (("width", width), ("height", height)):
-        if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
-            raise ValueError(f"{name}: must be a positive whole number of pixels, not {size!r}")
-    for name, number in (
-        ("near_plane", near_plane),
-        ("far_plane", far_plane),
-        ("radius_clip", radius_clip),
-        ("eps2d", eps2d),
-    ):
-        real = isinstance(number, numbers.Real) and not isinstance(number, bool)
-        if not real or not math.isfinite(number) or number < 0:
-            raise ValueError(f"{name}: must be a finite number of at least 0, not {number!r}")
-    if far_plane <= near_plane:
-        raise ValueError(f"far_plane: must exceed near_plane ({near_plane}), not {far_plane}")
-    whole = isinstance(sh_degree, numbers.Integral) and not isinstance(sh_degree, bool)
-    if sh_degree is not None and not (whole and sh_degree in range(MAX_SH_DEGREE + 1)):
-        raise ValueError(f"sh_degree: must be None or 0 to 4, not {sh_degree!r}")
-    if not isinstance(packed, bool):
-        raise ValueError(f"packed: must be True or False, not {packed!r}")
-    if render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode: must be one of {RENDER_MODES}, not {render_mode!r}")
-    if not isinstance(backend, str):
-        raise ValueError(f"backend: must be a name such as 'auto', not {backend!r}")
+def _joined(tensors: list[Tensor], packed: bool) -> Tensor:
+    """Of all cameras: one behind the other if packed, else along a new first dimension."""
+    if len(tensors) == 1:  # nothing to copy
+        return tensors[0] if packed else tensors[0][None]
+    return torch.cat(tensors) if packed else torch.stack(tensors)
 
 
-def _check_tensors(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    sh_degree: int | None,
-    dtypes: tuple[torch.dtype, ...],
-) -> None:
-    _check_tensor("means", means, [("N", 3)], dtypes)
-    count, device, dtypes = len(means), means.device, (means.dtype,)
-    _check_tensor("quats", quats, [(count, 4)], dtypes, device)
-    _check_tensor("scales", scales, [(count, 3)], dtypes, device)
-    _check_tensor("opacities", opacities, [(count,)], dtypes, device)
-    camera_dtypes = (torch.float32, torch.float64)
-    _check_tensor("viewmats", viewmats, [("C", 4, 4)], camera_dtypes, device)
-    cameras = len(viewmats)
-    if cameras == 0:
-        raise ValueError("viewmats: needs at least one camera")
-    _check_tensor("Ks", Ks, [(cameras, 3, 3)], camera_dtypes, device)
-    if sh_degree is None:
-        shapes: list[tuple[int | str, ...]] = [(count, 3), (cameras, count, 3)]
+def _absgrad_keeper(means2d: Tensor, of_camera: int | slice) -> Callable[[Tensor], None]:
+    """What a backward pass calls to leave a camera's part in ``means2d.absgrad``, as gsplat does.
+
+    ``means2d`` lies before the pass in the graph, so holding it there makes no cycle.
+    """
+
+    def keep(absolute: Tensor) -> None:
+        if not hasattr(means2d, "absgrad"):
+            means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
+        means2d.absgrad[of_camera] = absolute  # type: ignore[attr-defined]
+
+    return keep
+
+
+def _grouped(colors: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Colours [..., D] as the first three channels and the others, zeros after the last.
+
+    The first three go through the projection, which does not draw a splat that is not finite. For
+    the others to have the same effect, NaN there is carried over.
+    """
+    channels = colors.shape[-1]
+    if channels <= GROUP:
+        return torch.nn.functional.pad(colors, (0, GROUP - channels)), None
+    first, others = colors.split([GROUP, channels - GROUP], dim=-1)
+    zero_or_nan = (others.detach() * 0.0).sum(dim=-1, keepdim=True)
+    return first + zero_or_nan, torch.nn.functional.pad(others, (0, -channels % GROUP))
+
+
+def _draw(
+    view: dict[str, Tensor],
+    background: Tensor | None,
+    mask: Tensor | None,
+    channels: int,
+    render_mode: RenderMode,
+    settings: _Settings,
+    keep_absolute: Callable[[Tensor], None] | None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """One camera's picture [H, W, X], alpha [H, W, 1] and normals [H, W, 3], if asked for.
+
+    ``background`` is [D] or [H, W, D], ``mask`` [H, W]. Every group of three channels is a pass of
+    its own over the same 2D splats; autograd adds up what the passes say about them.
+    """
+    in_color = render_mode in COLOR_MODES
+    groups = [view["colors"]]
+    if "further" in view:
+        groups += view["further"].split(GROUP, dim=-1)
+    color_groups = len(groups) if in_color else 0
+    if "normals" in view:
+        groups = [*groups[:color_groups], view["normals"]]
+
+    behind = view["means2d"].new_zeros(GROUP * len(groups))
+    if background is not None and in_color and background.dim() == 1:
+        behind = torch.nn.functional.pad(background, (0, len(behind) - channels))
+    passes = [
+        _Rasterize.apply(
+            group_behind,
+            settings,
+            keep_absolute,
+            *(group if name == "colors" else view[name] for name in PROJECTED),
+        )
+        for group, group_behind in zip(groups, behind.split(GROUP), strict=True)
+    ]
+    # The same in every pass, so the gradient of one pass is the whole one.
+    _, alpha, depth, transmittance = (image[..., None] for image in passes[0])
+
+    pieces = [color for color, *_ in passes[:color_groups]]
+    if in_color and channels % GROUP:
+        pieces[-1] = pieces[-1][..., : channels % GROUP]
+    if render_mode.endswith("ED"):
+        # 0 where nothing is drawn; where something is, alpha is at least 1/255.
+        depth = depth / alpha.clamp(min=1e-3)
+    if render_mode != "RGB":
+        pieces.append(depth)
+    # Always a copy, which the caller may change: the backward pass needs the pieces.
+    picture = torch.cat(pieces, dim=-1) if len(pieces) > 1 else pieces[0].clone()
+    normals = passes[-1][0] if "normals" in view else None
+
+    if background is not None and in_color:
+        # Behind the depth there is nothing.
+        background = torch.nn.functional.pad(background, (0, picture.shape[-1] - channels))
+        if background.dim() == 3:
+            picture = picture + transmittance * background
     else:
-        shapes = [(count, "K", 3), (cameras, count, "K", 3)]
-    _check_tensor("colors", colors, shapes, dtypes, device)
-    if sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
-        raise ValueError(
-            f"colors: sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, "
-            f"not {colors.shape[-2]}"
-        )
-    if sh_degree is not None and colors.shape[-2] > (MAX_SH_DEGREE + 1) ** 2:
-        raise ValueError(
-            f"colors: at most {(MAX_SH_DEGREE + 1) ** 2} coefficients (degree {MAX_SH_DEGREE}) "
-            f"are supported, not {colors.shape[-2]}"
-        )
-    if backgrounds is not None:
-        _check_tensor("backgrounds", backgrounds, [(cameras, 3)], dtypes, device)
-        if not torch.isfinite(backgrounds).all():
-            raise ValueError("backgrounds: must be finite")
-    for c, viewmat in enumerate(_array(viewmats, np.float64)):
-        _check_viewmat(f"viewmats[{c}]", viewmat)
-    for c, K in enumerate(_array(Ks, np.float64)):
-        _check_intrinsics(f"Ks[{c}]", K)
-
-
-def _check_tensor(
-    name: str,
-    tensor: object,
-    shapes: list[tuple[int | str, ...]],
-    dtypes: tuple[torch.dtype, ...],
-    device: torch.device | None = None,
-) -> None:
-    """Letters in ``shapes`` stand for any size."""
-    if not isinstance(tensor, Tensor):
-        raise ValueError(f"{name}: must be a torch tensor, not {type(tensor).__name__}")
-    if tensor.dtype not in dtypes:
-        wanted = " or ".join(str(dtype) for dtype in dtypes)
-        raise ValueError(f"{name}: must be {wanted}, not {tensor.dtype}")
-    if not any(
-        tensor.dim() == len(shape)
-        and all(isinstance(s, str) or s == t for s, t in zip(shape, tensor.shape, strict=True))
-        for shape in shapes
-    ):
-        wanted = " or ".join("[" + ", ".join(map(str, shape)) + "]" for shape in shapes)
-        raise ValueError(f"{name}: must have shape {wanted}, not {list(tensor.shape)}")
-    if device is not None and tensor.device != device:
-        raise ValueError(f"{name}: must be on {device} like means, not on {tensor.device}")
-
-
-def _check_viewmat(name: str, viewmat: npt.NDArray[np.float64]) -> None:
-    if not np.isfinite(viewmat).all():
-        raise ValueError(f"{name}: must be finite")
-    rotation = viewmat[:3, :3]
-    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_TOLERANCE
-    if not rigid or np.linalg.det(rotation) < 0:
-        raise ValueError(f"{name}: its 3 x 3 part is not a rotation")
-    if np.abs(viewmat[3] - (0.0, 0.0, 0.0, 1.0)).max() > RIGID_TOLERANCE:
-        raise ValueError(f"{name}: its last row must be 0 0 0 1")
-
-
-def _check_intrinsics(name: str, K: npt.NDArray[np.float64]) -> None:
-    if not np.isfinite(K).all():
-        raise ValueError(f"{name}: must be finite")
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise ValueError(f"{name}: focal lengths must be positive, not {K[0, 0]}, {K[1, 1]}")
-    if K[0, 1] != 0 or K[1, 0] != 0 or (K[2] != (0.0, 0.0, 1.0)).any():
-        raise ValueError(f"{name}: must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew)")
+        background = picture.new_zeros(1)
+    if mask is not None:
+        mask = mask[..., None]
+        picture = torch.where(mask, picture, background)
+        alpha = torch.where(mask, alpha, 0.0)
+        normals = None if normals is None else torch.where(mask, normals, 0.0)
+    return picture, alpha, normals

@@ -1,0 +1,229 @@
+"""``rasterization``: many cameras at once, gradients of poses and lenses, tensors of any layout."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+import torch
+from scenes import torch_scene
+
+from igsr import rasterization
+
+WIDTH, HEIGHT = 24, 20
+
+
+def run(scene, **options):
+    arguments = {"sh_degree": 2, "backend": "cpu", **options}
+    return rasterization(**scene, width=WIDTH, height=HEIGHT, **arguments)
+
+
+def leaves(scene):
+    return {name: tensor.clone().requires_grad_() for name, tensor in scene.items()}
+
+
+PER_CAMERA = ("viewmats", "Ks", "backgrounds")
+
+
+@pytest.mark.parametrize("per_camera_colors", [False, True])
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("cameras", [1, 2, 5])
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_a_batch_is_its_cameras_one_by_one(backend, cameras, packed, per_camera_colors):
+    scene = torch_scene(count=20, cameras=cameras)
+    scene["means"][:4, 2] = -3.0  # behind the cameras
+    if per_camera_colors:
+        scale = torch.linspace(0.5, 1.0, cameras)
+        scene["colors"] = scene["colors"] * scale[:, None, None, None]
+    names = (*PER_CAMERA, "colors") if per_camera_colors else PER_CAMERA
+    options = {"backend": backend, "packed": packed, "render_mode": "RGB+ED"}
+
+    batch = leaves(scene)
+    picture, alpha, _ = run(batch, **options)
+    weights = torch.linspace(-1.0, 1.0, picture.numel()).reshape(picture.shape)
+    (picture * weights).sum().backward()
+
+    single = leaves(scene)
+    for c in range(cameras):
+        of_camera = {
+            name: tensor[c : c + 1] if name in names else tensor for name, tensor in single.items()
+        }
+        one, one_alpha, _ = run(of_camera, **options)
+        assert torch.equal(picture[c], one[0])
+        assert torch.equal(alpha[c], one_alpha[0])
+        (one[0] * weights[c]).sum().backward()
+    for name, tensor in single.items():
+        if name in names:
+            assert torch.equal(batch[name].grad, tensor.grad), name
+        else:  # sums over cameras, perhaps in another order
+            bound = 1e-6 * tensor.grad.abs().max()
+            assert (batch[name].grad - tensor.grad).abs().max() <= bound, name
+
+
+@pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED"])
+@pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("center", [(12.0, 10.0), (3.0, 17.5), (-6.0, 25.0)])
+def test_gradients_of_turned_cameras_and_off_centre_lenses(center, rasterize_mode, render_mode):
+    scene = torch_scene(count=10, dtype=torch.float64)
+    scene["scales"] = scene["scales"] * 1.5
+    generator = torch.Generator().manual_seed(7)
+    scene["Ks"][:, 0, 2], scene["Ks"][:, 1, 2] = center
+    # Towards where that principal point lets the splats fall on the picture.
+    shift = (torch.tensor([12.0, 10.0]) - torch.tensor(center)) / 30.0 * 4.0
+    scene["means"][:, :2] += shift
+    skew = torch.randn(2, 3, generator=generator, dtype=torch.float64) * 0.1
+    lenses = scene["Ks"][:, [0, 1, 0, 1], [0, 1, 2, 2]].clone()
+    twist = torch.cat([skew, scene["viewmats"][:, :3, 3]], dim=1).detach()
+
+    def render(twist, lenses, backgrounds):
+        a, b, c = twist[:, :3].unbind(dim=1)
+        zero, one = torch.zeros_like(a), torch.ones_like(a)
+        cross = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero], dim=1).reshape(-1, 3, 3)
+        pose = torch.cat([torch.matrix_exp(cross), twist[:, 3:, None]], dim=2)
+        viewmats = torch.cat([pose, scene["viewmats"][:, 3:]], dim=1)
+        fx, fy, cx, cy = lenses.unbind(dim=1)
+        K = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=1).reshape(-1, 3, 3)
+        arguments = {**scene, "viewmats": viewmats, "Ks": K, "backgrounds": backgrounds}
+        picture, alpha, _ = run(
+            arguments,
+            backend="reference",
+            render_mode=render_mode,
+            rasterize_mode=rasterize_mode,
+        )
+        weights = torch.linspace(-1.0, 1.0, picture.numel(), dtype=torch.float64)
+        return (picture.flatten() * weights).sum() + alpha.square().sum()
+
+    inputs = [twist, lenses, scene["backgrounds"]]
+    for tensor in inputs:
+        tensor.requires_grad_()
+    loss = render(*inputs)
+    for gradient in torch.autograd.grad(loss, inputs):
+        assert gradient.abs().max() > 1e-3
+    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
+
+
+def test_gradients_of_poses_are_those_of_the_twelve_free_numbers():
+    scene = leaves(torch_scene())
+    run(scene)[0].sum().backward()
+    v_viewmats, v_Ks = scene["viewmats"].grad, scene["Ks"].grad
+    assert v_viewmats[:, :3].any()
+    assert not v_viewmats[:, 3].any()
+    fixed = torch.tensor([[False, True, False], [True, False, False], [True, True, True]])
+    assert not v_Ks[:, fixed].any()
+    assert (v_Ks[:, ~fixed] != 0).all()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_tensors_of_any_layout_are_the_same_to_it(packed):
+    scene = torch_scene(count=20)
+    scene["backgrounds"] = torch.rand(2, HEIGHT, WIDTH, 3)
+    expected_scene = leaves(scene)
+    options = {"packed": packed, "render_mode": "RGB+ED", "render_normals": True}
+
+    def outcome(arguments):
+        picture, alpha, meta = run(arguments, **options)
+        normals = meta["render_normals"]
+        # Gradients that are expanded, transposed and strided views.
+        loss = picture.sum() + alpha.transpose(1, 2)[:, ::2].sum() + normals[..., ::2].sum()
+        return picture, alpha, normals, loss
+
+    expected = outcome(expected_scene)
+    expected[-1].backward()
+
+    strided = {}
+    for name, tensor in scene.items():
+        strided[name] = torch.stack([tensor, torch.full_like(tensor, 9.0)], dim=-1)
+        strided[name].requires_grad_()
+    views = {name: tensor[..., 0] for name, tensor in strided.items()}
+    assert not any(view.is_contiguous() for view in views.values())
+    found = outcome(views)
+    found[-1].backward()
+    for a, b in zip(expected, found, strict=True):
+        assert torch.equal(a, b)
+    for name, tensor in expected_scene.items():
+        assert torch.equal(tensor.grad, strided[name].grad[..., 0]), name
+
+
+def test_only_what_asks_for_a_gradient_gets_one():
+    scene = torch_scene()
+    scene["colors"].requires_grad_()
+    picture, _, _ = run(scene)
+    picture.sum().backward()
+    assert scene["colors"].grad.any()
+    assert all(tensor.grad is None for name, tensor in scene.items() if name != "colors")
+    with torch.no_grad():
+        silent, _, _ = run(scene)
+    assert not silent.requires_grad
+    assert torch.equal(silent, picture)
+
+
+def test_cameras_of_either_precision():
+    scene = torch_scene()
+    double = {**scene, "viewmats": scene["viewmats"].double(), "Ks": scene["Ks"].double()}
+    for arguments in (scene, double):
+        for name in ("viewmats", "Ks"):
+            arguments[name].requires_grad_()
+    picture, double_picture = run(scene)[0], run(double)[0]
+    assert torch.equal(picture, double_picture)
+    assert double_picture.dtype == torch.float32
+    picture.square().sum().backward()
+    double_picture.square().sum().backward()
+    for name in ("viewmats", "Ks"):
+        assert double[name].grad.dtype == torch.float64
+        assert torch.equal(scene[name].grad, double[name].grad.float())
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(("channels", "passes"), [(3, 1), (None, 1), (7, 3), (7, 4)])
+def test_what_crosses_the_bus_is_what_the_docs_say(monkeypatch, channels, passes, packed, absgrad):
+    absgrad = absgrad and passes == 1
+    count, cameras, pixels = 30, 2, WIDTH * HEIGHT
+    scene = torch_scene(count=count, cameras=cameras)
+    scene["means"][:7, 2] = -3.0
+    del scene["backgrounds"]
+    coefficients = 9
+    if channels is not None:
+        scene["colors"], coefficients = torch.rand(count, channels), 1
+    scene = leaves(scene)
+
+    # Both directions have one function each; on the CPU they share memory instead of copying.
+    module = importlib.import_module("igsr.rasterization")
+    crossed = {"to the host": 0, "to the device": 0}
+
+    def counting(direction, transfer):
+        def counted(what, *others):
+            if what.ndim > 0 and what.shape[0] > 6:  # not a camera and no background
+                crossed[direction] += 4 * int(np.prod(what.shape))
+            return transfer(what, *others)
+
+        return counted
+
+    monkeypatch.setattr(module, "_array", counting("to the host", module._array))
+    monkeypatch.setattr(module, "_tensor", counting("to the device", module._tensor))
+
+    picture, alpha, meta = run(
+        scene,
+        sh_degree=2 if channels is None else None,
+        packed=packed,
+        absgrad=absgrad,
+        render_mode="RGB+D",
+        render_normals=passes == 4,
+    )
+    drawn = len(meta["means2d"]) if packed else count * cameras
+    assert not packed or 0 < drawn < count * cameras
+    splats, parameters = count * cameras, 44 + 12 * coefficients
+    assert crossed["to the host"] == splats * parameters + 48 * passes * drawn
+    assert crossed["to the device"] == 48 * splats + 24 * passes * pixels * cameras
+
+    crossed.update({"to the host": 0, "to the device": 0})
+    loss = picture.sum() + alpha.sum()
+    if passes == 4:
+        loss = loss + meta["render_normals"].sum()
+    loss.backward()
+    # The passes behind the first are used for their colours only.
+    v_pixel = 20 + 12 * (passes - 1)
+    assert crossed["to the host"] == v_pixel * pixels * cameras + 40 * splats
+    v_drawn = 40 * passes + 8 * absgrad
+    assert crossed["to the device"] == v_drawn * drawn + splats * parameters
