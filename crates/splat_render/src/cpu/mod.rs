@@ -6,6 +6,7 @@ mod adam;
 mod bin;
 mod fit;
 mod loss;
+mod peak;
 mod project;
 mod project_backward;
 mod rasterize;
@@ -27,6 +28,7 @@ use rasterize::{Planes, TileSplat};
 use rasterize_backward::{ABSOLUTE_SUMS, DEPTH_SUMS, PairSums, gather, rasterize_backward};
 
 pub use fit::CpuFit;
+pub use peak::peak_multiply_add;
 pub use simd::instruction_set;
 
 /// The CPU implementation.
