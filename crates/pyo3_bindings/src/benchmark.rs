@@ -103,7 +103,8 @@ fn time_rasterize_with<'py, T: Real>(
         for _ in 0..repeats {
             let (ms, image) = timed(|| stages.rasterize(&projected, background))?;
             times[0].push(ms);
-            let backward = || stages.rasterize_backward(&projected, background, &image, &v_image);
+            let backward =
+                || stages.rasterize_backward(&projected, background, &image, &v_image, false);
             times[1].push(timed(backward)?.0);
         }
         Ok(times)
@@ -114,7 +115,7 @@ fn time_rasterize_with<'py, T: Real>(
 /// All four stages, one after another, on splats that are converted once.
 #[pyfunction]
 #[pyo3(signature = (means, quats, scales, opacities, colors, *, sh_degree, raw_parameters, viewmat,
-    intrinsics, width, height, near, far, eps2d, background, v_color, v_alpha, v_depth, repeats,
+    intrinsics, width, height, near, far, eps2d, antialiased, background, v_color, v_alpha, v_depth, repeats,
     backend))]
 #[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
 pub fn time_pipeline<'py>(
@@ -133,6 +134,7 @@ pub fn time_pipeline<'py>(
     near: f32,
     far: f32,
     eps2d: f32,
+    antialiased: bool,
     background: &Bound<'py, PyAny>,
     v_color: &Bound<'py, PyAny>,
     v_alpha: &Bound<'py, PyAny>,
@@ -149,7 +151,7 @@ pub fn time_pipeline<'py>(
         sh_degree,
         raw_parameters,
         camera: camera(viewmat, intrinsics, width, height)?,
-        options: ProjectOptions { near, far, blur: eps2d },
+        options: ProjectOptions { near, far, blur: eps2d, antialiased },
     };
     let v_image = [v_color, v_alpha, v_depth];
     with_stages!(backend, time_pipeline_with(py, &arguments, background, v_image, repeats))
@@ -175,7 +177,8 @@ fn time_pipeline_with<'py, T: Real>(
             times[0].push(ms);
             let (ms, image) = timed(|| stages.rasterize(&projected, background))?;
             times[1].push(ms);
-            let backward = || stages.rasterize_backward(&projected, background, &image, &v_image);
+            let backward =
+                || stages.rasterize_backward(&projected, background, &image, &v_image, false);
             let (ms, v_projected) = timed(backward)?;
             times[2].push(ms);
             let backward =

@@ -219,9 +219,7 @@ def _state(scene: Scene) -> Arrays:
     return state
 
 
-def fitter(
-    shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None
-) -> _core.Fitter:
+def fitter(shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) -> _core.Fitter:
     """A fit of the shot's scene to its one photo, without density control."""
     scene = shot.scene
     config = {
@@ -277,9 +275,7 @@ def fit_gradients(shot: Shot, backend: str, mask: npt.NDArray[np.bool_]) -> Arra
 class OwnLoop:
     """A fit by ``igsr.rasterization``, torch's Adam and a Charbonnier loss."""
 
-    def __init__(
-        self, shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None
-    ) -> None:
+    def __init__(self, shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) -> None:
         """Parameters as leaves, rates as the fit has them."""
         scene = shot.scene
         self.scene, self.backend = scene, backend

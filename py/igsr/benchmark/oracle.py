@@ -74,8 +74,10 @@ def _on_all_cores(work: Callable[[Crop], Any], items: Iterable[Crop]) -> list[An
         return list(pool.map(work, items))
 
 
-def picture(projected: Arrays, chosen: list[Crop], shape: tuple[int, int], background: Any) -> Arrays:
-    """The f64 picture of ``projected``: color, alpha, depth, transmittance; NaN outside the crops."""
+def picture(
+    projected: Arrays, chosen: list[Crop], shape: tuple[int, int], background: Any
+) -> Arrays:
+    """The f64 color, alpha, depth and transmittance of ``projected``; NaN outside the crops."""
     height, width = shape
     background = np.asarray(background, dtype=np.float64)
 
@@ -113,6 +115,7 @@ def gradients2d(
                 for name, whole in v_image.items()
             },
             background=background,
+            absolute=False,
             backend="reference",
         )
 

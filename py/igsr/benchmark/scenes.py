@@ -1,12 +1,12 @@
 """What the workloads draw: 2D splats (W1), the garden (W2), scenes of any size (W4, accuracy).
 
-Everything is drawn with numpy's PCG64 from the workload's seed, so the same seed gives the same bits
-on every machine.
+Everything is drawn with numpy's PCG64 from the workload's seed, so the same seed gives the same
+bits on every machine.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ import numpy.typing as npt
 from .. import _core
 from ..errors import IgsrError
 
-Arrays = dict[str, npt.NDArray[Any]]
+#: Arrays by name, as ``_core`` takes and returns them.
+Arrays = dict[str, Any]
 
 #: Opacity under which a splat contributes nothing anywhere.
 ALPHA_MIN = float(np.float32(1.0) / np.float32(255.0))
@@ -65,11 +66,8 @@ class Scene:
             "near": _core.NEAR_PLANE,
             "far": _core.FAR_PLANE,
             "eps2d": _core.EPS2D,
+            "antialiased": self.antialiased,
         }
-
-    def with_degree(self, sh_degree: int) -> Scene:
-        """The same splats, their colours evaluated up to ``sh_degree``."""
-        return replace(self, sh_degree=sh_degree)
 
 
 def splats2d(
@@ -106,7 +104,6 @@ def splats2d(
     arrays = {
         "means2d": means2d,
         "factors": factors,
-        "covars2d": np.stack([xx, xy, yy], axis=1),
         "depths": depths,
         "colors": colors,
         "opacities": opacities,
@@ -204,7 +201,7 @@ def ball(
 
 
 def upstream(seed: int, width: int, height: int) -> Arrays:
-    """Gradients N(0, 1) of a picture's colour, alpha and depth, float32; depth's a tenth of that."""
+    """Gradients N(0, 1) of a picture's colour and alpha, a tenth of it of its depth, float32."""
     random = np.random.default_rng([seed, width, height])
     arrays = {
         "v_color": random.normal(size=(height, width, 3)),

@@ -58,7 +58,9 @@ def runs_on_cores(backend: str) -> bool:
     return backend != "gpu" or "llvmpipe" in _core.backend_info(backend)["device"].lower()
 
 
-def timing_row(ms: npt.NDArray[np.float64], backend: str, operations: float | None) -> dict[str, Any]:
+def timing_row(
+    ms: npt.NDArray[np.float64], backend: str, operations: float | None
+) -> dict[str, Any]:
     """The time columns of a row. The fraction is of the peak measured right after."""
     peak = gflops_now()
     row: dict[str, Any] = {
@@ -95,14 +97,14 @@ def rasterize_rows(
     crops = oracle.crops(exact, side, side)
     expected = oracle.picture(exact, crops, shape, background)
     in_band = oracle.band(exact, crops, shape, oracle.ALPHA_BAND_2D)
-    options = {"background": background.astype(dtype), "backend": backend}
-    size = {"width": side, "height": side}
+    options: dict[str, Any] = {"background": background.astype(dtype), "backend": backend}
+    size: dict[str, Any] = {"width": side, "height": side}
     got = _core.rasterize(own, **size, **options)
     picture, band = picture_error(got, expected, in_band, BOUND_2D[backend])
     v_image = masked(upstream(seed, side, side), band.left_out, expected["alpha"])
     v_own = {name: v.astype(dtype) for name, v in v_image.items()}
     v_expected = oracle.gradients2d(exact, crops, expected, v_image, background)
-    v_got = _core.rasterize_backward(own, got, **v_own, **options)
+    v_got = _core.rasterize_backward(own, got, **v_own, **options, absolute=False)
     gradients = gradient_error(v_got, v_expected)
 
     times = repeated(
@@ -150,12 +152,12 @@ def compare(
     crops = chosen(oracle.crops(exact, scene.width, scene.height))
     expected = oracle.picture(exact, crops, shape, scene.background)
     in_band = oracle.band(exact, crops, shape, oracle.ALPHA_BAND_3D)
-    options = {"background": scene.background.astype(dtype), "backend": backend}
+    options: dict[str, Any] = {"background": scene.background.astype(dtype), "backend": backend}
     got = _core.rasterize(projected, width=scene.width, height=scene.height, **options)
     picture, band = picture_error(got, expected, in_band, BOUND_3D[backend])
     counted = masked(v_image, band.left_out, expected["alpha"])
     v_own = {name: v.astype(dtype) for name, v in counted.items()}
-    v2d = _core.rasterize_backward(projected, got, **v_own, **options)
+    v2d = _core.rasterize_backward(projected, got, **v_own, **options, absolute=False)
     v_got = _core.project_backward(
         *parameters, projected, v2d, **scene.options(), backend=backend
     ) | {"v_background": v2d["v_background"]}
