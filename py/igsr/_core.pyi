@@ -53,6 +53,7 @@ def project(
     near: float,
     far: float,
     eps2d: float,
+    antialiased: bool,
     backend: str,
 ) -> dict[str, Real]:
     """Splats and one camera to 2D splats.
@@ -83,6 +84,7 @@ def rasterize_backward(
     v_alpha: Real,
     v_depth: Real,
     background: Real,
+    absolute: bool,
     backend: str,
 ) -> dict[str, Real]:
     """Gradients v_means2d, v_covars2d, v_depths, v_colors, v_opacities and v_background [3].
@@ -108,6 +110,7 @@ def project_backward(
     near: float,
     far: float,
     eps2d: float,
+    antialiased: bool,
     backend: str,
 ) -> dict[str, Real]:
     """Gradients v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmat, v_intrinsics.

@@ -28,7 +28,7 @@ from ..rendering import intrinsics_of, viewmat_about
 from ..splats import Splats
 from . import oracle
 from .comparison import BOUND_3D, Band, Error, errors_row, gradient_error, picture_error
-from .scenes import Arrays, Scene
+from .scenes import PARAMETERS, Arrays, Scene
 from .stage_rows import MIN_REPEATS, SECONDS, timing_row
 
 #: Views that a step is timed on; they differ in what they show.
@@ -56,7 +56,6 @@ CHARBONNIER_EPSILON = 1e-3
 
 #: Of a picture, a photo [H, W, 3] and the mask of the pixels that count [H, W].
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
-PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,9 @@ from ..errors import IgsrError
 #: Arrays by name, as ``_core`` takes and returns them.
 Arrays = dict[str, Any]
 
+#: A scene's arrays in the renderer's order.
+PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+
 #: Opacity under which a splat contributes nothing anywhere.
 ALPHA_MIN = float(np.float32(1.0) / np.float32(255.0))
 
@@ -49,10 +52,12 @@ class Scene:
     background: npt.NDArray[np.float32]
     antialiased: bool = False
 
-    def arrays(self, dtype: Any) -> tuple[npt.NDArray[Any], ...]:
-        """The five parameter arrays in the order and dtype in which ``_core`` takes them."""
-        names = ("means", "quats", "scales", "opacities", "colors")
-        return tuple(np.ascontiguousarray(self.splats[name], dtype=dtype) for name in names)
+    def arrays(self, dtype: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """The parameter arrays in the order and dtype in which ``_core`` takes them."""
+        means, quats, scales, opacities, colors = (
+            np.ascontiguousarray(self.splats[name], dtype=dtype) for name in PARAMETERS
+        )
+        return means, quats, scales, opacities, colors
 
     def options(self) -> dict[str, Any]:
         """What ``_core.project`` takes by name, the backend left out."""

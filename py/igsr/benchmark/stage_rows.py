@@ -172,19 +172,9 @@ def time_scene(scene: Scene, backend: str, v_image: Arrays, seconds: float) -> T
     """Milliseconds of each repeat of the four stages."""
     dtype = _core.working_dtype(backend)
     parameters = scene.arrays(dtype)
-    v_own = {name: v.astype(dtype) for name, v in v_image.items()}
-    background = scene.background.astype(dtype)
-    return repeated(
-        lambda n: _core.time_pipeline(
-            *parameters,
-            **scene.options(),
-            **v_own,
-            background=background,
-            repeats=n,
-            backend=backend,
-        ),
-        seconds,
-    )
+    keywords = scene.options() | {name: v.astype(dtype) for name, v in v_image.items()}
+    keywords |= {"background": scene.background.astype(dtype), "backend": backend}
+    return repeated(lambda n: _core.time_pipeline(*parameters, **keywords, repeats=n), seconds)
 
 
 def pipeline_rows(
