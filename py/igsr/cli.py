@@ -612,7 +612,12 @@ def bench_command(
             seconds=seconds,
         )
         with console.status("starting") as status:
-            report = benchmark.run_benchmark(settings, status.update)
+            if accuracy is None:
+                report = benchmark.run_benchmark(settings, status.update)
+            else:
+                implementations = ("reference", *(name for name in names if name != "reference"))
+                report = benchmark.measure_accuracy(implementations, seed, seconds, status.update)
+                benchmark.write_accuracy(accuracy, report)
         if plot is not None:
             benchmark.plot_speed_vs_error(plot, report)
         if json_path is not None:

@@ -25,7 +25,7 @@ HEADINGS = (
 
 
 def rows_table(rows: list[dict[str, Any]]) -> Table:
-    """One line per row; what did not run says why below the table (``not_run_lines``)."""
+    """One line per row that ran; ``not_run_lines`` has the others."""
     table = Table(box=None, pad_edge=False)
     for heading, number in HEADINGS:
         table.add_column(heading, justify="right" if number else "left", no_wrap=True)
@@ -36,7 +36,7 @@ def rows_table(rows: list[dict[str, Any]]) -> Table:
         memory = row.get("bytes_per_splat")
         table.add_row(
             row["workload"],
-            row["pass"],
+            row["pass"] + (f", {row['setting']}" if "setting" in row else ""),
             row["backend"],
             str(row["splats"]),
             f"{row['width']}x{row['height']}",
@@ -83,7 +83,9 @@ def print_report(console: Console, report: dict[str, Any]) -> None:
     """The table, what did not run and why, and how to read it."""
     table = rows_table(report["rows"])
     # A terminal breaks long lines by itself; cells that end in an ellipsis say nothing.
-    console.print(table, width=console.measure(table).maximum, crop=False)
+    wide = console.options.update(max_width=1000)
+    console.width = max(console.width, console.measure(table, options=wide).maximum)
+    console.print(table)
     for line in not_run_lines(report["rows"]):
         console.print(line)
     console.print(machine_line(report["machine"]), style="dim")
