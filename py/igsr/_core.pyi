@@ -53,6 +53,7 @@ def project(
     near: float,
     far: float,
     eps2d: float,
+    antialiased: bool,
     backend: str,
 ) -> dict[str, Real]:
     """Splats and one camera to 2D splats.
@@ -83,6 +84,7 @@ def rasterize_backward(
     v_alpha: Real,
     v_depth: Real,
     background: Real,
+    absolute: bool,
     backend: str,
 ) -> dict[str, Real]:
     """Gradients v_means2d, v_covars2d, v_depths, v_colors, v_opacities and v_background [3].
@@ -108,12 +110,65 @@ def project_backward(
     near: float,
     far: float,
     eps2d: float,
+    antialiased: bool,
     backend: str,
 ) -> dict[str, Real]:
     """Gradients v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmat, v_intrinsics.
 
     The last two are float64 for every backend.
     """
+
+def peak_multiply_add(seconds: float) -> float:
+    """GFLOP/s of multiply-adds in registers on all threads, for about ``seconds``."""
+
+def band_pixels(
+    projected: dict[str, Real], *, width: int, height: int, alpha_band: float
+) -> npt.NDArray[np.uint8]:
+    """1 where an f32 implementation may rightly differ from the reference, [H, W].
+
+    ``projected`` is float64. There a pair's alpha lies within ``alpha_band`` (relative) of the
+    threshold, or the transmittance within 1e-4 of its own, or two depths within 1e-6.
+    """
+
+def time_rasterize(
+    projected: dict[str, Real],
+    *,
+    width: int,
+    height: int,
+    background: Real,
+    v_color: Real,
+    v_alpha: Real,
+    v_depth: Real,
+    repeats: int,
+    backend: str,
+) -> dict[str, Float64]:
+    """Milliseconds [repeats] of "rasterize" and "rasterize_backward", arrays converted once."""
+
+def time_pipeline(
+    means: Real,
+    quats: Real,
+    scales: Real,
+    opacities: Real,
+    colors: Real,
+    *,
+    sh_degree: int | None,
+    raw_parameters: bool,
+    viewmat: Float64,
+    intrinsics: Float64,
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    eps2d: float,
+    antialiased: bool,
+    background: Real,
+    v_color: Real,
+    v_alpha: Real,
+    v_depth: Real,
+    repeats: int,
+    backend: str,
+) -> dict[str, Float64]:
+    """Milliseconds [repeats] of each of the four stages, arrays converted once."""
 
 DEFAULT_MAX_SPLATS: int
 NEAR_PLANE: float  # what lies nearer than this, in world units, is not drawn

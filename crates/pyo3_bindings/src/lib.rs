@@ -5,6 +5,7 @@
 
 mod arrays;
 mod backend;
+mod benchmark;
 mod camera;
 mod error;
 mod exr_files;
@@ -32,6 +33,8 @@ mod _core {
     }
     #[pymodule_export]
     use crate::backend::{backend_info, resolve_backend, working_dtype};
+    #[pymodule_export]
+    use crate::benchmark::{band_pixels, peak_multiply_add, time_pipeline, time_rasterize};
     #[pymodule_export]
     use crate::exr_files::write_exr;
     #[pymodule_export]

@@ -31,22 +31,23 @@ macro_rules! with_stages {
         }
     };
 }
+pub(crate) use with_stages;
 
 /// Arguments that `project` and `project_backward` share.
-struct ProjectArguments<'a, 'py> {
-    means: &'a Bound<'py, PyAny>,
-    quats: &'a Bound<'py, PyAny>,
-    scales: &'a Bound<'py, PyAny>,
-    opacities: &'a Bound<'py, PyAny>,
-    colors: &'a Bound<'py, PyAny>,
-    sh_degree: Option<u32>,
-    raw_parameters: bool,
-    camera: splat_render::Camera,
-    options: ProjectOptions,
+pub struct ProjectArguments<'a, 'py> {
+    pub means: &'a Bound<'py, PyAny>,
+    pub quats: &'a Bound<'py, PyAny>,
+    pub scales: &'a Bound<'py, PyAny>,
+    pub opacities: &'a Bound<'py, PyAny>,
+    pub colors: &'a Bound<'py, PyAny>,
+    pub sh_degree: Option<u32>,
+    pub raw_parameters: bool,
+    pub camera: splat_render::Camera,
+    pub options: ProjectOptions,
 }
 
 /// Splat parameters, borrowed from numpy.
-struct SplatArrays<'py, T: Element> {
+pub struct SplatArrays<'py, T: Element> {
     means: PyReadonlyArrayDyn<'py, T>,
     quats: PyReadonlyArrayDyn<'py, T>,
     scales: PyReadonlyArrayDyn<'py, T>,
@@ -55,7 +56,7 @@ struct SplatArrays<'py, T: Element> {
 }
 
 impl<'py, T: Real> SplatArrays<'py, T> {
-    fn borrow(arguments: &ProjectArguments<'_, 'py>) -> PyResult<Self> {
+    pub fn borrow(arguments: &ProjectArguments<'_, 'py>) -> PyResult<Self> {
         Ok(Self {
             means: array("means", arguments.means)?,
             quats: array("quats", arguments.quats)?,
@@ -65,7 +66,7 @@ impl<'py, T: Real> SplatArrays<'py, T> {
         })
     }
 
-    fn params(&self, sh_degree: Option<u32>, raw: bool) -> PyResult<SplatParams<'_, T>> {
+    pub fn params(&self, sh_degree: Option<u32>, raw: bool) -> PyResult<SplatParams<'_, T>> {
         let means = rows("means", &self.means, &[-1])?;
         let n = means.len() as isize;
         let colors = match sh_degree {
@@ -87,7 +88,8 @@ impl<'py, T: Real> SplatArrays<'py, T> {
     }
 }
 
-fn projected_from<T: Real>(
+/// 2D splats, copied from the dict that `project` returns.
+pub fn projected_from<T: Real>(
     dict: &Bound<'_, PyDict>,
     width: u32,
     height: u32,

@@ -6,6 +6,7 @@ mod adam;
 mod bin;
 mod fit;
 mod loss;
+mod peak;
 mod project;
 mod project_backward;
 mod rasterize;
@@ -31,6 +32,7 @@ use rasterize_backward::{
 use tile::TileSplat;
 
 pub use fit::CpuFit;
+pub use peak::peak_multiply_add;
 pub use simd::instruction_set;
 
 /// The CPU implementation.

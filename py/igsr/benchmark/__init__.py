@@ -1,0 +1,19 @@
+"""``igsr bench``: seeded workloads, each with its time and its error against the f64 reference."""
+
+from __future__ import annotations
+
+from .accuracy import measure_accuracy, write_accuracy
+from .plots import plot_speed_vs_error
+from .run import WORKLOADS, Settings, resolved_backends, run_benchmark
+from .table import print_report
+
+__all__ = [
+    "WORKLOADS",
+    "Settings",
+    "measure_accuracy",
+    "plot_speed_vs_error",
+    "print_report",
+    "resolved_backends",
+    "run_benchmark",
+    "write_accuracy",
+]

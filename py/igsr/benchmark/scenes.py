@@ -1,0 +1,216 @@
+"""What the workloads draw: 2D splats (W1), the garden (W2), scenes of any size (W4, accuracy).
+
+Everything is drawn with numpy's PCG64 from the workload's seed, so the same seed gives the same
+bits on every machine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .. import _core
+from ..errors import IgsrError
+
+#: Arrays by name, as ``_core`` takes and returns them.
+Arrays = dict[str, Any]
+
+#: A scene's arrays in the renderer's order.
+PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+
+#: Opacity under which a splat contributes nothing anywhere.
+ALPHA_MIN = float(np.float32(1.0) / np.float32(255.0))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Splats in front of one camera.
+
+    Attributes:
+        splats: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3] or
+            [N, K, 3], float32.
+        sh_degree: degree of ``colors``, or None where they are colours themselves.
+        raw_parameters: whether scales are logarithms and opacities logits.
+        viewmat: [4, 4] world-to-camera.
+        intrinsics: [4] fx, fy, cx, cy.
+        width, height: picture size in pixels.
+        background: [3] RGB.
+        antialiased: whether opacities make up for the blur.
+    """
+
+    splats: Arrays
+    sh_degree: int | None
+    raw_parameters: bool
+    viewmat: npt.NDArray[np.float64]
+    intrinsics: npt.NDArray[np.float64]
+    width: int
+    height: int
+    background: npt.NDArray[np.float32]
+    antialiased: bool = False
+
+    def arrays(self, dtype: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """The parameter arrays in the order and dtype in which ``_core`` takes them."""
+        means, quats, scales, opacities, colors = (
+            np.ascontiguousarray(self.splats[name], dtype=dtype) for name in PARAMETERS
+        )
+        return means, quats, scales, opacities, colors
+
+    def options(self) -> dict[str, Any]:
+        """What ``_core.project`` takes by name, the backend left out."""
+        return {
+            "sh_degree": self.sh_degree,
+            "raw_parameters": self.raw_parameters,
+            "viewmat": self.viewmat,
+            "intrinsics": self.intrinsics,
+            "width": self.width,
+            "height": self.height,
+            "near": _core.NEAR_PLANE,
+            "far": _core.FAR_PLANE,
+            "eps2d": _core.EPS2D,
+            "antialiased": self.antialiased,
+        }
+
+
+def splats2d(
+    seed: int, count: int = 20_000, width: int = 400, height: int = 400
+) -> dict[str, npt.NDArray[np.float32]]:
+    """W1: 2D splats uniform over the picture, as ``_core.project`` would return them.
+
+    sigma = exp(N(ln 3, 0.6)) px per axis at a uniform angle, 0.3 px^2 of blur, opacity U(0.1, 0.9),
+    colours U(0, 1), depths U(1, 10).
+    """
+    random = np.random.default_rng(seed)
+    means2d = random.uniform((0.0, 0.0), (width, height), (count, 2))
+    sigma = np.exp(random.normal(np.log(3.0), 0.6, (count, 2)))
+    angle = random.uniform(0.0, np.pi, count)
+    opacities = random.uniform(0.1, 0.9, count)
+    colors = random.uniform(0.0, 1.0, (count, 3))
+    depths = random.uniform(1.0, 10.0, count)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    variance = sigma**2
+    xx = cosine**2 * variance[:, 0] + sine**2 * variance[:, 1] + _core.EPS2D
+    yy = sine**2 * variance[:, 0] + cosine**2 * variance[:, 1] + _core.EPS2D
+    xy = cosine * sine * (variance[:, 0] - variance[:, 1])
+    determinant = xx * yy - xy * xy
+    factors = np.stack(
+        [
+            np.sqrt(yy / determinant),
+            -xy / np.sqrt(yy * determinant),
+            1.0 / np.sqrt(yy),
+        ],
+        axis=1,
+    )
+    reach = 2.0 * np.log(opacities / ALPHA_MIN)
+    radii = np.sqrt(reach[:, None] * np.stack([xx, yy], axis=1))
+    arrays = {
+        "means2d": means2d,
+        "factors": factors,
+        "depths": depths,
+        "colors": colors,
+        "opacities": opacities,
+        "radii": radii,
+    }
+    return {name: np.ascontiguousarray(a, dtype=np.float32) for name, a in arrays.items()}
+
+
+def garden(path: Path, seed: int) -> Scene:
+    """W2: the points of the garden fixture with drawn shapes, in front of its first camera.
+
+    Scales U(0, 0.02), opacities U(0, 1), quats N(0, 1); positions, colours and cameras are the
+    file's (gsplat's ``test_garden.npz``).
+
+    Raises:
+        IgsrError: the file cannot be read or is not that fixture.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            means, colors = file["means3d"], file["colors"]
+            viewmat, K = file["viewmats"][0], file["Ks"][0]
+            width, height = int(file["width"]), int(file["height"])
+        if means.ndim != 2 or means.shape[1] != 3 or colors.shape != means.shape:
+            raise ValueError("means3d and colors must be [N, 3]")
+        if viewmat.shape != (4, 4) or K.shape != (3, 3):
+            raise ValueError("viewmats must be [C, 4, 4] and Ks [C, 3, 3]")
+    except FileNotFoundError as error:
+        raise IgsrError(f"There is no file {path}; give --garden test_garden.npz.") from error
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise IgsrError(f"{path} is not the garden fixture of gsplat ({error}).") from error
+    random = np.random.default_rng(seed)
+    count = len(means)
+    splats = {
+        "means": means,
+        "quats": random.normal(size=(count, 4)),
+        "scales": random.uniform(0.0, 0.02, (count, 3)),
+        "opacities": random.uniform(0.0, 1.0, count),
+        "colors": colors.astype(np.float32) / 255.0,
+    }
+    return Scene(
+        splats={name: np.ascontiguousarray(a, dtype=np.float32) for name, a in splats.items()},
+        sh_degree=None,
+        raw_parameters=False,
+        viewmat=np.ascontiguousarray(viewmat, dtype=np.float64),
+        intrinsics=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64),
+        width=width,
+        height=height,
+        background=np.zeros(3, np.float32),
+    )
+
+
+def ball(
+    seed: int,
+    count: int,
+    width: int,
+    height: int,
+    sh_degree: int = 2,
+    size: float = 1.0,
+) -> Scene:
+    """W4 and the accuracy tables: a ball of splats of SH ``sh_degree`` that fills the picture.
+
+    A splat's size falls with the cube root of their number, so that the ball stays as dense: each
+    pixel meets about as many splats. ``size`` scales all of them.
+    """
+    random = np.random.default_rng(seed)
+    direction = random.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    means = direction * random.uniform(0.0, 1.0, (count, 1)) ** (1.0 / 3.0)
+    spacing = (4.0 / 3.0 * np.pi / count) ** (1.0 / 3.0)
+    scales = np.log(0.3 * size * spacing) + random.normal(0.0, 0.5, (count, 3))
+    colors = random.normal(0.0, 0.1, (count, (sh_degree + 1) ** 2, 3))
+    colors[:, 0] = random.normal(0.0, 0.7, (count, 3))
+    splats = {
+        "means": means,
+        "quats": random.normal(size=(count, 4)),
+        "scales": scales,
+        "opacities": random.normal(0.0, 1.5, count),
+        "colors": colors,
+    }
+    distance = 3.0
+    viewmat = np.eye(4)
+    viewmat[2, 3] = distance
+    # The ball's outline lies at 1 / sqrt(distance^2 - 1); it reaches the shorter sides.
+    focal = 0.5 * min(width, height) * np.sqrt(distance**2 - 1.0)
+    return Scene(
+        splats={name: np.ascontiguousarray(a, dtype=np.float32) for name, a in splats.items()},
+        sh_degree=sh_degree,
+        raw_parameters=True,
+        viewmat=viewmat,
+        intrinsics=np.array([focal, focal, 0.5 * width, 0.5 * height]),
+        width=width,
+        height=height,
+        background=np.ones(3, np.float32),
+    )
+
+
+def upstream(seed: int, width: int, height: int) -> Arrays:
+    """Gradients N(0, 1) of a picture's colour and alpha, a tenth of it of its depth, float32."""
+    random = np.random.default_rng([seed, width, height])
+    arrays = {
+        "v_color": random.normal(size=(height, width, 3)),
+        "v_alpha": random.normal(size=(height, width)),
+        "v_depth": 0.1 * random.normal(size=(height, width)),
+    }
+    return {name: a.astype(np.float32) for name, a in arrays.items()}
