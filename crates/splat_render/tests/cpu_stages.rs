@@ -3,7 +3,10 @@
 mod common;
 
 use common::conformance::{Bounds, OPTIONS, SIZES, end_to_end, project_stages, rasterize_stages};
-use common::{random_camera, random_projected, random_scene, rng};
+use common::{
+    random_camera, random_image_gradients, random_projected, random_scene, rng, splat_gradient_bits,
+};
+use splat_render::Stages;
 use splat_render::cpu::Cpu;
 
 const BOUNDS: Bounds = Bounds { picture: 2e-6, gradient: 1e-4 };
@@ -54,7 +57,7 @@ fn end_to_end_matches_the_reference() {
 
 #[test]
 fn hard_scenes_agree_with_the_reference() {
-    common::hard_cases::hard_scenes_agree_with_the_reference(&Cpu, BOUNDS.gradient);
+    common::hard_cases::hard_scenes_agree_with_the_reference(&Cpu, BOUNDS);
 }
 
 #[test]
@@ -75,4 +78,59 @@ fn hard_splats_2d_agree_with_the_reference() {
 #[test]
 fn many_splats_in_one_tile_and_one_on_many() {
     common::hard_cases::many_splats_in_one_tile_and_one_on_many(&Cpu, BOUNDS);
+}
+
+#[test]
+fn a_zero_quaternion_culls_its_splat() {
+    common::hard_cases::a_zero_quaternion_culls_its_splat(&Cpu);
+}
+
+#[test]
+fn thresholds_are_the_same_everywhere() {
+    common::hard_cases::thresholds_are_the_same_everywhere(&Cpu);
+}
+
+#[test]
+fn tile_edges_show_nothing() {
+    common::hard_cases::tile_edges_show_nothing(&Cpu, BOUNDS);
+}
+
+#[test]
+fn any_values_give_finite_results() {
+    common::properties::any_values_give_finite_results(&Cpu, 1000);
+}
+
+#[test]
+fn the_order_of_splats_does_not_matter() {
+    common::properties::the_order_of_splats_does_not_matter(&Cpu, 100);
+}
+
+#[test]
+fn drawn_pictures_match_the_reference() {
+    common::properties::drawn_pictures_match_the_reference(&Cpu, BOUNDS, 100);
+}
+
+/// Pictures and gradients, on one thread to eight.
+#[test]
+fn the_number_of_threads_changes_no_bit() {
+    let mut rng = rng(50);
+    let scene = random_scene(&mut rng, 3000, Some(2));
+    let camera = random_camera(&mut rng, 130, 90);
+    let v_image = random_image_gradients(&mut rng, 130 * 90);
+    let options = OPTIONS[1];
+    let run = || {
+        let projected = Cpu.project(&scene.params(), &camera, &options).unwrap();
+        let image = Cpu.rasterize(&projected, [0.3; 3]).unwrap();
+        let v2d = Cpu.rasterize_backward(&projected, [0.3; 3], &image, &v_image, true).unwrap();
+        let v = Cpu.project_backward(&scene.params(), &camera, &options, &projected, &v2d).unwrap();
+        (image, v2d, splat_gradient_bits(&v))
+    };
+    let on = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(run)
+    };
+    let one = on(1);
+    for threads in 2..=8 {
+        assert!(one == on(threads), "{threads} threads give other bits than one");
+    }
 }

@@ -276,7 +276,7 @@ fn bad_arguments_are_named() {
 
 #[test]
 fn hard_scenes_agree_with_the_reference() {
-    common::hard_cases::hard_scenes_agree_with_the_reference(gpu(), BOUNDS.gradient);
+    common::hard_cases::hard_scenes_agree_with_the_reference(gpu(), BOUNDS);
 }
 
 #[test]

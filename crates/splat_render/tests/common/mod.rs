@@ -3,6 +3,8 @@
 
 pub mod conformance;
 pub mod hard_cases;
+pub mod narrowed;
+pub mod properties;
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
@@ -76,12 +78,17 @@ pub fn widen1(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&v| f64::from(v)).collect()
 }
 
+/// What f32 holds of a value; its largest where it holds it not.
+fn narrow_one(value: f64) -> f32 {
+    (value as f32).clamp(f32::MIN, f32::MAX)
+}
+
 pub fn narrow<const K: usize>(rows: &[[f64; K]]) -> Vec<[f32; K]> {
-    rows.iter().map(|row| row.map(|v| v as f32)).collect()
+    rows.iter().map(|row| row.map(narrow_one)).collect()
 }
 
 pub fn narrow1(values: &[f64]) -> Vec<f32> {
-    values.iter().map(|&v| v as f32).collect()
+    values.iter().map(|&v| narrow_one(v)).collect()
 }
 
 pub fn widen_projected(p: &Projected<f32>) -> Projected<f64> {

@@ -1,0 +1,36 @@
+//! The reference in the hard cases: what the others are compared with must get through them itself.
+
+mod common;
+
+use common::narrowed::Narrowed;
+use common::{hard_cases, properties};
+
+#[test]
+fn no_splats_give_the_background() {
+    hard_cases::no_splats_give_the_background(&Narrowed);
+}
+
+#[test]
+fn poison_in_any_slot_culls_one_splat_at_most() {
+    hard_cases::poison_in_any_slot_culls_one_splat_at_most(&Narrowed);
+}
+
+#[test]
+fn a_zero_quaternion_culls_its_splat() {
+    hard_cases::a_zero_quaternion_culls_its_splat(&Narrowed);
+}
+
+#[test]
+fn thresholds_are_the_same_everywhere() {
+    hard_cases::thresholds_are_the_same_everywhere(&Narrowed);
+}
+
+#[test]
+fn any_values_give_finite_results() {
+    properties::any_values_give_finite_results(&Narrowed, 300);
+}
+
+#[test]
+fn the_order_of_splats_does_not_matter() {
+    properties::the_order_of_splats_does_not_matter(&Narrowed, 24);
+}
