@@ -130,9 +130,10 @@ INPUTS = ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"]
 def changed_before_backward(change, cameras, packed):
     """The gradients, or None if backward() refuses to compute them."""
     scene = torch_scene(cameras=cameras)
+    render_mode = "RGB" if cameras == 1 else "RGB+ED"
     for tensor in scene.values():
         tensor.requires_grad_()
-    color, alpha, meta = run(scene, packed=packed, render_mode="RGB+ED")
+    color, alpha, meta = run(scene, packed=packed, render_mode=render_mode)
     with torch.no_grad():
         change(scene, color, alpha, meta)
     try:
@@ -167,6 +168,16 @@ def test_a_change_of_what_was_returned_is_refused_or_without_effect(changed, cam
         return
     untouched = changed_before_backward(lambda *_: None, cameras, packed)
     assert all(map(torch.equal, gradients, untouched))
+
+
+def test_a_loss_of_meta_alone_is_refused_when_meta_was_changed():
+    scene = torch_scene(cameras=1)
+    scene["means"].requires_grad_()
+    _, _, meta = run(scene, packed=False)
+    with torch.no_grad():
+        meta["means2d"].mul_(0.5)  # what the other half of the pipeline keeps
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        meta["depths"].sum().backward()
 
 
 def test_shapes_and_meta_follow_gsplat():

@@ -111,9 +111,9 @@ def test_gradients_are_the_sum_over_channels(packed):
         assert error <= 1e-5 * expected.abs().max(), name
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", ["cpu", "gpu", "reference"])
 @pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("channel", [0, 2, 3, 6])
+@pytest.mark.parametrize("channel", [2, 6])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_a_splat_poisoned_in_any_channel_is_not_drawn(value, channel, packed, backend):
     scene = feature_scene(7, count=8)
@@ -149,16 +149,16 @@ def test_a_background_of_equal_pixels_is_a_uniform_one(channels, render_mode):
 
 
 def test_a_background_is_weighted_by_the_transmittance_itself():
-    # Three nearly opaque layers: 1 - alpha would be wrong in its third digit.
+    # Three nearly opaque layers: 1 - alpha would be wrong in its fourth digit.
     scene = feature_scene(3, cameras=1, count=3, dtype=torch.float32)
     scene["means"] = torch.tensor([[0.0, 0, 4], [0, 0, 5], [0, 0, 6]])
-    scene["scales"] = torch.full((3, 3), 100.0)
-    scene["opacities"] = torch.tensor([0.93, 0.94, 0.95])
+    scene["scales"] = torch.full((3, 3), 1e4)
+    scene["opacities"] = torch.tensor([0.95, 0.95, 0.955])
     scene["colors"] = torch.zeros(3, 3)
     bright = torch.full((1, HEIGHT, WIDTH, 3), 1e6)
     picture, _, _ = run(scene, backgrounds=bright)
-    exact = (1 - torch.tensor([0.93, 0.94, 0.95]).double()).prod() * 1e6
-    assert abs(picture[0, 10, 12, 0] / exact - 1) < 1e-4
+    exact = (1 - scene["opacities"].double()).prod() * 1e6
+    assert abs(picture[0, 10, 12, 0] / exact - 1) < 1e-5
 
 
 @pytest.mark.parametrize("channels", [3, 4])

@@ -348,12 +348,10 @@ def rasterization(
         if radius_clip > 0.0:
             radii = view["radii"]
             view["radii"] = radii * (radii > radius_clip).any(dim=-1, keepdim=True)
-        if packed or render_normals or further is not None:
-            drawn = view["radii"].amin(dim=-1) > 0
         if further is not None:
-            # What is not drawn may hold NaN, which no weight of 0 would hide.
-            view_further = further[c] if per_camera_colors else further
-            view["further"] = torch.where(drawn[:, None], view_further, 0.0)
+            view["further"] = further[c] if per_camera_colors else further
+        if packed or render_normals:
+            drawn = view["radii"].amin(dim=-1) > 0
         if render_normals:
             view["normals"] = facing_normals(means, quats, scales, viewmats[c], drawn)
         if packed:
