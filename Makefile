@@ -1,5 +1,6 @@
 # make demo   sets everything up and fits the example capture
 # make test   sets everything up and runs every check
+# make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
 #
 # Needs a Python (3.10 or newer), a Rust toolchain, a C linker and a package manager. Everything
 # Python goes into .venv; what a rerun need not repeat is remembered in .venv/.*-ready.
@@ -23,7 +24,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test build wheel check-rust check-python vulkan example-capture clean
+.PHONY: demo test bench accuracy profile build wheel check-rust check-python vulkan example-capture clean
 .DELETE_ON_ERROR:
 
 # ---- what a user runs --------------------------------------------------------------------------
@@ -34,6 +35,30 @@ demo: build
 		'  out/demo/scene.ply    the splats: any splat viewer opens it' \
 		'  out/demo/report.json  the scores on the held-out views' \
 		'  out/demo/views.png    photo, render and error side by side'
+
+# What to measure on, and the files that two of the workloads need.
+BACKENDS ?= cpu
+BENCH := $(BIN)/igsr bench $(if $(GARDEN),--garden '$(GARDEN)') $(if $(CAPTURE),--capture '$(CAPTURE)')
+
+bench: build
+	$(BENCH) $(BACKENDS:%=--backend %) --plot out/bench/speed_vs_error.png --json out/bench/rows.json
+
+# Writes docs/accuracy.md and its plot; on the software driver where there is no GPU.
+accuracy: build vulkan
+	$(BIN)/igsr bench --backend cpu --backend gpu --accuracy docs/accuracy.md
+
+# The hottest functions of W1 or, with CAPTURE=DIR, of W3's fit steps (once its models are fitted).
+profile: build
+	@command -v perf >/dev/null || { \
+		echo "make profile needs Linux's perf: install the package linux-perf (Debian) or linux-tools-generic (Ubuntu)." >&2; exit 1; }
+	@# maturin strips the module; cargo's own file has the functions' names.
+	$(CARGO) build $(PROFILE) --locked --package pyo3_bindings
+	cp "$${CARGO_TARGET_DIR:-target}/release/lib_core.so" py/igsr/_core.abi3.so
+	@mkdir -p out/profile
+	perf record --output out/profile/perf.data --freq 999 -- \
+		$(BENCH) --backend cpu --workload $(if $(CAPTURE),W3,W1) --seconds 20
+	perf report --input out/profile/perf.data --stdio --no-children --dsos _core.abi3.so \
+		--percent-limit 1 2>/dev/null | grep -v '^#' | head -n 25
 
 build: $(VENV)/.build-ready
 

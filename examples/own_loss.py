@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 import igsr
+from igsr.evaluation import default_split
 from igsr.initialization import initial_splats
 
 RATES = {"means": 2e-3, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh": 2.5e-3}
@@ -82,10 +83,10 @@ def main() -> None:
             print(f"step {step}  loss {loss.item():.4f}", flush=True)
 
     fitted = {name: tensor.detach().numpy() for name, tensor in parameters.items()}
-    scores = igsr.evaluate(
-        igsr.Splats(**fitted, origin=start.origin), capture, background=(1.0, 1.0, 1.0)
-    )
-    print(f"PSNR {scores['psnr']:.2f} dB on the views that the loop never saw")
+    splats = igsr.Splats(**fitted, origin=start.origin)
+    split = default_split(capture)  # test views, which the loop never saw, where there are any
+    scores = igsr.evaluate(splats, capture, split, background=(1.0, 1.0, 1.0))
+    print(f"PSNR {scores['psnr']:.2f} dB on the {split} views")
 
 
 if __name__ == "__main__":

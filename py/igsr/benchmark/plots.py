@@ -28,9 +28,10 @@ def plot_speed_vs_error(path: Path, report: dict[str, Any]) -> None:
     grown = [row for row in measured if "bytes_per_splat" in row]
     points = [row for row in measured if "bytes_per_splat" not in row]
     lines = (1 if points or not grown else 0) + (1 if grown else 0)
-    figure = Figure(figsize=(13.0, 4.4 * lines), layout="constrained")
+    columns = 4 if any("setting" in row for row in points) else 3
+    figure = Figure(figsize=(4.4 * columns, 4.4 * lines), layout="constrained")
     figure.suptitle(machine_line(report["machine"]), fontsize=8, wrap=True)
-    axes = figure.subplots(lines, 3, squeeze=False)
+    axes = figure.subplots(lines, columns, squeeze=False)
     if points or not grown:
         _draw_points(axes[0], points)
     if grown:
@@ -49,17 +50,22 @@ def _label(row: dict[str, Any]) -> str:
 
 
 def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Pictures, gradients, and what the marks mean."""
+    """Pictures, gradients, what settings leave out where there are any, and the legend."""
     from matplotlib.lines import Line2D
 
     labels = list(dict.fromkeys(_label(row) for row in rows))
     marker_of = {label: MARKERS[k % len(MARKERS)] for k, label in enumerate(labels)}
-    for axis, kind in zip(axes, ("picture", "gradients"), strict=False):
+    panels = [
+        ("picture", "max_error", "picture", "largest error against the f64 reference"),
+        ("gradients", "max_error", "gradients", "largest error, in parts of the largest gradient"),
+        ("picture", "setting_mean_error", "the setting itself", "mean error of what it leaves out"),
+    ]
+    for axis, (kind, error, title, label) in zip(axes[:-1], panels, strict=False):
         for row in rows:
             if row["error_of"] == kind:
                 axis.plot(
                     row["ms"],
-                    max(row["max_error"], LEAST_ERROR),
+                    max(row[error], LEAST_ERROR),
                     marker_of[_label(row)],
                     color=COLORS[row["backend"]],
                     markersize=7,
@@ -69,11 +75,8 @@ def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
         axis.set_yscale("log")
         axis.margins(0.15)
         axis.set_xlabel("time, ms")
-        axis.set_ylabel("largest error against the f64 reference")
-        axis.set_title(
-            "picture" if kind == "picture" else "gradients, in parts of the largest of their kind",
-            fontsize=9,
-        )
+        axis.set_ylabel(label)
+        axis.set_title(title, fontsize=9)
         axis.grid(alpha=0.3)
     handles = [
         Line2D([], [], color=COLORS[backend], marker="s", linestyle="", label=backend)
@@ -84,8 +87,8 @@ def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
         Line2D([], [], color="#999999", marker=marker, linestyle="", label=label)
         for label, marker in marker_of.items()
     ]
-    axes[2].set_axis_off()
-    axes[2].legend(handles=handles, fontsize=9, loc="upper left", frameon=False)
+    axes[-1].set_axis_off()
+    axes[-1].legend(handles=handles, fontsize=9, loc="upper left", frameon=False)
 
 
 def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
