@@ -13,6 +13,7 @@ use super::rasterize::{Planes, rasterize};
 use super::rasterize_backward::{
     COLOR_SUMS, PairSums, PictureGradients, gather, rasterize_backward,
 };
+use super::simd::dispatch;
 use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
@@ -197,7 +198,6 @@ impl CpuFit {
         let opacity_pull = input.opacity_regularizer / n as f32;
         let scale_pull = input.scale_regularizer / (3 * n) as f32;
         let rates = BlockRates::new(&input.rates, stride, sh::coeffs(degree));
-        let arch = pulp::Arch::new();
 
         macro_rules! blocks {
             ($arrays:expr) => {
@@ -266,7 +266,7 @@ impl CpuFit {
                     }
                     macro_rules! adam {
                         ($values:expr, $first:expr, $second:expr, $name:ident) => {
-                            arch.dispatch(Adam {
+                            dispatch(Adam {
                                 values: bytemuck::cast_slice_mut($values),
                                 first: bytemuck::cast_slice_mut($first),
                                 second: bytemuck::cast_slice_mut($second),

@@ -3,6 +3,7 @@
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
+use super::simd::dispatch;
 use crate::fit::{SSIM_C, SSIM_WINDOW};
 
 /// Taps on each side of the window's centre.
@@ -319,7 +320,6 @@ impl Loss {
         let total: f64 = weights.map_or(pixels as f64, |w| w.iter().map(|&w| f64::from(w)).sum());
         // A photo that is masked out everywhere asks for nothing.
         let scale = if total > 0.0 { 1.0 / (3.0 * total) } else { 0.0 };
-        let arch = pulp::Arch::new();
         let band = BAND * width;
         let bands =
             |band_index: usize| band_index * BAND..((band_index + 1) * BAND).min(pixels / width);
@@ -338,7 +338,7 @@ impl Loss {
                     .zip(xy.par_chunks_mut(band))
                     .enumerate()
                     .map(move |(index, ((mu, xx), xy))| {
-                        arch.dispatch(Slopes {
+                        dispatch(Slopes {
                             x: x[c],
                             y: y[c],
                             weights,
@@ -357,7 +357,7 @@ impl Loss {
             .zip(&mut self.v_color)
             .flat_map(|(c, v)| {
                 v.par_chunks_mut(band).enumerate().map(move |(index, out)| {
-                    arch.dispatch(Gradient {
+                    dispatch(Gradient {
                         x: x[c],
                         y: y[c],
                         weights,

@@ -4,6 +4,7 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::bin::Bins;
+use super::simd::dispatch;
 use super::tile::{
     LIVE_INTERVAL, PIXELS, Pixels, Place, Reached, SIDE, TileSplat, Vectors, centers, live_vectors,
     take,
@@ -129,14 +130,13 @@ pub(super) fn rasterize<const DEPTH: bool>(
     background: [f32; 3],
     out: &mut Planes,
 ) {
-    let arch = pulp::Arch::new();
     let width = out.width;
     let columns = width.div_ceil(SIDE);
     out.bands().enumerate().for_each(|(tile_row, mut band)| {
         let rows = band[0].len() / width;
         for column in 0..columns {
             let first = column * SIDE;
-            arch.dispatch(Tile::<DEPTH> {
+            dispatch(Tile::<DEPTH> {
                 splats,
                 ids: &bins.splats[bins.range(tile_row * columns + column)],
                 left: first as f32,

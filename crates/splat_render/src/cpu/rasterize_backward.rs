@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use super::bin::Bins;
 use super::project_backward::V2d;
 use super::rasterize::Planes;
+use super::simd::dispatch;
 use super::tile::{
     LIVE_INTERVAL, PIXELS, Pixels, Place, Reached, SIDE, TileSplat, Vectors, centers, live_vectors,
     offsets, take,
@@ -170,7 +171,6 @@ pub(super) fn rasterize_backward<const N: usize>(
     picture: PictureGradients<'_>,
     sums: &mut Vec<PairSums<N>>,
 ) {
-    let arch = pulp::Arch::new();
     let (width, height) = (picture.image.width, picture.image.height);
     let columns = width.div_ceil(SIDE);
     sums.resize(bins.splats.len(), [0.0; N]);
@@ -194,7 +194,7 @@ pub(super) fn rasterize_backward<const N: usize>(
                 continue;
             }
             let (x, y) = (column * SIDE, tile_row * SIDE);
-            arch.dispatch(Tile::<N> {
+            dispatch(Tile::<N> {
                 splats,
                 ids: &bins.splats[range],
                 left: x as f32,

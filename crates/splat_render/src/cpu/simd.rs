@@ -4,7 +4,20 @@
 //! so `array::map` or `fold`, is compiled without the instruction set and turns every vector
 //! operation into a call.
 
-use pulp::Simd;
+use pulp::{Simd, WithSimd};
+
+/// Runs `operation` with the widest instruction set of this machine.
+#[inline]
+pub(super) fn dispatch<Operation: WithSimd>(operation: Operation) -> Operation::Output {
+    #[cfg(test)]
+    match tests::LANES.load(std::sync::atomic::Ordering::Relaxed) {
+        1 => return pulp::Scalar.vectorize(operation),
+        4 => return pulp::Scalar128b.vectorize(operation),
+        16 => return pulp::Scalar512b.vectorize(operation),
+        _ => {}
+    }
+    pulp::Arch::new().dispatch(operation)
+}
 
 /// f32 lanes of the vectors that kernels run with on this machine.
 fn lanes() -> usize {
@@ -15,7 +28,7 @@ fn lanes() -> usize {
             S::F32_LANES
         }
     }
-    pulp::Arch::new().dispatch(Lanes)
+    dispatch(Lanes)
 }
 
 /// Name of the instruction set that kernels run with on this machine.
@@ -60,7 +73,96 @@ pub fn exp2_of_minus<S: Simd>(s: S, d: S::f32s) -> S::f32s {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use rand::{Rng, SeedableRng};
+
     use super::*;
+    use crate::cpu::Cpu;
+    use crate::cpu::loss::Loss;
+    use crate::{Image, ImageGradients, Projected, ProjectedGradients, Stages};
+
+    /// Lanes to run with in place of the machine's own, 0 for those.
+    pub static LANES: AtomicUsize = AtomicUsize::new(0);
+
+    /// A picture, its gradients and its loss, at this many lanes.
+    fn run(
+        lanes: usize,
+        splats: &Projected<f32>,
+    ) -> (Image<f32>, ProjectedGradients<f32>, Vec<f32>) {
+        LANES.store(lanes, Ordering::Relaxed);
+        let image = Cpu.rasterize(splats, [0.1, 0.2, 0.3]).unwrap();
+        let v_image = ImageGradients {
+            v_color: image.color.iter().map(|c| c.map(|v| v - 0.4)).collect(),
+            v_alpha: image.alpha.clone(),
+            v_depth: image.depth.clone(),
+        };
+        let v = Cpu.rasterize_backward(splats, [0.1, 0.2, 0.3], &image, &v_image, true).unwrap();
+        let planes: [Vec<f32>; 3] =
+            std::array::from_fn(|c| image.color.iter().map(|color| color[c]).collect());
+        let [r, g, b] = &planes;
+        let mut loss = Loss::default();
+        let width = splats.width as usize;
+        let mut out = vec![loss.run([r, g, b], [g, b, r], Some(r), width, 0.2)];
+        out.extend(loss.v_color.iter().flatten());
+        LANES.store(0, Ordering::Relaxed);
+        (image, v, out)
+    }
+
+    fn apart<'a>(a: impl Iterator<Item = &'a f32>, b: impl Iterator<Item = &'a f32>) -> f32 {
+        let (mut most, mut largest) = (0.0f32, 0.0f32);
+        for (a, b) in a.zip(b) {
+            most = most.max((a - b).abs());
+            largest = largest.max(b.abs());
+        }
+        most / largest
+    }
+
+    /// Machines with other vectors than this one's must draw the same: 16 lanes as AVX-512 has,
+    /// 4 as NEON, 1 as where there are none, computed here without their instructions.
+    #[test]
+    fn every_vector_width_draws_the_same() {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(6);
+        for (width, height) in [(75, 50), (16, 16), (5, 33)] {
+            let n = 400;
+            let mut splats = Projected::<f32>::culled(n, width, height);
+            for i in 0..n {
+                splats.means2d[i] = [
+                    rng.random_range(-5.0..width as f32 + 5.0),
+                    rng.random_range(-5.0..height as f32 + 5.0),
+                ];
+                let [p, q, r] = std::array::from_fn(|_| rng.random_range(0.08..1.2f32));
+                splats.factors[i] = [p, q - 0.6, r];
+                splats.opacities[i] = rng.random_range(0.02..1.0);
+                splats.depths[i] = rng.random_range(1.0..9.0);
+                splats.colors[i] = std::array::from_fn(|_| rng.random());
+                splats.radii[i] = [60.0, 60.0];
+            }
+            let (image, v, loss) = run(0, &splats);
+            for lanes in [1, 4, 16] {
+                let (image_n, v_n, loss_n) = run(lanes, &splats);
+                let what = format!("{width}x{height} on {lanes} lanes");
+                let color =
+                    apart(image_n.color.as_flattened().iter(), image.color.iter().flatten());
+                assert!(color < 1e-6, "{what}: picture {color:e}");
+                // Not the same bits: where there are no instructions, multiply-adds round twice.
+                let t = apart(image_n.transmittance.iter(), image.transmittance.iter());
+                assert!(t < 1e-6, "{what}: transmittance {t:e}");
+                let pairs = [
+                    (v_n.v_means2d.as_flattened(), v.v_means2d.as_flattened()),
+                    (v_n.v_factors.as_flattened(), v.v_factors.as_flattened()),
+                    (v_n.v_colors.as_flattened(), v.v_colors.as_flattened()),
+                    (&v_n.v_opacities, &v.v_opacities),
+                    (&v_n.v_depths, &v.v_depths),
+                    (&loss_n, &loss),
+                ];
+                for (k, (a, b)) in pairs.into_iter().enumerate() {
+                    let off = apart(a.iter(), b.iter());
+                    assert!(off < 1e-5, "{what}: gradients {k} {off:e}");
+                }
+            }
+        }
+    }
 
     struct Exp2(f32);
     impl pulp::WithSimd for Exp2 {
@@ -78,12 +180,12 @@ mod tests {
         for i in 0..400_000 {
             let d = 20.0 * i as f32 / 400_000.0;
             let exact = (-f64::from(d)).exp2();
-            let got = f64::from(pulp::Arch::new().dispatch(Exp2(d)));
+            let got = f64::from(dispatch(Exp2(d)));
             worst = worst.max((got / exact - 1.0).abs());
         }
         assert!(worst < 1.2e-7, "relative error {worst:e}");
         for d in [126.0, 127.0, 1e4, 1e30, f32::INFINITY] {
-            let y = pulp::Arch::new().dispatch(Exp2(d));
+            let y = dispatch(Exp2(d));
             assert!((0.0..1e-37).contains(&y), "2^-{d} gave {y:e}");
         }
     }
