@@ -58,7 +58,12 @@ def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
     panels = [
         ("picture", "max_error", "picture", "largest error against the f64 reference"),
         ("gradients", "max_error", "gradients", "largest error, in parts of the largest gradient"),
-        ("picture", "setting_mean_error", "the setting itself", "mean error of what it leaves out"),
+        (
+            "picture",
+            "setting_mean_error",
+            "the setting: lower SH degrees against the highest,\nboth modes against many samples",
+            "mean error of what it leaves out",
+        ),
     ]
     for axis, (kind, error, title, label) in zip(axes[:-1], panels, strict=False):
         for row in rows:
