@@ -99,18 +99,15 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     let p = splats2d[i].pq.x;
     let q = splats2d[i].pq.y;
     let r = splats2d[i].r;
-    var v_uu = -0.5 * (p * v_factor.x + q * v_factor.y);
+    let v_uu = -0.5 * (p * v_factor.x + q * v_factor.y);
     let v_uv = -r * v_factor.y;
-    var v_vv = -0.5 * r * v_factor.z;
+    let v_vv = -0.5 * r * v_factor.z;
     var compensation = 1.0;
     var v_log = 0.0;
     if view.antialiased == 1u {
         let dets = root_dets(g);
         compensation = dets.x / dets.y;
-        // ln compensation = ln |m0 x m1| - ln det / 2; here the latter.
         v_log = v_opacity * g.opacity * compensation;
-        v_uu -= 0.5 * v_log;
-        v_vv -= 0.5 * v_log;
     }
     let fb_u = (cross(g.scales * g.scales * g.b1, g.normal) + view.blur * g.b0) * (p * r * r);
     let fb_v = g.b1 * r;
@@ -122,15 +119,20 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     var v_m0 = p * v_fm_u;
     var v_m1 = q * v_fm_u + r * v_fm_v;
     if view.antialiased == 1u {
-        // Divided by the length twice: its square may underflow where it does not.
+        // With S = M M^T and C = S + blur I, ln compensation = (ln det S - ln det C) / 2 has the
+        // gradient S^-1 M - C^-1 M, whose terms cancel for large splats; it is blur C^-1 S^-1 M.
+        // The rows of S^-1 M are m1 x n / n^2 and n x m0 / n^2 with n = m0 x m1; divided by the
+        // length twice, since its square may underflow where it does not.
         let area = sharp_area(g);
         let length_area = length(area);
-        let v_area = area / length_area * (v_log / length_area);
-        let v_area_m0 = cross(g.m1, v_area);
-        let v_area_m1 = cross(v_area, g.m0);
-        v_scales += v_area_m0 * g.b0 + v_area_m1 * g.b1;
-        v_m0 += v_area_m0;
-        v_m1 += v_area_m1;
+        let n = area / length_area / length_area;
+        let w0 = cross(g.m1, n);
+        let w1 = cross(n, g.m0);
+        let e_u = (p * w0 + q * w1) * (v_log * view.blur);
+        let e_v = r * w1 * (v_log * view.blur);
+        v_scales += e_u * fb_u + e_v * fb_v;
+        v_m0 += p * e_u;
+        v_m1 += q * e_u + r * e_v;
     }
     let v_b0 = v_m0 * g.scales;
     let v_b1 = v_m1 * g.scales;
