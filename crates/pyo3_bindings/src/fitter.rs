@@ -201,7 +201,7 @@ impl Fitter {
         let cameras = cameras(viewmats, intrinsics, &sizes)?;
         let (state, step) = state_from(state)?;
         let device = fit_device(backend)?;
-        py.detach(|| splat_render::fit::Fitter::new(device, targets, cameras, &state, step, config))
+        py.detach(|| splat_render::fit::Fitter::new(device, targets, cameras, state, step, config))
             .map(|fitter| Self(Mutex::new(fitter)))
             .map_err(to_python)
     }

@@ -55,7 +55,7 @@ fn start(seed: u64) -> FitState {
 fn fitter(density: DensityControl, state: &FitState, step: u32) -> Fitter {
     let (targets, cameras) = photos();
     let device = Box::new(CpuFit::default());
-    Fitter::new(device, targets, cameras, state, step, config(density)).unwrap()
+    Fitter::new(device, targets, cameras, state.clone(), step, config(density)).unwrap()
 }
 
 fn run(fitter: &mut Fitter, until: u32) -> FitState {
@@ -111,7 +111,7 @@ fn another_seed_gives_other_bits() {
     let (targets, cameras) = photos();
     let other = FitConfig { seed: 6, ..config(DensityControl::Mcmc) };
     let device = Box::new(CpuFit::default());
-    let mut other = Fitter::new(device, targets, cameras, &start(1), 0, other).unwrap();
+    let mut other = Fitter::new(device, targets, cameras, start(1), 0, other).unwrap();
     let mut one = fitter(DensityControl::Mcmc, &start(1), 0);
     assert!(run(&mut other, 20) != run(&mut one, 20));
 }
@@ -121,7 +121,7 @@ fn bad_arguments_are_named() {
     let (targets, cameras) = photos();
     let build = |targets: Vec<Target>, cameras: Vec<Camera>, state: &FitState, config| {
         let device = Box::new(CpuFit::default());
-        let error = Fitter::new(device, targets, cameras, state, 0, config).err();
+        let error = Fitter::new(device, targets, cameras, state.clone(), 0, config).err();
         error.as_ref().map_or_else(String::new, Error::to_string)
     };
     let good = config(DensityControl::Mcmc);

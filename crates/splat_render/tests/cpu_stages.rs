@@ -134,3 +134,13 @@ fn the_number_of_threads_changes_no_bit() {
         assert!(one == on(threads), "{threads} threads give other bits than one");
     }
 }
+
+#[test]
+fn culled_splats_change_nothing() {
+    common::hard_cases::culled_splats_change_nothing(&Cpu);
+}
+
+#[test]
+fn a_far_away_scene_renders_as_one_at_the_origin() {
+    common::hard_cases::a_far_away_scene_renders_as_one_at_the_origin(&Cpu);
+}

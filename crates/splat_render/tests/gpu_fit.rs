@@ -99,7 +99,7 @@ fn run(
     noise: f32,
 ) -> (FitState, Vec<f32>) {
     device.set_targets(capture.targets.clone()).unwrap();
-    device.upload(&capture.start).unwrap();
+    device.upload(capture.start.clone()).unwrap();
     let mut losses = Vec::new();
     for step in 1..=steps {
         device.step(&input(capture, step, noise)).unwrap();
@@ -223,7 +223,7 @@ fn missing_splats_photos_and_sizes_are_named() {
     device.set_targets(capture.targets.clone()).unwrap();
     let error = device.step(&input(&capture, 1, 0.0)).unwrap_err().to_string();
     assert!(error.starts_with("splats: "), "{error}");
-    device.upload(&capture.start).unwrap();
+    device.upload(capture.start.clone()).unwrap();
     let wrong = StepInput { view: 3, ..input(&capture, 1, 0.0) };
     let error = device.step(&wrong).unwrap_err().to_string();
     assert!(error.starts_with("view: "), "{error}");
@@ -240,7 +240,7 @@ fn steps_allocate_nothing_and_memory_grows_as_stated() {
         let (_, before) = gpu.made();
         let mut fit = GpuFit::new(Arc::clone(&gpu));
         fit.set_targets(capture.targets.clone()).unwrap();
-        fit.upload(&capture.start).unwrap();
+        fit.upload(capture.start.clone()).unwrap();
         let (_, bytes) = gpu.made();
         for step in 1..=10 {
             fit.step(&input(&capture, step, 0.0)).unwrap();

@@ -34,3 +34,13 @@ fn any_values_give_finite_results() {
 fn the_order_of_splats_does_not_matter() {
     properties::the_order_of_splats_does_not_matter(&Narrowed, 24);
 }
+
+#[test]
+fn culled_splats_change_nothing() {
+    hard_cases::culled_splats_change_nothing(&Narrowed);
+}
+
+#[test]
+fn a_far_away_scene_renders_as_one_at_the_origin() {
+    hard_cases::a_far_away_scene_renders_as_one_at_the_origin(&Narrowed);
+}

@@ -46,14 +46,19 @@ impl FitDevice for CpuFit {
         Ok(())
     }
 
-    fn upload(&mut self, state: &FitState) -> Result<()> {
+    fn upload(&mut self, state: FitState) -> Result<()> {
         state.validate()?;
-        self.state = state.clone();
+        self.state = state;
         Ok(())
     }
 
     fn download(&mut self) -> Result<FitState> {
         Ok(self.state.clone())
+    }
+
+    fn edit(&mut self, change: &mut dyn FnMut(&mut FitState)) -> Result<()> {
+        change(&mut self.state);
+        self.state.validate()
     }
 
     fn step(&mut self, input: &StepInput) -> Result<()> {

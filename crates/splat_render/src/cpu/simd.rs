@@ -10,7 +10,7 @@ use pulp::{Simd, WithSimd};
 #[inline]
 pub(super) fn dispatch<Operation: WithSimd>(operation: Operation) -> Operation::Output {
     #[cfg(test)]
-    match tests::LANES.load(std::sync::atomic::Ordering::Relaxed) {
+    match tests::LANES.get() {
         1 => return pulp::Scalar.vectorize(operation),
         4 => return pulp::Scalar128b.vectorize(operation),
         16 => return pulp::Scalar512b.vectorize(operation),
@@ -73,7 +73,7 @@ pub fn exp2_of_minus<S: Simd>(s: S, d: S::f32s) -> S::f32s {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::cell::Cell;
 
     use rand::{Rng, SeedableRng};
 
@@ -82,15 +82,25 @@ mod tests {
     use crate::cpu::loss::Loss;
     use crate::{Image, ImageGradients, Projected, ProjectedGradients, Stages};
 
-    /// Lanes to run with in place of the machine's own, 0 for those.
-    pub static LANES: AtomicUsize = AtomicUsize::new(0);
+    thread_local! {
+        /// Lanes to run with in place of the machine's own, 0 for those. Each thread has its own:
+        /// other tests run at the same time.
+        pub static LANES: Cell<usize> = const { Cell::new(0) };
+    }
+
+    type Results = (Image<f32>, ProjectedGradients<f32>, Vec<f32>);
 
     /// A picture, its gradients and its loss, at this many lanes.
-    fn run(
-        lanes: usize,
-        splats: &Projected<f32>,
-    ) -> (Image<f32>, ProjectedGradients<f32>, Vec<f32>) {
-        LANES.store(lanes, Ordering::Relaxed);
+    fn run(lanes: usize, splats: &Projected<f32>) -> Results {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(2)
+            .start_handler(move |_| LANES.set(lanes))
+            .build()
+            .unwrap()
+            .install(|| run_here(splats))
+    }
+
+    fn run_here(splats: &Projected<f32>) -> Results {
         let image = Cpu.rasterize(splats, [0.1, 0.2, 0.3]).unwrap();
         let v_image = ImageGradients {
             v_color: image.color.iter().map(|c| c.map(|v| v - 0.4)).collect(),
@@ -105,7 +115,6 @@ mod tests {
         let width = splats.width as usize;
         let mut out = vec![loss.run([r, g, b], [g, b, r], Some(r), width, 0.2)];
         out.extend(loss.v_color.iter().flatten());
-        LANES.store(0, Ordering::Relaxed);
         (image, v, out)
     }
 

@@ -144,10 +144,17 @@ pub trait FitDevice: Send {
     fn set_targets(&mut self, targets: Vec<Target>) -> Result<()>;
 
     /// Replaces the state.
-    fn upload(&mut self, state: &FitState) -> Result<()>;
+    fn upload(&mut self, state: FitState) -> Result<()>;
 
-    /// The state as it is now.
+    /// A copy of the state as it is now.
     fn download(&mut self) -> Result<FitState>;
+
+    /// Lets `change` work on the state; splats may come and go.
+    fn edit(&mut self, change: &mut dyn FnMut(&mut FitState)) -> Result<()> {
+        let mut state = self.download()?;
+        change(&mut state);
+        self.upload(state)
+    }
 
     /// One step: project, bin, rasterize, loss, rasterize_backward, project_backward, Adam, noise,
     /// density statistics.

@@ -59,7 +59,7 @@ impl Fitter {
         mut device: Box<dyn FitDevice>,
         targets: Vec<Target>,
         cameras: Vec<Camera>,
-        state: &FitState,
+        state: FitState,
         step: u32,
         config: FitConfig,
     ) -> Result<Self> {
@@ -97,6 +97,7 @@ impl Fitter {
         }
         let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
         device.set_targets(targets)?;
+        let splats = state.splats.len();
         device.upload(state)?;
         Ok(Self {
             device,
@@ -105,7 +106,7 @@ impl Fitter {
             cameras,
             has_alpha,
             order: Vec::new(),
-            splats: state.splats.len(),
+            splats,
             step,
         })
     }
@@ -197,18 +198,19 @@ impl Fitter {
         if !refine && !reset {
             return Ok(());
         }
-        let mut state = self.device.download()?;
         let mut rng = self.rng(Draw::Density, u64::from(step));
-        if refine && config.density == DensityControl::Mcmc {
-            density::mcmc(&mut state, config.max_splats, &mut rng);
-        } else if refine {
-            let huge = step > RESET_EVERY;
-            density::original(&mut state, config.max_splats, self.extent, huge, &mut rng);
-        }
-        if reset {
-            density::reset_opacities(&mut state);
-        }
-        self.splats = state.splats.len();
-        self.device.upload(&state)
+        let (extent, splats) = (self.extent, &mut self.splats);
+        self.device.edit(&mut |state| {
+            if refine && config.density == DensityControl::Mcmc {
+                density::mcmc(state, config.max_splats, &mut rng);
+            } else if refine {
+                let huge = step > RESET_EVERY;
+                density::original(state, config.max_splats, extent, huge, &mut rng);
+            }
+            if reset {
+                density::reset_opacities(state);
+            }
+            *splats = state.splats.len();
+        })
     }
 }

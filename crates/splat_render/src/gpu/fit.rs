@@ -508,12 +508,12 @@ impl FitDevice for GpuFit {
         // Pair buffers are laid out for the largest photo.
         if self.scene.is_some() {
             let state = self.download()?;
-            self.upload(&state)?;
+            self.upload(state)?;
         }
         Ok(())
     }
 
-    fn upload(&mut self, state: &FitState) -> Result<()> {
+    fn upload(&mut self, state: FitState) -> Result<()> {
         state.validate()?;
         self.pending.clear();
         // What the last scene has grown to is likely to be needed again.
@@ -521,7 +521,7 @@ impl FitDevice for GpuFit {
         for frame in &mut self.frames {
             frame.ops.clear();
         }
-        self.scene = Some(Scene::new(&self.gpu, state, self.tiles, capacity, chunks)?);
+        self.scene = Some(Scene::new(&self.gpu, &state, self.tiles, capacity, chunks)?);
         Ok(())
     }
 

@@ -344,3 +344,113 @@ pub fn poison_in_any_slot_culls_one_splat_at_most(stages: &dyn Stages<f32>) {
         }
     }
 }
+
+/// Splats that cannot be seen, put between the others, change no bit of picture or gradients.
+pub fn culled_splats_change_nothing(stages: &dyn Stages<f32>) {
+    let mut rng = rng(7);
+    let few = random_scene(&mut rng, 120, Some(2));
+    let camera = random_camera(&mut rng, 90, 61);
+    let (mut many, mut many_from_few) = (random_scene(&mut rng, 0, Some(2)), Vec::new());
+    for i in 0..few.means.len() {
+        let culled = [
+            ([0.0, 0.0, -1e4], few.scales[i], few.opacities[i]),
+            ([1e4, 0.0, 0.0], [-3.0; 3], few.opacities[i]),
+            (few.means[i], few.scales[i], -20.0),
+            (few.means[i], [f32::NAN; 3], few.opacities[i]),
+        ];
+        // None, one or several before each.
+        for (mean, scales, opacity) in culled.into_iter().cycle().skip(i).take(i % 7) {
+            many.means.push(mean);
+            many.quats.push(few.quats[i]);
+            many.scales.push(scales);
+            many.opacities.push(opacity);
+            many.colors.extend(&few.colors[9 * i..9 * i + 9]);
+        }
+        many_from_few.push(many.means.len());
+        many.means.push(few.means[i]);
+        many.quats.push(few.quats[i]);
+        many.scales.push(few.scales[i]);
+        many.opacities.push(few.opacities[i]);
+        many.colors.extend(&few.colors[9 * i..9 * i + 9]);
+    }
+    for options in OPTIONS {
+        let run = |scene: &Scene<f32>| {
+            let projected = stages.project(&scene.params(), &camera, &options).unwrap();
+            let image = stages.rasterize(&projected, [0.3, 0.2, 0.1]).unwrap();
+            let v_image = ImageGradients {
+                v_color: image.color.iter().map(|c| c.map(|v| v - 0.5)).collect(),
+                v_alpha: image.alpha.clone(),
+                v_depth: image.depth.clone(),
+            };
+            let v2d = stages
+                .rasterize_backward(&projected, [0.3, 0.2, 0.1], &image, &v_image, true)
+                .unwrap();
+            let v = stages
+                .project_backward(&scene.params(), &camera, &options, &projected, &v2d)
+                .unwrap();
+            (image, v2d, v)
+        };
+        let (image, v2d, v) = run(&few);
+        let (image_many, v2d_many, v_many) = run(&many);
+        assert!(image == image_many, "picture");
+        let seen = v.v_means.iter().filter(|&&v| v != [0.0; 3]).count();
+        assert!(seen > 60, "only {seen} splats have a gradient");
+        let (absolute, absolute_many) =
+            (v2d.v_means2d_absolute.unwrap(), v2d_many.v_means2d_absolute.unwrap());
+        for (i, &k) in many_from_few.iter().enumerate() {
+            assert_eq!(v2d.v_means2d[i], v2d_many.v_means2d[k], "v_means2d {i}");
+            assert_eq!(v2d.v_factors[i], v2d_many.v_factors[k], "v_factors {i}");
+            assert_eq!(absolute[i], absolute_many[k], "v_means2d_absolute {i}");
+            assert_eq!(v.v_means[i], v_many.v_means[k], "v_means {i}");
+            assert_eq!(v.v_quats[i], v_many.v_quats[k], "v_quats {i}");
+            assert_eq!(v.v_scales[i], v_many.v_scales[k], "v_scales {i}");
+            assert_eq!(v.v_opacities[i], v_many.v_opacities[k], "v_opacities {i}");
+            assert_eq!(v.v_colors[9 * i..9 * i + 9], v_many.v_colors[9 * k..9 * k + 9], "v_colors");
+        }
+        let culled = v_many.v_means.iter().enumerate().filter(|(k, _)| !many_from_few.contains(k));
+        for (k, v_mean) in culled {
+            assert_eq!(*v_mean, [0.0; 3], "culled splat {k} has a gradient");
+        }
+    }
+}
+
+/// A scene 1e6 units from the origin: its means and cameras, taken relative to an f64 origin before
+/// they become f32, give the picture and gradients of the scene at the origin.
+pub fn a_far_away_scene_renders_as_one_at_the_origin(stages: &dyn Stages<f32>) {
+    let mut rng = rng(8);
+    let scene = random_scene(&mut rng, 200, Some(1));
+    let camera = random_camera(&mut rng, 80, 60);
+    let options = ProjectOptions::default();
+    let offset = glam::DVec3::new(1e6, -2e6, 3e5);
+    // World coordinates as a capture has them, and an origin near but not at the offset.
+    let world = scene.means.iter().map(|m| glam::Vec3::from(*m).as_dvec3() + offset);
+    let world_camera = camera.viewmat * glam::DMat4::from_translation(-offset);
+    let origin = offset + glam::DVec3::new(0.25, -0.5, 0.125);
+    let mut far = scene.clone();
+    far.means = world.map(|m| (m - origin).as_vec3().to_array()).collect();
+    let far_camera = splat_render::Camera {
+        viewmat: world_camera * glam::DMat4::from_translation(origin),
+        ..camera
+    };
+    let run = |scene: &Scene<f32>, camera| {
+        let projected = stages.project(&scene.params(), camera, &options).unwrap();
+        let image = stages.rasterize(&projected, [0.1; 3]).unwrap();
+        let v_image = random_image_gradients(&mut super::rng(9), image.alpha.len());
+        let v2d = stages.rasterize_backward(&projected, [0.1; 3], &image, &v_image, false).unwrap();
+        let v = stages.project_backward(&scene.params(), camera, &options, &projected, &v2d);
+        (image, v.unwrap())
+    };
+    let (image, v) = run(&scene, &camera);
+    let (image_far, v_far) = run(&far, &far_camera);
+    let off = image_difference(&image_far, &widen_image(&image), &[]);
+    println!("picture {off:?}");
+    assert!(off.max < 1e-3, "{off:?}");
+    for (what, off) in [
+        ("v_means", difference(&v_far.v_means, &widen(&v.v_means), &[])),
+        ("v_scales", difference(&v_far.v_scales, &widen(&v.v_scales), &[])),
+        ("v_quats", difference(&v_far.v_quats, &widen(&v.v_quats), &[])),
+    ] {
+        println!("{what} {off:?}");
+        assert!(off.relative() < 1e-3, "{what}: {off:?}");
+    }
+}
