@@ -4,14 +4,11 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::simd::dispatch;
-use crate::fit::{SSIM_C, SSIM_WINDOW};
+use super::ssim_window::{HALF, Rows};
+use crate::fit::SSIM_C;
 
-/// Taps on each side of the window's centre.
-const HALF: usize = SSIM_WINDOW.len() / 2;
 /// Rows per task.
-const BAND: usize = 32;
-/// Zeros kept before and after each row: at least the window's half, and room for a whole vector.
-const PAD: usize = 16;
+const BAND: usize = 64;
 
 /// The loss's gradient and scratch memory, kept from step to step.
 #[derive(Debug, Default, Clone)]
@@ -32,89 +29,14 @@ struct Slopes<'a> {
     out: [&'a mut [f32]; 3],
 }
 
-/// Horizontally filtered rows of several maps, kept for the vertical pass.
-struct Rows {
-    stride: usize,
-    data: Vec<f32>,
-}
-
-impl Rows {
-    fn new(maps: usize, rows: usize, width: usize) -> Self {
-        let stride = width.div_ceil(PAD) * PAD;
-        Self { stride, data: vec![0.0; maps * rows * stride] }
-    }
-
-    fn row(&self, index: usize) -> &[f32] {
-        &self.data[index * self.stride..(index + 1) * self.stride]
-    }
-
-    fn row_mut(&mut self, index: usize) -> &mut [f32] {
-        &mut self.data[index * self.stride..(index + 1) * self.stride]
-    }
-}
-
-#[inline(always)]
-fn load<S: Simd>(values: &[f32], at: usize) -> S::f32s {
-    S::as_simd_f32s(&values[at..at + S::F32_LANES]).0[0]
-}
-
-/// `out[x] = sum_k window[k] padded[x + k + PAD - HALF]`, the window being symmetric.
-#[inline(always)]
-fn filter_row<S: Simd>(s: S, padded: &[f32], out: &mut [f32]) {
-    let mut taps = [s.splat_f32s(0.0); HALF + 1];
-    for (tap, weight) in taps.iter_mut().zip(SSIM_WINDOW) {
-        *tap = s.splat_f32s(weight);
-    }
-    let (out, _) = S::as_mut_simd_f32s(out);
-    let lanes = S::F32_LANES;
-    for (v, out) in out.iter_mut().enumerate() {
-        let at = v * lanes + PAD - HALF;
-        let mut sum = s.mul_f32s(taps[HALF], load::<S>(padded, at + HALF));
-        for k in 0..HALF {
-            let pair = s.add_f32s(load::<S>(padded, at + k), load::<S>(padded, at + 2 * HALF - k));
-            sum = s.mul_add_e_f32s(taps[k], pair, sum);
-        }
-        *out = sum;
-    }
-}
-
-/// The rows that a vertical window covers; None where it leaves the picture.
-type Window<'a, S> = [Option<&'a [<S as Simd>::f32s]>; 2 * HALF + 1];
-
-/// Gathers the rows around `row` of the map that starts at row `base` of `filtered`, which holds
-/// the picture's rows `held`.
-#[inline(always)]
-fn fill_window<'a, S: Simd>(
-    window: &mut Window<'a, S>,
-    filtered: &'a Rows,
-    base: usize,
-    held: std::ops::Range<usize>,
-    row: usize,
-) {
-    for (k, slot) in window.iter_mut().enumerate() {
-        // Compared without subtracting first: rows count from zero.
-        if row + k >= HALF + held.start && row + k < HALF + held.end {
-            *slot = Some(S::as_simd_f32s(filtered.row(base + row + k - HALF - held.start)).0);
-        }
-    }
-}
-
-/// Vertical pass at vector `v`; rows outside the picture count zero.
-#[inline(always)]
-fn filter_column<S: Simd>(s: S, rows: &Window<'_, S>, v: usize) -> S::f32s {
-    let mut sum = s.splat_f32s(0.0);
-    for (row, weight) in rows.iter().zip(SSIM_WINDOW) {
-        if let Some(row) = row {
-            sum = s.mul_add_e_f32s(s.splat_f32s(weight), row[v], sum);
-        }
-    }
-    sum
-}
-
-/// Copies `row` into the middle of `padded`, leaving zeros around it.
-#[inline(always)]
-fn pad(row: &[f32], padded: &mut [f32]) {
-    padded[PAD..PAD + row.len()].copy_from_slice(row);
+/// The picture's rows that the window meets around `rows`, each with its index in a [`Rows`].
+fn rows_around(
+    rows: &std::ops::Range<usize>,
+    height: usize,
+) -> impl Iterator<Item = (usize, usize)> + use<> {
+    let start = rows.start;
+    (start.saturating_sub(HALF)..(rows.end + HALF).min(height))
+        .map(move |row| (row + HALF - start, row))
 }
 
 impl WithSimd for Slopes<'_> {
@@ -124,43 +46,36 @@ impl WithSimd for Slopes<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> f64 {
         let width = self.width;
-        let height = self.x.len() / width;
-        let first = self.rows.start.saturating_sub(HALF);
-        let last = (self.rows.end + HALF).min(height);
-        let count = last - first;
         // x, y, xx + yy and xy: SSIM takes the two variances only as a sum.
-        let mut filtered = Rows::new(4, count, width);
-        let padded_len = filtered.stride + 2 * PAD;
-        let mut padded: [Vec<f32>; 4] = std::array::from_fn(|_| vec![0.0; padded_len]);
-        for row in first..last {
-            let (x, y) = (&self.x[row * width..][..width], &self.y[row * width..][..width]);
-            pad(x, &mut padded[0]);
-            pad(y, &mut padded[1]);
-            let [_, _, squares, xy] = &mut padded;
-            let products = squares[PAD..].iter_mut().zip(&mut xy[PAD..]);
-            for ((squares, xy), (x, y)) in products.zip(x.iter().zip(y)) {
+        let mut filtered = Rows::new(4, self.rows.len(), width);
+        let [mut x, mut y, mut squares, mut xy] = [(); 4].map(|()| filtered.padded());
+        for (index, row) in rows_around(&self.rows, self.x.len() / width) {
+            let at = row * width..(row + 1) * width;
+            let (from_x, from_y) = (&self.x[at.clone()], &self.y[at]);
+            x.row(width).copy_from_slice(from_x);
+            y.row(width).copy_from_slice(from_y);
+            let products = squares.row(width).iter_mut().zip(xy.row(width));
+            for ((squares, xy), (x, y)) in products.zip(from_x.iter().zip(from_y)) {
                 (*squares, *xy) = (x * x + y * y, x * y);
             }
-            for (map, padded) in padded.iter().enumerate() {
-                filter_row(s, padded, filtered.row_mut(map * count + row - first));
+            for (map, padded) in [&x, &y, &squares, &xy].into_iter().enumerate() {
+                filtered.filter_row(s, padded, map, index);
             }
         }
         let (c1, c2) = (s.splat_f32s(SSIM_C.0), s.splat_f32s(SSIM_C.1));
         let two = s.splat_f32s(2.0);
-        let vectors = filtered.stride / S::F32_LANES;
-        let mut lines = [(); 4].map(|()| vec![s.splat_f32s(0.0); vectors]);
+        let mut lines = [(); 4].map(|()| filtered.line(s));
         let mut total = 0.0f64;
         let [out_mu, out_xx, out_xy] = self.out;
         for row in self.rows.clone() {
-            let mut windows: [Window<'_, S>; 4] = [[None; 2 * HALF + 1]; 4];
-            for (map, window) in windows.iter_mut().enumerate() {
-                fill_window::<S>(window, &filtered, map * count, first..last, row);
+            for (map, line) in lines.iter_mut().enumerate() {
+                filtered.filter_column(s, map, row - self.rows.start, line);
             }
-            for v in 0..vectors {
-                let mu_x = filter_column(s, &windows[0], v);
-                let mu_y = filter_column(s, &windows[1], v);
-                let squares = filter_column(s, &windows[2], v);
-                let xy = filter_column(s, &windows[3], v);
+            let [line0, line1, line2, line3] = &mut lines;
+            let vectors = line0.as_flattened_mut().iter_mut().zip(line1.as_flattened_mut());
+            let vectors = vectors.zip(line2.as_flattened_mut()).zip(line3.as_flattened_mut());
+            for (((line0, line1), line2), line3) in vectors {
+                let (mu_x, mu_y, squares, xy) = (*line0, *line1, *line2, *line3);
                 let mu_xy = s.mul_f32s(mu_x, mu_y);
                 let (mu_xx, mu_yy) = (s.mul_f32s(mu_x, mu_x), s.mul_f32s(mu_y, mu_y));
                 let s_xy = s.sub_f32s(xy, mu_xy);
@@ -179,15 +94,16 @@ impl WithSimd for Slopes<'_> {
                     s.mul_f32s(mu_x, s.mul_f32s(s.mul_f32s(ssim, inverse), b2)),
                 );
                 let through = s.mul_add_e_f32s(s.mul_f32s(two, v_xx), mu_x, s.mul_f32s(v_xy, mu_y));
-                lines[0][v] = s.sub_f32s(s.mul_f32s(two, direct), through);
-                lines[1][v] = v_xx;
-                lines[2][v] = v_xy;
-                lines[3][v] = ssim;
+                *line0 = s.sub_f32s(s.mul_f32s(two, direct), through);
+                *line1 = v_xx;
+                *line2 = v_xy;
+                *line3 = ssim;
             }
             let to = (row - self.rows.start) * width;
             let at = row * width;
             let weights = self.weights.map(|w| &w[at..at + width]);
-            let line = |k: usize| &bytemuck::cast_slice::<S::f32s, f32>(&lines[k])[..width];
+            let line =
+                |k: usize| &bytemuck::cast_slice::<S::f32s, f32>(lines[k].as_flattened())[..width];
             for (k, out) in [&mut *out_mu, &mut *out_xx, &mut *out_xy].into_iter().enumerate() {
                 let out = &mut out[to..to + width];
                 match weights {
@@ -254,33 +170,25 @@ impl WithSimd for Gradient<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> f64 {
         let width = self.width;
-        let height = self.x.len() / width;
-        let first = self.rows.start.saturating_sub(HALF);
-        let last = (self.rows.end + HALF).min(height);
-        let count = last - first;
-        let mut filtered = Rows::new(3, count, width);
-        let mut padded = vec![0.0; filtered.stride + 2 * PAD];
+        let mut filtered = Rows::new(3, self.rows.len(), width);
+        let mut padded = filtered.padded();
         for (map, slopes) in self.slopes.iter().enumerate() {
-            for row in first..last {
-                pad(&slopes[row * width..][..width], &mut padded);
-                filter_row(s, &padded, filtered.row_mut(map * count + row - first));
+            for (index, row) in rows_around(&self.rows, self.x.len() / width) {
+                padded.row(width).copy_from_slice(&slopes[row * width..(row + 1) * width]);
+                filtered.filter_row(s, &padded, map, index);
             }
         }
-        let vectors = filtered.stride / S::F32_LANES;
-        let mut lines = [(); 3].map(|()| vec![s.splat_f32s(0.0); vectors]);
+        let mut lines = [(); 3].map(|()| filtered.line(s));
         let mut distances = vec![0.0f32; width];
         let mut total = 0.0f64;
         for row in self.rows.clone() {
             for (map, line) in lines.iter_mut().enumerate() {
-                let mut window: Window<'_, S> = [None; 2 * HALF + 1];
-                fill_window::<S>(&mut window, &filtered, map * count, first..last, row);
-                for (v, out) in line.iter_mut().enumerate() {
-                    *out = filter_column(s, &window, v);
-                }
+                filtered.filter_column(s, map, row - self.rows.start, line);
             }
             let at = row * width;
             let (x, y) = (&self.x[at..at + width], &self.y[at..at + width]);
-            let line = |k: usize| &bytemuck::cast_slice::<S::f32s, f32>(&lines[k])[..width];
+            let line =
+                |k: usize| &bytemuck::cast_slice::<S::f32s, f32>(lines[k].as_flattened())[..width];
             let (mu, xx, xy) = (line(0), line(1), line(2));
             let out = &mut self.out[(row - self.rows.start) * width..][..width];
             // Plain loops without a branch: the compiler makes vectors of them.
@@ -382,6 +290,7 @@ impl Loss {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fit::SSIM_WINDOW;
     use rand::{Rng, SeedableRng};
 
     /// The loss in f64, straight from its definition.

@@ -12,6 +12,7 @@ mod project_backward;
 mod rasterize;
 mod rasterize_backward;
 mod simd;
+mod ssim_window;
 mod tile;
 
 use rayon::prelude::*;
