@@ -263,6 +263,8 @@ def fit_step_ms(shot: Shot, backend: str, seconds: float) -> list[float]:
             before = time.perf_counter()
             running.step(steps)
             times.append(1e3 * (time.perf_counter() - before) / steps)
+        # Or the next one's state would stand beside this one's, and count as the fit's memory.
+        del running
     return times
 
 

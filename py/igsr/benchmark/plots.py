@@ -78,6 +78,7 @@ def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
                 )
         axis.set_xscale("log")
         axis.set_yscale("log")
+        _plain_numbers(axis.xaxis)
         axis.margins(0.15)
         axis.set_xlabel("time, ms")
         axis.set_ylabel(label)
@@ -121,6 +122,7 @@ def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
         axis.legend(fontsize=8)
     for axis in axes[:2]:
         axis.set_yscale("log")
+        _plain_numbers(axis.yaxis)
         axis.margins(0.1)
     memory = axes[2]
     memory.axhline(
@@ -132,6 +134,15 @@ def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
     )
     memory.set_ylim(bottom=0.0)
     memory.legend(fontsize=8)
+
+
+def _plain_numbers(axis: Any) -> None:
+    """1, 2 and 5 times powers of ten along a logarithmic axis, written out."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _short(number: int) -> str:

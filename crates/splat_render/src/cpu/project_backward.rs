@@ -174,13 +174,7 @@ fn gradients(
     // Whitened 2D covariance -> M = J R A S. The rows of F B and F M are of order 1 even for a
     // needle, and found without the cancellation that F, B and M would bring to their products.
     let [p, q, r] = ellipse.factor;
-    let [mut v_uu, v_uv, mut v_vv] = v.v_whitened;
-    let v_log = v.v_opacity * splat.opacity * ellipse.compensation;
-    if view.options.antialiased {
-        // ln compensation = ln |m0 x m1| - ln det / 2; here the latter.
-        v_uu -= 0.5 * v_log;
-        v_vv -= 0.5 * v_log;
-    }
+    let [v_uu, v_uv, v_vv] = v.v_whitened;
     let squares = splat.scales * splat.scales;
     let fb_u = ((squares * g.b[1]).cross(g.normal) + view.options.blur * g.b[0]) * (p * r * r);
     let fb_v = g.b[1] * r;
@@ -190,10 +184,17 @@ fn gradients(
     let mut v_scales = v_fm_u * fb_u + v_fm_v * fb_v;
     let mut v_m = [p * v_fm_u, q * v_fm_u + r * v_fm_v];
     if view.options.antialiased {
-        let v_area = ellipse.area * (v_log / ellipse.area.length_squared());
-        let v_area_m = [g.m[1].cross(v_area), v_area.cross(g.m[0])];
-        v_scales += v_area_m[0] * g.b[0] + v_area_m[1] * g.b[1];
-        v_m = [v_m[0] + v_area_m[0], v_m[1] + v_area_m[1]];
+        // With S = M M^T and C = S + blur I, ln compensation = (ln det S - ln det C) / 2 has the
+        // gradient S^-1 M - C^-1 M, whose terms cancel for large splats; it is blur C^-1 S^-1 M.
+        // The rows of S^-1 M are m1 x n / n^2 and n x m0 / n^2 with n = m0 x m1; divided by the
+        // length twice, since its square may underflow where it does not.
+        let length = ellipse.area.length();
+        let n = ellipse.area / length / length;
+        let w = [g.m[1].cross(n), n.cross(g.m[0])];
+        let v_log = v.v_opacity * splat.opacity * ellipse.compensation * view.options.blur;
+        let (e_u, e_v) = ((p * w[0] + q * w[1]) * v_log, r * w[1] * v_log);
+        v_scales += e_u * fb_u + e_v * fb_v;
+        v_m = [v_m[0] + p * e_u, v_m[1] + q * e_u + r * e_v];
     }
     out.v_scales = if raw { v_scales * splat.scales } else { v_scales }.to_array();
     let v_b = v_m.map(|v| v * splat.scales);
