@@ -78,8 +78,8 @@ def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
                 )
         axis.set_xscale("log")
         axis.set_yscale("log")
-        _plain_numbers(axis.xaxis)
         axis.margins(0.15)
+        _plain_numbers(axis.xaxis)
         axis.set_xlabel("time, ms")
         axis.set_ylabel(label)
         axis.set_title(title, fontsize=9)
@@ -122,8 +122,8 @@ def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
         axis.legend(fontsize=8)
     for axis in axes[:2]:
         axis.set_yscale("log")
-        _plain_numbers(axis.yaxis)
         axis.margins(0.1)
+        _plain_numbers(axis.yaxis)
     memory = axes[2]
     memory.axhline(
         rows[0]["contract_bytes_per_splat"],
@@ -133,14 +133,15 @@ def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
         label="2 × parameters + gradients + optimiser state",
     )
     memory.set_ylim(bottom=0.0)
-    memory.legend(fontsize=8)
+    memory.legend(fontsize=8, loc="lower left")
 
 
 def _plain_numbers(axis: Any) -> None:
-    """1, 2 and 5 times powers of ten along a logarithmic axis, written out."""
+    """Powers of ten along a logarithmic axis, written out, with 2 and 5 times them if few."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
 
