@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import runpy
 import shutil
 import sys
@@ -17,7 +18,7 @@ from PIL import Image
 
 from igsr import _core, cli
 from igsr.benchmark import accuracy, fit_rows, growth, machine, oracle, run, scenes, stage_rows
-from igsr.benchmark.comparison import gradient_error, picture_error
+from igsr.benchmark.comparison import FLIP, gradient_error, picture_error
 from igsr.benchmark.plots import plot_speed_vs_error
 from igsr.benchmark.table import not_run_lines
 from igsr.errors import IgsrError
@@ -81,18 +82,22 @@ def test_the_same_seed_gives_the_same_bits():
     assert all(a != b for a, b in zip(everything(5), everything(6), strict=True))
 
 
+def garden_file(path, **changes):
+    """A file like the fixture, with one point."""
+    arrays = {
+        "means3d": np.array([[0.0, 0.0, 2.0]], np.float32),
+        "colors": np.array([[255, 0, 51]], np.uint8),
+        "viewmats": np.eye(4, dtype=np.float32)[None],
+        "Ks": np.array([[[30.0, 0, 16], [0, 31.0, 12], [0, 0, 1]]], np.float32),
+        "height": 24,
+        "width": 32,
+    }
+    np.savez(path, **(arrays | changes))
+    return path
+
+
 def test_the_garden_takes_what_the_fixture_holds(tmp_path):
-    path = tmp_path / "garden.npz"
-    np.savez(
-        path,
-        means3d=np.array([[0.0, 0.0, 2.0]], np.float32),
-        colors=np.array([[255, 0, 51]], np.uint8),
-        viewmats=np.eye(4, dtype=np.float32)[None],
-        Ks=np.array([[[30.0, 0, 16], [0, 31.0, 12], [0, 0, 1]]], np.float32),
-        height=24,
-        width=32,
-    )
-    garden = scenes.garden(path, 0)
+    garden = scenes.garden(garden_file(tmp_path / "garden.npz"), 0)
     assert (garden.width, garden.height) == (32, 24)
     assert garden.intrinsics.tolist() == [30.0, 31.0, 16.0, 12.0]
     np.testing.assert_allclose(garden.splats["colors"], [[1.0, 0.0, 0.2]])
@@ -110,6 +115,31 @@ def test_what_is_not_the_garden_is_refused(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(IgsrError, match=r"other\.npz"):
         scenes.garden(path, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"width": 0}, "width"),
+        ({"width": 99999999999}, "out of range"),
+        ({"height": 16385}, "16384"),
+        ({"viewmats": 2.0 * np.eye(4)[None]}, "viewmat"),
+        ({"Ks": np.diag([-30.0, 31.0, 1.0])[None]}, "focal"),
+        ({"Ks": np.full((1, 3, 3), np.nan)}, "focal"),
+        ({"means3d": np.array([["a", "b", "c"]])}, "convert"),
+        ({"colors": np.array([["a", "b", "c"]])}, "convert"),
+        ({"means3d": np.full((1, 3), np.nan)}, "finite"),
+        ({"means3d": np.full((1, 3), 1e300)}, "finite"),
+        ({"means3d": np.zeros((0, 3)), "colors": np.zeros((0, 3))}, "sees none"),
+        ({"means3d": np.array([[0.0, 0.0, -2.0]])}, "sees none"),
+    ],
+)
+def test_a_garden_that_cannot_be_drawn_is_refused(tmp_path, changes, words):
+    path = garden_file(tmp_path / "other.npz", **changes)
+    with pytest.raises(IgsrError, match=words) as refused:
+        scenes.garden(path, 0)
+    assert "other.npz" in str(refused.value)
+    assert "--garden" in str(refused.value)
 
 
 # ---- the oracle ---------------------------------------------------------------------------------
@@ -184,19 +214,25 @@ def test_broken_gradients_show(monkeypatch):
 
 def test_nan_is_no_small_error():
     picture = {"color": np.zeros((2, 2, 3)), "alpha": np.zeros((2, 2))}
-    wrong = {"color": np.full((2, 2, 3), np.nan), "alpha": np.zeros((2, 2))}
+    picture["transmittance"] = np.ones((2, 2))
+    wrong = picture | {"color": np.full((2, 2, 3), np.nan)}
     error, _ = picture_error(wrong, picture, np.zeros((2, 2), bool), 1e-6)
     assert error.max == np.inf
     assert gradient_error({"v": np.array([np.nan])}, {"v": np.array([1.0])}).max == np.inf
 
 
 def test_only_pixels_of_the_band_are_left_out():
-    expected = {"color": np.zeros((1, 3, 3)), "alpha": np.zeros((1, 3))}
-    got = {"color": np.zeros((1, 3, 3)), "alpha": np.array([[1e-3, 1e-9, 1e-5]])}
-    error, band = picture_error(got, expected, np.array([[True, True, False]]), 1e-6)
+    expected = {"color": np.zeros((1, 4, 3)), "alpha": np.zeros((1, 4))}
+    expected["transmittance"] = np.full((1, 4), 1e-2)
+    # The third blended another pair behind something opaque: only its transmittance tells.
+    got = expected | {
+        "alpha": np.array([[1e-3, 1e-9, 1e-9, 1e-5]]),
+        "transmittance": np.array([[1e-2, 1e-2, 1e-2 * (1.0 - 2.0 * FLIP), 0.9e-2]]),
+    }
+    error, band = picture_error(got, expected, np.array([[True, True, True, False]]), 1e-6)
     assert error.max == 1e-5
-    assert band.left_out.tolist() == [[True, False, False]]
-    assert (band.pixels, band.of) == (2, 3)
+    assert band.left_out.tolist() == [[True, False, True, False]]
+    assert (band.pixels, band.of) == (3, 4)
 
 
 def test_the_loss_of_a_step_is_the_fits_own():
@@ -255,20 +291,63 @@ def test_rows_of_steps():
     assert (own["pass"], loop["pass"]) == ("fit step", "fit step, own loop")
 
 
-def test_growth_has_memory_beside_time():
-    rows = growth.growth_rows("cpu", 0, [(5000, 32)], 0.0)
-    (row,) = rows
+@pytest.mark.skipif(
+    not os.access(growth.CLEAR_REFS, os.W_OK), reason="only Linux forgets a process's peak memory"
+)
+def test_a_fit_keeps_its_memory_contract():
+    (row,) = growth.growth_rows("cpu", 0, [(100_000, 512)], 0.0)
     checked_row(row)
-    # Parameters and moments must be somewhere, and nothing is many times the contract.
-    assert 3 * growth.parameter_bytes(5000) < 5000 * row["bytes_per_splat"]
-    assert row["bytes_per_splat"] < 4 * row["contract_bytes_per_splat"]
+    # Parameters and moments must be somewhere.
+    assert 3 * growth.parameter_bytes(100_000) < 100_000 * row["bytes_per_splat"]
+    assert row["bytes_per_splat"] <= 1.0 * row["contract_bytes_per_splat"]
+
+
+@pytest.mark.parametrize("change", ["a device of its own", "a peak that stays"])
+def test_memory_that_cannot_be_told_is_left_out(monkeypatch, tmp_path, change):
+    if change == "a device of its own":
+        monkeypatch.setattr(growth, "runs_on_cores", lambda backend: False)
+    else:
+        monkeypatch.setattr(growth, "CLEAR_REFS", tmp_path / "nowhere" / "clear_refs")
+    point = growth.measure(0, 200, 32, "cpu", 0.0)
+    monkeypatch.setattr(growth, "measure_apart", lambda *arguments: point)
+    (row,) = growth.growth_rows("cpu", 0, [(200, 32)], 0.0)
+    checked_row(row)
+    assert not [name for name in row if "bytes" in name]
 
 
 def test_a_child_that_fails_is_a_row_that_says_so(monkeypatch):
     monkeypatch.setattr(sys, "executable", shutil.which("false"))
     (row,) = growth.growth_rows("cpu", 0, [(10, 16)], 0.0)
     assert "ms" not in row
-    assert "16 splats at 16 x 16 failed" in row["not_run"]
+    assert "10 splats at 16 x 16 failed" in row["not_run"]
+
+
+@pytest.mark.parametrize("error", [IgsrError("It ended early."), RuntimeError("The GPU is lost.")])
+def test_a_workload_that_fails_takes_no_other_rows_with_it(monkeypatch, tmp_path, error):
+    def failing(*arguments):
+        raise error
+
+    monkeypatch.setattr(run, "growth_rows", lambda backend, seed, seconds: [{"ms": 1.0}])
+    monkeypatch.setattr(run, "pair_rows", failing)
+    monkeypatch.setattr(run, "rasterize_rows", lambda backend, seed, seconds: [{"ms": 2.0}])
+    monkeypatch.setattr(run, "capture_rows", failing)
+    monkeypatch.setattr(run, "MODEL_COUNTS", (100,))
+    capture = made_up.write_capture(tmp_path / "photos", made_up.capture(views=4, size=32))
+    settings = run.Settings(
+        ("cpu", "reference"), ("W1", "W3", "W4"), capture=capture, models=tmp_path
+    )
+    rows = run.run_benchmark(settings)["rows"]
+    reason, never = str(error), run.DOES_NOT_FIT
+    assert [(row["ms"], row["splats"], row.get("not_run")) for row in rows] == [
+        (2.0, None, None),
+        (None, 100, reason),
+        (1.0, None, None),
+        (None, growth.PAIR[0], reason),
+        (2.0, None, None),
+        (None, 100, never),
+        (None, None, never),
+    ]
+    assert all(row.keys() >= run.COLUMNS.keys() for row in rows)
 
 
 def test_models_for_w3_are_fitted_once(tmp_path):
@@ -280,10 +359,22 @@ def test_models_for_w3_are_fitted_once(tmp_path):
         patch.setattr(fit_rows, "fit", None)
         again = fitted(capture, 200, tmp_path, 0)
     assert first.means.tobytes() == again.means.tobytes()
-    rows = run.run_benchmark(run.Settings(("reference",), ("W3",), models=tmp_path, seconds=0.0))[
-        "rows"
-    ]
-    assert [row["not_run"] for row in rows] == ["the reference does not fit"] * 2
+    # Another seed or another fit is another model.
+    paths = {fit_rows.model_path(capture, 200, tmp_path, seed) for seed in (0, 1)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_rows, "FIT_STEPS", 6)
+        paths.add(fit_rows.model_path(capture, 200, tmp_path, 0))
+    assert len(paths) == 3
+
+
+def test_a_models_folder_that_takes_no_file_is_found_before_the_work(monkeypatch, tmp_path):
+    capture = made_up.write_capture(tmp_path / "photos", made_up.capture(views=4, size=32))
+    monkeypatch.setattr(run, "rasterize_rows", None)
+    settings = run.Settings(
+        ("cpu",), ("W1", "W3"), capture=capture, models=Path("/dev/null/models")
+    )
+    with pytest.raises(IgsrError, match="/dev/null/models"):
+        run.run_benchmark(settings)
 
 
 def test_the_page_names_every_setting(tmp_path):
@@ -291,6 +382,7 @@ def test_the_page_names_every_setting(tmp_path):
     assert report.keys() == {"machine", "rows"}
     accuracy.write_accuracy(tmp_path / "accuracy.md", report)
     page = (tmp_path / "accuracy.md").read_text(encoding="utf-8")
+    assert "384 of its 384 pixels are compared" in page
     for degree in range(5):
         assert f"| SH degree {degree} | cpu |" in page
     assert "| SH degree 4, antialiased | cpu |" in page
@@ -352,13 +444,26 @@ def test_bad_arguments_are_one_sentence(igsr_bench, arguments, words):
     assert err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "option",
+    [["--workload", "W1"], ["--garden", "a.npz"], ["--capture", "a"], ["--models", "a"]],
+)
+def test_accuracy_takes_no_options_of_workloads(igsr_bench, tmp_path, option):
+    status, out, err = igsr_bench("--accuracy", tmp_path / "page.md", *option)
+    assert (status, out) == (1, "")
+    assert err == f"--accuracy runs no workloads; leave {option[0]} out.\n"
+
+
 def test_a_workload_that_is_not_there_is_refused(igsr_bench):
     status, _, err = igsr_bench("--workload", "W9")
     assert status == 2
     assert "W9" in err
 
 
-def test_growth_is_drawn(tmp_path):
+@pytest.mark.parametrize(
+    "memory", [{"bytes_per_splat": 900.0, "contract_bytes_per_splat": 760.0}, {}]
+)
+def test_growth_is_drawn(tmp_path, memory):
     rows = [
         {
             "workload": "W4",
@@ -367,8 +472,7 @@ def test_growth_is_drawn(tmp_path):
             "splats": count,
             "width": side,
             "ms": 1.0 * count * side,
-            "bytes_per_splat": 900.0,
-            "contract_bytes_per_splat": 760.0,
+            **memory,
         }
         for count, side in growth.points()
     ]

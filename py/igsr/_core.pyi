@@ -174,6 +174,12 @@ DEFAULT_MAX_SPLATS: int
 NEAR_PLANE: float  # what lies nearer than this, in world units, is not drawn
 FAR_PLANE: float  # what lies farther than this, in world units, is not drawn
 EPS2D: float  # variance in square pixels added to every projected Gaussian
+ALPHA_MIN: float  # a pair fainter than this contributes nothing
+ALPHA_MAX: float  # no pair is more opaque than this
+TRANSMITTANCE_MIN: float  # a pixel stops before its transmittance falls below this
+RIGID_TOLERANCE: float  # largest deviation of R R^T from the identity in a viewmat
+TILE_SIZE: int  # side of a tile in pixels
+SIDE_MAX: int  # largest side of a picture in pixels
 
 def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict[str, Float32]:
     """One round splat per point [P, 3] with colours [P, 3] in 0..1.

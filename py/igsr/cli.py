@@ -563,8 +563,13 @@ def bench_command(
         typer.Option("--capture", metavar="CAPTURE", help="Photos of 400x400 for W3."),
     ] = None,
     models: Annotated[
-        Path, typer.Option("--models", help="Folder that keeps the models fitted for W3.")
-    ] = Path("out/bench"),
+        Path | None,
+        typer.Option(
+            "--models",
+            metavar="DIR",
+            help="Folder that keeps the models fitted for W3. Default: out/bench.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same workloads.")] = 0,
     seconds: Annotated[
         float, typer.Option("--seconds", help="How long each row is repeated.")
@@ -598,6 +603,16 @@ def bench_command(
         if not 0.0 <= seconds <= 3600.0:
             raise IgsrError(f"--seconds must be from 0 to 3600, not {seconds:g}.")
         names = benchmark.resolved_backends([b.value for b in backends or [BackendChoice.auto]])
+        if accuracy is not None:
+            given = {
+                "--workload": workloads,
+                "--garden": garden,
+                "--capture": capture,
+                "--models": models,
+            }
+            for name, value in given.items():
+                if value:
+                    raise IgsrError(f"--accuracy runs no workloads; leave {name} out.")
         for path in (plot, json_path, accuracy):
             if path is not None:
                 check_writable(path)
@@ -607,7 +622,7 @@ def bench_command(
             workloads=tuple(w.value for w in workloads or WorkloadChoice),
             garden=garden,
             capture=capture,
-            models=models,
+            models=models or benchmark.Settings.models,
             seed=seed,
             seconds=seconds,
         )

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from . import _core
 from .normals import facing_normals
-from .rasterization_arguments import TILE_SIZE, check_arguments
+from .rasterization_arguments import FLOAT32_MAX, check_arguments
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
@@ -224,7 +224,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = TILE_SIZE,
+    tile_size: int = _core.TILE_SIZE,
     backgrounds: Tensor | None = None,
     render_mode: RenderMode = "RGB",
     sparse_grad: bool = False,
@@ -271,7 +271,8 @@ def rasterization(
     Args:
         means: [N, 3] centres, world frame.
         quats: [N, 4] rotations w x y z, normalised inside.
-        scales: [N, 3] standard deviations (not logarithms).
+        scales: [N, 3] standard deviations (not logarithms; a splat with a negative one is not
+            drawn).
         opacities: [N] in [0, 1] (not logits).
         colors: [N, D] or [C, N, D] colours or other features, any D >= 1; with ``sh_degree``,
             [N, K, 3] or [C, N, K, 3] spherical-harmonics coefficients with
@@ -280,8 +281,9 @@ def rasterization(
         viewmats: [C, 4, 4] rigid world-to-camera matrices, OpenCV axes.
         Ks: [C, 3, 3] pinhole matrices in pixels without skew; pixel centres at +0.5.
         width, height: picture size in pixels.
-        near_plane, far_plane: splats whose centre's camera-space z is outside are not drawn.
-        radius_clip: splats whose 2D radii are both at most this many pixels are not drawn.
+        near_plane, far_plane: splats whose centre's camera-space z is outside are not drawn;
+            far_plane may be inf.
+        radius_clip: splats whose ``radii`` are both at most this many pixels are not drawn.
         eps2d: variance in square pixels added to every projected Gaussian.
         sh_degree: degree to evaluate, 0-4, or None for direct colours.
         packed: True (gsplat's default) returns per-splat ``meta`` entries only for the nnz
@@ -314,7 +316,8 @@ def rasterization(
         ``retain_grad()`` before ``backward()``), ``radii`` (int32 pixels, x and y, rounded up),
         ``depths``, ``conics`` (xx, xy, yy), ``opacities``, ``batch_ids``, ``camera_ids``,
         ``gaussian_ids``, ``width``, ``height``, ``tile_size``, ``tile_width``, ``tile_height``,
-        ``n_batches``, ``n_cameras``; and ``render_normals`` [C, height, width, 3] if asked for:
+        ``n_batches``, ``n_cameras`` (gsplat's lists of tiles, ``isect_ids`` and the like, are
+        not there); and ``render_normals`` [C, height, width, 3] if asked for:
         each splat's shortest axis, turned to face the camera, in the world frame, accumulated
         with the weights of the colours (so of length alpha at most), as gsplat's
         ``rasterization_2dgs`` returns it.
@@ -329,7 +332,14 @@ def rasterization(
     backend = _core.resolve_backend(backend)
     antialiased = rasterize_mode == "antialiased"
     settings = _Settings(
-        width, height, near_plane, far_plane, eps2d, antialiased, sh_degree, backend
+        width,
+        height,
+        near_plane,
+        min(far_plane, FLOAT32_MAX),
+        eps2d,
+        antialiased,
+        sh_degree,
+        backend,
     )
     cameras = len(viewmats)
     channels = colors.shape[-1]
@@ -347,7 +357,8 @@ def rasterization(
         view = dict(zip(PROJECTED, outputs, strict=True))
         if radius_clip > 0.0:
             radii = view["radii"]
-            view["radii"] = radii * (radii > radius_clip).any(dim=-1, keepdim=True)
+            # Of the whole numbers that ``meta`` has, as gsplat compares them.
+            view["radii"] = radii * (torch.ceil(radii) > radius_clip).any(dim=-1, keepdim=True)
         if further is not None:
             view["further"] = further[c] if per_camera_colors else further
         if packed or render_normals:
@@ -393,8 +404,8 @@ def rasterization(
         "width": width,
         "height": height,
         "tile_size": tile_size,
-        "tile_width": math.ceil(width / TILE_SIZE),
-        "tile_height": math.ceil(height / TILE_SIZE),
+        "tile_width": math.ceil(width / _core.TILE_SIZE),
+        "tile_height": math.ceil(height / _core.TILE_SIZE),
         "n_batches": 1,
         "n_cameras": cameras,
     }

@@ -11,21 +11,18 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from . import _core
 from .splats import MAX_SH_DEGREE
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 
-#: A rotation in float32 is orthonormal to about 1e-6; a scaled or sheared pose is far outside (the
-#: renderer itself draws the same line).
-RIGID_TOLERANCE = 1e-3
-
-#: The tile's side in pixels; it shows in ``meta`` only, no picture depends on it.
-TILE_SIZE = 16
+#: What the renderer can hold.
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 #: gsplat arguments that exist to be refused by name, with the only value accepted.
 _UNSUPPORTED_DEFAULTS: dict[str, Any] = {
-    "tile_size": TILE_SIZE,
+    "tile_size": _core.TILE_SIZE,
     "sparse_grad": False,
     "distributed": False,
     "camera_model": "pinhole",
@@ -58,8 +55,13 @@ def _check_unsupported(arguments: dict[str, Any]) -> None:
         value = arguments[name]
         if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
             continue  # gsplat's own default, an enum that is not ours to import
-        if value is not default and (isinstance(value, Tensor) or value != default):
-            raise ValueError(f"{name}: only {default!r} is supported, not {value!r}")
+        if value is default:
+            continue
+        # Arrays do not compare to one truth value, and would fill the screen.
+        plain = isinstance(value, (str, bool, numbers.Number))
+        if not plain or value != default:
+            shown = repr(value) if plain else f"a {type(value).__name__}"
+            raise ValueError(f"{name}: only {default!r} is supported, not {shown}")
 
 
 def _check_settings(arguments: dict[str, Any]) -> None:
@@ -68,11 +70,18 @@ def _check_settings(arguments: dict[str, Any]) -> None:
             raise ValueError(
                 f"{name}: must be a positive whole number of pixels, not {arguments[name]!r}"
             )
+        if arguments[name] > _core.SIDE_MAX:
+            raise ValueError(
+                f"{name}: must be at most {_core.SIDE_MAX} pixels, not {arguments[name]}; "
+                "render a large picture in parts"
+            )
     for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
         number = arguments[name]
         real = isinstance(number, numbers.Real) and not isinstance(number, bool)
-        if not real or not math.isfinite(number) or number < 0:
-            raise ValueError(f"{name}: must be a finite number of at least 0, not {number!r}")
+        most = math.inf if name == "far_plane" else FLOAT32_MAX
+        if not real or not 0 <= number <= most:
+            kind = "a number" if name == "far_plane" else "a finite number"
+            raise ValueError(f"{name}: must be {kind} of at least 0, not {number!r}")
     near_plane, far_plane = arguments["near_plane"], arguments["far_plane"]
     if far_plane <= near_plane:
         raise ValueError(f"far_plane: must exceed near_plane ({near_plane}), not {far_plane}")
@@ -187,7 +196,16 @@ def _check_tensor(
         raise ValueError(f"{name}: must be a torch tensor, not {type(tensor).__name__}")
     if tensor.dtype not in dtypes:
         wanted = " or ".join(str(dtype) for dtype in dtypes)
-        raise ValueError(f"{name}: must be {wanted}, not {tensor.dtype}")
+        mend = ""
+        if tensor.dtype == torch.float64 and dtypes == (torch.float32,):
+            mend = "; convert it with .float()"
+            if name == "means":
+                mend += ', or take backend="reference", which computes in float64'
+        raise ValueError(f"{name}: must be {wanted}, not {tensor.dtype}{mend}")
+    if tensor.layout != torch.strided or tensor.device.type == "meta":
+        raise ValueError(
+            f"{name}: must be a dense tensor with values, not {tensor.layout} on {tensor.device}"
+        )
     if not any(
         tensor.dim() == len(shape)
         and all(isinstance(s, str) or s == t for s, t in zip(shape, tensor.shape, strict=True))
@@ -203,10 +221,13 @@ def _check_viewmat(name: str, viewmat: npt.NDArray[np.float64]) -> None:
     if not np.isfinite(viewmat).all():
         raise ValueError(f"{name}: must be finite")
     rotation = viewmat[:3, :3]
-    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_TOLERANCE
+    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= _core.RIGID_TOLERANCE
     if not rigid or np.linalg.det(rotation) < 0:
-        raise ValueError(f"{name}: its 3 x 3 part is not a rotation")
-    if np.abs(viewmat[3] - (0.0, 0.0, 0.0, 1.0)).max() > RIGID_TOLERANCE:
+        raise ValueError(
+            f"{name}: its 3 x 3 part is not a rotation; give a rigid world-to-camera matrix "
+            "without scale, shear or reflection"
+        )
+    if np.abs(viewmat[3] - (0.0, 0.0, 0.0, 1.0)).max() > _core.RIGID_TOLERANCE:
         raise ValueError(f"{name}: its last row must be 0 0 0 1")
 
 

@@ -123,11 +123,7 @@ fn state_from(dict: &Bound<'_, PyDict>) -> PyResult<(FitState, u32)> {
         splats,
         first: splat_arrays_from(dict, "first_")?,
         second: splat_arrays_from(dict, "second_")?,
-        stats: DensityStats {
-            grad_sum: stat("stats_grad_sum")?,
-            seen: stat("stats_seen")?,
-            radius: stat("stats_radius")?,
-        },
+        stats: DensityStats { grad_sum: stat("stats_grad_sum")?, seen: stat("stats_seen")? },
     };
     Ok((state, elements("step", &step, &[1])?[0]))
 }
@@ -250,7 +246,6 @@ impl Fitter {
         set_splat_arrays(&dict, "second_", state.second)?;
         dict.set_item("stats_grad_sum", shaped(py, state.stats.grad_sum, &[n])?)?;
         dict.set_item("stats_seen", shaped(py, state.stats.seen, &[n])?)?;
-        dict.set_item("stats_radius", shaped(py, state.stats.radius, &[n])?)?;
         dict.set_item("step", shaped(py, vec![step], &[1])?)?;
         Ok(dict)
     }

@@ -29,7 +29,13 @@ mod _core {
         module.add("DEFAULT_MAX_SPLATS", FitConfig::default().max_splats)?;
         module.add("NEAR_PLANE", constants::NEAR)?;
         module.add("FAR_PLANE", constants::FAR)?;
-        module.add("EPS2D", constants::BLUR)
+        module.add("EPS2D", constants::BLUR)?;
+        module.add("ALPHA_MIN", constants::ALPHA_MIN)?;
+        module.add("ALPHA_MAX", constants::ALPHA_MAX)?;
+        module.add("TRANSMITTANCE_MIN", constants::TRANSMITTANCE_MIN)?;
+        module.add("RIGID_TOLERANCE", constants::RIGID_TOLERANCE)?;
+        module.add("TILE_SIZE", constants::TILE)?;
+        module.add("SIDE_MAX", constants::SIDE_MAX)
     }
     #[pymodule_export]
     use crate::backend::{backend_info, resolve_backend, working_dtype};

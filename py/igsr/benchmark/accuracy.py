@@ -18,12 +18,12 @@ from .. import _core
 from ..atomic_write import atomic_write
 from ..splats import MAX_SH_DEGREE
 from . import oracle
+from .comparison import BOUND_3D, FLIP
 from .machine import describe_machine
 from .plots import plot_speed_vs_error
-from .run import not_run
 from .scenes import Arrays, Scene, ball
 from .stage_rows import pipeline_rows
-from .table import machine_line, milliseconds, not_run_lines
+from .table import machine_line, milliseconds
 
 #: The scene: small enough for the reference to walk all splats at every pixel, and its splats about
 #: a pixel in size, where antialiasing matters.
@@ -133,10 +133,7 @@ def measure_accuracy(
         columns = setting_columns(setting)
         for backend in backends:
             on_row(f"{setting.name} on {backend}")
-            try:
-                measured = pipeline_rows("accuracy", setting.scene, backend, seed, seconds)
-            except ValueError as error:  # a setting that a backend does not have says so
-                measured = [not_run("accuracy", backend, f"{setting.name}: {error}")]
+            measured = pipeline_rows("accuracy", setting.scene, backend, seed, seconds)
             rows.extend({**row, **columns} for row in measured)
     return {"machine": machine, "rows": rows}
 
@@ -154,9 +151,10 @@ def write_accuracy(path: Path, report: dict[str, Any]) -> None:
 
 def accuracy_page(report: dict[str, Any]) -> str:
     """The page in Markdown."""
-    machine = report["machine"]
-    rows = [row for row in report["rows"] if row["ms"] is not None]
+    machine, rows = report["machine"], report["rows"]
     first = rows[0]
+    compared = min(row["compared_pixels"] for row in rows)
+    left_out = max(row["left_out_pixels"] for row in rows)
     figures: Table = []
     for forward, backward in zip(rows[::2], rows[1::2], strict=True):
         figures.append(
@@ -191,8 +189,10 @@ def accuracy_page(report: dict[str, Any]) -> str:
             "Written by `igsr bench --accuracy docs/accuracy.md` (`make accuracy`); do not edit.",
             "",
             f"Measured with {machine_line(machine)}. The scene: {first['splats']} splats of about "
-            f"a pixel on {first['width']}×{first['height']}, {first['compared_pixels']} pixels, "
-            "all of them compared; gradients of a random loss over colour, alpha and depth.",
+            f"a pixel on {first['width']}×{first['height']}; {compared} of its "
+            f"{first['width'] * first['height']} pixels are compared, of which a line of the table "
+            f"leaves out {left_out} at most. Gradients are of a random loss over colour, alpha and "
+            "depth.",
             "",
             "## The arithmetic",
             "",
@@ -201,11 +201,11 @@ def accuracy_page(report: dict[str, Any]) -> str:
             "one that judges the others: culling leaves out only pairs that contribute nothing. "
             "Gradients are in parts of the largest of their kind, for the worst kind. A pixel of "
             "the [band](numerics.md#bounds-and-what-is-measured) is left out only where it differs "
-            "by more than the bound, 1e-4.",
+            f"by more than the bound, {max(BOUND_3D.values()):g}, or its transmittance by more "
+            f"than {FLIP:g} of itself.",
             "",
             *_markdown(headings, figures, left=2),
             "",
-            *[f"{line}\n" for line in not_run_lines(report["rows"])],
             f"![time against largest error of every setting]({PLOT_NAME})",
             "",
             "## The settings",

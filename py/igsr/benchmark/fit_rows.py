@@ -102,21 +102,29 @@ def _shot(view: View, splats: Splats) -> Shot:
     return Shot(scene, np.ascontiguousarray(view.image))
 
 
+def model_path(capture: Capture, count: int, models: Path, seed: int) -> Path:
+    """Where ``fitted_model`` keeps a model; the name holds all that the fit depends on."""
+    photos = f"{capture.path.resolve().name}-{fingerprint(capture.train_views)[:12]}"
+    return models / f"{photos}-{count}-seed{seed}-{FIT_STEPS}steps.ply"
+
+
 def fitted_model(capture: Capture, count: int, models: Path, seed: int) -> Splats:
     """A model of ``capture`` with ``count`` splats: from the folder ``models``, else fitted.
 
     Raises:
         IgsrError: the fit did not reach the number of splats, or the model cannot be written.
     """
-    name = f"{capture.path.resolve().name}-{fingerprint(capture.train_views)[:12]}-{count}.ply"
-    path = models / name
+    path = model_path(capture, count, models, seed)
     if path.is_file():
         return Splats.load(path)
     # Relocation grows the model up to the number asked for; the original control stops where the
     # photos ask for no more.
     splats = fit(capture, FIT_STEPS, seed=seed, max_splats=count, density="mcmc")
     if len(splats) < (1.0 - COUNT_TOLERANCE) * count:
-        raise IgsrError(f"A fit of {capture.path} ended with {len(splats)} splats, not {count}.")
+        raise IgsrError(
+            f"A fit of {capture.path} ended with {len(splats)} splats, not {count}; "
+            "give another --capture."
+        )
     splats.save(path)
     return splats
 
@@ -222,7 +230,7 @@ def _state(scene: Scene) -> Arrays:
     state: Arrays = dict(splats)
     for moment in ("first", "second"):
         state |= {f"{moment}_{name}": np.zeros_like(array) for name, array in splats.items()}
-    for statistic in ("grad_sum", "seen", "radius"):
+    for statistic in ("grad_sum", "seen"):
         state[f"stats_{statistic}"] = np.zeros(count, np.float32)
     state["step"] = np.array([STEPS_BEFORE], dtype=np.uint32)
     return state
@@ -255,11 +263,12 @@ def fit_step_ms(shot: Shot, backend: str, seconds: float) -> list[float]:
     started = time.perf_counter()
     while len(times) < MIN_REPEATS or time.perf_counter() - started < seconds:
         running = fitter(shot, backend)
+        running.step(1)  # allocates, and wakes a device
         before = time.perf_counter()
         running.step(1)
-        # Steps of a GPU are read back once per call; a call holds 20 ms of them.
-        steps = max(1, math.ceil(0.02 / (time.perf_counter() - before)))
-        for _ in range(max(1, STEPS_PER_STATE // steps)):
+        # Steps of a GPU are read back once per call; a call holds up to 20 ms of them.
+        steps = min(STEPS_PER_STATE, math.ceil(0.02 / (time.perf_counter() - before)))
+        for _ in range(STEPS_PER_STATE // steps):
             before = time.perf_counter()
             running.step(steps)
             times.append(1e3 * (time.perf_counter() - before) / steps)
@@ -287,7 +296,11 @@ class OwnLoop:
     """A fit by ``igsr.rasterization``, torch's Adam and a Charbonnier loss."""
 
     def __init__(self, shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) -> None:
-        """Parameters as leaves, rates as the fit has them."""
+        """Parameters as leaves, at fixed rates.
+
+        They are the fit's, but for the centres', which here is a tenth of the fit's first and knows
+        neither extent nor decay, and for all SH coefficients, which here share that of the first.
+        """
         scene = shot.scene
         self.scene, self.backend = scene, backend
         self.parameters = {

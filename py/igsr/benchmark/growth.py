@@ -6,7 +6,6 @@ splats that stays as dense while their number grows, the photo is noise; neither
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import json
 import os
@@ -21,7 +20,7 @@ from ..errors import IgsrError
 from .comparison import errors_row
 from .fit_rows import Shot, fit_step_ms, step_rows
 from .scenes import ball, upstream
-from .stage_rows import compare, timing_row
+from .stage_rows import compare, runs_on_cores, timing_row
 
 #: Splats, at GROWN_SIDE pixels a side; and sides, at GROWN_COUNT splats.
 COUNTS = (10_000, 30_000, 100_000, 300_000, 1_000_000)
@@ -36,6 +35,8 @@ EMPTY = 16
 STEP_SECONDS = 20.0
 #: Crops that are compared with the reference, evenly chosen.
 CROPS = 64
+#: Linux forgets a process's peak memory when 5 is written here.
+CLEAR_REFS = Path("/proc/self/clear_refs")
 #: How long one point is repeated.
 POINT_SECONDS = 1.0
 
@@ -65,36 +66,35 @@ def contract_bytes(count: int) -> int:
 
 
 def _peak_bytes() -> int:
-    """Largest resident size of this process so far."""
-    try:
-        # Linux: ru_maxrss there begins with the size of the process that started this one.
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
-    except OSError:
-        pass
-    import resource  # not on Windows
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak
+    """Largest resident size of this process since ``_forget_peak``."""
+    status = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return 1024 * next(int(line.split()[1]) for line in status if line.startswith("VmHWM:"))
 
 
-def _forget_peak() -> None:
-    """Let the peak start from what is resident now, where the system can (Linux)."""
+def _forget_peak() -> bool:
+    """Let the peak start from what is resident now; False where the system cannot (Linux can)."""
     gc.collect()
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+    try:
+        CLEAR_REFS.write_text("5")
+    except OSError:
+        return False
+    return True
 
 
 def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> dict[str, Any]:
-    """Time, memory and error of one point; for a process of its own."""
+    """Time, memory where it can be told, and error of one point; for a process of its own."""
     shot = shot_of(seed, count, side)
     # What a backend opens once, threads and devices, is not the fit's.
     fit_step_ms(shot_of(seed, EMPTY, 16), backend, 0.0)
-    _forget_peak()
-    before = _peak_bytes()
-    times = fit_step_ms(shot, backend, seconds)
-    used = _peak_bytes() - before
+    # The process's size says nothing of the memory that a device has of its own, nor what is below
+    # an earlier peak.
+    memory: dict[str, int] = {}
+    if runs_on_cores(backend) and _forget_peak():
+        before = _peak_bytes()
+        times = fit_step_ms(shot, backend, seconds)
+        memory["peak_bytes"] = _peak_bytes() - before
+    else:
+        times = fit_step_ms(shot, backend, seconds)
     v_image = upstream(seed, side, side)
     comparison, _ = compare(shot.scene, backend, v_image, _evenly_chosen)
     return {
@@ -105,7 +105,7 @@ def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> d
         "width": side,
         "height": side,
         **timing_row(np.array(times), backend, None),
-        "peak_bytes": used,
+        **memory,
         **errors_row("gradients", comparison.gradients, comparison.band, comparison.picture),
     }
 
@@ -145,7 +145,7 @@ def growth_rows(
     grid: list[tuple[int, int]] | None = None,
     seconds: float = POINT_SECONDS,
 ) -> list[dict[str, Any]]:
-    """W4: the rows of all points, and the two loops side by side."""
+    """W4: the rows of all points, with memory where it can be told."""
     rows: list[dict[str, Any]] = []
     buffers: dict[int, int] = {}
     too_slow: tuple[int, int] | None = None
@@ -162,21 +162,19 @@ def growth_rows(
             )
             continue
         try:
-            if side not in buffers:
-                buffers[side] = measure_apart(seed, EMPTY, side, backend, 0.0)["peak_bytes"]
             row = measure_apart(seed, count, side, backend, seconds)
+            if "peak_bytes" in row:
+                if side not in buffers:
+                    buffers[side] = measure_apart(seed, EMPTY, side, backend, 0.0)["peak_bytes"]
+                row |= {
+                    "image_bytes": buffers[side],
+                    "bytes_per_splat": max(0, row["peak_bytes"] - buffers[side]) / count,
+                    "contract_bytes_per_splat": contract_bytes(count) / count,
+                }
         except IgsrError as error:
             rows.append({**common, "not_run": str(error)})
             continue
-        own = max(0, row["peak_bytes"] - buffers[side])
-        rows.append(
-            {
-                **row,
-                "image_bytes": buffers[side],
-                "bytes_per_splat": own / count,
-                "contract_bytes_per_splat": contract_bytes(count) / count,
-            }
-        )
+        rows.append(row)
         if row["ms"] > 1e3 * STEP_SECONDS:
             too_slow = (count, side)
     return rows

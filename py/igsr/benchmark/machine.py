@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import _core
+from .comparison import FLIP
 
 #: How every figure comes about; goes into the JSON and above the tables.
 PROTOCOL = (
@@ -20,9 +21,11 @@ PROTOCOL = (
     "multiply-add counting as two; fraction_of_peak counts the arithmetic of blended pairs only. "
     "Errors are against the f64 reference on the same f32 inputs: of a picture absolute, over "
     "colour and alpha; of gradients in parts of the largest of their kind, for the worst kind. "
-    "Pixels that differ by more than the bound are left out only within the band of "
-    "docs/numerics.md (band_pixels, left_out_pixels); splats at equal depth up to rounding are "
-    "taken in the backend's order."
+    "A pixel is left out only within the band of docs/numerics.md, where it differs by more than "
+    f"the bound or its transmittance by more than {FLIP:g} of itself (band_pixels, "
+    "left_out_pixels); splats at equal depth up to rounding are taken in the backend's order. "
+    "bytes_per_splat is the fit's peak memory without that of the picture, told where the fit runs "
+    "on the cores."
 )
 
 

@@ -163,8 +163,6 @@ class PairCounts:
 
 def pair_counts(projected: Arrays, width: int, height: int) -> PairCounts:
     """Count pairs in f64, without the renderer."""
-    from .scenes import ALPHA_MIN
-
     order = np.argsort(projected["depths"].astype(np.float32), kind="stable")
     rank = np.empty(len(order), dtype=np.intp)
     rank[order] = np.arange(len(order))
@@ -180,9 +178,9 @@ def pair_counts(projected: Arrays, width: int, height: int) -> PairCounts:
         alpha = projected["opacities"][ids].astype(np.float64)[:, None, None] * np.exp(
             -0.5 * (u * u + v * v)
         )
-        seen = alpha >= ALPHA_MIN
-        through = np.cumprod(np.where(seen, 1.0 - np.minimum(alpha, 0.99), 1.0), axis=0)
-        blended = seen & (through >= 1e-4)
+        seen = alpha >= _core.ALPHA_MIN
+        through = np.cumprod(np.where(seen, 1.0 - np.minimum(alpha, _core.ALPHA_MAX), 1.0), axis=0)
+        blended = seen & (through >= _core.TRANSMITTANCE_MIN)
         return int(seen.any(axis=(1, 2)).sum()), int(seen.sum()), int(blended.sum())
 
     counts = _on_all_cores(work, crops(projected, width, height))

@@ -25,8 +25,8 @@ def plot_speed_vs_error(path: Path, report: dict[str, Any]) -> None:
     from matplotlib.figure import Figure
 
     measured = [row for row in report["rows"] if row["ms"] is not None]
-    grown = [row for row in measured if "bytes_per_splat" in row]
-    points = [row for row in measured if "bytes_per_splat" not in row]
+    grown = [row for row in measured if _is_of_growth(row)]
+    points = [row for row in measured if not _is_of_growth(row)]
     lines = (1 if points or not grown else 0) + (1 if grown else 0)
     columns = 4 if any("setting" in row for row in points) else 3
     figure = Figure(figsize=(4.4 * columns, 4.4 * lines), layout="constrained")
@@ -38,6 +38,11 @@ def plot_speed_vs_error(path: Path, report: dict[str, Any]) -> None:
         _draw_growth(axes[-1], grown)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
+
+
+def _is_of_growth(row: dict[str, Any]) -> bool:
+    on_a_line = row["width"] == GROWN_SIDE or row["splats"] == GROWN_COUNT
+    return row["workload"] == "W4" and on_a_line
 
 
 def _label(row: dict[str, Any]) -> str:
@@ -98,15 +103,19 @@ def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
 
 
 def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Time over splats, time over pixels, memory over splats."""
+    """Time over splats, time over pixels, memory over splats where it could be told."""
     by_count = [row for row in rows if row["width"] == GROWN_SIDE]
     by_side = [row for row in rows if row["splats"] == GROWN_COUNT]
+    with_memory = [row for row in by_count if "bytes_per_splat" in row]
     panels: list[tuple[list[dict[str, Any]], str, str, str, str]] = [
         (by_count, "splats", "ms", f"{GROWN_SIDE}×{GROWN_SIDE} pixels", "ms per fit step"),
         (by_side, "width", "ms", f"{GROWN_COUNT} splats", "ms per fit step"),
-        (by_count, "splats", "bytes_per_splat", "peak memory", "bytes per splat"),
+        (with_memory, "splats", "bytes_per_splat", "peak memory", "bytes per splat"),
     ]
     for axis, (chosen, across, up, title, label) in zip(axes, panels, strict=True):
+        if not chosen:
+            axis.set_axis_off()
+            continue
         for backend, color in COLORS.items():
             line = sorted((row[across], row[up]) for row in chosen if row["backend"] == backend)
             if line:
@@ -119,21 +128,21 @@ def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
         axis.set_ylabel(label)
         axis.set_title(title, fontsize=9)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
-    for axis in axes[:2]:
-        axis.set_yscale("log")
-        axis.margins(0.1)
-        _plain_numbers(axis.yaxis)
-    memory = axes[2]
-    memory.axhline(
-        rows[0]["contract_bytes_per_splat"],
-        color="#444444",
-        linestyle="--",
-        linewidth=1,
-        label="2 × parameters + gradients + optimiser state",
-    )
-    memory.set_ylim(bottom=0.0)
-    memory.legend(fontsize=8, loc="lower left")
+        if up == "ms":
+            axis.set_yscale("log")
+            axis.margins(0.1)
+            _plain_numbers(axis.yaxis)
+            axis.legend(fontsize=8)
+        else:
+            axis.axhline(
+                chosen[0]["contract_bytes_per_splat"],
+                color="#444444",
+                linestyle="--",
+                linewidth=1,
+                label="2 × parameters + gradients + optimiser state",
+            )
+            axis.set_ylim(bottom=0.0)
+            axis.legend(fontsize=8, loc="lower left")
 
 
 def _plain_numbers(axis: Any) -> None:

@@ -23,9 +23,6 @@ Arrays = dict[str, Any]
 #: A scene's arrays in the renderer's order.
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 
-#: Opacity under which a splat contributes nothing anywhere.
-ALPHA_MIN = float(np.float32(1.0) / np.float32(255.0))
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -105,7 +102,7 @@ def splats2d(
         ],
         axis=1,
     )
-    reach = 2.0 * np.log(opacities / ALPHA_MIN)
+    reach = 2.0 * np.log(opacities / _core.ALPHA_MIN)
     radii = np.sqrt(reach[:, None] * np.stack([xx, yy], axis=1))
     arrays = {
         "means2d": means2d,
@@ -125,21 +122,44 @@ def garden(path: Path, seed: int) -> Scene:
     file's (gsplat's ``test_garden.npz``).
 
     Raises:
-        IgsrError: the file cannot be read or is not that fixture.
+        IgsrError: the file cannot be read, is not that fixture, or holds what cannot be drawn.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            means, colors = file["means3d"], file["colors"]
-            viewmat, K = file["viewmats"][0], file["Ks"][0]
+        # What is too large for float32 becomes infinite, and is refused as such.
+        with np.load(path, allow_pickle=False) as file, np.errstate(over="ignore"):
+            means = file["means3d"].astype(np.float32)
+            colors = file["colors"].astype(np.float32) / np.float32(255.0)
+            viewmat, K = (file[name][0].astype(np.float64) for name in ("viewmats", "Ks"))
             width, height = int(file["width"]), int(file["height"])
         if means.ndim != 2 or means.shape[1] != 3 or colors.shape != means.shape:
             raise ValueError("means3d and colors must be [N, 3]")
         if viewmat.shape != (4, 4) or K.shape != (3, 3):
             raise ValueError("viewmats must be [C, 4, 4] and Ks [C, 3, 3]")
+        if not (np.isfinite(means).all() and np.isfinite(colors).all()):
+            raise ValueError("means3d and colors must be finite numbers")
+        scene = _scene_of_points(means, colors, viewmat, K, width, height, seed)
+        # The renderer knows what cameras and sizes it can draw.
+        drawn = _core.project(*scene.arrays(np.float32), **scene.options(), backend="cpu")
+        if not (drawn["radii"] > 0).any():
+            raise ValueError("its first camera sees none of its points")
     except FileNotFoundError as error:
         raise IgsrError(f"There is no file {path}; give --garden test_garden.npz.") from error
     except (*DAMAGE, TypeError, IndexError, AttributeError) as error:
-        raise IgsrError(f"{path} is not the garden fixture of gsplat ({error}).") from error
+        raise IgsrError(
+            f"{path} is not the garden fixture of gsplat ({error}); give --garden test_garden.npz."
+        ) from error
+    return scene
+
+
+def _scene_of_points(
+    means: npt.NDArray[np.float32],
+    colors: npt.NDArray[np.float32],
+    viewmat: npt.NDArray[np.float64],
+    K: npt.NDArray[np.float64],
+    width: int,
+    height: int,
+    seed: int,
+) -> Scene:
     random = np.random.default_rng(seed)
     count = len(means)
     splats = {
@@ -147,14 +167,14 @@ def garden(path: Path, seed: int) -> Scene:
         "quats": random.normal(size=(count, 4)),
         "scales": random.uniform(0.0, 0.02, (count, 3)),
         "opacities": random.uniform(0.0, 1.0, count),
-        "colors": colors.astype(np.float32) / 255.0,
+        "colors": colors,
     }
     return Scene(
         splats={name: np.ascontiguousarray(a, dtype=np.float32) for name, a in splats.items()},
         sh_degree=None,
         raw_parameters=False,
-        viewmat=np.ascontiguousarray(viewmat, dtype=np.float64),
-        intrinsics=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64),
+        viewmat=np.ascontiguousarray(viewmat),
+        intrinsics=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]),
         width=width,
         height=height,
         background=np.zeros(3, np.float32),

@@ -87,6 +87,6 @@ def print_report(console: Console, report: dict[str, Any]) -> None:
     console.width = max(console.width, console.measure(table, options=wide).maximum)
     console.print(table)
     for line in not_run_lines(report["rows"]):
-        console.print(line)
+        console.print(line, markup=False)  # a reason may hold brackets
     console.print(machine_line(report["machine"]), style="dim")
     console.print(report["machine"]["protocol"], style="dim")

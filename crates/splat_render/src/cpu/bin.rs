@@ -218,6 +218,8 @@ pub(super) fn touched_tiles(
 
 #[cfg(test)]
 mod tests {
+    use rand::{Rng, SeedableRng};
+
     use super::*;
 
     #[test]
@@ -231,5 +233,55 @@ mod tests {
         sort_by_depth(&mut keys, &mut Vec::new());
         let ids: Vec<u64> = keys.iter().map(|k| k & 0xffff_ffff).collect();
         assert_eq!(ids, [4, 1, 3, 2, 6, 0, 5]);
+    }
+    /// Every tile with a pixel that a splat reaches is listed, and hardly any other.
+    #[test]
+    fn tiles_are_those_that_splats_reach() {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(7);
+        let (width, height) = (203u32, 150u32);
+        let (columns, rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
+        let (mut listed, mut needed) = (0, 0);
+        for _ in 0..3000 {
+            let mut deviation = || rng.random_range(0.0f64..4.5).exp() * 0.3;
+            let (long, short) = (deviation(), deviation());
+            let (sin, cos) = rng.random_range(0.0..std::f64::consts::TAU).sin_cos();
+            let xx = (long * cos).powi(2) + (short * sin).powi(2);
+            let yy = (long * sin).powi(2) + (short * cos).powi(2);
+            let xy = (long * long - short * short) * sin * cos;
+            let det = (long * short).powi(2);
+            let factor = [(yy / det).sqrt(), -xy / (yy * det).sqrt(), yy.sqrt().recip()];
+            let opacity = rng.random_range(0.005..1.0);
+            let reach = (2.0 * (opacity / f64::from(ALPHA_MIN)).ln()).sqrt();
+            let splat = Splat2d {
+                mean: [rng.random_range(-40.0..243.0), rng.random_range(-40.0..190.0)],
+                factor: factor.map(|v| v as f32),
+                depth: 1.0,
+                color: [0.0; 3],
+                opacity: opacity as f32,
+                radii: [reach * xx.sqrt(), reach * yy.sqrt()].map(|v| v as f32),
+            };
+            let mut tiles = ChunkTiles::default();
+            tiles.push(&splat, width, height);
+            listed += tiles.tiles.len();
+            let [p, q, r] = splat.factor.map(f64::from);
+            for tile in 0..columns * rows {
+                let (left, top) = (tile % columns * TILE, tile / columns * TILE);
+                let reached = (top..(top + TILE).min(height)).any(|y| {
+                    (left..(left + TILE).min(width)).any(|x| {
+                        let dx = f64::from(x) + 0.5 - f64::from(splat.mean[0]);
+                        let dy = f64::from(y) + 0.5 - f64::from(splat.mean[1]);
+                        let (u, v) = (p * dx + q * dy, r * dy);
+                        opacity * (-0.5 * (u * u + v * v)).exp() >= f64::from(ALPHA_MIN)
+                    })
+                });
+                assert!(!reached || tiles.tiles.contains(&tile), "{splat:?} misses tile {tile}");
+                needed += usize::from(reached);
+            }
+        }
+        assert!(needed > 10_000, "only {needed} tiles are reached");
+        let excess = listed as f64 / needed as f64 - 1.0;
+        println!("{listed} tiles listed, {needed} reached: {:.2} % too many", 100.0 * excess);
+        // Those that an ellipse enters between pixel centres only.
+        assert!(excess < 0.03, "{listed} tiles are listed where {needed} are reached");
     }
 }

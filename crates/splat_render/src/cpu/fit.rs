@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::adam::{Adam, Bias};
 use super::bin::{Bins, CHUNK, ChunkTiles};
 use super::loss::Loss;
-use super::project::{Splat, Splat2d, View, project_splat};
+use super::project::{Splat, View, project_splat};
 use super::project_backward::{VSplat, splat_backward};
 use super::rasterize::{Planes, rasterize};
 use super::rasterize_backward::{
@@ -77,9 +77,8 @@ impl FitDevice for CpuFit {
             .par_chunks_mut(CHUNK)
             .zip(&mut self.chunks)
             .zip(stats.seen.par_chunks_mut(CHUNK))
-            .zip(stats.radius.par_chunks_mut(CHUNK))
             .enumerate()
-            .for_each(|(chunk, (((splats, tiles), seen), radius))| {
+            .for_each(|(chunk, ((splats, tiles), seen))| {
                 tiles.clear();
                 for (k, out) in splats.iter_mut().enumerate() {
                     let i = chunk * CHUNK + k;
@@ -90,7 +89,6 @@ impl FitDevice for CpuFit {
                             *out = TileSplat::new(&splat);
                             tiles.push(&splat, width, height);
                             seen[k] += 1.0;
-                            radius[k] = radius[k].max(extent(&splat, width, height));
                         }
                     }
                 }
@@ -129,11 +127,6 @@ impl FitDevice for CpuFit {
     fn loss(&mut self) -> Result<f32> {
         Ok(self.loss_value)
     }
-}
-
-/// Larger radius as a part of the larger image side.
-fn extent(splat: &Splat2d, width: u32, height: u32) -> f32 {
-    splat.radii[0].max(splat.radii[1]) / width.max(height) as f32
 }
 
 /// Splats whose gradients are gathered before Adam runs over them: they stay in the cache.

@@ -25,8 +25,12 @@ pub fn splats_from_points(
             format!("has {} rows where points has {}", colors.len(), points.len()),
         ));
     }
-    if !points.iter().chain(colors).flatten().all(|v| v.is_finite()) {
-        return Err(Error::argument("points", "hold a value that is not finite"));
+    // Squared distances of points further out would overflow.
+    if !points.iter().flatten().all(|v| v.abs() < 1e18) {
+        return Err(Error::argument("points", "hold a value that is not finite or beyond 1e18"));
+    }
+    if !colors.iter().flatten().all(|v| v.is_finite()) {
+        return Err(Error::argument("colors", "hold a value that is not finite"));
     }
     let mut out = SplatArrays::zeros(points.len(), sh_degree);
     out.means.copy_from_slice(points);
@@ -67,6 +71,11 @@ mod tests {
         }
         let same = splats_from_points(&[[1.0; 3]; 5], &[[0.5; 3]; 5], 0).unwrap();
         assert!(same.scales.iter().flatten().all(|s| s.is_finite()));
-        assert!(splats_from_points(&[[f32::NAN; 3]], &[[0.5; 3]], 0).is_err());
+        let error = |point, color| {
+            splats_from_points(&[[point; 3]], &[[color; 3]], 0).unwrap_err().to_string()
+        };
+        assert!(error(f32::NAN, 0.5).starts_with("points: "));
+        assert!(error(1e30, 0.5).starts_with("points: "));
+        assert!(error(0.0, f32::NAN).starts_with("colors: "));
     }
 }

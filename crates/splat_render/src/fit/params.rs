@@ -118,14 +118,12 @@ pub struct DensityStats {
     pub grad_sum: Vec<f32>,
     /// `[N]` number of steps in which the splat was visible (not culled).
     pub seen: Vec<f32>,
-    /// `[N]` largest extent (larger of the two radii) as a part of the larger image side.
-    pub radius: Vec<f32>,
 }
 
 impl DensityStats {
     /// All zero, for N splats.
     pub fn zeros(n: usize) -> Self {
-        Self { grad_sum: vec![0.0; n], seen: vec![0.0; n], radius: vec![0.0; n] }
+        Self { grad_sum: vec![0.0; n], seen: vec![0.0; n] }
     }
 }
 
@@ -165,8 +163,8 @@ impl FitState {
                 return Err(Error::argument(name, "does not belong to the same splats"));
             }
         }
-        let DensityStats { grad_sum, seen, radius } = &self.stats;
-        if [grad_sum.len(), seen.len(), radius.len()] != [n; 3] {
+        let DensityStats { grad_sum, seen } = &self.stats;
+        if [grad_sum.len(), seen.len()] != [n; 2] {
             return Err(Error::argument("stats", "do not belong to the same splats"));
         }
         Ok(())

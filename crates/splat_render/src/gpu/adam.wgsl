@@ -13,7 +13,7 @@
 @group(0) @binding(7) var<storage, read_write> second: array<f32>;
 @group(0) @binding(8) var<storage, read> splats2d: array<Splat2d>;
 @group(0) @binding(9) var<storage, read> v_splats2d: array<f32>;
-// STATS floats per splat: sum of gradient lengths, steps seen, largest extent.
+// STATS floats per splat: sum of gradient lengths, steps seen.
 @group(0) @binding(10) var<storage, read_write> stats: array<f32>;
 
 fn update(at: u32, g: f32, rate: f32) {
@@ -89,14 +89,11 @@ fn adam_geometry(
     if i >= window.count || status.overflow != 0u {
         return;
     }
-    let radii = splats2d[i].radii;
-    if any(radii != vec2(0.0)) {
+    if any(splats2d[i].radii != vec2(0.0)) {
         let size = vec2(f32(view.width), f32(view.height));
         let v_mean = vec2(v_splats2d[i * GRADIENT], v_splats2d[i * GRADIENT + 1u]);
         stats[i * STATS] += length(0.5 * size * v_mean);
         stats[i * STATS + 1u] += 1.0;
-        let extent = max(radii.x, radii.y) / max(size.x, size.y);
-        stats[i * STATS + 2u] = max(stats[i * STATS + 2u], extent);
     }
     let at = i * GEOMETRY;
     // opacity (1 - opacity) without the cancellation that is 0 for logits over 17.

@@ -132,9 +132,8 @@ impl Scene {
     fn new(gpu: &Gpu, state: &FitState, tiles: u32, capacity: u32, chunks: u32) -> Result<Self> {
         let splats = upload_arrays(gpu, &state.splats)?;
         let n = splats.splats;
-        let stats: Vec<[f32; STATS]> = (0..n as usize)
-            .map(|i| [state.stats.grad_sum[i], state.stats.seen[i], state.stats.radius[i]])
-            .collect();
+        let stats: Vec<[f32; STATS]> =
+            (0..n as usize).map(|i| [state.stats.grad_sum[i], state.stats.seen[i]]).collect();
         let first_guess = n.saturating_mul(PAIRS_PER_SPLAT).max(4096);
         let capacity = capacity.max(first_guess).min(pair_limit(gpu, GRADIENT));
         let (pairs, slots) = pair_buffers(gpu, capacity, tiles)?;
@@ -550,7 +549,6 @@ impl FitDevice for GpuFit {
             stats: DensityStats {
                 grad_sum: stats.iter().map(|s| s[0]).collect(),
                 seen: stats.iter().map(|s| s[1]).collect(),
-                radius: stats.iter().map(|s| s[2]).collect(),
             },
         })
     }

@@ -22,7 +22,7 @@ pub(super) const CAMERA: usize = 16;
 
 /// Floats per splat of what density control watches: sum of gradient lengths, steps seen, largest
 /// extent.
-pub(super) const STATS: usize = 3;
+pub(super) const STATS: usize = 2;
 
 /// Splats per workgroup of the per-splat kernels; windows are multiples of it, which also keeps
 /// every per-splat buffer's offset a multiple of 256 bytes.
