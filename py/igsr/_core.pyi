@@ -170,7 +170,6 @@ def time_pipeline(
 ) -> dict[str, Float64]:
     """Milliseconds [repeats] of each of the four stages, arrays converted once."""
 
-DEFAULT_MAX_SPLATS: int
 NEAR_PLANE: float  # what lies nearer than this, in world units, is not drawn
 FAR_PLANE: float  # what lies farther than this, in world units, is not drawn
 EPS2D: float  # variance in square pixels added to every projected Gaussian

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
@@ -25,8 +26,10 @@ from .atomic_write import atomic_write, check_writable
 from .capture import Camera, Capture, load_capture
 from .errors import IgsrError
 from .evaluation import METRICS, ScoredView, default_background, default_split, evaluate
-from .fitting import DEFAULT_MAX_SPLATS, Progress, fit
+from .fitting import Progress, fit
+from .initialization import chosen_start
 from .orbit import orbit
+from .presets import preset_settings
 from .rendering import render
 from .report import sheet_names, write_contact_sheet, write_report
 from .splats import Splats
@@ -59,6 +62,29 @@ class DensityChoice(str, enum.Enum):
     mcmc = "mcmc"
     original = "original"
     fixed = "fixed"
+
+
+class PresetChoice(str, enum.Enum):
+    """Sets of fit settings."""
+
+    default = "default"
+    baseline_3dgs = "3dgs"
+
+
+class StartChoice(str, enum.Enum):
+    """What the first splats are made from."""
+
+    auto = "auto"
+    points = "points"
+    hull = "hull"
+    rays = "rays"
+    random = "random"
+
+
+class StudyChoice(str, enum.Enum):
+    """Protocols of ``igsr study``."""
+
+    blender8 = "blender8"
 
 
 class WorkloadChoice(str, enum.Enum):
@@ -207,23 +233,43 @@ def fit_command(
         typer.Option("--out", help="Folder for scene.ply, report.json, views.png, checkpoint.npz."),
     ],
     holdout: HoldoutOption = None,
-    steps: Annotated[int, typer.Option("--steps", help="Optimiser steps.")] = 5000,
+    preset: Annotated[
+        PresetChoice,
+        typer.Option(
+            "--preset",
+            help="Settings where none is given below: default (for few photos or for many, by "
+            "their number), 3dgs (a baseline without help for few photos).",
+        ),
+    ] = PresetChoice.default,
+    steps: Annotated[int | None, typer.Option("--steps", help="Optimiser steps.")] = None,
     backend: BackendOption = BackendChoice.auto,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
     max_splats: Annotated[
-        int, typer.Option("--max-splats", help="Most splats there may be.")
-    ] = DEFAULT_MAX_SPLATS,
+        int | None, typer.Option("--max-splats", help="Most splats there may be.")
+    ] = None,
     sh_degree: Annotated[
-        int, typer.Option("--sh-degree", help="Degree of view-dependent colour, 0 to 4.")
-    ] = 2,
+        int | None, typer.Option("--sh-degree", help="Degree of view-dependent colour, 0 to 4.")
+    ] = None,
     density: Annotated[
-        DensityChoice,
+        DensityChoice | None,
         typer.Option(
             "--density",
             help="How splats are added and removed: mcmc (relocation under a cap), original "
             "(clone, split, prune), fixed.",
         ),
-    ] = DensityChoice.original,
+    ] = None,
+    dropout: Annotated[
+        float | None,
+        typer.Option("--dropout", help="Part of the splats that steps leave out at random."),
+    ] = None,
+    hull: Annotated[
+        bool | None,
+        typer.Option("--hull/--no-hull", help="Remove splats that a photo with alpha shows empty."),
+    ] = None,
+    start: Annotated[
+        StartChoice | None,
+        typer.Option("--start", help="What the first splats are made from."),
+    ] = None,
     background: BackgroundOption = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")
@@ -247,7 +293,18 @@ def fit_command(
         color = _color(background) or default_background(capture)
         # Photos with alpha are fitted over random colours, so that no background is learnt.
         has_alpha = any(view.image.shape[2] == 4 for view in capture.train_views)
-        with _fit_bar(steps, shown=not as_json) as show, _warnings_as_sentences():
+        settings = preset_settings(
+            preset.value,
+            len(capture.train_views),
+            steps=steps,
+            max_splats=max_splats,
+            sh_degree=sh_degree,
+            density=None if density is None else density.value,
+            dropout=dropout,
+            hull=hull,
+            start=None if start is None else start.value,
+        )
+        with _fit_bar(settings["steps"], shown=not as_json) as show, _warnings_as_sentences():
 
             def progress(now: Progress) -> None:
                 last[:] = [now]
@@ -255,13 +312,10 @@ def fit_command(
 
             splats = fit(
                 capture,
-                steps,
-                progress,
-                name,
-                seed,
-                max_splats=max_splats,
-                sh_degree=sh_degree,
-                density=density.value,
+                progress=progress,
+                backend=name,
+                seed=seed,
+                **settings,
                 background=None if has_alpha else color,
                 checkpoint=out / "checkpoint.npz",
                 resume=resume,
@@ -275,13 +329,12 @@ def fit_command(
         report = {
             **{metric: scores[metric] for metric in METRICS},
             "splats": len(splats),
-            "steps": steps,
+            "preset": preset.value,
+            **settings,
+            "start": chosen_start(capture, settings["start"]),
             "seconds": round(last[-1].seconds, 3) if last else _checkpoint_seconds(out),
             **info,
             "seed": seed,
-            "sh_degree": splats.sh_degree,
-            "max_splats": max_splats,
-            "density": density.value,
             "version": _core.__version__,
             "capture": str(capture_path),
             "protocol": scores["protocol"],
@@ -542,6 +595,65 @@ def info_command(
                 console.print(f"backend {name}: {what}")
         else:
             console.print(f"{key.replace('_', ' ')}: {_plain(value)}")
+
+
+@app.command("study")
+def study_command(
+    protocol: Annotated[
+        StudyChoice, typer.Argument(help="blender8: NeRF Synthetic from eight photos.")
+    ],
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder that holds the scenes.")],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for study.json, study.md, study.png and runs/.")
+    ],
+    scenes: Annotated[
+        list[str] | None,
+        typer.Option("--scene", help="Repeat it for several. Default: chair and lego."),
+    ] = None,
+    presets: Annotated[
+        list[PresetChoice] | None,
+        typer.Option("--preset", help="Repeat it for several. Default: all."),
+    ] = None,
+    seeds: Annotated[int, typer.Option("--seeds", help="Fits of each kind.")] = 3,
+    jobs: Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")] = 1,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a protocol of the literature: the same photos, seeds and scores for every preset.
+
+    What is finished is kept in --out, and the same command goes on from there.
+    """
+    from . import study
+
+    with one_sentence(
+        lambda: "Interrupted; finished fits are kept, the same command goes on from there."
+    ):
+        console = Console(file=sys.stderr, highlight=False)
+        started = time.monotonic()
+        first: list[int] = []
+
+        def on_run(done: int, total: int, row: dict[str, Any]) -> None:
+            first[:] = first or [done - 1]
+            left = (time.monotonic() - started) / (done - first[0]) * (total - done)
+            console.print(
+                f"{done} of {total}: {row['scene']} {row['preset']} seed {row['seed']}: "
+                f"{row['psnr']:.2f} dB in {row['seconds']:.0f} s; about {left / 60.0:.0f} min left"
+            )
+
+        report = study.blender8(
+            data,
+            out,
+            scenes=tuple(scenes or ("chair", "lego")),
+            presets=tuple(choice.value for choice in presets or PresetChoice),
+            seeds=seeds,
+            backend=_resolved(backend),
+            jobs=jobs,
+            on_run=on_run,
+        )
+    if as_json:
+        _print_json(report)
+        return
+    _console().print((out / "study.md").read_text(encoding="utf-8"), markup=False)
 
 
 @app.command("bench")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import numbers
 import os
 import time
 import warnings
@@ -19,7 +20,8 @@ from .atomic_write import check_writable
 from .capture import Capture, View
 from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
-from .initialization import initial_splats
+from .initialization import STARTS, initial_splats
+from .presets import preset_settings
 from .rendering import intrinsics_of, viewmat_about
 from .splats import MAX_SH_DEGREE, Splats
 
@@ -28,8 +30,8 @@ CHECKPOINT_STEPS = 500
 CHECKPOINT_SECONDS = 20.0
 #: Ways to control the number of splats.
 DENSITIES = ("mcmc", "original", "fixed")
-#: Most splats where the caller names no number.
-DEFAULT_MAX_SPLATS = _core.DEFAULT_MAX_SPLATS
+#: Most of the splats that a step may leave out.
+MAX_DROPOUT = 0.9
 #: How long the Rust side runs before Python may look at Ctrl-C and the progress callback.
 CHUNK_SECONDS = 0.2
 
@@ -59,14 +61,18 @@ class Progress:
 
 def fit(
     capture: Capture,
-    steps: int = 5000,
+    steps: int | None = None,
     progress: Callable[[Progress], bool | None] | None = None,
     backend: str = "auto",
     seed: int = 0,
     *,
+    preset: str = "default",
     max_splats: int | None = None,
-    sh_degree: int = 2,
-    density: str = "original",
+    sh_degree: int | None = None,
+    density: str | None = None,
+    dropout: float | None = None,
+    hull: bool | None = None,
+    start: str | None = None,
     background: tuple[float, float, float] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
@@ -78,17 +84,25 @@ def fit(
 
     Args:
         capture: photos and cameras; masked pixels do not count.
-        steps: optimiser steps, each on one photo.
+        steps: optimiser steps, each on one photo; None, here and below, is what the preset says.
         progress: called about five times a second; returning False ends the fit early, with the
             splats as they are then.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu".
         seed: of everything random.
-        max_splats: most splats there may be; None is ``DEFAULT_MAX_SPLATS``.
+        preset: "default" (other settings for up to 20 photos than for more) or "3dgs"; see
+            ``igsr.presets``.
+        max_splats: most splats there may be.
         sh_degree: degree of the colours' spherical harmonics, 0-4.
         density: how splats are added and removed: "mcmc" (relocation and growth under the cap,
             Kheradmand et al. 2024), "original" (clone, split, prune, Kerbl et al. 2023), "fixed".
         background: RGB in [0, 1] behind the splats and photos with alpha; None is a new random
             colour in every step for photos with alpha and black for photos without.
+        dropout: part of the splats that a step leaves out at random, growing from none in the first
+            step to this in the last, while the others' opacities are raised to make up for it
+            (DropGaussian, Park et al. 2025); 0 to 0.9. Against over-fitting few photos.
+        hull: whether splats are removed whose centre a photo with alpha shows empty.
+        start: what the first splats are made from: "auto", "points", "hull", "rays" or "random";
+            see ``igsr.initialization.initial_splats``.
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
             Ctrl-C (KeyboardInterrupt, which is raised again).
         resume: continue the fit that ``checkpoint`` holds.
@@ -99,12 +113,21 @@ def fit(
         UserWarning: the last checkpoint cannot be written; the splats are returned all the same.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
-    if max_splats is None:
-        max_splats = DEFAULT_MAX_SPLATS
-    _check_arguments(steps, seed, max_splats, sh_degree, density, background, checkpoint, resume)
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
+    chosen = preset_settings(
+        preset,
+        len(views),
+        steps=steps,
+        max_splats=max_splats,
+        sh_degree=sh_degree,
+        density=density,
+        dropout=dropout,
+        hull=hull,
+        start=start,
+    )
+    _check_arguments(chosen, seed, background, checkpoint, resume)
     for view in views:
         if view.mask is not None and not view.mask.any():
             raise IgsrError(f"{view.name}: its mask leaves no pixel to fit; leave the photo out.")
@@ -116,11 +139,14 @@ def fit(
         raise IgsrError(f"{error}.") from error
     path = None if checkpoint is None else Path(checkpoint)
     settings: dict[str, Any] = {
-        "steps": int(steps),
+        "steps": int(chosen["steps"]),
         "seed": int(seed),
-        "max_splats": int(max_splats),
-        "sh_degree": int(sh_degree),
-        "density": density,
+        "max_splats": int(chosen["max_splats"]),
+        "sh_degree": int(chosen["sh_degree"]),
+        "density": chosen["density"],
+        "dropout": float(chosen["dropout"]),
+        "hull": chosen["hull"],
+        "start": chosen["start"],
         "background": None if background is None else [float(channel) for channel in background],
         "backend": info["backend"],
         "instruction_set": info["instruction_set"],
@@ -134,7 +160,9 @@ def fit(
         seconds_before = saved.pop("seconds")
         _check_same_settings(path, saved, settings)
     else:
-        splats = initial_splats(capture, seed, max_splats, sh_degree)
+        splats = initial_splats(
+            capture, seed, settings["max_splats"], settings["sh_degree"], settings["start"]
+        )
         state = dict(vars(splats))
     origin = state.pop("origin", np.zeros(0))
     if path is not None:
@@ -171,28 +199,32 @@ def fingerprint(views: list[View]) -> str:
 
 
 def _check_arguments(
-    steps: object,
+    chosen: dict[str, Any],
     seed: object,
-    max_splats: object,
-    sh_degree: object,
-    density: object,
     background: object,
     checkpoint: object,
     resume: bool,
 ) -> None:
     limits: list[tuple[str, object, int, int]] = [
-        ("steps", steps, 1, 10_000_000),
+        ("steps", chosen["steps"], 1, 10_000_000),
         ("seed", seed, 0, 2**63 - 1),
-        ("sh_degree", sh_degree, 0, MAX_SH_DEGREE),
-        ("max_splats", max_splats, 1, 2**27),
+        ("sh_degree", chosen["sh_degree"], 0, MAX_SH_DEGREE),
+        ("max_splats", chosen["max_splats"], 1, 2**27),
     ]
     for name, value, low, high in limits:
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise IgsrError(f"{name} must be a whole number, not {value!r}.")
         if not low <= value <= high:
             raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
-    if density not in DENSITIES:
-        raise IgsrError(f"density must be one of {', '.join(DENSITIES)}, not {density!r}.")
+    for name, choices in (("density", DENSITIES), ("start", STARTS)):
+        if chosen[name] not in choices:
+            raise IgsrError(f"{name} must be one of {', '.join(choices)}, not {chosen[name]!r}.")
+    dropout = chosen["dropout"]
+    real = isinstance(dropout, numbers.Real) and not isinstance(dropout, bool)
+    if not real or not 0.0 <= dropout <= MAX_DROPOUT:
+        raise IgsrError(f"dropout must be a number from 0 to {MAX_DROPOUT}, not {dropout!r}.")
+    if not isinstance(chosen["hull"], bool):
+        raise IgsrError(f"hull must be True or False, not {chosen['hull']!r}.")
     if background is not None:
         try:
             color = np.asarray(background, dtype=np.float64)

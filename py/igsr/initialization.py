@@ -29,7 +29,36 @@ NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 8.0
 COMPARED_VIEWS = 24
 
 
-def initial_splats(capture: Capture, seed: int, max_splats: int, sh_degree: int) -> Splats:
+#: Where the splats of a start may come from.
+STARTS = ("auto", "points", "hull", "rays", "random")
+#: Splats of a random start (3DGS has 100 000 for many photos; the design's baseline has these).
+RANDOM_SPLATS = 10_000
+
+
+def chosen_start(capture: Capture, start: str = "auto") -> str:
+    """What a start is made from: what "auto" stands for with this capture, or ``start`` itself.
+
+    Raises:
+        IgsrError: the capture has not what ``start`` asks for, or there is no such start.
+    """
+    if start not in STARTS:
+        raise IgsrError(f"start must be one of {', '.join(STARTS)}, not {start!r}.")
+    has_points = capture.points is not None and len(capture.points.xyz) >= MIN_POINTS
+    has_alpha = all(view.image.shape[2] == 4 for view in capture.train_views)
+    if start == "points" and not has_points:
+        raise IgsrError(
+            f"{capture.path} has no {MIN_POINTS} points to start from; use another start."
+        )
+    if start == "hull" and not has_alpha:
+        raise IgsrError(f"{capture.path} has photos without alpha; start hull needs it in all.")
+    if start != "auto":
+        return start
+    return "points" if has_points else "hull" if has_alpha else "rays"
+
+
+def initial_splats(
+    capture: Capture, seed: int, max_splats: int, sh_degree: int, start: str = "auto"
+) -> Splats:
     """Splats to start a fit from; the same arguments give the same splats.
 
     Args:
@@ -37,14 +66,18 @@ def initial_splats(capture: Capture, seed: int, max_splats: int, sh_degree: int)
         seed: of the random choices.
         max_splats: at most so many.
         sh_degree: 0-4; coefficients above degree 0 start at zero.
+        start: "points" (the capture's), "hull" (inside the visual hull of photos with alpha),
+            "rays" (where photos agree best along each other's rays), "random" (uniform in the box
+            that the cameras look at, with random colours), or "auto", the first that can be.
 
     Raises:
-        IgsrError: no points can be placed: the poses, points or focal lengths are too extreme.
+        IgsrError: there is no such start, the capture has not what it needs, or no points can be
+            placed: the poses, points or focal lengths are too extreme.
     """
     try:
         # What overflows is found by the check of the points; numpy's warnings would say less.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            return _placed_splats(capture, seed, max_splats, sh_degree)
+            return _placed_splats(capture, seed, max_splats, sh_degree, start)
     except (ValueError, OverflowError) as error:  # numpy's LinAlgError is a ValueError
         raise IgsrError(
             f"{capture.path}: no splats can be placed before its cameras ({error}); check its "
@@ -52,21 +85,24 @@ def initial_splats(capture: Capture, seed: int, max_splats: int, sh_degree: int)
         ) from error
 
 
-def _placed_splats(capture: Capture, seed: int, max_splats: int, sh_degree: int) -> Splats:
+def _placed_splats(
+    capture: Capture, seed: int, max_splats: int, sh_degree: int, start: str
+) -> Splats:
     random = np.random.default_rng([seed, 0x1617])
-    points = capture.points
-    if points is not None and len(points.xyz) >= MIN_POINTS:
+    points, views = capture.points, capture.train_views
+    start = chosen_start(capture, start)
+    if start == "points" and points is not None:
         xyz, colors = points.xyz, points.rgb.astype(np.float64) / 255.0
         if len(xyz) > max_splats:
             chosen = np.sort(random.choice(len(xyz), size=max_splats, replace=False))
             xyz, colors = xyz[chosen], colors[chosen]
+    elif start == "random":
+        low, high = _looked_at_box([view.camera for view in views])
+        count = min(RANDOM_SPLATS, max_splats)
+        xyz, colors = random.uniform(low, high, size=(count, 3)), random.uniform(size=(count, 3))
     else:
-        count = min(MADE_UP_SPLATS, max_splats)
-        views = capture.train_views
-        if all(view.image.shape[2] == 4 for view in views):
-            xyz, colors = _inside_hull(views, count, random)
-        else:
-            xyz, colors = _along_rays(views, count, random)
+        place = _inside_hull if start == "hull" else _along_rays
+        xyz, colors = place(views, min(MADE_UP_SPLATS, max_splats), random)
     # Relative to the middle, so that float32 is precise where the scene is.
     origin = np.median(xyz, axis=0)
     return Splats(
@@ -97,6 +133,15 @@ def looked_at(cameras: list[Camera]) -> Float64:
     return point
 
 
+def _looked_at_box(cameras: list[Camera]) -> tuple[Float64, Float64]:
+    """Corners [3] of the cube around what the cameras look at that their pictures hold."""
+    target = looked_at(cameras)
+    distances = [float(np.linalg.norm(camera.centre - target)) for camera in cameras]
+    tangents = [0.5 * max(c.width / c.K[0, 0], c.height / c.K[1, 1]) for c in cameras]
+    half_side = float(np.median(distances) * np.median(tangents))
+    return target - half_side, target + half_side
+
+
 def _pixels(view: View, xyz: Float64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
     """Flat pixel index [P] of world points in a view, and which of them fall into it."""
     camera = view.camera
@@ -113,13 +158,8 @@ def _pixels(view: View, xyz: Float64) -> tuple[npt.NDArray[np.int64], npt.NDArra
 
 def _inside_hull(views: list[View], count: int, random: Generator) -> tuple[Float64, Float64]:
     """Points whose pixel has alpha in every photo that sees them, coloured by those photos."""
-    cameras = [view.camera for view in views]
-    target = looked_at(cameras)
-    distances = [float(np.linalg.norm(camera.centre - target)) for camera in cameras]
-    tangents = [0.5 * max(c.width / c.K[0, 0], c.height / c.K[1, 1]) for c in cameras]
-    half_side = float(np.median(distances) * np.median(tangents))
     # Thin objects fill little of the box: shrink it to what survives and draw again.
-    low, high = target - half_side, target + half_side
+    low, high = _looked_at_box([view.camera for view in views])
     found, colors = np.zeros((0, 3)), np.zeros((0, 3))
     for _ in range(8):
         candidates = random.uniform(low, high, size=(4 * count, 3))

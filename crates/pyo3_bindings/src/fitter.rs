@@ -55,6 +55,8 @@ fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
         max_splats: setting(config, "max_splats")?.unwrap_or(default.max_splats),
         density,
         background,
+        dropout: setting(config, "dropout")?.unwrap_or(default.dropout),
+        hull: setting(config, "hull")?.unwrap_or(default.hull),
         ..default
     })
 }

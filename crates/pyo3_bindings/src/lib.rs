@@ -19,14 +19,12 @@ use pyo3::prelude::*;
 mod _core {
     use pyo3::prelude::*;
     use splat_render::constants;
-    use splat_render::fit::FitConfig;
 
     #[pymodule_export]
     #[expect(non_upper_case_globals, reason = "Python's name for it")]
     const __version__: &str = env!("CARGO_PKG_VERSION");
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        module.add("DEFAULT_MAX_SPLATS", FitConfig::default().max_splats)?;
         module.add("NEAR_PLANE", constants::NEAR)?;
         module.add("FAR_PLANE", constants::FAR)?;
         module.add("EPS2D", constants::BLUR)?;

@@ -88,6 +88,7 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
         opacity_regularizer: 0.01,
         scale_regularizer: 0.01,
         noise,
+        dropout: if noise > 0.0 { 0.3 } else { 0.0 },
         noise_seed: step.wrapping_mul(2_654_435_761),
     }
 }

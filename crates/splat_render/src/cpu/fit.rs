@@ -17,7 +17,7 @@ use super::simd::dispatch;
 use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
-use crate::fit::{FitDevice, FitState, Rates, StepInput, Target, noise_normal};
+use crate::fit::{FitDevice, FitState, Rates, StepInput, Target, is_dropped, noise_normal};
 use crate::sh;
 use crate::stages::{Colors, ProjectOptions, SplatParams};
 
@@ -70,6 +70,7 @@ impl FitDevice for CpuFit {
 
         // project and the first half of bin
         let params = self.state.splats.params(input.sh_degree);
+        let dropout = Dropout::new(input);
         self.splats.resize(params.len(), TileSplat::default());
         self.chunks.resize(params.len().div_ceil(CHUNK), ChunkTiles::default());
         let stats = &mut self.state.stats;
@@ -82,7 +83,11 @@ impl FitDevice for CpuFit {
                 tiles.clear();
                 for (k, out) in splats.iter_mut().enumerate() {
                     let i = chunk * CHUNK + k;
-                    let splat = Splat::load(&params, i);
+                    if dropout.drops(i) {
+                        tiles.push_culled();
+                        continue;
+                    }
+                    let splat = Splat::load(&params, i).compensated(dropout.compensation);
                     match project_splat(&view, &splat, &params.colors, i) {
                         None => tiles.push_culled(),
                         Some(splat) => {
@@ -126,6 +131,27 @@ impl FitDevice for CpuFit {
 
     fn loss(&mut self) -> Result<f32> {
         Ok(self.loss_value)
+    }
+}
+
+/// Which splats a step leaves out, and what it multiplies the others' opacities by.
+struct Dropout {
+    seed: u32,
+    rate: f32,
+    compensation: f32,
+}
+
+impl Dropout {
+    fn new(input: &StepInput) -> Self {
+        Self {
+            seed: input.noise_seed,
+            rate: input.dropout,
+            compensation: 1.0 / (1.0 - input.dropout),
+        }
+    }
+
+    fn drops(&self, i: usize) -> bool {
+        self.rate > 0.0 && is_dropped(self.seed, i as u32, self.rate)
     }
 }
 
@@ -193,6 +219,7 @@ impl CpuFit {
         let degree = input.sh_degree.min(values.sh_degree);
         let bias = Bias::new(input.step);
         let (bins, tile_splats, sums) = (&self.bins, &self.splats, &self.sums);
+        let dropout = Dropout::new(input);
         let opacity_pull = input.opacity_regularizer / n as f32;
         let scale_pull = input.scale_regularizer / (3 * n) as f32;
         let rates = BlockRates::new(&input.rates, stride, sh::coeffs(degree));
@@ -242,7 +269,7 @@ impl CpuFit {
                             grad_sum[k] += (x * x + y * y).sqrt();
                             v = splat_backward(
                                 view,
-                                &splat,
+                                &splat.compensated(dropout.compensation),
                                 true,
                                 &params.colors,
                                 k,

@@ -51,6 +51,14 @@ pub(super) struct Splat {
 }
 
 impl Splat {
+    /// The same splat where others are left out at random: more opaque by `factor`.
+    #[inline(always)]
+    pub fn compensated(mut self, factor: f32) -> Self {
+        self.opacity *= factor;
+        self.opacity_slope *= factor;
+        self
+    }
+
     #[inline(always)]
     pub fn load(splats: &SplatParams<'_, f32>, i: usize) -> Self {
         let (scales, opacity) = (Vec3::from(splats.scales[i]), splats.opacities[i]);

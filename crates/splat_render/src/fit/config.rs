@@ -47,6 +47,11 @@ pub struct FitConfig {
     pub ssim_weight: f32,
     /// Adam's rates at the start; that of the centres in units of the scene's extent.
     pub rates: Rates,
+    /// Part of the splats that a step leaves out at random, growing from none in the first step to
+    /// this in the last (DropGaussian).
+    pub dropout: f32,
+    /// Whether splats outside the visual hull of photos with alpha are removed.
+    pub hull: bool,
     /// What the centres' rate has decayed to at the end, as a part of the start's.
     pub means_decay: f32,
 }
@@ -70,6 +75,8 @@ impl Default for FitConfig {
                 sh0: 2.5e-3,
                 sh_rest: 2.5e-3 / 20.0,
             },
+            dropout: 0.0,
+            hull: false,
             means_decay: 0.01,
         }
     }
@@ -100,6 +107,9 @@ impl FitConfig {
         let rates = [means, quats, scales, opacities, sh0, sh_rest];
         if !rates.iter().all(|r| r.is_finite() && *r >= 0.0) {
             return Err(Error::argument("rates", "must be finite and not negative"));
+        }
+        if !(0.0..=0.9).contains(&self.dropout) {
+            return Err(Error::argument("dropout", "must lie in 0..=0.9"));
         }
         if !(self.means_decay > 0.0 && self.means_decay <= 1.0) {
             return Err(Error::argument("means_decay", "must lie above 0 and at most at 1"));

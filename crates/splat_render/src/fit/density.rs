@@ -197,6 +197,7 @@ pub(super) fn original(
         }
     }
 
+    state.stats = DensityStats::zeros(state.splats.len());
     let keep: Vec<usize> = (0..state.splats.len())
         .filter(|&i| {
             let scale = state.splats.scales[i].iter().fold(f32::MIN, |a, &s| a.max(s)).exp();
@@ -207,11 +208,8 @@ pub(super) fn original(
         .collect();
     // A fit without splats cannot recover: keep what there is.
     if !keep.is_empty() && keep.len() < state.splats.len() {
-        for arrays in [&mut state.splats, &mut state.first, &mut state.second] {
-            *arrays = arrays.select(&keep);
-        }
+        state.select(&keep);
     }
-    state.stats = DensityStats::zeros(state.splats.len());
 }
 
 /// The original control's reset: no opacity above [`OPACITY_RESET`], moments of opacities restarted.

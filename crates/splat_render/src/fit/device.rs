@@ -113,7 +113,10 @@ pub struct StepInput {
     /// update: mean += C (z * noise / (1 + exp(-100 (0.005 - opacity)))) with C the splat's 3D
     /// covariance, z from [`noise_normal`] and the parameters as updated.
     pub noise: f32,
-    /// Seed of the noise; differs from step to step.
+    /// Part of the splats that this step leaves out, those of [`is_dropped`]; the opacities of the
+    /// others are divided by 1 - dropout, so that the picture stays as opaque on the whole.
+    pub dropout: f32,
+    /// Seed of noise and dropout; differs from step to step.
     pub noise_seed: u32,
 }
 
@@ -164,14 +167,27 @@ pub trait FitDevice: Send {
     fn loss(&mut self) -> Result<f32>;
 }
 
+/// PCG's output function on one 32-bit word.
+fn hash(x: u32) -> u32 {
+    let state = x.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+    let word = ((state >> ((state >> 28) + 4)) ^ state).wrapping_mul(277_803_737);
+    (word >> 22) ^ word
+}
+
+/// The hash value below which a splat is dropped.
+pub(crate) fn dropout_threshold(rate: f32) -> u32 {
+    (f64::from(rate) * 4_294_967_296.0) as u32
+}
+
+/// Whether a step with this seed and dropout leaves out the splat `index` (DropGaussian, Park et
+/// al. 2025). The same on every backend.
+pub fn is_dropped(seed: u32, index: u32, rate: f32) -> bool {
+    hash(index ^ hash(seed ^ 0x5bd1_e995)) < dropout_threshold(rate)
+}
+
 /// Three standard normal numbers from (seed, splat index): integer hash (PCG output function
 /// applied thrice), then Box-Muller. The same on every backend up to the rounding of log, sqrt, cos.
 pub fn noise_normal(seed: u32, index: u32) -> [f32; 3] {
-    fn hash(x: u32) -> u32 {
-        let state = x.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
-        let word = ((state >> ((state >> 28) + 4)) ^ state).wrapping_mul(277_803_737);
-        (word >> 22) ^ word
-    }
     // In (0, 1]: the logarithm stays finite.
     let unit = |h: u32| ((h >> 8) as f32 + 1.0) * (1.0 / 16_777_216.0);
     let base = hash(index ^ hash(seed));

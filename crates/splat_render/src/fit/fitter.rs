@@ -10,6 +10,7 @@ use rand_pcg::Pcg64;
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
 use super::device::{FitDevice, Rates, StepInput, Target};
+use super::hull::Hull;
 use super::params::FitState;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
@@ -38,6 +39,7 @@ pub struct Fitter {
     config: FitConfig,
     cameras: Vec<Camera>,
     has_alpha: Vec<bool>,
+    hull: Option<Hull>,
     extent: f32,
     order: Vec<usize>,
     splats: usize,
@@ -96,6 +98,7 @@ impl Fitter {
             ));
         }
         let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
+        let hull = config.hull.then(|| Hull::new(&targets, &cameras));
         device.set_targets(targets)?;
         let splats = state.splats.len();
         device.upload(state)?;
@@ -105,6 +108,7 @@ impl Fitter {
             config,
             cameras,
             has_alpha,
+            hull,
             order: Vec::new(),
             splats,
             step,
@@ -175,6 +179,7 @@ impl Fitter {
             opacity_regularizer: if mcmc { MCMC.0 } else { 0.0 },
             scale_regularizer: if mcmc { MCMC.1 } else { 0.0 },
             noise: if mcmc { MCMC.2 * rates.means } else { 0.0 },
+            dropout: config.dropout * progress as f32,
             noise_seed,
         };
         self.device.step(&input)?;
@@ -188,19 +193,27 @@ impl Fitter {
         let stop = match config.density {
             DensityControl::Mcmc => REFINE_STOP.0,
             DensityControl::Original => REFINE_STOP.1,
-            DensityControl::Fixed => return Ok(()),
+            DensityControl::Fixed => 0.0,
         };
         let active = f64::from(step) < stop * f64::from(config.steps);
+        // Splats leave the hull as long as they move.
+        let leaving = self.hull.is_some() && step >= start && step.is_multiple_of(every);
         let refine = active && step >= start && step.is_multiple_of(every);
         let reset = active
             && config.density == DensityControl::Original
             && step.is_multiple_of(RESET_EVERY);
-        if !refine && !reset {
+        if !refine && !reset && !leaving {
             return Ok(());
         }
         let mut rng = self.rng(Draw::Density, u64::from(step));
-        let (extent, splats) = (self.extent, &mut self.splats);
+        let (extent, splats, hull) = (self.extent, &mut self.splats, &self.hull);
         self.device.edit(&mut |state| {
+            if let Some(hull) = hull.as_ref().filter(|_| leaving) {
+                let inside = hull.inside(&state.splats);
+                if inside.len() < state.splats.len() {
+                    state.select(&inside);
+                }
+            }
             if refine && config.density == DensityControl::Mcmc {
                 density::mcmc(state, config.max_splats, &mut rng);
             } else if refine {

@@ -152,6 +152,16 @@ impl FitState {
         }
     }
 
+    /// Keeps the splats at `ids`, in that order.
+    pub fn select(&mut self, ids: &[usize]) {
+        for arrays in [&mut self.splats, &mut self.first, &mut self.second] {
+            *arrays = arrays.select(ids);
+        }
+        for values in [&mut self.stats.grad_sum, &mut self.stats.seen] {
+            *values = ids.iter().map(|&i| values[i]).collect();
+        }
+    }
+
     /// Checks that all arrays belong to the same splats.
     pub fn validate(&self) -> Result<()> {
         let n = self.splats.len();

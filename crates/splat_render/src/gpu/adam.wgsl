@@ -24,12 +24,6 @@ fn update(at: u32, g: f32, rate: f32) {
     values[at] -= rate * (m * step.bias_first) / (sqrt(v * step.bias_second) + ADAM_EPSILON);
 }
 
-fn hash(x: u32) -> u32 {
-    let state = x * 747796405u + 2891336453u;
-    let word = ((state >> ((state >> 28u) + 4u)) ^ state) * 277803737u;
-    return (word >> 22u) ^ word;
-}
-
 // In (0, 1].
 fn unit(h: u32) -> f32 {
     return (f32(h >> 8u) + 1.0) * (1.0 / 16777216.0);

@@ -27,7 +27,9 @@ use super::rasterize::rasterize_ops;
 use super::rasterize_backward::{BackwardBuffers, rasterize_backward_ops};
 use super::shaders::Kernel;
 use crate::error::{Error, Result};
-use crate::fit::{ADAM, DensityStats, FitDevice, FitState, SplatArrays, StepInput, Target};
+use crate::fit::{
+    ADAM, DensityStats, FitDevice, FitState, SplatArrays, StepInput, Target, dropout_threshold,
+};
 use crate::sh;
 use crate::stages::ProjectOptions;
 
@@ -351,6 +353,9 @@ impl GpuFit {
             sh_degree: input.sh_degree.min(scene.sh_degree),
             sh_stride: sh::coeffs(scene.sh_degree) as u32,
             raw: 1,
+            dropout_threshold: dropout_threshold(input.dropout),
+            dropout_seed: input.noise_seed,
+            compensation: 1.0 / (1.0 - input.dropout),
             ..View::of_view(&input.camera, &ProjectOptions::default(), input.background)
         };
         let step = Step {

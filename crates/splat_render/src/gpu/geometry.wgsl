@@ -60,6 +60,10 @@ fn load_geometry(local: u32) -> Geometry {
             return g;
         }
     }
+    let index = window.first + local;
+    if hash(index ^ hash(view.dropout_seed ^ 0x5bd1e995u)) < view.dropout_threshold {
+        return g;
+    }
     let mean = vec3(geometry[at], geometry[at + 1u], geometry[at + 2u]);
     let given = vec3(geometry[at + 3u], geometry[at + 4u], geometry[at + 5u]);
     let quat = vec4(geometry[at + 6u], geometry[at + 7u], geometry[at + 8u], geometry[at + 9u]);
@@ -106,6 +110,7 @@ fn load_geometry(local: u32) -> Geometry {
         g.scales = given;
         g.opacity = opacity;
     }
+    g.opacity *= view.compensation;
     let xy = g.t.xy / g.t.z;
     g.ratio = clamp(xy, view.jacobian_limits.xz, view.jacobian_limits.yw);
     g.inside = g.ratio == xy;

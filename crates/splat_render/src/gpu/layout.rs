@@ -47,7 +47,9 @@ pub(super) struct View {
     pub sh_stride: u32,
     pub raw: u32,
     pub antialiased: u32,
-    pub unused: [u32; 3],
+    pub dropout_threshold: u32,
+    pub dropout_seed: u32,
+    pub compensation: f32,
 }
 
 impl View {
@@ -86,6 +88,7 @@ impl View {
             far: options.far,
             blur: options.blur,
             antialiased: u32::from(options.antialiased),
+            compensation: 1.0,
             ..Self::of_picture(camera.width, camera.height, background)
         }
     }

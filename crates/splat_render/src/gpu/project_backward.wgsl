@@ -186,7 +186,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     let v_mean = to_world(v_t);
     v_rotation += outer(v_t, mean);
 
-    var v_given_opacity = v_opacity * compensation;
+    var v_given_opacity = v_opacity * compensation * view.compensation;
     if view.raw == 1u {
         v_scales *= g.scales;
         // o (1 - o), without the cancellation at saturated logits.

@@ -441,7 +441,10 @@ mod tests {
             sh_degree,
             sh_stride,
             raw,
-            antialiased
+            antialiased,
+            dropout_threshold,
+            dropout_seed,
+            compensation
         );
         layout!("project", Window, first, count);
         layout!(

@@ -23,6 +23,11 @@ struct View {
     raw: u32,
     // 1 where opacities are lowered by what the blur adds to a splat's area.
     antialiased: u32,
+    // Splats with a hash below the first are left out (0 for none), opacities of the others times
+    // the last. As is_dropped in fit/device.rs.
+    dropout_threshold: u32,
+    dropout_seed: u32,
+    compensation: f32,
 }
 
 // The splats of one dispatch; per-splat bindings begin at `first`.
@@ -140,4 +145,11 @@ fn exp_accurate4(x: vec4<f32>) -> vec4<f32> {
 // The index of an invocation in a dispatch whose workgroups may spill into y.
 fn linear_index(workgroup: vec3<u32>, groups: vec3<u32>, local: u32, size: u32) -> u32 {
     return (workgroup.y * groups.x + workgroup.x) * size + local;
+}
+
+// PCG's output function on one word.
+fn hash(x: u32) -> u32 {
+    let state = x * 747796405u + 2891336453u;
+    let word = ((state >> ((state >> 28u) + 4u)) ^ state) * 277803737u;
+    return (word >> 22u) ^ word;
 }

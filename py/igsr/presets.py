@@ -1,0 +1,74 @@
+"""Named sets of fit settings: the default, by what the photos can support, and a baseline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from .errors import IgsrError
+
+#: So many photos or fewer leave most of a scene's views unseen: fits to them over-fit without help.
+FEW_PHOTOS = 20
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings of ``igsr.fit`` where the caller names none; see there."""
+
+    steps: int
+    max_splats: int
+    sh_degree: int
+    density: str
+    dropout: float
+    hull: bool
+    start: str
+
+
+_MANY = Preset(
+    steps=5000,
+    max_splats=30_000,
+    sh_degree=2,
+    density="original",
+    dropout=0.0,
+    hull=False,
+    start="auto",
+)
+_FEW = Preset(
+    steps=2000,
+    max_splats=30_000,
+    sh_degree=1,
+    density="mcmc",
+    dropout=0.2,
+    hull=True,
+    start="auto",
+)
+#: As Kerbl et al. 2023 fit synthetic scenes, but for our number of steps and splats.
+_3DGS = Preset(
+    steps=5000,
+    max_splats=30_000,
+    sh_degree=3,
+    density="original",
+    dropout=0.0,
+    hull=False,
+    start="random",
+)
+
+PRESETS = ("default", "3dgs")
+
+
+def preset_settings(name: str, photos: int, **given: object) -> dict[str, Any]:
+    """The settings of ``Preset`` by name: those given, and the preset's where None is given.
+
+    Args:
+        name: "default" (measured to be best: one set for up to ``FEW_PHOTOS`` photos, another for
+            more) or "3dgs" (3D Gaussian Splatting without help for few photos, as a baseline).
+        photos: number of photos to fit.
+        **given: what a caller asked for.
+
+    Raises:
+        IgsrError: there is no such preset.
+    """
+    if name not in PRESETS:
+        raise IgsrError(f"preset must be one of {', '.join(PRESETS)}, not {name!r}.")
+    preset = _3DGS if name == "3dgs" else _FEW if photos <= FEW_PHOTOS else _MANY
+    return vars(preset) | {key: value for key, value in given.items() if value is not None}

@@ -1,0 +1,92 @@
+"""Independent fits, each kept in a file of its own, so that a study goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .. import _core
+from ..atomic_write import atomic_write
+from ..errors import IgsrError
+
+
+@dataclass(frozen=True)
+class Run:
+    """One fit: its file's name without ending, and what describes it."""
+
+    name: str
+    what: Any
+
+
+def _share_cores(threads: int) -> None:
+    """In a worker, before anything starts threads."""
+    os.environ["RAYON_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = str(threads)
+
+
+def finished_runs(
+    folder: Path,
+    runs: list[Run],
+    work: Callable[[str, Any], dict[str, Any]],
+    data: str,
+    jobs: int,
+    on_run: Callable[[int, int, dict[str, Any]], None] | None,
+) -> list[dict[str, Any]]:
+    """The row of every run, in order: read where its file is there, else done and written.
+
+    Raises:
+        IgsrError: a run fails, or its file cannot be read or written.
+    """
+    rows: dict[str, dict[str, Any]] = {}
+    missing = []
+    for run in runs:
+        row = _read(folder / f"{run.name}.json")
+        if row is not None and row.get("igsr") == _core.__version__:
+            rows[run.name] = row
+        else:
+            missing.append(run)
+
+    def keep(run: Run, row: dict[str, Any]) -> None:
+        row = {**row, "igsr": _core.__version__}
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_write(folder / f"{run.name}.json") as temporary:
+            temporary.write_text(json.dumps(row, indent=2, allow_nan=False), encoding="utf-8")
+        rows[run.name] = row
+        if on_run is not None:
+            on_run(len(rows), len(runs), row)
+
+    if jobs == 1:
+        for run in missing:
+            keep(run, work(data, run.what))
+    elif missing:
+        threads = max(1, (os.cpu_count() or 1) // jobs)
+        # Threads do not survive a fork.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, context, _share_cores, (threads,)) as pool:
+            pending = {pool.submit(work, data, run.what): run for run in missing}
+            try:
+                for done in as_completed(pending):
+                    keep(pending[done], done.result())
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    return [rows[run.name] for run in runs]
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    try:
+        row = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise IgsrError(
+            f"{path} cannot be read ({error}); delete it to do the fit again."
+        ) from error
+    if not isinstance(row, dict):
+        raise IgsrError(f"{path} does not hold a fit's row; delete it to do the fit again.")
+    return row

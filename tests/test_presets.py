@@ -1,0 +1,110 @@
+"""What few photos need: presets, starts, the visual hull, dropout."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+
+import igsr
+from igsr.initialization import chosen_start, initial_splats
+from igsr.presets import FEW_PHOTOS, preset_settings
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return scenes.capture(views=8, size=40, alpha=True)
+
+
+def fit(capture, **options):
+    arguments = {"steps": 200, "backend": "cpu", "max_splats": 400, "sh_degree": 0, **options}
+    return igsr.fit(capture, **arguments)
+
+
+def test_default_follows_the_number_of_photos_and_gives_way_to_the_caller():
+    few, many = preset_settings("default", FEW_PHOTOS), preset_settings("default", FEW_PHOTOS + 1)
+    assert few["dropout"] > 0.0
+    assert few["hull"]
+    assert many["dropout"] == 0.0
+    assert not many["hull"]
+    assert preset_settings("3dgs", 3) == preset_settings("3dgs", 300)
+    given = preset_settings("default", 3, dropout=0.0, hull=False, steps=None)
+    assert (given["dropout"], given["hull"], given["steps"]) == (0.0, False, few["steps"])
+
+
+def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
+    from igsr.checkpoint import load_checkpoint
+
+    igsr.fit(capture, steps=3, backend="cpu", checkpoint=tmp_path / "a.npz")
+    _, settings = load_checkpoint(tmp_path / "a.npz")
+    expected = preset_settings("default", len(capture.train_views), steps=3)
+    assert {name: settings[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"preset": "best"}, "preset must be one of default, 3dgs"),
+        ({"dropout": 0.95}, "dropout must be a number from 0 to 0.9"),
+        ({"dropout": float("nan")}, "dropout must be a number from 0 to 0.9"),
+        ({"dropout": True}, "dropout must be"),
+        ({"hull": "yes"}, "hull must be True or False"),
+        ({"start": "sphere"}, "start must be one of auto"),
+        ({"start": "points"}, "no 100 points to start from"),
+    ],
+)
+def test_bad_settings_are_one_sentence(capture, options, message):
+    with pytest.raises(igsr.IgsrError, match=message):
+        fit(capture, **options)
+
+
+def test_dropout_changes_the_fit_repeats_and_resumes(capture, tmp_path):
+    dropped = fit(capture, dropout=0.3)
+    assert np.array_equal(dropped.means, fit(capture, dropout=0.3).means)
+    assert not np.array_equal(dropped.means, fit(capture, dropout=0.0).means)
+    path = tmp_path / "a.npz"
+    fit(capture, dropout=0.3, checkpoint=path, progress=lambda now: now.step < 90)
+    resumed = fit(capture, dropout=0.3, checkpoint=path, resume=True)
+    assert np.array_equal(dropped.means, resumed.means)
+
+
+def outside_hull(splats, capture):
+    """How many splats a photo shows empty, by more than the pixel that edges are uncertain by."""
+    empty = np.zeros(len(splats), dtype=bool)
+    for view in capture.train_views:
+        alpha = np.pad(view.image[..., 3], 2, mode="edge") > 0
+        sides = range(5)
+        size = view.image.shape[:2]
+        near = np.any(
+            [alpha[y : y + size[0], x : x + size[1]] for y in sides for x in sides], axis=0
+        )
+        world = splats.means.astype(np.float64) + splats.origin
+        local = world @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
+        pixel = np.floor(local[:, :2] / local[:, 2:] * view.camera.K[0, 0] + size[0] / 2).astype(
+            int
+        )
+        seen = ((pixel >= 0) & (pixel < size[0])).all(axis=1)
+        column, row = np.clip(pixel, 0, size[0] - 1).T
+        empty |= seen & ~near[row, column]
+    return int(empty.sum())
+
+
+def test_splats_outside_the_hull_are_removed(capture):
+    options = {"start": "random", "density": "fixed", "steps": 400}
+    assert outside_hull(fit(capture, hull=False, **options), capture) > 50
+    kept = fit(capture, hull=True, **options)
+    assert len(kept) > 20
+    assert outside_hull(kept, capture) == 0
+
+
+def test_starts(capture):
+    assert chosen_start(capture) == "hull"
+    assert chosen_start(scenes.capture(views=4, size=24)) == "rays"
+    for start in ("hull", "rays", "random"):
+        splats = initial_splats(capture, 0, 300, 1, start)
+        assert len(splats) == 300
+        assert splats.sh_degree == 1
+    with pytest.raises(igsr.IgsrError, match="start hull needs it in all"):
+        initial_splats(scenes.capture(views=4, size=24), 0, 300, 1, "hull")
+    assert outside_hull(initial_splats(capture, 0, 1000, 0, "hull"), capture) == 0
+    assert outside_hull(initial_splats(capture, 0, 1000, 0, "random"), capture) > 150
