@@ -21,6 +21,7 @@ from .capture import Capture, View
 from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
 from .initialization import STARTS, initial_splats
+from .photo_checks import check_photos
 from .presets import preset_settings
 from .rendering import intrinsics_of, viewmat_about
 from .splats import MAX_SH_DEGREE, Splats
@@ -110,7 +111,8 @@ def fit(
     Raises:
         IgsrError: an argument cannot be used, the checkpoint cannot be written or belongs to
             another capture or other settings.
-        UserWarning: the last checkpoint cannot be written; the splats are returned all the same.
+        UserWarning: the photos leave something open (see ``igsr.photo_checks``); the last
+            checkpoint cannot be written; the splats are returned all the same.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     views = capture.train_views
@@ -128,9 +130,7 @@ def fit(
         start=start,
     )
     _check_arguments(chosen, seed, background, checkpoint, resume)
-    for view in views:
-        if view.mask is not None and not view.mask.any():
-            raise IgsrError(f"{view.name}: its mask leaves no pixel to fit; leave the photo out.")
+    check_photos(views)
     if backend == "reference":
         raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
     try:
