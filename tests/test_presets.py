@@ -108,3 +108,24 @@ def test_starts(capture):
         initial_splats(scenes.capture(views=4, size=24), 0, 300, 1, "hull")
     assert outside_hull(initial_splats(capture, 0, 1000, 0, "hull"), capture) == 0
     assert outside_hull(initial_splats(capture, 0, 1000, 0, "random"), capture) > 150
+
+
+def test_a_start_prefers_points_that_photos_agree_on(capture):
+    """Of the hull's points those near the surface; any number of photos will do."""
+    from igsr.initialization import _disagreement
+
+    agreed = np.full((4, 1, 3), 0.5, np.float32)
+    occluded = agreed.copy()
+    occluded[2:] = [[[0.9, 0.1, 0.0]], [[0.0, 0.8, 0.3]]]
+    inside = np.arange(12, dtype=np.float32).reshape(4, 1, 3) / 12.0
+    unseen = agreed.copy()
+    unseen[1:] = np.nan
+    values = _disagreement(np.concatenate([agreed, occluded, inside, unseen], axis=1))
+    assert values[0] == values[1] == 0.0
+    assert values[2] > 0.05
+    assert np.isinf(values[3])
+    for count in (1, 2, 3):
+        few = igsr.Capture(capture.path, capture.train_views[:count])
+        splats = initial_splats(few, 0, 300, 0, "hull")
+        assert len(splats) == 300
+        assert np.isfinite(splats.means).all()

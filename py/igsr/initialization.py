@@ -25,8 +25,11 @@ MIN_POINTS = 100
 #: Depths tried per ray, and their range in units of the distance to what the cameras look at.
 RAY_DEPTHS = 32
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 8.0
-#: Photos compared with per ray: more cost time and see other sides of the scene.
+#: Photos compared with per ray, and up to which points of the hull are compared: more cost time and
+#: see other sides of the scene.
 COMPARED_VIEWS = 24
+#: Part of the hull's points that is taken for a start, by how well photos agree on their colours.
+AGREEING = 0.5
 
 
 #: Where the splats of a start may come from.
@@ -157,37 +160,60 @@ def _pixels(view: View, xyz: Float64) -> tuple[npt.NDArray[np.int64], npt.NDArra
 
 
 def _inside_hull(views: list[View], count: int, random: Generator) -> tuple[Float64, Float64]:
-    """Points whose pixel has alpha in every photo that sees them, coloured by those photos."""
+    """Points whose pixel has alpha in every photo that sees them, coloured by those photos.
+
+    Few photos leave a hull that is much larger than the object: of its points those are taken on
+    whose colour photos agree best.
+    """
+    compare = len(views) <= COMPARED_VIEWS
+    tries = 16 if compare else 4
     # Thin objects fill little of the box: shrink it to what survives and draw again.
     low, high = _looked_at_box([view.camera for view in views])
     found, colors = np.zeros((0, 3)), np.zeros((0, 3))
     for _ in range(8):
-        candidates = random.uniform(low, high, size=(4 * count, 3))
-        inside_hull = np.ones(len(candidates), dtype=bool)
-        total = np.zeros((len(candidates), 3))
-        seen = np.zeros(len(candidates))
+        candidates = random.uniform(low, high, size=(tries * count, 3))
         for view in views:
-            alive = np.flatnonzero(inside_hull)
-            index, in_view = _pixels(view, candidates[alive])
-            pixels = view.image.reshape(-1, 4)[index]
-            inside_hull[alive[in_view & (pixels[:, 3] == 0)]] = False
-            kept = alive[in_view]
-            total[kept] += pixels[in_view, :3] / 255.0
-            seen[kept] += 1
-        inside_hull &= seen > 0
-        found = np.concatenate([found, candidates[inside_hull]])
-        colors = np.concatenate([colors, total[inside_hull] / seen[inside_hull, None]])
+            index, in_view = _pixels(view, candidates)
+            candidates = candidates[~in_view | (view.image.reshape(-1, 4)[index, 3] > 0)]
+        seen_colors = np.full((len(views), len(candidates), 3), np.nan, dtype=np.float32)
+        for v, view in enumerate(views):
+            index, in_view = _pixels(view, candidates)
+            seen_colors[v, in_view] = view.image.reshape(-1, 4)[index[in_view], :3] / 255.0
+        kept = np.isfinite(seen_colors[..., 0]).any(axis=0)
+        if compare and kept.any():
+            disagreement = _disagreement(seen_colors)
+            kept &= disagreement <= np.quantile(disagreement[kept], AGREEING, method="lower")
+        candidates, seen_colors = candidates[kept], seen_colors[:, kept]
+        found = np.concatenate([found, candidates])
+        if len(candidates):
+            colors = np.concatenate([colors, np.nanmean(seen_colors, axis=0, dtype=np.float64)])
         if len(found) >= count:
             break
-        if inside_hull.any():
+        if len(candidates):
             margin = 0.1 * (high - low)
-            survivors = candidates[inside_hull]
-            low = np.maximum(low, survivors.min(axis=0) - margin)
-            high = np.minimum(high, survivors.max(axis=0) + margin)
+            low = np.maximum(low, candidates.min(axis=0) - margin)
+            high = np.minimum(high, candidates.max(axis=0) + margin)
     if len(found) < MIN_POINTS:
         # The cameras do not agree on any hull; a box to start from is better than nothing.
         return random.uniform(low, high, size=(count, 3)), np.full((count, 3), 0.5)
     return found[:count], colors[:count]
+
+
+def _disagreement(colors: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Per point how far the colours are apart in the half of the photos that agree best on it.
+
+    In the other half something may stand before the point.
+
+    Args:
+        colors: [views, points, 3], NaN where a photo does not see the point.
+    """
+    half = min(len(colors), max(2, len(colors) // 2))
+    least = np.full(colors.shape[1], np.inf, dtype=np.float32)
+    for own in colors:
+        apart = np.abs(colors - own).mean(axis=2)
+        apart = np.where(np.isnan(apart), np.float32(np.inf), apart)
+        least = np.minimum(least, np.partition(apart, half - 1, axis=0)[:half].mean(axis=0))
+    return least
 
 
 def _along_rays(views: list[View], count: int, random: Generator) -> tuple[Float64, Float64]:

@@ -41,8 +41,11 @@ def check_photos(views: list[View]) -> None:
         )
         return
     centres = np.stack([view.camera.centre for view in views])
-    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    with np.errstate(over="ignore", invalid="ignore"):
+        distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     farthest = float(distances.max())
+    if not np.isfinite(farthest):
+        return  # what such cameras do to a fit is said where its splats are placed
     if farthest == 0.0:
         _warn(
             "All cameras stand at one place: nothing tells how far away things are, so the scene "
