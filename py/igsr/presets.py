@@ -34,11 +34,11 @@ _MANY = Preset(
     start="auto",
 )
 _FEW = Preset(
-    steps=2000,
+    steps=4000,
     max_splats=30_000,
     sh_degree=1,
     density="mcmc",
-    dropout=0.2,
+    dropout=0.3,
     hull=True,
     start="auto",
 )
