@@ -43,6 +43,8 @@ fn config(density: DensityControl) -> FitConfig {
         max_splats: 260,
         density,
         background: Background::Random,
+        dropout: 0.2,
+        hull: true,
         ..FitConfig::default()
     }
 }

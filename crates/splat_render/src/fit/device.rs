@@ -196,3 +196,21 @@ pub fn noise_normal(seed: u32, index: u32) -> [f32; 3] {
     let (a0, a1) = (std::f32::consts::TAU * draw[1], std::f32::consts::TAU * draw[3]);
     [r0 * a0.cos(), r0 * a0.sin(), r1 * a1.cos()]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dropout_leaves_out_its_part_and_other_splats_each_step() {
+        let dropped = |seed, rate| (0..100_000).filter(move |&i| is_dropped(seed, i, rate));
+        assert_eq!(dropped(3, 0.0).count(), 0);
+        for (seed, rate) in [(0, 0.1), (7, 0.3), (u32::MAX, 0.9)] {
+            let part = dropped(seed, rate).count() as f32 / 1e5;
+            assert!((part - rate).abs() < 0.01, "{part} where {rate} was asked for");
+        }
+        // Two steps agree by chance only.
+        let both = dropped(1, 0.3).filter(|&i| is_dropped(2, i, 0.3)).count() as f32 / 1e5;
+        assert!((both - 0.09).abs() < 0.01, "{both}");
+    }
+}

@@ -78,6 +78,7 @@ impl Fitter {
         }
         for (k, (camera, target)) in cameras.iter().zip(&targets).enumerate() {
             camera.validate()?;
+            target.validate(k)?;
             if (camera.width, camera.height) != (target.width, target.height) {
                 return Err(Error::argument(
                     format!("images[{k}]"),
