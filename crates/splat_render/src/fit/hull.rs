@@ -93,7 +93,7 @@ mod tests {
             pixels[4 * k + 3] = if k % width as usize >= 10 { 255 } else { 0 };
         }
         let target = Target { width, height, channels: 4, pixels, weights: None };
-        let hull = Hull::new(&[target.clone()], &[camera]);
+        let hull = Hull::new(std::slice::from_ref(&target), &[camera]);
         assert!(hull.contains([0.2, 0.0, 1.0]));
         // One pixel beyond the edge is not sure to be empty; two are.
         assert!(hull.contains([-0.05, 0.0, 1.0]));
