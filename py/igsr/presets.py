@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from .errors import IgsrError
@@ -33,25 +33,9 @@ _MANY = Preset(
     hull=False,
     start="auto",
 )
-_FEW = Preset(
-    steps=4000,
-    max_splats=30_000,
-    sh_degree=1,
-    density="mcmc",
-    dropout=0.3,
-    hull=True,
-    start="auto",
-)
+_FEW = replace(_MANY, steps=4000, sh_degree=1, density="mcmc", dropout=0.3, hull=True)
 #: As Kerbl et al. 2023 fit synthetic scenes, but for our number of steps and splats.
-_3DGS = Preset(
-    steps=5000,
-    max_splats=30_000,
-    sh_degree=3,
-    density="original",
-    dropout=0.0,
-    hull=False,
-    start="random",
-)
+_3DGS = replace(_MANY, sh_degree=3, start="random")
 
 PRESETS = ("default", "3dgs")
 

@@ -68,7 +68,6 @@ def run_fit(data: str, one: Fit) -> dict[str, Any]:
         **{name: scores[name] for name in SCORES},
         "splats": len(splats),
         "seconds": round(seconds, 2),
-        "settings": preset_settings(one.preset, len(capture.train_views)),
         "protocol": scores["protocol"],
     }
 
@@ -123,10 +122,12 @@ def blender8(
         for ids in views
         for preset in presets
     ]
-    for name in presets:
-        preset_settings(name, 8)
     tasks = [
-        Run(f"{one.scene}-views{one.views}-{one.preset}-seed{one.seed}-{one.backend}", one)
+        Run(
+            f"{one.scene}-views{one.views}-{one.preset}-seed{one.seed}-{one.backend}",
+            one,
+            preset_settings(one.preset, len(VIEW_IDS[one.views])),
+        )
         for one in fits
     ]
     rows = finished_runs(Path(out) / "runs", tasks, run_fit, str(data), jobs, on_run)

@@ -18,10 +18,11 @@ from ..errors import IgsrError
 
 @dataclass(frozen=True)
 class Run:
-    """One fit: its file's name without ending, and what describes it."""
+    """One fit: its file's name without ending, what describes it, and the settings that it uses."""
 
     name: str
     what: Any
+    settings: dict[str, Any]
 
 
 def _share_cores(threads: int) -> None:
@@ -39,6 +40,8 @@ def finished_runs(
 ) -> list[dict[str, Any]]:
     """The row of every run, in order: read where its file is there, else done and written.
 
+    A file of another version or with other settings (presets change) is done again.
+
     Raises:
         IgsrError: a run fails, or its file cannot be read or written.
     """
@@ -46,13 +49,14 @@ def finished_runs(
     missing = []
     for run in runs:
         row = _read(folder / f"{run.name}.json")
-        if row is not None and row.get("igsr") == _core.__version__:
+        current = {"igsr": _core.__version__, "settings": run.settings}
+        if row is not None and {key: row.get(key) for key in current} == current:
             rows[run.name] = row
         else:
             missing.append(run)
 
     def keep(run: Run, row: dict[str, Any]) -> None:
-        row = {**row, "igsr": _core.__version__}
+        row = {**row, "igsr": _core.__version__, "settings": run.settings}
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder / f"{run.name}.json") as temporary:
             temporary.write_text(json.dumps(row, indent=2, allow_nan=False), encoding="utf-8")
