@@ -50,7 +50,7 @@ def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
         ({"dropout": True}, "dropout must be"),
         ({"hull": "yes"}, "hull must be True or False"),
         ({"start": "sphere"}, "start must be one of auto"),
-        ({"start": "points"}, "no 100 points to start from"),
+        ({"start": "points"}, r"^made-up has no 100 points to start from; use another start\.$"),
     ],
 )
 def test_bad_settings_are_one_sentence(capture, options, message):
@@ -104,7 +104,9 @@ def test_starts(capture):
         splats = initial_splats(capture, 0, 300, 1, start)
         assert len(splats) == 300
         assert splats.sh_degree == 1
-    with pytest.raises(igsr.IgsrError, match="start hull needs it in all"):
+    with pytest.raises(
+        igsr.IgsrError, match=r"^made-up has photos without alpha; start hull needs it in all"
+    ):
         initial_splats(scenes.capture(views=4, size=24), 0, 300, 1, "hull")
     assert outside_hull(initial_splats(capture, 0, 1000, 0, "hull"), capture) == 0
     assert outside_hull(initial_splats(capture, 0, 1000, 0, "random"), capture) > 150

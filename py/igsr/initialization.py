@@ -77,6 +77,7 @@ def initial_splats(
         IgsrError: there is no such start, the capture has not what it needs, or no points can be
             placed: the poses, points or focal lengths are too extreme.
     """
+    start = chosen_start(capture, start)
     try:
         # What overflows is found by the check of the points; numpy's warnings would say less.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -93,7 +94,6 @@ def _placed_splats(
 ) -> Splats:
     random = np.random.default_rng([seed, 0x1617])
     points, views = capture.points, capture.train_views
-    start = chosen_start(capture, start)
     if start == "points" and points is not None:
         xyz, colors = points.xyz, points.rgb.astype(np.float64) / 255.0
         if len(xyz) > max_splats:
