@@ -205,8 +205,10 @@ class Fitter:
         ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
         ``viewmats`` [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4]. ``state`` is
         either the parameters to start from (``SplatArrays`` without origin) or what ``state()``
-        returned. ``config``: steps, seed, sh_degree, max_splats, density, background; an absent
-        or None entry takes the default.
+        returned. ``config``: steps, seed, sh_degree, max_splats, density, dropout, hull,
+        background; poses ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate
+        (pixels a step), camera_decay, camera_warm_up (part of the steps), frozen (splats stay as
+        they are); an absent or None entry takes the default.
         """
 
     def step(self, count: int) -> dict[str, Any]:
@@ -218,6 +220,9 @@ class Fitter:
 
     def splats(self) -> dict[str, Float32]:
         """The parameters as they are now, without origin."""
+
+    def cameras(self) -> dict[str, Float64]:
+        """The cameras as they are now: camera_viewmats [V, 4, 4] and camera_intrinsics [V, 4]."""
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Everything needed to go on bit for bit."""

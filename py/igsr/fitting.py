@@ -8,7 +8,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
 from .initialization import STARTS, initial_splats
 from .photo_checks import check_photos
+from .poses import fitted_cameras
 from .presets import preset_settings
 from .rendering import intrinsics_of, viewmat_about
 from .splats import MAX_SH_DEGREE, Splats
@@ -31,6 +32,9 @@ CHECKPOINT_STEPS = 500
 CHECKPOINT_SECONDS = 20.0
 #: Ways to control the number of splats.
 DENSITIES = ("mcmc", "original", "fixed")
+#: Whether cameras are fitted with the splats, and which of their focal lengths are.
+POSES = ("fixed", "joint")
+FOCALS = ("fixed", "shared", "per-camera")
 #: Most of the splats that a step may leave out.
 MAX_DROPOUT = 0.9
 #: How long the Rust side runs before Python may look at Ctrl-C and the progress callback.
@@ -74,11 +78,15 @@ def fit(
     dropout: float | None = None,
     hull: bool | None = None,
     start: str | None = None,
+    poses: str | None = None,
+    focal: str | None = None,
     background: tuple[float, float, float] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
 ) -> Splats:
     """Fit splats to the train views of ``capture``.
+
+    Where cameras are fitted too, ``fit_with_cameras`` also returns them.
 
     The same capture, settings and seed give the same splats, bit for bit, on one backend and
     instruction set; a resumed fit ends with the same bits as one that was never interrupted.
@@ -104,6 +112,10 @@ def fit(
         hull: whether splats are removed whose centre a photo with alpha shows empty.
         start: what the first splats are made from: "auto", "points", "hull", "rays" or "random";
             see ``igsr.initialization.initial_splats``.
+        poses: "fixed", or "joint": each camera is turned and moved with the splats. All together
+            stay where the given ones were on the whole: the scene keeps its place and size.
+        focal: "fixed", "shared" (one factor to all cameras' focal lengths is fitted) or
+            "per-camera".
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
             Ctrl-C (KeyboardInterrupt, which is raised again).
         resume: continue the fit that ``checkpoint`` holds.
@@ -114,6 +126,52 @@ def fit(
         UserWarning: the photos leave something open (see ``igsr.photo_checks``); the last
             checkpoint cannot be written; the splats are returned all the same.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    return fit_with_cameras(
+        capture,
+        steps,
+        progress,
+        backend,
+        seed,
+        preset=preset,
+        max_splats=max_splats,
+        sh_degree=sh_degree,
+        density=density,
+        dropout=dropout,
+        hull=hull,
+        start=start,
+        poses=poses,
+        focal=focal,
+        background=background,
+        checkpoint=checkpoint,
+        resume=resume,
+    )[0]
+
+
+def fit_with_cameras(
+    capture: Capture,
+    steps: int | None = None,
+    progress: Callable[[Progress], bool | None] | None = None,
+    backend: str = "auto",
+    seed: int = 0,
+    *,
+    preset: str = "default",
+    max_splats: int | None = None,
+    sh_degree: int | None = None,
+    density: str | None = None,
+    dropout: float | None = None,
+    hull: bool | None = None,
+    start: str | None = None,
+    poses: str | None = None,
+    focal: str | None = None,
+    background: tuple[float, float, float] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+) -> tuple[Splats, Capture]:
+    """As ``fit``, and the capture with its train cameras as they were fitted.
+
+    Raises:
+        IgsrError, UserWarning, RuntimeError: as ``fit``.
     """
     views = capture.train_views
     if not views:
@@ -128,6 +186,8 @@ def fit(
         dropout=dropout,
         hull=hull,
         start=start,
+        poses=poses,
+        focal=focal,
     )
     _check_arguments(chosen, seed, background, checkpoint, resume)
     check_photos(views)
@@ -147,6 +207,8 @@ def fit(
         "dropout": float(chosen["dropout"]),
         "hull": chosen["hull"],
         "start": chosen["start"],
+        "poses": chosen["poses"],
+        "focal": chosen["focal"],
         "background": None if background is None else [float(channel) for channel in background],
         "backend": info["backend"],
         "instruction_set": info["instruction_set"],
@@ -183,7 +245,16 @@ def fit(
         if resume:
             raise IgsrError(f"The checkpoint {path} cannot be used: {error}.") from error
         raise IgsrError(f"{error}.") from error
-    return _run(fitter, origin, settings, info, seconds_before, progress, path)
+    _run(fitter, origin, settings, info, seconds_before, progress, path)
+    splats = Splats(**fitter.splats(), origin=origin)
+    if settings["poses"] == settings["focal"] == "fixed":
+        return splats, capture
+    cameras = iter(fitted_cameras(views, fitter.cameras(), origin))
+    moved = [
+        replace(view, camera=next(cameras)) if view.split == "train" else view
+        for view in capture.views
+    ]
+    return splats, Capture(capture.path, moved, capture.points)
 
 
 def fingerprint(views: list[View]) -> str:
@@ -216,7 +287,12 @@ def _check_arguments(
             raise IgsrError(f"{name} must be a whole number, not {value!r}.")
         if not low <= value <= high:
             raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
-    for name, choices in (("density", DENSITIES), ("start", STARTS)):
+    for name, choices in (
+        ("density", DENSITIES),
+        ("start", STARTS),
+        ("poses", POSES),
+        ("focal", FOCALS),
+    ):
         if chosen[name] not in choices:
             raise IgsrError(f"{name} must be one of {', '.join(choices)}, not {chosen[name]!r}.")
     dropout = chosen["dropout"]
@@ -258,7 +334,7 @@ def _run(
     seconds_before: float,
     progress: Callable[[Progress], bool | None] | None,
     path: Path | None,
-) -> Splats:
+) -> None:
     """Step in chunks until done or told to stop, saving on the way."""
     steps = settings["steps"]
     started = time.perf_counter()
@@ -308,4 +384,3 @@ def _run(
     except KeyboardInterrupt:
         save()
         raise
-    return Splats(**fitter.splats(), origin=origin)

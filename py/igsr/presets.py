@@ -22,6 +22,8 @@ class Preset:
     dropout: float
     hull: bool
     start: str
+    poses: str = "fixed"
+    focal: str = "fixed"
 
 
 _MANY = Preset(

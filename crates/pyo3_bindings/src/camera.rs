@@ -6,6 +6,11 @@ use splat_render::Camera;
 
 use crate::arrays::{array, row, rows};
 
+/// From rows: numpy is row-major, glam column-major.
+pub fn viewmat(rows: &[[f64; 4]; 4]) -> DMat4 {
+    DMat4::from_cols_array_2d(rows).transpose()
+}
+
 /// A camera from `viewmat` f64 [4, 4], `intrinsics` f64 [4] (fx, fy, cx, cy) and a size.
 pub fn camera(
     viewmat: &Bound<'_, PyAny>,
@@ -19,9 +24,7 @@ pub fn camera(
         [rows[0], rows[1], rows[2], rows[3]]
     };
     let [fx, fy, cx, cy] = row::<f64, 4>("intrinsics", intrinsics)?;
-    // numpy is row-major, glam column-major.
-    let viewmat = DMat4::from_cols_array_2d(&matrix).transpose();
-    Ok(Camera { viewmat, fx, fy, cx, cy, width, height })
+    Ok(Camera { viewmat: self::viewmat(&matrix), fx, fy, cx, cy, width, height })
 }
 
 /// Cameras from `viewmats` f64 [V, 4, 4], `intrinsics` f64 [V, 4] and V sizes.
@@ -40,7 +43,7 @@ pub fn cameras(
         .zip(intrinsics)
         .zip(sizes)
         .map(|((viewmat, &[fx, fy, cx, cy]), &(width, height))| Camera {
-            viewmat: DMat4::from_cols_array_2d(viewmat).transpose(),
+            viewmat: self::viewmat(viewmat),
             fx,
             fy,
             cx,

@@ -2,17 +2,19 @@
 
 use std::sync::{Mutex, MutexGuard};
 
+use glam::DMat4;
 use numpy::PyUntypedArrayMethods;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 use splat_render::fit::{
-    Background, DensityControl, DensityStats, FitConfig, FitState, SplatArrays, Target,
+    Background, CameraConfig, CameraState, DensityControl, DensityStats, FitConfig, FitState,
+    Focal, Rates, SplatArrays, Target,
 };
 
 use crate::arrays::{array, elements, entry, rows, shaped, shaped_rows};
 use crate::backend::fit_device;
-use crate::camera::cameras;
+use crate::camera::{cameras, viewmat};
 use crate::error::to_python;
 
 /// A fit in progress.
@@ -46,6 +48,41 @@ fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
             )));
         }
     };
+    let focal = match setting::<String>(config, "focal")?.as_deref() {
+        None | Some("fixed") => Focal::Fixed,
+        Some("shared") => Focal::Shared,
+        Some("per-camera") => Focal::PerCamera,
+        Some(other) => {
+            return Err(PyValueError::new_err(format!(
+                "focal: must be fixed, shared or per-camera, not {other:?}"
+            )));
+        }
+    };
+    let poses = match setting::<String>(config, "poses")?.as_deref() {
+        None | Some("fixed") => false,
+        Some("joint") => true,
+        Some(other) => {
+            return Err(PyValueError::new_err(format!(
+                "poses: must be fixed or joint, not {other:?}"
+            )));
+        }
+    };
+    let frozen = setting(config, "frozen")?.unwrap_or(false);
+    let number = |name: &str, default: f32| PyResult::Ok(setting(config, name)?.unwrap_or(default));
+    let cameras = if poses || focal != Focal::Fixed {
+        let default = CameraConfig::default();
+        Some(CameraConfig {
+            poses,
+            focal,
+            rate: number("camera_rate", default.rate)?,
+            decay: number("camera_decay", default.decay)?,
+            warm_up: number("camera_warm_up", default.warm_up)?,
+            // Splats that stay where they are hold the cameras by themselves.
+            anchored: !frozen,
+        })
+    } else {
+        None
+    };
     let background =
         setting::<[f32; 3]>(config, "background")?.map_or(Background::Random, Background::Color);
     Ok(FitConfig {
@@ -57,6 +94,8 @@ fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
         background,
         dropout: setting(config, "dropout")?.unwrap_or(default.dropout),
         hull: setting(config, "hull")?.unwrap_or(default.hull),
+        rates: if frozen { Rates::ZERO } else { default.rates },
+        cameras,
         ..default
     })
 }
@@ -130,6 +169,55 @@ fn state_from(dict: &Bound<'_, PyDict>) -> PyResult<(FitState, u32)> {
     Ok((state, elements("step", &step, &[1])?[0]))
 }
 
+/// The cameras' state in `dict`, if it holds one.
+fn camera_state_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Option<CameraState>> {
+    if !dict.contains("camera_viewmats")? {
+        return Ok(None);
+    }
+    let n = count as isize;
+    let table = |name: &str| -> PyResult<Vec<[f64; 7]>> {
+        Ok(rows(name, &entry::<f64>(dict, name)?, &[n])?.to_vec())
+    };
+    let viewmats = entry::<f64>(dict, "camera_viewmats")?;
+    let viewmats = rows::<f64, 4>("camera_viewmats", &viewmats, &[n, 4])?.as_chunks::<4>().0;
+    let intrinsics = entry::<f64>(dict, "camera_intrinsics")?;
+    let distances = entry::<f64>(dict, "camera_distances")?;
+    let rounds = entry::<u32>(dict, "camera_rounds")?;
+    Ok(Some(CameraState {
+        viewmats: viewmats.iter().map(viewmat).collect(),
+        intrinsics: rows("camera_intrinsics", &intrinsics, &[n])?.to_vec(),
+        first: table("camera_first")?,
+        second: rows("camera_second", &entry::<f64>(dict, "camera_second")?, &[n])?.to_vec(),
+        gradients: table("camera_gradients")?,
+        distances: elements("camera_distances", &distances, &[n])?.to_vec(),
+        rounds: elements("camera_rounds", &rounds, &[1])?[0],
+    }))
+}
+
+/// The reverse of [`camera_state_from`].
+fn set_camera_state(dict: &Bound<'_, PyDict>, state: CameraState) -> PyResult<()> {
+    let (py, n) = (dict.py(), state.viewmats.len());
+    set_cameras(dict, &state.viewmats, state.intrinsics)?;
+    dict.set_item("camera_first", shaped_rows(py, state.first, &[n])?)?;
+    dict.set_item("camera_second", shaped_rows(py, state.second, &[n])?)?;
+    dict.set_item("camera_gradients", shaped_rows(py, state.gradients, &[n])?)?;
+    dict.set_item("camera_distances", shaped(py, state.distances, &[n])?)?;
+    dict.set_item("camera_rounds", shaped(py, vec![state.rounds], &[1])?)
+}
+
+/// `camera_viewmats` [V, 4, 4] and `camera_intrinsics` [V, 4].
+fn set_cameras(
+    dict: &Bound<'_, PyDict>,
+    viewmats: &[DMat4],
+    intrinsics: Vec<[f64; 4]>,
+) -> PyResult<()> {
+    let (py, n) = (dict.py(), viewmats.len());
+    let table: Vec<[f64; 4]> =
+        viewmats.iter().flat_map(|m| m.transpose().to_cols_array_2d()).collect();
+    dict.set_item("camera_viewmats", shaped_rows(py, table, &[n, 4])?)?;
+    dict.set_item("camera_intrinsics", shaped_rows(py, intrinsics, &[n])?)
+}
+
 fn targets_from(images: &Bound<'_, PyList>, masks: &Bound<'_, PyList>) -> PyResult<Vec<Target>> {
     if images.len() != masks.len() {
         return Err(PyValueError::new_err(format!(
@@ -197,11 +285,18 @@ impl Fitter {
         let targets = targets_from(images, masks)?;
         let sizes: Vec<(u32, u32)> = targets.iter().map(|t| (t.width, t.height)).collect();
         let cameras = cameras(viewmats, intrinsics, &sizes)?;
+        let camera_state = camera_state_from(state, cameras.len())?;
         let (state, step) = state_from(state)?;
         let device = fit_device(backend)?;
-        py.detach(|| splat_render::fit::Fitter::new(device, targets, cameras, state, step, config))
-            .map(|fitter| Self(Mutex::new(fitter)))
-            .map_err(to_python)
+        py.detach(|| {
+            let mut fitter =
+                splat_render::fit::Fitter::new(device, targets, cameras, state, step, config)?;
+            if let Some(camera_state) = camera_state {
+                fitter.resume_cameras(camera_state)?;
+            }
+            Ok(Self(Mutex::new(fitter)))
+        })
+        .map_err(to_python)
     }
 
     /// Does `count` steps; returns `step`, `loss` (of the last one) and `splats`.
@@ -235,11 +330,22 @@ impl Fitter {
         Ok(dict)
     }
 
+    /// The cameras as they are now: `camera_viewmats` and `camera_intrinsics`.
+    fn cameras<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let cameras = py.detach(|| PyResult::Ok(self.lock()?.cameras().to_vec()))?;
+        let viewmats: Vec<_> = cameras.iter().map(|c| c.viewmat).collect();
+        let dict = PyDict::new(py);
+        set_cameras(&dict, &viewmats, cameras.iter().map(|c| [c.fx, c.fy, c.cx, c.cy]).collect())?;
+        Ok(dict)
+    }
+
     /// Everything needed to go on bit for bit: the constructor's `state`.
     fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let (state, step) = py.detach(|| {
+        let (state, step, cameras) = py.detach(|| {
             let mut fitter = self.lock()?;
-            PyResult::Ok((fitter.state().map_err(to_python)?, fitter.steps_done()))
+            let state = fitter.state().map_err(to_python)?;
+            let cameras = fitter.camera_state().map_err(to_python)?;
+            PyResult::Ok((state, fitter.steps_done(), cameras))
         })?;
         let n = state.splats.len();
         let dict = PyDict::new(py);
@@ -249,6 +355,9 @@ impl Fitter {
         dict.set_item("stats_grad_sum", shaped(py, state.stats.grad_sum, &[n])?)?;
         dict.set_item("stats_seen", shaped(py, state.stats.seen, &[n])?)?;
         dict.set_item("step", shaped(py, vec![step], &[1])?)?;
+        if let Some(cameras) = cameras {
+            set_camera_state(&dict, cameras)?;
+        }
         Ok(dict)
     }
 }

@@ -6,7 +6,8 @@ mod common;
 use common::{random_camera, random_scene, rng};
 use splat_render::cpu::{Cpu, CpuFit};
 use splat_render::fit::{
-    Background, DensityControl, FitConfig, FitState, Fitter, Target, splats_from_points,
+    Background, CameraConfig, CameraState, DensityControl, FitConfig, FitDevice, FitState, Fitter,
+    Focal, Rates, StepInput, Target, splats_from_points,
 };
 use splat_render::{Camera, Error, ProjectOptions, Stages};
 
@@ -45,6 +46,7 @@ fn config(density: DensityControl) -> FitConfig {
         background: Background::Random,
         dropout: 0.2,
         hull: true,
+        cameras: Some(CameraConfig { focal: Focal::Shared, ..CameraConfig::default() }),
         ..FitConfig::default()
     }
 }
@@ -98,14 +100,79 @@ fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
 
 #[test]
 fn a_resumed_fit_ends_with_the_same_bits() {
+    let finish = |mut fitter: Fitter| -> (FitState, CameraState) {
+        (run(&mut fitter, STEPS), fitter.camera_state().unwrap().unwrap())
+    };
     for density in [DensityControl::Mcmc, DensityControl::Original] {
-        let whole = run(&mut fitter(density, &start(1), 0), STEPS);
-        for cut in [1, 299, 300, 357] {
-            let half = run(&mut fitter(density, &start(1), 0), cut);
-            let resumed = run(&mut fitter(density, &half, cut), STEPS);
-            assert!(resumed == whole, "{density:?} resumed at step {cut} ends otherwise");
+        let whole = finish(fitter(density, &start(1), 0));
+        // In the cameras' warm-up, within a round and at its end; before density control and after.
+        for cut in [1, 20, 52, 299, 300, 357] {
+            let mut half = fitter(density, &start(1), 0);
+            let state = run(&mut half, cut);
+            let mut resumed = fitter(density, &state, cut);
+            resumed.resume_cameras(half.camera_state().unwrap().unwrap()).unwrap();
+            assert!(finish(resumed) == whole, "{density:?} resumed at step {cut} ends otherwise");
+        }
+        for (camera, viewmat) in photos().1.iter().zip(&whole.1.viewmats) {
+            assert!(!camera.viewmat.abs_diff_eq(*viewmat, 1e-4), "a camera stood still");
         }
     }
+}
+
+/// One step that changes no splat, and what it says of its camera.
+fn still_step(device: &mut CpuFit, camera: Camera, step: u32) -> StepInput {
+    let input = StepInput {
+        view: 0,
+        camera,
+        background: [0.2, 0.5, 0.7],
+        sh_degree: 1,
+        rates: Rates::ZERO,
+        step,
+        ssim_weight: 0.2,
+        opacity_regularizer: 0.0,
+        scale_regularizer: 0.0,
+        noise: 0.0,
+        dropout: 0.2,
+        noise_seed: 3,
+        camera_gradient: true,
+    };
+    device.step(&input).unwrap();
+    input
+}
+
+#[test]
+fn the_camera_gradient_is_the_slope_of_the_loss() {
+    let (targets, cameras) = photos();
+    let mut device = CpuFit::default();
+    device.set_targets(targets).unwrap();
+    let mut state = start(1);
+    // Smooth where the loss is probed: large splats, far from the photo's colours.
+    state.splats.scales.iter_mut().for_each(|s| *s = s.map(|v| v + 1.5));
+    state.splats.opacities.iter_mut().for_each(|o| *o = -1.0);
+    state.splats.sh.iter_mut().for_each(|c| *c = c.map(|v| v + 0.3));
+    device.upload(state.clone()).unwrap();
+    let camera = cameras[0];
+    still_step(&mut device, camera, 1);
+    let gradient = device.camera_gradients().unwrap()[0];
+    let mut slope = |change: &dyn Fn(&mut Camera, f64), by: f64| {
+        let mut loss = |by: f64| {
+            let mut moved = camera;
+            change(&mut moved, by);
+            still_step(&mut device, moved, 2);
+            f64::from(device.loss().unwrap())
+        };
+        (loss(by) - loss(-by)) / (2.0 * by)
+    };
+    let largest = gradient.v_viewmat.iter().map(|row| row[3].abs()).fold(0.0, f64::max);
+    for axis in 0..3 {
+        let expected = gradient.v_viewmat[axis][3];
+        let got = slope(&|camera, by| camera.viewmat.w_axis[axis] += by, 2e-3);
+        assert!((got - expected).abs() < 0.03 * largest, "move {axis}: {got} for {expected}");
+    }
+    let expected = gradient.v_intrinsics[0];
+    let got = slope(&|camera, by| camera.fx += by, 0.05);
+    assert!((got - expected).abs() < 0.03 * expected.abs() + 1e-6, "fx: {got} for {expected}");
+    assert!(device.download().unwrap().splats == state.splats, "frozen splats moved");
 }
 
 #[test]

@@ -90,6 +90,7 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
         noise,
         dropout: if noise > 0.0 { 0.3 } else { 0.0 },
         noise_seed: step.wrapping_mul(2_654_435_761),
+        camera_gradient: true,
     }
 }
 
@@ -109,6 +110,19 @@ fn run(
         }
     }
     (device.download().unwrap(), losses)
+}
+
+/// Poses and focal lengths as one row per step.
+fn camera_rows(device: &mut dyn FitDevice) -> Vec<[f64; 16]> {
+    let rows = device.camera_gradients().unwrap();
+    rows.iter()
+        .map(|row| {
+            let mut out = [0.0; 16];
+            out[..12].copy_from_slice(row.v_viewmat.as_flattened());
+            out[12..].copy_from_slice(&row.v_intrinsics);
+            out
+        })
+        .collect()
 }
 
 fn gpu_fit() -> GpuFit {
@@ -185,6 +199,48 @@ fn one_step_changes_the_state_as_on_the_cpu() {
         assert!(off.mean <= 1e-5, "{steps} steps, sh: {off:?}");
         close("grad_sum", &got.stats.grad_sum, &expected.stats.grad_sum, 2e-3);
         assert_eq!(got.stats.seen, expected.stats.seen);
+    }
+}
+
+#[test]
+fn cameras_get_the_gradients_that_they_get_on_the_cpu() {
+    // More steps than are under way at a time, and among them some that do not find room at first.
+    let steps = 40;
+    let capture = capture(3, &[(64, 64); 3], 400);
+    let still =
+        |step: u32| StepInput { rates: Rates::ZERO, noise: 0.0, ..input(&capture, step, 0.0) };
+    let rows = |device: &mut dyn FitDevice| {
+        device.set_targets(capture.targets.clone()).unwrap();
+        device.upload(capture.start.clone()).unwrap();
+        let mut rows = Vec::new();
+        for step in 1..=steps {
+            device.step(&still(step)).unwrap();
+            // The second half is asked for once, after an edit between.
+            if step == steps / 2 {
+                rows = camera_rows(device);
+                assert_eq!(rows.len(), step as usize);
+            } else if step == steps / 2 + 7 {
+                device.edit(&mut |_| {}).unwrap();
+            }
+        }
+        rows.extend(camera_rows(device));
+        rows
+    };
+    let (expected, got) = (rows(&mut CpuFit::default()), rows(&mut gpu_fit()));
+    assert_eq!((got.len(), expected.len()), (steps as usize, steps as usize));
+    for (step, (got, expected)) in got.iter().zip(&expected).enumerate() {
+        for kinds in [0..12, 12..16] {
+            let largest = expected[kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
+            for k in kinds {
+                let off = (got[k] - expected[k]).abs();
+                assert!(
+                    off < 1e-3 * largest,
+                    "step {step}, entry {k}: {} for {}",
+                    got[k],
+                    expected[k]
+                );
+            }
+        }
     }
 }
 

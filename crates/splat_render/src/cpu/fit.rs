@@ -8,7 +8,7 @@ use super::adam::{Adam, Bias};
 use super::bin::{Bins, CHUNK, ChunkTiles};
 use super::loss::Loss;
 use super::project::{Splat, View, project_splat};
-use super::project_backward::{VSplat, splat_backward};
+use super::project_backward::{VCamera, VSplat, splat_backward};
 use super::rasterize::{Planes, rasterize};
 use super::rasterize_backward::{
     COLOR_SUMS, PairSums, PictureGradients, gather, rasterize_backward,
@@ -17,7 +17,9 @@ use super::simd::dispatch;
 use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
-use crate::fit::{FitDevice, FitState, Rates, StepInput, Target, is_dropped, noise_normal};
+use crate::fit::{
+    CameraGradient, FitDevice, FitState, Rates, StepInput, Target, is_dropped, noise_normal,
+};
 use crate::sh;
 use crate::stages::{Colors, ProjectOptions, SplatParams};
 
@@ -27,6 +29,7 @@ pub struct CpuFit {
     targets: Vec<Target>,
     state: FitState,
     loss_value: f32,
+    camera_gradients: Vec<CameraGradient>,
     // Buffers kept from step to step.
     chunks: Vec<ChunkTiles>,
     splats: Vec<TileSplat>,
@@ -35,6 +38,8 @@ pub struct CpuFit {
     photo: [Vec<f32>; 3],
     loss: Loss,
     sums: Vec<PairSums<COLOR_SUMS>>,
+    /// The camera's gradient by block of splats, so that its sum does not depend on the threads.
+    block_cameras: Vec<VCamera>,
 }
 
 impl FitDevice for CpuFit {
@@ -127,6 +132,10 @@ impl FitDevice for CpuFit {
         );
         self.update(&view, input, [width as f32, height as f32]);
         Ok(())
+    }
+
+    fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>> {
+        Ok(std::mem::take(&mut self.camera_gradients))
     }
 
     fn loss(&mut self) -> Result<f32> {
@@ -223,6 +232,9 @@ impl CpuFit {
         let opacity_pull = input.opacity_regularizer / n as f32;
         let scale_pull = input.scale_regularizer / (3 * n) as f32;
         let rates = BlockRates::new(&input.rates, stride, sh::coeffs(degree));
+        let frozen = input.rates == Rates::ZERO;
+        self.block_cameras.clear();
+        self.block_cameras.resize(n.div_ceil(BLOCK), VCamera::default());
 
         macro_rules! blocks {
             ($arrays:expr) => {
@@ -239,10 +251,11 @@ impl CpuFit {
             .zip(blocks!(first))
             .zip(blocks!(second))
             .zip(stats.grad_sum.par_chunks_mut(BLOCK))
+            .zip(&mut self.block_cameras)
             .enumerate()
             .for_each_init(
                 || Block::new(stride),
-                |v_block, (block, (((value, first), second), grad_sum))| {
+                |v_block, (block, ((((value, first), second), grad_sum), v_camera))| {
                     let ((((means, quats), scales), opacities), coeffs) = value;
                     let ((((means1, quats1), scales1), opacities1), coeffs1) = first;
                     let ((((means2, quats2), scales2), opacities2), coeffs2) = second;
@@ -275,7 +288,7 @@ impl CpuFit {
                                 k,
                                 &v2d,
                                 v_sh,
-                                None,
+                                input.camera_gradient.then_some(&mut *v_camera),
                             );
                         } else {
                             v_sh.fill([0.0; 3]);
@@ -288,6 +301,9 @@ impl CpuFit {
                         v_block.quats[k] = v.v_quat;
                         v_block.scales[k] = v.v_scales;
                         v_block.opacities[k] = v.v_opacity;
+                    }
+                    if frozen {
+                        return;
                     }
                     macro_rules! adam {
                         ($values:expr, $first:expr, $second:expr, $name:ident) => {
@@ -315,6 +331,16 @@ impl CpuFit {
                     }
                 },
             );
+        if input.camera_gradient {
+            let mut sum = VCamera::default();
+            self.block_cameras.iter().for_each(|block| sum.add(block));
+            let VCamera { v_viewmat, v_intrinsics } = sum;
+            self.camera_gradients.push(CameraGradient {
+                view: input.view,
+                v_viewmat,
+                v_intrinsics,
+            });
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! Settings of a fit.
 
+use super::cameras::CameraConfig;
 use super::device::Rates;
 use crate::constants::SH_DEGREE_MAX;
 use crate::error::{Error, Result};
@@ -52,6 +53,8 @@ pub struct FitConfig {
     pub dropout: f32,
     /// Whether splats outside the visual hull of photos with alpha are removed.
     pub hull: bool,
+    /// How cameras are fitted, or None: they are taken as exact.
+    pub cameras: Option<CameraConfig>,
     /// What the centres' rate has decayed to at the end, as a part of the start's.
     pub means_decay: f32,
 }
@@ -77,6 +80,7 @@ impl Default for FitConfig {
             },
             dropout: 0.0,
             hull: false,
+            cameras: None,
             means_decay: 0.01,
         }
     }
@@ -113,6 +117,9 @@ impl FitConfig {
         }
         if !(self.means_decay > 0.0 && self.means_decay <= 1.0) {
             return Err(Error::argument("means_decay", "must lie above 0 and at most at 1"));
+        }
+        if let Some(cameras) = &self.cameras {
+            cameras.validate()?;
         }
         if let Background::Color(color) = self.background
             && !color.iter().all(|c| (0.0..=1.0).contains(c))

@@ -85,6 +85,23 @@ pub struct Rates {
     pub sh_rest: f32,
 }
 
+impl Rates {
+    /// No parameter moves.
+    pub const ZERO: Self =
+        Self { means: 0.0, quats: 0.0, scales: 0.0, opacities: 0.0, sh0: 0.0, sh_rest: 0.0 };
+}
+
+/// Gradient of a step's loss with respect to its camera.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct CameraGradient {
+    /// Which target.
+    pub view: usize,
+    /// Rows of the gradient of the viewmat's upper 3x4 block.
+    pub v_viewmat: [[f64; 4]; 3],
+    /// Gradient of (fx, fy, cx, cy).
+    pub v_intrinsics: [f64; 4],
+}
+
 /// Adam's decay of the first and second moments and its epsilon.
 pub const ADAM: (f32, f32, f32) = (0.9, 0.999, 1e-15);
 
@@ -118,6 +135,8 @@ pub struct StepInput {
     pub dropout: f32,
     /// Seed of noise and dropout; differs from step to step.
     pub noise_seed: u32,
+    /// Whether [`FitDevice::camera_gradients`] will ask for this step's.
+    pub camera_gradient: bool,
 }
 
 /// Weights of the SSIM window: 11 taps of a Gaussian of sigma 1.5, summing to 1, as in 3DGS.
@@ -141,7 +160,8 @@ pub const SSIM_C: (f32, f32) = (0.01 * 0.01, 0.03 * 0.03);
 ///
 /// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p
 /// and channels c, with s the SSIM weight, zero padding in the window, plus the two regularisers.
-/// Every parameter takes an Adam step in every step, seen or not.
+/// Every parameter takes an Adam step in every step, seen or not; with [`Rates::ZERO`] and without
+/// noise all stay as they are.
 pub trait FitDevice: Send {
     /// Takes the photos, once.
     fn set_targets(&mut self, targets: Vec<Target>) -> Result<()>;
@@ -162,6 +182,9 @@ pub trait FitDevice: Send {
     /// One step: project, bin, rasterize, loss, rasterize_backward, project_backward, Adam, noise,
     /// density statistics.
     fn step(&mut self, input: &StepInput) -> Result<()>;
+
+    /// Gradients of the cameras of all steps since the last call that were to have them, in order.
+    fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>>;
 
     /// Loss of the last step (before its update, regularisers not included).
     fn loss(&mut self) -> Result<f32>;

@@ -7,6 +7,7 @@ use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
 
+use super::cameras::{CameraState, Cameras, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
 use super::device::{FitDevice, Rates, StepInput, Target};
@@ -38,6 +39,8 @@ pub struct Fitter {
     device: Box<dyn FitDevice>,
     config: FitConfig,
     cameras: Vec<Camera>,
+    /// The cameras, where they are fitted; `cameras` follows them.
+    moving: Option<Cameras>,
     has_alpha: Vec<bool>,
     hull: Option<Hull>,
     extent: f32,
@@ -99,13 +102,19 @@ impl Fitter {
             ));
         }
         let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
-        let hull = config.hull.then(|| Hull::new(&targets, &cameras));
+        let hull = config.hull.then(|| Hull::new(&targets));
         device.set_targets(targets)?;
         let splats = state.splats.len();
+        let moving = config.cameras.map(|moving| {
+            let means = &state.splats.means;
+            let distances = cameras.iter().map(|camera| scene_distance(camera, means)).collect();
+            Cameras::new(&cameras, distances, moving)
+        });
         device.upload(state)?;
         Ok(Self {
             device,
             extent: scene_extent(&cameras) as f32,
+            moving,
             config,
             cameras,
             has_alpha,
@@ -138,6 +147,30 @@ impl Fitter {
     /// Everything needed to go on bit for bit, with [`Fitter::steps_done`].
     pub fn state(&mut self) -> Result<FitState> {
         self.device.download()
+    }
+
+    /// The cameras as they are now.
+    pub fn cameras(&self) -> &[Camera] {
+        &self.cameras
+    }
+
+    /// What [`Fitter::resume_cameras`] needs, where cameras are fitted.
+    pub fn camera_state(&mut self) -> Result<Option<CameraState>> {
+        let gradients = self.device.camera_gradients()?;
+        Ok(self.moving.as_mut().map(|cameras| {
+            cameras.add(&gradients);
+            cameras.state()
+        }))
+    }
+
+    /// Goes on with cameras where another fit's had come to.
+    pub fn resume_cameras(&mut self, state: CameraState) -> Result<()> {
+        let Some(cameras) = self.moving.as_mut() else {
+            return Err(Error::argument("cameras", "are not fitted here"));
+        };
+        cameras.resume(state)?;
+        self.cameras = cameras.now().to_vec();
+        Ok(())
     }
 
     /// The photo of step `step` (from 0): every photo once per round, in a new order each round.
@@ -173,7 +206,11 @@ impl Fitter {
             view,
             camera: self.cameras[view],
             background,
-            sh_degree: (step / config.sh_interval).min(config.sh_degree),
+            sh_degree: if config.rates == Rates::ZERO {
+                config.sh_degree
+            } else {
+                (step / config.sh_interval).min(config.sh_degree)
+            },
             rates,
             step: step + 1,
             ssim_weight: config.ssim_weight,
@@ -182,10 +219,25 @@ impl Fitter {
             noise: if mcmc { MCMC.2 * rates.means } else { 0.0 },
             dropout: config.dropout * progress as f32,
             noise_seed,
+            camera_gradient: self.moving.as_ref().is_some_and(|cameras| cameras.moving(progress)),
         };
         self.device.step(&input)?;
         self.step += 1;
+        self.move_cameras(progress)?;
         self.control_density()
+    }
+
+    /// At the end of a round, when each camera has its gradient.
+    fn move_cameras(&mut self, progress: f64) -> Result<()> {
+        let Some(cameras) = self.moving.as_mut().filter(|cameras| cameras.moving(progress)) else {
+            return Ok(());
+        };
+        if self.step.is_multiple_of(self.cameras.len() as u32) {
+            cameras.add(&self.device.camera_gradients()?);
+            cameras.step(progress);
+            self.cameras = cameras.now().to_vec();
+        }
+        Ok(())
     }
 
     fn control_density(&mut self) -> Result<()> {
@@ -208,9 +260,10 @@ impl Fitter {
         }
         let mut rng = self.rng(Draw::Density, u64::from(step));
         let (extent, splats, hull) = (self.extent, &mut self.splats, &self.hull);
+        let cameras = &self.cameras;
         self.device.edit(&mut |state| {
             if let Some(hull) = hull.as_ref().filter(|_| leaving) {
-                let inside = hull.inside(&state.splats);
+                let inside = hull.inside(&state.splats, cameras);
                 if inside.len() < state.splats.len() {
                     state.select(&inside);
                 }

@@ -14,26 +14,29 @@ pub struct Hull {
 
 #[derive(Debug)]
 struct Silhouette {
-    camera: Camera,
+    /// Which photo's.
+    view: usize,
     /// `[H * W]`, whether the pixel or a neighbour of it is covered: poses and edges are not exact.
     covered: Vec<bool>,
 }
 
 impl Hull {
-    /// From photos and their cameras; photos without alpha say nothing, nor do masked pixels.
-    pub fn new(targets: &[Target], cameras: &[Camera]) -> Self {
-        let with_alpha = targets.iter().zip(cameras).filter(|(target, _)| target.channels == 4);
+    /// From photos; those without alpha say nothing, nor do masked pixels.
+    pub fn new(targets: &[Target]) -> Self {
+        let with_alpha = targets.iter().enumerate().filter(|(_, target)| target.channels == 4);
         Self {
             silhouettes: with_alpha
-                .map(|(target, camera)| Silhouette { camera: *camera, covered: covered(target) })
+                .map(|(view, target)| Silhouette { view, covered: covered(target) })
                 .collect(),
         }
     }
 
-    /// Whether no photo shows emptiness at this point, which is relative to the scene's origin.
-    pub fn contains(&self, point: [f32; 3]) -> bool {
+    /// Whether no photo, taken by these cameras, shows emptiness at this point, which is relative to
+    /// the scene's origin.
+    pub fn contains(&self, point: [f32; 3], cameras: &[Camera]) -> bool {
         let point = DVec3::from(point.map(f64::from));
-        self.silhouettes.iter().all(|Silhouette { camera, covered }| {
+        self.silhouettes.iter().all(|Silhouette { view, covered }| {
+            let camera = &cameras[*view];
             let t = camera.viewmat.transform_point3(point);
             let x = (camera.fx * t.x / t.z + camera.cx).floor();
             let y = (camera.fy * t.y / t.z + camera.cy).floor();
@@ -44,9 +47,9 @@ impl Hull {
     }
 
     /// Splats whose centres the hull contains; all, where it contains none.
-    pub fn inside(&self, splats: &SplatArrays) -> Vec<usize> {
+    pub fn inside(&self, splats: &SplatArrays, cameras: &[Camera]) -> Vec<usize> {
         let ids: Vec<usize> =
-            (0..splats.len()).filter(|&i| self.contains(splats.means[i])).collect();
+            (0..splats.len()).filter(|&i| self.contains(splats.means[i], cameras)).collect();
         if ids.is_empty() { (0..splats.len()).collect() } else { ids }
     }
 }
@@ -93,21 +96,24 @@ mod tests {
             pixels[4 * k + 3] = if k % width as usize >= 10 { 255 } else { 0 };
         }
         let target = Target { width, height, channels: 4, pixels, weights: None };
-        let hull = Hull::new(std::slice::from_ref(&target), &[camera]);
-        assert!(hull.contains([0.2, 0.0, 1.0]));
+        let hull = Hull::new(std::slice::from_ref(&target));
+        assert!(hull.contains([0.2, 0.0, 1.0], &[camera]));
         // One pixel beyond the edge is not sure to be empty; two are.
-        assert!(hull.contains([-0.05, 0.0, 1.0]));
-        assert!(!hull.contains([-0.15, 0.0, 1.0]));
+        assert!(hull.contains([-0.05, 0.0, 1.0], &[camera]));
+        assert!(!hull.contains([-0.15, 0.0, 1.0], &[camera]));
         // Beside the picture and behind the camera it knows nothing.
-        assert!(hull.contains([-3.0, 0.0, 1.0]) && hull.contains([-0.15, 0.0, -1.0]));
+        assert!(
+            hull.contains([-3.0, 0.0, 1.0], &[camera])
+                && hull.contains([-0.15, 0.0, -1.0], &[camera])
+        );
         let mut splats = SplatArrays::zeros(3, 0);
         splats.means = vec![[-0.5, 0.0, 1.0], [0.5, 0.0, 1.0], [f32::NAN; 3]];
-        assert_eq!(hull.inside(&splats), [1, 2]);
+        assert_eq!(hull.inside(&splats, &[camera]), [1, 2]);
         splats.means = vec![[-0.5, 0.0, 1.0]; 3];
-        assert_eq!(hull.inside(&splats), [0, 1, 2], "an empty scene helps nobody");
+        assert_eq!(hull.inside(&splats, &[camera]), [0, 1, 2], "an empty scene helps nobody");
         let masked = Target { weights: Some(vec![0.0; 200]), ..target.clone() };
-        assert!(Hull::new(&[masked], &[camera]).contains([-0.5, 0.0, 1.0]));
+        assert!(Hull::new(&[masked]).contains([-0.5, 0.0, 1.0], &[camera]));
         let opaque = Target { channels: 3, pixels: vec![0; 600], ..target };
-        assert!(Hull::new(&[opaque], &[camera]).contains([-0.5, 0.0, 1.0]));
+        assert!(Hull::new(&[opaque]).contains([-0.5, 0.0, 1.0], &[camera]));
     }
 }

@@ -1,5 +1,6 @@
 //! Fitting splats to photos with known cameras.
 
+mod cameras;
 mod config;
 mod density;
 mod device;
@@ -8,10 +9,12 @@ mod hull;
 mod initial;
 mod params;
 
+pub use cameras::{CameraConfig, CameraState, Cameras, Focal, scene_distance};
 pub use config::{Background, DensityControl, FitConfig};
 pub(crate) use device::dropout_threshold;
 pub use device::{
-    ADAM, FitDevice, Rates, SSIM_C, SSIM_WINDOW, StepInput, Target, is_dropped, noise_normal,
+    ADAM, CameraGradient, FitDevice, Rates, SSIM_C, SSIM_WINDOW, StepInput, Target, is_dropped,
+    noise_normal,
 };
 pub use fitter::{Fitter, scene_extent};
 pub use initial::splats_from_points;

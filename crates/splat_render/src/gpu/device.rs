@@ -82,8 +82,8 @@ pub(super) enum Op {
     Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2] },
     /// Fills a buffer with zeros.
     Clear(wgpu::Buffer),
-    /// Copies so many bytes from the first buffer to the second.
-    Copy(wgpu::Buffer, wgpu::Buffer, u64),
+    /// Copies so many bytes (the last) from the start of the first buffer to an offset in the second.
+    Copy(wgpu::Buffer, wgpu::Buffer, u64, u64),
 }
 
 /// Futures of wgpu's native backends are ready at once or after `poll`.
@@ -447,8 +447,8 @@ impl Gpu {
             match first {
                 Op::Dispatch { .. } => {}
                 Op::Clear(buffer) => encoder.clear_buffer(buffer, 0, None),
-                Op::Copy(from, to, bytes) => {
-                    encoder.copy_buffer_to_buffer(from, 0, to, 0, *bytes);
+                Op::Copy(from, to, offset, bytes) => {
+                    encoder.copy_buffer_to_buffer(from, 0, to, *offset, *bytes);
                 }
             }
             let run = rest.iter().take_while(|op| matches!(op, Op::Dispatch { .. })).count();

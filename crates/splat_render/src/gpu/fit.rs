@@ -17,18 +17,19 @@ use std::sync::Arc;
 use super::bin::{PairBins, SplatBins, TileChunk, pair_limit, tile_count};
 use super::device::{Gpu, Op};
 use super::layout::{
-    Chunk, ChunkCount, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, STATS, Splat2d, StatusHead, Step,
-    View, Window,
+    CAMERA, Chunk, ChunkCount, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, STATS, Splat2d, StatusHead,
+    Step, View, Window,
 };
 use super::loss::LossBuffers;
 use super::project::{SplatBuffers, project_ops, rows};
-use super::project_backward::{GradientBuffers, project_backward_ops};
+use super::project_backward::{GradientBuffers, camera_sum, camera_sums, project_backward_ops};
 use super::rasterize::rasterize_ops;
 use super::rasterize_backward::{BackwardBuffers, rasterize_backward_ops};
 use super::shaders::Kernel;
 use crate::error::{Error, Result};
 use crate::fit::{
-    ADAM, DensityStats, FitDevice, FitState, SplatArrays, StepInput, Target, dropout_threshold,
+    ADAM, CameraGradient, DensityStats, FitDevice, FitState, SplatArrays, StepInput, Target,
+    dropout_threshold,
 };
 use crate::sh;
 use crate::stages::ProjectOptions;
@@ -52,6 +53,7 @@ pub struct GpuFit {
     scene: Option<Scene>,
     /// Steps not known to have been done.
     pending: Vec<StepInput>,
+    camera_gradients: Vec<CameraGradient>,
     /// The last step: its photo and SSIM weight.
     last: Option<(usize, f32)>,
 }
@@ -94,6 +96,8 @@ struct Scene {
     splats2d: wgpu::Buffer,
     v_splats2d: wgpu::Buffer,
     gradients: GradientBuffers,
+    /// The camera sums of each pending step; None until a step is to have them.
+    pending_cameras: Option<wgpu::Buffer>,
     bins: SplatBins,
     /// What the host reads of `bins.status`.
     status_copy: wgpu::Buffer,
@@ -148,6 +152,7 @@ impl Scene {
             splats2d: gpu.bindable("splats2d", row(size_of::<Splat2d>() / 4))?,
             v_splats2d: gpu.bindable("v_splats2d", row(GRADIENT))?,
             gradients: GradientBuffers::new(gpu, &splats)?,
+            pending_cameras: None,
             bins: SplatBins::new(gpu, n, chunks)?,
             status_copy: gpu.readable(SplatBins::status_bytes(chunks)),
             chunks,
@@ -156,6 +161,11 @@ impl Scene {
             capacity,
             splats,
         })
+    }
+
+    /// Size of one step's camera sums.
+    fn camera_bytes(&self) -> u64 {
+        u64::from(camera_sums(self.splats.splats)) * CAMERA as u64 * 4
     }
 
     fn adam_ops(&self, gpu: &Gpu, view: &wgpu::Buffer, step: &wgpu::Buffer) -> Vec<Op> {
@@ -319,6 +329,7 @@ impl GpuFit {
             tiles: 1,
             scene: None,
             pending: Vec::new(),
+            camera_gradients: Vec::new(),
             last: None,
         }
     }
@@ -329,11 +340,11 @@ impl GpuFit {
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))
     }
 
-    /// Submits one step without waiting for it.
-    fn enqueue(&mut self, input: &StepInput) -> Result<()> {
+    /// Submits one step without waiting for it, as number `at` of those pending.
+    fn enqueue(&mut self, input: &StepInput, at: usize) -> Result<()> {
         let scene = self
             .scene
-            .as_ref()
+            .as_mut()
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))?;
         let photo = self.photos.get(input.view).ok_or_else(|| {
             Error::argument("view", format!("{} is not one of the photos", input.view))
@@ -381,19 +392,54 @@ impl GpuFit {
         let step_at = std::mem::offset_of!(StatusHead, step) as u64;
         queue.write_buffer(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
         let bytes = u64::from(frame.width) * u64::from(frame.height) * 4;
-        let mut copies = vec![Op::Copy(photo.rgba.clone(), frame.loss.photo.clone(), bytes)];
+        let mut copies = vec![Op::Copy(photo.rgba.clone(), frame.loss.photo.clone(), 0, bytes)];
         if let Some(weights) = &photo.weights {
-            copies.push(Op::Copy(weights.clone(), frame.loss.weights.clone(), bytes));
+            copies.push(Op::Copy(weights.clone(), frame.loss.weights.clone(), 0, bytes));
+        }
+        let mut cameras = Vec::new();
+        if input.camera_gradient {
+            let bytes = scene.camera_bytes();
+            let log = match &scene.pending_cameras {
+                Some(log) => log,
+                None => {
+                    let log = self.gpu.readable(STEPS_AHEAD as u64 * bytes);
+                    scene.pending_cameras.insert(log)
+                }
+            };
+            let (from, to) = (scene.gradients.camera.clone(), log.clone());
+            cameras.push(Op::Copy(from, to, at as u64 * bytes, bytes));
         }
         self.last = Some((input.view, input.ssim_weight));
-        self.gpu.submit(&[&copies, &frame.ops])
+        self.gpu.submit(&[&copies, &frame.ops, &cameras])
+    }
+
+    /// Takes in the camera sums of these steps, which have been done.
+    fn read_cameras(&mut self, steps: &[StepInput]) -> Result<()> {
+        if !steps.iter().any(|input| input.camera_gradient) {
+            return Ok(());
+        }
+        let scene = self.scene()?;
+        let Some(log) = &scene.pending_cameras else { return Ok(()) };
+        let bytes = scene.camera_bytes();
+        let data = self.gpu.read(&[(log, steps.len() as u64 * bytes)])?;
+        for (input, sums) in steps.iter().zip(data[0].chunks_exact(bytes as usize)) {
+            if input.camera_gradient {
+                let (v_viewmat, v_intrinsics) = camera_sum(sums);
+                self.camera_gradients.push(CameraGradient {
+                    view: input.view,
+                    v_viewmat,
+                    v_intrinsics,
+                });
+            }
+        }
+        Ok(())
     }
 
     /// Reads the flag and the counts of the last step.
     fn status(&self) -> Result<(StatusHead, Vec<ChunkCount>)> {
         let scene = self.scene()?;
         let bytes = SplatBins::status_bytes(scene.chunks);
-        let copy = Op::Copy(scene.bins.status.clone(), scene.status_copy.clone(), bytes);
+        let copy = Op::Copy(scene.bins.status.clone(), scene.status_copy.clone(), 0, bytes);
         self.gpu.submit(&[&[copy]])?;
         let data = self.gpu.read(&[(&scene.status_copy, bytes)])?;
         let (head, counts) = data[0].split_at(size_of::<StatusHead>());
@@ -408,16 +454,16 @@ impl GpuFit {
         let (head, _) = self.status()?;
         let pending = std::mem::take(&mut self.pending);
         if head.overflow == 0 {
-            return Ok(());
+            return self.read_cameras(&pending);
         }
         let first = pending.iter().position(|p| p.step == head.overflow).unwrap_or(0);
         // One at a time, so that the counts read are those of the step that needs the room.
-        for input in &pending[first..] {
+        for (at, input) in pending.iter().enumerate().skip(first) {
             loop {
                 let clear = std::mem::offset_of!(StatusHead, overflow) as u64;
                 let status = &self.scene()?.bins.status;
                 self.gpu.queue.write_buffer(status, clear, bytemuck::bytes_of(&0u32));
-                self.enqueue(input)?;
+                self.enqueue(input, at)?;
                 let (head, counts) = self.status()?;
                 if head.overflow == 0 {
                     break;
@@ -425,7 +471,7 @@ impl GpuFit {
                 self.grow(self.photos[input.view].frame, &counts)?;
             }
         }
-        Ok(())
+        self.read_cameras(&pending)
     }
 
     /// Makes room for the pairs that a step needs.
@@ -559,9 +605,14 @@ impl FitDevice for GpuFit {
     }
 
     fn step(&mut self, input: &StepInput) -> Result<()> {
-        self.enqueue(input)?;
+        self.enqueue(input, self.pending.len())?;
         self.pending.push(*input);
         if self.pending.len() >= STEPS_AHEAD { self.settle() } else { Ok(()) }
+    }
+
+    fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>> {
+        self.settle()?;
+        Ok(std::mem::take(&mut self.camera_gradients))
     }
 
     fn loss(&mut self) -> Result<f32> {

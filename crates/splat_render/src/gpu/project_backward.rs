@@ -14,6 +14,22 @@ pub(super) fn camera_sums(splats: u32) -> u32 {
     splats.div_ceil(SPLATS_PER_GROUP)
 }
 
+/// Gradients of viewmat and intrinsics from the sums of all workgroups, which are few enough to be
+/// added in f64, in their order.
+pub(super) fn camera_sum(sums: &[u8]) -> ([[f64; 4]; 3], [f64; 4]) {
+    let mut total = [0.0f64; CAMERA];
+    for row in sums.chunks_exact(CAMERA * 4) {
+        let row: [f32; CAMERA] = bytemuck::pod_read_unaligned(row);
+        for (sum, v) in total.iter_mut().zip(row) {
+            *sum += f64::from(v);
+        }
+    }
+    (
+        std::array::from_fn(|r| std::array::from_fn(|c| total[4 * r + c])),
+        std::array::from_fn(|k| total[12 + k]),
+    )
+}
+
 /// Gradient buffers of the parameters, laid out as [`SplatBuffers`].
 #[derive(Debug)]
 pub(super) struct GradientBuffers {
@@ -120,15 +136,6 @@ pub(super) fn project_backward(
         out.v_quats.push([row[6], row[7], row[8], row[9]]);
         out.v_opacities.push(row[10]);
     }
-    // Few enough to be summed in f64, in their order.
-    let mut camera_sum = [0.0f64; CAMERA];
-    for row in data[2].chunks_exact(CAMERA * 4) {
-        let row: [f32; CAMERA] = bytemuck::pod_read_unaligned(row);
-        for (sum, v) in camera_sum.iter_mut().zip(row) {
-            *sum += f64::from(v);
-        }
-    }
-    out.v_viewmat = std::array::from_fn(|r| std::array::from_fn(|c| camera_sum[4 * r + c]));
-    out.v_intrinsics = std::array::from_fn(|k| camera_sum[12 + k]);
+    (out.v_viewmat, out.v_intrinsics) = camera_sum(&data[2]);
     Ok(out)
 }
