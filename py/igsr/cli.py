@@ -85,6 +85,7 @@ class StudyChoice(str, enum.Enum):
     """Protocols of ``igsr study``."""
 
     blender8 = "blender8"
+    few_photos = "few-photos"
 
 
 class WorkloadChoice(str, enum.Enum):
@@ -600,7 +601,11 @@ def info_command(
 @app.command("study")
 def study_command(
     protocol: Annotated[
-        StudyChoice, typer.Argument(help="blender8: NeRF Synthetic from eight photos.")
+        StudyChoice,
+        typer.Argument(
+            help="blender8: NeRF Synthetic from eight photos. few-photos: real captures from 3, 6 "
+            "and 9 photos, or 3, 6 and 12 of the tankard."
+        ),
     ],
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder that holds the scenes.")],
     out: Annotated[
@@ -608,7 +613,19 @@ def study_command(
     ],
     scenes: Annotated[
         list[str] | None,
-        typer.Option("--scene", help="Repeat it for several. Default: chair and lego."),
+        typer.Option(
+            "--scene",
+            help="A folder in DATA; repeat it for several. Default: chair and lego; fern, "
+            "dtu_scan24 and tankard.",
+        ),
+    ] = None,
+    views: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--views",
+            help="Repeat it for several. blender8: 75 or 76, the view that codes differ in; "
+            "few-photos: a number of photos. Default: all.",
+        ),
     ] = None,
     presets: Annotated[
         list[PresetChoice] | None,
@@ -636,15 +653,21 @@ def study_command(
             first[:] = first or [done - 1]
             left = (time.monotonic() - started) / (done - first[0]) * (total - done)
             console.print(
-                f"{done} of {total}: {row['scene']} {row['preset']} seed {row['seed']}: "
+                f"{done} of {total}: {row['scene']} views {row['views']} {row['preset']} "
+                f"seed {row['seed']}: "
                 f"{row['psnr']:.2f} dB in {row['seconds']:.0f} s; about {left / 60.0:.0f} min left"
             )
 
-        report = study.blender8(
+        run = study.blender8 if protocol is StudyChoice.blender8 else study.few_photos
+        named: dict[str, Any] = {
+            "scenes": scenes,
+            "views": views,
+            "presets": presets and [choice.value for choice in presets],
+        }
+        report = run(
             data,
             out,
-            scenes=tuple(scenes or ("chair", "lego")),
-            presets=tuple(choice.value for choice in presets or PresetChoice),
+            **{name: tuple(given) for name, given in named.items() if given},
             seeds=seeds,
             backend=_resolved(backend),
             jobs=jobs,

@@ -2,7 +2,8 @@
 
 Where the capture has points (COLMAP), one splat per point. Where it has none, points are made up:
 inside the visual hull where photos have alpha, else along the rays of photo pixels at the depth
-where the other photos agree best with the pixel's colour.
+where the other photos agree best: with the pixel's surroundings where photos look from similar
+directions (``plane_sweep``), else with its colour.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from . import _core
 from .capture import Camera, Capture, View
 from .errors import IgsrError
+from .plane_sweep import can_sweep, swept_points
 from .splats import Splats
 
 Float64 = npt.NDArray[np.float64]
@@ -104,8 +106,13 @@ def _placed_splats(
         count = min(RANDOM_SPLATS, max_splats)
         xyz, colors = random.uniform(low, high, size=(count, 3)), random.uniform(size=(count, 3))
     else:
-        place = _inside_hull if start == "hull" else _along_rays
-        xyz, colors = place(views, min(MADE_UP_SPLATS, max_splats), random)
+        count, target = min(MADE_UP_SPLATS, max_splats), looked_at([view.camera for view in views])
+        if start == "hull":
+            xyz, colors = _inside_hull(views, count, random)
+        elif can_sweep(views, target):
+            xyz, colors = swept_points(views, target, count, random)
+        else:
+            xyz, colors = _along_rays(views, count, random)
     # Relative to the middle, so that float32 is precise where the scene is.
     origin = np.median(xyz, axis=0)
     return Splats(

@@ -1,5 +1,6 @@
 """Protocols of the literature as commands: fixed views, seeds and scores, so that runs compare."""
 
 from .blender import blender8
+from .real_captures import few_photos
 
-__all__ = ["blender8"]
+__all__ = ["blender8", "few_photos"]

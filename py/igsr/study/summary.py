@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -29,35 +30,24 @@ def summarized(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def write_study(
-    out: Path,
-    title: str,
-    rows: list[dict[str, Any]],
-    presets: tuple[str, ...],
-    scenes: tuple[str, ...],
-    protocol: dict[str, Any],
+    out: Path, title: str, rows: list[dict[str, Any]], protocol: dict[str, Any]
 ) -> dict[str, Any]:
     """Write ``study.json``, ``study.md`` and ``study.png`` into ``out``; returns the first's data.
 
     Raises:
         IgsrError: a file cannot be written.
     """
+    presets = dict.fromkeys(row["preset"] for row in rows)
+    scenes: dict[str, dict[str, dict[str, Any]]] = {}
+    for scene, views in dict.fromkeys((row["scene"], row["views"]) for row in rows):
+        same = [row for row in rows if (row["scene"], row["views"]) == (scene, views)]
+        scenes.setdefault(scene, {})[views] = _by_preset(same, presets)
     report = {
         "title": title,
         "igsr": _core.__version__,
         "protocol": protocol,
-        "mean": {
-            preset: summarized([row for row in rows if row["preset"] == preset])
-            for preset in presets
-        },
-        "scenes": {
-            scene: {
-                preset: summarized(
-                    [row for row in rows if (row["scene"], row["preset"]) == (scene, preset)]
-                )
-                for preset in presets
-            }
-            for scene in scenes
-        },
+        "mean": _by_preset(rows, presets),
+        "scenes": scenes,
         "runs": rows,
     }
     with atomic_write(out / "study.json") as temporary:
@@ -68,6 +58,21 @@ def write_study(
     return report
 
 
+def _by_preset(rows: list[dict[str, Any]], presets: Iterable[str]) -> dict[str, Any]:
+    return {
+        preset: summarized([row for row in rows if row["preset"] == preset]) for preset in presets
+    }
+
+
+def _groups(report: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
+    """Scene, views and the summaries by preset of every kind of fit, in order."""
+    return [
+        (scene, views, presets)
+        for scene, by_views in report["scenes"].items()
+        for views, presets in by_views.items()
+    ]
+
+
 def markdown(report: dict[str, Any]) -> str:
     """The table of a study, mean ± spread over seeds."""
     lines = [
@@ -75,11 +80,10 @@ def markdown(report: dict[str, Any]) -> str:
         "",
         f"igsr {report['igsr']}; {json.dumps(report['protocol'])}",
         "",
-        "| scene | preset | PSNR, dB | SSIM | FLIP | splats | seconds a fit |",
-        "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
+        "| scene | views | preset | PSNR, dB | SSIM | FLIP | splats | seconds a fit |",
+        "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: |",
     ]
-    groups = {**report["scenes"], "mean": report["mean"]}
-    for scene, presets in groups.items():
+    for scene, views, presets in [*_groups(report), ("mean", "all", report["mean"])]:
         for preset, scores in presets.items():
             cells = []
             for score in SCORES:
@@ -88,29 +92,34 @@ def markdown(report: dict[str, Any]) -> str:
                 if spread is not None:
                     cell += f" ± {spread:{FORMATS[score]}}"
                 cells.append(cell)
-            lines.append(f"| {scene} | {preset} | {' | '.join(cells)} |")
+            lines.append(f"| {scene} | {views} | {preset} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def _plot(path: Path, report: dict[str, Any]) -> None:
-    """PSNR of every fit, by scene and preset."""
+    """PSNR of every fit, by scene, views and preset."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(1.5 + 1.8 * len(report["scenes"]), 4.0), layout="constrained")
+    groups = _groups(report)
+    figure = Figure(figsize=(1.5 + 1.3 * len(groups), 4.0), layout="constrained")
     axis = figure.subplots()
     presets = list(report["mean"])
     for k, preset in enumerate(presets):
-        for s, scene in enumerate(report["scenes"]):
-            rows = [r for r in report["runs"] if (r["scene"], r["preset"]) == (scene, preset)]
-            at = s + 0.5 * (k + 0.5) / len(presets) - 0.25
-            axis.plot(
-                [at] * len(rows), [row["psnr"] for row in rows], "o", color=f"C{k}", alpha=0.6
-            )
-            mean = report["scenes"][scene][preset]["psnr"]
-            label = preset if s == 0 else None
+        for g, (scene, views, summaries) in enumerate(groups):
+            psnrs = [
+                row["psnr"]
+                for row in report["runs"]
+                if (row["scene"], row["views"], row["preset"]) == (scene, views, preset)
+            ]
+            at = g + 0.5 * (k + 0.5) / len(presets) - 0.25
+            axis.plot([at] * len(psnrs), psnrs, "o", color=f"C{k}", alpha=0.6)
+            mean = summaries[preset]["psnr"]
+            label = preset if g == 0 else None
             axis.plot(at, mean, "_", markersize=16, markeredgewidth=2, color=f"C{k}", label=label)
-    axis.set_xticks(range(len(report["scenes"])), list(report["scenes"]))
-    axis.set_xlim(-0.5, len(report["scenes"]) - 0.5)
+    axis.set_xticks(
+        range(len(groups)), [f"{scene}\nviews {views}" for scene, views, _ in groups], fontsize=8
+    )
+    axis.set_xlim(-0.5, len(groups) - 0.5)
     axis.set_ylabel("PSNR of held-out views, dB")
     axis.set_title(report["title"], fontsize=10)
     axis.grid(alpha=0.3, axis="y")
