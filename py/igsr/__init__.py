@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from ._core import __version__
 from .capture import Camera, Capture, Points, View, load_capture
+from .compaction import Compaction, compact
 from .errors import IgsrError
 from .evaluation import evaluate
 from .fitting import Progress, fit
@@ -21,6 +22,7 @@ from .splats import Splats
 __all__ = [
     "Camera",
     "Capture",
+    "Compaction",
     "IgsrError",
     "Points",
     "Progress",
@@ -28,6 +30,7 @@ __all__ = [
     "Splats",
     "View",
     "__version__",
+    "compact",
     "evaluate",
     "fit",
     "load_capture",

@@ -1,4 +1,4 @@
-"""The ``igsr`` command: fit, render, eval, info, bench."""
+"""The ``igsr`` command: fit, render, eval, info, compact, study, bench."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from rich.table import Table
 from . import _core
 from .atomic_write import atomic_write, check_writable
 from .capture import Camera, Capture, load_capture
+from .compaction import DEFAULT_STEPS, CompactProgress, compact, write_plot
 from .errors import IgsrError
 from .evaluation import METRICS, ScoredView, default_background, default_split, evaluate
 from .fitting import Progress, fit
@@ -473,6 +474,145 @@ def eval_command(
     console.print(table)
     console.print(_score_line(scores))
     console.print(_protocol_line(scores["protocol"]), style="dim")
+
+
+@app.command("compact")
+def compact_command(
+    scene: SceneArgument,
+    max_loss: Annotated[
+        str, typer.Option("--max-loss", metavar="DB", help="PSNR that may be lost, such as 0.1dB.")
+    ] = "0.1dB",
+    capture_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--capture",
+            metavar="CAPTURE",
+            help="The photos of the scene: refine to them and measure the loss on held-out ones. "
+            "Without it, both by pictures of SCENE from around it.",
+        ),
+    ] = None,
+    holdout: HoldoutOption = None,
+    psnr: Annotated[
+        float | None,
+        typer.Option(
+            "--psnr",
+            help="Without --capture: how good SCENE is, dB, for a change of it to be worth dB. "
+            "Default: what the report.json beside SCENE says, else 30.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="PLY",
+            help="The smaller scene; the curve goes beside it as .json and .png. "
+            "Default: SCENE's name with .compact.ply.",
+        ),
+    ] = None,
+    steps: Annotated[
+        int, typer.Option("--steps", help="Refinement steps of each size that is tried.")
+    ] = DEFAULT_STEPS,
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    background: BackgroundOption = None,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Make SCENE smaller: the fewest splats that lose no more than --max-loss."""
+    with one_sentence(lambda: "Interrupted; nothing is written."):
+        name = _resolved(backend)
+        limit = _decibels("--max-loss", max_loss)
+        target = scene.with_suffix(".compact.ply") if out is None else out
+        if target.suffix.lower() != ".ply":
+            raise IgsrError(f"--out {target} must be a .ply file.")
+        splats = Splats.load(scene)
+        capture = None
+        if capture_path is not None:
+            capture = _load(capture_path, holdout)
+        elif holdout is not None:
+            raise IgsrError("--holdout chooses among photos; give --capture or leave it out.")
+        elif psnr is None:
+            psnr = _reported_psnr(scene.parent / "report.json")
+        curve, plot = target.with_suffix(".json"), target.with_suffix(".png")
+        for path in (target, curve, plot):
+            check_writable(path)
+        with _compact_bar(shown=not as_json) as show:
+            compaction = compact(
+                splats,
+                limit,
+                capture,
+                psnr=psnr,
+                steps=steps,
+                seed=seed,
+                background=_color(background),
+                backend=name,
+                progress=show,
+            )
+        report = {"scene": str(scene), "out": str(target), **compaction.report}
+        report["protocol"]["holdout"] = holdout
+        compaction.splats.save(target)
+        write_report(curve, report)
+        write_plot(plot, report)
+    if as_json:
+        _print_json(report)
+        return
+    whole, result = report["whole"], report["result"]
+    console = _console()
+    console.print(
+        f"{result['splats']} splats of SH degree {result['sh_degree']}, {result['bytes']} bytes; "
+        f"before {whole['splats']}, {whole['sh_degree']}, {whole['bytes']}"
+    )
+    console.print(f"loses {result['loss']:.3f} dB of at most {limit:g}")
+    console.print(
+        f"{report['protocol']['judge_views']} views that were not refined to, against "
+        f"{report['protocol']['against']}",
+        style="dim",
+    )
+    console.print(f"{target}  {curve}  {plot}", style="dim")
+
+
+def _decibels(option: str, text: str) -> float:
+    try:
+        value = float(text.strip().lower().removesuffix("db"))
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 100.0:
+        raise IgsrError(f"{option} must be dB above 0 and below 100 such as 0.1dB, not {text!r}.")
+    return value
+
+
+def _reported_psnr(path: Path) -> float | None:
+    """What the report of a fit says of its scene, or None where there is none to be read."""
+    try:
+        psnr = json.loads(path.read_text(encoding="utf-8"))["psnr"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return psnr if isinstance(psnr, float) and 0.0 < psnr < 100.0 else None
+
+
+@contextlib.contextmanager
+def _compact_bar(shown: bool) -> Iterator[Callable[[CompactProgress], None]]:
+    """A progress bar on stderr for the size that is tried, with its time left."""
+    bar = ProgressBar(
+        TextColumn("size {task.fields[trial]}: {task.fields[what]}"),
+        BarColumn(bar_width=30),
+        TextColumn("step {task.completed}/{task.total}"),
+        TimeRemainingColumn(compact=True),
+        console=Console(file=sys.stderr, highlight=False),
+        disable=not shown,
+    )
+    tasks: dict[int, Any] = {}
+    with _stopped(bar):
+
+        def show(now: CompactProgress) -> None:
+            bar.start()
+            if now.trial not in tasks:
+                what = f"{now.splats} splats, SH {now.sh_degree}"
+                tasks[now.trial] = bar.add_task(
+                    "compact", total=now.steps, trial=now.trial, what=what
+                )
+            bar.update(tasks[now.trial], completed=now.step)
+
+        yield show
 
 
 @app.command("render")

@@ -170,20 +170,35 @@ def fit(
     try:
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError("origin: must be three finite numbers")
-        fitter = _core.Fitter(
-            [np.ascontiguousarray(view.image) for view in views],
-            [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
-            np.stack([viewmat_about(origin, view.camera.viewmat) for view in views]),
-            np.stack([intrinsics_of(view.camera.K) for view in views]),
-            state,
-            settings,
-            info["backend"],
-        )
+        fitter = fitter_of(views, origin, state, settings, info["backend"])
     except ValueError as error:
         if resume:
             raise IgsrError(f"The checkpoint {path} cannot be used: {error}.") from error
         raise IgsrError(f"{error}.") from error
     return _run(fitter, origin, settings, info, seconds_before, progress, path)
+
+
+def fitter_of(
+    views: list[View],
+    origin: npt.NDArray[np.float64],
+    state: dict[str, Any],
+    settings: dict[str, Any],
+    backend: str,
+) -> _core.Fitter:
+    """A fit in progress of ``state``, relative to ``origin``, to the views; see ``_core.Fitter``.
+
+    Raises:
+        ValueError: a view, the state or a setting cannot be used; the message names it.
+    """
+    return _core.Fitter(
+        [np.ascontiguousarray(view.image) for view in views],
+        [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
+        np.stack([viewmat_about(origin, view.camera.viewmat) for view in views]),
+        np.stack([intrinsics_of(view.camera.K) for view in views]),
+        state,
+        settings,
+        backend,
+    )
 
 
 def fingerprint(views: list[View]) -> str:
