@@ -509,8 +509,16 @@ def compact_command(
             "Default: SCENE's name with .compact.ply.",
         ),
     ] = None,
+    sh_degree: Annotated[
+        int | None,
+        typer.Option(
+            "--sh-degree",
+            help="Degree of view-dependent colour of the smaller scene: a higher one needs fewer "
+            "splats, but more bytes for each. Default: SCENE's, or lower where that loses little.",
+        ),
+    ] = None,
     steps: Annotated[
-        int, typer.Option("--steps", help="Refinement steps of each size that is tried.")
+        int, typer.Option("--steps", help="Refinement steps of a model that may be the result.")
     ] = DEFAULT_STEPS,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
     background: BackgroundOption = None,
@@ -541,6 +549,7 @@ def compact_command(
                 limit,
                 capture,
                 psnr=psnr,
+                sh_degree=sh_degree,
                 steps=steps,
                 seed=seed,
                 background=_color(background),

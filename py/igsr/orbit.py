@@ -17,8 +17,6 @@ DEFAULT_SIZE = (800, 600)
 DEFAULT_FOV_DEGREES = 45.0
 #: Elevation above the horizon where no capture says it.
 DEFAULT_ELEVATION_DEGREES = 20.0
-#: Side of the pictures of ``cameras_around``, pixels: what the NeRF benchmarks fit at a time.
-SPHERE_SIDE = 400
 
 
 def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
@@ -64,7 +62,7 @@ def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
     return result
 
 
-def cameras_around(splats: Splats, count: int, side: int = SPHERE_SIDE) -> list[Camera]:
+def cameras_around(splats: Splats, count: int, side: int) -> list[Camera]:
     """``count`` cameras spread evenly on a sphere, looking at the middle of the splats.
 
     Neighbours in the list stand far from each other, so every so many of them are spread as well.

@@ -31,17 +31,18 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
     axes = figure.subplots(1, 2, sharey=True)
     panels = (("splats", 1.0, "splats"), ("bytes", 1e-6, "size of the .ply, MB"))
     for axis, (key, unit, label) in zip(axes, panels, strict=True):
-        rows = sorted(report["curve"], key=lambda row: row[key])
+        settled = sorted((r for r in report["curve"] if r["settled"]), key=lambda row: row[key])
         axis.plot(
-            [row[key] * unit for row in rows],
-            [row["loss"] for row in rows],
+            [row[key] * unit for row in settled],
+            [row["loss"] for row in settled],
             color="#999999",
             linewidth=1,
             zorder=1,
         )
-        for row in rows:
+        for row in report["curve"]:
             color = WITHIN if row["loss"] <= report["max_loss"] else BEYOND
-            axis.plot(row[key] * unit, row["loss"], "o", color=color)
+            face = color if row["settled"] else "none"
+            axis.plot(row[key] * unit, row["loss"], "o", color=color, markerfacecolor=face)
             if row["sh_degree"] != whole["sh_degree"]:
                 axis.annotate(
                     f"SH {row['sh_degree']}",

@@ -19,8 +19,10 @@ from ..splats import Splats
 
 #: Without test views, every how many train views one judges, as in the protocol of LLFF and 3DGS.
 HOLDOUT = 8
-#: Cameras around a model without a capture; every fifth judges.
+#: Cameras around a model without a capture, the side of their pictures in pixels, and every how
+#: many one judges.
 AROUND = 50
+AROUND_SIDE = 400
 AROUND_HOLDOUT = 5
 #: Error assumed of a model whose error nobody knows, dB: a usual fit on views it has not seen.
 DEFAULT_PSNR = 30.0
@@ -135,7 +137,7 @@ def own_yardstick(
         IgsrError: there are no finite splats to look at.
     """
     color = _triple(GREY if background is None else background)
-    cameras = cameras_around(splats, AROUND)
+    cameras = cameras_around(splats, AROUND, AROUND_SIDE)
     refine_views = [
         View(f"around/{i}", camera, "train", _picture_with_alpha(splats, camera, backend))
         for i, camera in enumerate(cameras)
