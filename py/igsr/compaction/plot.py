@@ -22,19 +22,22 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     whole, result = report["whole"], report["result"]
     figure.suptitle(
-        f"{whole['splats']} to {result['splats']} splats for {result['loss']:.2f} dB "
-        f"(at most {report['max_loss']:g} dB), against {report['protocol']['against']}, "
-        f"{report['protocol']['judge_views']} views",
+        f"{whole['splats']} splats, SH {whole['sh_degree']}, to {result['splats']}, "
+        f"SH {result['sh_degree']}: {result['loss']:.2f} dB lost, against "
+        f"{report['protocol']['against']}, {report['protocol']['judge_views']} views",
         fontsize=10,
         wrap=True,
     )
     axes = figure.subplots(1, 2, sharey=True)
     panels = (("splats", 1.0, "splats"), ("bytes", 1e-6, "size of the .ply, MB"))
     for axis, (key, unit, label) in zip(axes, panels, strict=True):
-        settled = sorted((r for r in report["curve"] if r["settled"]), key=lambda row: row[key])
+        best: dict[int, dict[str, Any]] = {}
+        for row in sorted(report["curve"], key=lambda row: row["loss"]):
+            best.setdefault(row[key], row)
+        sizes = sorted(best)
         axis.plot(
-            [row[key] * unit for row in settled],
-            [row["loss"] for row in settled],
+            [size * unit for size in sizes],
+            [best[size]["loss"] for size in sizes],
             color="#999999",
             linewidth=1,
             zorder=1,
@@ -43,7 +46,7 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
             color = WITHIN if row["loss"] <= report["max_loss"] else BEYOND
             face = color if row["settled"] else "none"
             axis.plot(row[key] * unit, row["loss"], "o", color=color, markerfacecolor=face)
-            if row["sh_degree"] != whole["sh_degree"]:
+            if row["sh_degree"] != result["sh_degree"]:
                 axis.annotate(
                     f"SH {row['sh_degree']}",
                     (row[key] * unit, row["loss"]),
@@ -61,7 +64,11 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
             markeredgewidth=2,
             label="result",
         )
-        axis.axhline(report["max_loss"], color=BEYOND, linestyle="--", linewidth=1, label="limit")
+        axis.plot([], [], "o", color=WITHIN, label="refined to the end")
+        axis.plot([], [], "o", color=WITHIN, markerfacecolor="none", label="after a round")
+        axis.axhline(
+            report["max_loss"], color=BEYOND, linestyle="--", linewidth=1, label="--max-loss"
+        )
         axis.set_xscale("log")
         axis.set_xlabel(label)
         axis.grid(alpha=0.3, which="both")
