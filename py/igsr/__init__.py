@@ -11,9 +11,11 @@ from __future__ import annotations
 
 from ._core import __version__
 from .capture import Camera, Capture, Points, View, load_capture
+from .compaction import Compaction, compact
 from .errors import IgsrError
 from .evaluation import evaluate
-from .fitting import Progress, fit
+from .fitting import Progress, fit, fit_with_cameras
+from .poses import refine_cameras
 from .rasterization import rasterization
 from .rendering import Render, render
 from .splats import Splats
@@ -21,6 +23,7 @@ from .splats import Splats
 __all__ = [
     "Camera",
     "Capture",
+    "Compaction",
     "IgsrError",
     "Points",
     "Progress",
@@ -28,9 +31,12 @@ __all__ = [
     "Splats",
     "View",
     "__version__",
+    "compact",
     "evaluate",
     "fit",
+    "fit_with_cameras",
     "load_capture",
     "rasterization",
+    "refine_cameras",
     "render",
 ]

@@ -1,9 +1,10 @@
-"""The ``igsr`` command: fit, render, eval, info, bench."""
+"""The ``igsr`` command: fit, render, eval, info, compact, study, bench."""
 
 from __future__ import annotations
 
 import contextlib
 import enum
+import inspect
 import json
 import math
 import os
@@ -24,14 +25,16 @@ from rich.table import Table
 from . import _core
 from .atomic_write import atomic_write, check_writable
 from .capture import Camera, Capture, load_capture
+from .compaction import DEFAULT_STEPS, CompactProgress, compact, write_plot
 from .errors import IgsrError
 from .evaluation import METRICS, ScoredView, default_background, default_split, evaluate
-from .fitting import Progress, fit
+from .fitting import Progress, fit_with_cameras
 from .initialization import chosen_start
 from .orbit import orbit
+from .poses import refine_cameras
 from .presets import preset_settings
 from .rendering import render
-from .report import sheet_names, write_contact_sheet, write_report
+from .report import sheet_names, write_cameras, write_contact_sheet, write_report
 from .splats import Splats
 
 app = typer.Typer(
@@ -81,11 +84,27 @@ class StartChoice(str, enum.Enum):
     random = "random"
 
 
+class PosesChoice(str, enum.Enum):
+    """Whether cameras are fitted with the splats."""
+
+    fixed = "fixed"
+    joint = "joint"
+
+
+class FocalChoice(str, enum.Enum):
+    """Which focal lengths are fitted."""
+
+    fixed = "fixed"
+    shared = "shared"
+    per_camera = "per-camera"
+
+
 class StudyChoice(str, enum.Enum):
     """Protocols of ``igsr study``."""
 
     blender8 = "blender8"
     few_photos = "few-photos"
+    pose_noise = "pose-noise"
 
 
 class WorkloadChoice(str, enum.Enum):
@@ -271,6 +290,17 @@ def fit_command(
         StartChoice | None,
         typer.Option("--start", help="What the first splats are made from."),
     ] = None,
+    poses: Annotated[
+        PosesChoice | None,
+        typer.Option(
+            "--poses",
+            help="joint: the photos' cameras are fitted too and written to cameras.json.",
+        ),
+    ] = None,
+    focal: Annotated[
+        FocalChoice | None,
+        typer.Option("--focal", help="Focal lengths that are fitted: one factor for all, or each."),
+    ] = None,
     background: BackgroundOption = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")
@@ -304,6 +334,8 @@ def fit_command(
             dropout=dropout,
             hull=hull,
             start=None if start is None else start.value,
+            poses=None if poses is None else poses.value,
+            focal=None if focal is None else focal.value,
         )
         with _fit_bar(settings["steps"], shown=not as_json) as show, _warnings_as_sentences():
 
@@ -311,7 +343,7 @@ def fit_command(
                 last[:] = [now]
                 show(now)
 
-            splats = fit(
+            splats, fitted = fit_with_cameras(
                 capture,
                 progress=progress,
                 backend=name,
@@ -323,10 +355,12 @@ def fit_command(
             )
         splats.save(out / "scene.ply")
         info = _core.backend_info(name)
-        scores, sheet = _scored(
-            splats, capture, default_split(capture), color, name, shown=not as_json
-        )
+        split = default_split(fitted)
+        scores, sheet = _scored(splats, fitted, split, color, name, shown=not as_json)
         scores["protocol"]["holdout"] = holdout
+        moved = fitted is not capture
+        if moved:
+            write_cameras(out / "cameras.json", fitted.train_views)
         report = {
             **{metric: scores[metric] for metric in METRICS},
             "splats": len(splats),
@@ -341,6 +375,9 @@ def fit_command(
             "protocol": scores["protocol"],
             "views": scores["views"],
         }
+        if moved and split == "test":
+            # Photos that were not fitted have the cameras they were given; these are their best.
+            report["refined"] = _refined_scores(splats, fitted, color, name, shown=not as_json)
         write_contact_sheet(out / "views.png", sheet)
         write_report(out / "report.json", report)
     if as_json:
@@ -352,8 +389,41 @@ def fit_command(
         f"({info['instruction_set']}), seed {seed}"
     )
     console.print(_score_line(report))
+    if "refined" in report:
+        console.print(f"with refined cameras: {_score_line(report['refined'])}")
     console.print(_protocol_line(report["protocol"]), style="dim")
     console.print(f"{out / 'scene.ply'}  {out / 'report.json'}  {out / 'views.png'}", style="dim")
+
+
+def _refined_scores(
+    splats: Splats,
+    capture: Capture,
+    background: tuple[float, float, float],
+    backend: str,
+    shown: bool,
+) -> dict[str, Any]:
+    """Scores of the test views, each with its camera fitted to its photo."""
+    bar = ProgressBar(
+        TextColumn("refine cameras {task.completed}/{task.total}"),
+        BarColumn(bar_width=30),
+        TimeRemainingColumn(compact=True),
+        console=Console(file=sys.stderr, highlight=False),
+        disable=not shown,
+        transient=True,
+    )
+    task = bar.add_task("refine")
+    with _stopped(bar):
+
+        def progress(done: int, total: int) -> None:
+            bar.start()
+            bar.update(task, completed=done, total=total)
+
+        views = refine_cameras(
+            splats, capture.test_views, background, backend=backend, progress=progress
+        )
+    refined = Capture(capture.path, views, capture.points)
+    scores, _ = _scored(splats, refined, "test", background, backend, shown)
+    return {metric: scores[metric] for metric in METRICS}
 
 
 def _checkpoint_seconds(out: Path) -> float:
@@ -474,6 +544,154 @@ def eval_command(
     console.print(table)
     console.print(_score_line(scores))
     console.print(_protocol_line(scores["protocol"]), style="dim")
+
+
+@app.command("compact")
+def compact_command(
+    scene: SceneArgument,
+    max_loss: Annotated[
+        str, typer.Option("--max-loss", metavar="DB", help="PSNR that may be lost, such as 0.1dB.")
+    ] = "0.1dB",
+    capture_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--capture",
+            metavar="CAPTURE",
+            help="The photos of the scene: refine to them and measure the loss on held-out ones. "
+            "Without it, both by pictures of SCENE from around it.",
+        ),
+    ] = None,
+    holdout: HoldoutOption = None,
+    psnr: Annotated[
+        float | None,
+        typer.Option(
+            "--psnr",
+            help="Without --capture: how good SCENE is, dB, for a change of it to be worth dB. "
+            "Default: what the report.json beside SCENE says, else 30.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="PLY",
+            help="The smaller scene; the curve goes beside it as .json and .png. "
+            "Default: SCENE's name with .compact.ply.",
+        ),
+    ] = None,
+    sh_degree: Annotated[
+        int | None,
+        typer.Option(
+            "--sh-degree",
+            help="Degree of view-dependent colour of the smaller scene: a higher one needs fewer "
+            "splats, but more bytes for each. Default: SCENE's, or lower where that loses little.",
+        ),
+    ] = None,
+    steps: Annotated[
+        int, typer.Option("--steps", help="Refinement steps of a model that may be the result.")
+    ] = DEFAULT_STEPS,
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    background: BackgroundOption = None,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Make SCENE smaller: the fewest splats that lose no more than --max-loss."""
+    with one_sentence(lambda: "Interrupted; nothing is written."):
+        name = _resolved(backend)
+        limit = _decibels("--max-loss", max_loss)
+        target = scene.with_suffix(".compact.ply") if out is None else out
+        if target.suffix.lower() != ".ply":
+            raise IgsrError(f"--out {target} must be a .ply file.")
+        splats = Splats.load(scene)
+        capture = None
+        if capture_path is not None:
+            capture = _load(capture_path, holdout)
+        elif holdout is not None:
+            raise IgsrError("--holdout chooses among photos; give --capture or leave it out.")
+        elif psnr is None:
+            psnr = _reported_psnr(scene.parent / "report.json")
+        curve, plot = target.with_suffix(".json"), target.with_suffix(".png")
+        for path in (target, curve, plot):
+            check_writable(path)
+        with _compact_bar(shown=not as_json) as show:
+            compaction = compact(
+                splats,
+                limit,
+                capture,
+                psnr=psnr,
+                sh_degree=sh_degree,
+                steps=steps,
+                seed=seed,
+                background=_color(background),
+                backend=name,
+                progress=show,
+            )
+        report = {"scene": str(scene), "out": str(target), **compaction.report}
+        report["protocol"]["holdout"] = holdout
+        compaction.splats.save(target)
+        write_report(curve, report)
+        write_plot(plot, report)
+    if as_json:
+        _print_json(report)
+        return
+    whole, result = report["whole"], report["result"]
+    console = _console()
+    console.print(
+        f"{result['splats']} splats of SH degree {result['sh_degree']}, {result['bytes']} bytes; "
+        f"before {whole['splats']}, {whole['sh_degree']}, {whole['bytes']}"
+    )
+    console.print(f"loses {result['loss']:.3f} dB of at most {limit:g}")
+    console.print(
+        f"{report['protocol']['judge_views']} views that were not refined to, against "
+        f"{report['protocol']['against']}",
+        style="dim",
+    )
+    console.print(f"{target}  {curve}  {plot}", style="dim")
+
+
+def _decibels(option: str, text: str) -> float:
+    try:
+        value = float(text.strip().lower().removesuffix("db"))
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 100.0:
+        raise IgsrError(f"{option} must be dB above 0 and below 100 such as 0.1dB, not {text!r}.")
+    return value
+
+
+def _reported_psnr(path: Path) -> float | None:
+    """What the report of a fit says of its scene, or None where there is none to be read."""
+    try:
+        psnr = json.loads(path.read_text(encoding="utf-8"))["psnr"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return psnr if isinstance(psnr, float) and 0.0 < psnr < 100.0 else None
+
+
+@contextlib.contextmanager
+def _compact_bar(shown: bool) -> Iterator[Callable[[CompactProgress], None]]:
+    """A progress bar on stderr for the size that is tried, with its time left."""
+    bar = ProgressBar(
+        TextColumn("size {task.fields[trial]}: {task.fields[what]}"),
+        BarColumn(bar_width=30),
+        TextColumn("step {task.completed}/{task.total}"),
+        TimeRemainingColumn(compact=True),
+        console=Console(file=sys.stderr, highlight=False),
+        disable=not shown,
+    )
+    tasks: dict[int, Any] = {}
+    with _stopped(bar):
+
+        def show(now: CompactProgress) -> None:
+            bar.start()
+            if now.trial not in tasks:
+                what = f"{now.splats} splats, SH {now.sh_degree}"
+                tasks[now.trial] = bar.add_task(
+                    "compact", total=now.steps, trial=now.trial, what=what
+                )
+            bar.update(tasks[now.trial], completed=now.step)
+
+        yield show
 
 
 @app.command("render")
@@ -604,7 +822,8 @@ def study_command(
         StudyChoice,
         typer.Argument(
             help="blender8: NeRF Synthetic from eight photos. few-photos: real captures from 3, 6 "
-            "and 9 photos, or 3, 6 and 12 of the tankard."
+            "and 9 photos, or 3, 6 and 12 of the tankard. pose-noise: 20 views of NeRF Synthetic "
+            "with noise on their poses, which are kept or fitted."
         ),
     ],
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder that holds the scenes.")],
@@ -631,6 +850,16 @@ def study_command(
         list[PresetChoice] | None,
         typer.Option("--preset", help="Repeat it for several. Default: all."),
     ] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            "--noise", help="pose-noise: standard deviation of camera-to-world's numbers. [0.01]"
+        ),
+    ] = None,
+    raw_affine: Annotated[
+        bool,
+        typer.Option("--raw-affine", help="pose-noise: also keep the shear that noise brings."),
+    ] = False,
     seeds: Annotated[int, typer.Option("--seeds", help="Fits of each kind.")] = 3,
     jobs: Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")] = 1,
     backend: BackendOption = BackendChoice.auto,
@@ -652,22 +881,37 @@ def study_command(
         def on_run(done: int, total: int, row: dict[str, Any]) -> None:
             first[:] = first or [done - 1]
             left = (time.monotonic() - started) / (done - first[0]) * (total - done)
+            if protocol is StudyChoice.pose_noise:
+                kind = f"{row['noise']}, poses {row['poses']}"
+                psnr = row["refined"]["psnr"]
+            else:
+                kind, psnr = f"views {row['views']} {row['preset']}", row["psnr"]
             console.print(
-                f"{done} of {total}: {row['scene']} views {row['views']} {row['preset']} "
-                f"seed {row['seed']}: "
-                f"{row['psnr']:.2f} dB in {row['seconds']:.0f} s; about {left / 60.0:.0f} min left"
+                f"{done} of {total}: {row['scene']} {kind} seed {row['seed']}: "
+                f"{psnr:.2f} dB in {row['seconds']:.0f} s; about {left / 60.0:.0f} min left"
             )
 
-        run = study.blender8 if protocol is StudyChoice.blender8 else study.few_photos
-        named: dict[str, Any] = {
-            "scenes": scenes,
-            "views": views,
-            "presets": presets and [choice.value for choice in presets],
+        run: Callable[..., dict[str, Any]] = {
+            StudyChoice.blender8: study.blender8,
+            StudyChoice.few_photos: study.few_photos,
+            StudyChoice.pose_noise: study.pose_noise,
+        }[protocol]
+        given: dict[str, Any] = {
+            "scenes": scenes and tuple(scenes),
+            "views": views and tuple(views),
+            "presets": presets and tuple(choice.value for choice in presets),
+            "noise": noise,
+            "raw_affine": raw_affine or None,
         }
+        given = {name: value for name, value in given.items() if value is not None}
+        foreign = [name for name in given if name not in inspect.signature(run).parameters]
+        if foreign:
+            option = foreign[0].rstrip("s").replace("_", "-").replace("view", "views")
+            raise IgsrError(f"--{option} says nothing to {protocol.value}; leave it out.")
         report = run(
             data,
             out,
-            **{name: tuple(given) for name, given in named.items() if given},
+            **given,
             seeds=seeds,
             backend=_resolved(backend),
             jobs=jobs,

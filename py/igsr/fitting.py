@@ -20,11 +20,10 @@ from .atomic_write import check_writable
 from .capture import Capture, View
 from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
+from .fitter import fitted_cameras, fitter_of
 from .initialization import STARTS, initial_splats
 from .photo_checks import check_photos
-from .poses import fitted_cameras
 from .presets import preset_settings
-from .rendering import intrinsics_of, viewmat_about
 from .splats import MAX_SH_DEGREE, Splats
 
 #: A killed run loses at most this much work.
@@ -232,15 +231,7 @@ def fit_with_cameras(
     try:
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError("origin: must be three finite numbers")
-        fitter = _core.Fitter(
-            [np.ascontiguousarray(view.image) for view in views],
-            [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
-            np.stack([viewmat_about(origin, view.camera.viewmat) for view in views]),
-            np.stack([intrinsics_of(view.camera.K) for view in views]),
-            state,
-            settings,
-            info["backend"],
-        )
+        fitter = fitter_of(views, origin, state, settings, info["backend"])
     except ValueError as error:
         if resume:
             raise IgsrError(f"The checkpoint {path} cannot be used: {error}.") from error
@@ -249,7 +240,7 @@ def fit_with_cameras(
     splats = Splats(**fitter.splats(), origin=origin)
     if settings["poses"] == settings["focal"] == "fixed":
         return splats, capture
-    cameras = iter(fitted_cameras(views, fitter.cameras(), origin))
+    cameras = iter(fitted_cameras(views, fitter, origin))
     moved = [
         replace(view, camera=next(cameras)) if view.split == "train" else view
         for view in capture.views

@@ -1,4 +1,4 @@
-"""Cameras on a circle around a scene, for turntable videos."""
+"""Cameras around a scene: on a circle for turntable videos, or on a sphere for all its sides."""
 
 from __future__ import annotations
 
@@ -32,22 +32,13 @@ def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
     if frames < 1:
         raise IgsrError(f"orbit must have at least 1 frame, not {frames}.")
     if capture is None:
-        finite = splats.finite
-        if not finite.any():
-            raise IgsrError("The scene has no finite splats to orbit around.")
-        points = splats.means[finite].astype(np.float64) + splats.origin
-        logits = splats.opacities[finite]
-        solid = points[logits >= np.median(logits)]
-        target = np.median(solid, axis=0)
+        target, distance = _framed(splats)
         up = np.array([0.0, 0.0, 1.0])
         start = np.array([0.0, -1.0, 0.0])
-        reach = np.quantile(np.linalg.norm(solid - target, axis=1), 0.9)
-        distance = max(float(reach), 1e-6) / np.tan(np.radians(DEFAULT_FOV_DEGREES / 2)) * 1.2
         elevation = np.radians(DEFAULT_ELEVATION_DEGREES)
         radius, height = distance * np.cos(elevation), distance * np.sin(elevation)
         columns, rows = DEFAULT_SIZE
-        focal = rows / 2 / np.tan(np.radians(DEFAULT_FOV_DEGREES / 2))
-        K = np.array([[focal, 0.0, columns / 2], [0.0, focal, rows / 2], [0.0, 0.0, 1.0]])
+        K = _default_lens(columns, rows)
     else:
         cameras = [view.camera for view in capture.views]
         centres = np.stack([camera.centre for camera in cameras])
@@ -69,6 +60,49 @@ def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
         viewmat = look_at(target + ring + height * up, target, up)
         result.append(Camera(viewmat, K, columns, rows))
     return result
+
+
+def cameras_around(splats: Splats, count: int, side: int) -> list[Camera]:
+    """``count`` cameras spread evenly on a sphere, looking at the middle of the splats.
+
+    Neighbours in the list stand far from each other, so every so many of them are spread as well.
+    Pictures are ``side`` pixels wide and high.
+
+    Raises:
+        IgsrError: there are no finite splats to look at.
+    """
+    target, distance = _framed(splats)
+    # A Fibonacci lattice: equal areas by height, the golden angle apart.
+    heights = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    angles = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    flat = np.sqrt(1.0 - heights**2)
+    directions = np.stack([flat * np.cos(angles), flat * np.sin(angles), heights], axis=1)
+    # No direction of the lattice is vertical, so z is never along the view.
+    up = np.array([0.0, 0.0, 1.0])
+    K = _default_lens(side, side)
+    return [
+        Camera(look_at(target + distance * direction, target, up), K, side, side)
+        for direction in directions
+    ]
+
+
+def _framed(splats: Splats) -> tuple[Vector, float]:
+    """The middle of the splats and how far away a camera of the default lens frames them."""
+    finite = splats.finite
+    if not finite.any():
+        raise IgsrError("The scene has no finite splats to look at.")
+    points = splats.means[finite].astype(np.float64) + splats.origin
+    logits = splats.opacities[finite]
+    solid = points[logits >= np.median(logits)]
+    target = np.median(solid, axis=0)
+    reach = np.quantile(np.linalg.norm(solid - target, axis=1), 0.9)
+    distance = max(float(reach), 1e-6) / np.tan(np.radians(DEFAULT_FOV_DEGREES / 2)) * 1.2
+    return target, float(distance)
+
+
+def _default_lens(columns: int, rows: int) -> npt.NDArray[np.float64]:
+    focal = rows / 2 / np.tan(np.radians(DEFAULT_FOV_DEGREES / 2))
+    return np.array([[focal, 0.0, columns / 2], [0.0, focal, rows / 2], [0.0, 0.0, 1.0]])
 
 
 def look_at(position: Vector, target: Vector, up: Vector) -> Vector:

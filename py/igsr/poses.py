@@ -18,9 +18,8 @@ import numpy.typing as npt
 
 from . import _core
 from .capture import Camera, View
-from .capture.types import intrinsic_matrix
 from .errors import IgsrError
-from .rendering import intrinsics_of, viewmat_about
+from .fitter import fitted_cameras, fitter_of
 from .splats import Splats
 
 Float64 = npt.NDArray[np.float64]
@@ -117,28 +116,6 @@ def _angle(rotation: Float64) -> float:
     return float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(rotation) - 1.0))))
 
 
-def fitted_cameras(
-    views: Sequence[View], arrays: dict[str, npt.NDArray[np.float64]], origin: Float64
-) -> list[Camera]:
-    """The views' cameras with poses and focal lengths as a fitter has them.
-
-    Args:
-        views: V views.
-        arrays: ``_core.Fitter.cameras()``.
-        origin: [3] of the splats, which the fitter's poses are relative to.
-    """
-    return [
-        replace(
-            view.camera,
-            viewmat=viewmat_about(-origin, viewmat),
-            K=intrinsic_matrix(*(float(value) for value in intrinsics)),
-        )
-        for view, viewmat, intrinsics in zip(
-            views, arrays["camera_viewmats"], arrays["camera_intrinsics"], strict=True
-        )
-    ]
-
-
 def refine_cameras(
     splats: Splats,
     views: Sequence[View],
@@ -182,20 +159,12 @@ def refine_cameras(
         "camera_warm_up": 0.0,
     }
     try:
-        fitter = _core.Fitter(
-            [np.ascontiguousarray(view.image) for view in views],
-            [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
-            np.stack([viewmat_about(splats.origin, view.camera.viewmat) for view in views]),
-            np.stack([intrinsics_of(view.camera.K) for view in views]),
-            state,
-            settings,
-            _core.resolve_backend(backend),
-        )
+        fitter = fitter_of(views, splats.origin, state, settings, _core.resolve_backend(backend))
         for done in range(len(views), total + 1, len(views)):
             fitter.step(len(views))
             if progress is not None:
                 progress(done, total)
     except ValueError as error:
         raise IgsrError(f"{error}.") from error
-    cameras = fitted_cameras(views, fitter.cameras(), splats.origin)
+    cameras = fitted_cameras(views, fitter, splats.origin)
     return [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]

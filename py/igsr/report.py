@@ -1,4 +1,4 @@
-"""What a fit leaves beside its splats: ``report.json`` and the contact sheet ``views.png``."""
+"""What a fit leaves beside its splats: ``report.json``, ``cameras.json``, ``views.png``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from .atomic_write import atomic_write
+from .capture import View
 from .evaluation import ScoredView
 
 #: Views on a contact sheet: enough to judge a scene, few enough to look at.
@@ -35,6 +36,35 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
     text = json.dumps(report, indent=2, allow_nan=False) + "\n"
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_cameras(path: Path, views: Sequence[View]) -> None:
+    """Write the cameras of photos as nerfstudio's ``transforms.json`` has them.
+
+    One frame per photo: ``file_path`` (its name in the capture), ``w``, ``h``, ``fl_x``, ``fl_y``,
+    ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes.
+
+    Raises:
+        IgsrError: the file cannot be written.
+    """
+    frames = []
+    for view in views:
+        camera = view.camera
+        to_world = np.linalg.inv(camera.viewmat)
+        to_world[:3, 1:3] *= -1.0
+        frames.append(
+            {
+                "file_path": view.name,
+                "w": camera.width,
+                "h": camera.height,
+                "fl_x": float(camera.K[0, 0]),
+                "fl_y": float(camera.K[1, 1]),
+                "cx": float(camera.K[0, 2]),
+                "cy": float(camera.K[1, 2]),
+                "transform_matrix": to_world.tolist(),
+            }
+        )
+    write_report(path, {"camera_model": "PINHOLE", "frames": frames})
 
 
 def sheet_names(names: Sequence[str]) -> set[str]:

@@ -1,7 +1,7 @@
 """Cameras made wrong on purpose: what fixed and joint poses make of them.
 
-Twenty train views of a NeRF-Synthetic scene get noise on their poses and are fitted with poses fixed
-and joint, beside a fit with the true ones. Held-out views are scored in the three ways of
+Twenty train views of a NeRF-Synthetic scene get noise on their poses and are fitted with poses
+fixed and joint, beside a fit with the true ones. Held-out views are scored in the three ways of
 ``igsr.poses``, never mixed.
 """
 
@@ -107,9 +107,7 @@ def _rotation(axis: Float64) -> Float64:
     angle = float(np.linalg.norm(axis))
     x, y, z = axis / angle if angle > 0.0 else axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation: Float64 = (
-        np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    )
+    rotation: Float64 = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
     return rotation
 
 

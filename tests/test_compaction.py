@@ -1,0 +1,353 @@
+"""``igsr compact``: what splats contribute, the search for the smallest model, the command."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+import igsr
+from igsr import cli, metrics
+from igsr.compaction import contribution, yardstick
+from igsr.compaction.yardstick import loss_of_change, own_yardstick, photo_yardstick
+
+
+def wall(count=2000, seed=0):
+    """A flat wall of one colour, as a fit leaves it: many small splats, nothing to see on it."""
+    random = np.random.default_rng(seed)
+    columns = round(math.sqrt(count * 1.25))
+    grid = np.indices((columns, -(-count // columns))).reshape(2, -1).T[:count]
+    means = np.zeros((count, 3))
+    means[:, :2] = 2.0 * grid / columns - 1.0
+    means += random.normal(scale=[0.01, 0.01, 0.001], size=means.shape)
+    return igsr.Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.tile(np.log([0.04, 0.04, 0.002]).astype(np.float32), (count, 1)),
+        opacities=np.full(count, 3.0, np.float32),
+        sh=np.full((count, 1, 3), 0.7, np.float32),
+    )
+
+
+def beads(colors, opacities, depths):
+    """Round splats one behind the other on the axis of ``ring_camera(0)``, seen in that order."""
+    count = len(depths)
+    sh = (np.asarray(colors, np.float32)[:, None] - 0.5) / np.float32(0.28209479177387814)
+    return igsr.Splats(
+        means=np.array([[0, 0, depth] for depth in depths], np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), math.log(0.3), np.float32),
+        opacities=np.asarray(opacities, np.float32),
+        sh=np.ascontiguousarray(sh),
+    )
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    """Without a capture: fewer and smaller pictures than users get, for the time it takes."""
+    monkeypatch.setattr(yardstick, "AROUND", 15)
+    monkeypatch.setattr(yardstick, "AROUND_SIDE", 56)
+
+
+@pytest.fixture(scope="module")
+def photos():
+    """A capture of a scene, and a model of it: of wrong colours, with 120 faint splats too many."""
+    scene = scenes.splats(count=40, degree=1)
+    wrong = np.random.default_rng(7).normal(scale=0.1, size=scene.sh.shape).astype(np.float32)
+    off = replace(scene, sh=scene.sh + wrong)
+    rest = [scenes.splats(count=40, degree=1, seed=seed) for seed in (1, 2, 3)]
+    for useless in rest:
+        useless.opacities[:] = -5.0
+    model = igsr.Splats(
+        *(
+            np.concatenate([getattr(part, name) for part in (off, *rest)])
+            for name in ("means", "quats", "scales", "opacities", "sh")
+        )
+    )
+    return scenes.capture(views=8, size=40, alpha=True, scene=scene), model
+
+
+# ---- contribution ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_weights_add_up_to_the_opacity_of_the_pictures(backend):
+    splats = scenes.splats(count=30)
+    cameras = [scenes.ring_camera(angle) for angle in (0.0, 1.0, 2.5)]
+    weight = contribution(splats, cameras, backend=backend).weight
+    alpha = sum(igsr.render(splats, camera, backend=backend).alpha.sum() for camera in cameras)
+    assert weight.shape == (30,)
+    assert weight.sum() == pytest.approx(alpha, rel=1e-4)
+
+
+def test_change_is_the_derivative_of_the_picture():
+    splats = scenes.splats(count=6, degree=0)
+    camera = scenes.ring_camera(0.4, size=32)
+    seeds = range(200)
+    estimate = np.mean(
+        [contribution(splats, [camera], seed, "reference").change ** 2 for seed in seeds], axis=0
+    )
+    backgrounds = [np.random.default_rng([seed, 0xC047]).uniform(size=3) for seed in seeds]
+    for i in range(6):
+        opacity = 1.0 / (1.0 + math.exp(-splats.opacities[i]))
+        renders = []
+        for step in (0.01, -0.01):
+            moved = replace(splats, opacities=splats.opacities.copy())
+            moved.opacities[i] += step
+            renders.append(igsr.render(moved, camera, backend="reference"))
+        # d logit = d opacity / (opacity (1 - opacity)); to be multiplied with the opacity.
+        per_logit = 0.02 * (1.0 - opacity)
+        color = (renders[0].color - renders[1].color).astype(np.float64) / per_logit
+        open_share = (renders[0].transmittance - renders[1].transmittance)[..., None] / per_logit
+        truth = np.mean([np.square(color + open_share * behind).sum() for behind in backgrounds])
+        assert estimate[i] == pytest.approx(truth, rel=0.25)
+
+
+def test_what_is_hidden_or_before_its_own_colour_is_not_important():
+    red, green = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1)
+    camera = [scenes.ring_camera(0.0)]
+    before_own = contribution(beads([red, red], [3, 6], [-0.5, 0.5]), camera, backend="cpu")
+    before_other = contribution(beads([red, green], [3, 6], [-0.5, 0.5]), camera, backend="cpu")
+    assert before_own.importance[0] < 0.5 * before_other.importance[0]
+    assert before_own.weight[0] == pytest.approx(before_other.weight[0])
+    many = beads([red, red, red, green], [8, 8, 8, 8], [-0.6, -0.5, -0.4, 0.6])
+    hidden = contribution(many, camera, backend="cpu").importance
+    assert hidden[3] < 0.05 * hidden[0]
+
+
+# ---- what is judged by -------------------------------------------------------------------------
+
+
+def test_loss_of_a_change():
+    assert loss_of_change(30.0, 30.0) == pytest.approx(10.0 * math.log10(2.0))
+    assert loss_of_change(46.3, 30.0) == pytest.approx(0.1, abs=0.002)
+    assert loss_of_change(100.0, 30.0) < 1e-5
+
+
+def test_no_view_is_refined_to_and_judges(photos):
+    capture, model = photos
+    without_tests = igsr.Capture(
+        capture.path, [replace(view, split="train") for view in capture.views]
+    )
+    for measure, judges in (
+        (photo_yardstick(model, capture, None, "cpu"), 2),
+        (photo_yardstick(model, without_tests, None, "cpu"), 1),
+        (own_yardstick(model, None, None, "cpu"), 3),
+    ):
+        refine = {view.camera.viewmat.tobytes() for view in measure.refine_views}
+        judge = {view.camera.viewmat.tobytes() for view in measure.judge_views}
+        assert len(judge) == judges == measure.protocol["judge_views"]
+        assert len(refine) == measure.protocol["refine_views"]
+        assert not refine & judge
+
+
+def test_cameras_around_see_the_scene_from_all_sides():
+    splats = scenes.splats(count=60, origin=(100.0, -20.0, 5.0))
+    cameras = [view.camera for view in own_yardstick(splats, None, None, "cpu").refine_views]
+    directions = np.array([camera.centre for camera in cameras]) - [100.0, -20.0, 5.0]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert np.linalg.norm(directions.mean(axis=0)) < 0.25
+    for camera in cameras:
+        alpha = igsr.render(splats, camera, backend="cpu").alpha
+        assert 0.05 < alpha.mean() < 0.9
+
+
+# ---- the search --------------------------------------------------------------------------------
+
+
+def test_a_wall_of_one_colour_does_not_cost_a_thousand_splats():
+    whole = wall()
+    compaction = igsr.compact(whole, 0.1, steps=160, backend="cpu")
+    assert len(compaction.splats) < 400
+    assert compaction.report["whole"]["splats"] == 2000
+    assert compaction.report["result"]["splats"] == len(compaction.splats)
+    # Seen from a place that no camera of the search stands at.
+    camera = scenes.ring_camera(0.3, size=56, distance=3.0)
+    grey = (0.5, 0.5, 0.5)
+    change = metrics.psnr(
+        *(
+            igsr.render(splats, camera, grey, "cpu").to_uint8()
+            for splats in (compaction.splats, whole)
+        )
+    )
+    assert loss_of_change(change, 30.0) < 0.3
+
+
+def test_photos_measure_the_loss(photos):
+    capture, model = photos
+    compaction = igsr.compact(model, 0.1, capture, steps=40, backend="cpu")
+    report = compaction.report
+    assert len(compaction.splats) <= 60
+    before, after = (
+        igsr.evaluate(splats, capture, "test", backend="cpu")["psnr"]
+        for splats in (model, compaction.splats)
+    )
+    assert report["result"]["loss"] == pytest.approx(before - after, abs=1e-6)
+    assert report["result"]["loss"] <= 0.1
+    assert report["protocol"]["model_psnr"] == pytest.approx(before)
+    assert report["curve"][0] == report["whole"]
+    assert report["whole"]["loss"] == 0.0
+    assert report["result"] in report["curve"]
+    sizes = [row["splats"] for row in report["curve"] if row["sh_degree"] == 1]
+    assert min(sizes) < len(compaction.splats)  # smaller ones were tried and lost too much
+
+
+def test_same_seed_same_bits(photos):
+    capture, model = photos
+    first, again, other = (
+        igsr.compact(model, 0.1, capture, steps=100, seed=seed, backend="cpu") for seed in (1, 1, 2)
+    )
+    assert first.splats.means.tobytes() == again.splats.means.tobytes()
+    assert first.splats.sh.tobytes() == again.splats.sh.tobytes()
+    assert first.splats.means.tobytes() != other.splats.means.tobytes()
+
+
+def test_what_nobody_sees_goes_without_harm():
+    """Steps of fitting would only hurt a model that is judged by its own pictures."""
+    seen = scenes.splats(count=30, degree=1)
+    inside = replace(scenes.splats(count=30, degree=1), opacities=np.full(30, -9.0, np.float32))
+    model = igsr.Splats(
+        *(
+            np.concatenate([getattr(part, name) for part in (seen, inside)])
+            for name in ("means", "quats", "scales", "opacities", "sh")
+        )
+    )
+    report = igsr.compact(model, 1e-4, psnr=20.0, steps=4, backend="cpu").report
+    assert report["result"]["splats"] < 45
+    assert report["result"]["loss"] <= 1e-4
+
+
+def test_nothing_smaller_within_the_loss_leaves_the_model(photos):
+    capture, model = photos
+    needed = igsr.Splats(
+        *(getattr(model, name)[:40] for name in ("means", "quats", "scales", "opacities", "sh"))
+    )
+    compaction = igsr.compact(needed, 1e-6, capture, steps=1, backend="cpu")
+    assert compaction.report["result"] == compaction.report["whole"]
+    np.testing.assert_array_equal(compaction.splats.means, needed.means)
+
+
+def test_colours_that_do_not_depend_on_the_view_lose_their_bands():
+    flat = wall(60)
+    bands = np.zeros((60, 9, 3), np.float32)
+    bands[:, :1] = flat.sh
+    view_dependent = replace(flat, sh=bands)
+    lowered = igsr.compact(view_dependent, 0.1, steps=20, backend="cpu")
+    assert lowered.splats.sh_degree == 0
+    kept = igsr.compact(view_dependent, 0.1, sh_degree=3, steps=20, backend="cpu")
+    assert kept.splats.sh_degree == 3 or len(kept.splats) == 60
+
+
+def test_splats_that_are_not_finite_do_not_count():
+    broken = wall(80)
+    broken.means[5] = np.nan
+    compaction = igsr.compact(broken, 0.1, steps=4, backend="cpu")
+    assert compaction.report["whole"]["splats"] == 79
+    assert compaction.splats.finite.all()
+
+
+# ---- bad input ---------------------------------------------------------------------------------
+
+BAD = {
+    "max_loss": [0.0, -1.0, float("nan"), "0.1", True, 200.0],
+    "psnr": [0.0, float("inf"), "30"],
+    "sh_degree": [-1, 5, 1.5],
+    "steps": [0, 2.5, None],
+    "seed": [-1, "a"],
+    "background": [(1, 1), (0, 0, 2), "red"],
+    "backend": ["reference", "tpu"],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [(name, value) for name, values in BAD.items() for value in values]
+)
+def test_bad_arguments_are_named(name, value):
+    with pytest.raises(igsr.IgsrError, match=name):
+        igsr.compact(wall(10), **{"backend": "cpu", name: value})
+
+
+def test_scenes_and_captures_that_cannot_be_used(photos):
+    capture, model = photos
+    empty = wall(3)
+    empty.opacities[:] = np.nan
+    with pytest.raises(igsr.IgsrError, match="no finite splats"):
+        igsr.compact(empty, backend="cpu")
+    lone = igsr.Capture(capture.path, capture.views[:1])
+    with pytest.raises(igsr.IgsrError, match="others to judge by"):
+        igsr.compact(model, 0.1, lone, backend="cpu")
+    with pytest.raises(igsr.IgsrError, match="leave psnr or capture out"):
+        igsr.compact(model, 0.1, capture, psnr=30.0, backend="cpu")
+
+
+# ---- the command -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def igsr_here(capsys):
+    def run(*arguments):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.app([str(argument) for argument in arguments])
+        output = capsys.readouterr()
+        return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
+
+    return run
+
+
+def test_command_writes_scene_curve_and_plot(igsr_here, tmp_path):
+    wall(100).save(tmp_path / "scene.ply")
+    (tmp_path / "report.json").write_text(json.dumps({"psnr": 27.5}))
+    result = igsr_here(
+        "compact", tmp_path / "scene.ply", "--max-loss", "0.2dB", "--steps", 8, "--backend", "cpu",
+        "--json",
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report == json.loads((tmp_path / "scene.compact.json").read_text())
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "report.json",
+        "scene.compact.json",
+        "scene.compact.ply",
+        "scene.compact.png",
+        "scene.ply",
+    ]
+    assert report["max_loss"] == 0.2
+    assert report["protocol"]["model_psnr"] == 27.5
+    smaller = tmp_path / "scene.compact.ply"
+    assert report["result"]["splats"] == len(igsr.Splats.load(smaller))
+    assert report["result"]["bytes"] == smaller.stat().st_size
+    assert {"seed", "backend", "version"} <= set(report)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--max-loss", "lots"], ["--max-loss", "0.1dB", "lots"]),
+        (["--max-loss", "-1dB"], ["--max-loss", "above 0"]),
+        (["--max-loss", "nan"], ["--max-loss"]),
+        (["--out", "smaller.json"], ["--out", ".ply"]),
+        (["--holdout", "8"], ["--holdout", "--capture"]),
+        (["--steps", "0"], ["steps"]),
+        (["--backend", "reference"], ["reference", "cpu"]),
+    ],
+)
+def test_command_refuses_in_one_sentence(igsr_here, tmp_path, options, words):
+    wall(10).save(tmp_path / "scene.ply")
+    result = igsr_here("compact", tmp_path / "scene.ply", *options)
+    assert result.returncode == 1
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    assert all(word in result.stderr for word in words)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_command_without_its_scene(igsr_here, tmp_path):
+    result = igsr_here("compact", tmp_path / "none.ply")
+    assert result.returncode == 1
+    assert "none.ply" in result.stderr
