@@ -27,8 +27,12 @@ def test_default_follows_the_number_of_photos_and_gives_way_to_the_caller():
     assert few["hull"]
     assert many["dropout"] == 0.0
     assert not many["hull"]
+    assert not preset_settings("default", 8, poses="joint")["hull"]
+    assert preset_settings("default", 8, poses="joint", hull=True)["hull"]
+    assert preset_settings("default", 3)["steps"] < few["steps"]
+    assert preset_settings("default", 8)["steps"] == few["steps"]
     assert preset_settings("3dgs", 3) == preset_settings("3dgs", 300)
-    given = preset_settings("default", 3, dropout=0.0, hull=False, steps=None)
+    given = preset_settings("default", 8, dropout=0.0, hull=False, steps=None)
     assert (given["dropout"], given["hull"], given["steps"]) == (0.0, False, few["steps"])
 
 
@@ -41,10 +45,21 @@ def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
     assert {name: settings[name] for name in expected} == expected
 
 
+def test_instantsplat_starts_with_all_its_splats_and_moves_the_cameras(capture):
+    splats, fitted = igsr.fit_with_cameras(
+        capture, preset="instantsplat", steps=60, backend="cpu", max_splats=777
+    )
+    assert len(splats) == 777
+    given, found = (c.train_views[0].camera for c in (capture, fitted))
+    assert not np.array_equal(given.viewmat, found.viewmat)
+    assert given.K[0, 0] != found.K[0, 0]
+    assert len({view.camera.K[0, 0] for view in fitted.train_views}) == 1
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"preset": "best"}, "preset must be one of default, 3dgs"),
+        ({"preset": "best"}, "preset must be one of default, 3dgs, instantsplat"),
         ({"dropout": 0.95}, "dropout must be a number from 0 to 0.9"),
         ({"dropout": float("nan")}, "dropout must be a number from 0 to 0.9"),
         ({"dropout": True}, "dropout must be"),

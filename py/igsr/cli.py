@@ -72,6 +72,7 @@ class PresetChoice(str, enum.Enum):
 
     default = "default"
     baseline_3dgs = "3dgs"
+    instantsplat = "instantsplat"
 
 
 class StartChoice(str, enum.Enum):
@@ -258,7 +259,7 @@ def fit_command(
         typer.Option(
             "--preset",
             help="Settings where none is given below: default (for few photos or for many, by "
-            "their number), 3dgs (a baseline without help for few photos).",
+            "their number), 3dgs and instantsplat (baselines).",
         ),
     ] = PresetChoice.default,
     steps: Annotated[int | None, typer.Option("--steps", help="Optimiser steps.")] = None,
@@ -891,11 +892,12 @@ def study_command(
                 f"{psnr:.2f} dB in {row['seconds']:.0f} s; about {left / 60.0:.0f} min left"
             )
 
-        run: Callable[..., dict[str, Any]] = {
+        studies: dict[StudyChoice, Callable[..., dict[str, Any]]] = {
             StudyChoice.blender8: study.blender8,
             StudyChoice.few_photos: study.few_photos,
             StudyChoice.pose_noise: study.pose_noise,
-        }[protocol]
+        }
+        run = studies[protocol]
         given: dict[str, Any] = {
             "scenes": scenes and tuple(scenes),
             "views": views and tuple(views),
@@ -906,8 +908,10 @@ def study_command(
         given = {name: value for name, value in given.items() if value is not None}
         foreign = [name for name in given if name not in inspect.signature(run).parameters]
         if foreign:
-            option = foreign[0].rstrip("s").replace("_", "-").replace("view", "views")
-            raise IgsrError(f"--{option} says nothing to {protocol.value}; leave it out.")
+            option = {"scenes": "scene", "presets": "preset"}.get(foreign[0], foreign[0])
+            raise IgsrError(
+                f"--{option.replace('_', '-')} says nothing to {protocol.value}; leave it out."
+            )
         report = run(
             data,
             out,

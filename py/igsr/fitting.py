@@ -97,8 +97,8 @@ def fit(
             splats as they are then.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu".
         seed: of everything random.
-        preset: "default" (other settings for up to 20 photos than for more) or "3dgs"; see
-            ``igsr.presets``.
+        preset: "default" (other settings for up to 20 photos than for more), "3dgs" or
+            "instantsplat"; see ``igsr.presets``.
         max_splats: most splats there may be.
         sh_degree: degree of the colours' spherical harmonics, 0-4.
         density: how splats are added and removed: "mcmc" (relocation and growth under the cap,
@@ -222,7 +222,12 @@ def fit_with_cameras(
         _check_same_settings(path, saved, settings)
     else:
         splats = initial_splats(
-            capture, seed, settings["max_splats"], settings["sh_degree"], settings["start"]
+            capture,
+            seed,
+            settings["max_splats"],
+            settings["sh_degree"],
+            settings["start"],
+            dense=settings["density"] == "fixed",
         )
         state = dict(vars(splats))
     origin = state.pop("origin", np.zeros(0))

@@ -20,7 +20,8 @@ from .splats import Splats
 Float64 = npt.NDArray[np.float64]
 Generator = np.random.Generator
 
-#: Splats made up where a capture has no points. Density control adds more where they are needed.
+#: Splats made up where a capture has no points and density control adds more where they are needed.
+#: A fit that adds none starts with as many as it may have.
 MADE_UP_SPLATS = 20_000
 #: Fewer points than this say too little of a scene's surface to start from them alone.
 MIN_POINTS = 100
@@ -62,7 +63,13 @@ def chosen_start(capture: Capture, start: str = "auto") -> str:
 
 
 def initial_splats(
-    capture: Capture, seed: int, max_splats: int, sh_degree: int, start: str = "auto"
+    capture: Capture,
+    seed: int,
+    max_splats: int,
+    sh_degree: int,
+    start: str = "auto",
+    *,
+    dense: bool = False,
 ) -> Splats:
     """Splats to start a fit from; the same arguments give the same splats.
 
@@ -74,6 +81,7 @@ def initial_splats(
         start: "points" (the capture's), "hull" (inside the visual hull of photos with alpha),
             "rays" (where photos agree best along each other's rays), "random" (uniform in the box
             that the cameras look at, with random colours), or "auto", the first that can be.
+        dense: whether points are made up for all of ``max_splats``.
 
     Raises:
         IgsrError: there is no such start, the capture has not what it needs, or no points can be
@@ -83,7 +91,7 @@ def initial_splats(
     try:
         # What overflows is found by the check of the points; numpy's warnings would say less.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            return _placed_splats(capture, seed, max_splats, sh_degree, start)
+            return _placed_splats(capture, seed, max_splats, sh_degree, start, dense)
     except (ValueError, OverflowError) as error:  # numpy's LinAlgError is a ValueError
         raise IgsrError(
             f"{capture.path}: no splats can be placed before its cameras ({error}); check its "
@@ -92,7 +100,7 @@ def initial_splats(
 
 
 def _placed_splats(
-    capture: Capture, seed: int, max_splats: int, sh_degree: int, start: str
+    capture: Capture, seed: int, max_splats: int, sh_degree: int, start: str, dense: bool
 ) -> Splats:
     random = np.random.default_rng([seed, 0x1617])
     points, views = capture.points, capture.train_views
@@ -106,7 +114,8 @@ def _placed_splats(
         count = min(RANDOM_SPLATS, max_splats)
         xyz, colors = random.uniform(low, high, size=(count, 3)), random.uniform(size=(count, 3))
     else:
-        count, target = min(MADE_UP_SPLATS, max_splats), looked_at([view.camera for view in views])
+        count = max_splats if dense else min(MADE_UP_SPLATS, max_splats)
+        target = looked_at([view.camera for view in views])
         if start == "hull":
             xyz, colors = _inside_hull(views, count, random)
         elif can_sweep(views, target):

@@ -9,6 +9,8 @@ from .errors import IgsrError
 
 #: So many photos or fewer leave most of a scene's views unseen: fits to them over-fit without help.
 FEW_PHOTOS = 20
+#: Steps per photo after which fits to few photos gain no more, and later drift.
+STEPS_PER_PHOTO = 500
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,20 @@ _MANY = Preset(
 _FEW = replace(_MANY, steps=4000, sh_degree=1, density="mcmc", dropout=0.3, hull=True)
 #: As Kerbl et al. 2023 fit synthetic scenes, but for our number of steps and splats.
 _3DGS = replace(_MANY, sh_degree=3, start="random")
+#: As InstantSplat (Fan et al. 2024) fits: many splats from dense points, which stay as many, with
+#: cameras and one focal length fitted. Here the points are made up or the capture's, and all have
+#: one rate.
+_INSTANTSPLAT = replace(
+    _MANY,
+    steps=1000,
+    max_splats=60_000,
+    sh_degree=1,
+    density="fixed",
+    poses="joint",
+    focal="shared",
+)
 
-PRESETS = ("default", "3dgs")
+PRESETS = ("default", "3dgs", "instantsplat")
 
 
 def preset_settings(name: str, photos: int, **given: object) -> dict[str, Any]:
@@ -47,7 +61,8 @@ def preset_settings(name: str, photos: int, **given: object) -> dict[str, Any]:
 
     Args:
         name: "default" (measured to be best: one set for up to ``FEW_PHOTOS`` photos, another for
-            more) or "3dgs" (3D Gaussian Splatting without help for few photos, as a baseline).
+            more), or a baseline: "3dgs" (3D Gaussian Splatting without help for few photos) or
+            "instantsplat" (dense start, fixed number, joint poses, shared focal length).
         photos: number of photos to fit.
         **given: what a caller asked for.
 
@@ -56,5 +71,11 @@ def preset_settings(name: str, photos: int, **given: object) -> dict[str, Any]:
     """
     if name not in PRESETS:
         raise IgsrError(f"preset must be one of {', '.join(PRESETS)}, not {name!r}.")
-    preset = _3DGS if name == "3dgs" else _FEW if photos <= FEW_PHOTOS else _MANY
-    return vars(preset) | {key: value for key, value in given.items() if value is not None}
+    few = replace(_FEW, steps=min(_FEW.steps, STEPS_PER_PHOTO * max(1, photos)))
+    default = few if photos <= FEW_PHOTOS else _MANY
+    preset = {"3dgs": _3DGS, "instantsplat": _INSTANTSPLAT}.get(name, default)
+    settings = vars(preset) | {key: value for key, value in given.items() if value is not None}
+    if settings["poses"] == "joint" and given.get("hull") is None:
+        # Silhouettes seen from where cameras are not would take away what is there.
+        settings["hull"] = False
+    return settings

@@ -1,0 +1,373 @@
+"""Cameras that are not exact: alignment, refinement, fitting them with the splats."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from typer.testing import CliRunner
+
+import igsr
+from igsr.capture import Capture
+from igsr.cli import app
+from igsr.evaluation import BLACK
+from igsr.poses import Similarity, pose_errors, refine_cameras, similarity_between
+from igsr.study import pose_noise
+from igsr.study.pose_noise import CLEAN, Noise, PoseFit, compared, noisy_view, run_fit
+from igsr.study.pose_noise import markdown as pose_table
+
+
+def turn(degrees, axis=(0.3, 1.0, -0.2)):
+    x, y, z = np.asarray(axis) / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = np.radians(degrees)
+    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+
+
+def turned(view, degrees, axis=(0.3, 1.0, -0.2)):
+    viewmat = view.camera.viewmat.copy()
+    viewmat[:3] = turn(degrees, axis) @ viewmat[:3]
+    return replace(view, camera=replace(view.camera, viewmat=viewmat))
+
+
+def cameras(made):
+    return [view.camera for view in made.views]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return scenes.splats(count=120)
+
+
+@pytest.fixture(scope="module")
+def made(scene):
+    return scenes.capture(views=12, size=64, scene=scene)
+
+
+def wrong(made, degrees=1.0):
+    """The capture with its train cameras turned, each about another axis."""
+    random = np.random.default_rng(5)
+    views = [
+        turned(view, degrees, random.normal(size=3)) if view.split == "train" else view
+        for view in made.views
+    ]
+    return Capture(made.path, views)
+
+
+def test_a_similarity_is_found_and_leaves_no_error(made):
+    there = Similarity(1.7, turn(40.0), np.array([3.0, -1.0, 0.5]))
+    moved = [there.camera(camera) for camera in cameras(made)]
+    found = similarity_between(cameras(made), moved)
+    assert found.scale == pytest.approx(1.7, rel=1e-12)
+    assert np.allclose(found.rotation, there.rotation, atol=1e-12)
+    assert np.allclose(found.translation, there.translation, atol=1e-12)
+    errors = pose_errors(moved, cameras(made))
+    assert errors["rotation"] < 1e-6
+    assert errors["centre"] < 1e-9
+
+
+def test_pose_errors_are_in_degrees_and_the_true_world(made):
+    there = Similarity(2.0, turn(10.0), np.zeros(3))
+    # Opposite turns cancel in the alignment and stay as errors.
+    both = [
+        turned(view, 1.5 if k % 2 else -1.5, (0.0, 1.0, 0.0)).camera
+        for k, view in enumerate(made.views)
+    ]
+    errors = pose_errors([there.camera(camera) for camera in both], cameras(made))
+    assert errors["rotation"] == pytest.approx(1.5, abs=0.01)
+    assert errors["centre"] < 0.01
+
+
+def test_one_camera_and_cameras_at_one_place_have_no_scale(made):
+    one = made.views[1].camera
+    found = similarity_between([one], [Similarity(1.0, turn(30.0), np.ones(3)).camera(one)])
+    assert found.scale == 1.0
+    assert np.allclose(found.rotation, turn(30.0))
+    assert similarity_between([one, one], [one, one]).scale == 1.0
+    with pytest.raises(igsr.IgsrError, match="1 and 2"):
+        similarity_between([one], [one, one])
+
+
+def test_refining_finds_a_photos_camera_and_leaves_the_splats(made, scene):
+    before = scene.means.copy()
+    start = [turned(view, 1.0) for view in made.test_views]
+    found = refine_cameras(scene, start, BLACK, steps=80, backend="cpu")
+    for view, guess, result in zip(made.test_views, start, found, strict=True):
+        off = np.linalg.norm(guess.camera.viewmat - view.camera.viewmat)
+        left = np.linalg.norm(result.camera.viewmat - view.camera.viewmat)
+        assert left < 0.1 * off, f"{view.name}: {off:.4f} became {left:.4f}"
+        assert np.array_equal(result.camera.K, view.camera.K)
+    assert np.array_equal(scene.means, before)
+    assert refine_cameras(scene, [], BLACK) == []
+    with pytest.raises(igsr.IgsrError, match="steps"):
+        refine_cameras(scene, start, BLACK, steps=0)
+
+
+def test_joint_poses_undo_most_of_what_is_wrong(made):
+    given = wrong(made)
+    options = {"steps": 900, "backend": "cpu", "max_splats": 600, "seed": 3}
+    splats, fitted = igsr.fit_with_cameras(given, poses="joint", **options)
+    train = [view.camera for view in made.train_views]
+    before = pose_errors([view.camera for view in given.train_views], train)
+    after = pose_errors([view.camera for view in fitted.train_views], train)
+    assert after["rotation"] < 0.5 * before["rotation"], (before, after)
+    assert [view.name for view in fitted.views] == [view.name for view in made.views]
+    for view, same in zip(fitted.test_views, made.test_views, strict=True):
+        assert view is same
+    # As a whole they stay where they were given.
+    drift = similarity_between(
+        [view.camera for view in given.train_views], [view.camera for view in fitted.train_views]
+    )
+    assert drift.scale == pytest.approx(1.0, abs=1e-3)
+    assert np.allclose(drift.rotation, np.eye(3), atol=1e-3)
+    fixed = igsr.fit(given, **options)
+    scores = [
+        igsr.evaluate(model, Capture(made.path, views), background=BLACK, backend="cpu")["psnr"]
+        for model, views in [
+            (splats, refine_cameras(splats, made.test_views, BLACK, backend="cpu")),
+            (fixed, refine_cameras(fixed, made.test_views, BLACK, backend="cpu")),
+        ]
+    ]
+    assert scores[0] > scores[1] + 1.0, scores
+
+
+def test_a_shared_focal_length_is_found(made):
+    views = [
+        replace(
+            view,
+            camera=replace(
+                view.camera, K=view.camera.K * [[1.06, 1.0, 1.0], [1.0, 1.06, 1.0], [1, 1, 1]]
+            ),
+        )
+        for view in made.views
+    ]
+    given = Capture(made.path, views)
+    _, fitted = igsr.fit_with_cameras(
+        given, steps=900, backend="cpu", max_splats=600, focal="shared"
+    )
+    focal = [view.camera.K[0, 0] for view in fitted.train_views]
+    assert len(set(focal)) == 1
+    true = made.views[0].camera.K[0, 0]
+    assert abs(focal[0] / true - 1.0) < 0.03, "6 % too long at the start"
+    assert np.array_equal(fitted.train_views[0].camera.viewmat, views[1].camera.viewmat)
+
+
+def test_a_resumed_joint_fit_ends_with_the_same_bits(made, tmp_path):
+    options = {
+        "steps": 300,
+        "backend": "cpu",
+        "max_splats": 300,
+        "poses": "joint",
+        "focal": "per-camera",
+    }
+    whole, cameras_whole = igsr.fit_with_cameras(wrong(made), **options)
+    checkpoint = tmp_path / "checkpoint.npz"
+
+    def stop(now):
+        return now.step < 130
+
+    igsr.fit(wrong(made), checkpoint=checkpoint, progress=stop, **options)
+    part, cameras_part = igsr.fit_with_cameras(
+        wrong(made), checkpoint=checkpoint, resume=True, **options
+    )
+    assert np.array_equal(whole.means, part.means)
+    for a, b in zip(cameras_whole.views, cameras_part.views, strict=True):
+        assert np.array_equal(a.camera.viewmat, b.camera.viewmat)
+        assert np.array_equal(a.camera.K, b.camera.K)
+    with pytest.raises(igsr.IgsrError, match="poses 'joint', not 'fixed'"):
+        igsr.fit(wrong(made), checkpoint=checkpoint, resume=True, **(options | {"poses": "fixed"}))
+
+
+def test_a_damaged_camera_state_is_refused(made, tmp_path):
+    options = {"steps": 40, "backend": "cpu", "max_splats": 300, "poses": "joint"}
+    checkpoint = tmp_path / "checkpoint.npz"
+    igsr.fit(made, checkpoint=checkpoint, **options)
+    with np.load(checkpoint) as archive:
+        good = dict(archive)
+    for name, change in [
+        ("camera_viewmats", lambda a: 2.0 * a),
+        ("camera_first", lambda a: a[:-1]),
+        ("camera_gradients", lambda a: a * np.nan),
+        ("camera_distances", lambda a: -a),
+    ]:
+        np.savez(checkpoint, **good | {name: change(good[name])})
+        with pytest.raises(igsr.IgsrError, match="checkpoint"):
+            igsr.fit(made, checkpoint=checkpoint, resume=True, **options)
+
+
+@pytest.mark.parametrize(("name", "value"), [("poses", "free"), ("focal", "one"), ("poses", 3)])
+def test_unknown_choices_are_named(made, name, value):
+    with pytest.raises(igsr.IgsrError, match=f"{name} must be one of"):
+        igsr.fit(made, steps=1, **{name: value})
+
+
+def test_the_command_writes_cameras_that_load_again(made, tmp_path):
+    scenes.write_capture(tmp_path / "photos", wrong(made))
+    out = tmp_path / "out"
+    arguments = ["fit", str(tmp_path / "photos"), "--out", str(out), "--holdout", "4", "--json"]
+    options = ["--poses", "joint", "--steps", "60", "--max-splats", "300", "--backend", "cpu"]
+    result = CliRunner().invoke(app, arguments + options)
+    assert result.exit_code == 0, result.output
+    report = json.loads((out / "report.json").read_text())
+    assert report["poses"] == "joint"
+    assert report["refined"]["psnr"] >= report["psnr"] - 0.1
+    frames = json.loads((out / "cameras.json").read_text())
+    names = {frame["file_path"] for frame in frames["frames"]}
+    assert len(names) == 9
+    (tmp_path / "photos/transforms.json").write_text(json.dumps(frames))
+    again = igsr.load_capture(tmp_path / "photos")
+    assert {view.name for view in again.views} == names
+    given = {view.name: view.camera for view in wrong(made).views}
+    moved = [np.abs(v.camera.viewmat - given[v.name].viewmat).max() for v in again.views]
+    assert 1e-4 < max(moved) < 0.1
+
+
+def points_seen(camera, points):
+    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    return local @ camera.K.T / local[:, 2:]
+
+
+def test_noise_has_the_size_that_it_says(made):
+    random = np.random.default_rng(0)
+    view = made.views[2]
+    true = view.camera.viewmat
+    noisy = noisy_view(view, Noise("turn", 2.0), random)
+    between = noisy.camera.viewmat[:3, :3] @ true[:3, :3].T
+    angle = np.degrees(np.arccos((np.trace(between) - 1.0) / 2.0))
+    assert angle == pytest.approx(2.0, abs=1e-6)
+    assert np.allclose(noisy.camera.centre, view.camera.centre)
+    moves = [
+        noisy_view(view, Noise("matrix", 0.01), random).camera.centre - view.camera.centre
+        for _ in range(300)
+    ]
+    assert np.std(moves) == pytest.approx(0.01, rel=0.1)
+    assert noisy_view(view, CLEAN, random).camera.viewmat == pytest.approx(true, abs=1e-12)
+
+
+def test_affine_noise_is_the_same_picture_with_a_shear(made):
+    """Points that the noisy affine camera sees are where the sheared rigid one has them."""
+    view = made.views[2]
+    noisy = noisy_view(view, Noise("raw-affine", 0.01), np.random.default_rng(4))
+    affine = np.linalg.inv(view.camera.viewmat)
+    affine[:3, :4] += 0.01 * np.random.default_rng(4).normal(size=(3, 4))
+    points = np.random.default_rng(1).normal(scale=0.3, size=(50, 3))
+    local = np.linalg.inv(affine) @ np.concatenate([points, np.ones((50, 1))], axis=1).T
+    exact = (view.camera.K @ local[:3] / local[2]).T
+    rigid = points_seen(noisy.camera, points)
+    assert np.allclose(exact[:, 1], rigid[:, 1], atol=1e-9)
+    # Rows are moved as a whole, in proportion to their distance from the principal point.
+    slope = np.polyfit(rigid[:, 1], exact[:, 0] - rigid[:, 0], 1)
+    assert np.allclose(np.polyval(slope, rigid[:, 1]), exact[:, 0] - rigid[:, 0], atol=1e-9)
+    assert abs(slope[0]) > 1e-4
+    assert noisy.image.shape == view.image.shape
+    assert not np.array_equal(noisy.image, view.image)
+
+
+def test_the_photo_is_sheared_by_what_the_camera_is_not():
+    from igsr.study.pose_noise import _rows_shifted
+
+    image = np.zeros((3, 6, 4), np.uint8)
+    image[:, 2] = (200, 100, 50, 255)
+    moved = _rows_shifted(image, np.array([0.0, 1.0, -0.5]))
+    assert moved[0, 2].tolist() == [200, 100, 50, 255]
+    assert moved[1, 1].tolist() == [200, 100, 50, 255]
+    # Half covered pixels keep their colour.
+    assert moved[2, 2].tolist() == [200, 100, 50, 128]
+    assert moved[2, 3].tolist() == [200, 100, 50, 128]
+
+
+def stand_in(data, one):
+    level = {"clean": 28.0, "fixed": 18.0, "joint": 27.0}[
+        "clean" if one.noise == CLEAN else one.poses
+    ]
+    scores = {
+        way: {"psnr": level + more, "ssim": 0.9, "flip": 0.1}
+        for way, more in (("raw", -1.0), ("aligned", 0.0), ("refined", 0.5 * one.seed))
+    }
+    return {
+        "scene": one.scene,
+        "noise": str(one.noise),
+        "poses": one.poses,
+        "seed": one.seed,
+        "backend": one.backend,
+        "before": {"rotation": 0.6, "centre": 0.02},
+        "after": {"rotation": 0.1, "centre": 0.005},
+        "splats": 10,
+        "seconds": 1.0,
+        "protocol": {"views": 2},
+        **scores,
+    }
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory, scene):
+    folder = tmp_path_factory.mktemp("noise")
+    full = scenes.capture(views=98, size=16, alpha=True, scene=scenes.splats(count=10))
+    for split, views in (("train", full.views[:96]), ("test", full.views[96:])):
+        scenes.write_capture(folder / "ball", Capture(full.path, views))
+        (folder / "ball/transforms.json").rename(folder / f"ball/transforms_{split}.json")
+    return folder
+
+
+def test_the_study_compares_what_the_protocol_says(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(pose_noise, "run_fit", stand_in)
+    report = pose_noise.pose_noise(
+        data, tmp_path, scenes=("ball",), turns=(2.0,), raw_affine=True, seeds=2
+    )
+    assert [line["noise"] for line in report["summary"][::2]] == [
+        "matrix 0.01",
+        "turn 2°",
+        "raw-affine 0.01",
+    ]
+    line = report["summary"][0]
+    assert line["recovered"] == pytest.approx(0.9)
+    assert line["short_of_clean"] == pytest.approx(1.0)
+    assert line["joint"]["psnr_spread"] == pytest.approx(0.5 / np.sqrt(2.0))
+    assert json.loads((tmp_path / "study.json").read_text()) == report
+    table = (tmp_path / "study.md").read_text()
+    assert table == pose_table(report)
+    assert "| 90 % | 1.00 | 0.600 → 0.100 (6.0 ×) | 0.0200 → 0.0050 (4.0 ×) |" in table
+    assert (tmp_path / "study.png").stat().st_size > 1000
+    assert compared(report["runs"], "turn 2°", "ball") == report["summary"][2]
+
+
+def test_a_real_fit_of_the_study(data, monkeypatch):
+    from igsr import presets
+
+    short = presets.Preset(40, 300, 0, "fixed", 0.2, True, "auto")
+    monkeypatch.setattr(presets, "_FEW", short)
+    row = run_fit(str(data), PoseFit("ball", Noise("turn", 1.0), "joint", 0, "cpu"))
+    assert row["before"]["rotation"] == pytest.approx(1.0, abs=0.2)
+    assert set(row["refined"]) == {"psnr", "ssim", "flip"}
+    assert row["refined"]["psnr"] > 10.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"seeds": 0}, "seeds"),
+        ({"noise": -1.0}, "noise and turns"),
+        ({"turns": (float("nan"),)}, "noise and turns"),
+        ({"scenes": ("nothing",)}, "holds no transforms_train.json"),
+    ],
+)
+def test_what_the_study_cannot_use_is_named(data, tmp_path, options, message):
+    with pytest.raises(igsr.IgsrError, match=message):
+        pose_noise.pose_noise(data, tmp_path, **{"scenes": ("ball",), **options})
+
+
+def test_options_of_other_protocols_are_refused(data, tmp_path):
+    for protocol, option in [
+        ("pose-noise", ["--preset", "3dgs"]),
+        ("pose-noise", ["--views", "75"]),
+        ("blender8", ["--raw-affine"]),
+        ("few-photos", ["--noise", "0.1"]),
+    ]:
+        result = CliRunner().invoke(
+            app, ["study", protocol, str(data), "--out", str(tmp_path), *option]
+        )
+        assert result.exit_code == 1
+        assert f"{option[0]} says nothing to {protocol}" in result.stderr
