@@ -863,6 +863,10 @@ def study_command(
     ] = False,
     seeds: Annotated[int, typer.Option("--seeds", help="Fits of each kind.")] = 3,
     jobs: Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")] = 1,
+    ray: Annotated[
+        bool,
+        typer.Option("--ray", help="Fits go over a Ray cluster (pip install 'igsr[ray]')."),
+    ] = False,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
@@ -920,6 +924,7 @@ def study_command(
             backend=_resolved(backend),
             jobs=jobs,
             on_run=on_run,
+            ray=ray,
         )
     if as_json:
         _print_json(report)

@@ -17,10 +17,11 @@ import numpy.typing as npt
 
 from . import _core
 from .atomic_write import check_writable
-from .capture import Capture, View
+from .capture import Camera, Capture, View
 from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
 from .fitter import fitted_cameras, fitter_of
+from .halved import halved
 from .initialization import STARTS, initial_splats
 from .photo_checks import check_photos
 from .presets import preset_settings
@@ -34,6 +35,12 @@ DENSITIES = ("mcmc", "original", "fixed")
 #: Whether cameras are fitted with the splats, and which of their focal lengths are.
 POSES = ("fixed", "joint")
 FOCALS = ("fixed", "shared", "per-camera")
+#: Cameras are first looked for in photos of half the size, with this part of the steps and splats;
+#: not in photos whose smaller side is then shorter than so many pixels.
+ROUGH_STEPS, ROUGH_SPLATS = 0.375, 0.25
+ROUGH_SIDE = 64
+#: What checkpoints call the cameras that were found so.
+ROUGH = "rough_cameras"
 #: Most of the splats that a step may leave out.
 MAX_DROPOUT = 0.9
 #: How long the Rust side runs before Python may look at Ctrl-C and the progress callback.
@@ -216,24 +223,22 @@ def fit_with_cameras(
     }
 
     seconds_before = 0.0
+    moving = settings["poses"] != "fixed" or settings["focal"] != "fixed"
     if resume and path is not None:
         state, saved = load_checkpoint(path)
         seconds_before = saved.pop("seconds")
         _check_same_settings(path, saved, settings)
     else:
-        splats = initial_splats(
-            capture,
-            seed,
-            settings["max_splats"],
-            settings["sh_degree"],
-            settings["start"],
-            dense=settings["density"] == "fixed",
-        )
-        state = dict(vars(splats))
+        if moving:
+            started = time.perf_counter()
+            capture = _with_rough_cameras(capture, settings, info, progress)
+            seconds_before = time.perf_counter() - started
+        state = _start(capture, settings)
     origin = state.pop("origin", np.zeros(0))
     if path is not None:
         check_writable(path)
     try:
+        views = _moved(capture.train_views, state.pop(ROUGH, None))
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError("origin: must be three finite numbers")
         fitter = fitter_of(views, origin, state, settings, info["backend"])
@@ -241,16 +246,103 @@ def fit_with_cameras(
         if resume:
             raise IgsrError(f"The checkpoint {path} cannot be used: {error}.") from error
         raise IgsrError(f"{error}.") from error
-    _run(fitter, origin, settings, info, seconds_before, progress, path)
+    kept = {"origin": origin}
+    if moving:
+        kept[ROUGH] = np.stack([_numbers(view.camera) for view in views])
+    _run(fitter, kept, settings, info, seconds_before, progress, path)
     splats = Splats(**fitter.splats(), origin=origin)
-    if settings["poses"] == settings["focal"] == "fixed":
+    if not moving:
         return splats, capture
-    cameras = iter(fitted_cameras(views, fitter, origin))
-    moved = [
-        replace(view, camera=next(cameras)) if view.split == "train" else view
+    return splats, _with_train_cameras(capture, fitted_cameras(views, fitter, origin))
+
+
+def _start(capture: Capture, settings: dict[str, Any]) -> dict[str, Any]:
+    """The splats that a fit with these settings starts from, by name of parameter."""
+    splats = initial_splats(
+        capture,
+        settings["seed"],
+        settings["max_splats"],
+        settings["sh_degree"],
+        settings["start"],
+        dense=settings["density"] == "fixed",
+    )
+    return dict(vars(splats))
+
+
+def _with_rough_cameras(
+    capture: Capture,
+    settings: dict[str, Any],
+    info: dict[str, str],
+    progress: Callable[[Progress], bool | None] | None,
+) -> Capture:
+    """The capture with train cameras as a shorter fit to photos of half the size has them.
+
+    Splats that have settled around wrong cameras hold them there: it is better to find the cameras
+    roughly and to start again.
+    """
+    views = [halved(view) for view in capture.train_views]
+    if min(min(view.camera.width, view.camera.height) for view in views) < ROUGH_SIDE:
+        return capture
+    small = Capture(capture.path, views, capture.points)
+    steps = max(1, round(ROUGH_STEPS * settings["steps"]))
+    splats = max(1, round(ROUGH_SPLATS * settings["max_splats"]))
+    rough = {**settings, "steps": steps, "max_splats": splats}
+    state = _start(small, rough)
+    origin = state.pop("origin")
+    try:
+        fitter = fitter_of(views, origin, state, rough, info["backend"])
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
+
+    def waiting(now: Progress) -> bool | None:
+        # The fit itself has not begun; whoever stops it now stops before its first step.
+        return progress and progress(replace(now, step=0, steps=settings["steps"]))
+
+    _run(fitter, {}, rough, info, 0.0, waiting, None)
+    found = fitted_cameras(views, fitter, origin)
+    cameras = []
+    for view, camera in zip(capture.train_views, found, strict=True):
+        K = view.camera.K.copy()
+        K[[0, 1], [0, 1]] = 2.0 * camera.K[[0, 1], [0, 1]]
+        cameras.append(replace(view.camera, viewmat=camera.viewmat, K=K))
+    return _with_train_cameras(capture, cameras)
+
+
+def _with_train_cameras(capture: Capture, cameras: list[Camera]) -> Capture:
+    """The capture with other cameras for its train views, in their order."""
+    each = iter(cameras)
+    views = [
+        replace(view, camera=next(each)) if view.split == "train" else view
         for view in capture.views
     ]
-    return splats, Capture(capture.path, moved, capture.points)
+    return Capture(capture.path, views, capture.points)
+
+
+def _numbers(camera: Camera) -> npt.NDArray[np.float64]:
+    """Pose and focal lengths as one row [14]: viewmat's upper block, fx, fy."""
+    return np.concatenate([camera.viewmat[:3].reshape(-1), camera.K[[0, 1], [0, 1]]])
+
+
+def _moved(views: list[View], rows: npt.NDArray[np.float64] | None) -> list[View]:
+    """The views with cameras of which ``rows`` [V, 14] are the numbers.
+
+    Raises:
+        ValueError: there is not a finite row for each view.
+    """
+    if rows is None:
+        return views
+    if rows.shape != (len(views), 14) or not np.isfinite(rows).all():
+        raise ValueError(f"{ROUGH}: must be 14 finite numbers for each of {len(views)} views")
+    moved = []
+    for view, row in zip(views, rows, strict=True):
+        viewmat, K = np.eye(4), view.camera.K.copy()
+        viewmat[:3] = row[:12].reshape(3, 4)
+        K[[0, 1], [0, 1]] = row[12:]
+        try:
+            moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat, K=K)))
+        except IgsrError as error:
+            raise ValueError(f"{ROUGH}: {error}") from error
+    return moved
 
 
 def fingerprint(views: list[View]) -> str:
@@ -324,14 +416,14 @@ def _check_same_settings(path: Path, saved: dict[str, Any], settings: dict[str, 
 
 def _run(
     fitter: _core.Fitter,
-    origin: npt.NDArray[np.float64],
+    kept: dict[str, npt.NDArray[np.float64]],
     settings: dict[str, Any],
     info: dict[str, str],
     seconds_before: float,
     progress: Callable[[Progress], bool | None] | None,
     path: Path | None,
 ) -> None:
-    """Step in chunks until done or told to stop, saving on the way."""
+    """Step in chunks until done or told to stop, saving on the way, with what is ``kept``."""
     steps = settings["steps"]
     started = time.perf_counter()
     step = saved_step = fitter.steps_done
@@ -341,7 +433,7 @@ def _run(
     def save() -> None:
         if path is not None:
             seconds = seconds_before + time.perf_counter() - started
-            state = {**fitter.state(), "origin": origin}
+            state = {**fitter.state(), **kept}
             save_checkpoint(path, state, {**settings, "seconds": seconds})
 
     try:

@@ -25,7 +25,7 @@ from .splats import Splats
 Float64 = npt.NDArray[np.float64]
 
 #: Steps that refining spends on each camera.
-REFINE_STEPS = 100
+REFINE_STEPS = 30
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from igsr.errors import IgsrError
 # Files written with four or five decimals are this far from a rotation; anything further is not a
 # rounding but a scale, a shear or a wrong field.
 RIGID_TOLERANCE = 1e-3
+# A rotation computed in float64 is this near to an exact one.
+ROUNDING = 1e-13
 
 
 @dataclass(frozen=True, eq=False)  # arrays have no single truth to compare by
@@ -211,9 +213,11 @@ def nearest_rigid(matrix: np.ndarray, name: str) -> np.ndarray:
         )
     if np.linalg.det(block) < 0.0:
         raise IgsrError(f"{name} is a reflection (determinant -1); flip one axis of its rotation")
-    u, _, vt = np.linalg.svd(block)
     rigid = np.eye(4)
-    rigid[:3, :3] = u @ vt
+    rigid[:3, :3] = block
+    if deviation > ROUNDING:  # or a camera made from another's matrix would differ in its last bits
+        u, _, vt = np.linalg.svd(block)
+        rigid[:3, :3] = u @ vt
     rigid[:3, 3] = matrix[:3, 3]
     return rigid
 

@@ -39,6 +39,7 @@ def blender8(
     backend: str = "cpu",
     jobs: int = 1,
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
+    ray: bool = False,
 ) -> dict[str, Any]:
     """Fit every scene from eight photos with every preset and seed, and write what they score.
 
@@ -54,6 +55,7 @@ def blender8(
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own with its share of the cores.
         on_run: called with (done, all, the fit's row) after each fit.
+        ray: fits run over a Ray cluster instead (``pip install 'igsr[ray]'``).
 
     Returns:
         What ``study.json`` holds: "mean" by preset over all fits, each score with its spread (the
@@ -70,7 +72,7 @@ def blender8(
         if not (Path(data) / scene / "transforms_train.json").is_file():
             raise IgsrError(f"{Path(data) / scene} holds no transforms_train.json; name --scene.")
     photos = {(scene, key): len(VIEW_IDS[key]) for scene in scenes for key in views}
-    rows = fitted(data, out, load_views, photos, presets, seeds, backend, jobs, on_run)
+    rows = fitted(data, out, load_views, photos, presets, seeds, backend, jobs, on_run, ray)
     protocol = {
         "name": "blender8",
         "train_views": {key: list(VIEW_IDS[key]) for key in views},

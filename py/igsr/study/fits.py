@@ -77,6 +77,7 @@ def fitted(
     backend: str,
     jobs: int,
     on_run: Callable[[int, int, dict[str, Any]], None] | None,
+    ray: bool,
 ) -> list[dict[str, Any]]:
     """The rows of all fits; seeds go last, so that a study cut short has all its kinds of fits.
 
@@ -88,6 +89,7 @@ def fitted(
         presets, seeds, backend: every preset is fitted with seeds from 0.
         jobs: fits at a time, each in a process of its own.
         on_run: called with (done, all, the fit's row) after each fit.
+        ray: fits run over a Ray cluster instead.
 
     Raises:
         IgsrError: a number is not at least 1, there is no such preset, or a fit fails.
@@ -108,4 +110,5 @@ def fitted(
         )
         for one in fits
     ]
-    return finished_runs(Path(out) / "runs", tasks, partial(run_fit, load), str(data), jobs, on_run)
+    work = partial(run_fit, load)
+    return finished_runs(Path(out) / "runs", tasks, work, str(data), jobs, on_run, ray)

@@ -50,6 +50,7 @@ def few_photos(
     backend: str = "cpu",
     jobs: int = 1,
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
+    ray: bool = False,
 ) -> dict[str, Any]:
     """Fit every scene from few photos with every preset and seed, and write what they score.
 
@@ -67,6 +68,7 @@ def few_photos(
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own with its share of the cores.
         on_run: called with (done, all, the fit's row) after each fit.
+        ray: fits run over a Ray cluster instead (``pip install 'igsr[ray]'``).
 
     Returns:
         What ``study.json`` holds: "mean" by preset over all fits, each score with its spread (the
@@ -92,7 +94,7 @@ def few_photos(
         masked = any(view.mask is not None for view in capture.views)
         splits[scene] = {"split": "DTU" if is_dtu(scene) else "LLFF", "masks": masked}
         splits[scene]["train_views"] = train
-    rows = fitted(data, out, load_views, photos, presets, seeds, backend, jobs, on_run)
+    rows = fitted(data, out, load_views, photos, presets, seeds, backend, jobs, on_run, ray)
     scored = rows[0]["protocol"]
     protocol = {
         "name": "few-photos",

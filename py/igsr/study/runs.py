@@ -25,9 +25,13 @@ class Run:
     settings: dict[str, Any]
 
 
+#: Environment variables that say how many threads to start.
+THREADS = ("RAYON_NUM_THREADS", "OMP_NUM_THREADS")
+
+
 def _share_cores(threads: int) -> None:
     """In a worker, before anything starts threads."""
-    os.environ["RAYON_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = str(threads)
+    os.environ.update(dict.fromkeys(THREADS, str(threads)))
 
 
 def finished_runs(
@@ -37,13 +41,24 @@ def finished_runs(
     data: str,
     jobs: int,
     on_run: Callable[[int, int, dict[str, Any]], None] | None,
+    ray: bool = False,
 ) -> list[dict[str, Any]]:
     """The row of every run, in order: read where its file is there, else done and written.
 
     A file of another version or with other settings (presets change) is done again.
 
+    Args:
+        folder: of the runs' files.
+        runs: what there is to do.
+        work: does one run, given ``data`` and ``Run.what``.
+        data: folder that holds the scenes.
+        jobs: runs at a time on this machine, each in a process of its own with its share of cores.
+        on_run: called with (done, all, the run's row) after each run.
+        ray: run on the Ray cluster that this machine is part of, or on a local one, as many at a
+            time as it has room for; its machines see ``data`` under the same path.
+
     Raises:
-        IgsrError: a run fails, or its file cannot be read or written.
+        IgsrError: a run fails, its file cannot be read or written, or Ray is not installed.
     """
     rows: dict[str, dict[str, Any]] = {}
     missing = []
@@ -64,7 +79,9 @@ def finished_runs(
         if on_run is not None:
             on_run(len(rows), len(runs), row)
 
-    if jobs == 1:
+    if ray and missing:
+        _over_ray(missing, work, data, keep)
+    elif jobs == 1:
         for run in missing:
             keep(run, work(data, run.what))
     elif missing:
@@ -80,6 +97,48 @@ def finished_runs(
                 pool.shutdown(cancel_futures=True)
                 raise
     return [rows[run.name] for run in runs]
+
+
+def _over_ray(
+    runs: list[Run],
+    work: Callable[[str, Any], dict[str, Any]],
+    data: str,
+    keep: Callable[[Run, dict[str, Any]], None],
+) -> None:
+    """The one place that knows Ray: ``keep`` is called with each run as it is done."""
+    try:
+        import ray
+    except ImportError as error:
+        raise IgsrError("--ray needs Ray; install it with: pip install 'igsr[ray]'.") from error
+
+    started = not ray.is_initialized()
+    if started:
+        ray.init(log_to_driver=False)
+
+    # A function: Ray takes no partials. A core each, so that no fit waits for another's threads.
+    @ray.remote(num_cpus=1, runtime_env={"env_vars": dict.fromkeys(THREADS, "1")})
+    def remote(folder: str, what: Any) -> dict[str, Any]:
+        return work(folder, what)
+
+    pending = {remote.remote(data, run.what): run for run in runs}
+    try:
+        while pending:
+            for reference in ray.wait(list(pending))[0]:
+                keep(pending.pop(reference), _result(ray.get, reference))
+    finally:
+        for reference in pending:
+            ray.cancel(reference)
+        if started:
+            ray.shutdown()
+
+
+def _result(get: Callable[[Any], dict[str, Any]], reference: Any) -> dict[str, Any]:
+    """What a remote run returned; its IgsrError as such and not inside Ray's."""
+    try:
+        return get(reference)
+    except Exception as error:
+        cause = getattr(error, "cause", None)
+        raise cause if isinstance(cause, IgsrError) else error from None
 
 
 def _read(path: Path) -> dict[str, Any] | None:

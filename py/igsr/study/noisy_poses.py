@@ -195,6 +195,7 @@ def pose_noise(
     backend: str = "cpu",
     jobs: int = 1,
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
+    ray: bool = False,
 ) -> dict[str, Any]:
     """Fit scenes whose cameras have noise, with poses fixed and joint, and write what they score.
 
@@ -211,6 +212,7 @@ def pose_noise(
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own with its share of the cores.
         on_run: called with (done, all, the fit's row) after each fit.
+        ray: fits run over a Ray cluster instead (``pip install 'igsr[ray]'``).
 
     Returns:
         What ``study.json`` holds: "summary", one row per noise and scene (and "mean" over scenes);
@@ -244,7 +246,7 @@ def pose_noise(
         )
         for one in fits
     ]
-    rows = finished_runs(Path(out) / "runs", tasks, run_fit, str(data), jobs, on_run)
+    rows = finished_runs(Path(out) / "runs", tasks, run_fit, str(data), jobs, on_run, ray)
     report = {
         "title": "NeRF Synthetic, 20 views with noise on their poses",
         "igsr": _core.__version__,
