@@ -181,7 +181,7 @@ def test_a_resumed_joint_fit_ends_with_the_same_bits(made, tmp_path):
     for a, b in zip(cameras_whole.views, cameras_part.views, strict=True):
         assert np.array_equal(a.camera.viewmat, b.camera.viewmat)
         assert np.array_equal(a.camera.K, b.camera.K)
-    with pytest.raises(igsr.IgsrError, match="was made with (hull|poses)"):
+    with pytest.raises(igsr.IgsrError, match=r"was made with (hull|poses)"):
         igsr.fit(wrong(made), checkpoint=checkpoint, resume=True, **(options | {"poses": "fixed"}))
 
 
