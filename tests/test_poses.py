@@ -196,6 +196,8 @@ def test_a_damaged_camera_state_is_refused(made, tmp_path):
         ("camera_first", lambda a: a[:-1]),
         ("camera_gradients", lambda a: a * np.nan),
         ("camera_distances", lambda a: -a),
+        ("rough_cameras", lambda a: a[:, :-1]),
+        ("rough_cameras", lambda a: 2.0 * a),
     ]:
         np.savez(checkpoint, **good | {name: change(good[name])})
         with pytest.raises(igsr.IgsrError, match="checkpoint"):

@@ -312,7 +312,7 @@ def fit_command(
     last: list[Progress] = []
 
     def interrupted() -> str:
-        if not last:
+        if not last or last[-1].step == 0:
             return "Interrupted before the first step."
         return (
             f"Interrupted at step {last[-1].step}; the checkpoint is saved, "

@@ -1,4 +1,4 @@
-"""The renderer's fitter, made from views and read back as cameras."""
+"""The renderer's fitter, made from views and read back as cameras; cameras as plain numbers."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
-from .capture import Camera, View
+from .capture import Camera, Capture, View
 from .capture.types import intrinsic_matrix
+from .errors import IgsrError
 from .rendering import intrinsics_of, viewmat_about
 
 
@@ -59,3 +60,45 @@ def fitted_cameras(
             views, arrays["camera_viewmats"], arrays["camera_intrinsics"], strict=True
         )
     ]
+
+
+def with_train_cameras(capture: Capture, cameras: list[Camera]) -> Capture:
+    """The capture with other cameras for its train views, in their order."""
+    each = iter(cameras)
+    views = [
+        replace(view, camera=next(each)) if view.split == "train" else view
+        for view in capture.views
+    ]
+    return Capture(capture.path, views, capture.points)
+
+
+def camera_rows(views: Sequence[View]) -> npt.NDArray[np.float64]:
+    """Poses and focal lengths [V, 14]: the viewmat's upper block by rows, fx, fy."""
+    return np.stack(
+        [
+            np.concatenate([view.camera.viewmat[:3].reshape(-1), view.camera.K[[0, 1], [0, 1]]])
+            for view in views
+        ]
+    )
+
+
+def with_camera_rows(views: list[View], rows: npt.NDArray[np.float64] | None) -> list[View]:
+    """The views with the cameras of ``camera_rows``; as they are where there are none.
+
+    Raises:
+        ValueError: there is not a finite row for each view.
+    """
+    if rows is None:
+        return views
+    if rows.shape != (len(views), 14) or not np.isfinite(rows).all():
+        raise ValueError(f"cameras: must be 14 finite numbers for each of {len(views)} views")
+    moved = []
+    for view, row in zip(views, rows, strict=True):
+        viewmat, K = np.eye(4), view.camera.K.copy()
+        viewmat[:3] = row[:12].reshape(3, 4)
+        K[[0, 1], [0, 1]] = row[12:]
+        try:
+            moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat, K=K)))
+        except IgsrError as error:
+            raise ValueError(f"cameras: {error}") from error
+    return moved

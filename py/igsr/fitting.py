@@ -17,10 +17,16 @@ import numpy.typing as npt
 
 from . import _core
 from .atomic_write import check_writable
-from .capture import Camera, Capture, View
+from .capture import Capture, View
 from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
-from .fitter import fitted_cameras, fitter_of
+from .fitter import (
+    camera_rows,
+    fitted_cameras,
+    fitter_of,
+    with_camera_rows,
+    with_train_cameras,
+)
 from .halved import halved
 from .initialization import STARTS, initial_splats
 from .photo_checks import check_photos
@@ -224,21 +230,22 @@ def fit_with_cameras(
 
     seconds_before = 0.0
     moving = settings["poses"] != "fixed" or settings["focal"] != "fixed"
+    state: dict[str, Any] | None = None
     if resume and path is not None:
         state, saved = load_checkpoint(path)
         seconds_before = saved.pop("seconds")
         _check_same_settings(path, saved, settings)
-    else:
+    if path is not None:
+        check_writable(path)
+    if state is None:
         if moving:
             started = time.perf_counter()
             capture = _with_rough_cameras(capture, settings, info, progress)
             seconds_before = time.perf_counter() - started
         state = _start(capture, settings)
     origin = state.pop("origin", np.zeros(0))
-    if path is not None:
-        check_writable(path)
     try:
-        views = _moved(capture.train_views, state.pop(ROUGH, None))
+        views = with_camera_rows(capture.train_views, state.pop(ROUGH, None))
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError("origin: must be three finite numbers")
         fitter = fitter_of(views, origin, state, settings, info["backend"])
@@ -248,12 +255,12 @@ def fit_with_cameras(
         raise IgsrError(f"{error}.") from error
     kept = {"origin": origin}
     if moving:
-        kept[ROUGH] = np.stack([_numbers(view.camera) for view in views])
+        kept[ROUGH] = camera_rows(views)
     _run(fitter, kept, settings, info, seconds_before, progress, path)
     splats = Splats(**fitter.splats(), origin=origin)
     if not moving:
         return splats, capture
-    return splats, _with_train_cameras(capture, fitted_cameras(views, fitter, origin))
+    return splats, with_train_cameras(capture, fitted_cameras(views, fitter, origin))
 
 
 def _start(capture: Capture, settings: dict[str, Any]) -> dict[str, Any]:
@@ -305,44 +312,7 @@ def _with_rough_cameras(
         K = view.camera.K.copy()
         K[[0, 1], [0, 1]] = 2.0 * camera.K[[0, 1], [0, 1]]
         cameras.append(replace(view.camera, viewmat=camera.viewmat, K=K))
-    return _with_train_cameras(capture, cameras)
-
-
-def _with_train_cameras(capture: Capture, cameras: list[Camera]) -> Capture:
-    """The capture with other cameras for its train views, in their order."""
-    each = iter(cameras)
-    views = [
-        replace(view, camera=next(each)) if view.split == "train" else view
-        for view in capture.views
-    ]
-    return Capture(capture.path, views, capture.points)
-
-
-def _numbers(camera: Camera) -> npt.NDArray[np.float64]:
-    """Pose and focal lengths as one row [14]: viewmat's upper block, fx, fy."""
-    return np.concatenate([camera.viewmat[:3].reshape(-1), camera.K[[0, 1], [0, 1]]])
-
-
-def _moved(views: list[View], rows: npt.NDArray[np.float64] | None) -> list[View]:
-    """The views with cameras of which ``rows`` [V, 14] are the numbers.
-
-    Raises:
-        ValueError: there is not a finite row for each view.
-    """
-    if rows is None:
-        return views
-    if rows.shape != (len(views), 14) or not np.isfinite(rows).all():
-        raise ValueError(f"{ROUGH}: must be 14 finite numbers for each of {len(views)} views")
-    moved = []
-    for view, row in zip(views, rows, strict=True):
-        viewmat, K = np.eye(4), view.camera.K.copy()
-        viewmat[:3] = row[:12].reshape(3, 4)
-        K[[0, 1], [0, 1]] = row[12:]
-        try:
-            moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat, K=K)))
-        except IgsrError as error:
-            raise ValueError(f"{ROUGH}: {error}") from error
-    return moved
+    return with_train_cameras(capture, cameras)
 
 
 def fingerprint(views: list[View]) -> str:
