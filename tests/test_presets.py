@@ -114,17 +114,19 @@ def test_splats_outside_the_hull_are_removed(capture):
 
 def test_starts(capture):
     assert chosen_start(capture) == "hull"
-    assert chosen_start(scenes.capture(views=4, size=24)) == "rays"
+    assert chosen_start(scenes.capture(views=4, size=24)) == "sift"
+    assert chosen_start(scenes.capture(views=16, size=8)) == "rays"
     for start in ("hull", "rays", "random"):
-        splats = initial_splats(capture, 0, 300, 1, start)
+        splats, made_from = initial_splats(capture, 0, 300, 1, start)
+        assert made_from == start
         assert len(splats) == 300
         assert splats.sh_degree == 1
     with pytest.raises(
         igsr.IgsrError, match=r"^made-up has photos without alpha; start hull needs it in all"
     ):
         initial_splats(scenes.capture(views=4, size=24), 0, 300, 1, "hull")
-    assert outside_hull(initial_splats(capture, 0, 1000, 0, "hull"), capture) == 0
-    assert outside_hull(initial_splats(capture, 0, 1000, 0, "random"), capture) > 150
+    assert outside_hull(initial_splats(capture, 0, 1000, 0, "hull")[0], capture) == 0
+    assert outside_hull(initial_splats(capture, 0, 1000, 0, "random")[0], capture) > 150
 
 
 def test_a_start_prefers_points_that_photos_agree_on(capture):
@@ -143,6 +145,6 @@ def test_a_start_prefers_points_that_photos_agree_on(capture):
     assert np.isinf(values[3])
     for count in (1, 2, 3):
         few = igsr.Capture(capture.path, capture.train_views[:count])
-        splats = initial_splats(few, 0, 300, 0, "hull")
+        splats, _ = initial_splats(few, 0, 300, 0, "hull")
         assert len(splats) == 300
         assert np.isfinite(splats.means).all()

@@ -49,6 +49,7 @@ class Progress:
         steps: steps in all.
         loss: 0.8 L1 + 0.2 D-SSIM of the last step's photo, before that step.
         splats: number of splats now.
+        started: what the first splats were made from ("points", "hull" ...) and their number.
         seconds: time spent fitting, earlier runs that were resumed included.
         steps_per_second: of the last chunk of steps.
         backend: what runs: "backend", "device" and "instruction_set".
@@ -58,6 +59,7 @@ class Progress:
     steps: int
     loss: float
     splats: int
+    started: tuple[str, int]
     seconds: float
     steps_per_second: float
     backend: dict[str, str]
@@ -109,8 +111,8 @@ def fit(
             step to this in the last, while the others' opacities are raised to make up for it
             (DropGaussian, Park et al. 2025); 0 to 0.9. Against over-fitting few photos.
         hull: whether splats are removed whose centre a photo with alpha shows empty.
-        start: what the first splats are made from: "auto", "points", "hull", "rays" or "random";
-            see ``igsr.initialization.initial_splats``.
+        start: what the first splats are made from: "auto", "points", "hull", "sift", "rays" or
+            "random"; see ``igsr.initialization.initial_splats``.
         poses: "fixed", or "joint": each camera is turned and moved with the splats. All together
             stay where the given ones were on the whole: the scene keeps its place and size.
         focal: "fixed", "shared" (one factor to all cameras' focal lengths is fitted) or
@@ -218,10 +220,11 @@ def fit_with_cameras(
     seconds_before = 0.0
     if resume and path is not None:
         state, saved = load_checkpoint(path)
-        seconds_before = saved.pop("seconds")
+        seconds_before = saved["seconds"]
         _check_same_settings(path, saved, settings)
+        settings["started"] = saved["started"]
     else:
-        splats = initial_splats(
+        splats, made_from = initial_splats(
             capture,
             seed,
             settings["max_splats"],
@@ -229,6 +232,7 @@ def fit_with_cameras(
             settings["start"],
             dense=settings["density"] == "fixed",
         )
+        settings["started"] = [made_from, len(splats)]
         state = dict(vars(splats))
     origin = state.pop("origin", np.zeros(0))
     if path is not None:
@@ -362,6 +366,7 @@ def _run(
                     steps=steps,
                     loss=done["loss"],
                     splats=done["splats"],
+                    started=(settings["started"][0], settings["started"][1]),
                     seconds=seconds_before + now - started,
                     steps_per_second=speed,
                     backend=info,
