@@ -12,7 +12,7 @@ import scenes
 from igsr.capture import Capture, View
 from igsr.errors import IgsrError
 from igsr.initialization import SPLATS_PER_FEATURE, chosen_start, initial_splats
-from igsr.sift_points import _tracks, sift_points
+from igsr.sift_points import _features, _matches, _off_epipolar, _tracks, _triangulated, sift_points
 
 SIZE = 120
 NORMAL = np.array([0.4, 0.2, -1.0]) / np.linalg.norm([0.4, 0.2, -1.0])
@@ -102,15 +102,19 @@ def test_hidden_pixels_have_no_points_and_do_not_matter(photos, found):
     np.testing.assert_array_equal(masked, points(1, alpha=True))
 
 
+def turned(view):
+    """The view with its camera a quarter turned about its axis, the photo not."""
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    return replace(view, camera=replace(view.camera, viewmat=turn @ view.camera.viewmat))
+
+
 def nothing(photos):
     grey = [replace(view, image=np.full_like(view.image, 128)) for view in photos]
     hidden = [replace(view, mask=np.zeros((SIZE, SIZE), dtype=bool)) for view in photos]
     other = [photos[0], photo(0.15, seed=1)]
     same_place = [photos[0], photos[0]]
-    turn = np.eye(4)
-    turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
-    turned = replace(photos[2].camera, viewmat=turn @ photos[2].camera.viewmat)
-    wrong_pose = [photos[0], replace(photos[2], camera=turned)]
+    wrong_pose = [photos[0], turned(photos[2])]
     return [grey, hidden, other, same_place, wrong_pose, photos[:1]]
 
 
@@ -120,6 +124,54 @@ def test_photos_that_tell_nothing_have_no_points(photos, case):
     assert xyz.shape == colors.shape
     assert xyz.shape[1] == 3
     assert len(xyz) < 5
+
+
+def test_hidden_holes_are_no_features(photos):
+    """Filled with one grey, holes in a mask look like blobs."""
+    row, column = np.indices((SIZE, SIZE))
+    mask = (row % 24 > 6) | (column % 24 > 6)
+    pixels, descriptors = _features(replace(photos[0], mask=mask))
+    assert len(pixels) == len(descriptors) > 50
+    assert mask[pixels[:, 1].astype(int), pixels[:, 0].astype(int)].all()
+
+
+def projected(photos, xyz):
+    """Pixels [V, P, 2] of points that all photos see."""
+    pixels = []
+    for view in photos:
+        local = xyz @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
+        pixels.append(local[:, :2] / local[:, 2:] * 1.5 * SIZE + SIZE / 2)
+    return np.stack(pixels)
+
+
+def test_matches_off_the_epipolar_line_are_found(photos):
+    a, _, b = projected(photos, np.random.default_rng(0).uniform(-1, 1, (20, 3)))
+    off = _off_epipolar(photos[0], a, photos[2], b)
+    assert off.max() < 1e-6
+    # Cameras side by side: the lines run nearly along the rows.
+    off = _off_epipolar(photos[0], a, photos[2], b + [0.0, 3.0])
+    np.testing.assert_allclose(off, 3.0, atol=0.1)
+    off = _off_epipolar(photos[0], a, photos[2], b + [3.0, 0.0])
+    assert off.max() < 0.6
+    features = [_features(view) for view in photos]
+    right = _matches(photos[0], features[0], photos[2], features[2])
+    wrong = _matches(photos[0], features[0], turned(photos[2]), features[2])
+    assert len(right) > 50 > 4 * len(wrong)
+
+
+def test_only_tracks_that_fit_become_points(photos):
+    xyz = np.random.default_rng(0).uniform(-0.5, 0.5, (5, 3))
+    pixels = projected(photos, xyz)
+    pixels[1, 2] += 6.0
+    views, tracks = np.repeat(np.arange(3), 5), np.tile(np.arange(5), 3)
+    found, colors = _triangulated(photos, views, pixels.reshape(-1, 2), tracks)
+    np.testing.assert_allclose(found, xyz[[0, 1, 3, 4]], atol=1e-9)
+    column, row = pixels[..., 0].astype(int), pixels[..., 1].astype(int)
+    seen = [photos[v].image[row[v, 4], column[v, 4]] / 255.0 for v in range(3)]
+    np.testing.assert_allclose(colors[3], np.mean(seen, axis=0))
+    # Seen from behind, the same rays meet at the back of the cameras.
+    behind = projected(photos, np.array([[0.0, 0.0, -8.0]])).clip(0, SIZE - 1)
+    assert len(_triangulated(photos, np.arange(3), behind[:, 0], np.zeros(3, int))[0]) == 0
 
 
 def test_tracks_join_matches_across_photos():

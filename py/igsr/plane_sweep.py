@@ -18,7 +18,7 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 #: Patches are compared unwarped: photos must look at the scene from within so many degrees.
-MAX_ANGLE = 40.0
+MAX_ANGLE = 30.0
 #: Depths tried per ray, and their range in units of the distance to what the cameras look at.
 DEPTHS = 96
 NEAREST, FARTHEST = 0.25, 8.0

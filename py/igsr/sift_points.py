@@ -56,12 +56,7 @@ def sift_points(views: list[View]) -> tuple[Float64, Float64]:
     pairs = place.reshape(-1)[np.concatenate([np.zeros((0, 2), dtype=np.int64), *matches])]
     track = _tracks(pairs, len(places))
     view_of, pixels = places[:, 0].astype(np.int64), places[:, 1:]
-    matched = np.unique(pairs)
-    # No photo sees a point at two places: such a track has a wrong match in it.
-    seen, times = np.unique(
-        np.column_stack([track[matched], view_of[matched]]), axis=0, return_counts=True
-    )
-    used = matched[~np.isin(track[matched], seen[times > 1, 0])]
+    used = np.unique(pairs)
     return _triangulated(views, view_of[used], pixels[used], track[used])
 
 
@@ -195,9 +190,10 @@ def _triangulated(
     matrix[~sure] = np.eye(3)
     xyz = np.linalg.solve(matrix, right[..., None])[..., 0]
     seen = np.einsum("nij,nj->ni", viewmat[:, :3, :3], xyz[point]) + viewmat[:, :3, 3]
+    # What is behind a photo falls far outside it so.
     z = np.maximum(seen[:, 2:], 1e-9)
     off = np.linalg.norm(seen[:, :2] / z * K[:, [0, 1], [0, 1]] + K[:, :2, 2] - pixels, axis=1)
-    np.logical_and.at(sure, point, (seen[:, 2] > 0.0) & (off < MAX_ERROR))
+    np.logical_and.at(sure, point, off < MAX_ERROR)
     colors = np.zeros((len(names), 3))
     for v, view in enumerate(views):
         column, row = pixels[view_of == v].astype(np.int64).T
