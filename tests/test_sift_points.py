@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import scenes
 
-from igsr.capture import Capture, View
+import igsr.sift_points
+from igsr.capture import Camera, Capture, View
 from igsr.errors import IgsrError
 from igsr.initialization import SPLATS_PER_FEATURE, chosen_start, initial_splats
 from igsr.sift_points import _features, _matches, _off_epipolar, _tracks, _triangulated, sift_points
@@ -124,6 +125,24 @@ def test_photos_that_tell_nothing_have_no_points(photos, case):
     assert xyz.shape == colors.shape
     assert xyz.shape[1] == 3
     assert len(xyz) < 5
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+def test_large_photos_are_reduced(photos, found, monkeypatch, alpha):
+    monkeypatch.setattr(igsr.sift_points, "LONGEST", SIZE)
+    large = []
+    for view in photos:
+        image = view.image.repeat(3, axis=0).repeat(3, axis=1)
+        if alpha:
+            image = np.dstack([image, np.full(image.shape[:2], 255, dtype=np.uint8)])
+        K = view.camera.K * [[3.0], [3.0], [1.0]]
+        camera = Camera(view.camera.viewmat, K, 3 * SIZE, 3 * SIZE)
+        large.append(View(view.name, camera, "train", image))
+    xyz, colors = sift_points(large)
+    np.testing.assert_allclose(xyz, found[0], atol=1e-9)
+    np.testing.assert_allclose(colors, found[1], atol=1e-9)
+    monkeypatch.setattr(igsr.sift_points, "LONGEST", 1)
+    assert len(sift_points(large)[0]) == 0
 
 
 def test_hidden_holes_are_no_features(photos):

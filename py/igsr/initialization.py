@@ -139,16 +139,14 @@ def _placed_splats(
     if start == "points" and points is not None:
         confidence = points.confidence
         xyz, colors = points.xyz, points.rgb.astype(np.float64) / 255.0
-        if len(xyz) > max_splats:
-            chosen = np.sort(random.choice(len(xyz), size=max_splats, replace=False))
-            xyz, colors = xyz[chosen], colors[chosen]
-            confidence = None if confidence is None else confidence[chosen]
+        chosen = _at_most(max_splats, len(xyz), random)
+        xyz, colors = xyz[chosen], colors[chosen]
+        confidence = None if confidence is None else confidence[chosen]
     elif start == "sift" and features is not None:
         made = min(MADE_UP_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
         xyz, colors = _with_between(*features, max_splats if dense else made, random)
-        if len(xyz) > max_splats:
-            chosen = np.sort(random.choice(len(xyz), size=max_splats, replace=False))
-            xyz, colors = xyz[chosen], colors[chosen]
+        chosen = _at_most(max_splats, len(xyz), random)
+        xyz, colors = xyz[chosen], colors[chosen]
     elif start == "random":
         low, high = _looked_at_box([view.camera for view in views])
         count = min(RANDOM_SPLATS, max_splats)
@@ -172,18 +170,27 @@ def _placed_splats(
     return Splats(**arrays, origin=origin), start
 
 
+def _at_most(most: int, count: int, random: Generator) -> npt.NDArray[np.int64]:
+    """Indices of ``most`` of ``count`` points, or of all where they are not more."""
+    if count <= most:
+        return np.arange(count)
+    return np.sort(random.choice(count, size=most, replace=False))
+
+
 def _with_between(
     xyz: Float64, colors: Float64, count: int, random: Generator
 ) -> tuple[Float64, Float64]:
-    """The points, and before ``count`` is reached more between each and its nearest neighbours."""
+    """The points, and as many as ``count`` asks for between them and their nearest neighbours."""
     more = max(0, count - len(xyz))
     points = random.integers(len(xyz), size=more)
-    squares = (xyz**2).sum(axis=1)
+    # From the middle, where products of coordinates are small enough to tell points apart.
+    local = xyz - np.median(xyz, axis=0)
+    squares = (local**2).sum(axis=1)
     others = np.empty(more, dtype=np.int64)
     # In parts, which bounds memory.
     for part in np.array_split(np.arange(more), 1 + more // 1024):
         own = points[part]
-        apart = squares - 2.0 * xyz[own] @ xyz.T
+        apart = squares - 2.0 * local[own] @ local.T
         apart[np.arange(len(own)), own] = np.inf
         near = np.argpartition(apart, FEATURE_NEIGHBOURS, axis=1)[:, :FEATURE_NEIGHBOURS]
         others[part] = near[np.arange(len(own)), random.integers(near.shape[1], size=len(own))]

@@ -12,19 +12,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .capture import View
+from .capture import Camera, View
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Int64 = npt.NDArray[np.int64]
 
+#: Pixels of a photo's longer side, beyond which it is reduced; bounds time.
+LONGEST = 1024
 #: Photos that each is matched with, the nearest: more cost time and look from further apart.
 MATCHED = 8
 #: Largest features used per photo; bounds time and memory.
 FEATURES = 4096
 #: Second-best matches must be less alike than this (Lowe's ratio of distances).
 RATIO = 0.85
-#: Pixels that a feature may be from its point, as seen by its photo.
+#: Pixels, of the reduced photo, that a feature may be from its point.
 MAX_ERROR = 2.0
 #: Degrees that the rays to a point must part by, or its depth is a guess.
 MIN_ANGLE = 2.0
@@ -38,6 +40,7 @@ def sift_points(views: list[View]) -> tuple[Float64, Float64]:
     Args:
         views: the photos; masked and wholly transparent pixels have no features.
     """
+    views = [_reduced(view) for view in views]
     features = [_features(view) for view in views]
     counts = [len(pixels) for pixels, _ in features]
     first = np.cumsum([0, *counts])
@@ -60,12 +63,33 @@ def sift_points(views: list[View]) -> tuple[Float64, Float64]:
     return _triangulated(views, view_of[used], pixels[used], track[used])
 
 
+def _reduced(view: View) -> View:
+    """The view at ``LONGEST`` pixels or less, averaged over squares that are usable as a whole."""
+    camera = view.camera
+    side = -(-max(camera.width, camera.height) // LONGEST)
+    height, width = camera.height // side, camera.width // side
+    if side == 1 or min(height, width) == 0:
+        return view
+
+    def squares(pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return pixels[: height * side, : width * side].reshape(height, side, width, side, -1)
+
+    colors = squares(view.image[..., :3]).mean(axis=(1, 3)).round().astype(np.uint8)
+    usable = np.asarray(squares(_usable(view)).all(axis=(1, 3, 4)))
+    K = camera.K * np.array([[1.0 / side], [1.0 / side], [1.0]])
+    return View(view.name, Camera(camera.viewmat, K, width, height), view.split, colors, usable)
+
+
+def _usable(view: View) -> npt.NDArray[np.bool_]:
+    """Which pixels [H, W] are neither masked nor wholly transparent."""
+    shown = np.ones(view.image.shape[:2], dtype=bool) if view.mask is None else view.mask
+    return shown & (view.image[..., 3] > 0) if view.image.shape[2] == 4 else shown
+
+
 def _features(view: View) -> tuple[Float64, Float32]:
     """Pixel coordinates [N, 2] and descriptors [N, 128] of length 1, the largest first."""
     camera = view.camera
-    usable = np.ones((camera.height, camera.width), dtype=bool) if view.mask is None else view.mask
-    if view.image.shape[2] == 4:
-        usable = usable & (view.image[..., 3] > 0)
+    usable = _usable(view)
     if not usable.any():
         return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
     grey = view.image[..., :3] @ np.array([0.299, 0.587, 0.114])
