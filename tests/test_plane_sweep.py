@@ -72,11 +72,12 @@ def test_masked_pixels_have_no_points_and_do_not_matter():
 
 
 def test_photos_are_swept_that_have_a_near_neighbour():
-    ring = [replace(views(1)[0], camera=scenes.ring_camera(a, SIZE)) for a in (0.0, 0.45, 0.9, 1.5)]
+    ring = [replace(views(1)[0], camera=scenes.ring_camera(a, SIZE)) for a in (0.0, 0.6, 1.2, 2.4)]
     centre = np.zeros(3)
     assert can_sweep(ring[:3], centre)
     assert not can_sweep(ring, centre)
     assert not can_sweep(ring[:1], centre)
+    assert not can_sweep(ring[:3], centre, 30.0)
 
 
 def back_to_back():

@@ -231,6 +231,7 @@ def fit_with_cameras(
             settings["sh_degree"],
             settings["start"],
             dense=settings["density"] == "fixed",
+            exact_poses=settings["poses"] == "fixed",
         )
         settings["started"] = [made_from, len(splats)]
         state = dict(vars(splats))

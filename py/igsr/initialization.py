@@ -43,6 +43,8 @@ UNSURE_SIZE = 1.5
 
 #: Where the splats of a start may come from.
 STARTS = ("auto", "points", "hull", "sift", "rays", "random")
+#: Degrees to the nearest other photo up to which sweeping gives better starts than features do.
+SWEEP_BEFORE_SIFT = 30.0
 #: Fewer triangulated features than this say nothing of a scene's shape.
 MIN_FEATURES = 30
 #: Splats per triangulated feature: itself and points between it and one of its nearest neighbours.
@@ -76,7 +78,8 @@ def chosen_start(capture: Capture, start: str = "auto") -> str:
     if has_points or has_alpha:
         return "points" if has_points else "hull"
     views = capture.train_views
-    return "rays" if can_sweep(views, looked_at([view.camera for view in views])) else "sift"
+    target = looked_at([view.camera for view in views])
+    return "rays" if can_sweep(views, target, SWEEP_BEFORE_SIFT) else "sift"
 
 
 def initial_splats(
@@ -87,6 +90,7 @@ def initial_splats(
     start: str = "auto",
     *,
     dense: bool = False,
+    exact_poses: bool = True,
 ) -> tuple[Splats, str]:
     """Splats to start a fit from, and what they were made from ("points", "hull" ...).
 
@@ -103,11 +107,14 @@ def initial_splats(
             that the cameras look at, with random colours), or "auto": points, else hull, else rays
             where each photo has another from a similar direction, else sift, else rays.
         dense: whether points are made up for all of ``max_splats``.
+        exact_poses: whether "auto" may stand for "sift", which wrong poses mislead.
 
     Raises:
         IgsrError: there is no such start, the capture has not what it needs, or no points can be
             placed: the poses, points or focal lengths are too extreme.
     """
+    if start == "auto" and not exact_poses and chosen_start(capture) == "sift":
+        start = "rays"
     try:
         # What overflows is found by the check of the points; numpy's warnings would say less.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
