@@ -48,7 +48,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     capture = igsr.load_capture(arguments.capture)
-    start = initial_splats(capture, seed=0, max_splats=arguments.splats, sh_degree=1)
+    start, _ = initial_splats(capture, seed=0, max_splats=arguments.splats, sh_degree=1)
     parameters = {name: torch.from_numpy(getattr(start, name)).requires_grad_() for name in RATES}
     optimizer = torch.optim.Adam(
         [{"params": [parameters[name]], "lr": rate} for name, rate in RATES.items()], eps=1e-15

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from capture_files import random_viewmats
 
-from igsr.capture import Camera, Capture, View
+from igsr.capture import Camera, Capture, Points, View
 from igsr.errors import IgsrError
 
 K = np.array([[40.0, 0.0, 23.0], [0.0, 42.0, 17.0], [0.0, 0.0, 1.0]])
@@ -141,3 +141,19 @@ def test_extent_is_that_of_the_training_cameras() -> None:
 
 def test_extent_of_one_spot_does_not_vanish() -> None:
     assert capture(["a", "b"], np.ones((2, 3))).scene_extent == 1.0
+
+
+@pytest.mark.parametrize(
+    ("confidence", "words"),
+    [
+        ([1.0, 2.0], r"shape \[2\]; give \[3\]"),
+        ([[1.0], [2.0], [3.0]], "shape"),
+        ([1.0, 0.0, 2.0], "not positive and finite"),
+        ([1.0, np.nan, 2.0], "not positive and finite"),
+        ([1.0, np.inf, 2.0], "not positive and finite"),
+        (["high", "low", "low"], "not a list of numbers"),
+    ],
+)
+def test_bad_confidences_are_refused(confidence: object, words: str) -> None:
+    with pytest.raises(IgsrError, match=f"^confidence .*{words}"):
+        Points(np.zeros((3, 3)), np.zeros((3, 3), dtype=np.uint8), confidence)  # type: ignore[arg-type]

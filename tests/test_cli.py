@@ -93,6 +93,8 @@ def test_fit_writes_scene_report_views_and_checkpoint(fitted):
     assert report["psnr"] == pytest.approx(np.mean([row["psnr"] for row in report["views"]]))
     assert report["ms_ssim"] is None  # 40 pixels are too small for it
     assert f"PSNR {report['psnr']:.2f} dB" in result.stdout
+    assert (report["start"], report["start_splats"]) == ("hull", 300)
+    assert "start: hull, 300 points" in result.stdout
     assert "over white" in result.stdout
     sheet = Image.open(out / "views.png")
     assert sheet.width > 3 * 40

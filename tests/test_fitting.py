@@ -334,6 +334,10 @@ def test_damaged_checkpoints_are_refused(capture, tmp_path):
         np.savez(bad, **state, settings=np.frombuffer(text, dtype=np.uint8))
         with pytest.raises(igsr.IgsrError, match="seconds"):
             resumed(bad)
+    for started in (None, "rays", ["rays"], ["rays", 1.5], [1, "rays"]):
+        save_checkpoint(bad, state, {**settings, "started": started})
+        with pytest.raises(igsr.IgsrError, match="started"):
+            resumed(bad)
     directory = content.index(b"PK\x01\x02")
     for offset, flipped in (
         (directory + 6, 0xFF),  # version needed to extract

@@ -77,6 +77,7 @@ def test_photos_are_swept_that_have_a_near_neighbour():
     assert can_sweep(ring[:3], centre)
     assert not can_sweep(ring, centre)
     assert not can_sweep(ring[:1], centre)
+    assert not can_sweep(ring[:3], centre, 30.0)
 
 
 def back_to_back():

@@ -114,17 +114,19 @@ def test_splats_outside_the_hull_are_removed(capture):
 
 def test_starts(capture):
     assert chosen_start(capture) == "hull"
-    assert chosen_start(scenes.capture(views=4, size=24)) == "rays"
+    assert chosen_start(scenes.capture(views=4, size=24)) == "sift"
+    assert chosen_start(scenes.capture(views=16, size=8)) == "rays"
     for start in ("hull", "rays", "random"):
-        splats = initial_splats(capture, 0, 300, 1, start)
+        splats, made_from = initial_splats(capture, 0, 300, 1, start)
+        assert made_from == start
         assert len(splats) == 300
         assert splats.sh_degree == 1
     with pytest.raises(
         igsr.IgsrError, match=r"^made-up has photos without alpha; start hull needs it in all"
     ):
         initial_splats(scenes.capture(views=4, size=24), 0, 300, 1, "hull")
-    assert outside_hull(initial_splats(capture, 0, 1000, 0, "hull"), capture) == 0
-    assert outside_hull(initial_splats(capture, 0, 1000, 0, "random"), capture) > 150
+    assert outside_hull(initial_splats(capture, 0, 1000, 0, "hull")[0], capture) == 0
+    assert outside_hull(initial_splats(capture, 0, 1000, 0, "random")[0], capture) > 150
 
 
 def test_a_start_prefers_points_that_photos_agree_on(capture):
@@ -143,6 +145,39 @@ def test_a_start_prefers_points_that_photos_agree_on(capture):
     assert np.isinf(values[3])
     for count in (1, 2, 3):
         few = igsr.Capture(capture.path, capture.train_views[:count])
-        splats = initial_splats(few, 0, 300, 0, "hull")
+        splats, _ = initial_splats(few, 0, 300, 0, "hull")
         assert len(splats) == 300
         assert np.isfinite(splats.means).all()
+
+
+def test_unsure_points_start_faint_and_large(capture):
+    from igsr.initialization import SURE_OPACITY, UNSURE_OPACITY, UNSURE_SIZE
+
+    random = np.random.default_rng(0)
+    xyz, rgb = random.normal(size=(200, 3)), np.full((200, 3), 128, dtype=np.uint8)
+    confidence = np.exp(random.normal(size=200))
+
+    def start(confidence, max_splats=200):
+        points = igsr.Points(xyz, rgb, confidence)
+        return initial_splats(igsr.Capture(capture.path, capture.views, points), 0, max_splats, 0)[
+            0
+        ]
+
+    plain, sure = start(None), start(confidence)
+    order = np.argsort(confidence)
+    opacity = 1.0 / (1.0 + np.exp(-sure.opacities[order]))
+    np.testing.assert_allclose(opacity[[0, -1]], [UNSURE_OPACITY, SURE_OPACITY], rtol=1e-5)
+    assert (np.diff(opacity) > 0).all()
+    larger = np.exp(sure.scales - plain.scales)[order]
+    np.testing.assert_allclose(larger[[0, -1]], [[UNSURE_SIZE] * 3, [1.0] * 3], rtol=1e-5)
+    assert (np.diff(larger[:, 0]) < 0).all()
+    # The unit does not matter, and what is equal everywhere says nothing.
+    assert np.array_equal(start(confidence * 1e9).opacities, sure.opacities)
+    for name in ("opacities", "scales"):
+        assert np.array_equal(getattr(start(np.full(200, 7.0)), name), getattr(plain, name))
+    # Where the cap leaves points out, each keeps its own confidence.
+    half = start(confidence, max_splats=100)
+    places, own = half.means + half.origin, []
+    for place in places:
+        own.append(confidence[np.argmin(np.abs(xyz - place).sum(axis=1))])
+    assert (np.argsort(own) == np.argsort(half.opacities)).all()

@@ -45,7 +45,8 @@ State = dict[str, npt.NDArray[Any]]
 def save_checkpoint(path: Path, state: State, settings: dict[str, Any]) -> None:
     """Write a checkpoint, whole or not at all.
 
-    ``settings`` holds "seconds", the time spent so far, as a float.
+    ``settings`` holds "seconds", the time spent so far, as a float, and "started", what
+    the first splats were made from and their number.
 
     Raises:
         IgsrError: the file cannot be written; an older checkpoint is still there.
@@ -76,6 +77,9 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         seconds = settings.get("seconds")
         if not isinstance(seconds, float) or not math.isfinite(seconds):
             raise ValueError(f"its seconds are {seconds!r} where a finite number belongs")
+        started = settings.get("started")
+        if not isinstance(started, list) or [type(value) for value in started] != [str, int]:
+            raise ValueError(f"its started is {started!r} where a name and a number belong")
     except DAMAGE as error:
         raise IgsrError(
             f"The checkpoint {path} cannot be read ({error}); leave --resume out to start anew."

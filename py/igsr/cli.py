@@ -29,7 +29,6 @@ from .compaction import DEFAULT_STEPS, CompactProgress, compact, write_plot
 from .errors import IgsrError
 from .evaluation import METRICS, ScoredView, default_background, default_split, evaluate
 from .fitting import Progress, fit_with_cameras
-from .initialization import chosen_start
 from .orbit import orbit
 from .poses import refine_cameras
 from .presets import preset_settings
@@ -81,6 +80,7 @@ class StartChoice(str, enum.Enum):
     auto = "auto"
     points = "points"
     hull = "hull"
+    sift = "sift"
     rays = "rays"
     random = "random"
 
@@ -362,13 +362,18 @@ def fit_command(
         moved = fitted is not capture
         if moved:
             write_cameras(out / "cameras.json", fitted.train_views)
+        if last:
+            seconds, started = last[-1].seconds, last[-1].started
+        else:
+            seconds, started = _finished_before(out)
         report = {
             **{metric: scores[metric] for metric in METRICS},
             "splats": len(splats),
             "preset": preset.value,
             **settings,
-            "start": chosen_start(capture, settings["start"]),
-            "seconds": round(last[-1].seconds, 3) if last else _checkpoint_seconds(out),
+            "start": started[0],
+            "start_splats": started[1],
+            "seconds": round(seconds, 3),
             **info,
             "seed": seed,
             "version": _core.__version__,
@@ -389,6 +394,7 @@ def fit_command(
         f"{report['splats']} splats in {report['seconds']:.1f} s on {name} "
         f"({info['instruction_set']}), seed {seed}"
     )
+    console.print(f"start: {report['start']}, {report['start_splats']} points", style="dim")
     console.print(_score_line(report))
     if "refined" in report:
         console.print(f"with refined cameras: {_score_line(report['refined'])}")
@@ -427,12 +433,12 @@ def _refined_scores(
     return {metric: scores[metric] for metric in METRICS}
 
 
-def _checkpoint_seconds(out: Path) -> float:
-    """Fitting time of a resumed run that was already complete."""
+def _finished_before(out: Path) -> tuple[float, tuple[str, int]]:
+    """Seconds of fitting and first splats (see ``Progress``) of a fit that was already complete."""
     from .checkpoint import load_checkpoint
 
     _, settings = load_checkpoint(out / "checkpoint.npz")
-    return round(settings["seconds"], 3)
+    return settings["seconds"], tuple(settings["started"])
 
 
 @contextlib.contextmanager

@@ -62,6 +62,7 @@ class Progress:
         steps: steps in all.
         loss: 0.8 L1 + 0.2 D-SSIM of the last step's photo, before that step.
         splats: number of splats now.
+        started: what the first splats were made from ("points", "hull" ...) and their number.
         seconds: time spent fitting, earlier runs that were resumed included.
         steps_per_second: of the last chunk of steps.
         backend: what runs: "backend", "device" and "instruction_set".
@@ -71,6 +72,7 @@ class Progress:
     steps: int
     loss: float
     splats: int
+    started: tuple[str, int]
     seconds: float
     steps_per_second: float
     backend: dict[str, str]
@@ -122,8 +124,8 @@ def fit(
             step to this in the last, while the others' opacities are raised to make up for it
             (DropGaussian, Park et al. 2025); 0 to 0.9. Against over-fitting few photos.
         hull: whether splats are removed whose centre a photo with alpha shows empty.
-        start: what the first splats are made from: "auto", "points", "hull", "rays" or "random";
-            see ``igsr.initialization.initial_splats``.
+        start: what the first splats are made from: "auto", "points", "hull", "sift", "rays" or
+            "random"; see ``igsr.initialization.initial_splats``.
         poses: "fixed", or "joint": each camera is turned and moved with the splats. All together
             stay where the given ones were on the whole: the scene keeps its place and size.
         focal: "fixed", "shared" (one factor to all cameras' focal lengths is fitted) or
@@ -233,8 +235,9 @@ def fit_with_cameras(
     state: dict[str, Any] | None = None
     if resume and path is not None:
         state, saved = load_checkpoint(path)
-        seconds_before = saved.pop("seconds")
+        seconds_before = saved["seconds"]
         _check_same_settings(path, saved, settings)
+        settings["started"] = saved["started"]
     if path is not None:
         check_writable(path)
     if state is None:
@@ -242,7 +245,7 @@ def fit_with_cameras(
             started = time.perf_counter()
             capture = _with_rough_cameras(capture, settings, info, progress)
             seconds_before = time.perf_counter() - started
-        state = _start(capture, settings)
+        state, settings["started"] = _start(capture, settings)
     origin = state.pop("origin", np.zeros(0))
     try:
         views = with_camera_rows(capture.train_views, state.pop(ROUGH, None))
@@ -263,17 +266,21 @@ def fit_with_cameras(
     return splats, with_train_cameras(capture, fitted_cameras(views, fitter, origin))
 
 
-def _start(capture: Capture, settings: dict[str, Any]) -> dict[str, Any]:
-    """The splats that a fit with these settings starts from, by name of parameter."""
-    splats = initial_splats(
+def _start(capture: Capture, settings: dict[str, Any]) -> tuple[dict[str, Any], list[str | int]]:
+    """The splats that a fit with these settings starts from, by name of parameter.
+
+    And what they were made from, with their number.
+    """
+    splats, made_from = initial_splats(
         capture,
         settings["seed"],
         settings["max_splats"],
         settings["sh_degree"],
         settings["start"],
         dense=settings["density"] == "fixed",
+        exact_poses=settings["poses"] == "fixed",
     )
-    return dict(vars(splats))
+    return dict(vars(splats)), [made_from, len(splats)]
 
 
 def _with_rough_cameras(
@@ -294,7 +301,7 @@ def _with_rough_cameras(
     steps = max(1, round(ROUGH_STEPS * settings["steps"]))
     splats = max(1, round(ROUGH_SPLATS * settings["max_splats"]))
     rough = {**settings, "steps": steps, "max_splats": splats}
-    state = _start(small, rough)
+    state, rough["started"] = _start(small, rough)
     origin = state.pop("origin")
     try:
         fitter = fitter_of(views, origin, state, rough, info["backend"])
@@ -424,6 +431,7 @@ def _run(
                     steps=steps,
                     loss=done["loss"],
                     splats=done["splats"],
+                    started=(settings["started"][0], settings["started"][1]),
                     seconds=seconds_before + now - started,
                     steps_per_second=speed,
                     backend=info,

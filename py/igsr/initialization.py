@@ -1,9 +1,11 @@
 """The splats that a fit starts from.
 
 Where the capture has points (COLMAP), one splat per point. Where it has none, points are made up:
-inside the visual hull where photos have alpha, else along the rays of photo pixels at the depth
-where the other photos agree best: with the pixel's surroundings where photos look from similar
-directions (``plane_sweep``), else with its colour.
+inside the visual hull where photos have alpha, else, where photos look from similar directions,
+along the rays of photo pixels at the depth where the other photos agree best (``plane_sweep``).
+Where photos look from further apart, features that they have in common are triangulated
+(``sift_points``) and points put between them; where there are too few of those, rays are compared
+by the pixels' colours.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from . import _core
 from .capture import Camera, Capture, View
 from .errors import IgsrError
 from .plane_sweep import can_sweep, swept_points
+from .sift_points import sift_points
 from .splats import Splats
 
 Float64 = npt.NDArray[np.float64]
@@ -33,16 +36,29 @@ NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 8.0
 COMPARED_VIEWS = 24
 #: Part of the hull's points that is taken for a start, by how well photos agree on their colours.
 AGREEING = 0.5
-
+#: Opacity of the least and most confident points, where points have a confidence; others have the
+#: former, as in 3DGS. The least confident are larger by this factor.
+UNSURE_OPACITY, SURE_OPACITY = 0.1, 0.5
+UNSURE_SIZE = 1.5
 
 #: Where the splats of a start may come from.
-STARTS = ("auto", "points", "hull", "rays", "random")
+STARTS = ("auto", "points", "hull", "sift", "rays", "random")
+#: Degrees to the nearest other photo up to which sweeping gives better starts than features do.
+SWEEP_BEFORE_SIFT = 30.0
+#: Fewer triangulated features than this say nothing of a scene's shape.
+MIN_FEATURES = 30
+#: Splats per triangulated feature: itself and points between it and one of its nearest neighbours.
+#: Many more of them fit the photos but not the views between.
+SPLATS_PER_FEATURE = 10
+FEATURE_NEIGHBOURS = 5
 #: Splats of a random start (3DGS has 100 000 for many photos; the design's baseline has these).
 RANDOM_SPLATS = 10_000
 
 
 def chosen_start(capture: Capture, start: str = "auto") -> str:
     """What a start is made from: what "auto" stands for with this capture, or ``start`` itself.
+
+    Where "auto" stands for "sift", too few features may still turn it into "rays".
 
     Raises:
         IgsrError: the capture has not what ``start`` asks for, or there is no such start.
@@ -59,7 +75,11 @@ def chosen_start(capture: Capture, start: str = "auto") -> str:
         raise IgsrError(f"{capture.path} has photos without alpha; start hull needs it in all.")
     if start != "auto":
         return start
-    return "points" if has_points else "hull" if has_alpha else "rays"
+    if has_points or has_alpha:
+        return "points" if has_points else "hull"
+    views = capture.train_views
+    target = looked_at([view.camera for view in views])
+    return "rays" if can_sweep(views, target, SWEEP_BEFORE_SIFT) else "sift"
 
 
 def initial_splats(
@@ -70,8 +90,11 @@ def initial_splats(
     start: str = "auto",
     *,
     dense: bool = False,
-) -> Splats:
-    """Splats to start a fit from; the same arguments give the same splats.
+    exact_poses: bool = True,
+) -> tuple[Splats, str]:
+    """Splats to start a fit from, and what they were made from ("points", "hull" ...).
+
+    The same arguments give the same splats.
 
     Args:
         capture: its train views and points are used.
@@ -79,19 +102,25 @@ def initial_splats(
         max_splats: at most so many.
         sh_degree: 0-4; coefficients above degree 0 start at zero.
         start: "points" (the capture's), "hull" (inside the visual hull of photos with alpha),
+            "sift" (features that photos have in common, triangulated, and points between them),
             "rays" (where photos agree best along each other's rays), "random" (uniform in the box
-            that the cameras look at, with random colours), or "auto", the first that can be.
+            that the cameras look at, with random colours), or "auto": points, else hull, else rays
+            where each photo has another from a similar direction, else sift, else rays.
         dense: whether points are made up for all of ``max_splats``.
+        exact_poses: whether "auto" may stand for "sift", which wrong poses mislead.
 
     Raises:
         IgsrError: there is no such start, the capture has not what it needs, or no points can be
             placed: the poses, points or focal lengths are too extreme.
     """
-    start = chosen_start(capture, start)
+    if start == "auto" and not exact_poses and chosen_start(capture) == "sift":
+        start = "rays"
     try:
         # What overflows is found by the check of the points; numpy's warnings would say less.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             return _placed_splats(capture, seed, max_splats, sh_degree, start, dense)
+    except IgsrError:
+        raise
     except (ValueError, OverflowError) as error:  # numpy's LinAlgError is a ValueError
         raise IgsrError(
             f"{capture.path}: no splats can be placed before its cameras ({error}); check its "
@@ -101,14 +130,30 @@ def initial_splats(
 
 def _placed_splats(
     capture: Capture, seed: int, max_splats: int, sh_degree: int, start: str, dense: bool
-) -> Splats:
+) -> tuple[Splats, str]:
+    asked, start = start, chosen_start(capture, start)
     random = np.random.default_rng([seed, 0x1617])
     points, views = capture.points, capture.train_views
+    confidence = None
+    features = sift_points(views) if start == "sift" else None
+    if features is not None and len(features[0]) < MIN_FEATURES:
+        if asked != "auto":
+            raise IgsrError(
+                f"{capture.path}: only {len(features[0])} points could be triangulated from "
+                "features of its photos, too few to start from; use start rays or random."
+            )
+        start = "rays"
     if start == "points" and points is not None:
+        confidence = points.confidence
         xyz, colors = points.xyz, points.rgb.astype(np.float64) / 255.0
-        if len(xyz) > max_splats:
-            chosen = np.sort(random.choice(len(xyz), size=max_splats, replace=False))
-            xyz, colors = xyz[chosen], colors[chosen]
+        chosen = _at_most(max_splats, len(xyz), random)
+        xyz, colors = xyz[chosen], colors[chosen]
+        confidence = None if confidence is None else confidence[chosen]
+    elif start == "sift" and features is not None:
+        made = min(MADE_UP_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
+        xyz, colors = _with_between(*features, max_splats if dense else made, random)
+        chosen = _at_most(max_splats, len(xyz), random)
+        xyz, colors = xyz[chosen], colors[chosen]
     elif start == "random":
         low, high = _looked_at_box([view.camera for view in views])
         count = min(RANDOM_SPLATS, max_splats)
@@ -124,12 +169,59 @@ def _placed_splats(
             xyz, colors = _along_rays(views, count, random)
     # Relative to the middle, so that float32 is precise where the scene is.
     origin = np.median(xyz, axis=0)
-    return Splats(
-        **_core.splats_from_points(
-            (xyz - origin).astype(np.float32), colors.astype(np.float32), sh_degree
-        ),
-        origin=origin,
+    arrays = _core.splats_from_points(
+        (xyz - origin).astype(np.float32), colors.astype(np.float32), sh_degree
     )
+    if confidence is not None:
+        _follow_confidence(arrays, confidence)
+    return Splats(**arrays, origin=origin), start
+
+
+def _at_most(most: int, count: int, random: Generator) -> npt.NDArray[np.int64]:
+    """Indices of ``most`` of ``count`` points, or of all where they are not more."""
+    if count <= most:
+        return np.arange(count)
+    return np.sort(random.choice(count, size=most, replace=False))
+
+
+def _with_between(
+    xyz: Float64, colors: Float64, count: int, random: Generator
+) -> tuple[Float64, Float64]:
+    """The points, and as many as ``count`` asks for between them and their nearest neighbours."""
+    more = max(0, count - len(xyz))
+    points = random.integers(len(xyz), size=more)
+    # From the middle, where products of coordinates are small enough to tell points apart.
+    local = xyz - np.median(xyz, axis=0)
+    squares = (local**2).sum(axis=1)
+    others = np.empty(more, dtype=np.int64)
+    # In parts, which bounds memory.
+    for part in np.array_split(np.arange(more), 1 + more // 1024):
+        own = points[part]
+        apart = squares - 2.0 * local[own] @ local.T
+        apart[np.arange(len(own)), own] = np.inf
+        near = np.argpartition(apart, FEATURE_NEIGHBOURS, axis=1)[:, :FEATURE_NEIGHBOURS]
+        others[part] = near[np.arange(len(own)), random.integers(near.shape[1], size=len(own))]
+    way = random.uniform(size=(more, 1))
+    return (
+        np.concatenate([xyz, xyz[points] + way * (xyz[others] - xyz[points])]),
+        np.concatenate([colors, colors[points] + way * (colors[others] - colors[points])]),
+    )
+
+
+def _follow_confidence(arrays: dict[str, npt.NDArray[np.float32]], confidence: Float64) -> None:
+    """Make unsure points faint and larger, by the order of their confidence [P]; in place.
+
+    The order alone, since networks' confidences have no common unit. Where all are equal, they say
+    nothing.
+    """
+    levels, level = np.unique(confidence, return_inverse=True)
+    if len(levels) < 2:
+        return
+    rank = level / (len(levels) - 1.0)
+    opacity = UNSURE_OPACITY + rank * (SURE_OPACITY - UNSURE_OPACITY)
+    arrays["opacities"] = np.log(opacity / (1.0 - opacity)).astype(np.float32)
+    larger = (1.0 - rank) * np.log(UNSURE_SIZE)
+    arrays["scales"] = (arrays["scales"] + larger[:, None]).astype(np.float32)
 
 
 def looked_at(cameras: list[Camera]) -> Float64:

@@ -36,14 +36,14 @@ NEIGHBOURS = 4
 CHUNK = 1024
 
 
-def can_sweep(views: list[View], target: Float64) -> bool:
-    """Whether every photo has another that sees the target [3] from within ``MAX_ANGLE``."""
+def can_sweep(views: list[View], target: Float64, angle: float = MAX_ANGLE) -> bool:
+    """Whether every photo has another that sees the target [3] from within ``angle`` degrees."""
     rays = np.stack([view.camera.centre - target for view in views])
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
     rays = rays / np.maximum(lengths, np.finfo(np.float64).tiny)
     cosines = rays @ rays.T
     np.fill_diagonal(cosines, -1.0)
-    return bool((cosines.max(axis=1) > np.cos(np.radians(MAX_ANGLE))).all())
+    return bool((cosines.max(axis=1) > np.cos(np.radians(angle))).all())
 
 
 def swept_points(

@@ -107,10 +107,34 @@ class Points:
     Attributes:
         xyz: float64 [P, 3], world units.
         rgb: uint8 [P, 3].
+        confidence: [P], how sure each place is, positive and in any unit: only the order counts.
+            None where nothing is known of it.
+
+    Raises:
+        IgsrError: confidence has another shape or holds what is not a positive finite number.
     """
 
     xyz: np.ndarray
     rgb: np.ndarray
+    confidence: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Check the confidence against the points."""
+        if self.confidence is None:
+            return
+        try:
+            self.confidence = np.asarray(self.confidence, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise IgsrError("confidence is not a list of numbers; give one per point") from error
+        if self.confidence.shape != (len(self.xyz),):
+            raise IgsrError(
+                f"confidence has shape {list(self.confidence.shape)}; give [{len(self.xyz)}], one "
+                "number per point"
+            )
+        if not (np.isfinite(self.confidence) & (self.confidence > 0.0)).all():
+            raise IgsrError(
+                "confidence holds a number that is not positive and finite; remove such points"
+            )
 
 
 @dataclass(eq=False)
