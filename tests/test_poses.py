@@ -87,6 +87,17 @@ def test_one_camera_and_cameras_at_one_place_have_no_scale(made):
     assert found.scale == 1.0
     assert np.allclose(found.rotation, turn(30.0))
     assert similarity_between([one, one], [one, one]).scale == 1.0
+    place, random = np.array([1.3, 2.7, -0.4]), np.random.default_rng(2)
+    here = []
+    for _ in range(5):
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = turn(random.uniform(0.0, 170.0), random.normal(size=3))
+        viewmat[:3, 3] = -viewmat[:3, :3] @ place
+        here.append(replace(one, viewmat=viewmat))
+    views = [replace(made.views[1], camera=camera) for camera in here]
+    slightly = [turned(view, 0.1, random.normal(size=3)).camera for view in views]
+    assert similarity_between(here, slightly).scale == 1.0
+    assert pose_errors(slightly, here)["rotation"] < 0.15
     with pytest.raises(igsr.IgsrError, match="1 and 2"):
         similarity_between([one], [one, one])
 
@@ -183,6 +194,41 @@ def test_a_resumed_joint_fit_ends_with_the_same_bits(made, tmp_path):
         assert np.array_equal(a.camera.K, b.camera.K)
     with pytest.raises(igsr.IgsrError, match=r"was made with (hull|poses)"):
         igsr.fit(wrong(made), checkpoint=checkpoint, resume=True, **(options | {"poses": "fixed"}))
+
+
+def test_a_fit_stopped_while_cameras_are_looked_for_keeps_its_checkpoint(tmp_path):
+    made = scenes.capture(views=8, size=128)
+    checkpoint = tmp_path / "checkpoint.npz"
+    options = {"steps": 60, "backend": "cpu", "max_splats": 200, "poses": "joint"}
+    steps = []
+
+    def stop_once(now):
+        steps.append(now.step)
+        return len(steps) > 1
+
+    first, _ = igsr.fit_with_cameras(made, checkpoint=checkpoint, progress=stop_once, **options)
+    assert steps == [0], "nothing runs on"
+    resumed = igsr.fit(made, checkpoint=checkpoint, resume=True, **options)
+    assert not np.array_equal(first.means, resumed.means)
+    again = []
+    igsr.fit(made, checkpoint=checkpoint, resume=True, progress=again.append, **options)
+    assert again == [], "it was complete"
+
+
+def test_one_photo_keeps_its_camera():
+    made = scenes.capture(views=2, size=128)
+    with pytest.warns(UserWarning, match="photo"):
+        _, fitted = igsr.fit_with_cameras(made, steps=20, max_splats=200, poses="joint")
+    (view,) = fitted.train_views
+    assert np.allclose(view.camera.viewmat, made.train_views[0].camera.viewmat, atol=1e-9)
+
+
+def test_warnings_point_to_who_called():
+    made = scenes.capture(views=2, size=32)
+    for function in (igsr.fit, igsr.fit_with_cameras):
+        with pytest.warns(UserWarning, match="photo") as caught:
+            function(made, steps=1, max_splats=50, backend="cpu")
+        assert caught[0].filename == __file__
 
 
 def test_a_damaged_camera_state_is_refused(made, tmp_path):

@@ -362,6 +362,8 @@ def fit_command(
         moved = fitted is not capture
         if moved:
             write_cameras(out / "cameras.json", fitted.train_views)
+        else:  # another fit's would not belong to this scene
+            (out / "cameras.json").unlink(missing_ok=True)
         if last:
             seconds, started = last[-1].seconds, last[-1].started
         else:
@@ -381,11 +383,12 @@ def fit_command(
             "protocol": scores["protocol"],
             "views": scores["views"],
         }
+        write_contact_sheet(out / "views.png", sheet)
+        write_report(out / "report.json", report)
         if moved and split == "test":
             # Photos that were not fitted have the cameras they were given; these are their best.
             report["refined"] = _refined_scores(splats, fitted, color, name, shown=not as_json)
-        write_contact_sheet(out / "views.png", sheet)
-        write_report(out / "report.json", report)
+            write_report(out / "report.json", report)
     if as_json:
         _print_json(report)
         return
@@ -399,7 +402,8 @@ def fit_command(
     if "refined" in report:
         console.print(f"with refined cameras: {_score_line(report['refined'])}")
     console.print(_protocol_line(report["protocol"]), style="dim")
-    console.print(f"{out / 'scene.ply'}  {out / 'report.json'}  {out / 'views.png'}", style="dim")
+    names = ["scene.ply", "report.json", "views.png", *(["cameras.json"] if moved else [])]
+    console.print("  ".join(str(out / name) for name in names), style="dim")
 
 
 def _refined_scores(

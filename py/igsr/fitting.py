@@ -108,8 +108,8 @@ def fit(
     Args:
         capture: photos and cameras; masked pixels do not count.
         steps: optimiser steps, each on one photo; None, here and below, is what the preset says.
-        progress: called about five times a second; returning False ends the fit early, with the
-            splats as they are then.
+        progress: called about five times a second, with step 0 while cameras are looked for
+            roughly; returning False ends the fit early, with the splats as they are then.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu".
         seed: of everything random.
         preset: "default" (other settings for up to 20 photos than for more), "3dgs" or
@@ -131,7 +131,8 @@ def fit(
         focal: "fixed", "shared" (one factor to all cameras' focal lengths is fitted) or
             "per-camera".
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
-            Ctrl-C (KeyboardInterrupt, which is raised again).
+            Ctrl-C (KeyboardInterrupt, which is raised again); where cameras are fitted, from when
+            they have been found roughly.
         resume: continue the fit that ``checkpoint`` holds.
 
     Raises:
@@ -141,25 +142,28 @@ def fit(
             checkpoint cannot be written; the splats are returned all the same.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
-    return fit_with_cameras(
+    splats, _ = _fit(
         capture,
-        steps,
         progress,
         backend,
         seed,
-        preset=preset,
-        max_splats=max_splats,
-        sh_degree=sh_degree,
-        density=density,
-        dropout=dropout,
-        hull=hull,
-        start=start,
-        poses=poses,
-        focal=focal,
-        background=background,
-        checkpoint=checkpoint,
-        resume=resume,
-    )[0]
+        preset,
+        {
+            "steps": steps,
+            "max_splats": max_splats,
+            "sh_degree": sh_degree,
+            "density": density,
+            "dropout": dropout,
+            "hull": hull,
+            "start": start,
+            "poses": poses,
+            "focal": focal,
+        },
+        background,
+        checkpoint,
+        resume,
+    )
+    return splats
 
 
 def fit_with_cameras(
@@ -187,22 +191,45 @@ def fit_with_cameras(
     Raises:
         IgsrError, UserWarning, RuntimeError: as ``fit``.
     """
+    return _fit(
+        capture,
+        progress,
+        backend,
+        seed,
+        preset,
+        {
+            "steps": steps,
+            "max_splats": max_splats,
+            "sh_degree": sh_degree,
+            "density": density,
+            "dropout": dropout,
+            "hull": hull,
+            "start": start,
+            "poses": poses,
+            "focal": focal,
+        },
+        background,
+        checkpoint,
+        resume,
+    )
+
+
+def _fit(
+    capture: Capture,
+    progress: Callable[[Progress], bool | None] | None,
+    backend: str,
+    seed: int,
+    preset: str,
+    given: dict[str, object],
+    background: tuple[float, float, float] | None,
+    checkpoint: str | os.PathLike[str] | None,
+    resume: bool,
+) -> tuple[Splats, Capture]:
+    """What ``fit`` and ``fit_with_cameras`` do; warnings point to who called those."""
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
-    chosen = preset_settings(
-        preset,
-        len(views),
-        steps=steps,
-        max_splats=max_splats,
-        sh_degree=sh_degree,
-        density=density,
-        dropout=dropout,
-        hull=hull,
-        start=start,
-        poses=poses,
-        focal=focal,
-    )
+    chosen = preset_settings(preset, len(views), **given)
     _check_arguments(chosen, seed, background, checkpoint, resume)
     check_photos(views)
     if backend == "reference":
@@ -240,11 +267,21 @@ def fit_with_cameras(
         settings["started"] = saved["started"]
     if path is not None:
         check_writable(path)
+    go_on = True
+    rough = state is None and moving
+    if rough:
+
+        def waiting(now: Progress) -> bool:
+            # The fit itself has not begun: whoever stops it now stops it before its first step.
+            nonlocal go_on
+            now = replace(now, step=0, steps=settings["steps"])
+            go_on = progress is None or progress(now) is not False
+            return go_on
+
+        began = time.perf_counter()
+        capture = _with_rough_cameras(capture, settings, info, waiting)
+        seconds_before = time.perf_counter() - began
     if state is None:
-        if moving:
-            started = time.perf_counter()
-            capture = _with_rough_cameras(capture, settings, info, progress)
-            seconds_before = time.perf_counter() - started
         state, settings["started"] = _start(capture, settings)
     origin = state.pop("origin", np.zeros(0))
     try:
@@ -259,7 +296,12 @@ def fit_with_cameras(
     kept = {"origin": origin}
     if moving:
         kept[ROUGH] = camera_rows(views)
-    _run(fitter, kept, settings, info, seconds_before, progress, path)
+    if rough and path is not None:
+        # The cameras that took so long to find are kept from here on.
+        state = {**fitter.state(), **kept}
+        save_checkpoint(path, state, {**settings, "seconds": seconds_before})
+    if go_on:
+        _run(fitter, kept, settings, info, seconds_before, progress, path)
     splats = Splats(**fitter.splats(), origin=origin)
     if not moving:
         return splats, capture
@@ -294,6 +336,8 @@ def _with_rough_cameras(
     Splats that have settled around wrong cameras hold them there: it is better to find the cameras
     roughly and to start again.
     """
+    if len(capture.train_views) == 1 and settings["focal"] == "fixed":
+        return capture  # a camera alone stays where it is
     views = [halved(view) for view in capture.train_views]
     if min(min(view.camera.width, view.camera.height) for view in views) < ROUGH_SIDE:
         return capture
@@ -301,18 +345,13 @@ def _with_rough_cameras(
     steps = max(1, round(ROUGH_STEPS * settings["steps"]))
     splats = max(1, round(ROUGH_SPLATS * settings["max_splats"]))
     rough = {**settings, "steps": steps, "max_splats": splats}
-    state, rough["started"] = _start(small, rough)
-    origin = state.pop("origin")
     try:
+        state, rough["started"] = _start(small, rough)
+        origin = state.pop("origin")
         fitter = fitter_of(views, origin, state, rough, info["backend"])
-    except ValueError as error:
-        raise IgsrError(f"{error}.") from error
-
-    def waiting(now: Progress) -> bool | None:
-        # The fit itself has not begun; whoever stops it now stops before its first step.
-        return progress and progress(replace(now, step=0, steps=settings["steps"]))
-
-    _run(fitter, {}, rough, info, 0.0, waiting, None)
+    except (IgsrError, ValueError):
+        return capture  # what cannot be started from at half size may be at full size
+    _run(fitter, {}, rough, info, 0.0, progress, None)
     found = fitted_cameras(views, fitter, origin)
     cameras = []
     for view, camera in zip(capture.train_views, found, strict=True):
@@ -446,7 +485,7 @@ def _run(
             save()
         except IgsrError as error:
             # The splats are finished: losing them to a full disk would be the greater harm.
-            warnings.warn(str(error), stacklevel=3)
+            warnings.warn(str(error), stacklevel=4)
     except KeyboardInterrupt:
         save()
         raise

@@ -64,7 +64,7 @@ def check_photos(views: list[View]) -> None:
 
 def _warn(sentence: str) -> None:
     # To the caller of ``fit``.
-    warnings.warn(sentence, stacklevel=4)
+    warnings.warn(sentence, stacklevel=5)
 
 
 def _listed(names: list[str]) -> str:

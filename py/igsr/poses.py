@@ -24,6 +24,8 @@ from .splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 
+#: Cameras nearer together than this, in units of their coordinates, stand at one place.
+ONE_PLACE = 1e-9
 #: Steps that refining spends on each camera.
 REFINE_STEPS = 30
 
@@ -74,12 +76,14 @@ def similarity_between(cameras: Sequence[Camera], others: Sequence[Camera]) -> S
         other.viewmat[:3, :3].T @ camera.viewmat[:3, :3]
         for camera, other in zip(cameras, others, strict=True)
     ) / len(cameras)
-    if spread > 0.0 and target_spread > 0.0:
+    # Centres come from matrix products: what rounding leaves is no direction.
+    least = ONE_PLACE * (1.0 + max(float(np.abs(centres).max()), float(np.abs(targets).max())))
+    if min(spread, target_spread) > least:
         covariance = covariance + target_offsets.T @ offsets / (spread * target_spread)
     u, _, vt = np.linalg.svd(covariance)
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     scale = 1.0
-    if spread > 0.0:
+    if min(spread, target_spread) > least:
         matched = float(np.sum((offsets @ rotation.T) * target_offsets)) / spread**2
         scale = matched if matched > 0.0 else 1.0
     translation = targets.mean(axis=0) - scale * rotation @ centres.mean(axis=0)

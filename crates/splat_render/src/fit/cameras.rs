@@ -20,6 +20,8 @@ const POSE: usize = 6;
 /// motion in the picture measures a step.
 const DEPTHS: [f64; 3] = [0.8, 1.0, 1.25];
 const POSITIONS: [f64; 5] = [0.1, 0.3, 0.5, 0.7, 0.9];
+/// Cameras nearer together than this part of their distance to the scene stand at one place.
+const ONE_PLACE: f64 = 1e-3;
 /// Added to the measure, as a part of its mean diagonal: directions that move no picture stay put.
 const DAMPING: f64 = 0.01;
 
@@ -244,7 +246,7 @@ impl Cameras {
             }
         }
         if self.config.anchored && self.config.poses {
-            anchor(&mut self.now, &self.initial);
+            anchor(&mut self.now, &self.initial, &self.state.distances);
         }
     }
 
@@ -397,8 +399,9 @@ fn inverse_cholesky(matrix: [[f64; POSE]; POSE]) -> [[f64; POSE]; POSE] {
 }
 
 /// Moves all cameras by the similarity that brings them nearest to where they began: orientations
-/// on average, centres in the least-squares sense.
-fn anchor(now: &mut [Camera], initial: &[Camera]) {
+/// on average, centres in the least-squares sense. Cameras that stand at one place, seen from their
+/// distances to the scene, have no scale to keep.
+fn anchor(now: &mut [Camera], initial: &[Camera], distances: &[f64]) {
     let n = now.len() as f64;
     // World turns that take each camera's orientation back; all are small, so that signs agree.
     let turns = now.iter().zip(initial).map(|(now, initial)| {
@@ -415,9 +418,11 @@ fn anchor(now: &mut [Camera], initial: &[Camera]) {
             .map(|(now, initial)| (turn * (now.center() - from), initial.center() - to))
     };
     let spread: f64 = offsets().map(|(a, _)| a.length_squared()).sum();
+    let initial_spread: f64 = offsets().map(|(_, b)| b.length_squared()).sum();
     let matched: f64 = offsets().map(|(a, b)| a.dot(b)).sum();
-    // Cameras at one place have no scale to keep.
-    let scale = if matched > 1e-12 * spread && spread > 0.0 { matched / spread } else { 1.0 };
+    let reach = distances.iter().sum::<f64>() / n;
+    let apart = initial_spread > n * (ONE_PLACE * reach).powi(2);
+    let scale = if apart && matched > 0.0 { matched / spread } else { 1.0 };
     for camera in now {
         let center = to + scale * (turn * (camera.center() - from));
         let rotation = camera.rotation() * turn.transpose();
@@ -561,15 +566,42 @@ mod tests {
             let rotation = DQuat::from_mat3(&camera.rotation()) * turn.inverse();
             camera.viewmat = DMat4::from_rotation_translation(rotation, -(rotation * center));
         }
-        anchor(&mut now, &initial);
+        anchor(&mut now, &initial, &[4.0; 6]);
         for (a, b) in now.iter().zip(&initial) {
             assert!(a.viewmat.abs_diff_eq(b.viewmat, 1e-12), "{} {}", a.viewmat, b.viewmat);
         }
-        // One camera, and cameras at one place, have no scale.
         let mut one = vec![initial[0]];
         move_by(&mut one[0], [0.1; 6]);
-        anchor(&mut one, &initial[..1]);
+        anchor(&mut one, &initial[..1], &[4.0]);
         assert!(one[0].viewmat.abs_diff_eq(initial[0].viewmat, 1e-12));
+    }
+
+    #[test]
+    fn cameras_at_one_place_keep_the_scale_of_their_moves() {
+        // Up to rounding at one place, looking different ways.
+        let place = DVec3::new(31.3, -12.7, 5.4);
+        let initial: Vec<Camera> = ring(5)
+            .iter()
+            .map(|camera| {
+                let rotation = DQuat::from_mat3(&camera.rotation());
+                let viewmat = DMat4::from_rotation_translation(rotation, -(rotation * place));
+                Camera { viewmat, ..*camera }
+            })
+            .collect();
+        let mut now = initial.clone();
+        for (k, camera) in now.iter_mut().enumerate() {
+            let s = k as f64 - 2.0;
+            move_by(camera, [0.0, 0.0, 0.0, 0.02 * s, 0.0, 0.01 * s]);
+        }
+        let lengths = |cameras: &[Camera]| -> Vec<f64> {
+            let mean = cameras.iter().map(Camera::center).sum::<DVec3>() / 5.0;
+            cameras.iter().map(|c| (c.center() - mean).length()).collect()
+        };
+        let before = lengths(&now);
+        anchor(&mut now, &initial, &[4.0; 5]);
+        for (a, b) in lengths(&now).iter().zip(before) {
+            assert!((a - b).abs() < 1e-9, "{b} became {a}");
+        }
     }
 
     #[test]
