@@ -1,0 +1,1 @@
+"""Pointmaps of pairs of photos brought into one world."""
