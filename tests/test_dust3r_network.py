@@ -1,4 +1,4 @@
-"""The network of DUSt3R: parity with the published model, and checkpoints that cannot be trusted."""
+"""The network of DUSt3R: parity with the published model, and checkpoints nobody can trust."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TINY = NetworkConfig(
     encoder_dim=64, encoder_depth=2, encoder_heads=2, decoder_dim=48, decoder_heads=2
 )
 
-BLOCK = 1 << 16
+BLOCK = 1 << 13
 
 
 def hashed(key, count):

@@ -86,19 +86,28 @@ class LinearHead(nn.Module):
 
 
 class DptHead(nn.Module):
-    """The dense prediction transformer's head (Ranftl et al. 2021): four levels joined coarse to fine.
+    """The head of the dense prediction transformer (Ranftl et al. 2021): levels joined in turn.
 
     Args:
-        dims: channels of the tokens of each level, the finest first.
+        dims: channels of the tokens of each of the four levels, the finest first.
     """
 
     def __init__(self, dims: tuple[int, int, int, int]) -> None:
-        """Make the layers; the checkpoints nest them under the name ``dpt``."""
+        """Make the layers, which the checkpoints nest under the name ``dpt``."""
         super().__init__()
-        self.dpt = nn.Module()
+        self.dpt = _Dpt(dims)
+
+    def forward(self, levels: list[Tokens]) -> Tensor:
+        """[B, 4, H, W] from four levels of tokens."""
+        return self.dpt(levels)
+
+
+class _Dpt(nn.Module):
+    def __init__(self, dims: tuple[int, int, int, int]) -> None:
+        super().__init__()
         fine, middle, coarse, coarsest = LEVEL_CHANNELS
         # From a token's 16 pixels to strides of 4, 8, 16 and 32 pixels.
-        self.dpt.act_postprocess = nn.ModuleList(
+        self.act_postprocess = nn.ModuleList(
             [
                 nn.Sequential(
                     nn.Conv2d(dims[0], fine, 1), nn.ConvTranspose2d(fine, fine, 4, stride=4)
@@ -113,12 +122,12 @@ class DptHead(nn.Module):
                 ),
             ]
         )
-        self.dpt.scratch = nn.Module()
+        self.scratch = nn.ModuleDict()
         for level, channels in enumerate(LEVEL_CHANNELS, start=1):
             reduced = nn.Conv2d(channels, FEATURES, 3, padding=1, bias=False)
-            self.dpt.scratch.add_module(f"layer{level}_rn", reduced)
-            self.dpt.scratch.add_module(f"refinenet{level}", _Fusion())
-        self.dpt.head = nn.Sequential(
+            self.scratch[f"layer{level}_rn"] = reduced
+            self.scratch[f"refinenet{level}"] = _Fusion()
+        self.head = nn.Sequential(
             nn.Conv2d(FEATURES, FEATURES // 2, 3, padding=1),
             _Doubled(),
             nn.Conv2d(FEATURES // 2, FEATURES // 2, 3, padding=1),
@@ -127,17 +136,15 @@ class DptHead(nn.Module):
         )
 
     def forward(self, levels: list[Tokens]) -> Tensor:
-        """[B, 4, H, W] from four levels of tokens."""
-        scratch = self.dpt.scratch
         joined = None
         for level in (4, 3, 2, 1):
-            reassembled = self.dpt.act_postprocess[level - 1](levels[level - 1].as_image)
-            maps = scratch.get_submodule(f"layer{level}_rn")(reassembled)
+            reassembled = self.act_postprocess[level - 1](levels[level - 1].as_image)
+            maps = self.scratch[f"layer{level}_rn"](reassembled)
             if joined is not None:
                 # A coarsest level of an odd number of tokens is half a cell too large.
                 joined = joined[..., : maps.shape[-2], : maps.shape[-1]]
-            joined = scratch.get_submodule(f"refinenet{level}")(maps, joined)
-        return self.dpt.head(joined)
+            joined = self.scratch[f"refinenet{level}"](maps, joined)
+        return self.head(joined)
 
 
 class _Fusion(nn.Module):

@@ -93,23 +93,17 @@ class Dust3rNetwork(nn.Module):
         """Make the layers, with random weights."""
         super().__init__()
         self.config = config
-        self.patch_embed = nn.Module()
-        self.patch_embed.proj = nn.Conv2d(3, config.encoder_dim, PATCH, stride=PATCH)
+        patches = nn.Conv2d(3, config.encoder_dim, PATCH, stride=PATCH)
+        self.patch_embed = nn.ModuleDict({"proj": patches})
         self.enc_blocks = nn.ModuleList(
             _EncoderBlock(config.encoder_dim, config.encoder_heads)
             for _ in range(config.encoder_depth)
         )
         self.enc_norm = _norm(config.encoder_dim)
         self.decoder_embed = nn.Linear(config.encoder_dim, config.decoder_dim)
-        for name in ("dec_blocks", "dec_blocks2"):
-            blocks = nn.ModuleList(
-                _DecoderBlock(config.decoder_dim, config.decoder_heads)
-                for _ in range(config.decoder_depth)
-            )
-            self.add_module(name, blocks)
+        self.dec_blocks, self.dec_blocks2 = _decoder(config), _decoder(config)
         self.dec_norm = _norm(config.decoder_dim)
-        for name in ("downstream_head1", "downstream_head2"):
-            self.add_module(name, _head(config))
+        self.downstream_head1, self.downstream_head2 = _head(config), _head(config)
 
     def encode(self, images: Tensor) -> Tokens:
         """What the encoder makes of photos of one shape, each on its own.
@@ -117,7 +111,7 @@ class Dust3rNetwork(nn.Module):
         Args:
             images: [B, 3, H, W] in [-1, 1]; H and W multiples of 16.
         """
-        patches = self.patch_embed.proj(images)
+        patches = self.patch_embed["proj"](images)
         rows, columns = patches.shape[-2:]
         rotation = self._rotation("encoder", rows, columns, images.device)
         features = patches.flatten(2).mT
@@ -154,14 +148,9 @@ class Dust3rNetwork(nn.Module):
             torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False),
         ):
             return (
-                self._maps(self.downstream_head1, [levels[n][0] for n in self.config.levels], first),
-                self._maps(self.downstream_head2, [levels[n][1] for n in self.config.levels], second),
+                _maps(self.downstream_head1, [levels[n][0] for n in self.config.levels], first),
+                _maps(self.downstream_head2, [levels[n][1] for n in self.config.levels], second),
             )
-
-    def _maps(self, head: nn.Module, levels: list[Tensor], tokens: Tokens) -> PointMaps:
-        return point_maps(
-            head([Tokens(level.float(), tokens.rows, tokens.columns) for level in levels])
-        )
 
     def _rotation(self, part: str, rows: int, columns: int, device: torch.device) -> Rotation:
         dim, heads = getattr(self.config, f"{part}_dim"), getattr(self.config, f"{part}_heads")
@@ -196,10 +185,24 @@ def _norm(dim: int) -> nn.LayerNorm:
     return nn.LayerNorm(dim, eps=NORM_EPS)
 
 
+def _decoder(config: NetworkConfig) -> nn.ModuleList:
+    return nn.ModuleList(
+        _DecoderBlock(config.decoder_dim, config.decoder_heads) for _ in range(config.decoder_depth)
+    )
+
+
 def _head(config: NetworkConfig) -> nn.Module:
     if config.head == "linear":
         return LinearHead(config.decoder_dim)
-    return DptHead((config.encoder_dim, *[config.decoder_dim] * 3))
+    dim = config.decoder_dim
+    return DptHead((config.encoder_dim, dim, dim, dim))
+
+
+def _maps(head: nn.Module, levels: list[Tensor], tokens: Tokens) -> PointMaps:
+    """A head's maps from the levels of photos of the shape of ``tokens``."""
+    return point_maps(
+        head([Tokens(level.float(), tokens.rows, tokens.columns) for level in levels])
+    )
 
 
 def _per_head(x: Tensor, heads: int) -> Tensor:
