@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from .aligned_photo import AlignedPhoto
 from .alignment import Alignment, align
-from .confidence import TRUSTED, without_floaters
+from .confidence import TRUSTED, trusted_pixels
 from .predictions import Grid, PairPrediction, PhotoToAlign, Predictor
 
 __all__ = [
     "TRUSTED",
+    "AlignedPhoto",
     "Alignment",
     "Grid",
     "PairPrediction",
     "PhotoToAlign",
     "Predictor",
     "align",
-    "without_floaters",
+    "trusted_pixels",
 ]

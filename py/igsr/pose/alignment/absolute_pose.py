@@ -13,6 +13,8 @@ Float64 = npt.NDArray[np.float64]
 POINTS = 1000
 #: Part of the photo's longer side that a point may be off (5 of 512 pixels, as in DUSt3R).
 MAX_ERROR = 0.01
+#: Samples drawn at most; of points of which a fifth are right, one in 125 is right as a whole.
+TRIALS = 1000
 #: Focal lengths tried where none is known, and their range in units of the photo's longer side.
 FOCALS, SHORTEST, LONGEST = 21, 0.5, 3.0
 
@@ -54,6 +56,7 @@ def absolute_pose(
     )
     options: Any = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = MAX_ERROR * max(size)
+    options.ransac.max_num_trials = TRIALS
     options.ransac.random_seed = seed
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)

@@ -16,11 +16,13 @@ from igsr.capture import Camera
 from igsr.errors import IgsrError
 from igsr.poses import Similarity
 
-from .dense_depth import EdgeToCamera, dense_depth
+from .aligned_photo import AlignedPhoto
+from .depths_on_rays import CHUNK, depths_on_rays
 from .objective import Objective
-from .observations import Edge, Observations, observe, strong_edges
+from .observations import Edge, Observations, observe, sides, strong_edges, usable_confidence
 from .placement import Placement, inverse, joined
 from .predictions import Grid, PairPrediction, PhotoToAlign, checked_predictions
+from .similarity import apply
 from .spanning_tree import components
 from .start import start
 
@@ -40,19 +42,15 @@ class Alignment:
     """What the alignment found.
 
     Attributes:
-        cameras: per photo, in pixels of the photo; None where it could not be placed.
-        depths: per photo float32 [h, w], z-depth on its grid in world units, NaN where unknown;
-            None where it could not be placed.
-        confidences: per photo float32 [h, w], the greatest raw confidence of all its edges, at
-            least 1; None where it could not be placed.
-        start_loss: the objective after the start; distances in it are in units of the median depth.
+        photos: None where one could not be placed.
+        pairs: the directed pairs that were aligned.
+        start_loss: the objective after the start; its unit is the median depth.
         loss: the objective at the end.
         warnings: sentences that name the photos without a place.
     """
 
-    cameras: list[Camera | None]
-    depths: list[Float32 | None]
-    confidences: list[Float32 | None]
+    photos: list[AlignedPhoto | None]
+    pairs: list[tuple[int, int]]
     start_loss: float
     loss: float
     warnings: list[str]
@@ -106,24 +104,22 @@ def align(
         anchor = found.viewmats[int(observations.edges[np.argmax(observations.scores), 0])]
         found = found.mapped(Similarity(1.0, anchor[:3, :3], anchor[:3, 3]))
 
-    result = Alignment([], [], [], start_loss, loss, [])
+    placed: list[AlignedPhoto | None] = []
+    warnings = []
     for i, photo in enumerate(photos):
         if i not in found.viewmats:
-            result.cameras.append(None)
-            result.depths.append(None)
-            result.confidences.append(None)
-            result.warnings.append(
+            placed.append(None)
+            warnings.append(
                 f"{photo.name} could not be placed: the network sees nothing in it that the placed "
                 "photos show too"
             )
             continue
         viewmat = found.viewmats[i] if photo.viewmat is None else photo.viewmat
         camera = Camera(viewmat, found.intrinsics[i], photo.width, photo.height)
-        depth, confidence = _dense(edges, observations, found.edges, i, camera, photo.grid)
-        result.cameras.append(camera)
-        result.depths.append(depth)
-        result.confidences.append(confidence)
-    return result
+        depth, confidence = _depth(edges, observations, found.edges, i, camera, photo.grid)
+        placed.append(AlignedPhoto(camera, photo.grid, depth, confidence))
+    pairs = [(edge.prediction.first, edge.prediction.second) for edge in edges]
+    return Alignment(placed, pairs, start_loss, loss, warnings)
 
 
 def _started(
@@ -153,7 +149,8 @@ def _group_to_place(edges: list[Edge], photos: Sequence[PhotoToAlign]) -> set[in
         fixed = sum(photos[i].viewmat is not None for i in group) if len(group) > 1 else 0
         return fixed, len(group), sum(e.score for e in edges if e.prediction.first in group)
 
-    return set(max(components(len(photos), ends), key=rank))
+    best = max(components(len(photos), ends), key=rank)
+    return set(best)
 
 
 def _normal_frame(start: Placement, depths: dict[int, Float64]) -> Similarity:
@@ -194,7 +191,7 @@ def _optimise(
     return begun, least
 
 
-def _dense(
+def _depth(
     edges: Sequence[Edge],
     observations: Observations,
     placed: Sequence[Similarity],
@@ -203,14 +200,29 @@ def _dense(
     grid: Grid,
 ) -> tuple[Float32, Float32]:
     """Depth and confidence [h, w] of all pixels of a photo's grid, thinned or not."""
+    slopes = ((grid.photo_pixels() - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]).T
+    to_camera = Similarity(1.0, camera.viewmat[:3, :3], camera.viewmat[:3, 3])
     seen = observations.photos[photo]
-    views = []
+    maps, frames = [], []
     for e, is_first in zip(seen.edges, seen.is_first, strict=True):
         unit = observations.units[e]
         stored = Similarity(1.0 / unit, np.eye(3), -observations.centres[e] / unit)
-        edge = joined(placed[e], stored)
-        matrix = np.column_stack([edge.scale * edge.rotation, edge.translation])
-        matrix = camera.viewmat[:3, :3] @ matrix
-        matrix[:, 3] += camera.viewmat[:3, 3]
-        views.append(EdgeToCamera(edges[e].prediction, bool(is_first), matrix))
-    return dense_depth(views, grid.photo_pixels(), camera.K)
+        frames.append(joined(to_camera, joined(placed[e], stored)))
+        points, confidence = sides(edges[e].prediction)[0 if is_first else 1]
+        maps.append((points, usable_confidence(points, confidence)))
+    depth = np.empty((grid.height, grid.width), dtype=np.float32)
+    confidence = np.max([sure for _, sure in maps], axis=0)
+    # All maps at once would be a second copy of them.
+    step = max(1, CHUNK // (3 * len(maps) * grid.width))
+    for begin in range(0, grid.height, step):
+        rows = slice(begin, begin + step)
+        sure = np.stack([c[rows].ravel() for _, c in maps])
+        local = [
+            apply(frame, np.where(c > 1.0, xyz[rows].reshape(-1, 3).T, 0.0).astype(np.float64))
+            for frame, (xyz, _), c in zip(frames, maps, sure, strict=True)
+        ]
+        own = slice(begin * grid.width, begin * grid.width + sure.shape[1])
+        found = depths_on_rays(np.stack(local), np.log(sure), slopes[:, own])
+        depth[rows] = found.reshape(-1, grid.width)
+    depth[~(depth > 0.0)] = np.nan
+    return depth, confidence

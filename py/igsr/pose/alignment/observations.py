@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .predictions import PairPrediction, PhotoToAlign, kept
+from .similarity import is_spread
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -105,17 +106,21 @@ def strong_edges(predictions: Sequence[PairPrediction]) -> list[Edge]:
     """Those predictions whose photos have something in common, as far as these can tell."""
     edges = []
     for prediction in predictions:
-        seen = []
-        for points, confidence in _sides(prediction):
+        score = 1.0
+        for points, confidence in sides(prediction):
             look = tuple(kept(size, LOOK) for size in confidence.shape)
-            seen.append(usable_confidence(points[look], confidence[look]))
-        if min(float((side > SURE).mean()) for side in seen) >= SHARE:
-            first, second = (float(side.mean(dtype=np.float64)) for side in seen)
-            edges.append(Edge(prediction, first * second))
+            sure = usable_confidence(points[look], confidence[look]).ravel()
+            flat = np.where(sure > 1.0, points[look].reshape(-1, 3).T, 0.0).astype(np.float64)
+            if (sure > SURE).mean() < SHARE or not is_spread(flat, np.log(sure)):
+                break
+            score *= float(sure.mean(dtype=np.float64))
+        else:
+            edges.append(Edge(prediction, score))
     return edges
 
 
-def _sides(prediction: PairPrediction) -> list[tuple[Float32, Float32]]:
+def sides(prediction: PairPrediction) -> list[tuple[Float32, Float32]]:
+    """Points [h, w, 3] and raw confidence [h, w] of the first and of the second photo."""
     return [
         (prediction.first_points, prediction.first_confidence),
         (prediction.second_points, prediction.second_confidence),
@@ -141,19 +146,19 @@ def observe(edges: Sequence[Edge], photos: Sequence[PhotoToAlign]) -> Observatio
     seen: dict[int, PhotoObservations] = {}
     for photo in sorted(of_photo):
         pixels = photos[photo].grid.photo_pixels(stride)
-        on_edges, sides = (np.array(column) for column in zip(*of_photo[photo], strict=True))
+        on_edges, of_side = (np.array(column) for column in zip(*of_photo[photo], strict=True))
         seen[photo] = PhotoObservations(
             np.empty((len(on_edges), 3, len(pixels)), dtype=np.float32),
             np.empty((len(on_edges), len(pixels)), dtype=np.float32),
             on_edges,
-            sides == 0,
+            of_side == 0,
             pixels,
         )
     centres, units = np.zeros((len(predictions), 3)), np.ones(len(predictions))
     for e, prediction in enumerate(predictions):
         parts = []
         for side, (photo, (points, confidence)) in enumerate(
-            zip((prediction.first, prediction.second), _sides(prediction), strict=True)
+            zip((prediction.first, prediction.second), sides(prediction), strict=True)
         ):
             taken = tuple(kept(size, stride) for size in confidence.shape)
             usable = usable_confidence(points[taken], confidence[taken]).ravel()

@@ -11,8 +11,8 @@ Float64 = npt.NDArray[np.float64]
 
 #: Rounds of re-weighting; each is one closed solution.
 ROUNDS = 10
-#: Points spread less than this beside their largest extent tell no rotation.
-FLAT = 1e-6
+#: Points whose second extent is less than this part of the first lie on one line.
+FLAT = 1e-4
 #: Distances below this part of the spread weigh no more: what rounding leaves is no difference.
 NO_DISTANCE = 1e-7
 
@@ -62,7 +62,7 @@ def _least_squares(
     if not (variance > 0.0 and other_variance > 0.0):
         return None
     u, values, vt = np.linalg.svd((other_centred * weights) @ centred.T)
-    if values[1] <= FLAT * values[0]:
+    if values[1] <= FLAT**2 * values[0]:
         return None
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * signs) @ vt
@@ -71,6 +71,20 @@ def _least_squares(
         return None
     translation = other_mean - scale * rotation @ mean
     return Similarity(scale, rotation, translation), float(np.sqrt(other_variance))
+
+
+def is_spread(points: Float64, weights: Float64) -> bool:
+    """Whether points [3, N] with weights [N] are not all on one line, or at one place.
+
+    Of points without an extent no similarity can be found, and none is told by them.
+    """
+    total = weights.sum()
+    if not total > 0.0:
+        return False
+    weights = weights / total
+    centred = points - (points @ weights)[:, None]
+    extents = np.linalg.eigvalsh((centred * weights) @ centred.T)
+    return bool(extents[1] > FLAT**2 * extents[2])
 
 
 def apply(similarity: Similarity, points: Float64) -> Float64:

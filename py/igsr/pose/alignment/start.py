@@ -11,14 +11,17 @@ from igsr.capture import Camera
 from igsr.poses import Similarity, similarity_between
 
 from .absolute_pose import absolute_pose, absolute_pose_and_focal
+from .depths_on_rays import depths_on_rays
 from .focal import weiszfeld_focal
 from .observations import Observations
-from .placement import Placement, mapped_viewmat
+from .placement import Placement, joined, mapped_viewmat
 from .predictions import PhotoToAlign
 from .similarity import apply, similarity_of_points
 from .spanning_tree import spanning_tree
 
 Float64 = npt.NDArray[np.float64]
+#: Points [3, P] and their raw confidence [P].
+Placed = tuple[Float64, Float64]
 
 
 def start(
@@ -34,7 +37,7 @@ def start(
         photos: all of them; where poses are fixed, the world frame is theirs.
         seed: what draws samples.
     """
-    points, poses, lost = _along_the_tree(observations)
+    placed, poses, lost = _along_the_tree(observations)
     if lost:
         return lost
     found_intrinsics = _intrinsics(observations, photos)
@@ -44,7 +47,7 @@ def start(
             found[photo] = poses[photo]
             continue
         K = found_intrinsics.get(photo)
-        posed = _posed(observations, photo, points[photo], K, photos[photo], seed)
+        posed = _posed(observations, photo, placed[photo], K, photos[photo], seed)
         if posed is None:
             lost += np.flatnonzero((observations.edges == photo).any(axis=1)).tolist()
         else:
@@ -52,40 +55,46 @@ def start(
     if lost:
         return lost
     world = _to_fixed(found, photos)
-    points = {photo: apply(world, xyz) for photo, xyz in points.items()}
+    placed = {photo: (apply(world, xyz), sure) for photo, (xyz, sure) in placed.items()}
     for photo, viewmat in found.items():
         fixed = photos[photo].viewmat
         found[photo] = mapped_viewmat(world, viewmat) if fixed is None else fixed
-    edges = _edges(observations, points)
+    edges = _edges(observations, placed)
     lost = [e for e, similarity in enumerate(edges) if similarity is None]
     if lost:
         return lost
-    depths = {photo: _depths(found[photo], xyz) for photo, xyz in points.items()}
-    return Placement(found, found_intrinsics, [edge for edge in edges if edge]), depths
+    placement = Placement(found, found_intrinsics, [edge for edge in edges if edge])
+    return placement, {photo: _depths(observations, placement, photo) for photo in placed}
 
 
 def _along_the_tree(
     observations: Observations,
-) -> tuple[dict[int, Float64], dict[int, Float64], list[int]]:
-    """Points [3, P] of the photos, world-to-camera [4, 4] of those that are first on an edge of the
-    tree, and the edge that could not be joined to the others, if one could not."""
-    points: dict[int, Float64] = {}
+) -> tuple[dict[int, Placed], dict[int, Float64], list[int]]:
+    """The photos' points, world-to-camera [4, 4] of those that are first on an edge of the tree,
+    and the edge that could not be joined to the others, if one could not."""
+    points: dict[int, Placed] = {}
     poses: dict[int, Float64] = {}
     for e, from_first in spanning_tree(observations.edges, observations.scores):
         photos = [int(photo) for photo in observations.edges[e]]
-        placed, new = (0, 1) if from_first else (1, 0)
+        old, new = (0, 1) if from_first else (1, 0)
         sides = [observations.side(e, side) for side in (0, 1)]
-        similarity: Similarity | None = Similarity(1.0, np.eye(3), np.zeros(3))
-        if points:
-            xyz, confidence = sides[placed]
-            similarity = similarity_of_points(xyz, points[photos[placed]], np.log(confidence))
-        else:
-            points[photos[placed]] = sides[placed][0]
+        points.setdefault(photos[old], sides[old])  # The first edge's are where they are.
+        similarity = _onto([(sides[old], points[photos[old]])])
         if similarity is None:
             return points, poses, [e]
-        points[photos[new]] = apply(similarity, sides[new][0])
+        xyz, confidence = sides[new]
+        points[photos[new]] = apply(similarity, xyz), confidence
         poses.setdefault(photos[0], _camera_of_edge(observations, e, similarity))
     return points, poses, []
+
+
+def _onto(parts: Sequence[tuple[Placed, Placed]]) -> Similarity | None:
+    """The similarity from points to where they are placed, by what both are sure of."""
+    return similarity_of_points(
+        np.concatenate([xyz for (xyz, _), _ in parts], axis=1),
+        np.concatenate([xyz for _, (xyz, _) in parts], axis=1),
+        np.concatenate([np.log(np.minimum(one, other)) for (_, one), (_, other) in parts]),
+    )
 
 
 def _camera_of_edge(observations: Observations, edge: int, similarity: Similarity) -> Float64:
@@ -100,19 +109,19 @@ def _camera_of_edge(observations: Observations, edge: int, similarity: Similarit
 def _posed(
     observations: Observations,
     photo: int,
-    points: Float64,
+    placed: Placed,
     K: Float64 | None,
     known: PhotoToAlign,
     seed: int,
 ) -> tuple[Float64, Float64] | None:
-    """World-to-camera [4, 4] and intrinsics [3, 3] of a photo whose points [3, P] are placed.
+    """World-to-camera [4, 4] and intrinsics [3, 3] of a photo whose points are placed.
 
     Of the poses that the pixels and that the photo's own frame tell, the one whose rays pass nearer
     to the points: where these are right only nearly, and seen from far beside where they were first
     seen, RANSAC finds some that agree on a wrong pose.
     """
     seen = observations.photos[photo]
-    confidence = seen.confidence.max(axis=0).astype(np.float64)
+    points, confidence = placed
     size = (known.height, known.width)
     if K is None:
         guessed = absolute_pose_and_focal(points, seen.pixels, confidence, size, seed)
@@ -123,7 +132,7 @@ def _posed(
     else:
         posed = absolute_pose(points, seen.pixels, confidence, K, size, seed)
         poses = [] if posed is None else [posed[0]]
-    own = _own_pose(observations, photo, points)
+    own = _own_pose(observations, photo, placed)
     if own is not None:
         poses.append(own)
     if not poses:
@@ -139,12 +148,11 @@ def _posed(
     return min(poses, key=off_rays), K
 
 
-def _own_pose(observations: Observations, photo: int, points: Float64) -> Float64 | None:
-    """World-to-camera [4, 4] from what the photo's own frame says of its points [3, P], or None."""
+def _own_pose(observations: Observations, photo: int, placed: Placed) -> Float64 | None:
+    """World-to-camera [4, 4] from what the photo's own frame says of its points, or None."""
     own = np.flatnonzero(observations.edges[:, 0] == photo)
     for e in own[np.argsort(-observations.scores[own], kind="stable")]:
-        xyz, confidence = observations.side(int(e), 0)
-        similarity = similarity_of_points(xyz, points, np.log(confidence))
+        similarity = _onto([(observations.side(int(e), 0), placed)])
         if similarity is not None:
             return _camera_of_edge(observations, int(e), similarity)
     return None
@@ -195,24 +203,27 @@ def _to_fixed(found: dict[int, Float64], photos: Sequence[PhotoToAlign]) -> Simi
     return similarity_between(cameras, others)
 
 
-def _edges(observations: Observations, points: dict[int, Float64]) -> list[Similarity | None]:
+def _edges(observations: Observations, placed: dict[int, Placed]) -> list[Similarity | None]:
     """Per edge the similarity from its frame to the points of both its photos."""
-    result = []
-    for e, photos in enumerate(observations.edges):
-        sides = [observations.side(e, side) for side in (0, 1)]
-        result.append(
-            similarity_of_points(
-                np.concatenate([xyz for xyz, _ in sides], axis=1),
-                np.concatenate([points[int(photo)] for photo in photos], axis=1),
-                np.log(np.concatenate([confidence for _, confidence in sides])),
-            )
-        )
-    return result
+    return [
+        _onto([(observations.side(e, side), placed[int(photos[side])]) for side in (0, 1)])
+        for e, photos in enumerate(observations.edges)
+    ]
 
 
-def _depths(viewmat: Float64, points: Float64) -> Float64:
-    """Depths [P] of points [3, P]; what is not in front of the camera gets the median depth."""
-    depth = viewmat[2, :3] @ points + viewmat[2, 3]
-    ahead = depth > 0.0
+def _depths(observations: Observations, placement: Placement, photo: int) -> Float64:
+    """Depths [P] of a photo's pixels; those that nobody sees before the camera get the median."""
+    seen = observations.photos[photo]
+    K, viewmat = placement.intrinsics[photo], placement.viewmats[photo]
+    camera = Similarity(1.0, viewmat[:3, :3], viewmat[:3, 3])
+    to_camera = [joined(camera, placement.edges[e]) for e in seen.edges]
+    slopes = (seen.pixels - K[[0, 1], 2]) / K[[0, 1], [0, 1]]
+    depth = depths_on_rays(
+        np.stack([apply(edge, xyz) for edge, xyz in zip(to_camera, seen.points, strict=True)]),
+        np.log(seen.confidence),
+        slopes.T,
+    )
+    with np.errstate(invalid="ignore"):
+        ahead = depth > 0.0
     typical = float(np.median(depth[ahead])) if ahead.any() else 1.0
     return np.maximum(np.where(ahead, depth, typical), 1e-3 * typical)
