@@ -15,6 +15,7 @@ from .compaction import Compaction, compact
 from .errors import IgsrError
 from .evaluation import evaluate
 from .fitting import Progress, fit, fit_with_cameras
+from .pose import estimate_poses
 from .poses import refine_cameras
 from .rasterization import rasterization
 from .rendering import Render, render
@@ -32,6 +33,7 @@ __all__ = [
     "View",
     "__version__",
     "compact",
+    "estimate_poses",
     "evaluate",
     "fit",
     "fit_with_cameras",

@@ -1,4 +1,4 @@
-"""Write a file whole or not at all.
+"""Write a file, or a folder of files, whole or not at all.
 
 A file that someone may be reading, or may need after a crash, is never opened for writing: the
 new content goes to a temporary name in the same folder and takes the old name in one rename.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -56,6 +57,58 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
+    """Give a temporary folder to fill; on success it takes the name ``path``, on failure it goes.
+
+    Args:
+        path: where the finished folder shall lie; it must not be there or be empty.
+        replace: a folder that is there, whatever it holds, is replaced at the end.
+
+    Yields:
+        The folder to fill; it lies beside ``path``.
+
+    Raises:
+        IgsrError: ``path`` is there and holds something, or the folder cannot be made or filled.
+    """
+    target = Path(path)
+    check_folder(target, replace=replace)
+    temporary: Path | None = None
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(
+            tempfile.mkdtemp(prefix=f".{target.name}-", suffix=".unfinished", dir=target.parent)
+        )
+        new, old = temporary / "new", temporary / "old"
+        new.mkdir()
+        yield new
+        if target.exists():
+            os.rename(target, old)
+        os.rename(new, target)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise IgsrError(f"Cannot write {target}: {reason}.") from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_folder(path: str | os.PathLike[str], *, replace: bool = False) -> None:
+    """Find out before long work whether ``atomic_folder`` will take a path.
+
+    Raises:
+        IgsrError: the path is a file, or a folder that holds something and is not to be replaced.
+    """
+    target = Path(path)
+    try:
+        if target.exists() and not target.is_dir():
+            raise IgsrError(f"Cannot write {target}: it is a file.")
+        if not replace and target.is_dir() and any(target.iterdir()):
+            raise IgsrError(f"{target} holds something already; name a new folder.")
+    except OSError as error:
+        raise IgsrError(f"Cannot write {target}: {error.strerror or error}.") from error
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

@@ -1,4 +1,4 @@
-"""The ``igsr`` command: fit, render, eval, info, compact, study, bench."""
+"""The ``igsr`` command: pose, fit, render, eval, info, export, compact, study, bench."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,13 +23,19 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
 from . import _core
-from .atomic_write import atomic_write, check_writable
+from .atomic_write import atomic_write, check_folder, check_writable
 from .capture import Camera, Capture, load_capture
+from .capture.folder import holds_cameras
+from .capture.photo_folder import FRAMES, has_photos
+from .capture.write_colmap import write_colmap
+from .capture.write_files import relative_name
+from .capture.write_transforms import write_transforms
 from .compaction import DEFAULT_STEPS, CompactProgress, compact, write_plot
 from .errors import IgsrError
 from .evaluation import METRICS, ScoredView, default_background, default_split, evaluate
 from .fitting import Progress, fit_with_cameras
 from .orbit import orbit
+from .pose import capture_of, estimate, photos_of
 from .poses import refine_cameras
 from .presets import preset_settings
 from .rendering import render
@@ -37,7 +43,7 @@ from .report import sheet_names, write_cameras, write_contact_sheet, write_repor
 from .splats import Splats
 
 app = typer.Typer(
-    help="Fit a Gaussian-splat scene from photos with known cameras.",
+    help="Fit a Gaussian-splat scene from photos, with known cameras or without.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -100,6 +106,22 @@ class FocalChoice(str, enum.Enum):
     per_camera = "per-camera"
 
 
+class EstimatorChoice(str, enum.Enum):
+    """What finds cameras."""
+
+    auto = "auto"
+    colmap = "colmap"
+    dust3r = "dust3r"
+
+
+class FormatChoice(str, enum.Enum):
+    """Files that describe cameras."""
+
+    colmap = "colmap"
+    colmap_text = "colmap-text"
+    transforms = "transforms"
+
+
 class StudyChoice(str, enum.Enum):
     """Protocols of ``igsr study``."""
 
@@ -145,6 +167,19 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object,
 CaptureArgument = Annotated[
     Path, typer.Argument(metavar="CAPTURE", help="Folder or file that holds photos and cameras.")
 ]
+FramesOption = Annotated[
+    int, typer.Option("--frames", help="How many frames are taken of each video.")
+]
+EstimatorOption = Annotated[
+    EstimatorChoice,
+    typer.Option(
+        "--estimator",
+        help="What finds cameras: auto is DUSt3R where a checkpoint is found, else COLMAP.",
+    ),
+]
+CheckpointOption = Annotated[
+    Path | None, typer.Option("--checkpoint", metavar="FILE", help="Of DUSt3R's network.")
+]
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A splat .ply file.")]
 
 
@@ -178,11 +213,10 @@ def one_sentence(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Ite
 
 @contextlib.contextmanager
 def _warnings_as_sentences() -> Iterator[None]:
-    """Print the warnings of igsr itself as the command prints its errors."""
-    with warnings.catch_warnings(record=True) as caught:
+    """Print the warnings of igsr itself as the command prints its errors, as they come."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *rest: _complain(str(message))
         yield
-    for warning in caught:
-        _complain(str(warning.message))
 
 
 def _complain(sentence: str) -> None:
@@ -217,6 +251,41 @@ def _load(path: Path, holdout: int | None) -> Capture:
     return capture if holdout is None else capture.with_holdout(holdout)
 
 
+def _fit_capture(
+    path: Path,
+    out: Path,
+    holdout: int | None,
+    estimator: EstimatorChoice,
+    checkpoint: Path | None,
+    frames: int,
+    seed: int,
+    *,
+    resume: bool,
+    shown: bool,
+) -> Capture:
+    """The capture at a path; photos without cameras get them, kept in ``out/capture``."""
+    if holds_cameras(path) or not has_photos(path):
+        if checkpoint is not None or estimator is not EstimatorChoice.auto:
+            raise IgsrError(
+                f"{path} has cameras, or no photos; leave --estimator and --checkpoint out"
+            )
+        return _load(path, holdout)
+    kept = out / "capture"
+    if kept.resolve() in (path.resolve(), *path.resolve().parents):
+        raise IgsrError(f"{path} lies where the fit would write {kept}; name another --out")
+    if resume and holds_cameras(kept):
+        _complain(f"The cameras found before are used, from {kept}")
+    else:
+        report = _posed(
+            path, kept, estimator, checkpoint, frames, seed, plot=False, shown=shown, replace=True
+        )
+        _complain(
+            f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
+            f"{report['estimator']} and are kept in {kept}"
+        )
+    return _load(kept, holdout)
+
+
 def _console() -> Console:
     # Paths stay whole: a terminal breaks long lines by itself.
     return Console(file=sys.stdout, highlight=False, soft_wrap=True)
@@ -244,6 +313,145 @@ def _protocol_line(protocol: dict[str, Any]) -> str:
         f"scored on {protocol['views']} {protocol['split']} view"
         f"{'' if protocol['views'] == 1 else 's'} over {behind}, {protocol['pixels']}"
     )
+
+
+@app.command("pose")
+def pose_command(
+    photos: Annotated[
+        list[Path],
+        typer.Argument(metavar="PHOTOS", help="A folder of photos, or photos and videos."),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for the capture; it must be new or empty.")
+    ],
+    estimator: EstimatorOption = EstimatorChoice.auto,
+    checkpoint: CheckpointOption = None,
+    plot: Annotated[
+        bool, typer.Option("--plot", help="Draw cameras and points to poses.png in --out.")
+    ] = False,
+    frames: FramesOption = FRAMES,
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the cameras of PHOTOS and write both as a COLMAP capture."""
+    with one_sentence(lambda: "Interrupted; nothing is written."), _warnings_as_sentences():
+        check_folder(out)
+        started = time.monotonic()
+        given = photos[0] if len(photos) == 1 else photos
+        if estimator is EstimatorChoice.auto and isinstance(given, Path) and holds_cameras(given):
+            raise IgsrError(
+                f"{given} has cameras already; fit it as it is, or name an --estimator to find "
+                "them anew"
+            )
+        report = _posed(
+            given, out, estimator, checkpoint, frames, seed, plot=plot, shown=not as_json
+        )
+        report["seconds"] = round(time.monotonic() - started, 3)
+    if as_json:
+        _print_json(report)
+        return
+    console = _console()
+    console.print(
+        f"{len(report['cameras'])} of {report['photos']} photos placed by {report['estimator']} in "
+        f"{report['seconds']:.1f} s, {report['points']} points, seed {seed}"
+    )
+    console.print("  ".join([str(out), *([str(out / "poses.png")] if plot else [])]), style="dim")
+
+
+def _posed(
+    photos: Path | list[Path],
+    out: Path,
+    estimator: EstimatorChoice,
+    checkpoint: Path | None,
+    frames: int,
+    seed: int,
+    *,
+    plot: bool,
+    shown: bool,
+    replace: bool = False,
+) -> dict[str, Any]:
+    """Find cameras and write the capture; what ``igsr pose`` reports."""
+    from .pose.plot import plot_poses
+
+    options: dict[str, Any] = {} if checkpoint is None else {"checkpoint": checkpoint}
+    loaded = photos_of(photos, frames)
+    with _pose_bar(shown) as show:
+        name, found = estimate(loaded, estimator.value, seed=seed, progress=show, **options)
+    for sentence in found.warnings:
+        _complain(sentence)
+    capture = capture_of(photos if isinstance(photos, Path) else Path("photos"), loaded, found)
+    write_colmap(capture, out, replace=replace)
+    if plot:
+        plot_poses(out / "poses.png", capture)
+    return {
+        "estimator": name,
+        "photos": len(loaded),
+        "cameras": [
+            {
+                "name": view.name,
+                "centre": view.camera.centre.tolist(),
+                "focal": [float(view.camera.K[0, 0]), float(view.camera.K[1, 1])],
+            }
+            for view in capture.views
+        ],
+        "not_placed": [
+            photo.name
+            for photo, camera in zip(loaded, found.cameras, strict=True)
+            if camera is None
+        ],
+        "points": 0 if capture.points is None else len(capture.points.xyz),
+        "warnings": found.warnings,
+        "seed": seed,
+        "version": _core.__version__,
+        "out": str(out),
+    }
+
+
+@contextlib.contextmanager
+def _pose_bar(shown: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on stderr, one line for each stage of finding cameras."""
+    bar = ProgressBar(
+        TextColumn("{task.description} {task.completed}/{task.total}"),
+        BarColumn(bar_width=30),
+        TimeRemainingColumn(compact=True),
+        console=Console(file=sys.stderr, highlight=False),
+        disable=not shown,
+        transient=True,
+    )
+    tasks: dict[str, Any] = {}
+    with _stopped(bar):
+
+        def show(stage: str, done: int, total: int) -> None:
+            bar.start()
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield show
+
+
+@app.command("export")
+def export_command(
+    capture_path: CaptureArgument,
+    out: Annotated[Path, typer.Option("--out", help="Folder; it must be new or empty.")],
+    form: Annotated[
+        FormatChoice,
+        typer.Option("--format", help="colmap (binary), colmap-text, or nerfstudio's transforms."),
+    ] = FormatChoice.colmap,
+    as_json: JsonOption = False,
+) -> None:
+    """Write CAPTURE in another format: photos undistorted, at full resolution, masks as masks."""
+    with one_sentence(lambda: "Interrupted; nothing is written."):
+        check_folder(out)
+        capture = load_capture(capture_path)
+        if form is FormatChoice.transforms:
+            write_transforms(capture, out)
+        else:
+            write_colmap(capture, out, text=form is FormatChoice.colmap_text)
+    if as_json:
+        _print_json({"out": str(out), "format": form.value, "views": len(capture.views)})
+    else:
+        _console().print(f"{len(capture.views)} views in {out}")
 
 
 @app.command("fit")
@@ -302,13 +510,19 @@ def fit_command(
         FocalChoice | None,
         typer.Option("--focal", help="Focal lengths that are fitted: one factor for all, or each."),
     ] = None,
+    estimator: EstimatorOption = EstimatorChoice.auto,
+    network: CheckpointOption = None,
+    frames: FramesOption = FRAMES,
     background: BackgroundOption = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit splats to the photos of CAPTURE and score them."""
+    """Fit splats to the photos of CAPTURE and score them.
+
+    Where CAPTURE is a plain folder of photos, or a video, its cameras are found first.
+    """
     last: list[Progress] = []
 
     def interrupted() -> str:
@@ -321,7 +535,18 @@ def fit_command(
 
     with one_sentence(interrupted):
         name = _resolved(backend)
-        capture = _load(capture_path, holdout)
+        with _warnings_as_sentences():
+            capture = _fit_capture(
+                capture_path,
+                out,
+                holdout,
+                estimator,
+                network,
+                frames,
+                seed,
+                resume=resume,
+                shown=not as_json,
+            )
         color = _color(background) or default_background(capture)
         # Photos with alpha are fitted over random colours, so that no background is learnt.
         has_alpha = any(view.image.shape[2] == 4 for view in capture.train_views)
@@ -801,9 +1026,7 @@ def _write_pictures(
 
 def _picture_name(view_name: str, suffix: str) -> Path:
     """A view's name as a relative path that cannot leave the folder it is joined to."""
-    parts = [part for part in PurePosixPath(view_name).parts if part not in ("/", "..", ".")]
-    relative = Path(*parts) if parts else Path("view")
-    return relative.with_suffix(suffix)
+    return Path(relative_name(view_name)).with_suffix(suffix)
 
 
 @app.command("info")

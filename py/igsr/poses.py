@@ -103,12 +103,12 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> di
     angles, distances = [], []
     for camera, true_camera in zip(cameras, true_cameras, strict=True):
         aligned = to_cameras.camera(true_camera)
-        angles.append(_angle(camera.viewmat[:3, :3] @ aligned.viewmat[:3, :3].T))
+        angles.append(rotation_angle(camera.viewmat[:3, :3] @ aligned.viewmat[:3, :3].T))
         distances.append(np.linalg.norm(camera.centre - aligned.centre) / to_cameras.scale)
     return {"rotation": float(np.mean(angles)), "centre": float(np.mean(distances))}
 
 
-def _angle(rotation: Float64) -> float:
+def rotation_angle(rotation: Float64) -> float:
     """Degrees that a rotation matrix turns by; accurate for small ones too."""
     sine = 0.5 * np.linalg.norm(
         [

@@ -5,6 +5,9 @@ pycolmap, which reads a truncated file as zeros without a word and ends the whol
 the tests hold this reader against models that pycolmap wrote. Models of COLMAP 3.12 and later have
 rigs and frames too, but their images file still gives each image's own pose.
 
+Points without a track are not COLMAP's own: their error, where positive, is 1 / confidence, as
+``write_colmap`` has it.
+
 Source of the formats and camera models: https://colmap.github.io/format.html and cameras.html.
 """
 
@@ -95,7 +98,8 @@ def load_colmap(path: Path, model: Path) -> Capture:
     """Load a COLMAP capture; all its views are for training.
 
     Args:
-        path: the capture; its photos are in ``images/`` or, where that is missing, in itself.
+        path: the capture; its photos are in ``images/`` or, where that is missing, in itself, and
+            a photo's mask, where it has one, in ``masks/`` under its whole name and ``.png``.
         model: the folder with cameras, images and points3D, all ``.bin`` or all ``.txt``.
 
     Raises:
@@ -136,7 +140,9 @@ def load_colmap(path: Path, model: Path) -> Capture:
         except IgsrError as error:
             raise IgsrError(f"{cameras_path}, camera {image.camera_id}: {error}") from error
         name = posixpath.normpath((images_folder.relative_to(path) / image.name).as_posix())
-        shots.append(Shot(name, photo, camera, lens, "train", None, images_path))
+        mask = path / "masks" / f"{image.name}.png"
+        mask_path = mask if is_file(mask) else None
+        shots.append(Shot(name, photo, camera, lens, "train", mask_path, images_path))
     points = None
     if is_file(points_path):
         points = (_binary_points if binary else _text_points)(points_path)
@@ -273,13 +279,15 @@ def _binary_points(path: Path) -> Points | None:
     file = _Bytes(path)
     xyz: list[tuple[float, ...]] = []
     rgb: list[tuple[int, ...]] = []
+    errors: list[float] = []
     for _ in range(_count(file)):
-        _, x, y, z, r, g, b, _, track_length = file.unpack(_POINT)
+        _, x, y, z, r, g, b, error, track_length = file.unpack(_POINT)
         file.skip(8 * track_length)
         xyz.append((x, y, z))
         rgb.append((r, g, b))
+        errors.append(math.nan if track_length else error)
     file.finish()
-    return _points(path, xyz, rgb)
+    return _points(path, xyz, rgb, errors)
 
 
 # --- text -----------------------------------------------------------------------------------------
@@ -341,24 +349,33 @@ def _text_images(path: Path) -> list[_ColmapImage]:
 def _text_points(path: Path) -> Points | None:
     xyz: list[tuple[float, ...]] = []
     rgb: list[tuple[int, ...]] = []
+    errors: list[float] = []
     for number, line in _lines(path):
         if not line:
             continue
         try:
-            _, x, y, z, r, g, b = line.split(maxsplit=7)[:7]
+            _, x, y, z, r, g, b, *rest = line.split(maxsplit=8)
+            errors.append(float(rest[0]) if len(rest) == 1 else math.nan)
             xyz.append((float(x), float(y), float(z)))
             rgb.append((int(r), int(g), int(b)))
             if not all(0 <= value <= 255 for value in rgb[-1]):
                 raise ValueError
         except ValueError as error:
             raise _damaged(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from error
-    return _points(path, xyz, rgb)
+    return _points(path, xyz, rgb, errors)
 
 
-def _points(path: Path, xyz: list[tuple[float, ...]], rgb: list[tuple[int, ...]]) -> Points | None:
+def _points(
+    path: Path, xyz: list[tuple[float, ...]], rgb: list[tuple[int, ...]], errors: list[float]
+) -> Points | None:
+    """Points, ``errors`` NaN where they have tracks."""
     if not xyz:
         return None
-    points = Points(np.array(xyz, dtype=np.float64), np.array(rgb, dtype=np.uint8))
+    error = np.array(errors, dtype=np.float64)
+    # Beyond these, 1 / error is no finite number.
+    told = (error > 1e-300) & (error < 1e300)
+    confidence = 1.0 / error if told.all() else None
+    points = Points(np.array(xyz, dtype=np.float64), np.array(rgb, dtype=np.uint8), confidence)
     if not np.isfinite(points.xyz).all():
         raise IgsrError(f"{path} has a point that is not finite; remove it")
     return points

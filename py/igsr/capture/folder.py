@@ -57,16 +57,33 @@ def load_capture(path: str | os.PathLike[str]) -> Capture:
     if photos:
         raise IgsrError(
             f"{path} holds {len(photos)} images but no cameras; put a COLMAP model (sparse/0) or a "
-            "transforms.json beside them"
+            "transforms.json beside them, or find cameras with igsr pose"
         )
     if (path / "images").is_dir():
         raise IgsrError(
             f"{path} holds an images folder but no cameras; put a COLMAP model (sparse/0) or a "
-            "transforms.json beside it"
+            "transforms.json beside it, or find cameras with igsr pose"
         )
     raise IgsrError(
         f"{path} holds no images and no cameras; give a folder with a transforms.json, or with "
         "images and a COLMAP model in sparse/0"
+    )
+
+
+def holds_cameras(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is a capture, photos with cameras, as ``load_capture`` finds it."""
+    path = Path(path)
+    if is_file(path):
+        return path.suffix.lower() == ".json"
+    try:
+        folders = [path, path.resolve().parent] if path.resolve().name == "images" else [path]
+    except (OSError, ValueError):
+        return False
+    return any(
+        is_file(folder / "transforms.json")
+        or is_file(folder / "transforms_train.json")
+        or find_model(folder) is not None
+        for folder in folders
     )
 
 

@@ -16,7 +16,11 @@ from igsr.capture.types import Camera, View
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".gif")
+_HEIF_SUFFIXES = (".heic", ".heif")
+SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".gif"),
+    *_HEIF_SUFFIXES,
+)
 
 # Pillow knows more, but some of those (EPS) hand the file to another program.
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "GIF")
@@ -56,11 +60,22 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def _open(path: Path) -> Image.Image:
-    """The image behind a path, its pixels not yet decoded."""
+def open_image(path: Path) -> Image.Image:
+    """The image behind a path, its pixels not yet decoded.
+
+    Raises:
+        IgsrError: missing, of no format that is read, or claiming more pixels than its bytes hold.
+    """
+    formats: tuple[str, ...] = _FORMATS
+    if path.suffix.lower() in _HEIF_SUFFIXES:
+        # It loads an HEVC decoder, which few captures need.
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
+        formats = ("HEIF",)
     try:
         file_size = path.stat().st_size
-        image = Image.open(path, formats=_FORMATS)
+        image = Image.open(path, formats=formats)
     except FileNotFoundError as error:
         raise IgsrError(f"{path} does not exist; put the image there") from error
     except Image.DecompressionBombError as error:
@@ -84,12 +99,12 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         IgsrError: the file is missing or no image.
     """
-    with _open(path) as image:
+    with open_image(path) as image:
         return image.size
 
 
 def _decode(path: Path, width: int, height: int, source: Path, what: str) -> Image.Image:
-    with _open(path) as image:
+    with open_image(path) as image:
         if image.size != (width, height):
             turned = (
                 " (an EXIF orientation is never applied)"
@@ -100,11 +115,20 @@ def _decode(path: Path, width: int, height: int, source: Path, what: str) -> Ima
                 f"{path} is {image.width}x{image.height} pixels but its camera in {source.name} "
                 f"is {width}x{height}{turned}; resize the {what} or correct the camera"
             )
-        try:
-            image.load()
-        except Exception as error:  # as above
-            raise IgsrError(f"{path} is truncated or damaged; copy it again") from error
+        load_pixels(image, path)
         return image
+
+
+def load_pixels(image: Image.Image, path: Path) -> None:
+    """Decode the pixels of an image that ``open_image`` gave.
+
+    Raises:
+        IgsrError: they are truncated or damaged.
+    """
+    try:
+        image.load()
+    except Exception as error:  # as in open_image
+        raise IgsrError(f"{path} is truncated or damaged; copy it again") from error
 
 
 def _eight_bit(image: Image.Image, path: Path) -> Image.Image:
@@ -135,7 +159,16 @@ def read_image(path: Path, width: int, height: int, source: Path) -> np.ndarray:
     Raises:
         IgsrError: missing, unreadable, truncated, or of another size.
     """
-    image = _eight_bit(_decode(path, width, height, source, "image"), path)
+    return pixels_of(_decode(path, width, height, source, "image"), path)
+
+
+def pixels_of(image: Image.Image, path: Path) -> np.ndarray:
+    """A decoded image as uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha where it has any.
+
+    Raises:
+        IgsrError: its pixels are of a kind that is no photo's.
+    """
+    image = _eight_bit(image, path)
     transparent = "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
     mode = "RGBA" if transparent else "RGB"
     if image.mode == "La":
@@ -156,7 +189,16 @@ def read_mask(path: Path, width: int, height: int, source: Path) -> np.ndarray:
     Raises:
         IgsrError: as ``read_image``.
     """
-    image = _eight_bit(_decode(path, width, height, source, "mask"), path)
+    return mask_of(_decode(path, width, height, source, "mask"), path)
+
+
+def mask_of(image: Image.Image, path: Path) -> np.ndarray:
+    """A decoded image as a mask, bool [H, W]; see ``read_mask``.
+
+    Raises:
+        IgsrError: its pixels are of a kind that is no mask's.
+    """
+    image = _eight_bit(image, path)
     try:
         # convert("L") of transparent images keeps the grey and drops the alpha.
         grey = np.array(image.convert("L")).astype(np.int32)

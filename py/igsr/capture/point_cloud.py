@@ -1,4 +1,4 @@
-"""Point clouds in .ply files, as nerfstudio's ``ply_file_path`` names them."""
+"""Point clouds in .ply files, as nerfstudio's ``ply_file_path`` names them, read and written."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
 def read_point_cloud(path: Path) -> Points | None:
-    """Read positions and colours; other properties and elements are passed over.
+    """Read positions, colours and confidences; other properties and elements are passed over.
 
-    Points without colours come out grey.
+    Points without colours come out grey. Confidences count where all are positive.
 
     Raises:
         IgsrError: the file is missing, is no .ply of points, is truncated, or has a point that is
@@ -88,4 +88,30 @@ def read_point_cloud(path: Path) -> Points | None:
         if order != "ascii" and kinds["red"][1] == "f":
             colours = colours * 255.0
         rgb = np.clip(np.nan_to_num(colours), 0, 255).astype(np.uint8)
-    return Points(xyz, rgb)
+    confidence = columns.get("confidence")
+    if confidence is not None and not (np.isfinite(confidence) & (confidence > 0.0)).all():
+        confidence = None
+    return Points(xyz, rgb, confidence)
+
+
+def write_point_cloud(path: Path, points: Points) -> None:
+    """Write positions in float64, colours and, where there are any, confidences; binary."""
+    layout = [*((name, "<f8") for name in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))]
+    if points.confidence is not None:
+        layout.append(("confidence", "<f8"))
+    table = np.zeros(len(points.xyz), dtype=np.dtype(layout))
+    for column, name in enumerate("xyz"):
+        table[name] = points.xyz[:, column]
+    for column, name in enumerate(("red", "green", "blue")):
+        table[name] = points.rgb[:, column]
+    if points.confidence is not None:
+        table["confidence"] = points.confidence
+    kinds = {"<f8": "double", "u1": "uchar"}
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(table)}",
+        *(f"property {kinds[kind]} {name}" for name, kind in layout),
+        "end_header",
+    ]
+    path.write_bytes("\n".join(header).encode() + b"\n" + table.tobytes())

@@ -1,0 +1,98 @@
+"""What a camera wrote into a photo about itself: which way is up, its focal length, its name.
+
+EXIF is untrusted and often wrong or damaged: what cannot be read is taken as not written.
+
+Sources: Exif 2.32 (CIPA DC-008); 35 mm equivalents are by the diagonal of the picture, 43.27 mm on
+film (CIPA DCG-001).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+_ORIENTATION, _MAKE, _MODEL, _SUB_FOLDER = 0x0112, 0x010F, 0x0110, 0x8769
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
+_PIXEL_WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA20E, 0xA210
+_MM_FROM_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_FILM_DIAGONAL = math.hypot(36.0, 24.0)
+# Fisheyes and telescopes lie within; what is outside is no focal length but a wrong field.
+_FOCAL_RANGE = (0.2, 50.0)
+
+
+@dataclass(frozen=True)
+class Exif:
+    """What a photo's EXIF says.
+
+    Attributes:
+        orientation: 1 to 8, as EXIF numbers them; 1 is upright.
+        focal: focal length in pixels of the photo as stored, or None.
+        device: make, model and lens of the camera, or None.
+    """
+
+    orientation: int
+    focal: float | None
+    device: str | None
+
+
+def read_exif(image: Image.Image) -> Exif:
+    """Read the EXIF of an image that is open; pixels need not be decoded."""
+    try:
+        fields = dict(image.getexif())
+        fields.update(image.getexif().get_ifd(_SUB_FOLDER))
+    except Exception:  # Pillow raises anything at all on broken EXIF
+        fields = {}
+    orientation = fields.get(_ORIENTATION)
+    if not isinstance(orientation, int) or not 1 <= orientation <= 8:
+        orientation = 1
+    names = [_text(fields.get(tag)) for tag in (_MAKE, _MODEL, _LENS_MODEL)]
+    device = " ".join(name for name in names if name) or None
+    return Exif(orientation, _focal(fields, *image.size), device)
+
+
+def _focal(fields: dict[int, Any], width: int, height: int) -> float | None:
+    equivalent = _number(fields.get(_FOCAL_LENGTH_35MM))
+    if equivalent is not None:
+        return _plausible(equivalent * math.hypot(width, height) / _FILM_DIAGONAL, width, height)
+    length, resolution = (_number(fields.get(tag)) for tag in (_FOCAL_LENGTH, _PLANE_RESOLUTION))
+    if length is None or resolution is None:
+        return None
+    unit = _MM_FROM_UNIT.get(fields.get(_PLANE_UNIT, 2), 25.4)
+    # The plane's resolution is that of the photo as it was taken, before it was reduced.
+    taken = _number(fields.get(_PIXEL_WIDTH)) or float(width)
+    reduced = max(width, height) / taken if taken >= max(width, height) else 1.0
+    return _plausible(length * resolution / unit * reduced, width, height)
+
+
+def _plausible(focal: float, width: int, height: int) -> float | None:
+    low, high = (factor * max(width, height) for factor in _FOCAL_RANGE)
+    return focal if low < focal < high else None
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0.0 else None
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        return ""
+    return " ".join("".join(c if c.isprintable() else " " for c in value).split())
+
+
+def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Pixels [H, W, ...] turned and mirrored as an EXIF orientation says, so that up is up."""
+    if orientation in (5, 6, 7, 8):
+        pixels = np.swapaxes(pixels, 0, 1)
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    return np.ascontiguousarray(pixels)

@@ -1,0 +1,162 @@
+"""Captures written as COLMAP writes them: ``sparse/0``, ``images/`` and ``masks/``.
+
+Cameras are PINHOLE, and there are no tracks. A point without a track has its confidence as an
+error, 1 / confidence (0 where none is known), which ``load_capture`` reads back. A mask has the
+photo's whole name and ``.png``, as COLMAP's feature extraction expects it.
+
+Source of the formats: https://colmap.github.io/format.html.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.atomic_write import atomic_folder
+from igsr.capture.types import Camera, Capture, Points
+from igsr.capture.write_files import png_names, write_pictures
+
+Float64 = npt.NDArray[np.float64]
+
+_PINHOLE = 1
+
+
+def write_colmap(
+    capture: Capture,
+    out: str | os.PathLike[str],
+    *,
+    text: bool = False,
+    replace: bool = False,
+) -> None:
+    """Write a capture as a folder that COLMAP and all that read its models take.
+
+    Args:
+        capture: what to write. Which views are for training is not part of the format.
+        out: the folder; it must not be there or be empty.
+        text: write ``.txt`` files instead of ``.bin``.
+        replace: a folder that is there is replaced once the new one is whole.
+
+    Raises:
+        IgsrError: the folder is there and holds something, or cannot be written.
+    """
+    names = png_names(capture.views)
+    with atomic_folder(out, replace=replace) as folder:
+        write_pictures(folder, capture.views, names, lambda name: f"{name}.png")
+        model = folder / "sparse" / "0"
+        model.mkdir(parents=True)
+        cameras = [view.camera for view in capture.views]
+        (_write_text if text else _write_binary)(model, cameras, names, capture.points)
+
+
+def _distinct(cameras: list[Camera]) -> tuple[list[Camera], list[int]]:
+    """Cameras of different intrinsics, and each one's number among them, from 1."""
+    numbers: dict[object, int] = {}
+    distinct, number_of = [], []
+    for camera in cameras:
+        key = camera.K.tobytes(), camera.width, camera.height
+        if key not in numbers:
+            numbers[key] = len(numbers) + 1
+            distinct.append(camera)
+        number_of.append(numbers[key])
+    return distinct, number_of
+
+
+def _parameters(camera: Camera) -> list[float]:
+    K = camera.K
+    return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+
+
+def _pose(camera: Camera) -> list[float]:
+    """Quaternion wxyz and translation, world to camera."""
+    return [*quaternion(camera.viewmat[:3, :3]), *map(float, camera.viewmat[:3, 3])]
+
+
+def quaternion(rotation: Float64) -> list[float]:
+    """The unit quaternion wxyz of a rotation matrix [3, 3], w not negative.
+
+    Source: Shepperd, "Quaternion from Rotation Matrix", 1978: the largest component comes from the
+    diagonal and the others from it, so that none is divided by a small number.
+    """
+    m = rotation
+    squares = np.array(
+        [
+            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
+            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    products = np.array(
+        [
+            [squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], squares[1], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], squares[2], m[2, 1] + m[1, 2]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], squares[3]],
+        ]
+    )
+    row = products[int(squares.argmax())]
+    row = row / np.linalg.norm(row)
+    return [float(value) for value in (row if row[0] >= 0.0 else -row)]
+
+
+def _errors(points: Points) -> Float64:
+    if points.confidence is None:
+        return np.zeros(len(points.xyz))
+    return np.asarray(1.0 / points.confidence)
+
+
+def _write_binary(
+    model: Path, cameras: list[Camera], names: list[str], points: Points | None
+) -> None:
+    distinct, number_of = _distinct(cameras)
+    with open(model / "cameras.bin", "wb") as file:
+        file.write(struct.pack("<Q", len(distinct)))
+        for number, camera in enumerate(distinct, start=1):
+            file.write(struct.pack("<IiQQ", number, _PINHOLE, camera.width, camera.height))
+            file.write(struct.pack("<4d", *_parameters(camera)))
+    with open(model / "images.bin", "wb") as file:
+        file.write(struct.pack("<Q", len(cameras)))
+        for image, (camera, name, number) in enumerate(
+            zip(cameras, names, number_of, strict=True), start=1
+        ):
+            file.write(struct.pack("<I7dI", image, *_pose(camera), number))
+            file.write(name.encode() + b"\0" + struct.pack("<Q", 0))
+    count = 0 if points is None else len(points.xyz)
+    layout = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")]
+    table = np.zeros(count, dtype=np.dtype(layout))
+    if points is not None:
+        table["id"] = np.arange(1, count + 1)
+        table["xyz"], table["rgb"], table["error"] = points.xyz, points.rgb, _errors(points)
+    (model / "points3D.bin").write_bytes(struct.pack("<Q", count) + table.tobytes())
+
+
+def _write_text(
+    model: Path, cameras: list[Camera], names: list[str], points: Points | None
+) -> None:
+    distinct, number_of = _distinct(cameras)
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    for number, camera in enumerate(distinct, start=1):
+        numbers = " ".join(map(repr, _parameters(camera)))
+        lines.append(f"{number} PINHOLE {camera.width} {camera.height} {numbers}")
+    _write_lines(model / "cameras.txt", lines)
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[]"]
+    for image, (camera, name, number) in enumerate(
+        zip(cameras, names, number_of, strict=True), start=1
+    ):
+        lines += [f"{image} {' '.join(map(repr, _pose(camera)))} {number} {name}", ""]
+    _write_lines(model / "images.txt", lines)
+    lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
+    if points is not None:
+        rows = zip(points.xyz.tolist(), points.rgb.tolist(), _errors(points).tolist(), strict=True)
+        for point, (xyz, rgb, error) in enumerate(rows, start=1):
+            place = " ".join(map(repr, xyz))
+            lines.append(f"{point} {place} {' '.join(map(str, rgb))} {error!r}")
+    _write_lines(model / "points3D.txt", lines)
+
+
+def _write_lines(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

@@ -1,0 +1,69 @@
+"""Captures written as nerfstudio has them: ``transforms.json`` with cameras in OpenGL axes."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+import numpy as np
+
+from igsr.atomic_write import atomic_folder
+from igsr.capture.point_cloud import write_point_cloud
+from igsr.capture.types import Camera, Capture
+from igsr.capture.write_files import png_names, write_pictures
+
+
+def write_transforms(
+    capture: Capture, out: str | os.PathLike[str], *, replace: bool = False
+) -> None:
+    """Write ``transforms.json``, ``images/``, ``masks/`` and ``points.ply`` into a folder.
+
+    Args:
+        capture: what to write; which views are for training is kept where any is for testing.
+        out: the folder; it must not be there or be empty.
+        replace: a folder that is there is replaced once the new one is whole.
+
+    Raises:
+        IgsrError: the folder is there and holds something, or cannot be written.
+    """
+    names = png_names(capture.views)
+    frames = []
+    for view, name in zip(capture.views, names, strict=True):
+        frame = {"file_path": f"images/{name}", **_camera_fields(view.camera)}
+        if view.mask is not None:
+            frame["mask_path"] = f"masks/{name}"
+        frames.append(frame)
+    document: dict[str, Any] = {"camera_model": "PINHOLE", "frames": frames}
+    if capture.test_views:
+        for split in ("train", "test"):
+            document[f"{split}_filenames"] = [
+                frame["file_path"]
+                for frame, view in zip(frames, capture.views, strict=True)
+                if view.split == split
+            ]
+    with atomic_folder(out, replace=replace) as folder:
+        write_pictures(folder, capture.views, names, str)
+        if capture.points is not None:
+            document["ply_file_path"] = "points.ply"
+            write_point_cloud(folder / "points.ply", capture.points)
+        text = json.dumps(document, indent=2, allow_nan=False)
+        (folder / "transforms.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _camera_fields(camera: Camera) -> dict[str, Any]:
+    K = camera.K
+    pose = np.eye(4)
+    pose[:3, :3] = camera.viewmat[:3, :3].T
+    pose[:3, 3] = camera.centre
+    # From x right, y down, z forward to x right, y up, z back.
+    pose[:3, 1:3] *= -1.0
+    return {
+        "fl_x": float(K[0, 0]),
+        "fl_y": float(K[1, 1]),
+        "cx": float(K[0, 2]),
+        "cy": float(K[1, 2]),
+        "w": camera.width,
+        "h": camera.height,
+        "transform_matrix": pose.tolist(),
+    }

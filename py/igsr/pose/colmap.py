@@ -1,0 +1,369 @@
+"""Cameras by structure from motion, through pycolmap: features, matches, photo after photo.
+
+Nothing is downloaded, and nothing is learnt: where photos share too few recognisable places, they
+are not placed. What is matched decides more than how: all pairs of few photos, and of many those
+that lie near in the order of names or whose largest features look alike (Wu, "Towards Linear-time
+Incremental Structure from Motion", 3DV 2013, section 3).
+
+Photos that EXIF gives no focal length get one from the fundamental matrices of all pairs together
+(Sweeney et al., "Optimizing the Viewing Graph for Structure-from-Motion", ICCV 2015) before the
+first is placed: a start at a wrong focal length is where few photos fail most.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from igsr.capture import Camera, Points
+from igsr.capture.photo_folder import Photo
+from igsr.capture.types import intrinsic_matrix
+from igsr.capture.undistort import Lens
+
+from .estimate import Estimate, Progress
+
+Float64 = npt.NDArray[np.float64]
+
+#: Pixels of a photo's longer side at which features are found; bounds time.
+LONGEST = 1600
+#: Up to this many photos, every pair is matched.
+EXHAUSTIVE = 60
+#: Of more photos, each is matched with those that follow it by name and those that look alike.
+FOLLOWING = 8
+ALIKE = 16
+#: Largest features by which photos are found to look alike, and least matches of them.
+GLANCE = 256
+LEAST_ALIKE = 4
+#: Features and pairs done between two calls of progress; Ctrl-C is heard then.
+FEATURES_AT_ONCE, PAIRS_AT_ONCE = 4, 40
+#: Up to this many photos, what was not placed is tried with less evidence.
+FEW = 60
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a photo needs to be placed; COLMAP's names and, first, COLMAP's numbers.
+
+    Attributes:
+        init_min_num_inliers: matches of the first pair.
+        init_min_tri_angle: degrees that the rays of the first pair part by, in the median.
+        abs_pose_min_num_inliers: points that a further photo sees.
+        filter_min_tri_angle: degrees that the rays to a point part by.
+    """
+
+    init_min_num_inliers: int
+    init_min_tri_angle: float
+    abs_pose_min_num_inliers: int
+    filter_min_tri_angle: float
+
+
+STEPS = (Evidence(100, 16.0, 30, 1.5), Evidence(40, 6.0, 15, 1.0), Evidence(15, 2.0, 10, 0.5))
+
+
+class Colmap:
+    """Finds cameras with pycolmap; see the module."""
+
+    name = "colmap"
+
+    def __call__(
+        self, photos: Sequence[Photo], *, seed: int = 0, progress: Progress | None = None
+    ) -> Estimate:
+        """Place what can be placed; see ``Estimator``.
+
+        The largest set of photos that hang together is kept. The same photos and seed give the same
+        bits on the same machine.
+        """
+        show = progress or (lambda stage, done, total: None)
+        with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, _quiet(seed):
+            workspace = Path(folder)
+            database = workspace / "database.db"
+            _find_features(photos, workspace, database, show)
+            _match(photos, database, seed, show)
+            model, step = _mapped(photos, workspace, database, seed, show)
+        return _estimate(photos, model, step)
+
+
+@contextlib.contextmanager
+def _quiet(seed: int) -> Iterator[None]:
+    """pycolmap without its log, its random numbers from a seed."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    pycolmap.set_random_seed(seed)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def _file(index: int) -> str:
+    """The name of a photo in COLMAP's database: users' names are not trusted to it."""
+    return f"{index:06d}.png"
+
+
+def _groups(photos: Sequence[Photo]) -> list[list[int]]:
+    """Indices of photos that share their intrinsics."""
+    groups: dict[object, list[int]] = {}
+    for index, photo in enumerate(photos):
+        key = (photo.device, photo.image.shape[:2], photo.focal)
+        groups.setdefault(key, []).append(index)
+    return list(groups.values())
+
+
+def _find_features(
+    photos: Sequence[Photo], workspace: Path, database: Path, show: Progress
+) -> None:
+    import pycolmap
+
+    images, masks = workspace / "images", workspace / "masks"
+    images.mkdir()
+    masks.mkdir()
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = LONGEST
+    extraction.use_gpu = False
+    done = 0
+    for camera_id, group in enumerate(_groups(photos), start=1):
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "SIMPLE_RADIAL"
+        masked = any(_hides(photos[index]) for index in group)
+        if masked:
+            reader.mask_path = masks
+        first = photos[group[0]]
+        if first.focal is not None:
+            height, width = first.image.shape[:2]
+            reader.camera_params = f"{first.focal!r},{width / 2!r},{height / 2!r},0"
+        for start in range(0, len(group), FEATURES_AT_ONCE):
+            show("features", done, len(photos))
+            chunk = group[start : start + FEATURES_AT_ONCE]
+            for index in chunk:
+                mask_path = masks / f"{_file(index)}.png" if masked else None
+                _write(photos[index], images / _file(index), mask_path)
+            pycolmap.extract_features(
+                database,
+                images,
+                [_file(index) for index in chunk],
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
+            for index in chunk:
+                (images / _file(index)).unlink()
+            reader.existing_camera_id = camera_id
+            done += len(chunk)
+    show("features", done, len(photos))
+
+
+def _hides(photo: Photo) -> bool:
+    return photo.mask is not None or photo.image.shape[2] == 4
+
+
+def _write(photo: Photo, path: Path, mask_path: Path | None) -> None:
+    image = photo.image
+    grey = (image[..., :3] @ np.array([0.299, 0.587, 0.114])).round().astype(np.uint8)
+    if mask_path is not None:
+        usable = np.ones(grey.shape, dtype=bool) if photo.mask is None else photo.mask
+        if image.shape[2] == 4:
+            usable = usable & (image[..., 3] > 0)
+        # What is hidden must not matter to the features beside it.
+        grey[~usable] = round(grey[usable].mean()) if usable.any() else 0
+        Image.fromarray(255 * usable.astype(np.uint8)).save(mask_path)
+    Image.fromarray(grey).save(path, compress_level=1)
+
+
+def _match(photos: Sequence[Photo], database: Path, seed: int, show: Progress) -> None:
+    import pycolmap
+
+    pairs = _pairs(len(photos), database)
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    listing = pycolmap.ImportedPairingOptions()
+    listing.match_list_path = database.with_name("pairs.txt")
+    for start in range(0, len(pairs), PAIRS_AT_ONCE):
+        show("matching", start, len(pairs))
+        listing.match_list_path.write_text(
+            "".join(f"{_file(a)} {_file(b)}\n" for a, b in pairs[start : start + PAIRS_AT_ONCE])
+        )
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=matching,
+            pairing_options=listing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+    show("matching", len(pairs), len(pairs))
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    calibration.random_seed = seed
+    pycolmap.calibrate_view_graph(database, calibration)
+
+
+def _pairs(count: int, database: Path) -> list[tuple[int, int]]:
+    """The pairs of photos to match, as indices; see the module."""
+    if count <= EXHAUSTIVE:
+        return [(a, b) for a in range(count) for b in range(a + 1, count)]
+    pairs = {(a, b) for a in range(count) for b in range(a + 1, min(a + 1 + FOLLOWING, count))}
+    alike = _alike(_glances(count, database))
+    for a in range(count):
+        best = np.argsort(-alike[a], kind="stable")[:ALIKE]
+        pairs |= {(min(a, int(b)), max(a, int(b))) for b in best if alike[a, b] >= LEAST_ALIKE}
+    return sorted(pairs)
+
+
+def _glances(count: int, database: Path) -> list[npt.NDArray[np.float32]]:
+    """Descriptors of length 1 of each photo's largest features."""
+    import pycolmap
+
+    glances = []
+    with pycolmap.Database.open(database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        for index in range(count):
+            image_id = ids.get(_file(index))
+            if image_id is None:
+                glances.append(np.zeros((0, 128), dtype=np.float32))
+                continue
+            keypoints = opened.read_keypoints(image_id)
+            descriptors = opened.read_descriptors(image_id).data.astype(np.float32)
+            # The determinant of a feature's affine shape is the square of its size.
+            size = np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2)))
+            largest = descriptors[np.argsort(-size, kind="stable")[:GLANCE]]
+            lengths = np.linalg.norm(largest, axis=1, keepdims=True)
+            glances.append(largest / np.maximum(lengths, 1e-9))
+    return glances
+
+
+def _alike(glances: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
+    """How many of the largest features of each two photos are each other's clear best, [N, N]."""
+    counts = np.zeros((len(glances), len(glances)), dtype=np.int64)
+    for a, of_a in enumerate(glances):
+        for b in range(a + 1, len(glances)):
+            if min(len(of_a), len(glances[b])) < 2:
+                continue
+            alike = of_a @ glances[b].T
+            best = alike.argmax(axis=1)
+            mutual = alike.argmax(axis=0)[best] == np.arange(len(best))
+            two = np.sqrt(np.maximum(2.0 - 2.0 * np.partition(alike, -2, axis=1)[:, -2:], 0.0))
+            counts[a, b] = counts[b, a] = np.sum(mutual & (two[:, 1] < 0.8 * two[:, 0]))
+    return counts
+
+
+def _mapped(
+    photos: Sequence[Photo], workspace: Path, database: Path, seed: int, show: Progress
+) -> tuple[Any | None, int]:
+    """The model with most photos, and which of ``STEPS`` it needed."""
+    best, best_step = None, 0
+    for step, evidence in enumerate(STEPS):
+        model = _map(len(photos), workspace / str(step), database, evidence, seed, show)
+        if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
+            best, best_step = model, step
+        if best is not None and (best.num_reg_images() == len(photos) or len(photos) > FEW):
+            break
+    show("mapping", len(photos), len(photos))
+    return best, best_step
+
+
+def _map(
+    count: int, folder: Path, database: Path, evidence: Evidence, seed: int, show: Progress
+) -> Any | None:
+    import pycolmap
+
+    folder.mkdir()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    # Sums over threads come in any order, and with them the last bits.
+    options.num_threads = 1
+    options.extract_colors = False
+    options.min_model_size = 2
+    options.mapper.init_min_num_inliers = evidence.init_min_num_inliers
+    options.mapper.init_min_tri_angle = evidence.init_min_tri_angle
+    options.mapper.abs_pose_min_num_inliers = evidence.abs_pose_min_num_inliers
+    options.mapper.filter_min_tri_angle = evidence.filter_min_tri_angle
+    options.triangulation.min_angle = evidence.filter_min_tri_angle
+    placed = 0
+
+    def start() -> None:
+        nonlocal placed
+        placed = 2
+        show("mapping", placed, count)
+
+    def next_photo() -> None:
+        nonlocal placed
+        placed = min(placed + 1, count)
+        show("mapping", placed, count)
+
+    models = pycolmap.incremental_mapping(
+        database,
+        folder,
+        folder,
+        options,
+        initial_image_pair_callback=start,
+        next_image_callback=next_photo,
+    )
+    return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+
+
+def _estimate(photos: Sequence[Photo], model: Any | None, step: int) -> Estimate:
+    nothing: list[Any] = [None] * len(photos)
+    if model is None:
+        return Estimate(nothing, None, nothing, nothing, [])
+    cameras: list[Camera | None] = list(nothing)
+    lenses: list[Lens | None] = list(nothing)
+    index_of: dict[int, int] = {}
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        index = index_of[image_id] = int(Path(image.name).stem)
+        height, width = photos[index].image.shape[:2]
+        focal, cx, cy, k = (float(value) for value in image.camera.params)
+        viewmat = np.eye(4)
+        viewmat[:3] = image.cam_from_world().matrix()
+        cameras[index] = Camera(viewmat, intrinsic_matrix(focal, focal, cx, cy), width, height)
+        lenses[index] = Lens(False, (k,)) if k != 0.0 else None
+    sentences = []
+    lost = [photo.name for photo, camera in zip(photos, cameras, strict=True) if camera is None]
+    if lost:
+        sentences.append(
+            f"{len(photos) - len(lost)} of {len(photos)} photos could be placed; not placed, for "
+            f"want of places that they share with these: {', '.join(lost)}."
+        )
+    if step > 0:
+        sentences.append(
+            "The photos share few places, so cameras were found with less evidence than usual and "
+            "may be wrong; look at the plot, or add photos between those that you have."
+        )
+    points = _points(photos, model, index_of)
+    return Estimate(cameras, points, list(nothing), list(nothing), sentences, lenses)
+
+
+def _points(photos: Sequence[Photo], model: Any, index_of: dict[int, int]) -> Points | None:
+    """Points with their mean colour; confident where many photos see them in nearly one place."""
+    rows = {point_id: row for row, point_id in enumerate(sorted(model.point3D_ids()))}
+    if not rows:
+        return None
+    points = [model.points3D[point_id] for point_id in rows]
+    seen = np.zeros(len(rows))
+    colors = np.zeros((len(rows), 3))
+    for image_id, index in index_of.items():
+        observed = model.images[image_id].get_observation_points2D()
+        if not observed:
+            continue
+        at = np.array([rows[point.point3D_id] for point in observed])
+        column, row = np.array([point.xy for point in observed]).astype(np.int64).T
+        height, width = photos[index].image.shape[:2]
+        pixels = photos[index].image[row.clip(0, height - 1), column.clip(0, width - 1), :3]
+        np.add.at(colors, at, pixels.astype(np.float64))
+        np.add.at(seen, at, 1.0)
+    rgb = (colors / np.maximum(seen, 1.0)[:, None]).round().astype(np.uint8)
+    errors = np.array([max(point.error, 0.0) for point in points])
+    return Points(
+        np.stack([point.xyz for point in points]), rgb, np.maximum(seen, 1.0) / (1.0 + errors)
+    )

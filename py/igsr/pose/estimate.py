@@ -1,0 +1,62 @@
+"""What finds cameras, and what it returns: the seam that every estimator fits into."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from igsr.capture import Camera, Points
+from igsr.capture.photo_folder import Photo
+from igsr.capture.undistort import Lens
+
+#: Called with what is being done, how much of it is done, and how much there is.
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(eq=False)
+class Estimate:
+    """Cameras of photos, one world frame for all, and what else an estimator found out.
+
+    Attributes:
+        cameras: per photo, pinhole, in pixels of the photo (centres at +0.5), or None where the
+            photo could not be placed.
+        points: in the world frame, with confidence, or None.
+        depths: per photo float32 [h, w], z-depth along the camera's axis in world units, NaN where
+            it is not known, at any resolution of the photo's aspect; or None.
+        trusted: per photo bool of the shape of its depth, True where the depth may be trusted; or
+            None.
+        warnings: sentences for the user: what could not be placed, and why.
+        lenses: per photo the distortion that ``cameras`` leave out, None for none; an empty list
+            says none for all. ``igsr.estimate_poses`` undoes it.
+    """
+
+    cameras: list[Camera | None]
+    points: Points | None
+    depths: list[np.ndarray | None]
+    trusted: list[np.ndarray | None]
+    warnings: list[str]
+    lenses: list[Lens | None] = field(default_factory=list)
+
+
+class Estimator(Protocol):
+    """What finds cameras of photos."""
+
+    name: str
+
+    def __call__(
+        self, photos: Sequence[Photo], *, seed: int = 0, progress: Progress | None = None
+    ) -> Estimate:
+        """Find the cameras of at least two photos.
+
+        Args:
+            photos: upright, their names unique.
+            seed: of everything random; same seed, same bits.
+            progress: called with a stage ("pairs", "alignment", "features", "matching" or
+                "mapping"), how much of it is done, and how much there is.
+
+        Raises:
+            IgsrError: the estimator cannot be used at all; photos that cannot be placed are None.
+        """

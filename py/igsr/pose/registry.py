@@ -1,0 +1,48 @@
+"""The estimators there are, by name; another one is a file of its own and an entry here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from .estimate import Estimator
+
+
+@dataclass(frozen=True)
+class Entry:
+    """How an estimator is made.
+
+    Attributes:
+        make: its parameters are the options that the estimator has.
+        ready: whether it can run here with these options; "auto" takes the first that can.
+    """
+
+    make: Callable[..., Estimator]
+    ready: Callable[[Mapping[str, Any]], bool]
+
+
+def _dust3r(checkpoint: str | os.PathLike[str] | None = None) -> Estimator:
+    from .dust3r.estimator import Dust3r
+
+    return Dust3r(checkpoint=checkpoint)
+
+
+def _dust3r_is_ready(options: Mapping[str, Any]) -> bool:
+    from .dust3r.checkpoint import find_checkpoint
+
+    return find_checkpoint(options.get("checkpoint")) is not None
+
+
+def _colmap() -> Estimator:
+    from .colmap import Colmap
+
+    return Colmap()
+
+
+#: In the order that "auto" tries them; the last is always ready.
+ESTIMATORS = {
+    "dust3r": Entry(_dust3r, _dust3r_is_ready),
+    "colmap": Entry(_colmap, lambda options: True),
+}
