@@ -1,74 +1,21 @@
-"""The network of DUSt3R: parity with the published model, and checkpoints nobody can trust."""
+"""The network of DUSt3R: parity with the published model."""
 
 from __future__ import annotations
 
+import re
 import zlib
-from math import prod
 
 import numpy as np
 import pytest
 import torch
+from dust3r_networks import TINY, empty_network, hashed_image, hashed_network, hashed_weight
 
 from igsr.errors import IgsrError
-from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig, rotary_tables, rotated
+from igsr.pose.dust3r.heads import Tokens
+from igsr.pose.dust3r.network import NetworkConfig, rotary_tables, rotated
 
 DPT_512 = NetworkConfig()
-LINEAR_512 = NetworkConfig(head="linear")
 LINEAR_224 = NetworkConfig(image_size=224, head="linear")
-# Heads of 32 and of 24 channels: other sizes of the rotary halves than the published 64.
-TINY = NetworkConfig(
-    encoder_dim=64, encoder_depth=2, encoder_heads=2, decoder_dim=48, decoder_heads=2
-)
-
-BLOCK = 1 << 13
-
-
-def hashed(key, count):
-    """Numbers in [-0.5, 0.5) that any program can make from a key: murmur3's finaliser of j."""
-    values = np.empty(count, dtype=np.float32)
-    for start in range(0, count, BLOCK):
-        stop = min(start + BLOCK, count)
-        x = np.arange(start + 1, stop + 1, dtype=np.uint32)
-        x *= np.uint32(0x9E3779B1)
-        x += np.uint32(zlib.crc32(key.encode()))
-        x ^= x >> np.uint32(16)
-        x *= np.uint32(0x85EBCA6B)
-        x ^= x >> np.uint32(13)
-        x *= np.uint32(0xC2B2AE35)
-        x ^= x >> np.uint32(16)
-        values[start:stop] = x / 2.0**32 - 0.5
-    return values
-
-
-def hashed_weight(key, shape):
-    """The test weight of a key: norms near 1, layers that keep the size of what they are given."""
-    u = hashed(key, prod(shape))
-    if len(shape) == 1:
-        u *= np.float32(0.2)
-        if "norm" in key and key.endswith("weight"):
-            u += np.float32(1.0)
-    else:
-        u *= np.float32((12.0 / prod(shape[1:])) ** 0.5)
-        if key.endswith("head.4.weight"):
-            u *= np.float32(0.1)
-    return torch.from_numpy(u.reshape(shape))
-
-
-def empty_network(config):
-    with torch.device("meta"):
-        return Dust3rNetwork(config).eval()
-
-
-def hashed_network(config):
-    network = empty_network(config)
-    weights = {key: hashed_weight(key, t.shape) for key, t in network.state_dict().items()}
-    network.load_state_dict(weights, assign=True)
-    return network
-
-
-def hashed_image(name, height, width):
-    return torch.from_numpy(2.0 * hashed(name, 3 * height * width).reshape(1, 3, height, width))
-
 
 # What the published code gives on a CPU in float32 for hashed weights and images, to six decimals:
 # per photo the points of pixels [0, 0], [17, 23] and [-1, -1], the confidences of the first two
@@ -176,3 +123,106 @@ def test_parity_tiny(tiny, height, width):
 def test_parity_full_size():
     maps = outputs(hashed_network(DPT_512), 48, 64)
     assert worst(maps, PUBLISHED["full 48x64"]) <= 1e-5
+
+
+def key_lines(config):
+    """Every key of a published checkpoint with its shape, from the network's own."""
+    shapes = {key: tuple(t.shape) for key, t in empty_network(config).state_dict().items()}
+    # Two kinds of keys that the network has no use for.
+    shapes["mask_token"] = (1, 1, config.decoder_dim)
+    for key in list(shapes):
+        level = re.fullmatch(r"(.*\.scratch\.)layer(\d)_rn\.weight", key)
+        if level:
+            shapes[f"{level[1]}layer_rn.{int(level[2]) - 1}.weight"] = shapes[key]
+    return sorted(f"{key}\t{'x'.join(map(str, shape))}" for key, shape in shapes.items())
+
+
+# The checksums are those of the key lists of the published models.
+@pytest.mark.parametrize(
+    ("config", "keys", "checksum", "parameters"),
+    [(DPT_512, 1009, 3494443566, 571_171_208), (LINEAR_224, 877, 1285370070, 532_342_784)],
+)
+def test_keys_and_shapes_are_those_of_the_published_checkpoints(config, keys, checksum, parameters):
+    lines = key_lines(config)
+    assert len(lines) == keys
+    assert zlib.crc32("\n".join(lines).encode()) == checksum
+    mask_token = config.decoder_dim
+    assert sum(p.numel() for p in empty_network(config).parameters()) == parameters - mask_token
+
+
+def test_rotated_products_depend_on_distances_alone():
+    random = torch.Generator().manual_seed(0)
+    q, k = torch.randn(2, 1, 1, 1, 24, generator=random)
+    tables = rotary_tables(40, 50, 24, torch.device("cpu"))
+
+    def turned(x, row, column):
+        return rotated(x, tuple(table[[row * 50 + column]] for table in tables))
+
+    def product(at, other):
+        return float((turned(q, *at) * turned(k, *other)).sum())
+
+    assert product((3, 7), (10, 2)) == pytest.approx(product((23, 37), (30, 32)), abs=1e-4)
+    assert abs(product((3, 7), (10, 2)) - product((7, 3), (2, 10))) > 1e-2
+    assert torch.equal(turned(q, 0, 0), q)
+    # Half precision keeps its type, and the angles of tokens far apart are still told apart.
+    half = turned(q.to(torch.bfloat16), 39, 49)
+    assert half.dtype == torch.bfloat16
+    assert (half.float() - turned(q, 39, 49)).abs().max() < 0.03
+
+
+def test_photos_of_different_shapes_are_decoded_together(tiny):
+    with torch.inference_mode():
+        tall = tiny.encode(hashed_image("tall", 80, 48))
+        wide = tiny.encode(hashed_image("wide", 48, 64))
+        first, second = tiny.decode(tall, wide)
+        assert first.points.shape == (1, 80, 48, 3)
+        assert second.points.shape == (1, 48, 64, 3)
+        assert second.confidence.shape == (1, 48, 64)
+        assert (torch.cat([first.confidence.ravel(), second.confidence.ravel()]) > 1.0).all()
+        # A batch is nothing but its photos one by one.
+        other = tiny.encode(hashed_image("other", 80, 48))
+        both = Tokens(torch.cat([tall.features, other.features]), 5, 3)
+        twice = Tokens(torch.cat([wide.features, wide.features]), 3, 4)
+        batch = tiny.decode(both, twice)[1]
+        alone = tiny.decode(other, wide)[1]
+    assert (batch.points[0] - second.points[0]).abs().max() < 1e-5
+    assert (batch.points[1] - alone.points[0]).abs().max() < 1e-5
+    assert (batch.points[0] - batch.points[1]).abs().max() > 1e-3
+
+
+def test_heads_are_float32_where_the_rest_is_half(tiny):
+    whole = outputs(tiny, 48, 64)
+    seen = []
+    hooks = [
+        head.register_forward_pre_hook(
+            lambda module, args: seen.append(
+                ({level.features.dtype for level in args[0]}, torch.is_autocast_enabled("cpu"))
+            )
+        )
+        for head in (tiny.downstream_head1, tiny.downstream_head2)
+    ]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = outputs(tiny, 48, 64)
+    for hook in hooks:
+        hook.remove()
+    assert seen == [({torch.float32}, False)] * 2
+    for maps, exact in zip(half, whole, strict=True):
+        assert maps.points.dtype == torch.float32
+        error = (maps.points - exact.points).abs().mean() / exact.points.abs().mean()
+        assert 1e-5 < error < 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"head": "mlp"}, "head"),
+        ({"encoder_depth": 0}, "encoder_depth"),
+        ({"decoder_depth": 10**9}, "decoder_depth"),
+        ({"image_size": 512.0}, "image_size"),
+        ({"encoder_dim": 1000}, "encoder_heads"),
+        ({"decoder_heads": 5}, "decoder_heads"),
+    ],
+)
+def test_sizes_that_no_network_can_have(change, named):
+    with pytest.raises(IgsrError, match=named):
+        NetworkConfig(**change)

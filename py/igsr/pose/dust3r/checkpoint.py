@@ -170,6 +170,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
         config, stored = _read_safetensors(path)
     else:
         config, stored = _read_torch(path)
+    if not all(isinstance(key, str) for key in stored):
+        raise IgsrError(f"{path} has keys that are no text; use the published checkpoint")
     wanted = _without_weights(config).state_dict()
     weights = {key: _weight(path, stored, key, tensor.shape) for key, tensor in wanted.items()}
     unknown = sorted(k for k in stored if k not in wanted and not _UNNEEDED.fullmatch(k))
@@ -255,11 +257,12 @@ def _read_safetensors(path: Path) -> tuple[NetworkConfig, dict[str, Any]]:
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise IgsrError(f"{beside} cannot be read ({error}); download it again") from error
+    config = _config(arguments, beside)
     try:
         stored = load_file(path)
     except Exception as error:  # the library's own exception is not all that it raises
         raise IgsrError(f"{path} is damaged or no safetensors; download it again") from error
-    return _config(arguments, beside), stored
+    return config, stored
 
 
 def _parsed_call(call: str, path: Path) -> dict[str, Any]:

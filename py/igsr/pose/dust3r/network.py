@@ -114,7 +114,8 @@ class Dust3rNetwork(nn.Module):
         patches = self.patch_embed["proj"](images)
         rows, columns = patches.shape[-2:]
         rotation = self._rotation("encoder", rows, columns, images.device)
-        features = patches.flatten(2).mT
+        # The sums that the blocks add to stay in float32, whatever the blocks compute in.
+        features = patches.flatten(2).mT.float()
         for block in self.enc_blocks:
             features = block(features, rotation)
         return Tokens(self.enc_norm(features), rows, columns)
@@ -130,7 +131,7 @@ class Dust3rNetwork(nn.Module):
         """
         device = first.features.device
         rotations = [self._rotation("decoder", t.rows, t.columns, device) for t in (first, second)]
-        one, two = (self.decoder_embed(tokens.features) for tokens in (first, second))
+        one, two = (self.decoder_embed(tokens.features).float() for tokens in (first, second))
         levels = {0: (first.features, second.features)}
         for n, (block1, block2) in enumerate(
             zip(self.dec_blocks, self.dec_blocks2, strict=True), start=1

@@ -39,7 +39,7 @@ NO_CONFIDENCE = np.float32(1.0)
 # to 1/1000.
 _SAMPLE = 4 * 4
 # Bytes per pixel and ordered pair that the heads' maps take at once, as measured.
-_WORK = 4000
+_WORK = 3000
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def memory_bound(
     """Bytes that predicting ``pairs`` ordered pairs of ``photos`` photos needs at most.
 
     With T tokens and S grid samples per photo, weights of W bytes and C channels of the encoder:
-    device = W + 4 T C photos + 4000 * 256 T * 2 and kept = 32 S pairs + 16 * 256 T photos. Nothing
+    device = W + 4 T C photos + 3000 * 256 T * 2 and kept = 32 S pairs + 16 * 256 T photos. Nothing
     grows faster than photos or pairs. The photos themselves and torch's own needs come on top.
 
     Args:
@@ -281,10 +281,11 @@ class _EncodedPhotos:
 def stride_for(side: int, longest: int) -> int:
     """Pixels from sample to sample of a grid with at most ``longest`` along ``side`` pixels.
 
-    It is odd, so that samples can lie symmetrically about the centre of an even number of pixels.
+    It is odd, so that samples can lie symmetrically about the centre of an even number of pixels,
+    and under 16, so that no side of a crop is left without.
     """
     stride = 1
-    while len(grid_samples(side, stride)) > longest:
+    while len(grid_samples(side, stride)) > longest and stride < PATCH - 1:
         stride += 2
     return stride
 
