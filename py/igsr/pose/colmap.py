@@ -13,7 +13,9 @@ first is placed: a start at a wrong focal length is where few photos fail most.
 from __future__ import annotations
 
 import contextlib
+import copy
 import tempfile
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +29,7 @@ from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import intrinsic_matrix
 from igsr.capture.undistort import Lens
+from igsr.errors import IgsrError
 
 from .estimate import Estimate, Progress
 
@@ -40,12 +43,20 @@ EXHAUSTIVE = 60
 FOLLOWING = 8
 ALIKE = 16
 #: Largest features by which photos are found to look alike, and least matches of them.
-GLANCE = 256
+GLANCE = 128
 LEAST_ALIKE = 4
-#: Features and pairs done between two calls of progress; Ctrl-C is heard then.
+#: Where nothing is known: the focal length over the longer side; 42 degrees, COLMAP's own.
+GUESSED_FOCAL = 1.2
+#: Photos and pairs done between two calls of progress; Ctrl-C is heard then.
 FEATURES_AT_ONCE, PAIRS_AT_ONCE = 4, 40
 #: Up to this many photos, what was not placed is tried with less evidence.
 FEW = 60
+#: Squared errors may grow by this factor for lenses to count as free of distortion: photos that are
+#: not resampled stay sharp, and from few photos a distortion is often no more than a wrong focal.
+DISTORTION_WORTH = 1.02
+#: Seconds of one core that a photo takes, and photos from which that is said; by our measurements.
+SECONDS_A_PHOTO = 8.0
+MANY = 200
 
 
 @dataclass(frozen=True)
@@ -57,15 +68,24 @@ class Evidence:
         init_min_tri_angle: degrees that the rays of the first pair part by, in the median.
         abs_pose_min_num_inliers: points that a further photo sees.
         filter_min_tri_angle: degrees that the rays to a point part by.
+        ignore_two_view_tracks: whether points that two photos alone see are left out.
     """
 
     init_min_num_inliers: int
     init_min_tri_angle: float
     abs_pose_min_num_inliers: int
     filter_min_tri_angle: float
+    ignore_two_view_tracks: bool
 
 
-STEPS = (Evidence(100, 16.0, 30, 1.5), Evidence(40, 6.0, 15, 1.0), Evidence(15, 2.0, 10, 0.5))
+STEPS = (
+    Evidence(100, 16.0, 30, 1.5, True),
+    Evidence(100, 16.0, 30, 1.5, False),
+    Evidence(40, 6.0, 15, 1.0, False),
+    Evidence(15, 2.0, 10, 0.5, False),
+)
+#: Steps before this one are no reason to doubt.
+DOUBTFUL = 2
 
 
 class Colmap:
@@ -82,18 +102,28 @@ class Colmap:
         bits on the same machine.
         """
         show = progress or (lambda stage, done, total: None)
-        with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, _quiet(seed):
+        if len(photos) > MANY:
+            minutes = SECONDS_A_PHOTO * len(photos) / 60.0
+            warnings.warn(
+                f"COLMAP needs about {minutes:.0f} minutes for {len(photos)} photos; every third "
+                "is mostly enough",
+                stacklevel=2,
+            )
+        with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, _guarded(seed):
             workspace = Path(folder)
             database = workspace / "database.db"
+            _list_photos(photos, database)
             _find_features(photos, workspace, database, show)
             _match(photos, database, seed, show)
-            model, step = _mapped(photos, workspace, database, seed, show)
+            model, step = _mapped(photos, database, seed, show)
+            if model is not None:
+                model = _without_distortion(model)
         return _estimate(photos, model, step)
 
 
 @contextlib.contextmanager
-def _quiet(seed: int) -> Iterator[None]:
-    """pycolmap without its log, its random numbers from a seed."""
+def _guarded(seed: int) -> Iterator[None]:
+    """pycolmap without its log, its random numbers from a seed, its failures as sentences."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel
@@ -101,6 +131,10 @@ def _quiet(seed: int) -> Iterator[None]:
     pycolmap.set_random_seed(seed)
     try:
         yield
+    except (RuntimeError, ValueError) as error:
+        raise IgsrError(
+            f"COLMAP failed ({error}); leave out unusual photos and try again"
+        ) from error
     finally:
         pycolmap.logging.minloglevel = level
 
@@ -127,40 +161,59 @@ def _find_features(
     images, masks = workspace / "images", workspace / "masks"
     images.mkdir()
     masks.mkdir()
+    masked = any(_hides(photo) for photo in photos)
+    reader = pycolmap.ImageReaderOptions()
+    if masked:
+        reader.mask_path = masks
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = LONGEST
     extraction.use_gpu = False
-    done = 0
-    for camera_id, group in enumerate(_groups(photos), start=1):
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = "SIMPLE_RADIAL"
-        masked = any(_hides(photos[index]) for index in group)
-        if masked:
-            reader.mask_path = masks
-        first = photos[group[0]]
-        if first.focal is not None:
+    for start in range(0, len(photos), FEATURES_AT_ONCE):
+        show("features", start, len(photos))
+        chunk = range(start, min(start + FEATURES_AT_ONCE, len(photos)))
+        for index in chunk:
+            mask_path = masks / f"{_file(index)}.png" if masked else None
+            _write(photos[index], images / _file(index), mask_path)
+        pycolmap.extract_features(
+            database,
+            images,
+            [_file(index) for index in chunk],
+            reader_options=reader,
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
+        for index in chunk:
+            (images / _file(index)).unlink()
+    show("features", len(photos), len(photos))
+
+
+def _list_photos(photos: Sequence[Photo], database: Path) -> None:
+    """Number photos and cameras in the database.
+
+    Left to feature extraction, they are numbered as its threads end, and nothing after comes out
+    the same twice.
+    """
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        for number, group in enumerate(_groups(photos), start=1):
+            first = photos[group[0]]
             height, width = first.image.shape[:2]
-            reader.camera_params = f"{first.focal!r},{width / 2!r},{height / 2!r},0"
-        for start in range(0, len(group), FEATURES_AT_ONCE):
-            show("features", done, len(photos))
-            chunk = group[start : start + FEATURES_AT_ONCE]
-            for index in chunk:
-                mask_path = masks / f"{_file(index)}.png" if masked else None
-                _write(photos[index], images / _file(index), mask_path)
-            pycolmap.extract_features(
-                database,
-                images,
-                [_file(index) for index in chunk],
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=extraction,
-                device=pycolmap.Device.cpu,
+            focal = first.focal if first.focal is not None else GUESSED_FOCAL * max(width, height)
+            camera = pycolmap.Camera.create_from_model_name(
+                number, "SIMPLE_RADIAL", focal, width, height
             )
-            for index in chunk:
-                (images / _file(index)).unlink()
-            reader.existing_camera_id = camera_id
-            done += len(chunk)
-    show("features", done, len(photos))
+            camera.has_prior_focal_length = first.focal is not None
+            opened.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig(rig_id=number)
+            rig.add_ref_sensor(camera.sensor_id)
+            opened.write_rig(rig, use_rig_id=True)
+            for index in group:
+                image = pycolmap.Image(name=_file(index), camera_id=number, image_id=index + 1)
+                opened.write_image(image, use_image_id=True)
+                frame = pycolmap.Frame(frame_id=index + 1, rig_id=number)
+                frame.add_data_id(image.data_id)
+                opened.write_frame(frame, use_frame_id=True)
 
 
 def _hides(photo: Photo) -> bool:
@@ -244,26 +297,32 @@ def _glances(count: int, database: Path) -> list[npt.NDArray[np.float32]]:
 
 def _alike(glances: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
     """How many of the largest features of each two photos are each other's clear best, [N, N]."""
-    counts = np.zeros((len(glances), len(glances)), dtype=np.int64)
-    for a, of_a in enumerate(glances):
-        for b in range(a + 1, len(glances)):
-            if min(len(of_a), len(glances[b])) < 2:
-                continue
-            alike = of_a @ glances[b].T
-            best = alike.argmax(axis=1)
-            mutual = alike.argmax(axis=0)[best] == np.arange(len(best))
-            two = np.sqrt(np.maximum(2.0 - 2.0 * np.partition(alike, -2, axis=1)[:, -2:], 0.0))
-            counts[a, b] = counts[b, a] = np.sum(mutual & (two[:, 1] < 0.8 * two[:, 0]))
-    return counts
+    count, most = len(glances), max(len(glance) for glance in glances)
+    padded = np.zeros((count, most, 128), dtype=np.float32)
+    for index, glance in enumerate(glances):
+        padded[index, : len(glance)] = glance
+    counts = np.zeros((count, count), dtype=np.int64)
+    rows = np.arange(most)
+    for a in range(count - 1):
+        others = padded[a + 1 :]
+        alike = (others @ padded[a].T).swapaxes(1, 2)  # [photo, feature of a, feature of photo]
+        best = alike.argmax(axis=2)
+        mutual = np.take_along_axis(alike.argmax(axis=1), best, axis=1) == rows
+        first = np.take_along_axis(alike, best[..., None], axis=2)[..., 0]
+        np.put_along_axis(alike, best[..., None], -1.0, axis=2)
+        near, next_near = (np.maximum(2.0 - 2.0 * s, 0.0) for s in (first, alike.max(axis=2)))
+        # Of squared distances, Lowe's ratio is 0.8 squared.
+        counts[a, a + 1 :] = (mutual & (near < 0.64 * next_near)).sum(axis=1)
+    return counts + counts.T
 
 
 def _mapped(
-    photos: Sequence[Photo], workspace: Path, database: Path, seed: int, show: Progress
+    photos: Sequence[Photo], database: Path, seed: int, show: Progress
 ) -> tuple[Any | None, int]:
     """The model with most photos, and which of ``STEPS`` it needed."""
     best, best_step = None, 0
     for step, evidence in enumerate(STEPS):
-        model = _map(len(photos), workspace / str(step), database, evidence, seed, show)
+        model = _map(len(photos), database, evidence, seed, show)
         if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
             best, best_step = model, step
         if best is not None and (best.num_reg_images() == len(photos) or len(photos) > FEW):
@@ -272,12 +331,9 @@ def _mapped(
     return best, best_step
 
 
-def _map(
-    count: int, folder: Path, database: Path, evidence: Evidence, seed: int, show: Progress
-) -> Any | None:
+def _map(count: int, database: Path, evidence: Evidence, seed: int, show: Progress) -> Any | None:
     import pycolmap
 
-    folder.mkdir()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     # Sums over threads come in any order, and with them the last bits.
@@ -288,7 +344,10 @@ def _map(
     options.mapper.init_min_tri_angle = evidence.init_min_tri_angle
     options.mapper.abs_pose_min_num_inliers = evidence.abs_pose_min_num_inliers
     options.mapper.filter_min_tri_angle = evidence.filter_min_tri_angle
+    options.triangulation.ignore_two_view_tracks = evidence.ignore_two_view_tracks
     options.triangulation.min_angle = evidence.filter_min_tri_angle
+    # Two photos alone tell a focal length too badly to better EXIF's or the fundamental matrix's.
+    options.ba_refine_focal_length = options.ba_refine_extra_params = count > 2
     placed = 0
 
     def start() -> None:
@@ -301,15 +360,43 @@ def _map(
         placed = min(placed + 1, count)
         show("mapping", placed, count)
 
-    models = pycolmap.incremental_mapping(
-        database,
-        folder,
-        folder,
-        options,
-        initial_image_pair_callback=start,
-        next_image_callback=next_photo,
-    )
-    return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+    models = pycolmap.ReconstructionManager()
+    with pycolmap.Database.open(database) as opened:
+        pipeline = pycolmap.IncrementalPipeline(options, opened, models)
+        events = pycolmap.IncrementalPipelineCallback
+        pipeline.add_callback(int(events.INITIAL_IMAGE_PAIR_REG_CALLBACK), start)
+        pipeline.add_callback(int(events.NEXT_IMAGE_REG_CALLBACK), next_photo)
+        pipeline.run()
+    found = [models.get(index) for index in range(models.size())]
+    return max(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+
+
+def _without_distortion(model: Any) -> Any:
+    """The model adjusted to lenses without distortion where that fits nearly as well."""
+    import pycolmap
+
+    if all(camera.params[3] == 0.0 for camera in model.cameras.values()):
+        return model
+    pinhole = copy.deepcopy(model)
+    for camera in pinhole.cameras.values():
+        camera.params = [*camera.params[:3], 0.0]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = False
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in pinhole.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # pycolmap.bundle_adjustment writes to the log whatever its level.
+    pycolmap.create_default_bundle_adjuster(options, config, pinhole).solve()
+    needed = _squared_error(pinhole) > DISTORTION_WORTH * _squared_error(model)
+    return model if needed else pinhole
+
+
+def _squared_error(model: Any) -> float:
+    model.update_point_3d_errors()
+    return float(sum(p.error**2 * len(p.track.elements) for p in model.points3D.values()))
 
 
 def _estimate(photos: Sequence[Photo], model: Any | None, step: int) -> Estimate:
@@ -335,7 +422,7 @@ def _estimate(photos: Sequence[Photo], model: Any | None, step: int) -> Estimate
             f"{len(photos) - len(lost)} of {len(photos)} photos could be placed; not placed, for "
             f"want of places that they share with these: {', '.join(lost)}."
         )
-    if step > 0:
+    if step >= DOUBTFUL:
         sentences.append(
             "The photos share few places, so cameras were found with less evidence than usual and "
             "may be wrong; look at the plot, or add photos between those that you have."

@@ -1,0 +1,86 @@
+"""Photos of a made-up room with known cameras: textured walls, ray-cast in numpy.
+
+Structure from motion needs corners that look like themselves from elsewhere, which a few random
+splats do not give.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from igsr.capture import Camera
+from igsr.capture.photo_folder import Photo
+from igsr.capture.types import intrinsic_matrix
+
+#: Planes point . normal = offset, and two axes along each.
+WALLS = (
+    ((0.0, 0.0, 1.0), 4.0, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.0, 1.0, 0.0), 1.0, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ((-1.0, 0.0, 0.3), 3.0, (0.3, 0.0, 1.0), (0.0, 1.0, 0.0)),
+    ((1.0, 0.0, 0.4), 3.0, (0.4, 0.0, -1.0), (0.0, 1.0, 0.0)),
+)
+TEXELS = 24.0
+
+
+def texture(seed: int, size: int = 256) -> np.ndarray:
+    """float64 [size, size, 3] in 0..255: blotches of several sizes."""
+    random = np.random.default_rng(seed)
+    total = np.zeros((size, size, 3))
+    for cell in (2, 4, 8, 16):
+        noise = random.uniform(-1.0, 1.0, (size // cell, size // cell, 3))
+        total += np.repeat(np.repeat(noise, cell, axis=0), cell, axis=1) * np.sqrt(cell)
+    return np.clip(128.0 + 25.0 * total, 0.0, 255.0)
+
+
+def camera(angle: float, focal: float = 200.0, width: int = 240, height: int = 180) -> Camera:
+    """A camera on an arc about the room's middle, looking at it; angle in radians."""
+    middle = np.array([0.0, 0.0, 3.0])
+    centre = middle + 4.0 * np.array(
+        [np.sin(angle), -0.1 + 0.1 * np.cos(7.0 * angle), -np.cos(angle)]
+    )
+    z = middle - centre
+    z /= np.linalg.norm(z)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    return Camera(viewmat, intrinsic_matrix(focal, focal, width / 2, height / 2), width, height)
+
+
+def picture(camera: Camera, seed: int = 0, k: float = 0.0) -> np.ndarray:
+    """uint8 [H, W, 3]: the room of a seed as a camera sees it, four rays a pixel.
+
+    Its lens puts a ray at radius r (1 + k r^2).
+    """
+    x, y = np.meshgrid(
+        (np.arange(2 * camera.width) + 0.5) / 2.0, (np.arange(2 * camera.height) + 0.5) / 2.0
+    )
+    K = camera.K
+    x, y = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
+    bent_x, bent_y = x, y
+    for _ in range(20):
+        factor = 1.0 + k * (x * x + y * y)
+        x, y = bent_x / factor, bent_y / factor
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera.viewmat[:3, :3]
+    nearest = np.full(x.shape, np.inf)
+    colors = np.zeros((*x.shape, 3))
+    for wall, (normal, offset, along, up) in enumerate(WALLS):
+        with np.errstate(divide="ignore"):
+            distance = (offset - camera.centre @ normal) / (rays @ np.array(normal))
+        hit = (distance > 0.0) & (distance < nearest)
+        nearest[hit] = distance[hit]
+        places = camera.centre + distance[hit][:, None] * rays[hit]
+        texels = texture(10 * seed + wall)
+        row, column = (
+            np.floor(places @ np.array(axis) * TEXELS).astype(np.int64) % len(texels)
+            for axis in (up, along)
+        )
+        colors[hit] = texels[row, column]
+    height, width = camera.height, camera.width
+    return np.rint(colors.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))).astype(np.uint8)
+
+
+def photos(cameras: list[Camera], seed: int = 0, k: float = 0.0) -> list[Photo]:
+    """Photos of the room, named 0.png and so on."""
+    return [Photo(f"{i}.png", picture(camera, seed, k)) for i, camera in enumerate(cameras)]
