@@ -48,16 +48,21 @@ def camera(angle: float, focal: float = 200.0, width: int = 240, height: int = 1
     return Camera(viewmat, intrinsic_matrix(focal, focal, width / 2, height / 2), width, height)
 
 
-def picture(camera: Camera, seed: int = 0) -> np.ndarray:
-    """uint8 [H, W, 3]: the room of a seed as a camera sees it, four rays a pixel."""
+def picture(camera: Camera, seed: int = 0, k: float = 0.0) -> np.ndarray:
+    """uint8 [H, W, 3]: the room of a seed as a camera sees it, four rays a pixel.
+
+    Its lens puts a ray at radius r (1 + k r^2).
+    """
     x, y = np.meshgrid(
         (np.arange(2 * camera.width) + 0.5) / 2.0, (np.arange(2 * camera.height) + 0.5) / 2.0
     )
     K = camera.K
-    rays = (
-        np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
-        @ camera.viewmat[:3, :3]
-    )
+    x, y = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
+    bent_x, bent_y = x, y
+    for _ in range(20):
+        factor = 1.0 + k * (x * x + y * y)
+        x, y = bent_x / factor, bent_y / factor
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera.viewmat[:3, :3]
     nearest = np.full(x.shape, np.inf)
     colors = np.zeros((*x.shape, 3))
     for wall, (normal, offset, along, up) in enumerate(WALLS):
@@ -76,6 +81,6 @@ def picture(camera: Camera, seed: int = 0) -> np.ndarray:
     return np.rint(colors.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))).astype(np.uint8)
 
 
-def photos(cameras: list[Camera], seed: int = 0) -> list[Photo]:
+def photos(cameras: list[Camera], seed: int = 0, k: float = 0.0) -> list[Photo]:
     """Photos of the room, named 0.png and so on."""
-    return [Photo(f"{i}.png", picture(camera, seed)) for i, camera in enumerate(cameras)]
+    return [Photo(f"{i}.png", picture(camera, seed, k)) for i, camera in enumerate(cameras)]

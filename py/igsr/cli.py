@@ -35,7 +35,8 @@ from .errors import IgsrError
 from .evaluation import METRICS, ScoredView, default_background, default_split, evaluate
 from .fitting import Progress, fit_with_cameras
 from .orbit import orbit
-from .pose import capture_of, estimate, photos_of
+from .pose import AUTO, capture_of, estimate, photos_of
+from .pose.registry import ESTIMATORS
 from .poses import refine_cameras
 from .presets import preset_settings
 from .rendering import render
@@ -106,14 +107,6 @@ class FocalChoice(str, enum.Enum):
     per_camera = "per-camera"
 
 
-class EstimatorChoice(str, enum.Enum):
-    """What finds cameras."""
-
-    auto = "auto"
-    colmap = "colmap"
-    dust3r = "dust3r"
-
-
 class FormatChoice(str, enum.Enum):
     """Files that describe cameras."""
 
@@ -128,6 +121,7 @@ class StudyChoice(str, enum.Enum):
     blender8 = "blender8"
     few_photos = "few-photos"
     pose_noise = "pose-noise"
+    poses = "poses"
 
 
 class WorkloadChoice(str, enum.Enum):
@@ -171,10 +165,12 @@ FramesOption = Annotated[
     int, typer.Option("--frames", help="How many frames are taken of each video.")
 ]
 EstimatorOption = Annotated[
-    EstimatorChoice,
+    str,
     typer.Option(
         "--estimator",
-        help="What finds cameras: auto is DUSt3R where a checkpoint is found, else COLMAP.",
+        metavar="NAME",
+        help=f"What finds cameras: {', '.join(ESTIMATORS)}, or auto, the first of them that can "
+        "run here.",
     ),
 ]
 CheckpointOption = Annotated[
@@ -255,7 +251,7 @@ def _fit_capture(
     path: Path,
     out: Path,
     holdout: int | None,
-    estimator: EstimatorChoice,
+    estimator: str,
     checkpoint: Path | None,
     frames: int,
     seed: int,
@@ -265,7 +261,7 @@ def _fit_capture(
 ) -> Capture:
     """The capture at a path; photos without cameras get them, kept in ``out/capture``."""
     if holds_cameras(path) or not has_photos(path):
-        if checkpoint is not None or estimator is not EstimatorChoice.auto:
+        if checkpoint is not None or estimator != AUTO:
             raise IgsrError(
                 f"{path} has cameras, or no photos; leave --estimator and --checkpoint out"
             )
@@ -324,7 +320,7 @@ def pose_command(
     out: Annotated[
         Path, typer.Option("--out", help="Folder for the capture; it must be new or empty.")
     ],
-    estimator: EstimatorOption = EstimatorChoice.auto,
+    estimator: EstimatorOption = AUTO,
     checkpoint: CheckpointOption = None,
     plot: Annotated[
         bool, typer.Option("--plot", help="Draw cameras and points to poses.png in --out.")
@@ -338,7 +334,7 @@ def pose_command(
         check_folder(out)
         started = time.monotonic()
         given = photos[0] if len(photos) == 1 else photos
-        if estimator is EstimatorChoice.auto and isinstance(given, Path) and holds_cameras(given):
+        if estimator == AUTO and isinstance(given, Path) and holds_cameras(given):
             raise IgsrError(
                 f"{given} has cameras already; fit it as it is, or name an --estimator to find "
                 "them anew"
@@ -361,7 +357,7 @@ def pose_command(
 def _posed(
     photos: Path | list[Path],
     out: Path,
-    estimator: EstimatorChoice,
+    estimator: str,
     checkpoint: Path | None,
     frames: int,
     seed: int,
@@ -376,7 +372,7 @@ def _posed(
     options: dict[str, Any] = {} if checkpoint is None else {"checkpoint": checkpoint}
     loaded = photos_of(photos, frames)
     with _pose_bar(shown) as show:
-        name, found = estimate(loaded, estimator.value, seed=seed, progress=show, **options)
+        name, found = estimate(loaded, estimator, seed=seed, progress=show, **options)
     for sentence in found.warnings:
         _complain(sentence)
     capture = capture_of(photos if isinstance(photos, Path) else Path("photos"), loaded, found)
@@ -510,7 +506,7 @@ def fit_command(
         FocalChoice | None,
         typer.Option("--focal", help="Focal lengths that are fitted: one factor for all, or each."),
     ] = None,
-    estimator: EstimatorOption = EstimatorChoice.auto,
+    estimator: EstimatorOption = AUTO,
     network: CheckpointOption = None,
     frames: FramesOption = FRAMES,
     background: BackgroundOption = None,
@@ -1057,7 +1053,8 @@ def study_command(
         typer.Argument(
             help="blender8: NeRF Synthetic from eight photos. few-photos: real captures from 3, 6 "
             "and 9 photos, or 3, 6 and 12 of the tankard. pose-noise: 20 views of NeRF Synthetic "
-            "with noise on their poses, which are kept or fitted."
+            "with noise on their poses, which are kept or fitted. poses: cameras found in photos "
+            "against the true ones."
         ),
     ],
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder that holds the scenes.")],
@@ -1069,7 +1066,7 @@ def study_command(
         typer.Option(
             "--scene",
             help="A folder in DATA; repeat it for several. Default: chair and lego; fern, "
-            "dtu_scan24 and tankard.",
+            "dtu_scan24 and tankard; for poses the sets of docs/pose_colmap.md.",
         ),
     ] = None,
     views: Annotated[
@@ -1094,7 +1091,13 @@ def study_command(
         bool,
         typer.Option("--raw-affine", help="pose-noise: also keep the shear that noise brings."),
     ] = False,
-    seeds: Annotated[int, typer.Option("--seeds", help="Fits of each kind.")] = 3,
+    estimator: Annotated[
+        str | None,
+        typer.Option("--estimator", metavar="NAME", help="poses: what finds cameras. [colmap]"),
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option("--seeds", help="Fits of each kind. [3; poses: 1]")
+    ] = None,
     jobs: Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")] = 1,
     ray: Annotated[
         bool,
@@ -1119,6 +1122,13 @@ def study_command(
         def on_run(done: int, total: int, row: dict[str, Any]) -> None:
             first[:] = first or [done - 1]
             left = (time.monotonic() - started) / (done - first[0]) * (total - done)
+            if protocol is StudyChoice.poses:
+                console.print(
+                    f"{done} of {total}: {row['scene']} seed {row['seed']}: {row['registered']} of "
+                    f"{row['photos']} placed in {row['seconds']:.0f} s; about {left / 60.0:.0f} "
+                    "min left"
+                )
+                return
             if protocol is StudyChoice.pose_noise:
                 kind = f"{row['noise']}, poses {row['poses']}"
                 psnr = row["refined"]["psnr"]
@@ -1133,6 +1143,7 @@ def study_command(
             StudyChoice.blender8: study.blender8,
             StudyChoice.few_photos: study.few_photos,
             StudyChoice.pose_noise: study.pose_noise,
+            StudyChoice.poses: study.poses,
         }
         run = studies[protocol]
         given: dict[str, Any] = {
@@ -1141,6 +1152,9 @@ def study_command(
             "presets": presets and tuple(choice.value for choice in presets),
             "noise": noise,
             "raw_affine": raw_affine or None,
+            "estimator": estimator,
+            "seeds": seeds,
+            "backend": None if backend is BackendChoice.auto else backend,
         }
         given = {name: value for name, value in given.items() if value is not None}
         foreign = [name for name in given if name not in inspect.signature(run).parameters]
@@ -1149,16 +1163,9 @@ def study_command(
             raise IgsrError(
                 f"--{option.replace('_', '-')} says nothing to {protocol.value}; leave it out."
             )
-        report = run(
-            data,
-            out,
-            **given,
-            seeds=seeds,
-            backend=_resolved(backend),
-            jobs=jobs,
-            on_run=on_run,
-            ray=ray,
-        )
+        if "backend" in inspect.signature(run).parameters:
+            given["backend"] = _resolved(backend)
+        report = run(data, out, **given, jobs=jobs, on_run=on_run, ray=ray)
     if as_json:
         _print_json(report)
         return

@@ -92,7 +92,9 @@ def load_photos(
         except IgsrError as error:
             return error
 
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+    with warnings.catch_warnings(), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        # Of damaged EXIF and the like, which matters to nobody where the pixels can be read.
+        warnings.filterwarnings("ignore", module="PIL")
         loaded = list(pool.map(load, files, names))
     photos = [photo for found in loaded if isinstance(found, list) for photo in found]
     broken = [found for found in loaded if isinstance(found, IgsrError)]

@@ -22,12 +22,16 @@ from igsr.errors import IgsrError
 from .estimate import Estimate, Estimator, Progress
 from .registry import ESTIMATORS
 
-__all__ = ["Estimate", "Estimator", "capture_of", "estimate", "estimate_poses"]
+__all__ = ["AUTO", "Estimate", "Estimator", "capture_of", "estimate", "estimate_poses"]
+
+
+#: The first of ``ESTIMATORS`` that can run here.
+AUTO = "auto"
 
 
 def estimate_poses(
     photos: str | os.PathLike[str] | Sequence[str | os.PathLike[str] | Photo],
-    estimator: str = "auto",
+    estimator: str = AUTO,
     *,
     seed: int = 0,
     frames: int = FRAMES,
@@ -53,7 +57,7 @@ def estimate_poses(
     Raises:
         IgsrError: fewer than two photos can be read or placed, or an argument cannot be used.
     """
-    if estimator == "auto" and isinstance(photos, (str, os.PathLike)) and holds_cameras(photos):
+    if estimator == AUTO and isinstance(photos, (str, os.PathLike)) and holds_cameras(photos):
         return load_capture(photos)
     loaded = photos_of(photos, frames)
     _, found = estimate(loaded, estimator, seed=seed, progress=progress, **options)
@@ -81,7 +85,7 @@ def photos_of(
 
 def estimate(
     photos: Sequence[Photo],
-    estimator: str = "auto",
+    estimator: str = AUTO,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -97,10 +101,10 @@ def estimate(
     if len(photos) < FEWEST:
         only = f"; there is only {photos[0].name}" if photos else ""
         raise IgsrError(f"Cameras are found from {FEWEST} photos at least{only}; add photos")
-    if estimator == "auto":
+    if estimator == AUTO:
         estimator = next(name for name, entry in ESTIMATORS.items() if entry.ready(options))
     elif estimator not in ESTIMATORS:
-        raise IgsrError(f"estimator must be auto, {' or '.join(ESTIMATORS)}, not {estimator!r}")
+        raise IgsrError(f"estimator must be {AUTO}, {' or '.join(ESTIMATORS)}, not {estimator!r}")
     make = ESTIMATORS[estimator].make
     foreign = [name for name in options if name not in inspect.signature(make).parameters]
     if foreign:

@@ -29,6 +29,7 @@ from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import intrinsic_matrix
 from igsr.capture.undistort import Lens
+from igsr.errors import IgsrError
 
 from .estimate import Estimate, Progress
 
@@ -42,7 +43,7 @@ EXHAUSTIVE = 60
 FOLLOWING = 8
 ALIKE = 16
 #: Largest features by which photos are found to look alike, and least matches of them.
-GLANCE = 256
+GLANCE = 128
 LEAST_ALIKE = 4
 #: Where nothing is known: the focal length over the longer side; 42 degrees, COLMAP's own.
 GUESSED_FOCAL = 1.2
@@ -108,7 +109,7 @@ class Colmap:
                 "is mostly enough",
                 stacklevel=2,
             )
-        with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, _quiet(seed):
+        with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, _guarded(seed):
             workspace = Path(folder)
             database = workspace / "database.db"
             _list_photos(photos, database)
@@ -121,8 +122,8 @@ class Colmap:
 
 
 @contextlib.contextmanager
-def _quiet(seed: int) -> Iterator[None]:
-    """pycolmap without its log, its random numbers from a seed."""
+def _guarded(seed: int) -> Iterator[None]:
+    """pycolmap without its log, its random numbers from a seed, its failures as sentences."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel
@@ -130,6 +131,10 @@ def _quiet(seed: int) -> Iterator[None]:
     pycolmap.set_random_seed(seed)
     try:
         yield
+    except (RuntimeError, ValueError) as error:
+        raise IgsrError(
+            f"COLMAP failed ({error}); leave out unusual photos and try again"
+        ) from error
     finally:
         pycolmap.logging.minloglevel = level
 
@@ -292,17 +297,23 @@ def _glances(count: int, database: Path) -> list[npt.NDArray[np.float32]]:
 
 def _alike(glances: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
     """How many of the largest features of each two photos are each other's clear best, [N, N]."""
-    counts = np.zeros((len(glances), len(glances)), dtype=np.int64)
-    for a, of_a in enumerate(glances):
-        for b in range(a + 1, len(glances)):
-            if min(len(of_a), len(glances[b])) < 2:
-                continue
-            alike = of_a @ glances[b].T
-            best = alike.argmax(axis=1)
-            mutual = alike.argmax(axis=0)[best] == np.arange(len(best))
-            two = np.sqrt(np.maximum(2.0 - 2.0 * np.partition(alike, -2, axis=1)[:, -2:], 0.0))
-            counts[a, b] = counts[b, a] = np.sum(mutual & (two[:, 1] < 0.8 * two[:, 0]))
-    return counts
+    count, most = len(glances), max(len(glance) for glance in glances)
+    padded = np.zeros((count, most, 128), dtype=np.float32)
+    for index, glance in enumerate(glances):
+        padded[index, : len(glance)] = glance
+    counts = np.zeros((count, count), dtype=np.int64)
+    rows = np.arange(most)
+    for a in range(count - 1):
+        others = padded[a + 1 :]
+        alike = (others @ padded[a].T).swapaxes(1, 2)  # [photo, feature of a, feature of photo]
+        best = alike.argmax(axis=2)
+        mutual = np.take_along_axis(alike.argmax(axis=1), best, axis=1) == rows
+        first = np.take_along_axis(alike, best[..., None], axis=2)[..., 0]
+        np.put_along_axis(alike, best[..., None], -1.0, axis=2)
+        near, next_near = (np.maximum(2.0 - 2.0 * s, 0.0) for s in (first, alike.max(axis=2)))
+        # Of squared distances, Lowe's ratio is 0.8 squared.
+        counts[a, a + 1 :] = (mutual & (near < 0.64 * next_near)).sum(axis=1)
+    return counts + counts.T
 
 
 def _mapped(

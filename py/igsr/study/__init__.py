@@ -1,7 +1,8 @@
 """Protocols of the literature as commands: fixed views, seeds and scores, so that runs compare."""
 
 from .blender import blender8
+from .estimated_poses import poses
 from .noisy_poses import pose_noise
 from .real_captures import few_photos
 
-__all__ = ["blender8", "few_photos", "pose_noise"]
+__all__ = ["blender8", "few_photos", "pose_noise", "poses"]

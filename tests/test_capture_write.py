@@ -1,0 +1,160 @@
+"""Captures written and read back: cameras, pixels, masks and points are the same."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from capture_files import photo, random_viewmats, save
+from capture_files import write_colmap as write_with_pycolmap
+
+from igsr.atomic_write import atomic_folder
+from igsr.capture import Camera, Capture, Points, View, load_capture
+from igsr.capture.types import intrinsic_matrix
+from igsr.capture.write_colmap import quaternion, write_colmap
+from igsr.capture.write_transforms import write_transforms
+from igsr.errors import IgsrError
+
+WRITERS = {
+    "colmap": write_colmap,
+    "colmap-text": lambda *arguments: write_colmap(*arguments, text=True),
+    "transforms": write_transforms,
+}
+
+
+def made_up(confidence: bool = True) -> Capture:
+    """Four views of two sizes, with alpha, masks and awkward names."""
+    random = np.random.default_rng(0)
+    names = ["images/a/1.jpg", "images/a/1.png", "../out side/2.heic", "images/line\nbreak.webp"]
+    views = []
+    for index, viewmat in enumerate(random_viewmats(4)):
+        width, height = (48, 32) if index < 3 else (30, 50)
+        focal = random.uniform(20.0, 90.0, 2) if index > 1 else (40.1, 42.3)
+        K = intrinsic_matrix(*focal, width / 2 + 0.3, height / 2 - 1 / 3)
+        mask = random.uniform(size=(height, width)) < 0.5 if index % 2 else None
+        pixels = photo(index, width, height, 4 if index == 2 else 3)
+        camera = Camera(viewmat, K, width, height)
+        views.append(View(names[index], camera, "train", pixels, mask))
+    rgb = random.integers(0, 256, (7, 3)).astype(np.uint8)
+    sure = random.uniform(0.1, 50.0, 7) if confidence else None
+    points = Points(1e3 * random.normal(size=(7, 3)), rgb, sure)
+    return Capture(Path("made-up"), views, points)
+
+
+@pytest.mark.parametrize("form", WRITERS)
+@pytest.mark.parametrize("confidence", [False, True])
+def test_round_trip(tmp_path: Path, form: str, confidence: bool) -> None:
+    capture = made_up(confidence)
+    WRITERS[form](capture, tmp_path / "new" / "out")
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["out"]
+    again = load_capture(tmp_path / "new" / "out")
+    names = [
+        "images/a/1.png",
+        "images/a/1.png.png",
+        "images/out side/2.png",
+        "images/line_break.png",
+    ]
+    read = {view.name: view for view in again.views}
+    assert set(read) == set(names)
+    for name, view in zip(names, capture.views, strict=True):
+        np.testing.assert_allclose(read[name].camera.viewmat, view.camera.viewmat, 1e-9, 1e-12)
+        np.testing.assert_array_equal(read[name].camera.K, view.camera.K)
+        np.testing.assert_array_equal(read[name].image, view.image)
+        if view.mask is None:
+            assert read[name].mask is None
+        else:
+            np.testing.assert_array_equal(read[name].mask, view.mask)
+    np.testing.assert_array_equal(again.points.xyz, capture.points.xyz)
+    np.testing.assert_array_equal(again.points.rgb, capture.points.rgb)
+    if confidence:
+        np.testing.assert_allclose(again.points.confidence, capture.points.confidence, 1e-12)
+    else:
+        assert again.points.confidence is None
+
+
+@pytest.mark.parametrize("form", ["colmap", "colmap-text"])
+def test_pycolmap_reads_what_we_write(tmp_path: Path, form: str) -> None:
+    capture = made_up()
+    WRITERS[form](capture, tmp_path / "out")
+    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    assert len(model.images) == 4
+    assert len(model.cameras) == 3  # the first two views have the same
+    for number, view in enumerate(capture.views, start=1):
+        image = model.images[number]
+        pose = image.cam_from_world().matrix()
+        np.testing.assert_allclose(pose, view.camera.viewmat[:3], 1e-9, 1e-12)
+        assert (image.camera.width, image.camera.height) == (view.camera.width, view.camera.height)
+        np.testing.assert_array_equal(image.camera.calibration_matrix(), view.camera.K)
+    xyz = np.stack([model.points3D[i].xyz for i in range(1, 8)])
+    np.testing.assert_array_equal(xyz, capture.points.xyz)
+
+
+def test_what_pycolmap_wrote_has_no_confidence_of_ours(tmp_path: Path) -> None:
+    write_with_pycolmap(tmp_path)
+    assert load_capture(tmp_path).points.confidence is None
+
+
+def test_masks_beside_a_model_are_read(tmp_path: Path) -> None:
+    write_with_pycolmap(tmp_path)
+    mask = np.zeros((32, 48), dtype=np.uint8)
+    mask[:, :9] = 255
+    save(tmp_path / "masks/1.png.png", mask)
+    views = load_capture(tmp_path).views
+    assert views[0].mask is None
+    np.testing.assert_array_equal(views[1].mask, mask > 0)
+
+
+def test_transforms_keep_the_split(tmp_path: Path) -> None:
+    capture = made_up().with_holdout(2)
+    write_transforms(capture, tmp_path / "out")
+    splits = {view.name: view.split for view in load_capture(tmp_path / "out").views}
+    assert sorted(splits.values()) == ["test", "test", "train", "train"]
+    document = json.loads((tmp_path / "out/transforms.json").read_text())
+    assert document["ply_file_path"] == "points.ply"
+
+
+def test_no_points(tmp_path: Path) -> None:
+    capture = made_up()
+    capture.points = None
+    for form, write in WRITERS.items():
+        write(capture, tmp_path / form)
+        assert load_capture(tmp_path / form).points is None
+
+
+def test_quaternions_of_all_turns() -> None:
+    half_turns = [np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, 1])]
+    for rotation in [*half_turns, *random_viewmats(50)[:, :3, :3]]:
+        w, x, y, z = quaternion(np.asarray(rotation, dtype=np.float64))
+        assert w >= 0.0
+        back = pycolmap.Rotation3d(np.array([x, y, z, w])).matrix()
+        np.testing.assert_allclose(back, rotation, atol=1e-14)
+
+
+def test_a_folder_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    out.mkdir()  # an empty one is taken
+    write_colmap(made_up(), out)
+    with pytest.raises(IgsrError, match="out holds something already"):
+        write_colmap(made_up(), out)
+    before = (out / "sparse/0/points3D.bin").read_bytes()
+
+    def full(*arguments: object, **options: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("igsr.capture.write_files.Image.fromarray", full)
+        with pytest.raises(IgsrError, match=r"Cannot write .*out: No space left on device"):
+            write_colmap(made_up(), out, replace=True)
+    assert (out / "sparse/0/points3D.bin").read_bytes() == before
+    capture = made_up()
+    capture.points = None
+    write_colmap(capture, out, replace=True)
+    assert load_capture(out).points is None
+    assert os.listdir(tmp_path) == ["out"]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(IgsrError, match="file: it is a file"), atomic_folder(tmp_path / "file"):
+        pass

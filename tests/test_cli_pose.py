@@ -1,0 +1,236 @@
+"""``igsr pose``, ``igsr export``, and ``igsr fit`` of photos without cameras."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from PIL import Image
+
+import igsr
+from igsr import cli
+from igsr.capture.undistort import Lens
+from igsr.pose import registry
+from igsr.pose.accuracy import pose_accuracy
+from igsr.pose.estimate import Estimate
+
+MADE = scenes.capture(views=6, size=40)
+FIT = ["--steps", "30", "--max-splats", "200", "--sh-degree", "0", "--backend", "cpu", "--json"]
+
+
+@pytest.fixture
+def run(capsys):
+    def run(*arguments):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.app([str(argument) for argument in arguments])
+        output = capsys.readouterr()
+        return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
+
+    return run
+
+
+def refused(result, *words):
+    assert result.returncode == 1
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    for word in words:
+        assert str(word) in result.stderr
+    assert result.stdout == ""
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """A plain folder of photos."""
+    for view in MADE.views:
+        path = tmp_path / "photos" / f"{view.name[-6:-4]}.png"
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(view.image).save(path)
+    return tmp_path / "photos"
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """An estimator in COLMAP's place that knows the cameras; its calls."""
+    calls = []
+
+    def make():
+        def run(photos, *, seed=0, progress=None):
+            calls.append([photo.name for photo in photos])
+            progress("features", len(photos), len(photos))
+            cameras = [view.camera for view in MADE.views[: len(photos)]]
+            cameras[2] = None
+            nothing = [None] * len(photos)
+            points = igsr.Points(np.eye(3), np.full((3, 3), 9, np.uint8), np.array([1.0, 2.0, 3.0]))
+            sentence = f"Not placed: {photos[2].name}."
+            return Estimate(cameras, points, nothing, nothing, [sentence])
+
+        return run
+
+    monkeypatch.setitem(registry.ESTIMATORS, "dust3r", registry.Entry(make, lambda options: False))
+    monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
+    return calls
+
+
+def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, run):
+    out = tmp_path / "posed"
+    result = run("pose", photos, "--out", out, "--plot", "--json")
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == "Not placed: 02.png.\n"
+    report = json.loads(result.stdout)
+    assert report["estimator"] == "colmap"
+    assert (report["photos"], report["not_placed"]) == (6, ["02.png"])
+    assert [camera["name"] for camera in report["cameras"]] == [
+        f"{i:02d}.png" for i in (0, 1, 3, 4, 5)
+    ]
+    assert sorted(path.name for path in out.iterdir()) == ["images", "poses.png", "sparse"]
+    capture = igsr.load_capture(out)
+    assert [view.name for view in capture.views] == [f"images/{i:02d}.png" for i in (0, 1, 3, 4, 5)]
+    for view, i in zip(capture.views, (0, 1, 3, 4, 5), strict=True):
+        np.testing.assert_allclose(view.camera.viewmat, MADE.views[i].camera.viewmat, atol=1e-9)
+        np.testing.assert_array_equal(view.image, MADE.views[i].image)
+    np.testing.assert_allclose(capture.points.confidence, [1.0, 2.0, 3.0])
+    with Image.open(out / "poses.png") as plot:
+        colors = {color for _, color in plot.convert("RGB").getcolors(1 << 20)}
+    assert len(colors) > 50  # five cameras, each of its own colour
+    again = run("pose", photos, "--out", tmp_path / "plain")
+    assert "5 of 6 photos placed by colmap" in again.stdout
+    refused(run("pose", photos, "--out", out), out, "holds something already")
+    assert len(calls) == 2
+
+
+def test_mistakes_of_pose(photos, calls, tmp_path, run):
+    out = tmp_path / "out"
+    refused(run("pose", tmp_path / "nowhere", "--out", out), "nowhere")
+    refused(run("pose", photos / "00.png", "--out", out), "2 photos at least", "00.png")
+    refused(run("pose", photos, "--out", out, "--checkpoint", "x"), "checkpoint", "colmap")
+    refused(run("pose", photos, "--out", out, "--estimator", "magic"), "magic", "dust3r or colmap")
+    refused(run("pose", photos, "--out", photos / "00.png"), "it is a file")
+    given = scenes.write_capture(tmp_path / "given", MADE)
+    refused(run("pose", given, "--out", out), "has cameras already", "--estimator")
+    (photos / "03.png").write_bytes(b"no photo")
+    result = run("pose", photos, "--out", out)
+    assert result.returncode == 0
+    assert "One of 6 photos is left out" in result.stderr
+    assert "03.png" in result.stderr
+    assert calls == [["00.png", "01.png", "02.png", "04.png", "05.png"]]
+
+
+def test_nothing_placed_is_a_sentence(photos, tmp_path, run, monkeypatch):
+    def make():
+        def run(photos, *, seed=0, progress=None):
+            nothing = [None] * len(photos)
+            return Estimate(nothing, None, nothing, nothing, [])
+
+        return run
+
+    monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
+    refused(
+        run("pose", photos, "--out", tmp_path / "out", "--estimator", "colmap"),
+        "No camera could be found", "6 photos",
+    )  # fmt: skip
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("form", ["colmap", "colmap-text", "transforms"])
+def test_export(tmp_path, run, form):
+    given = scenes.write_capture(tmp_path / "given", MADE)
+    out = tmp_path / "out"
+    result = run("export", given, "--format", form, "--out", out, "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout) == {"out": str(out), "format": form, "views": 6}
+    cameras = [view.camera for view in igsr.load_capture(out).views]
+    exact = pose_accuracy(cameras, [view.camera for view in MADE.views])
+    assert exact["ATE"] < 1e-9
+    refused(run("export", given, "--format", form, "--out", out), "holds something already")
+
+
+def test_fit_finds_cameras_once_and_keeps_them(photos, calls, tmp_path, run):
+    out = tmp_path / "fitted"
+    fit = ["fit", photos, "--out", out, "--holdout", "4", *FIT]
+    first = run(*fit)
+    assert first.returncode == 0, first.stderr
+    assert "Not placed: 02.png." in first.stderr
+    assert f"Cameras of 5 of 6 photos were found by colmap and are kept in {out}" in first.stderr
+    report = json.loads(first.stdout)
+    assert [row["name"] for row in report["views"]] == ["images/00.png", "images/05.png"]
+    scene = (out / "scene.ply").read_bytes()
+    resumed = run(*fit, "--resume")
+    assert "The cameras found before are used" in resumed.stderr
+    assert len(calls) == 1
+    assert (out / "scene.ply").read_bytes() == scene
+    assert run(*fit).returncode == 0  # anew, over what was there
+    assert len(calls) == 2
+    assert (out / "scene.ply").read_bytes() == scene
+    scored = run("eval", out / "scene.ply", out / "capture", "--holdout", "4", "--json")
+    assert json.loads(scored.stdout)["psnr"] == report["psnr"]
+
+
+def test_mistakes_of_fit_without_cameras(photos, calls, tmp_path, run):
+    given = scenes.write_capture(tmp_path / "given", MADE)
+    out = tmp_path / "out"
+    refused(run("fit", given, "--out", out, "--estimator", "colmap", *FIT), "--estimator")
+    refused(run("eval", "scene.ply", photos), "scene.ply")
+    inside = out / "capture" / "photos"
+    inside.parent.mkdir(parents=True)
+    photos.rename(inside)
+    refused(run("fit", inside, "--out", out, *FIT), "lies where the fit would write")
+    assert len(list(inside.iterdir())) == 6
+    assert calls == []
+
+
+def test_captures_without_cameras_are_told_of_pose(photos, run):
+    refused(run("info", photos), "6 images but no cameras", "igsr pose")
+
+
+def test_lenses_are_undone(monkeypatch, photos, tmp_path, run):
+    def make():
+        def run(photos, *, seed=0, progress=None):
+            nothing = [None] * len(photos)
+            cameras = [view.camera for view in MADE.views]
+            lenses = [Lens(False, (0.3,))] * len(photos)
+            return Estimate(list(cameras), None, nothing, nothing, [], lenses)
+
+        return run
+
+    monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
+    out = tmp_path / "out"
+    assert run("pose", photos, "--out", out, "--estimator", "colmap").returncode == 0
+    views = igsr.load_capture(out).views
+    assert (out / "masks/00.png.png").is_file()
+    assert 0.5 < views[0].mask.mean() < 1.0
+    assert not np.array_equal(views[0].image, MADE.views[0].image)
+
+
+def test_study_of_poses(tmp_path, run, calls, monkeypatch):
+    turned = replace(
+        MADE.views[0].camera, viewmat=np.diag([-1.0, -1.0, 1.0, 1.0]) @ MADE.views[0].camera.viewmat
+    )
+    scenes.write_capture(tmp_path / "ring", MADE)
+    (tmp_path / "plain").mkdir()
+    for index in range(3):
+        Image.fromarray(MADE.views[index].image).save(tmp_path / "plain" / f"{index}.png")
+
+    def make():
+        def run(photos, *, seed=0, progress=None):
+            nothing = [None] * len(photos)
+            cameras = [turned, *(view.camera for view in MADE.views[1 : len(photos)])]
+            return Estimate(cameras, None, nothing, nothing, [])
+
+        return run
+
+    monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
+    study = ["study", "poses", tmp_path, "--out", tmp_path / "out", "--scene", "ring"]
+    done = run(*study, "--scene", "plain")
+    assert done.returncode == 0, done.stderr
+    assert "1 of 2: ring seed 0: 6 of 6 placed" in done.stderr
+    # Five of fifteen pairs have the camera that stands on its head.
+    assert "| ring | 0 | 6 | 6 | 0.667 |" in done.stdout
+    assert "| plain | 0 | 3 | 3 | - |" in done.stdout
+    report = json.loads((tmp_path / "out/study.json").read_text())
+    assert report["protocol"] == {"name": "poses", "estimator": "colmap", "seeds": 1}
+    refused(run(*study, "--views", "3"), "--views says nothing to poses")
+    refused(run(*study, "--estimator", "magic"), "estimator must be")
