@@ -24,16 +24,14 @@ def fit(capture, **options):
 def test_default_follows_the_number_of_photos_and_gives_way_to_the_caller():
     few, many = preset_settings("default", FEW_PHOTOS), preset_settings("default", FEW_PHOTOS + 1)
     assert few["dropout"] > 0.0
-    assert few["hull"]
     assert many["dropout"] == 0.0
-    assert not many["hull"]
-    assert not preset_settings("default", 8, poses="joint")["hull"]
-    assert preset_settings("default", 8, poses="joint", hull=True)["hull"]
+    assert (few["density"], many["density"]) == ("mcmc", "original")
     assert preset_settings("default", 3)["steps"] < few["steps"]
     assert preset_settings("default", 8)["steps"] == few["steps"]
-    assert preset_settings("3dgs", 3) == preset_settings("3dgs", 300)
-    given = preset_settings("default", 8, dropout=0.0, hull=False, steps=None)
-    assert (given["dropout"], given["hull"], given["steps"]) == (0.0, False, few["steps"])
+    plain = preset_settings("3dgs", FEW_PHOTOS)
+    assert preset_settings("3dgs", FEW_PHOTOS + 1) == plain | {"steps": 7000}
+    given = preset_settings("default", 8, dropout=0.0, hull=True, steps=None)
+    assert (given["dropout"], given["hull"], given["steps"]) == (0.0, True, few["steps"])
 
 
 def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):

@@ -177,9 +177,9 @@ def test_dtu_has_its_own_photos():
 def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypatch):
     seen = []
 
-    def quick(load, folder, one):
+    def quick(load, folder, one, refined):
         seen.append((one.scene, len(load(folder, one).train_views)))
-        return stand_in(one, float(one.views))
+        return stand_in(one, float(one.views)) | {"psnr_refined": float(one.views) + 0.5}
 
     monkeypatch.setattr(fits, "run_fit", quick)
     report = few_photos(real, tmp_path, scenes=("leaf", "dtu_1"), seeds=1)
@@ -189,7 +189,20 @@ def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypa
     split = report["protocol"]["scenes"]["dtu_1"]
     assert split["split"] == "DTU"
     assert split["train_views"]["3"] == [f"photos/{i}.png" for i in (25, 22, 28)]
-    assert "| leaf | 9 | default | 9.00 |" in (tmp_path / "study.md").read_text()
+    table = (tmp_path / "study.md").read_text()
+    assert "| preset | PSNR, dB | refined PSNR, dB | SSIM |" in table
+    assert "| leaf | 9 | default | 9.00 | 9.50 |" in table
+
+
+def test_presets_that_move_cameras_are_scored_refined_too(real, monkeypatch):
+    from igsr import presets
+
+    short = presets.Preset(20, 300, 0, "fixed", 0.0, False, "random", "joint", "shared")
+    monkeypatch.setattr(presets, "_INSTANTSPLAT", short)
+    one = Fit("leaf", "3", "instantsplat", 0, "cpu")
+    row = run_fit(load_views, str(real), one, refined=True)
+    assert row["psnr_refined"] > row["psnr"], "a camera fitted to its photo scores better"
+    assert "psnr_refined" not in run_fit(load_views, str(real), one)
 
 
 def test_what_a_mask_hides_in_a_scored_photo_changes_no_score(real, monkeypatch):

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ..capture import Capture
 from ..errors import IgsrError
-from ..evaluation import evaluate
-from ..fitting import fit
+from ..evaluation import default_background, evaluate
+from ..fitting import fit_with_cameras
+from ..poses import refine_cameras, similarity_between
 from ..presets import preset_settings
+from ..splats import Splats
 from .runs import Run, finished_runs
 
 SCORES = ("psnr", "ssim", "flip")
@@ -43,11 +45,14 @@ class Fit:
 Load = Callable[[str, Fit], Capture]
 
 
-def run_fit(load: Load, data: str, one: Fit) -> dict[str, Any]:
+def run_fit(load: Load, data: str, one: Fit, refined: bool = False) -> dict[str, Any]:
     """Fit and score; for a process of its own.
 
     As ``igsr fit`` does it: photos with alpha are fitted over random colours and scored over white,
     photos without are fitted and scored over black, and masked pixels count in neither.
+
+    With ``refined`` the row has "psnr_refined" too: test cameras aligned to the fitted ones where
+    those moved, then each fitted to its photo.
     """
     capture = load(data, one)
     seconds = 0.0
@@ -56,15 +61,29 @@ def run_fit(load: Load, data: str, one: Fit) -> dict[str, Any]:
         nonlocal seconds
         seconds = now.seconds
 
-    splats = fit(capture, backend=one.backend, seed=one.seed, preset=one.preset, progress=progress)
+    splats, moved = fit_with_cameras(
+        capture, backend=one.backend, seed=one.seed, preset=one.preset, progress=progress
+    )
     scores = evaluate(splats, capture, backend=one.backend)
     return {
         **vars(one),
         **{name: scores[name] for name in SCORES},
+        **({"psnr_refined": _refined_psnr(splats, capture, moved, one.backend)} if refined else {}),
         "splats": len(splats),
         "seconds": round(seconds, 2),
         "protocol": scores["protocol"],
     }
+
+
+def _refined_psnr(splats: Splats, given: Capture, moved: Capture, backend: str) -> float:
+    to_fitted = similarity_between(
+        [view.camera for view in given.train_views], [view.camera for view in moved.train_views]
+    )
+    aligned = [replace(v, camera=to_fitted.camera(v.camera)) for v in given.test_views]
+    background = default_background(given)
+    views = refine_cameras(splats, aligned, background, backend=backend)
+    refined = Capture(given.path, views, None)
+    return float(evaluate(splats, refined, background=background, backend=backend)["psnr"])
 
 
 def fitted(
@@ -78,6 +97,7 @@ def fitted(
     jobs: int,
     on_run: Callable[[int, int, dict[str, Any]], None] | None,
     ray: bool,
+    refined: bool = False,
 ) -> list[dict[str, Any]]:
     """The rows of all fits; seeds go last, so that a study cut short has all its kinds of fits.
 
@@ -90,6 +110,7 @@ def fitted(
         jobs: fits at a time, each in a process of its own.
         on_run: called with (done, all, the fit's row) after each fit.
         ray: fits run over a Ray cluster instead.
+        refined: also score test views with refined cameras.
 
     Raises:
         IgsrError: a number is not at least 1, there is no such preset, or a fit fails.
@@ -106,9 +127,10 @@ def fitted(
         Run(
             f"{one.scene}-views{one.views}-{one.preset}-seed{one.seed}-{one.backend}",
             one,
-            preset_settings(one.preset, photos[one.scene, one.views]),
+            preset_settings(one.preset, photos[one.scene, one.views])
+            | ({"refined": True} if refined else {}),
         )
         for one in fits
     ]
-    work = partial(run_fit, load)
+    work = partial(run_fit, load, refined=True) if refined else partial(run_fit, load)
     return finished_runs(Path(out) / "runs", tasks, work, str(data), jobs, on_run, ray)

@@ -12,14 +12,21 @@ import numpy as np
 from .. import _core
 from ..atomic_write import atomic_write
 
-SCORES = ("psnr", "ssim", "flip", "splats", "seconds")
-FORMATS = {"psnr": ".2f", "ssim": ".4f", "flip": ".4f", "splats": ".0f", "seconds": ".0f"}
+#: Scores in the order of the table: how they are headed and written. Not every study has all.
+SCORES = {
+    "psnr": ("PSNR, dB", ".2f"),
+    "psnr_refined": ("refined PSNR, dB", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+    "flip": ("FLIP", ".4f"),
+    "splats": ("splats", ".0f"),
+    "seconds": ("seconds a fit", ".0f"),
+}
 
 
 def summarized(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Mean of each score over the rows; its spread over seeds, each seed's rows averaged first."""
     out: dict[str, Any] = {"fits": len(rows)}
-    for score in SCORES:
+    for score in (score for score in SCORES if all(score in row for row in rows)):
         by_seed: dict[int, list[float]] = {}
         for row in rows:
             by_seed.setdefault(row["seed"], []).append(row[score])
@@ -75,22 +82,24 @@ def _groups(report: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
 
 def markdown(report: dict[str, Any]) -> str:
     """The table of a study, mean ± spread over seeds."""
+    shown = [score for score in SCORES if score in next(iter(report["mean"].values()))]
     lines = [
         f"# {report['title']}",
         "",
         f"igsr {report['igsr']}; {json.dumps(report['protocol'])}",
         "",
-        "| scene | views | preset | PSNR, dB | SSIM | FLIP | splats | seconds a fit |",
-        "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: |",
+        f"| scene | views | preset | {' | '.join(SCORES[score][0] for score in shown)} |",
+        f"| --- | --- | --- |{' ---: |' * len(shown)}",
     ]
     for scene, views, presets in [*_groups(report), ("mean", "all", report["mean"])]:
         for preset, scores in presets.items():
             cells = []
-            for score in SCORES:
+            for score in shown:
+                digits = SCORES[score][1]
                 spread = scores[f"{score}_spread"]
-                cell = format(scores[score], FORMATS[score])
+                cell = format(scores[score], digits)
                 if spread is not None:
-                    cell += f" ± {spread:{FORMATS[score]}}"
+                    cell += f" ± {spread:{digits}}"
                 cells.append(cell)
             lines.append(f"| {scene} | {views} | {preset} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

@@ -1,0 +1,192 @@
+"""Cameras of photos by DUSt3R: the network on pairs of photos, then global alignment."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.capture import Camera, Points
+from igsr.capture.photo_folder import Photo
+from igsr.errors import IgsrError
+from igsr.pose.alignment import (
+    AlignedPhoto,
+    Grid,
+    PhotoToAlign,
+    Predictor,
+    align,
+    trusted_pixels,
+)
+from igsr.pose.dust3r.pairs import pair_graph, usual_graph
+from igsr.pose.dust3r.preprocessing import usable
+from igsr.pose.estimate import Estimate
+
+#: Points of an estimate at most; of more, evenly many of all photos are taken.
+MOST_POINTS = 100_000
+
+
+class Dust3r:
+    """DUSt3R (Wang et al. 2024) as an estimator.
+
+    Args:
+        predictor: what stands where the network stands; by default the network itself.
+        checkpoint: file with the network's weights; by default where they usually lie.
+        graph: which pairs of photos are looked at, as in ``pair_graph``; by default all, of many
+            photos those that follow each other.
+        cameras: by photo name, cameras that are known; they stay as they are. Photos of the same
+            camera that are not among them then have its intrinsics.
+    """
+
+    name = "dust3r"
+
+    def __init__(
+        self,
+        predictor: Predictor | None = None,
+        checkpoint: str | os.PathLike[str] | None = None,
+        graph: str | None = None,
+        cameras: Mapping[str, Camera] | None = None,
+    ) -> None:
+        """Keep the settings; nothing is loaded yet."""
+        self.predictor = predictor
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.graph = graph
+        self.cameras = dict(cameras or {})
+
+    def __call__(
+        self,
+        photos: Sequence[Photo],
+        *,
+        seed: int = 0,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> Estimate:
+        """Find the cameras of photos.
+
+        Photos of one device, size and EXIF focal length, upright or not, share their focal length.
+
+        Args:
+            photos: at least two.
+            seed: of RANSAC.
+            progress: called with ("pairs" or "alignment", done, all).
+
+        Raises:
+            IgsrError: there are under two photos, a known camera is of no photo or of another size,
+                no checkpoint is found, or no two photos show the same thing.
+        """
+        pairs = pair_graph(self.graph or usual_graph(len(photos)), len(photos))
+        self._check_cameras(photos)
+        predictor = self._network() if self.predictor is None else self.predictor
+        grids, predictions = predictor(photos, pairs, progress)
+        alignment = align(predictions, self._known(photos, grids), seed=seed, progress=progress)
+        aligned = _dense(alignment.photos, grids)
+        trusted = trusted_pixels(aligned, alignment.pairs)
+        for photo, placed, sure in zip(photos, aligned, trusted, strict=True):
+            if placed is not None and sure is not None:
+                sure &= usable(photo, placed.grid)
+        return Estimate(
+            cameras=[None if photo is None else photo.camera for photo in aligned],
+            points=fused_points(photos, aligned, trusted),
+            depths=[None if photo is None else photo.depth for photo in aligned],
+            trusted=list(trusted),
+            warnings=alignment.warnings,
+        )
+
+    def _network(self) -> Predictor:
+        from igsr.pose.dust3r.checkpoint import find_checkpoint, load_network
+        from igsr.pose.dust3r.prediction import DustPredictor
+
+        found = find_checkpoint(self.checkpoint)
+        if found is None:
+            raise IgsrError(
+                "no checkpoint of DUSt3R is found where downloads usually lie; name one"
+            )
+        return DustPredictor(load_network(found))
+
+    def _check_cameras(self, photos: Sequence[Photo]) -> None:
+        sizes = {photo.name: photo.image.shape[:2] for photo in photos}
+        for name, camera in self.cameras.items():
+            if name not in sizes:
+                raise IgsrError(f"cameras names {name!r}, which is none of the photos")
+            if sizes[name] != (camera.height, camera.width):
+                height, width = sizes[name]
+                raise IgsrError(
+                    f"the camera given for {name} is of {camera.width} x {camera.height} pixels, "
+                    f"and the photo has {width} x {height}; scale its intrinsics"
+                )
+
+    def _known(self, photos: Sequence[Photo], grids: Sequence[Grid]) -> list[PhotoToAlign]:
+        given: dict[Hashable, np.ndarray] = {}
+        for photo in photos:
+            if photo.name in self.cameras:
+                given.setdefault(_camera_key(photo), self.cameras[photo.name].K)
+        known = []
+        for photo, grid in zip(photos, grids, strict=True):
+            height, width = photo.image.shape[:2]
+            camera = self.cameras.get(photo.name)
+            known.append(
+                PhotoToAlign(
+                    photo.name,
+                    height,
+                    width,
+                    grid,
+                    group=(photo.device, photo.focal, *sorted((height, width))),
+                    viewmat=None if camera is None else camera.viewmat,
+                    intrinsics=given.get(_camera_key(photo)) if camera is None else camera.K,
+                )
+            )
+        return known
+
+
+def _dense(
+    photos: Sequence[AlignedPhoto | None], grids: Sequence[Grid]
+) -> list[AlignedPhoto | None]:
+    """The photos with depths at the network's resolution where the predictor kept that."""
+    from igsr.pose.dust3r.dense_depth import with_dense_depth
+    from igsr.pose.dust3r.prediction import DenseGrid
+
+    return [
+        with_dense_depth(photo, grid.dense)
+        if photo is not None and isinstance(grid, DenseGrid) and grid.dense is not None
+        else photo
+        for photo, grid in zip(photos, grids, strict=True)
+    ]
+
+
+def _camera_key(photo: Photo) -> Hashable:
+    """Equal for photos that one camera took, held the same way."""
+    return photo.device, photo.focal, photo.image.shape[:2]
+
+
+def fused_points(
+    photos: Sequence[Photo],
+    aligned: Sequence[AlignedPhoto | None],
+    trusted: Sequence[npt.NDArray[np.bool_] | None],
+) -> Points | None:
+    """The trusted pixels of all photos as points with raw confidence, at most ``MOST_POINTS``.
+
+    Args:
+        photos: whose colours the points have.
+        aligned: the same photos' depths; None where one has no place.
+        trusted: [h, w] per photo.
+    """
+    xyz, rgb, confidence = [], [], []
+    for photo, placed, sure in zip(photos, aligned, trusted, strict=True):
+        if placed is None or sure is None:
+            continue
+        points, index = placed.world_points()
+        kept = sure.ravel()[index]
+        column, row = np.floor(placed.grid.photo_pixels()[index[kept]]).astype(np.int64).T
+        height, width = photo.image.shape[:2]
+        row, column = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
+        xyz.append(points[kept])
+        rgb.append(photo.image[row, column, :3])
+        confidence.append(placed.confidence.ravel()[index[kept]])
+    count = sum(len(points) for points in xyz)
+    if count == 0:
+        return None
+    taken = np.linspace(0, count - 1, min(count, MOST_POINTS)).round().astype(np.int64)
+    return Points(
+        np.concatenate(xyz)[taken], np.concatenate(rgb)[taken], np.concatenate(confidence)[taken]
+    )

@@ -1,0 +1,542 @@
+"""Global alignment: exact pointmaps, noise, what is fixed, and predictions that cannot be used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pointmaps import CONFIDENCE, PointmapScene, all_pairs
+
+from igsr.errors import IgsrError
+from igsr.pose.alignment import AlignedPhoto, Grid, PairPrediction, PhotoToAlign, align
+from igsr.pose.alignment import observations as observations_module
+from igsr.pose.alignment.absolute_pose import absolute_pose_and_focal
+from igsr.pose.alignment.confidence import trusted_pixels
+from igsr.pose.alignment.focal import weiszfeld_focal
+from igsr.pose.alignment.objective import Objective
+from igsr.pose.alignment.observations import observe, strong_edges
+from igsr.pose.alignment.similarity import apply, similarity_of_points
+from igsr.pose.alignment.spanning_tree import components, spanning_tree
+from igsr.pose.alignment.start import start
+from igsr.poses import Similarity, pose_errors, similarity_between
+
+
+def depth_noise(part, seed=0):
+    """Errors of depth, smooth and per pixel, each ``part`` in relative root mean square."""
+    random = np.random.default_rng(seed)
+
+    def spoil(points, confidence, first, photo):
+        height, width = confidence.shape
+        blocks = random.normal(size=(-(-height // 8), -(-width // 8)))
+        smooth = np.kron(blocks, np.ones((8, 8)))[:height, :width]
+        error = part * (smooth + random.normal(size=confidence.shape))
+        return points * np.exp(error)[..., None], confidence
+
+    return spoil
+
+
+def cameras_of(alignment):
+    return [photo.camera for photo in alignment.photos if photo is not None]
+
+
+def assert_exact(alignment, scene, photos=None, degrees=1e-3, centre=1e-4, focal=1e-3):
+    photos = range(len(scene.cameras)) if photos is None else photos
+    truth = [scene.cameras[i] for i in photos]
+    found = [alignment.photos[i].camera for i in photos]
+    errors = pose_errors(found, truth)
+    assert errors["rotation"] < degrees
+    assert errors["centre"] < centre
+    for camera, true_camera in zip(found, truth, strict=True):
+        np.testing.assert_allclose(camera.K, true_camera.K, rtol=focal, atol=1e-9)
+        assert (camera.width, camera.height) == (true_camera.width, true_camera.height)
+
+
+# --- what is exact
+
+
+def mixed_scene():
+    """Two cameras of different focal lengths and sizes, one of them held upright too."""
+    return PointmapScene(6, sizes=((96, 128), (128, 96), (80, 112)), focals=(1.2, 1.2, 0.9))
+
+
+def by_size(i):
+    return i % 3 == 2
+
+
+def test_the_start_from_exact_pointmaps_is_exact():
+    scene = mixed_scene()
+    alignment = align(scene.predictions(), scene.photos(group=by_size), steps=0)
+    assert alignment.start_loss < 1e-5
+    assert_exact(alignment, scene)
+    assert alignment.warnings == []
+    assert sorted(alignment.pairs) == all_pairs(6)
+
+
+def test_optimising_what_is_exact_leaves_it_exact():
+    scene = mixed_scene()
+    alignment = align(scene.predictions(), scene.photos(group=by_size), steps=20)
+    assert alignment.loss <= alignment.start_loss
+    assert_exact(alignment, scene)
+
+
+def test_depths_are_those_of_the_scene_in_the_world_of_the_cameras():
+    scene = mixed_scene()
+    alignment = align(scene.predictions(), scene.photos(group=by_size), steps=0)
+    world = similarity_between(cameras_of(alignment), scene.cameras)
+    for photo, grid, truth in zip(alignment.photos, scene.grids, scene.worlds, strict=True):
+        assert photo.depth.shape == photo.confidence.shape == (grid.height, grid.width)
+        assert photo.depth.dtype == photo.confidence.dtype == np.float32
+        np.testing.assert_array_equal(photo.confidence, CONFIDENCE)
+        xyz, index = photo.world_points()
+        assert len(index) == photo.depth.size
+        np.testing.assert_allclose(apply(world, xyz.T).T, truth, atol=1e-3)
+
+
+def test_the_world_is_the_camera_frame_of_a_photo():
+    alignment = align(PointmapScene(3).predictions(), PointmapScene(3).photos(), steps=5)
+    nearest = min(np.abs(photo.camera.viewmat - np.eye(4)).max() for photo in alignment.photos)
+    assert nearest < 1e-12
+
+
+def test_two_photos():
+    scene = PointmapScene(2, arc=0.4)
+    assert_exact(align(scene.predictions(), scene.photos(), steps=20), scene)
+
+
+def test_one_direction_of_each_pair_is_enough():
+    scene = PointmapScene(4)
+    pairs = [(0, 1), (2, 1), (3, 2), (0, 3)]
+    assert_exact(align(scene.predictions(pairs), scene.photos(), steps=0), scene)
+
+
+def test_a_photo_that_is_never_first_has_its_focal_length_searched():
+    # Its own group: no other photo tells. 21 values are tried and the optimiser does the rest.
+    scene = PointmapScene(4)
+    pairs = [(i, j) for i, j in all_pairs(4) if i != 2]
+    photos = scene.photos(group=lambda i: i == 2)
+    begun = align(scene.predictions(pairs), photos, steps=0).photos[2].camera
+    found = align(scene.predictions(pairs), photos, steps=150).photos[2].camera
+    true_focal = scene.cameras[2].K[0, 0]
+    assert abs(begun.K[0, 0] / true_focal - 1) < 0.1
+    assert abs(found.K[0, 0] / true_focal - 1) < 0.01
+
+
+def test_fifty_photos_in_a_sliding_window():
+    scene = PointmapScene(50, arc=6.0, sizes=((64, 96),))
+    pairs = [(i, j) for i, j in all_pairs(50) if abs(i - j) <= 2]
+    alignment = align(scene.predictions(pairs), scene.photos(), steps=1)
+    # Rounding adds up along 49 links.
+    assert_exact(alignment, scene, degrees=0.02, centre=1e-3)
+
+
+def test_thinned_grids_still_give_every_depth(monkeypatch):
+    monkeypatch.setattr(observations_module, "MOST_POINTS", 3_000)
+    scene = PointmapScene(4)
+    edges = strong_edges(scene.predictions())
+    photo = observe(edges, scene.photos()).photos[0]
+    assert len(photo.pixels) < 200
+    assert_exact(align(scene.predictions(), scene.photos(), steps=0), scene)
+    alignment = align(scene.predictions(), scene.photos(), steps=0)
+    assert np.isfinite(alignment.photos[0].depth).all()
+    assert alignment.photos[0].depth.shape == (23, 30)
+
+
+# --- what is not
+
+
+def test_noise_is_averaged_away():
+    scene = PointmapScene(6)
+    predictions = scene.predictions(spoil=depth_noise(0.05))
+    begun = align(predictions, scene.photos(), steps=0)
+    found = align(predictions, scene.photos())
+    assert found.start_loss == begun.loss == begun.start_loss
+    assert found.loss < found.start_loss
+    assert_exact(found, scene, degrees=0.3, centre=0.05, focal=5e-3)
+    before, after = (pose_errors(cameras_of(a), scene.cameras) for a in (begun, found))
+    assert after["rotation"] < 0.5 * before["rotation"]
+    assert after["centre"] < 0.5 * before["centre"]
+
+
+def test_the_confident_half_of_the_pixels_wins():
+    scene = PointmapScene(5)
+    random = np.random.default_rng(1)
+
+    def spoil(points, confidence, first, photo):
+        wrong = random.random(confidence.shape) < 0.5
+        shift = random.normal(size=points.shape) + [1.0, 0.0, 3.0]
+        points = np.where(wrong[..., None], points + shift, points)
+        return points, np.where(wrong, 1.05, confidence)
+
+    predictions = scene.predictions(spoil=spoil)
+    assert_exact(align(predictions, scene.photos(), steps=0), scene, degrees=0.05, centre=5e-3)
+    assert_exact(align(predictions, scene.photos(), steps=60), scene, degrees=0.02, centre=2e-3)
+
+
+def test_the_order_of_photos_does_not_matter():
+    scene = PointmapScene(5)
+    predictions = scene.predictions(spoil=depth_noise(0.02))
+    straight = cameras_of(align(predictions, scene.photos(), steps=150))
+    order = np.array([3, 0, 4, 2, 1])
+    place = np.argsort(order)
+    shuffled = [
+        replace(p, first=int(place[p.first]), second=int(place[p.second])) for p in predictions
+    ]
+    photos = scene.photos()
+    other = cameras_of(align(shuffled[::-1], [photos[i] for i in order], steps=150))
+    errors = pose_errors([other[i] for i in place], straight)
+    assert errors["rotation"] < 5e-3
+    assert errors["centre"] < 1e-3
+    np.testing.assert_allclose(other[0].K[0, 0], straight[0].K[0, 0], rtol=1e-3)
+
+
+def test_same_seed_same_bits():
+    scene = PointmapScene(4)
+    predictions = scene.predictions(spoil=depth_noise(0.05))
+    one, two = (align(predictions, scene.photos(), steps=20, seed=3) for _ in range(2))
+    assert one.loss == two.loss
+    for a, b in zip(one.photos, two.photos, strict=True):
+        np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
+        np.testing.assert_array_equal(a.camera.K, b.camera.K)
+        np.testing.assert_array_equal(a.depth, b.depth)
+
+
+def test_photos_of_one_group_share_their_focal_length():
+    scene = PointmapScene(4)
+    predictions = scene.predictions(spoil=depth_noise(0.05))
+    shared = cameras_of(align(predictions, scene.photos(), steps=30))
+    assert len({camera.K[0, 0] for camera in shared}) == 1
+    own = cameras_of(align(predictions, scene.photos(group=lambda i: i), steps=30))
+    assert len({camera.K[0, 0] for camera in own}) == 4
+
+
+def test_predictions_are_left_as_they_are():
+    scene = PointmapScene(3)
+    predictions = scene.predictions()
+    before = [p.first_points.copy() for p in predictions]
+    align(predictions, scene.photos(), steps=2)
+    for prediction, points in zip(predictions, before, strict=True):
+        np.testing.assert_array_equal(prediction.first_points, points)
+
+
+# --- what is fixed
+
+
+@pytest.mark.parametrize("fixed", [[1], [0, 3], [1, 2, 4], [0, 1, 2, 3, 4]])
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_fixed_poses_set_the_world(fixed, noise):
+    scene = PointmapScene(5)
+    photos = scene.photos(viewmat=lambda i: scene.cameras[i].viewmat if i in fixed else None)
+    alignment = align(scene.predictions(spoil=depth_noise(noise)), photos, steps=60)
+    # Noise of 2 % at 5 units: what is averaged over hundreds of pixels is far below.
+    bound = 0.2 if noise else 1e-4
+    for i, (camera, truth) in enumerate(zip(cameras_of(alignment), scene.cameras, strict=True)):
+        if i in fixed:
+            np.testing.assert_array_equal(camera.viewmat, truth.viewmat)
+        np.testing.assert_allclose(camera.viewmat[:3, :3], truth.viewmat[:3, :3], atol=0.1 * bound)
+        if len(fixed) > 1:
+            np.testing.assert_allclose(camera.centre, truth.centre, atol=bound)
+    if len(fixed) > 1:
+        depth = scene.worlds[0] @ scene.cameras[0].viewmat[2, :3] + scene.cameras[0].viewmat[2, 3]
+        found = alignment.photos[0].depth.ravel()
+        assert np.median(np.abs(found / depth - 1)) < (0.05 if noise else 1e-4)
+
+
+def test_fixed_poses_far_from_the_origin():
+    scene = PointmapScene(4)
+    away = Similarity(3.0, np.eye(3), np.array([1e6, -2e6, 5e5]))
+    moved = [away.camera(camera) for camera in scene.cameras]
+    photos = scene.photos(viewmat=lambda i: moved[i].viewmat if i < 2 else None)
+    alignment = align(scene.predictions(), photos, steps=20)
+    for found, truth in zip(cameras_of(alignment), moved, strict=True):
+        np.testing.assert_allclose(found.centre, truth.centre, atol=1e-3)
+
+
+def test_fixed_poses_at_one_place_leave_the_scale_free():
+    scene = PointmapScene(4)
+    photos = scene.photos(viewmat=lambda i: scene.cameras[0].viewmat if i == 0 else None)
+    twin = replace(photos[0], name="twin.jpg")
+    pairs = [p for p in scene.predictions() if p.first != 3 and p.second != 3]
+    # Photo 3 is photo 0 once more.
+    doubled = [replace(p, first=3) for p in pairs if p.first == 0]
+    alignment = align(pairs + doubled, [*photos[:3], twin], steps=20)
+    assert_exact(alignment, scene, photos=range(3))
+
+
+def test_fixed_intrinsics_stay():
+    scene = mixed_scene()
+    given = scene.cameras[1].K * [[1.01, 1.0, 1.0], [1.0, 0.99, 1.02], [1.0, 1.0, 1.0]]
+    photos = scene.photos(group=by_size, intrinsics=lambda i: given if i == 1 else None)
+    alignment = align(scene.predictions(), photos, steps=5)
+    np.testing.assert_array_equal(alignment.photos[1].camera.K, given)
+    focals = [photo.camera.K[0, 0] for photo in alignment.photos]
+    assert focals[0] == focals[3] != focals[1]
+
+
+# --- predictions that cannot be used
+
+
+def test_pixels_that_are_not_finite_are_left_out():
+    scene = PointmapScene(4)
+
+    def spoil(points, confidence, first, photo):
+        points = points.copy()
+        points[:6] = np.nan
+        points[6:8] = np.inf
+        points[8:9] = 1e30
+        confidence = confidence.copy()
+        confidence[9:10], confidence[10:11], confidence[11:12] = np.nan, np.inf, -3.0
+        return points, confidence
+
+    with np.errstate(over="ignore"):
+        predictions = scene.predictions(spoil=spoil)
+    alignment = align(predictions, scene.photos(), steps=10)
+    assert_exact(alignment, scene)
+    for photo in alignment.photos:
+        assert np.isnan(photo.depth[:12]).all()
+        assert np.isfinite(photo.depth[12:]).all()
+        assert (photo.confidence[:12] == 1.0).all()
+
+
+@pytest.mark.parametrize("kind", ["garbage", "nothing", "not finite", "one point", "one line"])
+def test_a_photo_that_cannot_be_used_is_named(kind):
+    scene = PointmapScene(5)
+    random = np.random.default_rng(2)
+
+    def spoil(points, confidence, first, photo):
+        if 3 not in (first, photo):
+            return points, confidence
+        if kind == "garbage":
+            return random.normal(size=points.shape), np.full_like(confidence, 1.1)
+        if kind == "nothing":
+            return points, np.ones_like(confidence)
+        if kind == "one point":
+            return np.full_like(points, 2.0), confidence
+        if kind == "one line":
+            return points[..., :1] * [1.0, 2.0, 3.0], confidence
+        return np.full_like(points, np.nan), confidence
+
+    alignment = align(scene.predictions(spoil=spoil), scene.photos(), steps=5)
+    assert alignment.photos[3] is None
+    assert len(alignment.warnings) == 1
+    assert "3.jpg" in alignment.warnings[0]
+    assert_exact(alignment, scene, photos=[0, 1, 2, 4])
+
+
+def test_of_two_things_the_one_with_more_photos_is_placed():
+    scene = PointmapScene(5)
+    pairs = [(i, j) for i, j in all_pairs(5) if (i < 2) == (j < 2)]
+    alignment = align(scene.predictions(pairs), scene.photos(), steps=5)
+    assert [photo is None for photo in alignment.photos] == [True, True, False, False, False]
+    assert ["0.jpg" in alignment.warnings[0], "1.jpg" in alignment.warnings[1]] == [True, True]
+    assert_exact(alignment, scene, photos=[2, 3, 4])
+
+
+def test_of_two_things_the_one_with_known_poses_is_placed():
+    scene = PointmapScene(5)
+    pairs = [(i, j) for i, j in all_pairs(5) if (i < 2) == (j < 2)]
+    photos = scene.photos(viewmat=lambda i: scene.cameras[i].viewmat if i == 1 else None)
+    alignment = align(scene.predictions(pairs), photos, steps=5)
+    assert [photo is None for photo in alignment.photos] == [False, False, True, True, True]
+
+
+@pytest.mark.parametrize("kind", ["nothing", "not finite", "none", "one point"])
+def test_nothing_to_place_is_a_sentence(kind):
+    scene = PointmapScene(3)
+
+    def spoil(points, confidence, first, photo):
+        if kind == "nothing":
+            return points, np.ones_like(confidence)
+        if kind == "one point":
+            return np.zeros_like(points), confidence
+        return np.full_like(points, np.nan), confidence
+
+    predictions = [] if kind == "none" else scene.predictions(spoil=spoil)
+    with pytest.raises(IgsrError, match="no two of the photos show the same thing"):
+        align(predictions, scene.photos())
+
+
+def test_random_predictions_end_or_raise():
+    random = np.random.default_rng(5)
+    for trial in range(3):
+        photos = [
+            PhotoToAlign(f"{i}.png", 40, 60, Grid(8, 12, 5.0, 5.0, 0.0, 0.0)) for i in range(3)
+        ]
+        predictions = [
+            PairPrediction(
+                i,
+                j,
+                *(
+                    random.normal(size=shape).astype(np.float32) * 10.0 ** (6 * trial - 6)
+                    if shape[2:]
+                    else np.exp(random.normal(size=shape)).astype(np.float32) + 1
+                    for shape in ((8, 12, 3), (8, 12), (8, 12, 3), (8, 12))
+                ),
+            )
+            for i, j in all_pairs(3)
+        ]
+        try:
+            alignment = align(predictions, photos, steps=10)
+        except IgsrError:
+            continue
+        assert np.isfinite(alignment.loss)
+
+
+def test_arguments_are_checked():
+    scene = PointmapScene(2)
+    photos, predictions = scene.photos(), scene.predictions()
+    with pytest.raises(IgsrError, match="steps is -1"):
+        align(predictions, photos, steps=-1)
+    with pytest.raises(IgsrError, match="two different photos, counted from 0 to 1"):
+        align([replace(predictions[0], second=2)], photos)
+    with pytest.raises(IgsrError, match="two different photos"):
+        align([replace(predictions[0], second=0)], photos)
+    with pytest.raises(IgsrError, match=r"second_points float32 \[4, 4, 3\]"):
+        align([replace(predictions[0], second_points=np.zeros((4, 4, 3), np.float32))], photos)
+    with pytest.raises(IgsrError, match="first_confidence int64"):
+        align([replace(predictions[0], first_confidence=np.ones((23, 30), np.int64))], photos)
+    with pytest.raises(IgsrError, match=r"the pose of 0.jpg is not rigid"):
+        replace(photos[0], viewmat=np.diag([2.0, 1.0, 1.0, 1.0]))
+    with pytest.raises(IgsrError, match=r"0.jpg: the focal length fx is 0"):
+        replace(photos[0], intrinsics=np.diag([0.0, 1.0, 1.0]))
+    with pytest.raises(IgsrError, match="a grid's height is 0"):
+        Grid(0, 4, 1.0, 1.0, 0.0, 0.0)
+    with pytest.raises(IgsrError, match="a grid's scale_y is nan"):
+        Grid(4, 4, 1.0, float("nan"), 0.0, 0.0)
+
+
+# --- the parts
+
+
+def test_the_gradient_is_that_of_the_loss():
+    scene = PointmapScene(3, sizes=((64, 96),))
+    photos = scene.photos(viewmat=lambda i: scene.cameras[i].viewmat if i == 0 else None)
+    observations = observe(strong_edges(scene.predictions(spoil=depth_noise(0.05))), photos)
+    placement, depths = start(observations, photos, seed=0)
+    objective = Objective(observations, placement, depths, photos)
+    random = np.random.default_rng(0)
+    # The start has distances of nearly zero, where the norm has a kink.
+    for parameter in objective.parameters:
+        parameter.data += 0.05 * parameter.new_tensor(random.normal(size=parameter.shape))
+    objective.loss()
+    gradients = [parameter.grad.clone() for parameter in objective.parameters]
+    for parameter, gradient in zip(objective.parameters, gradients, strict=True):
+        direction = gradient.sign() * gradient.new_tensor(random.random(gradient.shape))
+        expected = float((gradient * direction).sum())
+        losses = []
+        for step in (1e-3, -1e-3):
+            parameter.data += step * direction
+            losses.append(objective.loss())
+            parameter.data -= step * direction
+        assert expected > 0.0
+        assert abs((losses[0] - losses[1]) / 2e-3 / expected - 1) < 2e-3
+    assert (objective.turns.grad[0] == 0).all()
+
+
+def test_similarity_with_a_third_of_the_points_wrong():
+    random = np.random.default_rng(3)
+    q, r = np.linalg.qr(random.normal(size=(3, 3)))
+    rotation = q * np.sign(np.diag(r))
+    rotation *= np.sign(np.linalg.det(rotation))
+    truth = Similarity(2.5, rotation, np.array([1.0, -2.0, 7.0]))
+    points = random.normal(size=(3, 300))
+    others = apply(truth, points)
+    others[:, :100] += random.normal(size=(3, 100)) + 2.0
+    found = similarity_of_points(points, others, np.ones(300))
+    assert abs(found.scale / truth.scale - 1) < 1e-3
+    np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-3)
+    line = np.outer([1.0, 2.0, 3.0], random.normal(size=300))
+    assert similarity_of_points(line, apply(truth, line), np.ones(300)) is None
+    assert similarity_of_points(points, others, np.zeros(300)) is None
+
+
+def test_weiszfeld_focal():
+    random = np.random.default_rng(4)
+    offsets = random.uniform(-200, 200, size=(500, 2))
+    depth = random.uniform(1, 9, size=500)
+    points = np.vstack([offsets.T / 321.0, np.ones(500)]) * depth
+    points[:, :150] += random.normal(size=(3, 150))
+    points[2, 400] = 0.0
+    points[2, 401] = -5.0
+    assert abs(weiszfeld_focal(points, offsets, np.ones(500)) / 321.0 - 1) < 1e-3
+    assert weiszfeld_focal(points, -offsets, np.ones(500)) is None
+    assert weiszfeld_focal(points, offsets, np.zeros(500)) is None
+    assert weiszfeld_focal(-points, offsets, np.ones(500)) is None
+
+
+def test_focal_lengths_are_searched_where_none_is_known():
+    scene = PointmapScene(1)
+    camera = scene.cameras[0]
+    pixels = scene.grids[0].photo_pixels()
+    found = absolute_pose_and_focal(
+        scene.worlds[0].T, pixels, np.full(len(pixels), 5.0), (96, 128), seed=0
+    )
+    assert found is not None
+    assert abs(found[1] / camera.K[0, 0] - 1) < 0.1
+    few = absolute_pose_and_focal(
+        scene.worlds[0].T[:, :3], pixels[:3], np.full(3, 5.0), (96, 128), 0
+    )
+    assert few is None
+
+
+def test_spanning_tree_takes_the_strongest_edges():
+    edges = np.array([(0, 1), (1, 0), (1, 2), (2, 0), (3, 2)])
+    scores = np.array([2.0, 5.0, 1.0, 4.0, 3.0])
+    assert spanning_tree(edges, scores) == [(1, True), (3, False), (4, False)]
+    assert components(5, [(0, 1), (3, 4), (1, 2)]) == [[0, 1, 2], [3, 4]]
+
+
+# --- trust
+
+
+def floater_scene():
+    """Two photos of one wall; in the first, one pixel stands before it."""
+    cameras = PointmapScene(2, arc=0.2).cameras
+    grid = Grid(24, 32, 4.0, 4.0, 0.0, 0.0)
+    photos = []
+    for camera in cameras:
+        truth = PointmapScene(2, arc=0.2)
+        truth.grids = [grid, grid]
+        depth = np.full((24, 32), 5.0, np.float32)
+        photos.append(AlignedPhoto(camera, grid, depth, np.full((24, 32), 9.0, np.float32)))
+    return photos
+
+
+def test_a_less_sure_pixel_before_a_surface_is_not_trusted():
+    photos = floater_scene()
+    assert all(mask.all() for mask in trusted_pixels(photos, [(0, 1)]))
+    photos[0].depth[12, 16] = 2.5
+    photos[0].confidence[12, 16] = 8.0
+    first, second = trusted_pixels(photos, [(0, 1)])
+    assert not first[12, 16]
+    assert first.sum() == first.size - 1
+    assert second.all()
+    assert all(mask.all() for mask in trusted_pixels(photos, []))
+    photos[0].confidence[12, 16] = 10.0
+    assert trusted_pixels(photos, [(0, 1)])[0].all()
+
+
+def test_trust_does_not_depend_on_the_order_of_photos():
+    scene = PointmapScene(4)
+    random = np.random.default_rng(7)
+    predictions = scene.predictions(spoil=depth_noise(0.1))
+    photos = align(predictions, scene.photos(), steps=0).photos
+    for photo in photos:
+        photo.confidence[:] = random.uniform(2, 9, size=photo.confidence.shape)
+    pairs, order = all_pairs(4), [2, 0, 3, 1]
+    straight = trusted_pixels(photos, pairs)
+    shuffled = trusted_pixels([photos[i] for i in order], pairs)
+    assert 0 < sum(mask.sum() for mask in straight) < sum(mask.size for mask in straight)
+    for place, i in enumerate(order):
+        np.testing.assert_array_equal(shuffled[place], straight[i])
+
+
+def test_low_confidence_and_unknown_depth_are_not_trusted():
+    photos = floater_scene()
+    photos[0].confidence[0, 0] = 3.0
+    photos[0].depth[0, 1] = np.nan
+    first, missing = trusted_pixels([photos[0], None], [(0, 1)])
+    assert missing is None
+    assert not first[0, 0]
+    assert not first[0, 1]
+    assert first.sum() == first.size - 2

@@ -1,0 +1,374 @@
+"""Photos to pointmaps: what the network is shown, which pairs, and what is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from dust3r_networks import SMALL, hashed_network
+
+from igsr.capture.photo_folder import Photo
+from igsr.errors import IgsrError
+from igsr.pose.dust3r.network import NetworkConfig
+from igsr.pose.dust3r.pairs import MOST_COMPLETE, pair_graph, usual_graph
+from igsr.pose.dust3r.prediction import (
+    DustPredictor,
+    _EncodedPhotos,
+    _View,
+    grid_samples,
+    memory_bound,
+    stride_for,
+)
+from igsr.pose.dust3r.preprocessing import crop_of, network_input, usable
+
+
+def photo(width, height, name="a.jpg", seed=0, mask=None, channels=3):
+    random = np.random.default_rng(seed)
+    # Coarse blocks, so that photos differ after they are resized too.
+    blocks = random.integers(0, 256, (7, 7, channels), dtype=np.uint8)
+    rows, columns = np.arange(height) * 7 // height, np.arange(width) * 7 // width
+    return Photo(name, blocks[rows][:, columns], mask, None, None)
+
+
+# ---- preprocessing -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("size", "image_size", "expected"),
+    [
+        ((1024, 768), 512, (512, 384)),
+        ((768, 1024), 512, (384, 512)),
+        ((960, 540), 512, (512, 288)),
+        ((640, 427), 512, (512, 336)),  # 342 rows, of which six are cut off
+        ((500, 333), 512, (512, 336)),
+        ((512, 32), 512, (512, 32)),
+        ((700, 700), 512, (512, 384)),
+        ((700, 699), 512, (512, 496)),  # 511 rows
+        ((701, 700), 512, (512, 496)),
+        ((64, 64), 64, (64, 48)),
+        ((1023, 768), 224, (224, 224)),
+        ((100, 333), 224, (224, 224)),
+        ((50, 50), 224, (224, 224)),
+    ],
+)
+def test_what_the_network_is_shown(size, image_size, expected):
+    taken = photo(*size)
+    crop = crop_of(taken, image_size)
+    assert (crop.width, crop.height) == expected
+    pixels = network_input(taken, crop)
+    assert pixels.shape == (3, crop.height, crop.width)
+    assert pixels.dtype == np.float32
+    assert np.abs(pixels).max() <= 1.0
+    # What is cut off is the same on both sides, up to the odd pixel.
+    assert 0 <= crop.resized_width - crop.width - 2 * crop.left <= 1
+    assert 0 <= crop.resized_height - crop.height - 2 * crop.top <= 1
+
+
+@pytest.mark.parametrize("image_size", [512, 224])
+@pytest.mark.parametrize(
+    "size", [(1600, 1200), (300, 451), (700, 700), (1000, 333), (1279, 961), (511, 512)]
+)
+def test_grids_lead_back_to_the_photo(size, image_size):
+    width, height = size
+    centre = np.array([0.54 * width, 0.47 * height])
+    row, column = np.indices((height, width)) + 0.5
+    radius = 0.02 * min(size)
+    near = (column - centre[0]) ** 2 + (row - centre[1]) ** 2
+    image = np.repeat(np.rint(250 * np.exp(-near / (2 * radius**2)))[..., None], 3, axis=2)
+    taken = Photo("spot.png", image.astype(np.uint8), None, None, None)
+    crop = crop_of(taken, image_size)
+    seen = network_input(taken, crop)[0] + 1.0
+    for columns, rows in (
+        (range(crop.width), range(crop.height)),
+        (range(2, crop.width, 3), range(1, crop.height, 3)),
+    ):
+        sampled = seen[np.ix_(rows, columns)]
+        grid = crop.grid(columns, rows)
+        assert sampled.shape == (grid.height, grid.width)
+        row, column = np.indices(sampled.shape) + 0.5
+        found = np.array([(column * sampled).sum(), (row * sampled).sum()]) / sampled.sum()
+        found = found * [grid.scale_x, grid.scale_y] + [grid.offset_x, grid.offset_y]
+        # Half a pixel of the network is what mistaken pixel centres would cost.
+        assert np.abs(found - centre).max() < 0.05 * width / crop.resized_width
+
+
+def test_transparent_and_masked_pixels():
+    taken = photo(100, 60, channels=4)
+    taken.image[..., 3] = 255
+    taken.image[:, :50, 3] = 0
+    crop = crop_of(taken, 64)
+    seen = network_input(taken, crop)
+    assert (seen[:, :, :20] == 1.0).all()
+    other = Photo("b.png", taken.image.copy(), None, None, None)
+    other.image[:, :50, :3] = 7
+    assert np.array_equal(network_input(other, crop), seen)
+    half = Photo("c.png", np.full((30, 40, 4), 128, dtype=np.uint8), None, None, None)
+    inside = network_input(half, crop_of(half, 64))
+    np.testing.assert_allclose((inside + 1) * 127.5, (128 * 128 + 255 * 127) / 255, atol=0.6)
+    mask = np.zeros((60, 100), dtype=bool)
+    mask[:30] = True
+    masked = Photo("d.png", taken.image, mask, None, None)
+    grid = crop.grid(range(crop.width), range(crop.height))
+    shown = usable(masked, grid)
+    assert shown[:10, 40:].all()
+    assert not shown[:, :30].any()
+    assert not shown[20:].any()
+
+
+@pytest.mark.parametrize(
+    ("taken", "named"),
+    [
+        (photo(1000, 30), "too narrow"),
+        (photo(30, 1000), "too narrow"),
+        (Photo("a.jpg", np.zeros((40, 40), np.uint8), None, None, None), "image is uint8"),
+        (Photo("a.jpg", np.zeros((40, 40, 3)), None, None, None), "image is float64"),
+        (photo(40, 30, mask=np.ones((40, 30), bool)), "mask"),
+    ],
+)
+def test_photos_that_cannot_be_shown(taken, named):
+    with pytest.raises(IgsrError, match=rf"^a\.jpg.*{named}"):
+        crop_of(taken, 512)
+
+
+# ---- pairs ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "photos", "expected"),
+    [
+        ("complete", 2, {(0, 1)}),
+        ("complete", 4, {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}),
+        ("swin-1", 4, {(0, 1), (1, 2), (2, 3), (0, 3)}),
+        ("swin-1-noncyclic", 4, {(0, 1), (1, 2), (2, 3)}),
+        ("swin-2-noncyclic", 4, {(0, 1), (1, 2), (2, 3), (0, 2), (1, 3)}),
+        ("logwin-2", 5, {(0, 1), (1, 2), (2, 3), (3, 4), (0, 4), (0, 2), (1, 3), (2, 4), (0, 3),
+                         (1, 4)}),
+        ("logwin-3-noncyclic", 6, {(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 3), (2, 4),
+                                   (3, 5), (0, 4), (1, 5)}),
+        ("oneref", 3, {(0, 1), (0, 2)}),
+        ("oneref-1", 4, {(0, 1), (1, 2), (1, 3)}),
+    ],
+)  # fmt: skip
+def test_pair_graphs(kind, photos, expected):
+    pairs = pair_graph(kind, photos)
+    assert len(pairs) == len(set(pairs)) == 2 * len(expected)
+    assert {pair for pair in pairs if pair[0] < pair[1]} == expected
+    assert {(j, i) for i, j in pairs} == set(pairs)
+    # Both orders follow each other, and a photo's pairs are near each other.
+    assert [tuple(sorted(pair)) for pair in pairs] == sorted(2 * sorted(expected))
+
+
+def test_windows_of_all_photos_are_complete():
+    for kind in ("swin-6", "swin-999999999", "logwin-999999999-noncyclic"):
+        pairs = pair_graph(kind, 7)
+        if kind.startswith("swin"):
+            assert pairs == pair_graph("complete", 7)
+    assert pair_graph("swin", 9) == pair_graph("swin-3", 9)
+    assert pair_graph("logwin", 20) == pair_graph("logwin-3", 20)
+
+
+@pytest.mark.parametrize("photos", [2, 3, 15, MOST_COMPLETE, MOST_COMPLETE + 1, 50, 500])
+def test_the_usual_graph_joins_all_and_grows_slowly(photos):
+    pairs = pair_graph(usual_graph(photos), photos)
+    assert len(pairs) <= 20 * photos
+    reached = {0}
+    for i, j in 2 * pairs:
+        if i in reached:
+            reached.add(j)
+    assert reached == set(range(photos))
+
+
+@pytest.mark.parametrize(
+    ("kind", "photos"),
+    [
+        ("all", 5),
+        ("complete-3", 5),
+        ("swin-x", 5),
+        ("swin--1", 5),
+        ("swin-0", 5),
+        ("logwin-0", 5),
+        ("oneref-5", 5),
+        ("oneref-0-noncyclic", 5),
+        ("", 5),
+        ("complete", 1),
+        ("swin-3", 0),
+    ],
+)
+def test_graphs_that_are_none(kind, photos):
+    with pytest.raises(IgsrError) as caught:
+        pair_graph(kind, photos)
+    assert (kind if photos > 1 else "at least two photos") in str(caught.value)
+
+
+# ---- prediction ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("side", "longest", "stride", "samples"),
+    [
+        (512, 128, 5, 102),
+        (384, 128, 3, 128),
+        (224, 128, 3, 74),
+        (64, 128, 1, 64),
+        (512, 40, 13, 40),
+        (16, 15, 3, 6),
+        (16, 2, 7, 2),
+    ],
+)
+def test_grids_are_symmetric(side, longest, stride, samples):
+    assert stride_for(side, longest) == stride
+    pixels = grid_samples(side, stride)
+    assert len(pixels) == samples <= longest
+    assert pixels[0] == side - 1 - pixels[-1] >= 0
+
+
+@pytest.fixture(scope="module")
+def network():
+    return hashed_network(SMALL)
+
+
+@pytest.fixture(scope="module")
+def photos():
+    return [
+        photo(80, 60, "wide.jpg", 1),
+        photo(60, 80, "tall.jpg", 2),
+        photo(128, 96, "wide2.jpg", 3),
+        photo(90, 40, "flat.jpg", 4),
+    ]
+
+
+def directly(network, first, second):
+    """The network's maps of two photos, one after the other."""
+    with torch.inference_mode():
+        tokens = [
+            network.encode(torch.from_numpy(network_input(one, crop_of(one, 64))[None]))
+            for one in (first, second)
+        ]
+        return network.decode(*tokens)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_predictions_are_the_networks_in_the_order_of_the_pairs(network, photos, order):
+    pairs = pair_graph("complete", 4)[::order]
+    steps = []
+    grids, predictions = DustPredictor(network)(photos, pairs, lambda *step: steps.append(step))
+    assert [(p.first, p.second) for p in predictions] == pairs
+    assert steps[-1] == ("pairs", 12, 12)
+    assert [step[1] for step in steps] == sorted({step[1] for step in steps})
+    assert [(grid.height, grid.width) for grid in grids] == [(48, 64), (64, 48), (48, 64), (16, 64)]
+    for found in predictions:
+        first, second = directly(network, photos[found.first], photos[found.second])
+        for got, wanted in (
+            (found.first_points, first.points),
+            (found.first_confidence, first.confidence),
+            (found.second_points, second.points),
+            (found.second_confidence, second.confidence),
+        ):
+            assert got.dtype == np.float32
+            np.testing.assert_allclose(got, wanted[0], rtol=1e-4, atol=1e-5)
+
+
+def test_grids_are_samples_of_the_surest_map(network, photos):
+    pairs = [(0, 1), (1, 0), (0, 2), (2, 3), (2, 0)]
+    grids, predictions = DustPredictor(network, longest=20)(photos, pairs)
+    scores = [
+        np.prod([m.confidence.double().mean() for m in directly(network, photos[i], photos[j])])
+        for i, j in pairs
+    ]
+    for i, grid in enumerate(grids[:3]):
+        own = grid.dense
+        of_photo = [n for n, pair in enumerate(pairs) if pair[0] == i]
+        assert own.prediction == max(of_photo, key=lambda n: scores[n])
+        sampled = predictions[own.prediction]
+        assert np.array_equal(own.points[own.rows, own.columns], sampled.first_points)
+        assert np.array_equal(own.confidence[own.rows, own.columns], sampled.first_confidence)
+        assert sampled.first_points.shape == (grid.height, grid.width, 3)
+        assert max(grid.height, grid.width) <= 20
+        for samples, count, scale, offset, whole_scale, whole_offset in (
+            (own.columns, grid.width, grid.scale_x, grid.offset_x,
+             own.grid.scale_x, own.grid.offset_x),
+            (own.rows, grid.height, grid.scale_y, grid.offset_y,
+             own.grid.scale_y, own.grid.offset_y),
+        ):  # fmt: skip
+            pixel = np.arange(own.grid.width + own.grid.height)[samples][:count] + 0.5
+            expected = pixel * whole_scale + whole_offset
+            np.testing.assert_allclose((np.arange(count) + 0.5) * scale + offset, expected)
+    assert grids[3].dense is None
+
+
+def test_each_photo_is_encoded_once_and_forgotten_after_its_last_pair(photos):
+    network = hashed_network(SMALL)
+    encode, encoded = network.encode, []
+
+    def counted(images):
+        encoded.append(images)
+        return encode(images)
+
+    network.encode = counted
+    DustPredictor(network)(photos, pair_graph("complete", 4))
+    assert len(encoded) == 4
+    pairs = [(0, 1), (1, 0), (1, 2)]
+    kept = _EncodedPhotos(network, [_View(one, SMALL, 64) for one in photos], pairs)
+    for pair, left in zip(pairs, [{0, 1}, {1}, set()], strict=True):
+        kept.batch([pair[0]])
+        kept.batch([pair[1]])
+        kept.release([pair])
+        assert set(kept.tokens) == left
+
+
+def test_what_may_not_be_used_has_no_confidence(network, photos):
+    mask = np.ones((60, 80), dtype=bool)
+    mask[:, 40:] = False
+    masked = [replace(photos[0], mask=mask), photos[1]]
+    grids, (found, back) = DustPredictor(network)(masked, [(0, 1), (1, 0)])
+    _, (whole, _) = DustPredictor(network)(photos[:2], [(0, 1), (1, 0)])
+    for confidence in (found.first_confidence, back.second_confidence, grids[0].dense.confidence):
+        assert (confidence[:, 32:] == 1.0).all()
+        assert (confidence[:, :32] > 1.0).all()
+    assert np.array_equal(found.first_confidence[:, :32], whole.first_confidence[:, :32])
+    assert np.array_equal(found.first_points, whole.first_points)
+
+
+def test_the_same_photos_give_the_same_bits(network, photos):
+    pairs = pair_graph("swin-1", 4)
+    runs = [DustPredictor(network, longest=30)(photos, pairs)[1] for _ in range(2)]
+    for one, other in zip(*runs, strict=True):
+        assert np.array_equal(one.first_points, other.first_points)
+        assert np.array_equal(one.second_confidence, other.second_confidence)
+
+
+def test_pairs_and_checkpoints_that_cannot_be_used(photos):
+    network = hashed_network(SMALL)
+    for pair in ((0, 0), (0, 4), (-1, 0), (0,)):
+        with pytest.raises(IgsrError, match="pairs holds"):
+            DustPredictor(network)(photos, [(0, 1), pair])
+    with pytest.raises(IgsrError, match="longest"):
+        DustPredictor(network, longest=1)
+    assert DustPredictor(network)(photos, [])[1] == []
+    with torch.no_grad():
+        network.downstream_head2.proj.bias[5] = torch.nan
+    with pytest.raises(IgsrError, match=r"wide\.jpg and tall\.jpg"):
+        DustPredictor(network)(photos, [(0, 1)])
+
+
+def test_memory_stays_within_its_bound(network):
+    taken = [photo(64, 60, f"{n}.jpg", n) for n in range(4)]
+    pairs = pair_graph("complete", 4)
+    grids, predictions = DustPredictor(network, longest=20)(taken, pairs)
+    arrays = [a for p in predictions for a in vars(p).values() if isinstance(a, np.ndarray)]
+    assert all(array.base is None for array in arrays)
+    arrays += [array for grid in grids for array in (grid.dense.points, grid.dense.confidence)]
+    kept = sum(array.nbytes for array in arrays)
+    bound = memory_bound(SMALL, 4, len(pairs), longest=20)
+    assert 0.7 * bound.kept < kept <= bound.kept
+    # A device of 16 GB holds 15 photos in all their pairs, and what more photos add is their own.
+    published = NetworkConfig()
+    fifteen, fifty, hundred = (
+        memory_bound(published, n, len(pair_graph(usual_graph(n), n))) for n in (15, 50, 100)
+    )
+    assert sum(fifteen) < 8e9
+    assert 4 * 571_000_000 < fifteen.device < fifty.device < 5e9
+    assert fifty.kept < 0.6e9
+    assert hundred.kept == 2 * fifty.kept

@@ -1,0 +1,265 @@
+"""The DUSt3R route, photos to estimate, with exact pointmaps in the network's place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import ring_camera, splats
+
+from igsr.capture import Camera
+from igsr.capture.photo_folder import Photo
+from igsr.errors import IgsrError
+from igsr.pose.alignment import TRUSTED, Grid, PairPrediction
+from igsr.pose.dust3r import estimator as estimator_module
+from igsr.pose.dust3r.dense_depth import with_dense_depth
+from igsr.pose.dust3r.estimator import Dust3r
+from igsr.pose.dust3r.prediction import DenseGrid, DensePrediction
+from igsr.poses import pose_errors, similarity_between
+from igsr.rendering import render
+
+COUNT, SIZE, STEP = 4, 48, 2
+#: A photo's grid leaves out its border, as cropping to patches does.
+GRID = Grid(SIZE // STEP - 2, SIZE // STEP - 4, STEP, STEP, 4.0, 2.0)
+
+
+class Scene:
+    """Photos of a ball of splats with a background, and the depth of every pixel."""
+
+    def __init__(self):
+        ball = splats(count=300, seed=3)
+        self.cameras = [ring_camera(0.25 * i, SIZE) for i in range(COUNT)]
+        self.photos, self.worlds, self.seen = [], [], []
+        for i, camera in enumerate(self.cameras):
+            picture = render(ball, camera, backend="cpu")
+            self.photos.append(Photo(f"{i}.png", picture.to_uint8(), None, None, "phone"))
+            column, row = GRID.photo_pixels().astype(int).T
+            depth = picture.expected_depth[row, column].astype(np.float64)
+            seen = picture.alpha[row, column] > 0.9
+            depth[~seen] = 8.0
+            rays = (GRID.photo_pixels() - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]
+            local = np.pad(rays, ((0, 0), (0, 1)), constant_values=1.0) * depth[:, None]
+            self.worlds.append((local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+            self.seen.append(seen)
+
+    def predictor(self, photos, pairs, progress=None):
+        """Exact pointmaps of the photos by their names, each pair at a scale of its own."""
+        index = [int(photo.name.removesuffix(".png")) for photo in photos]
+        predictions = []
+        for done, (first, second) in enumerate(pairs):
+            viewmat, maps = self.cameras[index[first]].viewmat, []
+            for photo in (first, second):
+                local = self.worlds[index[photo]] @ viewmat[:3, :3].T + viewmat[:3, 3]
+                points = (0.5 + 0.1 * first) * local
+                confidence = np.where(self.seen[index[photo]], 6.0 + index[photo], 1.02)
+                maps.append(points.reshape(GRID.height, GRID.width, 3).astype(np.float32))
+                maps.append(confidence.reshape(GRID.height, GRID.width).astype(np.float32))
+            predictions.append(PairPrediction(first, second, *maps))
+            if progress is not None:
+                progress("pairs", done + 1, len(pairs))
+        return [GRID] * len(photos), predictions
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+@pytest.fixture(scope="module")
+def estimate(scene):
+    return Dust3r(scene.predictor)(scene.photos)
+
+
+def test_cameras_are_right(scene, estimate):
+    errors = pose_errors(estimate.cameras, scene.cameras)
+    assert errors["rotation"] < 0.01
+    assert errors["centre"] < 1e-3
+    for camera, truth in zip(estimate.cameras, scene.cameras, strict=True):
+        np.testing.assert_allclose(camera.K, truth.K, rtol=1e-3)
+        assert (camera.width, camera.height) == (SIZE, SIZE)
+    assert estimate.warnings == []
+
+
+def test_points_lie_on_the_scene_with_its_colours(scene, estimate):
+    world = similarity_between(estimate.cameras, scene.cameras)
+    points = estimate.points
+    xyz = world.scale * points.xyz @ world.rotation.T + world.translation
+    truth = np.concatenate([w[s] for w, s in zip(scene.worlds, scene.seen, strict=True)])
+    nearest = np.linalg.norm(xyz[:, None] - truth[None], axis=2)
+    assert nearest.min(axis=1).max() < 1e-2
+    assert len(xyz) > 0.5 * len(truth)
+    assert points.confidence.min() > TRUSTED
+    column, row = GRID.photo_pixels().astype(int).T
+    colors = np.concatenate(
+        [
+            photo.image[row[seen], column[seen]]
+            for photo, seen in zip(scene.photos, scene.seen, strict=True)
+        ]
+    )
+    # Points of two photos may coincide.
+    assert (points.rgb == colors[nearest.argmin(axis=1)]).mean() > 0.99
+
+
+def test_depths_and_trusted_masks(scene, estimate):
+    scale = similarity_between(estimate.cameras, scene.cameras).scale
+    for i, (depth, trusted) in enumerate(zip(estimate.depths, estimate.trusted, strict=True)):
+        viewmat = scene.cameras[i].viewmat
+        truth = (scene.worlds[i] @ viewmat[2, :3] + viewmat[2, 3]).reshape(depth.shape)
+        assert depth.dtype == np.float32
+        assert trusted.dtype == bool
+        assert trusted.shape == depth.shape == (GRID.height, GRID.width)
+        np.testing.assert_allclose(scale * depth[trusted], truth[trusted], rtol=1e-3)
+        assert not trusted[~scene.seen[i].reshape(depth.shape)].any()
+        assert 0 < trusted.sum() < trusted.size
+
+
+def test_photos_are_left_as_they_are(scene):
+    before = [photo.image.copy() for photo in scene.photos]
+    Dust3r(scene.predictor)(scene.photos[:2])
+    for photo, image in zip(scene.photos, before, strict=True):
+        np.testing.assert_array_equal(photo.image, image)
+
+
+def test_masked_pixels_are_not_trusted(scene, estimate):
+    mask = np.ones((SIZE, SIZE), dtype=bool)
+    mask[:, SIZE // 2 :] = False
+    photos = [Photo(p.name, p.image, mask, None, None) for p in scene.photos]
+    masked = Dust3r(scene.predictor)(photos).trusted
+    left = GRID.photo_pixels()[:, 0].reshape(GRID.height, GRID.width) < SIZE // 2
+    for now, before in zip(masked, estimate.trusted, strict=True):
+        np.testing.assert_array_equal(now, before & left)
+
+
+def test_progress_and_pairs(scene):
+    told = []
+    Dust3r(scene.predictor, graph="oneref-1")(
+        scene.photos, progress=lambda stage, done, of: told.append((stage, done, of))
+    )
+    assert [of for stage, _, of in told if stage == "pairs"] == [2 * (COUNT - 1)] * (2 * COUNT - 2)
+    assert told[-1][0] == "alignment"
+    assert told[-1][1] == told[-1][2]
+
+
+def test_same_seed_same_bits(scene, estimate):
+    again = Dust3r(scene.predictor)(scene.photos)
+    np.testing.assert_array_equal(again.points.xyz, estimate.points.xyz)
+    for one, two in zip(again.cameras, estimate.cameras, strict=True):
+        np.testing.assert_array_equal(one.viewmat, two.viewmat)
+
+
+def test_known_cameras_stay_and_lend_their_intrinsics(scene):
+    known = {f"{i}.png": scene.cameras[i] for i in (0, 3)}
+    found = Dust3r(scene.predictor, cameras=known)(scene.photos)
+    for i, (camera, truth) in enumerate(zip(found.cameras, scene.cameras, strict=True)):
+        np.testing.assert_array_equal(camera.K, truth.K)
+        np.testing.assert_allclose(camera.centre, truth.centre, atol=1e-2)
+        if i in (0, 3):
+            np.testing.assert_array_equal(camera.viewmat, truth.viewmat)
+
+
+def test_devices_have_focal_lengths_of_their_own(scene):
+    zoomed = [Photo(p.name, p.image, None, None, "12"[i > 1]) for i, p in enumerate(scene.photos)]
+
+    def predictor(photos, pairs, progress=None):
+        """Depths off by a tenth in two photos, as if their focal length were another."""
+        grids, predictions = scene.predictor(photos, pairs)
+        for prediction in predictions:
+            if prediction.first > 1:
+                prediction.first_points[..., 2] *= 1.1
+                prediction.second_points[..., 2] *= 1.1
+        return grids, predictions
+
+    cameras = Dust3r(predictor)(zoomed).cameras
+    focals = [camera.K[0, 0] for camera in cameras]
+    assert len(set(focals[:2])) == len(set(focals[2:])) == 1
+    assert focals[3] > 1.03 * focals[0]
+    shared = Dust3r(predictor)(scene.photos).cameras
+    assert len({camera.K[0, 0] for camera in shared}) == 1
+
+
+def test_points_are_bounded(scene, monkeypatch):
+    monkeypatch.setattr(estimator_module, "MOST_POINTS", 50)
+    points = Dust3r(scene.predictor)(scene.photos).points
+    assert len(points.xyz) == len(points.rgb) == len(points.confidence) == 50
+    assert len(np.unique(points.confidence)) > 1  # of more than one photo
+
+
+def test_dense_depths_keep_the_edges_of_the_pointmap(scene):
+    """A predictor that kept every pixel of a step, and every second of them to align."""
+    fine = Grid(20, 24, 2.0, 2.0, 0.0, 0.0)
+    coarse = Grid(10, 12, 4.0, 4.0, -1.0, -1.0)
+    depth = np.where(np.arange(24) < 11, 2.0, 5.0) * np.ones((20, 1))
+    points = np.repeat(depth[..., None], 3, axis=2).astype(np.float32)
+    confidence = np.full((20, 24), 4.0, np.float32)
+    confidence[3, 3] = 1.0
+    rows = columns = slice(0, None, 2)
+    dense = DensePrediction(0, points, confidence, fine, rows, columns)
+    camera = Camera(np.eye(4), np.array([[50.0, 0, 24], [0, 50, 20], [0, 0, 1]]), 48, 40)
+    aligned = (3.0 * depth[rows, columns]).astype(np.float32)
+    aligned[4, 4] = np.nan
+    sure = np.full((10, 12), 6.0, np.float32)
+    photo = with_dense_depth(estimator_module.AlignedPhoto(camera, coarse, aligned, sure), dense)
+    expected = 3.0 * depth
+    expected[3, 3] = np.nan
+    expected[8, 8] = np.nan
+    np.testing.assert_allclose(photo.depth, expected, rtol=1e-6)
+    assert photo.grid is fine
+    assert photo.confidence[3, 3] == 1.0
+    assert photo.confidence[0, 0] == 6.0
+
+
+def test_a_predictor_that_keeps_dense_maps_gives_dense_depths(scene):
+    def predictor(photos, pairs, progress=None):
+        grids, predictions = scene.predictor(photos, pairs)
+        dense = []
+        for i in range(len(photos)):
+            own = next(n for n, p in enumerate(predictions) if p.first == i)
+            kept = predictions[own]
+            points = np.repeat(np.repeat(kept.first_points, 2, axis=0), 2, axis=1)
+            sure = np.repeat(np.repeat(kept.first_confidence, 2, axis=0), 2, axis=1)
+            whole = Grid(2 * GRID.height, 2 * GRID.width, 1.0, 1.0, 4.0, 2.0)
+            samples = slice(0, None, 2)
+            map_of = DensePrediction(own, points, sure, whole, samples, samples)
+            dense.append(DenseGrid(**vars(grids[i]), dense=map_of))
+        return dense, predictions
+
+    found = Dust3r(predictor)(scene.photos)
+    assert found.depths[0].shape == found.trusted[0].shape == (2 * GRID.height, 2 * GRID.width)
+    assert found.trusted[0].any()
+
+
+def test_photos_of_another_thing_are_named(scene):
+    def predictor(photos, pairs, progress=None):
+        grids, predictions = scene.predictor(photos, pairs)
+        strangers = {3}
+        for prediction in predictions:
+            if (prediction.first in strangers) != (prediction.second in strangers):
+                prediction.first_confidence[:] = prediction.second_confidence[:] = 1.1
+        return grids, predictions
+
+    found = Dust3r(predictor)(scene.photos)
+    assert found.cameras[3] is found.depths[3] is found.trusted[3] is None
+    assert [("3.png" in sentence) for sentence in found.warnings] == [True]
+    assert pose_errors(found.cameras[:3], scene.cameras[:3])["rotation"] < 0.01
+
+
+def test_bad_input_is_a_sentence(scene):
+    def useless(photos, pairs, progress=None):
+        grids, predictions = scene.predictor(photos, pairs)
+        for prediction in predictions:
+            prediction.first_confidence[:] = prediction.second_confidence[:] = 1.0
+        return grids, predictions
+
+    with pytest.raises(IgsrError, match="no two of the photos show the same thing"):
+        Dust3r(useless)(scene.photos[:2])
+    with pytest.raises(IgsrError, match="at least two photos"):
+        Dust3r(scene.predictor)(scene.photos[:1])
+    with pytest.raises(IgsrError, match="pair graph 'star' is unknown"):
+        Dust3r(scene.predictor, graph="star")(scene.photos)
+    with pytest.raises(IgsrError, match=r"cameras names '9.png', which is none of the photos"):
+        Dust3r(scene.predictor, cameras={"9.png": scene.cameras[0]})(scene.photos)
+    camera = scene.cameras[0]
+    small = Camera(camera.viewmat, camera.K, 24, 48)
+    with pytest.raises(IgsrError, match="of 24 x 48 pixels, and the photo has 48 x 48"):
+        Dust3r(scene.predictor, cameras={"0.png": small})(scene.photos)
+    with pytest.raises(IgsrError, match="nowhere"):
+        Dust3r(checkpoint="/nowhere/at_all.pth")(scene.photos)
