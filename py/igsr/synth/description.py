@@ -68,7 +68,7 @@ class Description:
         objects: the parts that masks show.
         surroundings: all other parts.
         lights: beside the sky.
-        sky: linear RGB radiance, equirectangular [H, W, 3], row 0 at the zenith.
+        sky: linear RGB radiance, equirectangular [H, W, 3], row 0 at the zenith, or None for none.
         centre: the point that cameras look at, about.
         radius: how far the objects reach from ``centre``.
         open_towards: the azimuth in radians from which objects are seen best, or None where they
@@ -80,7 +80,7 @@ class Description:
     kind: str
     contents: list[str]
     objects: list[Part]
-    sky: np.ndarray
+    sky: np.ndarray | None
     surroundings: list[Part] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))

@@ -16,14 +16,14 @@ class Materials:
 
     Args:
         rng: draws everything.
-        shininess: how likely surfaces are to be glossy or metal; by default drawn.
+        vividness: how likely the palette is to be saturated.
     """
 
-    def __init__(self, rng: np.random.Generator, shininess: float | None = None) -> None:
+    def __init__(self, rng: np.random.Generator, vividness: float = 0.35) -> None:
         """Draw the palette."""
         self.rng = rng
-        self.colours = palette(rng)
-        self.shininess = rng.beta(1.5, 2.0) if shininess is None else shininess
+        self.colours = palette(rng, vividness)
+        self.shininess = rng.beta(1.5, 2.0)
 
     def colour(self) -> np.ndarray:
         """[3], sRGB: one of the palette."""

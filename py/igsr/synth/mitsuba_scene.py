@@ -21,10 +21,13 @@ from .meshes import Mesh, vertex_normals
 from .textures import to_linear, to_srgb
 
 VARIANT = "scalar_rgb"
-#: Bounces of a light path; of more the pictures tell little.
-MAX_DEPTH = 5
+#: Surfaces on a light path and the light at its end: each further one costs as much time again and
+#: shows in nothing but darker corners.
+MAX_DEPTH = 3
 #: Pixels per side of the blocks that are rendered and seeded by themselves.
 BLOCK_SIZE = 32
+#: Where rays begin, z along the camera's axis in world units.
+NEAR_CLIP = 0.01
 
 
 @contextlib.contextmanager
@@ -172,12 +175,13 @@ def load_scene(description: Description) -> LoadedScene:
     items.update({f"around_{i}": loaded(part) for i, part in enumerate(description.surroundings)})
     for index, light in enumerate(description.lights):
         items[f"lamp_{index}"] = _lamp(light)
-    items["sky"] = {
-        "type": "envmap",
-        "bitmap": mi.Bitmap(description.sky.astype(np.float32)),
-        # Mitsuba's maps have y up.
-        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90.0),
-    }
+    if description.sky is not None:
+        items["sky"] = {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(description.sky.astype(np.float32)),
+            # Mitsuba's maps have y up.
+            "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90.0),
+        }
     return LoadedScene(
         mi.load_dict(items),
         mi.load_dict({"type": "scene", **objects}),
@@ -196,7 +200,7 @@ def sensor(viewpoint: Viewpoint, sampler: dict[str, Any]) -> Any:
             "type": "perspective",
             "fov": math.degrees(viewpoint.field_of_view),
             "fov_axis": "x",
-            "near_clip": 0.01,
+            "near_clip": NEAR_CLIP,
             "to_world": mi.ScalarTransform4f(to_world),
             "film": {
                 "type": "hdrfilm",
@@ -258,7 +262,7 @@ def first_hits(loaded: LoadedScene, viewpoint: Viewpoint) -> tuple[np.ndarray, n
     x = (np.arange(viewpoint.width) + 0.5 - 0.5 * viewpoint.width) / viewpoint.focal
     y = (np.arange(viewpoint.height) + 0.5 - 0.5 * viewpoint.height) / viewpoint.focal
     along = 1.0 / np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
-    depth = np.where(np.isfinite(far), far * along, np.nan)
+    depth = np.where(np.isfinite(far), NEAR_CLIP + far * along, np.nan)
     return depth.astype(np.float32), is_object
 
 

@@ -15,6 +15,8 @@ from .textures import landscape, noise, to_linear
 
 #: Part of the scenes that are of the family "object".
 OBJECT_SHARE = 0.45
+#: Rooms and ground are seldom as colourful as things.
+ROOM_VIVIDNESS = 0.1
 
 
 def draw_description(rng: np.random.Generator) -> Description:
@@ -85,7 +87,7 @@ def _lone_object(rng: np.random.Generator) -> Description:
     count = int(rng.choice([1, 1, 1, 2, 4]))
     names, parts = _cluster(rng, count)
     if rng.random() < 0.3:
-        materials = Materials(rng)
+        materials = Materials(rng, ROOM_VIVIDNESS)
         reach = 1.1 * float(max(np.abs(part.mesh[0][:, :2]).max() for part in parts))
         base = materials.textured()
         if rng.random() < 0.5:
@@ -151,6 +153,21 @@ def _walls(
     return parts
 
 
+def _ceiling(rng: np.random.Generator, room: float, parts: list[Part]) -> list[Light]:
+    """A shining ceiling as large as the room, and at times a lamp below it.
+
+    A sky over open walls would light the room too, but most light paths to it would end in a wall.
+    """
+    height = 0.99 * float(bounds(parts)[1][2])
+    tint = to_linear(np.array([1.0, *rng.uniform(0.85, 1.0, 2)]))
+    lights = [Light(np.array([0, 0, height]), np.zeros(3), (1.1 * room, 1.1 * room), tint)]
+    if rng.random() < 0.3:
+        at = np.array([*rng.uniform(-0.7, 0.7, 2) * room, 0.9 * height])
+        size = float(rng.uniform(0.2, 0.6))
+        lights.append(Light(at, rng.normal(0, 0.3, 3), (size, size), 8.0 / size * tint[::-1]))
+    return lights
+
+
 def _bystanders(
     rng: np.random.Generator,
     count: int,
@@ -171,7 +188,7 @@ def _bystanders(
 
 def _table(rng: np.random.Generator) -> Description:
     names, objects = _cluster(rng, int(rng.integers(2, 6)))
-    materials = Materials(rng)
+    materials = Materials(rng, ROOM_VIVIDNESS)
     reach, floor = float(rng.uniform(1.2, 2.0)), -float(rng.uniform(0.8, 1.4))
     top = materials.textured("wood", "marble", "plaid", "checker", "speckle", "stone", "tiles")
     parts = []
@@ -191,11 +208,13 @@ def _table(rng: np.random.Generator) -> Description:
             for y in (-0.9 * deep, 0.9 * deep)
         ]
         parts.append(Part(joined(legs), materials.plain()))
-    sky = SKIES[rng.integers(len(SKIES))](rng)
+    sky: np.ndarray | None = SKIES[rng.integers(len(SKIES))](rng)
+    lamps = _lamps(rng, 2, 7.0, 1.0)
     room = np.inf
     if rng.random() < 0.6:
         room = float(rng.uniform(4.0, 6.0))
         parts += _walls(rng, materials, floor, dict.fromkeys(range(4), room))
+        sky, lamps = None, _ceiling(rng, room, parts)
         parts += _bystanders(
             rng, int(rng.integers(1, 5)), 0.75 * room, 0.85 * room, floor, (0.4, 0.8)
         )
@@ -204,29 +223,26 @@ def _table(rng: np.random.Generator) -> Description:
         vertices, faces, uv = disc(float(rng.uniform(4.0, 9.0)))
         parts.append(Part((vertices + [0, 0, floor], faces, 6 * uv), ground))
     return _framed(
-        Description(
-            "surroundings", "table", names, objects, sky, parts, _lamps(rng, 2, 7.0, 1.0), room=room
-        )
+        Description("surroundings", "table", names, objects, sky, parts, lamps, room=room)
     )
 
 
 def _room(rng: np.random.Generator) -> Description:
     names, objects = _cluster(rng, int(rng.integers(1, 5)))
-    materials = Materials(rng)
+    materials = Materials(rng, ROOM_VIVIDNESS)
     room = float(rng.uniform(3.0, 5.0))
     sides = {side: room * float(rng.uniform(1.0, 1.3)) for side in range(4)}
     parts = _walls(rng, materials, 0.0, sides)
     parts += _bystanders(rng, int(rng.integers(2, 7)), 0.75 * room, 0.9 * room, 0.0, (0.4, 0.9))
-    sky = UNSEEN_SKIES[rng.integers(2)](rng)
-    lamps = _lamps(rng, 3, 2.0 * room, 1.0)
+    lamps = _ceiling(rng, room, parts)
     return _framed(
-        Description("surroundings", "room", names, objects, sky, parts, lamps, room=0.7 * room)
+        Description("surroundings", "room", names, objects, None, parts, lamps, room=0.7 * room)
     )
 
 
 def _outdoors(rng: np.random.Generator) -> Description:
     names, objects = _cluster(rng, int(rng.integers(1, 5)))
-    materials = Materials(rng)
+    materials = Materials(rng, ROOM_VIVIDNESS)
     size, cells = 36.0, 96
     heights = rng.uniform(0.5, 3.0) * (noise(rng, cells, cells, (8, 8)) - 0.5)
     x, y = np.meshgrid(np.linspace(-1, 1, cells), np.linspace(-1, 1, cells))
@@ -253,7 +269,7 @@ def _corner(rng: np.random.Generator) -> Description:
             spot = np.array([*rng.normal(0.0, 0.6, 2), 0.0])
             objects += _turned(rng, made, float(rng.uniform(0.5, 0.9)), spot)
             names.append("plant")
-    materials = Materials(rng)
+    materials = Materials(rng, ROOM_VIVIDNESS)
     behind = float(bounds(objects)[1][:2].max() + rng.uniform(0.05, 1.0))
     sides = {0: behind} if rng.random() < 0.5 else {0: behind, 1: behind}
     parts = _walls(rng, materials, 0.0, sides)
@@ -278,7 +294,7 @@ def _corner(rng: np.random.Generator) -> Description:
 
 def _shelves(rng: np.random.Generator) -> Description:
     """Rows of objects on boards before a wall, seen from the front (the side of -x)."""
-    materials = Materials(rng)
+    materials = Materials(rng, ROOM_VIVIDNESS)
     wide, deep = float(rng.uniform(2.2, 3.6)), float(rng.uniform(0.6, 0.9))
     boards, gap = int(rng.integers(1, 4)), float(rng.uniform(0.8, 1.1))
     wood = materials.textured("wood", "speckle", "marble")

@@ -44,11 +44,16 @@ def hsv(hue: float, saturation: float, value: float) -> np.ndarray:
     return value - value * saturation * np.clip(np.minimum(offset, 4.0 - offset), 0.0, 1.0)
 
 
-def palette(rng: np.random.Generator) -> np.ndarray:
-    """[8, 3] sRGB colours that could stand side by side: one or two hues, neutrals, an accent."""
+def palette(rng: np.random.Generator, vividness: float) -> np.ndarray:
+    """[8, 3] sRGB colours that could stand side by side: one or two hues, neutrals, an accent.
+
+    Args:
+        rng: draws them.
+        vividness: the probability that all but the neutrals are saturated.
+    """
     hue = rng.random()
     second = hue + rng.choice([0.05, -0.08, 0.33, 0.5])
-    vivid = rng.random() < 0.4
+    vivid = rng.random() < vividness
     colours = []
     for index in range(8):
         if index < 2:
@@ -56,7 +61,7 @@ def palette(rng: np.random.Generator) -> np.ndarray:
             colours.append(hsv(warmth, rng.uniform(0.0, 0.2), rng.uniform(0.2, 0.95)))
             continue
         base = hue if index < 5 else second if index < 7 else rng.random()
-        saturation = rng.uniform(0.55, 1.0) if vivid or index == 7 else rng.uniform(0.12, 0.65)
+        saturation = rng.uniform(0.5, 0.95) if vivid or index == 7 else rng.uniform(0.05, 0.5)
         colours.append(hsv(base + rng.normal(0.0, 0.03), saturation, rng.uniform(0.2, 1.0) ** 0.7))
     return np.array(colours)
 
