@@ -124,8 +124,8 @@ def draw_rig(rng: np.random.Generator, description: Description, size: int) -> R
         kind = str(rng.choice(["hemisphere", "sphere", "turntable"], p=[0.6, 0.2, 0.2]))
         heights = {"hemisphere": (0.02, 0.95), "sphere": (-0.9, 0.95), "turntable": (0.1, 0.6)}
         view = math.radians(rng.uniform(26.0, 60.0))
-        # So that the ball about the objects just fits, or is cropped a little.
-        distance = description.radius * rng.uniform(0.85, 1.1) / math.sin(0.5 * view)
+        # So that the ball about the objects fits, or is cropped a very little.
+        distance = description.radius * rng.uniform(0.95, 1.2) / math.sin(0.5 * view)
         rise, azimuth = heights[kind], around
     else:
         aspect = float(rng.choice([1.0, 4 / 3, 3 / 2, 3 / 4], p=[0.3, 0.4, 0.2, 0.1]))
@@ -134,7 +134,7 @@ def draw_rig(rng: np.random.Generator, description: Description, size: int) -> R
         )
         view = math.radians(rng.uniform(38.0, 68.0)) * min(aspect, 1.0)
         fits = min(view, 2 * math.atan(math.tan(0.5 * view) * height / width))
-        distance = description.radius * rng.uniform(0.5, 1.0) / math.sin(0.5 * fits)
+        distance = description.radius * rng.uniform(0.6, 1.1) / math.sin(0.5 * fits)
         distance = min(distance, description.room)
         kind = str(rng.choice(["turntable", "arc", "forward"], p=[0.4, 0.25, 0.35]))
         if description.open_towards is not None:

@@ -79,7 +79,10 @@ def _framed(description: Description) -> Description:
     """The description with ``centre`` and ``radius`` of its objects."""
     lowest, highest = bounds(description.objects)
     description.centre = 0.5 * (lowest + highest)
-    description.radius = 0.5 * float(np.linalg.norm(highest - lowest))
+    description.radius = max(
+        float(np.linalg.norm(part.mesh[0] - description.centre, axis=1).max())
+        for part in description.objects
+    )
     return description
 
 
