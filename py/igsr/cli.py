@@ -1,4 +1,4 @@
-"""The ``igsr`` command: pose, fit, render, eval, info, export, compact, study, bench."""
+"""The ``igsr`` command: pose, fit, render, eval, info, export, compact, study, synth, bench."""
 
 from __future__ import annotations
 
@@ -1170,6 +1170,59 @@ def study_command(
         _print_json(report)
         return
     _console().print((out / "study.md").read_text(encoding="utf-8"), markup=False)
+
+
+@app.command("synth")
+def synth_command(
+    scenes: Annotated[int, typer.Option("--scenes", metavar="N", help="How many.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the captures.")],
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same scenes.")] = 0,
+    first: Annotated[int, typer.Option("--first", help="Number of the first scene.")] = 0,
+    size: Annotated[int, typer.Option("--size", help="Pixels of the photos' longer side.")] = 256,
+    views: Annotated[int, typer.Option("--views", help="Photos to fit, per scene.")] = 24,
+    test_views: Annotated[
+        int, typer.Option("--test-views", help="Photos to score, per scene.")
+    ] = 8,
+    spp: Annotated[int, typer.Option("--spp", help="Light paths per pixel, a square.")] = 36,
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", help="Scenes at a time, a core each. Default: all cores."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make procedural captures: random scenes rendered with exact cameras, depth and masks.
+
+    Needs Mitsuba 3 (pip install 'igsr[synth]'). What is finished is kept in --out, and the same
+    command goes on from there.
+    """
+    from . import synth
+
+    with one_sentence(
+        lambda: "Interrupted; finished scenes are kept, the same command goes on from there."
+    ):
+        console = Console(file=sys.stderr, highlight=False)
+
+        def on_scene(done: int, total: int, row: dict[str, Any]) -> None:
+            where = "" if row["kind"] == "none" else f", {row['kind']}"
+            console.print(
+                f"{done} of {total}: {row['name']} ({', '.join(row['contents'])}{where}) "
+                f"in {row['seconds']:.0f} s"
+            )
+
+        report = synth.synthesize(
+            out,
+            scenes,
+            seed=seed,
+            first=first,
+            settings=synth.CaptureSettings(size, views, test_views, spp),
+            jobs=(os.cpu_count() or 1) if jobs is None else jobs,
+            on_scene=on_scene,
+        )
+    if as_json:
+        _print_json(report)
+        return
+    made = sum(row["seconds"] is not None for row in report["scenes"])
+    _console().print(f"{made} made, {scenes - made} there already: {out}", markup=False)
 
 
 @app.command("bench")
