@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from capture_files import photo, random_viewmats, save
 from capture_files import write_colmap as write_with_pycolmap
+from PIL import Image
 
 from igsr.atomic_write import atomic_folder
 from igsr.capture import Camera, Capture, Points, View, load_capture
@@ -106,6 +107,20 @@ def test_masks_beside_a_model_are_read(tmp_path: Path) -> None:
     views = load_capture(tmp_path).views
     assert views[0].mask is None
     np.testing.assert_array_equal(views[1].mask, mask > 0)
+
+
+def test_further_masks_are_masks_of_the_photos_size(tmp_path: Path) -> None:
+    capture = made_up()
+    trusted = np.array([[True, False, True], [False, False, True]])
+    write_colmap(
+        capture, tmp_path / "out", further_masks={"trusted": [trusted, None, None, trusted]}
+    )
+    with Image.open(tmp_path / "out/trusted/a/1.png.png") as image:
+        written = np.array(image)
+    np.testing.assert_array_equal(written > 0, np.kron(trusted, np.ones((16, 16), dtype=bool)))
+    assert len(list((tmp_path / "out/trusted").rglob("*.png"))) == 2
+    read = {view.name: view.mask for view in load_capture(tmp_path / "out").views}
+    assert read["images/a/1.png"] is None
 
 
 def test_transforms_keep_the_split(tmp_path: Path) -> None:

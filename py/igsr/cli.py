@@ -376,7 +376,12 @@ def _posed(
     for sentence in found.warnings:
         _complain(sentence)
     capture = capture_of(photos if isinstance(photos, Path) else Path("photos"), loaded, found)
-    write_colmap(capture, out, replace=replace)
+    trusted = [
+        mask
+        for mask, camera in zip(found.trusted, found.cameras, strict=True)
+        if camera is not None
+    ]
+    write_colmap(capture, out, replace=replace, further_masks={"trusted": trusted})
     if plot:
         plot_poses(out / "poses.png", capture)
     return {

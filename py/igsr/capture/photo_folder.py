@@ -82,7 +82,6 @@ def load_photos(
     else:
         root, files, masks = _files([Path(file) for file in path])
     names = [file.relative_to(root).as_posix() for file in files]
-    _refuse_large(files)
 
     def load(file: Path, name: str) -> list[Photo] | IgsrError:
         try:
@@ -95,6 +94,7 @@ def load_photos(
     with warnings.catch_warnings(), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         # Of damaged EXIF and the like, which matters to nobody where the pixels can be read.
         warnings.filterwarnings("ignore", module="PIL")
+        _refuse_large(files)
         loaded = list(pool.map(load, files, names))
     photos = [photo for found in loaded if isinstance(found, list) for photo in found]
     broken = [found for found in loaded if isinstance(found, IgsrError)]

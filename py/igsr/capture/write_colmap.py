@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from igsr.atomic_write import atomic_folder
 from igsr.capture.types import Camera, Capture, Points
-from igsr.capture.write_files import png_names, write_pictures
+from igsr.capture.write_files import png_names, save_png, write_pictures
 
 Float64 = npt.NDArray[np.float64]
 
@@ -31,6 +32,7 @@ def write_colmap(
     *,
     text: bool = False,
     replace: bool = False,
+    further_masks: Mapping[str, Sequence[np.ndarray | None]] | None = None,
 ) -> None:
     """Write a capture as a folder that COLMAP and all that read its models take.
 
@@ -39,6 +41,9 @@ def write_colmap(
         out: the folder; it must not be there or be empty.
         text: write ``.txt`` files instead of ``.bin``.
         replace: a folder that is there is replaced once the new one is whole.
+        further_masks: by the name of a folder for them: per view bool [h, w] of any size, which is
+            brought to the photo's, or None. They are for other programs; ``load_capture`` reads
+            ``masks`` alone.
 
     Raises:
         IgsrError: the folder is there and holds something, or cannot be written.
@@ -46,10 +51,23 @@ def write_colmap(
     names = png_names(capture.views)
     with atomic_folder(out, replace=replace) as folder:
         write_pictures(folder, capture.views, names, lambda name: f"{name}.png")
+        for kind, masks in (further_masks or {}).items():
+            for view, name, mask in zip(capture.views, names, masks, strict=True):
+                if mask is not None:
+                    save_png(folder / kind / f"{name}.png", _at_size(mask, view.camera))
         model = folder / "sparse" / "0"
         model.mkdir(parents=True)
         cameras = [view.camera for view in capture.views]
         (_write_text if text else _write_binary)(model, cameras, names, capture.points)
+
+
+def _at_size(mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """A mask [h, w] as 0 and 255 in the pixels of a camera, each from the nearest."""
+    row, column = (
+        ((np.arange(size) + 0.5) * given / size).astype(np.int64)
+        for size, given in zip((camera.height, camera.width), mask.shape, strict=True)
+    )
+    return 255 * mask[np.ix_(row, column)].astype(np.uint8)
 
 
 def _distinct(cameras: list[Camera]) -> tuple[list[Camera], list[int]]:
