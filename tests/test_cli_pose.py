@@ -107,6 +107,7 @@ def test_mistakes_of_pose(photos, calls, tmp_path, run):
     refused(run("pose", tmp_path / "nowhere", "--out", out), "nowhere")
     refused(run("pose", photos / "00.png", "--out", out), "2 photos at least", "00.png")
     refused(run("pose", photos, "--out", out, "--checkpoint", "x"), "checkpoint", "colmap")
+    refused(run("pose", photos, "--out", out, "--graph", "swin-3"), "graph", "colmap")
     refused(run("pose", photos, "--out", out, "--estimator", "magic"), "magic", "dust3r or colmap")
     refused(run("pose", photos, "--out", photos / "00.png"), "it is a file")
     given = scenes.write_capture(tmp_path / "given", MADE)

@@ -12,6 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -174,7 +175,15 @@ EstimatorOption = Annotated[
     ),
 ]
 CheckpointOption = Annotated[
-    Path | None, typer.Option("--checkpoint", metavar="FILE", help="Of DUSt3R's network.")
+    Path | None, typer.Option("--checkpoint", metavar="FILE", help="dust3r: the network's weights.")
+]
+GraphOption = Annotated[
+    str | None,
+    typer.Option(
+        "--graph",
+        metavar="KIND",
+        help="dust3r: which pairs of photos it sees: complete, swin-K, logwin-K or oneref-K.",
+    ),
 ]
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A splat .ply file.")]
 
@@ -247,23 +256,37 @@ def _load(path: Path, holdout: int | None) -> Capture:
     return capture if holdout is None else capture.with_holdout(holdout)
 
 
+@dataclass(frozen=True)
+class CameraFinder:
+    """What was said of how cameras are to be found."""
+
+    estimator: str
+    checkpoint: Path | None
+    graph: str | None
+    frames: int
+    seed: int
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What goes to the estimator itself."""
+        given = {"checkpoint": self.checkpoint, "graph": self.graph}
+        return {name: value for name, value in given.items() if value is not None}
+
+
 def _fit_capture(
     path: Path,
     out: Path,
     holdout: int | None,
-    estimator: str,
-    checkpoint: Path | None,
-    frames: int,
-    seed: int,
+    finder: CameraFinder,
     *,
     resume: bool,
     shown: bool,
 ) -> Capture:
     """The capture at a path; photos without cameras get them, kept in ``out/capture``."""
     if holds_cameras(path) or not has_photos(path):
-        if checkpoint is not None or estimator != AUTO:
+        if finder.options or finder.estimator != AUTO:
             raise IgsrError(
-                f"{path} has cameras, or no photos; leave --estimator and --checkpoint out"
+                f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
             )
         return _load(path, holdout)
     kept = out / "capture"
@@ -272,9 +295,7 @@ def _fit_capture(
     if resume and holds_cameras(kept):
         _complain(f"The cameras found before are used, from {kept}")
     else:
-        report = _posed(
-            path, kept, estimator, checkpoint, frames, seed, plot=False, shown=shown, replace=True
-        )
+        report = _posed(path, kept, finder, plot=False, shown=shown, replace=True)
         _complain(
             f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
             f"{report['estimator']} and are kept in {kept}"
@@ -322,6 +343,7 @@ def pose_command(
     ],
     estimator: EstimatorOption = AUTO,
     checkpoint: CheckpointOption = None,
+    graph: GraphOption = None,
     plot: Annotated[
         bool, typer.Option("--plot", help="Draw cameras and points to poses.png in --out.")
     ] = False,
@@ -339,9 +361,8 @@ def pose_command(
                 f"{given} has cameras already; fit it as it is, or name an --estimator to find "
                 "them anew"
             )
-        report = _posed(
-            given, out, estimator, checkpoint, frames, seed, plot=plot, shown=not as_json
-        )
+        finder = CameraFinder(estimator, checkpoint, graph, frames, seed)
+        report = _posed(given, out, finder, plot=plot, shown=not as_json)
         report["seconds"] = round(time.monotonic() - started, 3)
     if as_json:
         _print_json(report)
@@ -357,10 +378,7 @@ def pose_command(
 def _posed(
     photos: Path | list[Path],
     out: Path,
-    estimator: str,
-    checkpoint: Path | None,
-    frames: int,
-    seed: int,
+    finder: CameraFinder,
     *,
     plot: bool,
     shown: bool,
@@ -369,10 +387,11 @@ def _posed(
     """Find cameras and write the capture; what ``igsr pose`` reports."""
     from .pose.plot import plot_poses
 
-    options: dict[str, Any] = {} if checkpoint is None else {"checkpoint": checkpoint}
-    loaded = photos_of(photos, frames)
+    loaded = photos_of(photos, finder.frames)
     with _pose_bar(shown) as show:
-        name, found = estimate(loaded, estimator, seed=seed, progress=show, **options)
+        name, found = estimate(
+            loaded, finder.estimator, seed=finder.seed, progress=show, **finder.options
+        )
     for sentence in found.warnings:
         _complain(sentence)
     capture = capture_of(photos if isinstance(photos, Path) else Path("photos"), loaded, found)
@@ -402,7 +421,7 @@ def _posed(
         ],
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "warnings": found.warnings,
-        "seed": seed,
+        "seed": finder.seed,
         "version": _core.__version__,
         "out": str(out),
     }
@@ -513,6 +532,7 @@ def fit_command(
     ] = None,
     estimator: EstimatorOption = AUTO,
     network: CheckpointOption = None,
+    graph: GraphOption = None,
     frames: FramesOption = FRAMES,
     background: BackgroundOption = None,
     resume: Annotated[
@@ -541,10 +561,7 @@ def fit_command(
                 capture_path,
                 out,
                 holdout,
-                estimator,
-                network,
-                frames,
-                seed,
+                CameraFinder(estimator, network, graph, frames, seed),
                 resume=resume,
                 shown=not as_json,
             )

@@ -48,7 +48,7 @@ def estimate_poses(
         seed: of everything random; same seed, same bits.
         frames: how many frames are taken of each video.
         progress: called with a stage, how much of it is done, and how much there is.
-        options: of the estimator alone, such as DUSt3R's ``checkpoint``.
+        options: of the estimator alone: DUSt3R's ``checkpoint``, ``graph`` and ``cameras``.
 
     Returns:
         The photos that could be placed, upright and with lens distortion undone, in one world of

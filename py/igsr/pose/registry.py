@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from igsr.capture import Camera
+
 from .estimate import Estimator
 
 
@@ -23,10 +25,14 @@ class Entry:
     ready: Callable[[Mapping[str, Any]], bool]
 
 
-def _dust3r(checkpoint: str | os.PathLike[str] | None = None) -> Estimator:
+def _dust3r(
+    checkpoint: str | os.PathLike[str] | None = None,
+    graph: str | None = None,
+    cameras: Mapping[str, Camera] | None = None,
+) -> Estimator:
     from .dust3r.estimator import Dust3r
 
-    return Dust3r(checkpoint=checkpoint)
+    return Dust3r(checkpoint=checkpoint, graph=graph, cameras=cameras)
 
 
 def _dust3r_is_ready(options: Mapping[str, Any]) -> bool:
