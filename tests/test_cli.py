@@ -19,6 +19,7 @@ from PIL import Image
 
 import igsr
 from igsr import cli
+from igsr.cli.shared import PresetChoice
 from igsr.presets import PRESETS
 
 COMMAND = [sys.executable, "-m", "igsr.cli"]
@@ -416,4 +417,4 @@ def test_study_few_photos(igsr_here, tmp_path, monkeypatch):
 
 
 def test_every_preset_can_be_named():
-    assert tuple(choice.value for choice in cli.PresetChoice) == PRESETS
+    assert tuple(choice.value for choice in PresetChoice) == PRESETS
