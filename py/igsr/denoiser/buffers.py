@@ -11,6 +11,7 @@ import torch
 
 from .. import _core
 from ..capture import Camera
+from ..errors import IgsrError
 from ..normals import facing_normals
 from ..rendering import project, viewmat_about
 from ..splats import Splats
@@ -27,6 +28,8 @@ EMPTY = 1e-3
 class Buffers:
     """One rendered view. All float32, pixel centres at +0.5; zero where nothing is drawn.
 
+    Only the colour must be there: what another renderer does not know is None.
+
     Attributes:
         color: [H, W, 3] over the background, not clamped.
         alpha: [H, W], accumulated opacity in [0, 1].
@@ -36,15 +39,36 @@ class Buffers:
         normal: [H, W, 3], mean unit normal in the camera frame (OpenCV axes), facing the camera.
         footprint: [H, W], log2 of the splats' mean standard deviation in pixels.
         support: [H, W], mean number of photos that see the splats shown.
+        camera: the view's.
+
+    Raises:
+        IgsrError: an array has another shape than the colour's picture.
     """
 
     color: Float32
-    alpha: Float32
-    depth: Float32
-    depth_deviation: Float32
-    normal: Float32
-    footprint: Float32
-    support: Float32
+    alpha: Float32 | None = None
+    depth: Float32 | None = None
+    depth_deviation: Float32 | None = None
+    normal: Float32 | None = None
+    footprint: Float32 | None = None
+    support: Float32 | None = None
+    camera: Camera | None = None
+
+    def __post_init__(self) -> None:
+        """Check that all are of one picture."""
+        if self.color.ndim != 3 or self.color.shape[2] != 3 or 0 in self.color.shape:
+            raise IgsrError(f"color must be [H, W, 3], not {list(self.color.shape)}")
+        size = self.color.shape[:2]
+        for name in ("alpha", "depth", "depth_deviation", "normal", "footprint", "support"):
+            array = getattr(self, name)
+            shape = (*size, 3) if name == "normal" else size
+            if array is not None and array.shape != shape:
+                raise IgsrError(f"{name} must be {list(shape)} as color, not {list(array.shape)}")
+        if self.camera is not None and (self.camera.height, self.camera.width) != size:
+            raise IgsrError(
+                f"camera is of a {self.camera.width}x{self.camera.height} picture, color is "
+                f"{size[1]}x{size[0]}; give the camera of this render"
+            )
 
 
 def render_buffers(
@@ -117,6 +141,7 @@ def render_buffers(
         normal=normal,
         footprint=features[..., 0],
         support=features[..., 2],
+        camera=camera,
     )
 
 

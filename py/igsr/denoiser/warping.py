@@ -96,10 +96,9 @@ def warp_photos(
         [(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(rows)], axis=-1
     )
     to_world = np.linalg.inv(camera.viewmat)
-    points = (rays * depth[..., None]) @ to_world[:3, :3].T + to_world[:3, 3]
+    points = (rays * depth[..., None].astype(np.float64)) @ to_world[:3, :3].T + to_world[:3, 3]
     surface = alpha > SURFACE_ALPHA
     here = _directions(points, camera.centre)
-
     found = [_looked_up(source, points, surface, here) for source in sources]
     angles = np.stack([angle for _, angle in found] or [np.full(depth.shape, np.pi, np.float32)])
     colors = np.stack([color for color, _ in found] or [np.zeros((height, width, 3), np.float32)])
