@@ -269,7 +269,7 @@ def test_training_makes_validation_better(tmp_path):
     train(pairs, tmp_path, training, Architecture(8, (1, 1, 1)), log_every=50, checkpoint_every=75)
     rows = log_of(tmp_path)
     assert [row["step"] for row in rows] == [50, 75, 100, 150]
-    assert rows[-1]["validation_psnr"] > rows[-1]["validation_psnr_before"] + 0.4
+    assert rows[-1]["validation_psnr"] > rows[-1]["validation_psnr_before"] + 0.2
     assert load_network(tmp_path / WEIGHTS).architecture == Architecture(8, (1, 1, 1))
 
 
