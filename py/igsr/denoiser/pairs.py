@@ -25,10 +25,11 @@ from .inputs import PHOTOS, network_inputs
 from .pair_files import Bytes, packed, write_pairs
 from .warping import photo_sources, warp_photos
 
-#: Kinds of fits. "paper" is the paper's recipe, "scattered" its other one; "sparse" has 3 to 12
-#: photos; "underfit" stops early; "noise" has wrong cameras; "leave-one-out" leaves one photo of
-#: the capture out of each fit, for a capture of one's own.
-RECIPES = ("sparse", "underfit", "noise", "paper", "scattered", "leave-one-out")
+#: Kinds of fits. "sparse" has 3 to 12 photos; "underfit" stops early; "noise" has wrong cameras;
+#: "paper" is the paper's recipe, "scattered" its other one; "leave-one-out" leaves one photo of the
+#: capture out of each fit, for a capture of one's own.
+DEFAULT_RECIPES = ("sparse", "underfit", "noise")
+RECIPES = (*DEFAULT_RECIPES, "paper", "scattered", "leave-one-out")
 #: Photos of a "sparse" or "underfit" fit.
 FEW = (3, 4, 5, 6, 8, 9, 12)
 #: Photos of a fit with noise (the paper has 20), and of the paper's "many scattered views".
@@ -58,7 +59,7 @@ def make_pairs(
     captures: Sequence[str | os.PathLike[str]],
     out: str | os.PathLike[str],
     *,
-    recipes: Sequence[str] = ("sparse", "underfit", "noise"),
+    recipes: Sequence[str] = DEFAULT_RECIPES,
     fits: int = 1,
     views: int = 8,
     steps: int | None = None,
