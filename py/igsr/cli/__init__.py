@@ -1,4 +1,4 @@
-"""The ``igsr`` command: pose, fit, render, eval, info, export, compact, study, synth, bench."""
+"""The ``igsr`` command, a file per subcommand."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import typer
 
 from .bench import bench_command
 from .compact import compact_command
+from .denoise import app as denoise_app
 from .evaluate import eval_command
 from .export import export_command
 from .fit import fit_command
@@ -31,6 +32,7 @@ app.command("eval")(eval_command)
 app.command("info")(info_command)
 app.command("export")(export_command)
 app.command("compact")(compact_command)
+app.add_typer(denoise_app, name="denoise")
 app.command("study")(study_command)
 app.command("synth")(synth_command)
 app.command("bench")(bench_command)

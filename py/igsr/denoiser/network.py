@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ..errors import IgsrError
 from .inputs import BUFFERS, CHANNELS, COLOR, PHOTO, PHOTOS
 
 #: Pictures are padded to multiples of this: one step of pixel shuffle and two of the U-Net.
@@ -21,6 +22,10 @@ MULTIPLE = 8
 REACH = 96
 #: Errors are predicted as logarithms within these bounds, in units of the colours' range.
 LEAST_LOG_ERROR, MOST_LOG_ERROR = -7.0, 0.0
+
+
+#: Ways to look at the photos.
+PHOTO_WAYS = ("concatenated", "attention", "none")
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,11 @@ class Architecture:
     residual: bool = True
     buffers: bool = True
     photos: str = "concatenated"
+
+    def __post_init__(self) -> None:
+        """Check what could be mistyped."""
+        if self.photos not in PHOTO_WAYS:
+            raise IgsrError(f"photos must be one of {', '.join(PHOTO_WAYS)}, not {self.photos!r}.")
 
 
 class _ChannelNorm(nn.Module):

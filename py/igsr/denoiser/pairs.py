@@ -203,7 +203,7 @@ def _chosen(
         return train, unseen, SCATTERED_STEPS, {}
     if one.recipe == "underfit":
         whole = one.steps or preset_settings("default", count)["steps"]
-        return train, unseen, int(random.uniform(0.25, 0.75) * whole), {}
+        return train, unseen, max(1, int(random.uniform(0.25, 0.75) * whole)), {}
     steps = one.steps
     if one.recipe == "paper":
         noise, steps = Noise(AFFINE, 0.01), PAPER_STEPS

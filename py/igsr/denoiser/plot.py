@@ -22,7 +22,7 @@ def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
         rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError) as error:
         raise IgsrError(f"{log} cannot be read ({error}); train again.") from error
-    names = [name for name in dict.fromkeys(key for row in rows for key in row)]
+    names = list(dict.fromkeys(key for row in rows for key in row))
     # A score before has no axis of its own: it lies beside the one after.
     drawn = [
         name for name in names if name not in ("step", "seconds") and not name.endswith("_before")

@@ -96,7 +96,6 @@ def _architecture(text: str | None, path: Path) -> Architecture:
         or not 2 <= architecture.width <= MOST_WIDTH
         or architecture.width % 2
         or not all(0 <= size <= MOST_BLOCKS for size in blocks)
-        or architecture.photos not in ("concatenated", "attention", "none")
         or not all(type(flag) is bool for flag in (architecture.residual, architecture.buffers))
     ):
         raise refused
