@@ -159,7 +159,7 @@ def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_of_many_photos_the_time_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    for step in ("_list_photos", "_find_features", "_match"):
+    for step in ("_list_photos", "_find_features"):
         monkeypatch.setattr(colmap, step, lambda *arguments: None)
     monkeypatch.setattr(colmap, "_mapped", lambda *arguments: (None, 0))
     tiny = [Photo(f"{i}.png", np.zeros((2, 2, 3), dtype=np.uint8)) for i in range(500)]

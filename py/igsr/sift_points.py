@@ -115,15 +115,13 @@ def _sift(grey: npt.NDArray[np.uint8]) -> tuple[Float32, Float32]:
     # It takes longer to load than all of igsr, and only this start needs it.
     import pycolmap
 
-    # What the defaults are changed names in pycolmap 3.13; left away, they differ between versions.
-    options: Any = getattr(pycolmap, "FeatureExtractionOptions", pycolmap.SiftExtractionOptions)
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     try:
         with warnings.catch_warnings():
-            # Its successor is in pycolmap 4 only.
+            # In favour of a class that takes pycolmap's own bitmaps only.
             warnings.simplefilter("ignore", DeprecationWarning)
-            extractor = pycolmap.Sift(options(), pycolmap.Device.cpu)
+            extractor = pycolmap.Sift(pycolmap.FeatureExtractionOptions(), pycolmap.Device.cpu)
         keypoints, descriptors = extractor.extract(grey)
     finally:
         pycolmap.logging.minloglevel = level

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import shutil
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
@@ -69,6 +70,7 @@ class Evidence:
         abs_pose_min_num_inliers: points that a further photo sees.
         filter_min_tri_angle: degrees that the rays to a point part by.
         ignore_two_view_tracks: whether points that two photos alone see are left out.
+        guided_matching: whether more matches are looked for along the epipolar lines of a pair.
     """
 
     init_min_num_inliers: int
@@ -76,16 +78,18 @@ class Evidence:
     abs_pose_min_num_inliers: int
     filter_min_tri_angle: float
     ignore_two_view_tracks: bool
+    guided_matching: bool
 
 
 STEPS = (
-    Evidence(100, 16.0, 30, 1.5, True),
-    Evidence(100, 16.0, 30, 1.5, False),
-    Evidence(40, 6.0, 15, 1.0, False),
-    Evidence(15, 2.0, 10, 0.5, False),
+    Evidence(100, 16.0, 30, 1.5, True, False),
+    Evidence(100, 16.0, 30, 1.5, False, False),
+    Evidence(100, 16.0, 30, 1.5, False, True),
+    Evidence(40, 6.0, 15, 1.0, False, True),
+    Evidence(15, 2.0, 10, 0.5, False, True),
 )
 #: Steps before this one are no reason to doubt.
-DOUBTFUL = 2
+DOUBTFUL = 3
 
 
 class Colmap:
@@ -114,7 +118,6 @@ class Colmap:
             database = workspace / "database.db"
             _list_photos(photos, database)
             _find_features(photos, workspace, database, show)
-            _match(photos, database, seed, show)
             model, step = _mapped(photos, database, seed, show)
             if model is not None:
                 model = _without_distortion(model)
@@ -233,12 +236,18 @@ def _write(photo: Photo, path: Path, mask_path: Path | None) -> None:
     Image.fromarray(grey).save(path, compress_level=1)
 
 
-def _match(photos: Sequence[Photo], database: Path, seed: int, show: Progress) -> None:
+def _matched(
+    photos: Sequence[Photo], features: Path, guided: bool, seed: int, show: Progress
+) -> Path:
+    """A copy of the database of features, with matches and with focal lengths by them."""
     import pycolmap
 
+    database = features.with_name("guided.db" if guided else "matched.db")
+    shutil.copyfile(features, database)
     pairs = _pairs(len(photos), database)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
+    matching.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     listing = pycolmap.ImportedPairingOptions()
@@ -259,6 +268,7 @@ def _match(photos: Sequence[Photo], database: Path, seed: int, show: Progress) -
     calibration = pycolmap.ViewGraphCalibrationOptions()
     calibration.random_seed = seed
     pycolmap.calibrate_view_graph(database, calibration)
+    return database
 
 
 def _pairs(count: int, database: Path) -> list[tuple[int, int]]:
@@ -317,12 +327,16 @@ def _alike(glances: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
 
 
 def _mapped(
-    photos: Sequence[Photo], database: Path, seed: int, show: Progress
+    photos: Sequence[Photo], features: Path, seed: int, show: Progress
 ) -> tuple[Any | None, int]:
     """The model with most photos, and which of ``STEPS`` it needed."""
     best, best_step = None, 0
+    databases: dict[bool, Path] = {}
     for step, evidence in enumerate(STEPS):
-        model = _map(len(photos), database, evidence, seed, show)
+        guided = evidence.guided_matching
+        if guided not in databases:
+            databases[guided] = _matched(photos, features, guided, seed, show)
+        model = _map(len(photos), databases[guided], evidence, seed, show)
         if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
             best, best_step = model, step
         if best is not None and (best.num_reg_images() == len(photos) or len(photos) > FEW):
