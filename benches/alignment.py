@@ -1,8 +1,8 @@
 """Time, memory and errors of global alignment on exact pointmaps and on ones with wrong depths.
 
 The scene is that of the tests: two spheres on a floor in a dome, cameras on an arc. "smooth" errors
-are 5 % in root mean square over blocks of 8 x 8 pixels, and 1 % per pixel; "white" are 5 % per pixel;
-each pointmap of each pair has its own.
+are 5 % in root mean square over blocks of 8 x 8 pixels, and 1 % per pixel; "white" are 5 % per
+pixel; each pointmap of each pair has its own.
 
     python benches/alignment.py --photos 10 --grid 128 --noise smooth
 """
@@ -71,8 +71,9 @@ def main() -> None:
         f"{len(pairs)} pairs, CPU seconds of one thread: {marks[-1] - marks[0]:.1f} "
         f"(start {marks[1] - marks[0]:.1f}, steps {marks[-2] - marks[1]:.1f}), "
         f"{(after - before) / 1024:.0f} MiB on top of the predictions\n"
-        f"loss {alignment.start_loss:.3g} -> {alignment.loss:.6g}; rotation {errors['rotation']:.4f} "
-        f"degrees, centres {errors['centre']:.4f} units of 4, focal length {100 * focal:.3f} %"
+        f"loss {alignment.start_loss:.3g} -> {alignment.loss:.6g}; rotation "
+        f"{errors['rotation']:.4f} degrees, centres {errors['centre']:.4f} units of 4, "
+        f"focal length {100 * focal:.3f} %"
     )
 
 
