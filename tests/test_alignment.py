@@ -549,3 +549,17 @@ def test_low_confidence_and_unknown_depth_are_not_trusted():
     assert not first[0, 0]
     assert not first[0, 1]
     assert first.sum() == first.size - 2
+
+
+# --- grids
+
+
+def test_grid_pixels_lie_at_their_centres_in_the_photo():
+    grid = Grid(2, 3, 4.0, 5.0, 1.0, -2.0)
+    expected = [[x, y] for y in (0.5, 5.5) for x in (3.0, 7.0, 11.0)]
+    np.testing.assert_array_equal(grid.photo_pixels(), expected)
+    # Of five columns and of four rows every second.
+    thinned = Grid(4, 5, 1.0, 1.0, 0.0, 0.0).photo_pixels(2)
+    np.testing.assert_array_equal(np.unique(thinned[:, 0]), [0.5, 2.5, 4.5])
+    np.testing.assert_array_equal(np.unique(thinned[:, 1]), [0.5, 2.5])
+    assert len(Grid(1, 2, 1.0, 1.0, 0.0, 0.0).photo_pixels(9)) == 1

@@ -98,9 +98,7 @@ class Dust3r:
             warnings=alignment.warnings,
         )
 
-    def _any_known(
-        self, photos: Sequence[Photo], aligned: Sequence[AlignedPhoto | None]
-    ) -> bool:
+    def _any_known(self, photos: Sequence[Photo], aligned: Sequence[AlignedPhoto | None]) -> bool:
         pairs = zip(photos, aligned, strict=True)
         return any(placed is not None and photo.name in self.cameras for photo, placed in pairs)
 
