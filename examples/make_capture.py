@@ -27,6 +27,11 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
+from igsr.synth.cameras import Viewpoint
+from igsr.synth.meshes import Mesh, box, grid_mesh, lathe, place, tube
+from igsr.synth.mitsuba_scene import bitmap, camera_error, encode, sensor, shape
+from igsr.synth.textures import mix, noise
+
 mi.set_variant("scalar_rgb")
 
 SIZE = 256
@@ -38,7 +43,6 @@ TEST_VIEWS = 8
 SEED = 20
 
 Scene = dict[str, Any]
-Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices [V,3], faces [F,3], uv [V,2]
 
 
 # ---- cameras ----------------------------------------------------------------------------------
@@ -82,94 +86,27 @@ def test_cameras() -> list[np.ndarray]:
     ]
 
 
-def sensor(matrix: np.ndarray, samples: int, seed: int) -> mi.Sensor:
-    # Mitsuba's camera looks along +z with x to the left: turned half round the y axis.
-    to_world = matrix @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    description: Scene = {
-        "type": "perspective",
-        "fov": math.degrees(FIELD_OF_VIEW),
-        "fov_axis": "x",
-        "near_clip": 0.01,
-        "to_world": mi.ScalarTransform4f(to_world),
-        "film": {
-            "type": "hdrfilm",
-            "width": SIZE,
-            "height": SIZE,
-            "pixel_format": "rgba",
-            # Each pixel is the plain average over its own square, as of a camera's photosite.
-            "rfilter": {"type": "box"},
-        },
-        "sampler": {"type": "multijitter", "sample_count": samples, "seed": seed},
-    }
-    return mi.load_dict(description)
+def viewpoint(matrix: np.ndarray) -> Viewpoint:
+    return Viewpoint(matrix, FIELD_OF_VIEW, SIZE, SIZE)
 
 
 def take_photo(scene: mi.Scene, matrix: np.ndarray, samples: int, seed: int) -> np.ndarray:
     """Linear premultiplied RGBA float32 [H,W,4]."""
-    return np.array(mi.render(scene, sensor=sensor(matrix, samples, seed), spp=samples, seed=seed))
-
-
-def encode(linear: np.ndarray) -> np.ndarray:
-    """Premultiplied linear RGBA -> straight 8-bit sRGB RGBA, black where nothing was hit."""
-    alpha = np.clip(linear[..., 3:], 0.0, 1.0)
-    colour = np.clip(linear[..., :3] / np.maximum(alpha, 1e-6), 0.0, 1.0)
-    srgb = np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
-    pixels = np.round(255.0 * np.concatenate([srgb, alpha], axis=-1)).astype(np.uint8)
-    pixels[pixels[..., 3] == 0] = 0
-    return pixels
+    sampler = {"type": "multijitter", "sample_count": samples, "seed": seed}
+    camera = sensor(viewpoint(matrix), sampler)
+    return np.array(mi.render(scene, sensor=camera, spp=samples, seed=seed))
 
 
 def check_cameras(cameras: list[np.ndarray], tolerance: float = 0.05) -> float:
     """Renders lamps at known places; returns the largest error in pixels of where they appear."""
     lamps = TARGET + np.array([[0.8, 0, 0], [0, 0.7, 0.2], [-0.6, -0.5, 0], [0.1, 0.2, 0.6]])
-    radius = 0.03
-    focal = 0.5 * SIZE / math.tan(0.5 * FIELD_OF_VIEW)
-    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
-    worst = 0.0
-    for lamp in lamps:
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": "direct"},
-                "lamp": {
-                    "type": "sphere",
-                    "center": lamp.tolist(),
-                    "radius": radius,
-                    "emitter": {"type": "area", "radiance": 1.0},
-                },
-            }
-        )
-        for matrix in cameras:
-            right, up, back = (lamp - matrix[:3, 3]) @ matrix[:3, :3]
-            expected = np.array([right, -up]) / -back * focal + 0.5 * SIZE
-            weight = take_photo(scene, matrix, samples=64, seed=0)[..., 3]
-            seen = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
-            worst = max(worst, float(np.linalg.norm(seen - expected)))
+    worst = camera_error([viewpoint(matrix) for matrix in cameras], lamps, radius=0.03)
     if worst > tolerance:
         raise SystemExit(f"a lamp appears {worst:.2f} pixels from where its camera projects it")
     return worst
 
 
 # ---- textures: sRGB in [0,1], float32 [H,W,3] -------------------------------------------------
-
-
-def noise(rng: np.random.Generator, height: int, width: int, cells: tuple[int, int]) -> np.ndarray:
-    """Smooth noise in [0,1] that repeats at the edges: cosine-blended random values."""
-    grid = rng.random(cells)
-    rows = np.arange(height) / height * cells[0]
-    columns = np.arange(width) / width * cells[1]
-    r0, c0 = rows.astype(int), columns.astype(int)
-    r1, c1 = (r0 + 1) % cells[0], (c0 + 1) % cells[1]
-    blend_r = (0.5 - 0.5 * np.cos(np.pi * (rows - r0)))[:, None]
-    blend_c = (0.5 - 0.5 * np.cos(np.pi * (columns - c0)))[None, :]
-    top = grid[np.ix_(r0, c0)] * (1 - blend_c) + grid[np.ix_(r0, c1)] * blend_c
-    bottom = grid[np.ix_(r1, c0)] * (1 - blend_c) + grid[np.ix_(r1, c1)] * blend_c
-    return top * (1 - blend_r) + bottom * blend_r
-
-
-def mix(a: Any, b: Any, amount: np.ndarray) -> np.ndarray:
-    amount = np.asarray(amount)[..., None]
-    return np.asarray(a) * (1 - amount) + np.asarray(b) * amount
 
 
 def wood_texture(rng: np.random.Generator) -> np.ndarray:
@@ -278,130 +215,6 @@ def die_texture() -> np.ndarray:
     return picture
 
 
-def bitmap(picture: np.ndarray) -> Scene:
-    linear = np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(linear.astype(np.float32)),
-        "raw": True,
-        "wrap_mode": "repeat",
-    }
-
-
-# ---- meshes -----------------------------------------------------------------------------------
-
-
-def grid_faces(rows: int, columns: int) -> np.ndarray:
-    index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    triangles = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
-    return triangles.reshape(-1, 3)
-
-
-def grid_mesh(points: np.ndarray) -> Mesh:
-    """A mesh over a [rows, columns, 3] sheet of points, u along columns, v along rows."""
-    rows, columns = points.shape[:2]
-    v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
-    return points.reshape(-1, 3), grid_faces(rows, columns), np.stack([u, v], -1).reshape(-1, 2)
-
-
-def lathe(profile: list[tuple[float, float]], around: int = 96) -> Mesh:
-    """The (radius, height) profile turned about z, its corners rounded."""
-    corners = np.array(profile)
-    for _ in range(3):  # Chaikin's corner cutting, the ends kept
-        inner = np.empty((2 * len(corners) - 2, 2))
-        inner[0::2] = 0.75 * corners[:-1] + 0.25 * corners[1:]
-        inner[1::2] = 0.25 * corners[:-1] + 0.75 * corners[1:]
-        corners = np.concatenate([corners[:1], inner, corners[-1:]])
-    angle = np.linspace(0, 2 * np.pi, around + 1)
-    radius, height = corners[:, :1], corners[:, 1:]
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height + 0 * angle], axis=-1)
-    vertices, faces, uv = grid_mesh(points)
-    # v follows the height, so that painted bands stay level on a curved wall.
-    span = np.ptp(corners[:, 1])
-    uv[:, 1] = (vertices[:, 2] - corners[:, 1].min()) / span
-    return vertices, faces, uv
-
-
-def tube(path: np.ndarray, radius: float, closed: bool, around: int = 24) -> Mesh:
-    """A round tube about a [P,3] path; radius in scene units."""
-    tangent = np.gradient(path, axis=0)
-    if closed:
-        tangent[0] = tangent[-1] = path[1] - path[-2]
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    # The frame is carried along the path (parallel transport), so that the tube does not twist.
-    normal = np.cross(tangent[0], [0.31, 0.17, 0.93])
-    rings = []
-    angle = np.linspace(0, 2 * np.pi, around + 1)[:, None]
-    for point, forward in zip(path, tangent, strict=True):
-        normal = normal - forward * (normal @ forward)
-        normal /= np.linalg.norm(normal)
-        side = np.cross(forward, normal)
-        rings.append(point + radius * (np.cos(angle) * normal + np.sin(angle) * side))
-    return grid_mesh(np.stack(rings))
-
-
-def box(size: tuple[float, float, float]) -> list[Mesh]:
-    """The faces +x, -x, +y, -y, +z, -z of a box standing on z = 0, each with its own [0,1]^2."""
-    sx, sy, sz = size
-    faces = []
-    for axis in range(3):
-        for sign in (1, -1):
-            unit = np.zeros(3)
-            unit[axis] = sign
-            across = np.cross([0, 0, 1], unit) if axis < 2 else np.array([0.0, sign, 0.0])
-            up = np.cross(unit, across)
-            corners = [
-                unit + (2 * i - 1) * across + (1 - 2 * j) * up for j in (0, 1) for i in (0, 1)
-            ]
-            points = (np.array(corners).reshape(2, 2, 3) * 0.5 + [0, 0, 0.5]) * [sx, sy, sz]
-            faces.append(grid_mesh(points))
-    return faces
-
-
-def place(mesh: Mesh, at: tuple[float, float, float], turn: float = 0.0) -> Mesh:
-    vertices, faces, uv = mesh
-    cos, sin = math.cos(turn), math.sin(turn)
-    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return vertices @ rotation.T + at, faces, uv
-
-
-def shape(mesh: Mesh, material: Scene, smooth: bool = True) -> mi.Mesh:
-    vertices, faces, uv = mesh
-    properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict({"type": "twosided", "bsdf": material})
-    properties["face_normals"] = not smooth
-    result = mi.Mesh(
-        "mesh",
-        vertex_count=len(vertices),
-        face_count=len(faces),
-        has_vertex_normals=smooth,
-        has_vertex_texcoords=True,
-        props=properties,
-    )
-    parameters = mi.traverse(result)
-    parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
-    parameters["faces"] = faces.astype(np.uint32).ravel()
-    parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
-    if smooth:
-        parameters["vertex_normals"] = vertex_normals(vertices, faces).astype(np.float32).ravel()
-    parameters.update()
-    return result
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted; vertices that lie together (a seam) share one normal, so that none shows."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    face = np.cross(b - a, c - a)
-    _, together = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
-    together = together.reshape(-1)
-    total = np.zeros((together.max() + 1, 3))
-    for i in range(3):
-        np.add.at(total, together[faces[:, i]], face)
-    normals = total[together]
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
 # ---- the scene --------------------------------------------------------------------------------
 
 
@@ -431,7 +244,8 @@ def build_scene() -> mi.Scene:
     shapes: list[mi.Mesh] = []
 
     def add(mesh: Mesh, material: Scene, smooth: bool = True) -> None:
-        shapes.append(shape(mesh, material, smooth))
+        bsdf = mi.load_dict({"type": "twosided", "bsdf": material})
+        shapes.append(shape(mesh, bsdf, smooth))
 
     # The table: a disc of planks (uv over its square), a turned rim, a foot.
     angle, radius = np.linspace(0, 2 * np.pi, 129), np.linspace(0, 1.15, 9)

@@ -11,7 +11,7 @@ from pointmaps import CONFIDENCE, PointmapScene, all_pairs
 from igsr.errors import IgsrError
 from igsr.pose.alignment import AlignedPhoto, Grid, PairPrediction, PhotoToAlign, align
 from igsr.pose.alignment import observations as observations_module
-from igsr.pose.alignment.absolute_pose import absolute_pose_and_focal
+from igsr.pose.alignment.absolute_pose import searched_focal
 from igsr.pose.alignment.confidence import trusted_pixels
 from igsr.pose.alignment.focal import weiszfeld_focal
 from igsr.pose.alignment.objective import Objective
@@ -120,6 +120,19 @@ def test_a_photo_that_is_never_first_has_its_focal_length_searched():
     true_focal = scene.cameras[2].K[0, 0]
     assert abs(begun.K[0, 0] / true_focal - 1) < 0.1
     assert abs(found.K[0, 0] / true_focal - 1) < 0.01
+
+
+def test_a_group_of_which_nothing_tells_still_shares_its_focal_length():
+    scene = PointmapScene(4)
+
+    def spoil(points, confidence, first, photo):
+        """Photos 2 and 3 are behind themselves."""
+        return (-points if first >= 2 else points), confidence
+
+    found = align(scene.predictions(spoil=spoil), scene.photos(group=lambda i: i >= 2), steps=3)
+    focals = [photo.camera.K[0, 0] for photo in found.photos if photo is not None]
+    assert len(focals) == 4
+    assert len(set(focals)) == 2
 
 
 def test_fifty_photos_in_a_sliding_window():
@@ -468,14 +481,10 @@ def test_focal_lengths_are_searched_where_none_is_known():
     scene = PointmapScene(1)
     camera = scene.cameras[0]
     pixels = scene.grids[0].photo_pixels()
-    found = absolute_pose_and_focal(
-        scene.worlds[0].T, pixels, np.full(len(pixels), 5.0), (96, 128), seed=0
-    )
+    found = searched_focal(scene.worlds[0].T, pixels, np.full(len(pixels), 5.0), (96, 128), seed=0)
     assert found is not None
-    assert abs(found[1] / camera.K[0, 0] - 1) < 0.1
-    few = absolute_pose_and_focal(
-        scene.worlds[0].T[:, :3], pixels[:3], np.full(3, 5.0), (96, 128), 0
-    )
+    assert abs(found[0] / camera.K[0, 0] - 1) < 0.1
+    few = searched_focal(scene.worlds[0].T[:, :3], pixels[:3], np.full(3, 5.0), (96, 128), 0)
     assert few is None
 
 
@@ -540,3 +549,17 @@ def test_low_confidence_and_unknown_depth_are_not_trusted():
     assert not first[0, 0]
     assert not first[0, 1]
     assert first.sum() == first.size - 2
+
+
+# --- grids
+
+
+def test_grid_pixels_lie_at_their_centres_in_the_photo():
+    grid = Grid(2, 3, 4.0, 5.0, 1.0, -2.0)
+    expected = [[x, y] for y in (0.5, 5.5) for x in (3.0, 7.0, 11.0)]
+    np.testing.assert_array_equal(grid.photo_pixels(), expected)
+    # Of five columns and of four rows every second.
+    thinned = Grid(4, 5, 1.0, 1.0, 0.0, 0.0).photo_pixels(2)
+    np.testing.assert_array_equal(np.unique(thinned[:, 0]), [0.5, 2.5, 4.5])
+    np.testing.assert_array_equal(np.unique(thinned[:, 1]), [0.5, 2.5])
+    assert len(Grid(1, 2, 1.0, 1.0, 0.0, 0.0).photo_pixels(9)) == 1

@@ -19,6 +19,7 @@ from PIL import Image
 
 import igsr
 from igsr import cli
+from igsr.cli.shared import PresetChoice
 from igsr.presets import PRESETS
 
 COMMAND = [sys.executable, "-m", "igsr.cli"]
@@ -402,8 +403,15 @@ def test_study_few_photos(igsr_here, tmp_path, monkeypatch):
 
     scenes.write_capture(tmp_path / "leaf", scenes.capture(views=10, size=16))
 
-    def quick(load, data, one):
-        scores = {"psnr": 20.0, "ssim": 0.9, "flip": 0.1, "splats": 10, "seconds": 1.0}
+    def quick(load, data, one, refined):
+        scores = {
+            "psnr": 20.0,
+            "psnr_refined": 21.0,
+            "ssim": 0.9,
+            "flip": 0.1,
+            "splats": 10,
+            "seconds": 1.0,
+        }
         return {**vars(one), **scores, "protocol": {"ssim": "window", "flip": "LDR"}}
 
     monkeypatch.setattr(fits, "run_fit", quick)
@@ -411,9 +419,9 @@ def test_study_few_photos(igsr_here, tmp_path, monkeypatch):
     done = igsr_here(*study, "--views", "3", "--preset", "default", "--seeds", "1")
     assert done.returncode == 0, done.stderr
     assert "1 of 1: leaf views 3 default seed 0: 20.00 dB" in done.stderr
-    assert "| leaf | 3 | default | 20.00 |" in done.stdout
+    assert "| leaf | 3 | default | 20.00 | 21.00 |" in done.stdout
     refused(igsr_here(*study, "--views", "9"), "leaf", "has 8 photos", "not 9")
 
 
 def test_every_preset_can_be_named():
-    assert tuple(choice.value for choice in cli.PresetChoice) == PRESETS
+    assert tuple(choice.value for choice in PresetChoice) == PRESETS

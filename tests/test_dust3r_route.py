@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from dust3r_networks import SMALL, hashed_network
 from scenes import ring_camera, splats
 
 from igsr.capture import Camera
@@ -13,7 +14,7 @@ from igsr.pose.alignment import TRUSTED, Grid, PairPrediction
 from igsr.pose.dust3r import estimator as estimator_module
 from igsr.pose.dust3r.dense_depth import with_dense_depth
 from igsr.pose.dust3r.estimator import Dust3r
-from igsr.pose.dust3r.prediction import DenseGrid, DensePrediction
+from igsr.pose.dust3r.prediction import DenseGrid, DensePrediction, DustPredictor
 from igsr.poses import pose_errors, similarity_between
 from igsr.rendering import render
 
@@ -227,6 +228,20 @@ def test_a_predictor_that_keeps_dense_maps_gives_dense_depths(scene):
     assert found.trusted[0].any()
 
 
+def test_the_network_fits_into_the_route(scene):
+    """A network that says nothing right, for its predictions' form."""
+    network = DustPredictor(hashed_network(SMALL), longest=16)
+    try:
+        found = Dust3r(network)(scene.photos[:3])
+    except IgsrError as error:
+        assert "no two of the photos show the same thing" in str(error)
+        return
+    for camera, depth, trusted in zip(found.cameras, found.depths, found.trusted, strict=True):
+        if camera is not None:
+            assert np.isfinite(camera.viewmat).all()
+            assert depth.shape == trusted.shape == (48, 64)
+
+
 def test_photos_of_another_thing_are_named(scene):
     def predictor(photos, pairs, progress=None):
         grids, predictions = scene.predictor(photos, pairs)
@@ -240,6 +255,10 @@ def test_photos_of_another_thing_are_named(scene):
     assert found.cameras[3] is found.depths[3] is found.trusted[3] is None
     assert [("3.png" in sentence) for sentence in found.warnings] == [True]
     assert pose_errors(found.cameras[:3], scene.cameras[:3])["rotation"] < 0.01
+    # Known cameras stay, but never in a world that is not theirs.
+    both = {f"{i}.png": scene.cameras[i] for i in (0, 3)}
+    assert Dust3r(predictor, cameras=both)(scene.photos).cameras[3] is scene.cameras[3]
+    assert Dust3r(predictor, cameras={"3.png": scene.cameras[3]})(scene.photos).cameras[3] is None
 
 
 def test_bad_input_is_a_sentence(scene):

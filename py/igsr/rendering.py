@@ -75,22 +75,22 @@ def render(
     return Render(color, alpha, depth, expected, transmittance)
 
 
-def _render_arrays(
-    splats: Splats, camera: Camera, background: npt.NDArray[np.float64], backend: str
-) -> dict[str, npt.NDArray[Any]]:
-    backend = _core.resolve_backend(backend)
+def project(splats: Splats, camera: Camera, backend: str) -> dict[str, npt.NDArray[Any]]:
+    """The splats as 2D Gaussians in one camera's picture: what ``_core.rasterize`` draws.
+
+    Args:
+        splats: the scene.
+        camera: pinhole camera, OpenCV axes, world frame of the capture.
+        backend: "cpu", "gpu" or "reference".
+
+    Raises:
+        ValueError: the parameters cannot be drawn; the message names the argument.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
     dtype = _core.working_dtype(backend)
-    projected = _core.project(
-        *(
-            parameter.astype(dtype, order="C", copy=False)
-            for parameter in (
-                splats.means,
-                splats.quats,
-                splats.scales,
-                splats.opacities,
-                splats.sh,
-            )
-        ),
+    parameters = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    projected: dict[str, npt.NDArray[Any]] = _core.project(
+        *(parameter.astype(dtype, order="C", copy=False) for parameter in parameters),
         sh_degree=splats.sh_degree,
         raw_parameters=True,
         viewmat=viewmat_about(splats.origin, camera.viewmat),
@@ -103,13 +103,21 @@ def _render_arrays(
         antialiased=False,
         backend=backend,
     )
-    return _core.rasterize(
-        projected,
+    return projected
+
+
+def _render_arrays(
+    splats: Splats, camera: Camera, background: npt.NDArray[np.float64], backend: str
+) -> dict[str, npt.NDArray[Any]]:
+    backend = _core.resolve_backend(backend)
+    image: dict[str, npt.NDArray[Any]] = _core.rasterize(
+        project(splats, camera, backend),
         width=camera.width,
         height=camera.height,
-        background=background.astype(dtype),
+        background=background.astype(_core.working_dtype(backend)),
         backend=backend,
     )
+    return image
 
 
 def viewmat_about(

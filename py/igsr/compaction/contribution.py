@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from .. import _core
 from ..capture import Camera
-from ..rendering import intrinsics_of, viewmat_about
+from ..rendering import project
 from ..splats import Splats
 
 Float64 = npt.NDArray[np.float64]
@@ -56,32 +56,9 @@ def contribution(
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)
     random = np.random.default_rng([seed, 0xC047])
-    parameters = [
-        parameter.astype(dtype, order="C", copy=False)
-        for parameter in (
-            splats.means,
-            splats.quats,
-            splats.scales,
-            splats.opacities,
-            splats.sh,
-        )
-    ]
     weight, squared = np.zeros(len(splats)), np.zeros(len(splats))
     for camera in cameras:
-        projected = _core.project(
-            *parameters,
-            sh_degree=splats.sh_degree,
-            raw_parameters=True,
-            viewmat=viewmat_about(splats.origin, camera.viewmat),
-            intrinsics=intrinsics_of(camera.K),
-            width=camera.width,
-            height=camera.height,
-            near=_core.NEAR_PLANE,
-            far=_core.FAR_PLANE,
-            eps2d=_core.EPS2D,
-            antialiased=False,
-            backend=backend,
-        )
+        projected = project(splats, camera, backend)
         background = random.uniform(size=3).astype(dtype)
         image = _core.rasterize(
             projected,

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from igsr.capture.types import intrinsic_matrix
+
 Float64 = npt.NDArray[np.float64]
 
 #: Points used; more cost time and tell no more.
@@ -73,23 +75,23 @@ def absolute_pose(
     return (viewmat, int(found["num_inliers"])) if np.isfinite(viewmat).all() else None
 
 
-def absolute_pose_and_focal(
+def searched_focal(
     points: Float64,
     pixels: Float64,
     confidence: Float64,
     size: tuple[int, int],
     seed: int,
-) -> tuple[Float64, float] | None:
-    """World-to-camera [4, 4] and the focal length in pixels that most points agree with, or None.
+) -> tuple[float, int] | None:
+    """The focal length in pixels that most points agree with, and how many, or None.
 
     Args:
         points, pixels, confidence, size, seed: as for ``absolute_pose``.
     """
     height, width = size
-    best: tuple[int, Float64, float] | None = None
+    best: tuple[float, int] | None = None
     for focal in max(size) * np.geomspace(SHORTEST, LONGEST, FOCALS):
-        K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+        K = intrinsic_matrix(focal, focal, width / 2, height / 2)
         found = absolute_pose(points, pixels, confidence, K, size, seed)
-        if found is not None and (best is None or found[1] > best[0]):
-            best = (found[1], found[0], float(focal))
-    return None if best is None else (best[1], best[2])
+        if found is not None and (best is None or found[1] > best[1]):
+            best = float(focal), found[1]
+    return best

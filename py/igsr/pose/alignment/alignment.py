@@ -110,8 +110,8 @@ def align(
         if i not in found.viewmats:
             placed.append(None)
             warnings.append(
-                f"{photo.name} could not be placed: the network sees nothing in it that the placed "
-                "photos show too"
+                f"{photo.name} could not be aligned: the network sees nothing in it that the "
+                "other photos show too"
             )
             continue
         viewmat = found.viewmats[i] if photo.viewmat is None else photo.viewmat

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +10,9 @@ import numpy.typing as npt
 from igsr.capture import Camera
 from igsr.poses import Similarity, similarity_between
 
-from .absolute_pose import absolute_pose, absolute_pose_and_focal
+from .absolute_pose import absolute_pose
 from .depths_on_rays import depths_on_rays
-from .focal import weiszfeld_focal
+from .intrinsics import Placed, intrinsics_of
 from .observations import Observations
 from .placement import Placement, joined, mapped_viewmat
 from .predictions import PhotoToAlign
@@ -20,8 +20,6 @@ from .similarity import apply, similarity_of_points
 from .spanning_tree import spanning_tree
 
 Float64 = npt.NDArray[np.float64]
-#: Points [3, P] and their raw confidence [P].
-Placed = tuple[Float64, Float64]
 
 
 def start(
@@ -40,30 +38,28 @@ def start(
     placed, poses, lost = _along_the_tree(observations)
     if lost:
         return lost
-    found_intrinsics = _intrinsics(observations, photos)
-    found = {}
+    intrinsics = intrinsics_of(observations, photos, placed, seed)
     for photo in observations.photos:
-        if photo in poses and photo in found_intrinsics:
-            found[photo] = poses[photo]
-            continue
-        K = found_intrinsics.get(photo)
-        posed = _posed(observations, photo, placed[photo], K, photos[photo], seed)
-        if posed is None:
+        if photo in intrinsics and photo not in poses:
+            K, size = intrinsics[photo], (photos[photo].height, photos[photo].width)
+            pose = _pose(observations, photo, placed[photo], K, size, seed)
+            if pose is not None:
+                poses[photo] = pose
+    for photo in observations.photos:
+        if photo not in intrinsics or photo not in poses:
             lost += np.flatnonzero((observations.edges == photo).any(axis=1)).tolist()
-        else:
-            found[photo], found_intrinsics[photo] = posed
     if lost:
         return lost
-    world = _to_fixed(found, photos)
+    world = _to_fixed(poses, photos)
     placed = {photo: (apply(world, xyz), sure) for photo, (xyz, sure) in placed.items()}
-    for photo, viewmat in found.items():
+    for photo, viewmat in poses.items():
         fixed = photos[photo].viewmat
-        found[photo] = mapped_viewmat(world, viewmat) if fixed is None else fixed
+        poses[photo] = mapped_viewmat(world, viewmat) if fixed is None else fixed
     edges = _edges(observations, placed)
     lost = [e for e, similarity in enumerate(edges) if similarity is None]
     if lost:
         return lost
-    placement = Placement(found, found_intrinsics, [edge for edge in edges if edge])
+    placement = Placement(poses, intrinsics, [edge for edge in edges if edge])
     return placement, {photo: _depths(observations, placement, photo) for photo in placed}
 
 
@@ -106,46 +102,38 @@ def _camera_of_edge(observations: Observations, edge: int, similarity: Similarit
     return viewmat
 
 
-def _posed(
+def _pose(
     observations: Observations,
     photo: int,
     placed: Placed,
-    K: Float64 | None,
-    known: PhotoToAlign,
+    K: Float64,
+    size: tuple[int, int],
     seed: int,
-) -> tuple[Float64, Float64] | None:
-    """World-to-camera [4, 4] and intrinsics [3, 3] of a photo whose points are placed.
+) -> Float64 | None:
+    """World-to-camera [4, 4] of a photo whose points are placed.
 
     Of the poses that the pixels and that the photo's own frame tell, the one whose rays pass nearer
     to the points: where these are right only nearly, and seen from far beside where they were first
     seen, RANSAC finds some that agree on a wrong pose.
     """
-    seen = observations.photos[photo]
+    pixels = observations.photos[photo].pixels
     points, confidence = placed
-    size = (known.height, known.width)
-    if K is None:
-        guessed = absolute_pose_and_focal(points, seen.pixels, confidence, size, seed)
-        if guessed is None:
-            return None
-        K = known.centred(guessed[1])
-        poses = [guessed[0]]
-    else:
-        posed = absolute_pose(points, seen.pixels, confidence, K, size, seed)
-        poses = [] if posed is None else [posed[0]]
+    found = absolute_pose(points, pixels, confidence, K, size, seed)
+    poses = [] if found is None else [found[0]]
     own = _own_pose(observations, photo, placed)
     if own is not None:
         poses.append(own)
     if not poses:
         return None
-    rays = np.ones((3, len(seen.pixels)))
-    rays[:2] = ((seen.pixels - K[[0, 1], 2]) / K[[0, 1], [0, 1]]).T
+    rays = np.ones((3, len(pixels)))
+    rays[:2] = ((pixels - K[[0, 1], 2]) / K[[0, 1], [0, 1]]).T
     weights = np.log(confidence)
 
     def off_rays(viewmat: Float64) -> float:
         local = viewmat[:3, :3] @ points + viewmat[:3, 3:]
         return float(np.linalg.norm(local - rays * np.maximum(local[2], 0.0), axis=0) @ weights)
 
-    return min(poses, key=off_rays), K
+    return min(poses, key=off_rays)
 
 
 def _own_pose(observations: Observations, photo: int, placed: Placed) -> Float64 | None:
@@ -156,38 +144,6 @@ def _own_pose(observations: Observations, photo: int, placed: Placed) -> Float64
         if similarity is not None:
             return _camera_of_edge(observations, int(e), similarity)
     return None
-
-
-def _intrinsics(observations: Observations, photos: Sequence[PhotoToAlign]) -> dict[int, Float64]:
-    """[3, 3] of the photos whose own frame, or that of one of their group, tells the focal length.
-
-    Each photo is judged by its own best edge.
-    """
-    evidence: dict[Hashable, list[tuple[Float64, Float64, Float64]]] = {}
-    for photo, seen in observations.photos.items():
-        own = np.flatnonzero(observations.edges[:, 0] == photo)
-        if len(own):
-            e = int(own[np.argmax(observations.scores[own])])
-            xyz, confidence = observations.side(e, 0)
-            middle = seen.pixels - [photos[photo].width / 2, photos[photo].height / 2]
-            own_frame = xyz - observations.camera(e)[:, None]
-            evidence.setdefault(photos[photo].group, []).append(
-                (own_frame, middle, np.log(confidence))
-            )
-    focals = {}
-    for group, parts in evidence.items():
-        local, offsets, weights = (list(column) for column in zip(*parts, strict=True))
-        focals[group] = weiszfeld_focal(
-            np.concatenate(local, axis=1), np.concatenate(offsets), np.concatenate(weights)
-        )
-    result = {}
-    for photo in observations.photos:
-        given, focal = photos[photo].intrinsics, focals.get(photos[photo].group)
-        if given is not None:
-            result[photo] = given
-        elif focal is not None:
-            result[photo] = photos[photo].centred(focal)
-    return result
 
 
 def _to_fixed(found: dict[int, Float64], photos: Sequence[PhotoToAlign]) -> Similarity:

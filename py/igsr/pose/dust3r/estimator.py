@@ -85,13 +85,22 @@ class Dust3r:
         for photo, placed, sure in zip(photos, aligned, trusted, strict=True):
             if placed is not None and sure is not None:
                 sure &= usable(photo, placed.grid)
+        # Known cameras are of one world with the rest only if some of them were aligned.
+        known = self.cameras if self._any_known(photos, aligned) else {}
         return Estimate(
-            cameras=[None if photo is None else photo.camera for photo in aligned],
+            cameras=[
+                known.get(photo.name) if placed is None else placed.camera
+                for photo, placed in zip(photos, aligned, strict=True)
+            ],
             points=fused_points(photos, aligned, trusted),
             depths=[None if photo is None else photo.depth for photo in aligned],
             trusted=list(trusted),
             warnings=alignment.warnings,
         )
+
+    def _any_known(self, photos: Sequence[Photo], aligned: Sequence[AlignedPhoto | None]) -> bool:
+        pairs = zip(photos, aligned, strict=True)
+        return any(placed is not None and photo.name in self.cameras for photo, placed in pairs)
 
     def _network(self) -> Predictor:
         from igsr.pose.dust3r.checkpoint import find_checkpoint, load_network

@@ -1,0 +1,46 @@
+"""The ``igsr`` command, a file per subcommand."""
+
+from __future__ import annotations
+
+import os
+
+import typer
+
+from .bench import bench_command
+from .compact import compact_command
+from .denoise import app as denoise_app
+from .evaluate import eval_command
+from .export import export_command
+from .fit import fit_command
+from .info import info_command
+from .pose import pose_command
+from .render import render_command
+from .study import study_command
+from .synth import synth_command
+
+app = typer.Typer(
+    help="Fit a Gaussian-splat scene from photos, with known cameras or without.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+app.command("pose")(pose_command)
+app.command("fit")(fit_command)
+app.command("render")(render_command)
+app.command("eval")(eval_command)
+app.command("info")(info_command)
+app.command("export")(export_command)
+app.command("compact")(compact_command)
+app.add_typer(denoise_app, name="denoise")
+app.command("study")(study_command)
+app.command("synth")(synth_command)
+app.command("bench")(bench_command)
+
+
+def main() -> None:
+    """Run the ``igsr`` command."""
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        # Mesa's layer that asks the desktop for its GPU prints an error where there is no desktop.
+        os.environ.setdefault("NODEVICE_SELECT", "1")
+    app()

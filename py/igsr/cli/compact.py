@@ -1,0 +1,183 @@
+"""``igsr compact``: the smallest model within a loss."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBar
+
+from ..atomic_write import check_writable
+from ..compaction import DEFAULT_STEPS, CompactProgress, compact, write_plot
+from ..errors import IgsrError
+from ..report import write_report
+from ..splats import Splats
+from .shared import (
+    BackendChoice,
+    BackendOption,
+    BackgroundOption,
+    HoldoutOption,
+    JsonOption,
+    SceneArgument,
+    background_color,
+    error_console,
+    load,
+    one_sentence,
+    output_console,
+    print_json,
+    resolved,
+    stopped,
+)
+
+
+def compact_command(
+    scene: SceneArgument,
+    max_loss: Annotated[
+        str, typer.Option("--max-loss", metavar="DB", help="PSNR that may be lost, such as 0.1dB.")
+    ] = "0.1dB",
+    capture_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--capture",
+            metavar="CAPTURE",
+            help="The photos of the scene: refine to them and measure the loss on held-out ones. "
+            "Without it, both by pictures of SCENE from around it.",
+        ),
+    ] = None,
+    holdout: HoldoutOption = None,
+    psnr: Annotated[
+        float | None,
+        typer.Option(
+            "--psnr",
+            help="Without --capture: how good SCENE is, dB, for a change of it to be worth dB. "
+            "Default: what the report.json beside SCENE says, else 30.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="PLY",
+            help="The smaller scene; the curve goes beside it as .json and .png. "
+            "Default: SCENE's name with .compact.ply.",
+        ),
+    ] = None,
+    sh_degree: Annotated[
+        int | None,
+        typer.Option(
+            "--sh-degree",
+            help="Degree of view-dependent colour of the smaller scene: a higher one needs fewer "
+            "splats, but more bytes for each. Default: SCENE's, or lower where that loses little.",
+        ),
+    ] = None,
+    steps: Annotated[
+        int, typer.Option("--steps", help="Refinement steps of a model that may be the result.")
+    ] = DEFAULT_STEPS,
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    background: BackgroundOption = None,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Make SCENE smaller: the fewest splats that lose no more than --max-loss."""
+    with one_sentence(lambda: "Interrupted; nothing is written."):
+        name = resolved(backend)
+        limit = _decibels("--max-loss", max_loss)
+        target = scene.with_suffix(".compact.ply") if out is None else out
+        if target.suffix.lower() != ".ply":
+            raise IgsrError(f"--out {target} must be a .ply file.")
+        splats = Splats.load(scene)
+        capture = None
+        if capture_path is not None:
+            capture = load(capture_path, holdout)
+        elif holdout is not None:
+            raise IgsrError("--holdout chooses among photos; give --capture or leave it out.")
+        elif psnr is None:
+            psnr = _reported_psnr(scene.parent / "report.json")
+        curve, plot = target.with_suffix(".json"), target.with_suffix(".png")
+        for path in (target, curve, plot):
+            check_writable(path)
+        with _compact_bar(shown=not as_json) as show:
+            compaction = compact(
+                splats,
+                limit,
+                capture,
+                psnr=psnr,
+                sh_degree=sh_degree,
+                steps=steps,
+                seed=seed,
+                background=background_color(background),
+                backend=name,
+                progress=show,
+            )
+        report = {"scene": str(scene), "out": str(target), **compaction.report}
+        report["protocol"]["holdout"] = holdout
+        compaction.splats.save(target)
+        write_report(curve, report)
+        write_plot(plot, report)
+    if as_json:
+        print_json(report)
+        return
+    whole, result = report["whole"], report["result"]
+    console = output_console()
+    console.print(
+        f"{result['splats']} splats of SH degree {result['sh_degree']}, {result['bytes']} bytes; "
+        f"before {whole['splats']}, {whole['sh_degree']}, {whole['bytes']}"
+    )
+    console.print(f"loses {result['loss']:.3f} dB of at most {limit:g}")
+    console.print(
+        f"{report['protocol']['judge_views']} views that were not refined to, against "
+        f"{report['protocol']['against']}",
+        style="dim",
+    )
+    console.print(f"{target}  {curve}  {plot}", style="dim")
+
+
+def _decibels(option: str, text: str) -> float:
+    try:
+        value = float(text.strip().lower().removesuffix("db"))
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 100.0:
+        raise IgsrError(f"{option} must be dB above 0 and below 100 such as 0.1dB, not {text!r}.")
+    return value
+
+
+def _reported_psnr(path: Path) -> float | None:
+    """What the report of a fit says of its scene, or None where there is none to be read."""
+    try:
+        psnr = json.loads(path.read_text(encoding="utf-8"))["psnr"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return psnr if isinstance(psnr, float) and 0.0 < psnr < 100.0 else None
+
+
+@contextlib.contextmanager
+def _compact_bar(shown: bool) -> Iterator[Callable[[CompactProgress], None]]:
+    """A progress bar on stderr for the size that is tried, with its time left."""
+    bar = ProgressBar(
+        TextColumn("size {task.fields[trial]}: {task.fields[what]}"),
+        BarColumn(bar_width=30),
+        TextColumn("step {task.completed}/{task.total}"),
+        TimeRemainingColumn(compact=True),
+        console=error_console(),
+        disable=not shown,
+    )
+    tasks: dict[int, Any] = {}
+    with stopped(bar):
+
+        def show(now: CompactProgress) -> None:
+            bar.start()
+            if now.trial not in tasks:
+                what = f"{now.splats} splats, SH {now.sh_degree}"
+                tasks[now.trial] = bar.add_task(
+                    "compact", total=now.steps, trial=now.trial, what=what
+                )
+            bar.update(tasks[now.trial], completed=now.step)
+
+        yield show

@@ -1,0 +1,72 @@
+"""``igsr eval``: score splats."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from .. import _core
+from ..evaluation import default_background, default_split
+from ..splats import Splats
+from .shared import (
+    BackendChoice,
+    BackendOption,
+    BackgroundOption,
+    CaptureArgument,
+    HoldoutOption,
+    JsonOption,
+    SceneArgument,
+    SplitChoice,
+    background_color,
+    load,
+    one_sentence,
+    output_console,
+    print_json,
+    protocol_line,
+    resolved,
+    score_line,
+    scored,
+)
+
+
+def eval_command(
+    scene: SceneArgument,
+    capture_path: CaptureArgument,
+    holdout: HoldoutOption = None,
+    split: Annotated[
+        SplitChoice | None, typer.Option("--split", help="Default: test views if there are any.")
+    ] = None,
+    background: BackgroundOption = None,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Score SCENE against the photos of CAPTURE."""
+    with one_sentence():
+        name = resolved(backend)
+        splats = Splats.load(scene)
+        capture = load(capture_path, holdout)
+        color = background_color(background) or default_background(capture)
+        chosen = split.value if split is not None else default_split(capture)
+        scores, _ = scored(splats, capture, chosen, color, name, shown=not as_json)
+        scores["protocol"]["holdout"] = holdout
+    report = {**scores, "splats": len(splats), **_core.backend_info(name)}
+    if as_json:
+        print_json(report)
+        return
+    table = Table(box=None, pad_edge=False)
+    for heading in ("view", "PSNR", "SSIM", "MS-SSIM", "FLIP"):
+        table.add_column(heading, justify="left" if heading == "view" else "right")
+    for row in scores["views"]:
+        table.add_row(
+            row["name"],
+            f"{row['psnr']:.2f}",
+            f"{row['ssim']:.4f}",
+            "-" if row["ms_ssim"] is None else f"{row['ms_ssim']:.4f}",
+            f"{row['flip']:.4f}",
+        )
+    console = output_console()
+    console.print(table)
+    console.print(score_line(scores))
+    console.print(protocol_line(scores["protocol"]), style="dim")

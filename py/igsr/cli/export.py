@@ -1,0 +1,52 @@
+"""``igsr export``: write a capture in another form."""
+
+from __future__ import annotations
+
+import enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..atomic_write import check_folder
+from ..capture import load_capture
+from ..capture.write_colmap import write_colmap
+from ..capture.write_transforms import write_transforms
+from .shared import (
+    CaptureArgument,
+    JsonOption,
+    one_sentence,
+    output_console,
+    print_json,
+)
+
+
+class FormatChoice(str, enum.Enum):
+    """Files that describe cameras."""
+
+    colmap = "colmap"
+    colmap_text = "colmap-text"
+    transforms = "transforms"
+
+
+def export_command(
+    capture_path: CaptureArgument,
+    out: Annotated[Path, typer.Option("--out", help="Folder; it must be new or empty.")],
+    form: Annotated[
+        FormatChoice,
+        typer.Option("--format", help="colmap (binary), colmap-text, or nerfstudio's transforms."),
+    ] = FormatChoice.colmap,
+    as_json: JsonOption = False,
+) -> None:
+    """Write CAPTURE in another format: photos undistorted, at full resolution, masks as masks."""
+    with one_sentence(lambda: "Interrupted; nothing is written."):
+        check_folder(out)
+        capture = load_capture(capture_path)
+        if form is FormatChoice.transforms:
+            write_transforms(capture, out)
+        else:
+            write_colmap(capture, out, text=form is FormatChoice.colmap_text)
+    if as_json:
+        print_json({"out": str(out), "format": form.value, "views": len(capture.views)})
+    else:
+        output_console().print(f"{len(capture.views)} views in {out}")

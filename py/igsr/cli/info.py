@@ -1,0 +1,107 @@
+"""``igsr info``: what is in a file, and what this machine has."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from .. import _core
+from ..capture import load_capture
+from ..splats import Splats
+from .shared import (
+    JsonOption,
+    one_sentence,
+    output_console,
+    print_json,
+)
+
+
+def info_command(
+    path: Annotated[Path, typer.Argument(metavar="SCENE|CAPTURE", help="What to describe.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Describe a scene or a capture, and the backends of this machine."""
+    with one_sentence():
+        report = _scene_info(path) if path.suffix.lower() == ".ply" else _capture_info(path)
+        report["backends"] = _backends()
+    if as_json:
+        print_json(report)
+        return
+    console = output_console()
+    for key, value in report.items():
+        if key == "backends":
+            for name, what in value.items():
+                console.print(f"backend {name}: {what}")
+        else:
+            console.print(f"{key.replace('_', ' ')}: {_plain(value)}")
+
+
+def _opacity(logit: float) -> float:
+    # tanh does not overflow for any logit, as exp does.
+    return 0.5 + 0.5 * math.tanh(0.5 * logit)
+
+
+def _scene_info(path: Path) -> dict[str, Any]:
+    splats = Splats.load(path)
+    bounds = splats.bounds()
+    finite = splats.finite
+    logit = float(np.median(splats.opacities[finite])) if finite.any() else None
+    return {
+        "kind": "scene",
+        "path": str(path),
+        "splats": len(splats),
+        "not_finite": int((~finite).sum()),
+        "sh_degree": splats.sh_degree,
+        "lowest_corner": None if bounds is None else bounds[0].tolist(),
+        "highest_corner": None if bounds is None else bounds[1].tolist(),
+        "origin": splats.origin.tolist(),
+        "median_opacity": None if logit is None else _opacity(logit),
+        "bytes": path.stat().st_size,
+    }
+
+
+def _known(number: float) -> float | None:
+    """None where poses so far out that their mean overflows leave no number; JSON has none."""
+    return float(number) if math.isfinite(number) else None
+
+
+def _capture_info(path: Path) -> dict[str, Any]:
+    capture = load_capture(path)
+    sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in capture.views})
+    points = None if capture.points is None else len(capture.points.xyz)
+    return {
+        "kind": "capture",
+        "path": str(path),
+        "views": len(capture.views),
+        "train_views": len(capture.train_views),
+        "test_views": len(capture.test_views),
+        "sizes": sizes,
+        "views_with_alpha": sum(view.image.shape[2] == 4 for view in capture.views),
+        "views_with_mask": sum(view.mask is not None for view in capture.views),
+        "points": points,
+        "scene_centre": [_known(x) for x in capture.scene_centre],
+        "scene_extent": _known(capture.scene_extent),
+    }
+
+
+def _backends() -> dict[str, str]:
+    """Each backend with what it runs on, or why it does not."""
+    found = {}
+    for name in ("cpu", "gpu", "reference"):
+        try:
+            info = _core.backend_info(_core.resolve_backend(name))
+            found[name] = f"{info['device']}, {info['instruction_set']}"
+        except RuntimeError as error:
+            found[name] = f"not available: {error}"
+    found["auto"] = _core.resolve_backend("auto")
+    return found
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list):
+        return "  ".join(_plain(item) for item in value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,229 @@
+"""``igsr pose``: find the cameras of photos."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBar
+
+from .. import _core
+from ..atomic_write import check_folder
+from ..capture import Capture
+from ..capture.folder import holds_cameras
+from ..capture.photo_folder import FRAMES, has_photos
+from ..capture.write_colmap import write_colmap
+from ..errors import IgsrError
+from ..pose import AUTO, capture_of, estimate, photos_of
+from ..pose.registry import ESTIMATORS
+from .shared import (
+    JsonOption,
+    complain,
+    error_console,
+    load,
+    one_sentence,
+    output_console,
+    print_json,
+    stopped,
+    warnings_as_sentences,
+)
+
+FramesOption = Annotated[
+    int, typer.Option("--frames", help="How many frames are taken of each video.")
+]
+
+
+EstimatorOption = Annotated[
+    str,
+    typer.Option(
+        "--estimator",
+        metavar="NAME",
+        help=f"What finds cameras: {', '.join(ESTIMATORS)}, or auto, the first of them that can "
+        "run here.",
+    ),
+]
+
+
+CheckpointOption = Annotated[
+    Path | None, typer.Option("--checkpoint", metavar="FILE", help="dust3r: the network's weights.")
+]
+
+
+GraphOption = Annotated[
+    str | None,
+    typer.Option(
+        "--graph",
+        metavar="KIND",
+        help="dust3r: which pairs of photos it sees: complete, swin-K, logwin-K or oneref-K.",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class CameraFinder:
+    """What was said of how cameras are to be found."""
+
+    estimator: str
+    checkpoint: Path | None
+    graph: str | None
+    frames: int
+    seed: int
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What goes to the estimator itself."""
+        given = {"checkpoint": self.checkpoint, "graph": self.graph}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+def capture_to_fit(
+    path: Path,
+    out: Path,
+    holdout: int | None,
+    finder: CameraFinder,
+    *,
+    resume: bool,
+    shown: bool,
+) -> Capture:
+    """The capture at a path; photos without cameras get them, kept in ``out/capture``."""
+    if holds_cameras(path) or not has_photos(path):
+        if finder.options or finder.estimator != AUTO:
+            raise IgsrError(
+                f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
+            )
+        return load(path, holdout)
+    kept = out / "capture"
+    if kept.resolve() in (path.resolve(), *path.resolve().parents):
+        raise IgsrError(f"{path} lies where the fit would write {kept}; name another --out")
+    if resume and holds_cameras(kept):
+        complain(f"The cameras found before are used, from {kept}")
+    else:
+        report = _posed(path, kept, finder, plot=False, shown=shown, replace=True)
+        complain(
+            f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
+            f"{report['estimator']} and are kept in {kept}"
+        )
+    return load(kept, holdout)
+
+
+def pose_command(
+    photos: Annotated[
+        list[Path],
+        typer.Argument(metavar="PHOTOS", help="A folder of photos, or photos and videos."),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for the capture; it must be new or empty.")
+    ],
+    estimator: EstimatorOption = AUTO,
+    checkpoint: CheckpointOption = None,
+    graph: GraphOption = None,
+    plot: Annotated[
+        bool, typer.Option("--plot", help="Draw cameras and points to poses.png in --out.")
+    ] = False,
+    frames: FramesOption = FRAMES,
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the cameras of PHOTOS and write both as a COLMAP capture."""
+    with one_sentence(lambda: "Interrupted; nothing is written."), warnings_as_sentences():
+        check_folder(out)
+        started = time.monotonic()
+        given = photos[0] if len(photos) == 1 else photos
+        if estimator == AUTO and isinstance(given, Path) and holds_cameras(given):
+            raise IgsrError(
+                f"{given} has cameras already; fit it as it is, or name an --estimator to find "
+                "them anew"
+            )
+        finder = CameraFinder(estimator, checkpoint, graph, frames, seed)
+        report = _posed(given, out, finder, plot=plot, shown=not as_json)
+        report["seconds"] = round(time.monotonic() - started, 3)
+    if as_json:
+        print_json(report)
+        return
+    console = output_console()
+    console.print(
+        f"{len(report['cameras'])} of {report['photos']} photos placed by {report['estimator']} in "
+        f"{report['seconds']:.1f} s, {report['points']} points, seed {seed}"
+    )
+    console.print("  ".join([str(out), *([str(out / "poses.png")] if plot else [])]), style="dim")
+
+
+def _posed(
+    photos: Path | list[Path],
+    out: Path,
+    finder: CameraFinder,
+    *,
+    plot: bool,
+    shown: bool,
+    replace: bool = False,
+) -> dict[str, Any]:
+    """Find cameras and write the capture; what ``igsr pose`` reports."""
+    from ..pose.plot import plot_poses
+
+    loaded = photos_of(photos, finder.frames)
+    with _pose_bar(shown) as show:
+        name, found = estimate(
+            loaded, finder.estimator, seed=finder.seed, progress=show, **finder.options
+        )
+    for sentence in found.warnings:
+        complain(sentence)
+    capture = capture_of(photos if isinstance(photos, Path) else Path("photos"), loaded, found)
+    trusted = [
+        mask
+        for mask, camera in zip(found.trusted, found.cameras, strict=True)
+        if camera is not None
+    ]
+    write_colmap(capture, out, replace=replace, further_masks={"trusted": trusted})
+    if plot:
+        plot_poses(out / "poses.png", capture)
+    return {
+        "estimator": name,
+        "photos": len(loaded),
+        "cameras": [
+            {
+                "name": view.name,
+                "centre": view.camera.centre.tolist(),
+                "focal": [float(view.camera.K[0, 0]), float(view.camera.K[1, 1])],
+            }
+            for view in capture.views
+        ],
+        "not_placed": [
+            photo.name
+            for photo, camera in zip(loaded, found.cameras, strict=True)
+            if camera is None
+        ],
+        "points": 0 if capture.points is None else len(capture.points.xyz),
+        "warnings": found.warnings,
+        "seed": finder.seed,
+        "version": _core.__version__,
+        "out": str(out),
+    }
+
+
+@contextlib.contextmanager
+def _pose_bar(shown: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on stderr, one line for each stage of finding cameras."""
+    bar = ProgressBar(
+        TextColumn("{task.description} {task.completed}/{task.total}"),
+        BarColumn(bar_width=30),
+        TimeRemainingColumn(compact=True),
+        console=error_console(),
+        disable=not shown,
+        transient=True,
+    )
+    tasks: dict[str, Any] = {}
+    with stopped(bar):
+
+        def show(stage: str, done: int, total: int) -> None:
+            bar.start()
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield show

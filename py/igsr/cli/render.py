@@ -1,0 +1,126 @@
+"""``igsr render``: pictures and videos of splats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .. import _core
+from ..atomic_write import atomic_write
+from ..capture import Camera, Capture, load_capture
+from ..errors import IgsrError
+from ..evaluation import default_background
+from ..orbit import orbit
+from ..rendering import render
+from ..splats import Splats
+from .shared import (
+    NAMED_COLORS,
+    BackendChoice,
+    BackendOption,
+    BackgroundOption,
+    JsonOption,
+    SceneArgument,
+    background_color,
+    one_sentence,
+    output_console,
+    picture_name,
+    print_json,
+    resolved,
+)
+
+
+def render_command(
+    scene: SceneArgument,
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for pictures, or .mp4 file with --orbit.")
+    ],
+    cameras: Annotated[
+        Path | None,
+        typer.Option("--cameras", metavar="CAPTURE", help="Render from the cameras of a capture."),
+    ] = None,
+    orbit_frames: Annotated[
+        int | None,
+        typer.Option(
+            "--orbit",
+            metavar="FRAMES",
+            help="Write a video once around the scene; with --cameras, at their distance.",
+        ),
+    ] = None,
+    exr: Annotated[
+        bool,
+        typer.Option(
+            "--exr", help="EXR in 32-bit float: R, G, B, A and Z (expected depth) instead of PNG."
+        ),
+    ] = False,
+    background: BackgroundOption = None,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Render SCENE to PNG or EXR pictures, or to a video around it."""
+    with one_sentence():
+        name = resolved(backend)
+        splats = Splats.load(scene)
+        capture = None if cameras is None else load_capture(cameras)
+        color = background_color(background) or (
+            NAMED_COLORS["black"] if capture is None else default_background(capture)
+        )
+        if orbit_frames is not None:
+            if exr:
+                raise IgsrError("--exr writes pictures and --orbit a video; leave one out.")
+            if out.suffix.lower() not in (".mp4", ".mkv", ".mov"):
+                raise IgsrError(f"--out {out} must be a video file such as orbit.mp4 with --orbit.")
+            files = [_write_orbit(splats, orbit(splats, capture, orbit_frames), out, color, name)]
+        elif capture is not None:
+            files = _write_pictures(splats, capture, out, color, name, exr)
+        else:
+            raise IgsrError("Say where from: --cameras CAPTURE, --orbit FRAMES, or both.")
+    if as_json:
+        print_json({"files": [str(file) for file in files], **_core.backend_info(name)})
+    else:
+        output_console().print(
+            str(files[0]) if len(files) == 1 else f"{len(files)} pictures in {out}"
+        )
+
+
+def _write_orbit(
+    splats: Splats,
+    path_cameras: list[Camera],
+    out: Path,
+    background: tuple[float, float, float],
+    backend: str,
+) -> Path:
+    from ..video import write_video
+
+    frames = (render(splats, camera, background, backend).to_uint8() for camera in path_cameras)
+    write_video(out, frames)
+    return out
+
+
+def _write_pictures(
+    splats: Splats,
+    capture: Capture,
+    out: Path,
+    background: tuple[float, float, float],
+    backend: str,
+    exr: bool,
+) -> list[Path]:
+    from PIL import Image
+
+    suffix = ".exr" if exr else ".png"
+    files: list[Path] = []
+    for view in capture.views:
+        path = out / picture_name(view.name, suffix)
+        if path in files:
+            path = out / picture_name(view.name + suffix, suffix)
+        picture = render(splats, view.camera, background, backend)
+        with atomic_write(path) as temporary:
+            if exr:
+                _core.write_exr(
+                    str(temporary), picture.color, picture.alpha, picture.expected_depth
+                )
+            else:
+                Image.fromarray(picture.to_uint8()).save(temporary, format="PNG")
+        files.append(path)
+    return files

@@ -1,0 +1,159 @@
+"""``igsr study``: protocols of the literature."""
+
+from __future__ import annotations
+
+import enum
+import inspect
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..errors import IgsrError
+from .shared import (
+    BackendChoice,
+    BackendOption,
+    JsonOption,
+    PresetChoice,
+    error_console,
+    one_sentence,
+    output_console,
+    print_json,
+    resolved,
+)
+
+
+class StudyChoice(str, enum.Enum):
+    """Protocols of ``igsr study``."""
+
+    blender8 = "blender8"
+    few_photos = "few-photos"
+    pose_noise = "pose-noise"
+    poses = "poses"
+
+
+def study_command(
+    protocol: Annotated[
+        StudyChoice,
+        typer.Argument(
+            help="blender8: NeRF Synthetic from eight photos. few-photos: real captures from 3, 6 "
+            "and 9 photos, or 3, 6 and 12 of the tankard. pose-noise: 20 views of NeRF Synthetic "
+            "with noise on their poses, which are kept or fitted. poses: cameras found in photos "
+            "against the true ones."
+        ),
+    ],
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder that holds the scenes.")],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for study.json, study.md, study.png and runs/.")
+    ],
+    scenes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scene",
+            help="A folder in DATA; repeat it for several. Default: chair and lego; fern, "
+            "dtu_scan24 and tankard; for poses the sets of docs/pose_colmap.md.",
+        ),
+    ] = None,
+    views: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--views",
+            help="Repeat it for several. blender8: 75 or 76, the view that codes differ in; "
+            "few-photos: a number of photos. Default: all.",
+        ),
+    ] = None,
+    presets: Annotated[
+        list[PresetChoice] | None,
+        typer.Option("--preset", help="Repeat it for several. Default: all."),
+    ] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            "--noise", help="pose-noise: standard deviation of camera-to-world's numbers. [0.01]"
+        ),
+    ] = None,
+    raw_affine: Annotated[
+        bool,
+        typer.Option("--raw-affine", help="pose-noise: also keep the shear that noise brings."),
+    ] = False,
+    estimator: Annotated[
+        str | None,
+        typer.Option("--estimator", metavar="NAME", help="poses: what finds cameras. [colmap]"),
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option("--seeds", help="Fits of each kind. [3; poses: 1]")
+    ] = None,
+    jobs: Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")] = 1,
+    ray: Annotated[
+        bool,
+        typer.Option("--ray", help="Fits go over a Ray cluster (pip install 'igsr[ray]')."),
+    ] = False,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a protocol of the literature: the same photos, seeds and scores for every preset.
+
+    What is finished is kept in --out, and the same command goes on from there.
+    """
+    from .. import study
+
+    with one_sentence(
+        lambda: "Interrupted; finished fits are kept, the same command goes on from there."
+    ):
+        console = error_console()
+        started = time.monotonic()
+        first: list[int] = []
+
+        def on_run(done: int, total: int, row: dict[str, Any]) -> None:
+            first[:] = first or [done - 1]
+            left = (time.monotonic() - started) / (done - first[0]) * (total - done)
+            if protocol is StudyChoice.poses:
+                console.print(
+                    f"{done} of {total}: {row['scene']} seed {row['seed']}: {row['registered']} of "
+                    f"{row['photos']} placed in {row['seconds']:.0f} s; about {left / 60.0:.0f} "
+                    "min left"
+                )
+                return
+            if protocol is StudyChoice.pose_noise:
+                kind = f"{row['noise']}, poses {row['poses']}"
+                psnr = row["refined"]["psnr"]
+            else:
+                kind, psnr = f"views {row['views']} {row['preset']}", row["psnr"]
+            console.print(
+                f"{done} of {total}: {row['scene']} {kind} seed {row['seed']}: "
+                f"{psnr:.2f} dB in {row['seconds']:.0f} s; about {left / 60.0:.0f} min left"
+            )
+
+        studies: dict[StudyChoice, Callable[..., dict[str, Any]]] = {
+            StudyChoice.blender8: study.blender8,
+            StudyChoice.few_photos: study.few_photos,
+            StudyChoice.pose_noise: study.pose_noise,
+            StudyChoice.poses: study.poses,
+        }
+        run = studies[protocol]
+        given: dict[str, Any] = {
+            "scenes": scenes and tuple(scenes),
+            "views": views and tuple(views),
+            "presets": presets and tuple(choice.value for choice in presets),
+            "noise": noise,
+            "raw_affine": raw_affine or None,
+            "estimator": estimator,
+            "seeds": seeds,
+            "backend": None if backend is BackendChoice.auto else backend,
+        }
+        given = {name: value for name, value in given.items() if value is not None}
+        foreign = [name for name in given if name not in inspect.signature(run).parameters]
+        if foreign:
+            option = {"scenes": "scene", "presets": "preset"}.get(foreign[0], foreign[0])
+            raise IgsrError(
+                f"--{option.replace('_', '-')} says nothing to {protocol.value}; leave it out."
+            )
+        if "backend" in inspect.signature(run).parameters:
+            given["backend"] = resolved(backend)
+        report = run(data, out, **given, jobs=jobs, on_run=on_run, ray=ray)
+    if as_json:
+        print_json(report)
+        return
+    output_console().print((out / "study.md").read_text(encoding="utf-8"), markup=False)

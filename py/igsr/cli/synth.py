@@ -1,0 +1,69 @@
+"""``igsr synth``: make procedural captures."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from .shared import (
+    JsonOption,
+    error_console,
+    one_sentence,
+    output_console,
+    print_json,
+)
+
+
+def synth_command(
+    scenes: Annotated[int, typer.Option("--scenes", metavar="N", help="How many.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the captures.")],
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same scenes.")] = 0,
+    first: Annotated[int, typer.Option("--first", help="Number of the first scene.")] = 0,
+    size: Annotated[int, typer.Option("--size", help="Pixels of the photos' longer side.")] = 256,
+    views: Annotated[int, typer.Option("--views", help="Photos to fit, per scene.")] = 24,
+    test_views: Annotated[
+        int, typer.Option("--test-views", help="Photos to score, per scene.")
+    ] = 8,
+    spp: Annotated[int, typer.Option("--spp", help="Light paths per pixel, a square.")] = 36,
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", help="Scenes at a time, a core each. Default: all cores."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make procedural captures: random scenes rendered with exact cameras, depth and masks.
+
+    Needs Mitsuba 3 (pip install 'igsr[synth]'). What is finished is kept in --out, and the same
+    command goes on from there.
+    """
+    from .. import synth
+
+    with one_sentence(
+        lambda: "Interrupted; finished scenes are kept, the same command goes on from there."
+    ):
+        console = error_console()
+
+        def on_scene(done: int, total: int, row: dict[str, Any]) -> None:
+            where = "" if row["kind"] == "none" else f", {row['kind']}"
+            console.print(
+                f"{done} of {total}: {row['name']} ({', '.join(row['contents'])}{where}) "
+                f"in {row['seconds']:.0f} s"
+            )
+
+        report = synth.synthesize(
+            out,
+            scenes,
+            seed=seed,
+            first=first,
+            settings=synth.CaptureSettings(size, views, test_views, spp),
+            jobs=(os.cpu_count() or 1) if jobs is None else jobs,
+            on_scene=on_scene,
+        )
+    if as_json:
+        print_json(report)
+        return
+    made = sum(row["seconds"] is not None for row in report["scenes"])
+    output_console().print(f"{made} made, {scenes - made} there already: {out}", markup=False)

@@ -1,0 +1,135 @@
+"""``igsr.denoise``: a render made cleaner, and where the result may be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ..errors import IgsrError
+from ..rendering import Render
+from .buffers import Buffers
+from .inputs import PHOTOS, network_inputs
+from .network import MULTIPLE, REACH, DenoiserNetwork
+from .warping import Source, Warped, warp_photos
+from .weights import load_network
+
+Float32 = npt.NDArray[np.float32]
+
+#: Expected error, in units of the colours' range, at which the confidence is a half.
+HALF_CONFIDENCE_ERROR = 0.05
+#: Pictures of more pixels go through the network in tiles of this side, without what is around.
+TILE = 768
+assert TILE % MULTIPLE == 0
+assert REACH % MULTIPLE == 0
+
+
+class Denoiser(Protocol):
+    """Anything that cleans renders: a render, its buffers and photos to a picture and confidence.
+
+    Returns the picture float32 [H, W, 3] in [0, 1] and the confidence float32 [H, W] in [0, 1].
+    """
+
+    def __call__(self, render: Buffers, photos: Sequence[Source]) -> tuple[Float32, Float32]:
+        """Clean one render."""
+
+
+class NetworkDenoiser:
+    """The denoiser that igsr trains.
+
+    Args:
+        network: its network, ready for use (``load_network``).
+    """
+
+    def __init__(self, network: DenoiserNetwork) -> None:
+        """Keep the network."""
+        self.network = network
+
+    def __call__(self, render: Buffers, photos: Sequence[Source]) -> tuple[Float32, Float32]:
+        """Clean one render; see ``denoise``."""
+        inputs = torch.from_numpy(network_inputs(render, _warped(render, photos)))
+        image, log_error = self._in_tiles(inputs[None])
+        picture = image[0].clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
+        error = log_error[0, 0].exp().numpy()
+        confidence = HALF_CONFIDENCE_ERROR / (HALF_CONFIDENCE_ERROR + error)
+        # A picture that was not finite has been guessed, not cleaned.
+        broken = ~np.isfinite(render.color).all(axis=-1)
+        return picture, np.where(broken, np.float32(0.0), confidence)
+
+    def _in_tiles(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        height, width = inputs.shape[-2:]
+        image = torch.empty(1, 3, height, width)
+        log_error = torch.empty(1, 1, height, width)
+        with torch.inference_mode():
+            for top in range(0, height, TILE):
+                for left in range(0, width, TILE):
+                    above, before = min(top, REACH), min(left, REACH)
+                    rows = slice(top - above, top + TILE + REACH)
+                    columns = slice(left - before, left + TILE + REACH)
+                    tile = inputs[..., rows, columns].contiguous(memory_format=torch.channels_last)
+                    inner = (..., slice(above, above + TILE), slice(before, before + TILE))
+                    at = (..., slice(top, top + TILE), slice(left, left + TILE))
+                    picture, error = self.network(tile)
+                    image[at], log_error[at] = picture[inner], error[inner]
+        return image, log_error
+
+
+def denoise(
+    render: Buffers | Render | npt.NDArray[Any],
+    photos: Sequence[Source] = (),
+    denoiser: Denoiser | None = None,
+) -> tuple[Float32, Float32]:
+    """Clean a render of a poorly known scene.
+
+    Args:
+        render: of any size: ``igsr.denoiser.render_buffers`` (best), ``igsr.render``, or only a
+            picture [H, W, 3], uint8 or float in [0, 1]. The less is known, the less is mended.
+        photos: of ``igsr.denoiser.photo_sources``; used where ``render`` has a camera and depth.
+        denoiser: what cleans; None is the one that comes with igsr.
+
+    Returns:
+        The picture, float32 [H, W, 3] in [0, 1], and the confidence, float32 [H, W] in [0, 1]:
+        0.05 / (0.05 + expected absolute error of the colours), so a half where colours are expected
+        to be a twentieth of their range off. NaN pixels are filled in and have confidence 0.
+
+    Raises:
+        IgsrError: an array has another shape or dtype, or the shipped weights cannot be read.
+    """
+    return (denoiser or _shipped())(_buffers(render), photos)
+
+
+@cache
+def _shipped() -> NetworkDenoiser:
+    return NetworkDenoiser(load_network())
+
+
+def _buffers(render: Buffers | Render | npt.NDArray[Any]) -> Buffers:
+    if isinstance(render, Buffers):
+        return render
+    if isinstance(render, Render):
+        return Buffers(color=render.color, alpha=render.alpha, depth=render.expected_depth)
+    picture = np.asarray(render)
+    if picture.dtype == np.uint8:
+        return Buffers(color=picture.astype(np.float32) / np.float32(255.0))
+    if not np.issubdtype(picture.dtype, np.floating):
+        raise IgsrError(f"render must be uint8 or float [H, W, 3], not {picture.dtype}")
+    return Buffers(color=picture.astype(np.float32))
+
+
+def _warped(render: Buffers, photos: Sequence[Source]) -> Warped:
+    if render.camera is None or render.depth is None or render.alpha is None:
+        height, width = render.color.shape[:2]
+        nothing = np.zeros((PHOTOS, height, width), np.bool_)
+        return Warped(
+            np.zeros((*nothing.shape, 3), np.float32),
+            nothing,
+            np.full(nothing.shape, np.pi, np.float32),
+        )
+    depth = np.nan_to_num(render.depth, nan=0.0, posinf=0.0, neginf=0.0)
+    alpha = np.nan_to_num(render.alpha, nan=0.0, posinf=0.0, neginf=0.0)
+    return warp_photos(render.camera, depth, alpha, photos, PHOTOS)

@@ -1,0 +1,144 @@
+"""What a denoiser is trained to make small: the default and the three losses of the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..errors import IgsrError
+from .perceptual import Distance
+
+#: Names of ``--loss``. The last three are the paper's.
+LOSSES = ("default", "gan", "gan+lpips", "lpips")
+#: Parts of the default: a pixel's distance counts 1.
+PERCEPTUAL, REGRET, LIKELIHOOD = 0.05, 0.5, 0.1
+#: Below this the distance of two colours counts by its square (Charbonnier).
+CHARBONNIER = 1e-3
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a network made of a batch, and what it should have made.
+
+    Attributes:
+        render: [B, 3, H, W] in [0, 1], before.
+        image: [B, 3, H, W], after; not clamped.
+        log_error: [B, 1, H, W], natural logarithm of the predicted absolute error.
+        truth: [B, 3, H, W] in [0, 1].
+    """
+
+    render: Tensor
+    image: Tensor
+    log_error: Tensor
+    truth: Tensor
+
+
+def charbonnier(prediction: Prediction) -> Tensor:
+    """Mean of sqrt(difference^2 + eps^2) - eps: a smooth absolute error (Charbonnier 1994)."""
+    difference = prediction.image - prediction.truth
+    return ((difference.square() + CHARBONNIER**2).sqrt() - CHARBONNIER).mean()
+
+
+def regret(prediction: Prediction) -> Tensor:
+    """Mean of how much further from the truth colours are than they were; 0 where nearer.
+
+    What was right must stay right: a mean over all pixels would trade it for what was wrong.
+    """
+    before = (prediction.render - prediction.truth).abs()
+    after = (prediction.image - prediction.truth).abs()
+    return (after - before).clamp_min(0.0).mean()
+
+
+def error_likelihood(prediction: Prediction) -> Tensor:
+    """Negative log-likelihood of the error under a Laplace distribution of the predicted scale.
+
+    Its gradient does not reach the picture (Kendall and Gal 2017 let it, which lets hard pixels be
+    given up).
+    """
+    error = (prediction.image.detach() - prediction.truth).abs().mean(dim=1, keepdim=True)
+    return (error * (-prediction.log_error).exp() + prediction.log_error).mean()
+
+
+def perceptual(prediction: Prediction, distance: Distance) -> Tensor:
+    """Mean distance by a perceptual metric of the clamped pictures."""
+    # The clamp lets gradients through: colours out of range must be able to come back.
+    image = prediction.image + (prediction.image.clamp(0.0, 1.0) - prediction.image).detach()
+    return distance(image, prediction.truth).mean()
+
+
+class Discriminator(nn.Module):
+    """Tells patches of true pictures from others': logits [B, 1, h, w] (Isola et al. 2017)."""
+
+    def __init__(self, width: int = 48) -> None:
+        """Build the layers."""
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, width, 4, stride=2, padding=1),
+            nn.LeakyReLU(0.2),
+            nn.Conv2d(width, 2 * width, 4, stride=2, padding=1),
+            nn.GroupNorm(8, 2 * width),
+            nn.LeakyReLU(0.2),
+            nn.Conv2d(2 * width, 4 * width, 4, stride=2, padding=1),
+            nn.GroupNorm(8, 4 * width),
+            nn.LeakyReLU(0.2),
+            nn.Conv2d(4 * width, 1, 3, padding=1),
+        )
+
+    def forward(self, picture: Tensor) -> Tensor:
+        """Logits of pictures [B, 3, H, W] in [0, 1] being true ones."""
+        logits: Tensor = self.layers(2.0 * picture - 1.0)
+        return logits
+
+    def loss(self, prediction: Prediction) -> Tensor:
+        """-E log D(truth) - E log(1 - D(image)); does not reach the denoiser."""
+        true = F.softplus(-self(prediction.truth)).mean()
+        made = F.softplus(self(prediction.image.detach())).mean()
+        return true + made
+
+
+class Loss:
+    """A loss by name; its parts are returned beside the total, for logs.
+
+    Args:
+        name: of ``LOSSES``: "default" (Charbonnier, regret, perceptual distance if there is one,
+            and the predicted error's likelihood), "gan", "gan+lpips" ((1 - a) GAN + a LPIPS) or
+            "lpips". The likelihood is part of all: without it there is no confidence; its gradient
+            does not reach the picture.
+        distance: the perceptual one, where the loss has it.
+        a: of "gan+lpips"; the paper has 0.9.
+
+    Raises:
+        IgsrError: no such loss, or one that needs a distance without one.
+    """
+
+    def __init__(self, name: str, distance: Distance | None, a: float = 0.9) -> None:
+        """Check the arguments."""
+        if name not in LOSSES:
+            raise IgsrError(f"loss must be one of {', '.join(LOSSES)}, not {name!r}")
+        if name.endswith("lpips") and distance is None:
+            raise IgsrError(f"loss {name} needs a perceptual distance; name --features or --lpips")
+        if not 0.0 <= a <= 1.0:
+            raise IgsrError(f"a must be from 0 to 1, not {a:g}")
+        self.name, self.distance, self.a = name, distance, a
+        self.discriminator = Discriminator() if "gan" in name else None
+
+    def __call__(self, prediction: Prediction) -> tuple[Tensor, dict[str, float]]:
+        """The total and its parts."""
+        parts: dict[str, tuple[float, Tensor]] = {}
+        if self.name == "default":
+            parts["charbonnier"] = 1.0, charbonnier(prediction)
+            parts["regret"] = REGRET, regret(prediction)
+            if self.distance is not None:
+                parts["perceptual"] = PERCEPTUAL, perceptual(prediction, self.distance)
+        if self.discriminator is not None:
+            weight = 1.0 if self.name == "gan" else 1.0 - self.a
+            parts["gan"] = weight, F.softplus(-self.discriminator(prediction.image)).mean()
+        if self.name.endswith("lpips") and self.distance is not None:
+            weight = 1.0 if self.name == "lpips" else self.a
+            parts["perceptual"] = weight, perceptual(prediction, self.distance)
+        parts["likelihood"] = LIKELIHOOD, error_likelihood(prediction)
+        total = torch.stack([weight * part for weight, part in parts.values()]).sum()
+        return total, {name: float(part.detach()) for name, (_, part) in parts.items()}

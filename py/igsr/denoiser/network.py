@@ -1,0 +1,181 @@
+"""The network: a small U-Net that predicts what to add to a render and how wrong that still is.
+
+Its blocks are those of NAFNet (Chen et al. 2022: depthwise convolutions and gates in place of
+activations) without their pooling over the whole picture: what comes out at a pixel depends on the
+pixels within ``REACH`` of it alone, so that tiles of a large picture give what the whole would.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..errors import IgsrError
+from .inputs import BUFFERS, CHANNELS, COLOR, PHOTO, PHOTOS
+
+#: Pictures are padded to multiples of this: one step of pixel shuffle and two of the U-Net.
+MULTIPLE = 8
+#: Pixels in each direction that an output may depend on; a multiple of ``MULTIPLE``.
+REACH = 96
+#: Errors are predicted as logarithms within these bounds, in units of the colours' range.
+LEAST_LOG_ERROR, MOST_LOG_ERROR = -7.0, 0.0
+
+
+#: Ways to look at the photos.
+PHOTO_WAYS = ("concatenated", "attention", "none")
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """What distinguishes one network from another; stored beside its weights.
+
+    Attributes:
+        width: channels at half resolution; twice and four times as many below.
+        blocks: blocks at a half (each way), a quarter (each way) and an eighth of the resolution.
+        residual: add the output to the render, or take it as the picture.
+        buffers: look at the rasterizer's buffers.
+        photos: "concatenated", "attention" (per pixel over the photos, in place of a fixed order)
+            or "none".
+    """
+
+    width: int = 32
+    blocks: tuple[int, int, int] = (2, 2, 4)
+    residual: bool = True
+    buffers: bool = True
+    photos: str = "concatenated"
+
+    def __post_init__(self) -> None:
+        """Check what could be mistyped."""
+        if self.photos not in PHOTO_WAYS:
+            raise IgsrError(f"photos must be one of {', '.join(PHOTO_WAYS)}, not {self.photos!r}.")
+
+
+class _ChannelNorm(nn.Module):
+    """Layer normalisation over the channels of each pixel."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        mean = x.mean(dim=1, keepdim=True)
+        centred = x - mean
+        variance = centred.square().mean(dim=1, keepdim=True)
+        normal = centred * torch.rsqrt(variance + 1e-6)
+        return normal * self.weight[:, None, None] + self.bias[:, None, None]
+
+
+def _gate(x: Tensor) -> Tensor:
+    first, second = x.chunk(2, dim=1)
+    return first * second
+
+
+class _Block(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm1 = _ChannelNorm(channels)
+        self.expand1 = nn.Conv2d(channels, 2 * channels, 1)
+        self.depthwise = nn.Conv2d(2 * channels, 2 * channels, 3, padding=1, groups=2 * channels)
+        self.project1 = nn.Conv2d(channels, channels, 1)
+        self.norm2 = _ChannelNorm(channels)
+        self.expand2 = nn.Conv2d(channels, 2 * channels, 1)
+        self.project2 = nn.Conv2d(channels, channels, 1)
+        # Blocks begin as the identity (NAFNet).
+        self.scale1 = nn.Parameter(torch.zeros(channels))
+        self.scale2 = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        inner = self.project1(_gate(self.depthwise(self.expand1(self.norm1(x)))))
+        x = x + inner * self.scale1[:, None, None]
+        inner = self.project2(_gate(self.expand2(self.norm2(x))))
+        return x + inner * self.scale2[:, None, None]
+
+
+class _PhotoAttention(nn.Module):
+    """One photo's worth of features per pixel: a mean over photos, weighted by how they fit."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.query = nn.Conv2d(4 * (COLOR + BUFFERS), width, 1)
+        self.key = nn.Conv2d(4 * PHOTO, width, 1)
+        self.value = nn.Conv2d(4 * PHOTO, width, 1)
+
+    def forward(self, render: Tensor, photos: Tensor) -> Tensor:
+        batch, _, height, width = photos.shape
+        each = photos.reshape(batch * PHOTOS, -1, height, width)
+        key = self.key(each).reshape(batch, PHOTOS, -1, height, width)
+        value = self.value(each).reshape(batch, PHOTOS, -1, height, width)
+        fit = (self.query(render)[:, None] * key).sum(dim=2) / key.shape[2] ** 0.5
+        return (fit.softmax(dim=1)[:, :, None] * value).sum(dim=1)
+
+
+class DenoiserNetwork(nn.Module):
+    """Channels of ``network_inputs`` to a picture and the logarithm of its expected error.
+
+    Args:
+        architecture: which network.
+        dropout: in training, part of the features at the lowest resolution that is left out.
+    """
+
+    def __init__(self, architecture: Architecture | None = None, dropout: float = 0.0) -> None:
+        """Build the layers; the last begins at zero, so that the render comes out unchanged."""
+        super().__init__()
+        self.architecture = architecture or Architecture()
+        width, (half, quarter, eighth) = self.architecture.width, self.architecture.blocks
+        attention = self.architecture.photos == "attention"
+        self.attention = _PhotoAttention(width) if attention else None
+        channels = 4 * (COLOR + BUFFERS) + (width if attention else 4 * PHOTOS * PHOTO)
+        self.head = nn.Conv2d(channels, width, 3, padding=1)
+        self.down_half = nn.Sequential(*(_Block(width) for _ in range(half)))
+        self.to_quarter = nn.Conv2d(width, 2 * width, 2, stride=2)
+        self.down_quarter = nn.Sequential(*(_Block(2 * width) for _ in range(quarter)))
+        self.to_eighth = nn.Conv2d(2 * width, 4 * width, 2, stride=2)
+        self.middle = nn.Sequential(*(_Block(4 * width) for _ in range(eighth)))
+        self.dropout = nn.Dropout2d(dropout)
+        self.from_eighth = nn.Conv2d(4 * width, 8 * width, 1)
+        self.up_quarter = nn.Sequential(*(_Block(2 * width) for _ in range(quarter)))
+        self.from_quarter = nn.Conv2d(2 * width, 4 * width, 1)
+        self.up_half = nn.Sequential(*(_Block(width) for _ in range(half)))
+        self.tail = nn.Conv2d(width, 4 * (COLOR + 1), 3, padding=1)
+        for parameter in self.tail.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Denoise.
+
+        Args:
+            inputs: [B, ``CHANNELS``, H, W] of any size, as ``network_inputs`` makes them.
+
+        Returns:
+            The picture [B, 3, H, W], not clamped, and the natural logarithm of the expected
+            absolute error of its colours [B, 1, H, W].
+        """
+        if inputs.shape[1] != CHANNELS:
+            raise ValueError(f"inputs must have {CHANNELS} channels, not {inputs.shape[1]}")
+        height, width = inputs.shape[-2:]
+        padding = (0, -width % MULTIPLE, 0, -height % MULTIPLE)
+        x = F.pad(inputs, padding, mode="replicate")
+        render, photos = x[:, : COLOR + BUFFERS], x[:, COLOR + BUFFERS :]
+        if not self.architecture.buffers:
+            render = torch.cat([render[:, :COLOR], torch.zeros_like(render[:, COLOR:])], dim=1)
+        if self.architecture.photos == "none":
+            photos = torch.zeros_like(photos)
+        render, photos = F.pixel_unshuffle(render, 2), F.pixel_unshuffle(photos, 2)
+        if self.attention is not None:
+            photos = self.attention(render, photos)
+        half = self.down_half(self.head(torch.cat([render, photos], dim=1)))
+        quarter = self.down_quarter(self.to_quarter(half))
+        eighth = self.dropout(self.middle(self.to_eighth(quarter)))
+        quarter = self.up_quarter(quarter + F.pixel_shuffle(self.from_eighth(eighth), 2))
+        half = self.up_half(half + F.pixel_shuffle(self.from_quarter(quarter), 2))
+        out = F.pixel_shuffle(self.tail(half), 2)[..., :height, :width]
+        image = out[:, :COLOR]
+        if self.architecture.residual:
+            image = image + inputs[:, :COLOR]
+        # At the start every picture is taken to be wrong by about a twentieth of the range.
+        log_error = (out[:, COLOR:] - 3.0).clamp(LEAST_LOG_ERROR, MOST_LOG_ERROR)
+        return image, log_error

@@ -1,0 +1,217 @@
+"""Training pairs: renders of fits that have too little to go on, beside the true pictures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..capture import Capture, View, load_capture
+from ..errors import IgsrError
+from ..evaluation import WHITE, over_background
+from ..fitting import fit_with_cameras
+from ..metrics import psnr
+from ..presets import preset_settings
+from ..splats import Splats
+from ..study.noisy_poses import AFFINE, MATRIX, TURN, Noise, noisy_view
+from ..study.runs import Run, finished_runs
+from .buffers import photo_support, render_buffers
+from .inputs import PHOTOS, network_inputs
+from .pair_files import Bytes, packed, write_pairs
+from .warping import photo_sources, warp_photos
+
+#: Kinds of fits. "sparse" has 3 to 12 photos; "underfit" stops early; "noise" has wrong cameras;
+#: "paper" is the paper's recipe, "scattered" its other one; "leave-one-out" leaves one photo of the
+#: capture out of each fit, for a capture of one's own.
+DEFAULT_RECIPES = ("sparse", "underfit", "noise")
+RECIPES = (*DEFAULT_RECIPES, "paper", "scattered", "leave-one-out")
+#: Photos of a "sparse" or "underfit" fit.
+FEW = (3, 4, 5, 6, 8, 9, 12)
+#: Photos of a fit with noise (the paper has 20), and of the paper's "many scattered views".
+NOISY_PHOTOS, SCATTERED_PHOTOS = 20, 60
+#: Steps of "paper", and of "scattered": few for so many photos.
+PAPER_STEPS, SCATTERED_STEPS = 5000, 1000
+#: Standard deviations of camera-to-world's numbers, and degrees of turns.
+MATRIX_NOISE, TURN_NOISE = (0.003, 0.02), (0.2, 2.0)
+#: Of the photos fitted, so many are rendered too: what is good already must be seen in training.
+FITTED_RENDERED = 1
+
+
+@dataclass(frozen=True)
+class PairFit:
+    """One fit that pairs are made from; everything that they depend on."""
+
+    capture: str
+    recipe: str
+    number: int
+    views: int
+    steps: int | None
+    seed: int
+    backend: str
+
+
+def make_pairs(
+    captures: Sequence[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    *,
+    recipes: Sequence[str] = DEFAULT_RECIPES,
+    fits: int = 1,
+    views: int = 8,
+    steps: int | None = None,
+    seed: int = 0,
+    backend: str = "cpu",
+    jobs: int = 1,
+    on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
+    ray: bool = False,
+) -> list[dict[str, Any]]:
+    """Fit captures poorly in the ways of ``recipes`` and write what renders look like, and should.
+
+    Args:
+        captures: folders or files that ``igsr.load_capture`` reads, with no two names alike.
+        out: folder for one ``.npz`` of pairs per fit, and ``runs/`` with a row about each; a fit
+            whose row is there is not done again.
+        recipes: names of ``RECIPES``.
+        fits: fits per capture and recipe ("leave-one-out" has one per photo instead).
+        views: unseen views rendered per fit; as many as there are, if fewer.
+        steps: of each fit, where the recipe does not say; None is the default preset's.
+        seed: of everything that is drawn.
+        backend: what fits and renders.
+        jobs: fits at a time, each in a process of its own.
+        on_run: called with (done, all, the fit's row) after each fit.
+        ray: fits run over a Ray cluster instead (``pip install 'igsr[ray]'``).
+
+    Returns:
+        One row per fit: "pairs" (the file's name), "psnr" of its renders, "photos", "recipe".
+
+    Raises:
+        IgsrError: an argument cannot be used, a capture cannot be read or has too few views.
+    """
+    for name, number in (("fits", fits), ("views", views), ("jobs", jobs)):
+        if number < 1:
+            raise IgsrError(f"{name} must be at least 1, not {number}.")
+    unknown = [recipe for recipe in recipes if recipe not in RECIPES]
+    if unknown:
+        raise IgsrError(f"recipe must be one of {', '.join(RECIPES)}, not {unknown[0]!r}.")
+    paths = [Path(path).resolve() for path in captures]
+    names = [path.stem if path.suffix == ".json" else path.name for path in paths]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise IgsrError(f"two captures are called {min(twice)}; rename one, pairs go by the name.")
+    runs = []
+    for path, name in zip(paths, names, strict=True):
+        for recipe in recipes:
+            count = len(load_capture(path).views) if recipe == "leave-one-out" else fits
+            for number in range(count):
+                one = PairFit(str(path), recipe, number, views, steps, seed, backend)
+                settings = preset_settings("default", FEW[0]) | {"views": views, "steps": steps}
+                runs.append(Run(f"{name}-{recipe}-{number}-seed{seed}-{backend}", one, settings))
+    out = Path(out)
+    return finished_runs(out / "runs", runs, partial(_work, out), "", jobs, on_run, ray)
+
+
+def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
+    """Make the pairs of one fit; for a process of its own. Paths are whole: ``data`` is unused."""
+    capture = load_capture(one.capture)
+    name = Path(one.capture).stem
+    random = np.random.default_rng(
+        [one.seed, one.number, 0xDE40, *name.encode(), *one.recipe.encode()]
+    )
+    train, unseen, steps, about = _chosen(capture, one, random)
+    given = Capture(capture.path, train, None if about.get("noise") else capture.points)
+    splats, _ = fit_with_cameras(
+        given, backend=one.backend, seed=one.seed + one.number, steps=steps, hull=_hull(one, train)
+    )
+    has_alpha = train[0].image.shape[2] == 4
+    background = WHITE if not has_alpha or random.uniform() < 0.7 else tuple(random.uniform(size=3))
+    fitted = [train[i] for i in random.permutation(len(train))[:FITTED_RENDERED]]
+    inputs, truth = rendered_pairs(splats, train, unseen + fitted, background, one.backend)
+    file = f"{name}-{one.recipe}-{one.number}-seed{one.seed}.npz"
+    write_pairs(out / file, inputs, truth)
+    before = [
+        psnr(np.moveaxis(seen[:3], 0, -1).copy(), np.moveaxis(true, 0, -1).copy())
+        for seen, true in zip(inputs, truth, strict=True)
+    ]
+    return {
+        "pairs": file,
+        "recipe": one.recipe,
+        "photos": len(train),
+        "steps": steps,
+        "renders": len(inputs),
+        "psnr": float(np.mean(before[: len(unseen)])),
+        **about,
+    }
+
+
+def rendered_pairs(
+    splats: Splats,
+    photos: Sequence[View],
+    views: Sequence[View],
+    background: Sequence[float],
+    backend: str,
+) -> tuple[list[Bytes], list[Bytes]]:
+    """What the network sees of each view, and the true pictures, both in 8 bits."""
+    support = photo_support(splats, [view.camera for view in photos], backend)
+    sources = photo_sources(splats, photos, background, backend)
+    inputs, truth = [], []
+    for view in views:
+        buffers = render_buffers(splats, view.camera, support, background, backend)
+        others = [s for s, photo in zip(sources, photos, strict=True) if photo.name != view.name]
+        assert buffers.depth is not None
+        assert buffers.alpha is not None
+        warped = warp_photos(view.camera, buffers.depth, buffers.alpha, others, PHOTOS)
+        inputs.append(packed(network_inputs(buffers, warped)))
+        truth.append(np.moveaxis(over_background(view.image, background), -1, 0))
+    return inputs, truth
+
+
+def _hull(one: PairFit, train: list[View]) -> bool | None:
+    """Silhouettes of wrong cameras, or as the paper had them, take nothing away."""
+    return False if one.recipe in ("noise", "paper", "scattered") else None
+
+
+def _chosen(
+    capture: Capture, one: PairFit, random: np.random.Generator
+) -> tuple[list[View], list[View], int | None, dict[str, Any]]:
+    """Photos to fit (their cameras as the recipe has them), views to render, steps, and a note."""
+    views = capture.views
+    if one.recipe == "leave-one-out":
+        train = [replace(v, split="train") for i, v in enumerate(views) if i != one.number]
+        if len(train) < 2:
+            raise IgsrError(f"{capture.path} has {len(views)} photos; leave-one-out needs 3.")
+        return train, [views[one.number]], one.steps, {"left_out": views[one.number].name}
+    count = {
+        "paper": NOISY_PHOTOS,
+        "noise": NOISY_PHOTOS,
+        "scattered": SCATTERED_PHOTOS,
+    }.get(one.recipe) or int(random.choice(FEW))
+    count = min(count, len(views) - max(1, min(one.views, len(views) // 4)))
+    if count < 2:
+        raise IgsrError(
+            f"{capture.path} has {len(views)} views; {one.recipe} needs more to render."
+        )
+    order = random.permutation(len(views))
+    train = [replace(views[i], split="train") for i in order[:count]]
+    unseen = [views[i] for i in order[count : count + one.views]]
+    if one.recipe == "sparse":
+        return train, unseen, one.steps, {}
+    if one.recipe == "scattered":
+        return train, unseen, SCATTERED_STEPS, {}
+    if one.recipe == "underfit":
+        whole = one.steps or preset_settings("default", count)["steps"]
+        return train, unseen, max(1, int(random.uniform(0.25, 0.75) * whole)), {}
+    steps = one.steps
+    if one.recipe == "paper":
+        noise, steps = Noise(AFFINE, 0.01), PAPER_STEPS
+    else:
+        kind, least, most = (
+            (MATRIX, *MATRIX_NOISE) if random.uniform() < 0.5 else (TURN, *TURN_NOISE)
+        )
+        size = least * (most / least) ** random.uniform()
+        noise, steps = Noise(kind, float(size)), one.steps
+    # Noise on camera positions is in units of a scene like NeRF Synthetic's, 4 across.
+    return [noisy_view(v, noise, random) for v in train], unseen, steps, {"noise": str(noise)}

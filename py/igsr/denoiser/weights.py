@@ -1,0 +1,102 @@
+"""Denoisers as files: weights and what network they belong to, in one safetensors file."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from ..atomic_write import atomic_write
+from ..errors import IgsrError
+from .network import Architecture, DenoiserNetwork
+
+#: The denoiser that comes with igsr.
+SHIPPED = Path(__file__).with_name("denoiser.safetensors")
+#: No larger network is built for a file that asks for one.
+MOST_WIDTH, MOST_BLOCKS = 256, 32
+
+
+def save_network(
+    network: DenoiserNetwork, path: str | os.PathLike[str], recipe: dict[str, Any]
+) -> None:
+    """Write a network in half precision, under a temporary name first.
+
+    Args:
+        network: what to write.
+        path: the ``.safetensors`` file.
+        recipe: what it was trained on and how, kept beside the weights.
+
+    Raises:
+        IgsrError: the file cannot be written.
+    """
+    weights = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
+    metadata = {
+        "architecture": json.dumps(asdict(network.architecture)),
+        "recipe": json.dumps(recipe, allow_nan=False),
+    }
+    with atomic_write(Path(path)) as temporary:
+        save_file(weights, temporary, metadata=metadata)
+
+
+def load_network(path: str | os.PathLike[str] | None = None) -> DenoiserNetwork:
+    """Read a network; None is the one that comes with igsr.
+
+    Raises:
+        IgsrError: the file is missing, no denoiser of igsr's, truncated, or lacks a weight.
+    """
+    path = SHIPPED if path is None else Path(path)
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except FileNotFoundError as error:
+        raise IgsrError(f"{path} does not exist; give a denoiser's .safetensors file") from error
+    except (SafetensorError, OSError) as error:
+        raise IgsrError(
+            f"{path} is no whole .safetensors file; copy it again or train one"
+        ) from error
+    network = DenoiserNetwork(_architecture(metadata.get("architecture"), path))
+    wanted = network.state_dict()
+    for name, tensor in wanted.items():
+        if name not in weights:
+            raise IgsrError(f"{path} lacks the weight {name}; it is another version's denoiser")
+        if weights[name].shape != tensor.shape or not weights[name].is_floating_point():
+            raise IgsrError(
+                f"{path}: {name} has shape {list(weights[name].shape)} where its architecture "
+                f"needs {list(tensor.shape)}"
+            )
+        if not torch.isfinite(weights[name]).all():
+            raise IgsrError(f"{path}: {name} holds a NaN or infinite weight; train it again")
+    unknown = sorted(set(weights) - set(wanted))
+    if unknown:
+        raise IgsrError(f"{path} holds the weight {unknown[0]}, which igsr's denoisers do not have")
+    network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})
+    # Faster on CPUs by a third.
+    return network.to(memory_format=torch.channels_last).eval()
+
+
+def _architecture(text: str | None, path: Path) -> Architecture:
+    refused = IgsrError(f"{path} does not say which network it is of; it is no denoiser of igsr's")
+    try:
+        given = json.loads(text or "")
+        blocks = tuple(given["blocks"])
+        architecture = Architecture(**{**given, "blocks": blocks})
+    except (ValueError, TypeError, KeyError) as error:
+        raise refused from error
+    sizes = (architecture.width, *architecture.blocks)
+    if (
+        len(blocks) != 3
+        or not all(type(size) is int for size in sizes)
+        or not 2 <= architecture.width <= MOST_WIDTH
+        or architecture.width % 2
+        or not all(0 <= size <= MOST_BLOCKS for size in blocks)
+        or not all(type(flag) is bool for flag in (architecture.residual, architecture.buffers))
+    ):
+        raise refused
+    return architecture

@@ -1,0 +1,71 @@
+"""``igsr denoise``: pairs, training and use from the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import scenes
+from PIL import Image
+from typer.testing import CliRunner
+
+from igsr.cli import app
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A capture, its splats, and a folder with a denoiser trained for a few steps."""
+    folder = tmp_path_factory.mktemp("denoise")
+    scene = scenes.splats()
+    scenes.write_capture(folder / "ball", scenes.capture(views=5, size=40, scene=scene))
+    scene.save(folder / "ball.ply")
+    options = ("--steps", 3, "--views", 1, "--backend", "cpu", "--json")
+    made = run("denoise", "pairs", folder / "ball", "--out", folder / "pairs", *options)
+    assert made.exit_code == 0, made.output
+    assert len(json.loads(made.stdout)["fits"]) == 3
+    options = ("--steps", 4, "--batch", 2, "--crop", 16, "--width", 4, "--json")
+    taught = run("denoise", "train", "--pairs", folder / "pairs", "--out", folder / "out", *options)
+    assert taught.exit_code == 0, taught.output
+    assert json.loads(taught.stdout)["step"] == 4
+    assert (folder / "out" / "loss.png").stat().st_size > 1000
+    return folder
+
+
+def test_views_are_cleaned_with_the_weights_given(trained):
+    out = trained / "clean"
+    done = run(
+        "denoise", "apply", trained / "ball.ply", "--capture", trained / "ball", "--out", out,
+        "--weights", trained / "out" / "denoiser.safetensors", "--backend", "cpu", "--holdout", 4,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    files = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.png"))
+    names = ["photos/00", "photos/04"]
+    assert files == [f"{name}{end}" for name in names for end in (".confidence.png", ".png")]
+    picture = np.asarray(Image.open(out / "photos/00.png"))
+    photo = np.asarray(Image.open(trained / "ball" / "photos/00.png"))
+    # A network that has hardly learnt changes hardly anything.
+    assert np.abs(picture.astype(int) - photo).mean() < 8.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["apply", "ball.ply", "--capture", "ball", "--weights", "none"], "none does not exist"),
+        (["train", "--pairs", "ball"], "holds no .npz of pairs"),
+        (["train", "--pairs", "pairs", "--features", "a", "--lpips", "alex"], "give one"),
+        (["train", "--pairs", "pairs", "--loss", "lpips"], "needs a perceptual distance"),
+        (["train", "--pairs", "pairs", "--photos", "all"], "photos must be one of"),
+        (["pairs", "ball", "--fits", "0"], "fits must be at least 1"),
+    ],
+)
+def test_mistakes_are_one_sentence(trained, monkeypatch, arguments, message):
+    monkeypatch.chdir(trained)
+    done = run("denoise", *arguments, "--out", "wrong")
+    assert done.exit_code == 1
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1

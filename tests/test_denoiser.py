@@ -1,0 +1,380 @@
+"""The denoiser's network, losses, training, files and use."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import igsr
+from igsr.denoiser import (
+    Buffers,
+    NetworkDenoiser,
+    cleaning,
+    denoise,
+    load_network,
+    save_network,
+)
+from igsr.denoiser.inputs import CHANNELS, COLOR
+from igsr.denoiser.losses import LOSSES, Loss, Prediction, error_likelihood, regret
+from igsr.denoiser.network import REACH, Architecture, DenoiserNetwork
+from igsr.denoiser.pair_files import write_pairs
+from igsr.denoiser.perceptual import SqueezeNetDistance, lpips_distance
+from igsr.denoiser.training import CHECKPOINT, LOG, WEIGHTS, Training, train
+from igsr.rendering import Render
+
+SMALL = Architecture(width=4, blocks=(1, 1, 1))
+
+
+def network(architecture=SMALL, seed=0):
+    """With random weights everywhere, so that nothing is the identity."""
+    torch.manual_seed(seed)
+    made = DenoiserNetwork(architecture).eval()
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.copy_(0.3 * torch.randn_like(parameter))
+    return made
+
+
+@pytest.mark.parametrize("photos", ["concatenated", "attention", "none"])
+def test_a_new_network_changes_nothing(photos):
+    inputs = torch.rand(2, CHANNELS, 9, 14)
+    image, log_error = DenoiserNetwork(Architecture(4, (1, 1, 1), photos=photos))(inputs)
+    assert torch.equal(image, inputs[:, :COLOR])
+    assert (log_error == -3.0).all()
+    image, _ = DenoiserNetwork(Architecture(4, (1, 1, 1), residual=False))(inputs)
+    assert not image.any()
+
+
+def test_what_the_architecture_leaves_out_does_not_matter():
+    inputs = torch.rand(1, CHANNELS, 16, 16)
+    other = inputs.clone()
+    other[:, COLOR : COLOR + 8] = 0.5
+    for flags, same in (({"buffers": False}, True), ({}, False)):
+        made = network(Architecture(4, (1, 1, 1), **flags))
+        assert torch.equal(made(inputs)[0], made(other)[0]) is same
+    other = inputs.clone()
+    other[:, COLOR + 8 :] = 0.5
+    for photos, same in (("none", True), ("attention", False), ("concatenated", False)):
+        made = network(Architecture(4, (1, 1, 1), photos=photos))
+        assert torch.equal(made(inputs)[0], made(other)[0]) is same
+
+
+def test_an_output_depends_on_pixels_within_reach_only():
+    made = network(Architecture(4, (2, 2, 4)))
+    inputs = torch.rand(1, CHANNELS, 16, 2 * REACH + 32)
+    changed = inputs.clone()
+    changed[..., :8] = 0.0
+    with torch.inference_mode():
+        difference = (made(inputs)[0] - made(changed)[0]).abs().amax(dim=(0, 1, 2))
+    assert difference[:40].max() > 0.0
+    assert difference[8 + REACH :].max() == 0.0
+
+
+def test_tiles_give_what_the_whole_gives(monkeypatch):
+    color = np.random.default_rng(0).uniform(size=(50, 230, 3)).astype(np.float32)
+    cleaner = NetworkDenoiser(network(Architecture(4, (2, 2, 4))))
+    whole = cleaner(Buffers(color), [])
+    monkeypatch.setattr(cleaning, "TILE", 40)
+    tiled = cleaner(Buffers(color), [])
+    for a, b in zip(whole, tiled, strict=True):
+        assert np.abs(a - b).max() < 1e-5
+    assert np.abs(whole[0] - color).max() > 0.1
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 500), (2, 8000), (33, 7)])
+def test_any_size_comes_out_as_it_went_in(size):
+    color = np.random.default_rng(0).uniform(size=(*size, 3)).astype(np.float32)
+    picture, confidence = denoise(color, denoiser=NetworkDenoiser(network()))
+    assert picture.shape == (*size, 3)
+    assert confidence.shape == size
+    assert picture.dtype == confidence.dtype == np.float32
+    assert 0.0 <= picture.min() <= picture.max() <= 1.0
+    assert 0.0 <= confidence.min() <= confidence.max() <= 1.0
+
+
+def test_pixels_that_are_not_numbers_are_filled_in_without_confidence():
+    color = np.full((20, 20, 3), 0.5, np.float32)
+    color[3, 4] = np.nan
+    color[5, 6, 1] = np.inf
+    picture, confidence = denoise(color, denoiser=NetworkDenoiser(network()))
+    assert np.isfinite(picture).all()
+    assert confidence[3, 4] == confidence[5, 6] == 0.0
+    assert (np.delete(confidence.ravel(), [3 * 20 + 4, 5 * 20 + 6]) > 0.0).all()
+
+
+def test_renders_of_all_kinds_are_taken():
+    cleaner = NetworkDenoiser(network())
+    color = np.random.default_rng(0).integers(0, 255, (8, 9, 3), dtype=np.uint8)
+    floats = color.astype(np.float32) / 255
+    from_bytes = denoise(color, denoiser=cleaner)
+    assert np.array_equal(from_bytes[0], denoise(floats, denoiser=cleaner)[0])
+    assert np.array_equal(from_bytes[0], denoise(Buffers(floats), denoiser=cleaner)[0])
+    ones = np.ones((8, 9), np.float32)
+    drawn = Render(floats, ones, ones, ones, 0 * ones)
+    assert denoise(drawn, denoiser=cleaner)[0].shape == (8, 9, 3)
+    with pytest.raises(igsr.IgsrError, match=r"color must be \[H, W, 3\], not \[8, 9\]"):
+        denoise(floats[..., 0], denoiser=cleaner)
+    with pytest.raises(igsr.IgsrError, match="render must be uint8 or float"):
+        denoise(np.zeros((2, 2, 3), np.int64), denoiser=cleaner)
+
+
+def test_a_network_comes_back_from_its_file(tmp_path):
+    architecture = Architecture(6, (0, 1, 2), residual=False, photos="attention")
+    save_network(network(architecture), tmp_path / "a.safetensors", {"seed": 3})
+    read = load_network(tmp_path / "a.safetensors")
+    assert read.architecture == architecture
+    inputs = torch.rand(1, CHANNELS, 8, 8)
+    assert torch.allclose(read(inputs)[0], network(architecture)(inputs)[0], rtol=1e-2, atol=5e-2)
+
+
+def test_damaged_files_of_weights_are_refused_in_a_sentence(tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    path = tmp_path / "a.safetensors"
+    save_network(network(), path, {})
+    whole = path.read_bytes()
+    weights = load_file(path)
+    about = {
+        "architecture": '{"width": 4, "blocks": [1, 1, 1], "residual": true, "buffers": true, '
+        '"photos": "concatenated"}'
+    }
+
+    def refused(match):
+        with pytest.raises(igsr.IgsrError, match=match) as caught:
+            load_network(path)
+        assert str(path) in str(caught.value)
+
+    for length in (0, 4, 100, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        refused("is no whole .safetensors file")
+    save_file(weights, path)
+    refused("does not say which network it is of")
+    for wrong in (
+        '{"width": 100000, "blocks": [1, 1, 1]}',
+        "[]",
+        '{"width": 4}',
+        "{",
+        '{"width": 4, "blocks": [1, 1]}',
+        '{"width": 4.5, "blocks": [1, 1, 1]}',
+        '{"width": 4, "blocks": [1, 1, 1], "photos": "all"}',
+        '{"width": 4, "blocks": [1, 1, 1], "code": "import os"}',
+    ):
+        save_file(weights, path, metadata={"architecture": wrong})
+        refused("does not say which network it is of")
+    save_file({k: v for k, v in weights.items() if k != "head.bias"}, path, metadata=about)
+    refused("lacks the weight head.bias")
+    save_file(weights | {"head.bias": torch.zeros(3)}, path, metadata=about)
+    refused("head.bias has shape")
+    save_file(weights | {"head.bias": weights["head.bias"] * float("nan")}, path, metadata=about)
+    refused("head.bias holds a NaN")
+    save_file(weights | {"more": torch.zeros(3)}, path, metadata=about)
+    refused("holds the weight more")
+    path.unlink()
+    refused("does not exist")
+
+
+def prediction(image, truth, render=None, log_error=-3.0):
+    render = torch.zeros_like(image) if render is None else render
+    return Prediction(render, image, torch.full_like(image[:, :1], log_error), truth)
+
+
+def test_regret_is_what_was_made_worse_only():
+    truth = torch.full((1, 3, 2, 2), 0.5)
+    render = truth + 0.1
+    better, worse = truth + 0.05, truth - 0.3
+    assert regret(prediction(better, truth, render)) == 0.0
+    assert regret(prediction(worse, truth, render)).item() == pytest.approx(0.2)
+
+
+def test_the_likelihood_is_best_at_the_true_error_and_leaves_the_picture_alone():
+    truth = torch.zeros(1, 3, 4, 4)
+    image = torch.full_like(truth, 0.1, requires_grad=True)
+    values = {
+        log: error_likelihood(prediction(image, truth, log_error=log)).item()
+        for log in (-4.0, float(np.log(0.1)), -1.0)
+    }
+    assert min(values, key=values.get) == float(np.log(0.1))
+    log_error = torch.full((1, 1, 4, 4), -3.0, requires_grad=True)
+    error_likelihood(Prediction(truth, image, log_error, truth)).backward()
+    assert image.grad is None
+    assert log_error.grad.abs().sum() > 0.0
+
+
+def mean_distance(first, second):
+    return (first - second).abs().mean(dim=(1, 2, 3))
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_every_loss_has_its_parts_and_moves_the_network(name):
+    loss = Loss(name, mean_distance, a=0.25)
+    made = network()
+    inputs, truth = torch.rand(1, CHANNELS, 32, 32), torch.rand(1, 3, 32, 32)
+    image, log_error = made(inputs)
+    total, parts = loss(Prediction(inputs[:, :COLOR], image, log_error, truth))
+    expected = {
+        "default": {"charbonnier", "regret", "perceptual", "likelihood"},
+        "gan": {"gan", "likelihood"},
+        "gan+lpips": {"gan", "perceptual", "likelihood"},
+        "lpips": {"perceptual", "likelihood"},
+    }[name]
+    assert set(parts) == expected
+    if name == "gan+lpips":
+        weighed = 0.75 * parts["gan"] + 0.25 * parts["perceptual"] + 0.1 * parts["likelihood"]
+        assert total.item() == pytest.approx(weighed, rel=1e-5)
+    total.backward()
+    assert made.tail.weight.grad.abs().sum() > 0.0
+    with pytest.raises(igsr.IgsrError, match="a must be from 0 to 1"):
+        Loss(name, mean_distance, a=1.5)
+
+
+def test_losses_that_cannot_be_had_are_refused():
+    with pytest.raises(igsr.IgsrError, match="loss must be one of default, gan"):
+        Loss("mse", None)
+    with pytest.raises(igsr.IgsrError, match="loss lpips needs a perceptual distance"):
+        Loss("lpips", None)
+    with pytest.raises(igsr.IgsrError, match="backbone must be one of alex, vgg, squeeze"):
+        lpips_distance("resnet")
+
+
+def pair_files(folder, count=3, size=40):
+    """Truth is smooth; renders are the truth with coarse noise."""
+    random = np.random.default_rng(0)
+    paths = []
+    for k in range(count):
+        y, x = np.mgrid[:size, :size] / size
+        truth = np.stack([np.sin(4 * x + k), np.cos(5 * y), np.sin(3 * (x + y))]) * 0.4 + 0.5
+        inputs = np.zeros((2, CHANNELS, size, size), np.uint8)
+        noise = (
+            random.normal(scale=0.1, size=(2, 3, size // 4, size // 4)).repeat(4, 2).repeat(4, 3)
+        )
+        inputs[:, :3] = np.clip(255 * (truth + noise), 0, 255)
+        whole = np.repeat((255 * truth).astype(np.uint8)[None], 2, 0)
+        write_pairs(folder / f"{k}.npz", list(inputs), list(whole))
+        paths.append(folder / f"{k}.npz")
+    return paths
+
+
+TINY = Training(steps=60, batch=4, crop=32, rate=5e-3)
+
+
+def log_of(out):
+    return [json.loads(line) for line in (out / LOG).read_text().splitlines()]
+
+
+def test_training_makes_validation_better(tmp_path):
+    training = replace(TINY, steps=150)
+    pairs = pair_files(tmp_path / "pairs")
+    train(pairs, tmp_path, training, Architecture(8, (1, 1, 1)), log_every=50, checkpoint_every=75)
+    rows = log_of(tmp_path)
+    assert [row["step"] for row in rows] == [50, 75, 100, 150]
+    assert rows[-1]["validation_psnr"] > rows[-1]["validation_psnr_before"] + 0.2
+    assert load_network(tmp_path / WEIGHTS).architecture == Architecture(8, (1, 1, 1))
+
+
+def test_training_repeats_to_the_bit(tmp_path):
+    pairs = pair_files(tmp_path / "pairs")
+    training = replace(TINY, steps=6)
+    first, second = (train(pairs, tmp_path / out, training, SMALL) for out in "ab")
+    for one, other in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(one, other)
+    other = train(pairs, tmp_path / "c", replace(training, seed=1), SMALL)
+    assert not torch.equal(first.tail.weight, other.tail.weight)
+
+
+@pytest.mark.parametrize("loss", ["default", "gan"])
+def test_a_training_that_was_stopped_ends_with_the_same_weights(tmp_path, loss):
+    pairs = pair_files(tmp_path / "pairs")
+    training = replace(TINY, steps=12, loss=loss, dropout=0.2)
+
+    class Stop(Exception):
+        pass
+
+    def stop(now):
+        if now.step == 8:
+            raise Stop
+
+    whole = train(pairs, tmp_path / "a", training, SMALL, log_every=4, checkpoint_every=4)
+    with pytest.raises(Stop):
+        train(
+            pairs, tmp_path / "b", training, SMALL, log_every=4, checkpoint_every=4, progress=stop
+        )
+    resumed = train(
+        pairs, tmp_path / "b", training, SMALL, log_every=4, checkpoint_every=4, resume=True
+    )
+    for one, other in zip(whole.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+    with pytest.raises(igsr.IgsrError, match="is of a training with other pairs or settings"):
+        train(pairs, tmp_path / "b", replace(training, rate=1e-4), SMALL, resume=True)
+    data = (tmp_path / "b" / CHECKPOINT).read_bytes()
+    (tmp_path / "b" / CHECKPOINT).write_bytes(data[:999])
+    with pytest.raises(igsr.IgsrError, match="is no whole checkpoint"):
+        train(pairs, tmp_path / "b", training, SMALL, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"crop": 30}, "crop must be a multiple of 8"),
+        ({"rate": float("nan")}, "rate must be positive"),
+        ({"dropout": 1.0}, "dropout must be from 0 to 1"),
+    ],
+)
+def test_bad_settings_of_a_training(options, message):
+    with pytest.raises(igsr.IgsrError, match=message):
+        Training(**options)
+
+
+def test_training_needs_two_files_of_pairs(tmp_path):
+    with pytest.raises(igsr.IgsrError, match="at least two files of pairs"):
+        train(pair_files(tmp_path, count=1), tmp_path / "out", TINY, SMALL)
+
+
+def squeezenet_file(path):
+    from igsr.denoiser.perceptual import _FIRES
+
+    random = np.random.default_rng(0)
+    shapes = {"conv1": (96, 3, 7, 7)}
+    channels = 96
+    for number, (squeezed, expanded) in _FIRES.items():
+        shapes[f"fire{number}/conv1x1_1"] = (squeezed, channels, 1, 1)
+        shapes[f"fire{number}/conv1x1_2"] = (expanded, squeezed, 1, 1)
+        shapes[f"fire{number}/conv3x3_2"] = (expanded, squeezed, 3, 3)
+        channels = 2 * expanded
+    arrays = {}
+    for name, shape in shapes.items():
+        scale = np.sqrt(2.0 / np.prod(shape[1:]))
+        arrays[f"{name}.weight"] = (scale * random.normal(size=shape)).astype(np.float32)
+        arrays[f"{name}.bias"] = np.zeros(shape[0], np.float32)
+    np.savez(path, **arrays)
+    return arrays
+
+
+def test_the_feature_distance_grows_with_blur_and_carries_gradients(tmp_path):
+    arrays = squeezenet_file(tmp_path / "s.npz")
+    distance = SqueezeNetDistance(tmp_path / "s.npz")
+    picture = torch.rand(2, 3, 48, 48)
+    kernel = torch.ones(3, 1, 5, 5) / 25
+    blurred = torch.nn.functional.conv2d(picture, kernel, padding=2, groups=3)
+    slightly = 0.8 * picture + 0.2 * blurred
+    assert (distance(picture, picture) == 0.0).all()
+    assert (distance(picture, slightly) < distance(picture, blurred)).all()
+    slightly.requires_grad_()
+    distance(picture, slightly).sum().backward()
+    assert slightly.grad.abs().sum() > 0.0
+    with pytest.raises(igsr.IgsrError, match="pictures must be at least 32 pixels"):
+        distance(picture[..., :20], picture[..., :20])
+
+    del arrays["fire4/conv1x1_1.bias"]
+    np.savez(tmp_path / "lacking.npz", **arrays)
+    (tmp_path / "torn.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:5000])
+    for name, message in (
+        ("lacking", "lacks .*fire4/conv1x1_1.bias"),
+        ("torn", "is no whole .npz file"),
+        ("none", "does not exist"),
+    ):
+        with pytest.raises(igsr.IgsrError, match=message):
+            SqueezeNetDistance(tmp_path / f"{name}.npz")
