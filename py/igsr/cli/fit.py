@@ -168,7 +168,7 @@ def fit_command(
     with one_sentence(interrupted):
         name = resolved(backend)
         with warnings_as_sentences():
-            capture = capture_to_fit(
+            capture, found = capture_to_fit(
                 capture_path,
                 out,
                 holdout,
@@ -239,8 +239,9 @@ def fit_command(
         }
         write_contact_sheet(out / "views.png", sheet)
         write_report(out / "report.json", report)
-        if moved and split == "test":
-            # Photos that were not fitted have the cameras they were given; these are their best.
+        if (moved or found) and split == "test":
+            # Photos that were not fitted have the cameras they were given, which may be as wrong
+            # as those that were found or moved; these are their best.
             report["refined"] = _refined_scores(splats, fitted, color, name, shown=not as_json)
             write_report(out / "report.json", report)
     if as_json:

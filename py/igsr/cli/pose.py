@@ -90,14 +90,17 @@ def capture_to_fit(
     *,
     resume: bool,
     shown: bool,
-) -> Capture:
-    """The capture at a path; photos without cameras get them, kept in ``out/capture``."""
+) -> tuple[Capture, bool]:
+    """The capture at a path, and whether its cameras were found here.
+
+    Photos without cameras get them, kept in ``out/capture``.
+    """
     if holds_cameras(path) or not has_photos(path):
         if finder.options or finder.estimator != AUTO:
             raise IgsrError(
                 f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
             )
-        return load(path, holdout)
+        return load(path, holdout), False
     kept = out / "capture"
     if kept.resolve() in (path.resolve(), *path.resolve().parents):
         raise IgsrError(f"{path} lies where the fit would write {kept}; name another --out")
@@ -109,7 +112,7 @@ def capture_to_fit(
             f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
             f"{report['estimator']} and are kept in {kept}"
         )
-    return load(kept, holdout)
+    return load(kept, holdout), True
 
 
 def pose_command(
