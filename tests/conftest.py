@@ -1,9 +1,12 @@
 """Fixtures that several test files share."""
 
+import subprocess
 from pathlib import Path
 
 import hypothesis
 import pytest
+
+from igsr import cli
 
 # A failure must be the same failure on the next run, and a slow machine is no failure.
 hypothesis.settings.register_profile("igsr", derandomize=True, deadline=None)
@@ -14,3 +17,17 @@ hypothesis.settings.load_profile("igsr")
 def example_path() -> Path:
     """The capture that is committed as an example."""
     return Path(__file__).parent.parent / "examples" / "tea_table"
+
+
+@pytest.fixture
+def igsr_here(capsys):
+    """The ``igsr`` command within this process: a new one would import torch each time."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.app([str(argument) for argument in arguments])
+        output = capsys.readouterr()
+        return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
+
+    return run

@@ -18,7 +18,6 @@ import scenes
 from PIL import Image
 
 import igsr
-from igsr import cli
 from igsr.cli.shared import PresetChoice
 from igsr.presets import PRESETS
 
@@ -29,20 +28,6 @@ FIT = ["--steps", "60", "--max-splats", "300", "--sh-degree", "1", "--backend", 
 def igsr_command(*arguments, **options):
     command = [*COMMAND, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
-
-
-@pytest.fixture
-def igsr_here(capsys):
-    """``igsr_command`` within this process: a new one would import torch each time."""
-
-    def run(*arguments):
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.app([str(argument) for argument in arguments])
-        output = capsys.readouterr()
-        return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
-
-    return run
 
 
 def refused(result, *words, code=1):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,6 @@ import scenes
 from PIL import Image
 
 import igsr
-from igsr import cli
 from igsr.capture.undistort import Lens
 from igsr.pose import registry
 from igsr.pose.accuracy import pose_accuracy
@@ -20,18 +18,6 @@ from igsr.pose.estimate import Estimate
 
 MADE = scenes.capture(views=6, size=40)
 FIT = ["--steps", "30", "--max-splats", "200", "--sh-degree", "0", "--backend", "cpu", "--json"]
-
-
-@pytest.fixture
-def run(capsys):
-    def run(*arguments):
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.app([str(argument) for argument in arguments])
-        output = capsys.readouterr()
-        return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
-
-    return run
 
 
 def refused(result, *words):
@@ -75,9 +61,9 @@ def calls(monkeypatch):
     return calls
 
 
-def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, run):
+def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, igsr_here):
     out = tmp_path / "posed"
-    result = run("pose", photos, "--out", out, "--plot", "--json")
+    result = igsr_here("pose", photos, "--out", out, "--plot", "--json")
     assert result.returncode == 0, result.stderr
     assert result.stderr == "Not placed: 02.png.\n"
     report = json.loads(result.stdout)
@@ -96,31 +82,33 @@ def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, run):
     with Image.open(out / "poses.png") as plot:
         colors = {color for _, color in plot.convert("RGB").getcolors(1 << 20)}
     assert len(colors) > 50  # five cameras, each of its own colour
-    again = run("pose", photos, "--out", tmp_path / "plain")
+    again = igsr_here("pose", photos, "--out", tmp_path / "plain")
     assert "5 of 6 photos placed by colmap" in again.stdout
-    refused(run("pose", photos, "--out", out), out, "holds something already")
+    refused(igsr_here("pose", photos, "--out", out), out, "holds something already")
     assert len(calls) == 2
 
 
-def test_mistakes_of_pose(photos, calls, tmp_path, run):
+def test_mistakes_of_pose(photos, calls, tmp_path, igsr_here):
     out = tmp_path / "out"
-    refused(run("pose", tmp_path / "nowhere", "--out", out), "nowhere")
-    refused(run("pose", photos / "00.png", "--out", out), "2 photos at least", "00.png")
-    refused(run("pose", photos, "--out", out, "--checkpoint", "x"), "checkpoint", "colmap")
-    refused(run("pose", photos, "--out", out, "--graph", "swin-3"), "graph", "colmap")
-    refused(run("pose", photos, "--out", out, "--estimator", "magic"), "magic", "dust3r or colmap")
-    refused(run("pose", photos, "--out", photos / "00.png"), "it is a file")
+    refused(igsr_here("pose", tmp_path / "nowhere", "--out", out), "nowhere")
+    refused(igsr_here("pose", photos / "00.png", "--out", out), "2 photos at least", "00.png")
+    refused(igsr_here("pose", photos, "--out", out, "--checkpoint", "x"), "checkpoint", "colmap")
+    refused(igsr_here("pose", photos, "--out", out, "--graph", "swin-3"), "graph", "colmap")
+    refused(
+        igsr_here("pose", photos, "--out", out, "--estimator", "magic"), "magic", "dust3r or colmap"
+    )
+    refused(igsr_here("pose", photos, "--out", photos / "00.png"), "it is a file")
     given = scenes.write_capture(tmp_path / "given", MADE)
-    refused(run("pose", given, "--out", out), "has cameras already", "--estimator")
+    refused(igsr_here("pose", given, "--out", out), "has cameras already", "--estimator")
     (photos / "03.png").write_bytes(b"no photo")
-    result = run("pose", photos, "--out", out)
+    result = igsr_here("pose", photos, "--out", out)
     assert result.returncode == 0
     assert "One of 6 photos is left out" in result.stderr
     assert "03.png" in result.stderr
     assert calls == [["00.png", "01.png", "02.png", "04.png", "05.png"]]
 
 
-def test_nothing_placed_is_a_sentence(photos, tmp_path, run, monkeypatch):
+def test_nothing_placed_is_a_sentence(photos, tmp_path, igsr_here, monkeypatch):
     def make():
         def run(photos, *, seed=0, progress=None):
             nothing = [None] * len(photos)
@@ -130,29 +118,29 @@ def test_nothing_placed_is_a_sentence(photos, tmp_path, run, monkeypatch):
 
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
     refused(
-        run("pose", photos, "--out", tmp_path / "out", "--estimator", "colmap"),
+        igsr_here("pose", photos, "--out", tmp_path / "out", "--estimator", "colmap"),
         "No camera could be found", "6 photos",
     )  # fmt: skip
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("form", ["colmap", "colmap-text", "transforms"])
-def test_export(tmp_path, run, form):
+def test_export(tmp_path, igsr_here, form):
     given = scenes.write_capture(tmp_path / "given", MADE)
     out = tmp_path / "out"
-    result = run("export", given, "--format", form, "--out", out, "--json")
+    result = igsr_here("export", given, "--format", form, "--out", out, "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout) == {"out": str(out), "format": form, "views": 6}
     cameras = [view.camera for view in igsr.load_capture(out).views]
     exact = pose_accuracy(cameras, [view.camera for view in MADE.views])
     assert exact["ATE"] < 1e-9
-    refused(run("export", given, "--format", form, "--out", out), "holds something already")
+    refused(igsr_here("export", given, "--format", form, "--out", out), "holds something already")
 
 
-def test_fit_finds_cameras_once_and_keeps_them(photos, calls, tmp_path, run):
+def test_fit_finds_cameras_once_and_keeps_them(photos, calls, tmp_path, igsr_here):
     out = tmp_path / "fitted"
     fit = ["fit", photos, "--out", out, "--holdout", "4", *FIT]
-    first = run(*fit)
+    first = igsr_here(*fit)
     assert first.returncode == 0, first.stderr
     assert "Not placed: 02.png." in first.stderr
     assert f"Cameras of 5 of 6 photos were found by colmap and are kept in {out}" in first.stderr
@@ -161,35 +149,35 @@ def test_fit_finds_cameras_once_and_keeps_them(photos, calls, tmp_path, run):
     # Cameras that were found may be wrong for the photos held out as well.
     assert report["refined"]["psnr"] > report["psnr"]
     scene = (out / "scene.ply").read_bytes()
-    resumed = run(*fit, "--resume")
+    resumed = igsr_here(*fit, "--resume")
     assert "The cameras found before are used" in resumed.stderr
     assert len(calls) == 1
     assert (out / "scene.ply").read_bytes() == scene
-    assert run(*fit).returncode == 0  # anew, over what was there
+    assert igsr_here(*fit).returncode == 0  # anew, over what was there
     assert len(calls) == 2
     assert (out / "scene.ply").read_bytes() == scene
-    scored = run("eval", out / "scene.ply", out / "capture", "--holdout", "4", "--json")
+    scored = igsr_here("eval", out / "scene.ply", out / "capture", "--holdout", "4", "--json")
     assert json.loads(scored.stdout)["psnr"] == report["psnr"]
 
 
-def test_mistakes_of_fit_without_cameras(photos, calls, tmp_path, run):
+def test_mistakes_of_fit_without_cameras(photos, calls, tmp_path, igsr_here):
     given = scenes.write_capture(tmp_path / "given", MADE)
     out = tmp_path / "out"
-    refused(run("fit", given, "--out", out, "--estimator", "colmap", *FIT), "--estimator")
-    refused(run("eval", "scene.ply", photos), "scene.ply")
+    refused(igsr_here("fit", given, "--out", out, "--estimator", "colmap", *FIT), "--estimator")
+    refused(igsr_here("eval", "scene.ply", photos), "scene.ply")
     inside = out / "capture" / "photos"
     inside.parent.mkdir(parents=True)
     photos.rename(inside)
-    refused(run("fit", inside, "--out", out, *FIT), "lies where the fit would write")
+    refused(igsr_here("fit", inside, "--out", out, *FIT), "lies where the fit would write")
     assert len(list(inside.iterdir())) == 6
     assert calls == []
 
 
-def test_captures_without_cameras_are_told_of_pose(photos, run):
-    refused(run("info", photos), "6 images but no cameras", "igsr pose")
+def test_captures_without_cameras_are_told_of_pose(photos, igsr_here):
+    refused(igsr_here("info", photos), "6 images but no cameras", "igsr pose")
 
 
-def test_lenses_are_undone(monkeypatch, photos, tmp_path, run):
+def test_lenses_are_undone(monkeypatch, photos, tmp_path, igsr_here):
     def make():
         def run(photos, *, seed=0, progress=None):
             nothing = [None] * len(photos)
@@ -201,14 +189,14 @@ def test_lenses_are_undone(monkeypatch, photos, tmp_path, run):
 
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
     out = tmp_path / "out"
-    assert run("pose", photos, "--out", out, "--estimator", "colmap").returncode == 0
+    assert igsr_here("pose", photos, "--out", out, "--estimator", "colmap").returncode == 0
     views = igsr.load_capture(out).views
     assert (out / "masks/00.png.png").is_file()
     assert 0.5 < views[0].mask.mean() < 1.0
     assert not np.array_equal(views[0].image, MADE.views[0].image)
 
 
-def test_study_of_poses(tmp_path, run, calls, monkeypatch):
+def test_study_of_poses(tmp_path, igsr_here, calls, monkeypatch):
     turned = replace(
         MADE.views[0].camera, viewmat=np.diag([-1.0, -1.0, 1.0, 1.0]) @ MADE.views[0].camera.viewmat
     )
@@ -227,7 +215,7 @@ def test_study_of_poses(tmp_path, run, calls, monkeypatch):
 
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
     study = ["study", "poses", tmp_path, "--out", tmp_path / "out", "--scene", "ring"]
-    done = run(*study, "--scene", "plain")
+    done = igsr_here(*study, "--scene", "plain")
     assert done.returncode == 0, done.stderr
     assert "1 of 2: ring seed 0: 6 of 6 placed" in done.stderr
     # Five of fifteen pairs have the camera that stands on its head.
@@ -235,5 +223,5 @@ def test_study_of_poses(tmp_path, run, calls, monkeypatch):
     assert "| plain | 0 | 3 | 3 | - |" in done.stdout
     report = json.loads((tmp_path / "out/study.json").read_text())
     assert report["protocol"] == {"name": "poses", "estimator": "colmap", "seeds": 1}
-    refused(run(*study, "--views", "3"), "--views says nothing to poses")
-    refused(run(*study, "--estimator", "magic"), "estimator must be")
+    refused(igsr_here(*study, "--views", "3"), "--views says nothing to poses")
+    refused(igsr_here(*study, "--estimator", "magic"), "estimator must be")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 import scenes
 
 import igsr
-from igsr import cli, metrics
+from igsr import metrics
 from igsr.compaction import contribution, yardstick
 from igsr.compaction.yardstick import loss_of_change, own_yardstick, photo_yardstick
 
@@ -286,18 +285,6 @@ def test_scenes_and_captures_that_cannot_be_used(photos):
 
 
 # ---- the command -------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def igsr_here(capsys):
-    def run(*arguments):
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.app([str(argument) for argument in arguments])
-        output = capsys.readouterr()
-        return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
-
-    return run
 
 
 def test_command_writes_scene_curve_and_plot(igsr_here, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import enum
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,8 +20,11 @@ from ..splats import Splats
 from .shared import (
     BackendChoice,
     BackendOption,
+    JobsOption,
     JsonOption,
+    RayOption,
     SplitChoice,
+    TimeLeft,
     error_console,
     load,
     one_sentence,
@@ -83,10 +85,8 @@ def pairs_command(
         int | None, typer.Option("--steps", help="Of each fit. Default: as igsr fit.")
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same pairs.")] = 0,
-    jobs: Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")] = 1,
-    ray: Annotated[
-        bool, typer.Option("--ray", help="Fits go over a Ray cluster (pip install 'igsr[ray]').")
-    ] = False,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
@@ -99,15 +99,13 @@ def pairs_command(
     with one_sentence(
         lambda: "Interrupted; finished fits are kept, the same command goes on from there."
     ):
-        started = time.monotonic()
-        first: list[int] = []
+        time_left = TimeLeft()
 
         def on_run(done: int, total: int, row: dict[str, Any]) -> None:
-            first[:] = first or [done - 1]
-            left = (time.monotonic() - started) / (done - first[0]) * (total - done)
+            left = time_left(done, total)
             error_console().print(
                 f"{done} of {total}: {row['pairs']} from {row['photos']} photos, "
-                f"{row['psnr']:.2f} dB; about {left / 60.0:.0f} min left"
+                f"{row['psnr']:.2f} dB; {left}"
             )
 
         rows = make_pairs(

@@ -6,6 +6,7 @@ import contextlib
 import enum
 import json
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -81,6 +82,10 @@ HoldoutOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, for machines.")]
 
 
+JobsOption = Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")]
+RayOption = Annotated[
+    bool, typer.Option("--ray", help="Fits go over a Ray cluster (pip install 'igsr[ray]').")
+]
 CaptureArgument = Annotated[
     Path, typer.Argument(metavar="CAPTURE", help="Folder or file that holds photos and cameras.")
 ]
@@ -150,6 +155,21 @@ def load(path: Path, holdout: int | None) -> Capture:
     """A capture, with every ``holdout``-th view held out if that is given."""
     capture = load_capture(path)
     return capture if holdout is None else capture.with_holdout(holdout)
+
+
+class TimeLeft:
+    """Time left of runs of which some were there already, guessed from those done since."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+        self._before: int | None = None
+
+    def __call__(self, done: int, total: int) -> str:
+        """In words, when ``done`` of ``total`` are there."""
+        if self._before is None:
+            self._before = done - 1
+        each = (time.monotonic() - self._started) / (done - self._before)
+        return f"about {each * (total - done) / 60.0:.0f} min left"
 
 
 def error_console() -> Console:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 import inspect
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,8 +14,11 @@ from ..errors import IgsrError
 from .shared import (
     BackendChoice,
     BackendOption,
+    JobsOption,
     JsonOption,
     PresetChoice,
+    RayOption,
+    TimeLeft,
     error_console,
     one_sentence,
     output_console,
@@ -85,11 +87,8 @@ def study_command(
     seeds: Annotated[
         int | None, typer.Option("--seeds", help="Fits of each kind. [3; poses: 1]")
     ] = None,
-    jobs: Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")] = 1,
-    ray: Annotated[
-        bool,
-        typer.Option("--ray", help="Fits go over a Ray cluster (pip install 'igsr[ray]')."),
-    ] = False,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
@@ -103,17 +102,14 @@ def study_command(
         lambda: "Interrupted; finished fits are kept, the same command goes on from there."
     ):
         console = error_console()
-        started = time.monotonic()
-        first: list[int] = []
+        time_left = TimeLeft()
 
         def on_run(done: int, total: int, row: dict[str, Any]) -> None:
-            first[:] = first or [done - 1]
-            left = (time.monotonic() - started) / (done - first[0]) * (total - done)
+            left = time_left(done, total)
             if protocol is StudyChoice.poses:
                 console.print(
                     f"{done} of {total}: {row['scene']} seed {row['seed']}: {row['registered']} of "
-                    f"{row['photos']} placed in {row['seconds']:.0f} s; about {left / 60.0:.0f} "
-                    "min left"
+                    f"{row['photos']} placed in {row['seconds']:.0f} s; {left}"
                 )
                 return
             if protocol is StudyChoice.pose_noise:
@@ -123,7 +119,7 @@ def study_command(
                 kind, psnr = f"views {row['views']} {row['preset']}", row["psnr"]
             console.print(
                 f"{done} of {total}: {row['scene']} {kind} seed {row['seed']}: "
-                f"{psnr:.2f} dB in {row['seconds']:.0f} s; about {left / 60.0:.0f} min left"
+                f"{psnr:.2f} dB in {row['seconds']:.0f} s; {left}"
             )
 
         studies: dict[StudyChoice, Callable[..., dict[str, Any]]] = {
