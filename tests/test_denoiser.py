@@ -19,7 +19,7 @@ from igsr.denoiser import (
 from igsr.denoiser.inputs import CHANNELS, COLOR
 from igsr.denoiser.losses import LOSSES, Loss, Prediction, error_likelihood, regret
 from igsr.denoiser.network import REACH, Architecture, DenoiserNetwork
-from igsr.denoiser.pair_files import write_pairs
+from igsr.denoiser.pair_files import Pairs, write_pairs
 from igsr.denoiser.perceptual import SqueezeNetDistance, lpips_distance
 from igsr.denoiser.training import CHECKPOINT, LOG, WEIGHTS, Training, train
 from igsr.rendering import Render
@@ -251,7 +251,8 @@ def pair_files(folder, count=3, size=40):
         )
         inputs[:, :3] = np.clip(255 * (truth + noise), 0, 255)
         whole = np.repeat((255 * truth).astype(np.uint8)[None], 2, 0)
-        write_pairs(folder / f"{k}.npz", list(inputs), list(whole))
+        known = np.ones((2, size, size), np.bool_)
+        write_pairs(folder / f"{k}.npz", Pairs(inputs, whole, known))
         paths.append(folder / f"{k}.npz")
     return paths
 

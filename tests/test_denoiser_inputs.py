@@ -1,5 +1,7 @@
 """What the denoiser looks at: buffers, photos warped to a render, network channels, pairs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
@@ -8,8 +10,9 @@ import igsr
 from igsr.capture import Camera, View
 from igsr.denoiser import Buffers, Source, Warped, photo_support, render_buffers, warp_photos
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
-from igsr.denoiser.pair_files import OFFSET, SCALE, packed, read_pairs, write_pairs
+from igsr.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
 from igsr.denoiser.pairs import make_pairs, rendered_pairs
+from igsr.evaluation import BLACK
 
 
 def camera(x=0.0, size=32, focal=40.0):
@@ -167,16 +170,20 @@ def test_eight_bits_keep_what_counts(tmp_path):
     assert np.abs(restored[COLOR + 4]).max() < 1e-6, "zero stays zero"
 
     truth = random.integers(0, 255, (3, 5, 6), dtype=np.uint8)
-    write_pairs(tmp_path / "a.npz", [packed(inputs)], [truth])
+    mask = random.uniform(size=(5, 6)) < 0.5
+    write_pairs(tmp_path / "a.npz", Pairs(packed(inputs)[None], truth[None], mask[None]))
     pairs = read_pairs(tmp_path / "a.npz")
+    assert np.array_equal(pairs.inputs[0], packed(inputs))
     assert np.array_equal(pairs.truth[0], truth)
+    assert np.array_equal(pairs.masks[0], mask)
     data = (tmp_path / "a.npz").read_bytes()
     (tmp_path / "torn.npz").write_bytes(data[: len(data) // 2])
     with pytest.raises(igsr.IgsrError, match=r"torn\.npz is no whole file of pairs"):
         read_pairs(tmp_path / "torn.npz")
     with pytest.raises(igsr.IgsrError, match=r"missing\.npz does not exist"):
         read_pairs(tmp_path / "missing.npz")
-    np.savez(tmp_path / "old.npz", inputs=np.zeros((1, 4, 5, 6), np.uint8), truth=truth[None])
+    old = {"inputs": np.zeros((1, 4, 5, 6), np.uint8), "truth": truth[None], "masks": mask[None]}
+    np.savez(tmp_path / "old.npz", **old)
     with pytest.raises(igsr.IgsrError, match=r"old\.npz holds pairs of another version"):
         read_pairs(tmp_path / "old.npz")
 
@@ -187,11 +194,19 @@ def test_a_photo_is_not_looked_up_in_itself():
     for k, x in enumerate((0.0, 0.4)):
         picture = igsr.render(scene, camera(x), backend="cpu").to_uint8()
         views.append(View(f"{k}.png", camera(x), "train", picture))
-    inputs, truth = rendered_pairs(scene, views, views, (0.0, 0.0, 0.0), "cpu")
+    pairs = rendered_pairs(scene, views, views, BLACK, "cpu")
     valid = COLOR + BUFFERS + 3
-    assert inputs[0][valid, 16, 16] == 255
-    assert inputs[0][valid + 5].max() == 0, "the only other photo is the other one"
-    assert np.array_equal(truth[1], np.moveaxis(views[1].image, -1, 0))
+    assert pairs.inputs[0][valid, 16, 16] == 255
+    assert pairs.inputs[0][valid + 5].max() == 0, "the only other photo is the other one"
+    assert np.array_equal(pairs.truth[1], np.moveaxis(views[1].image, -1, 0))
+    assert pairs.masks.all()
+    hidden = np.eye(32, dtype=np.bool_)
+    masked = [replace(views[0], mask=hidden)]
+    assert np.array_equal(rendered_pairs(scene, views, masked, BLACK, "cpu").masks[0], hidden)
+    small = replace(camera(0.0), width=16)
+    other = View("small.png", small, "train", views[1].image[:, :16])
+    with pytest.raises(igsr.IgsrError, match="views to render are of sizes"):
+        rendered_pairs(scene, views, [views[0], other], BLACK, "cpu")
 
 
 @pytest.mark.parametrize("recipe", ["sparse", "underfit", "noise", "leave-one-out"])

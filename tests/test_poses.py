@@ -16,7 +16,7 @@ from igsr.cli import app
 from igsr.evaluation import BLACK
 from igsr.poses import Similarity, pose_errors, refine_cameras, similarity_between
 from igsr.study import noisy_poses, pose_noise
-from igsr.study.noisy_poses import CLEAN, Noise, PoseFit, compared, noisy_view, run_fit
+from igsr.study.noisy_poses import CLEAN, Noise, PoseFit, compared, noise_unit, noisy_view, run_fit
 from igsr.study.noisy_poses import markdown as pose_table
 
 
@@ -297,6 +297,24 @@ def test_noise_has_the_size_that_it_says(made):
     ]
     assert np.std(moves) == pytest.approx(0.01, rel=0.1)
     assert noisy_view(view, CLEAN, random).camera.viewmat == pytest.approx(true, abs=1e-12)
+
+
+def test_noise_on_positions_goes_by_how_far_cameras_stand_from_what_they_see():
+    views = scenes.capture(views=6, size=16).views
+    unit = noise_unit(views)
+    for view in views:
+        distance = np.linalg.norm(view.camera.centre)
+        assert distance / 4.03 == pytest.approx(unit, rel=0.05), "they look at the origin"
+
+    def moved(unit):
+        random = np.random.default_rng(3)
+        noisy = noisy_view(views[0], Noise("matrix", 0.01), random, unit)
+        return noisy.camera.viewmat[:3, :3], noisy.camera.centre - views[0].camera.centre
+
+    (turned, offset), (as_turned, doubled) = moved(1.0), moved(2.0)
+    assert np.array_equal(turned, as_turned)
+    assert doubled == pytest.approx(2.0 * offset, abs=1e-9)
+    assert noise_unit(views[:1]) == 1.0, "one camera does not say how far it looks"
 
 
 def test_affine_noise_is_the_same_picture_with_a_shear(made):

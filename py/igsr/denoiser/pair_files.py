@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,10 +33,12 @@ class Pairs:
         inputs: uint8 [V, ``CHANNELS``, H, W]; times ``SCALE`` plus ``OFFSET`` is what
             ``network_inputs`` gave.
         truth: uint8 [V, 3, H, W], the true pictures.
+        masks: bool [V, H, W], where the true pictures may be relied on.
     """
 
     inputs: Bytes
     truth: Bytes
+    masks: npt.NDArray[np.bool_]
 
 
 def packed(inputs: npt.NDArray[np.float32]) -> Bytes:
@@ -46,7 +47,7 @@ def packed(inputs: npt.NDArray[np.float32]) -> Bytes:
     return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
 
-def write_pairs(path: Path, inputs: Sequence[Bytes], truth: Sequence[Bytes]) -> None:
+def write_pairs(path: Path, pairs: Pairs) -> None:
     """Write the pairs of a fit as ``.npz``, under a temporary name first.
 
     Raises:
@@ -54,7 +55,7 @@ def write_pairs(path: Path, inputs: Sequence[Bytes], truth: Sequence[Bytes]) -> 
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, inputs=np.stack(inputs), truth=np.stack(truth))
+        np.savez_compressed(file, inputs=pairs.inputs, truth=pairs.truth, masks=pairs.masks)
 
 
 def read_pairs(path: str | os.PathLike[str]) -> Pairs:
@@ -65,7 +66,7 @@ def read_pairs(path: str | os.PathLike[str]) -> Pairs:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            pairs = Pairs(file["inputs"], file["truth"])
+            pairs = Pairs(file["inputs"], file["truth"], file["masks"])
     except FileNotFoundError as error:
         raise IgsrError(f"{path} does not exist; make pairs with igsr denoise pairs") from error
     except (
@@ -77,13 +78,15 @@ def read_pairs(path: str | os.PathLike[str]) -> Pairs:
         zipfile.LargeZipFile,
     ) as error:
         raise IgsrError(f"{path} is no whole file of pairs; make it again") from error
-    inputs, truth = pairs.inputs, pairs.truth
+    inputs, truth, masks = pairs.inputs, pairs.truth, pairs.masks
     if (
         inputs.ndim != 4
         or inputs.dtype != np.uint8
         or truth.dtype != np.uint8
         or inputs.shape[1] != CHANNELS
+        or masks.dtype != np.bool_
         or truth.shape != (len(inputs), 3, *inputs.shape[2:])
+        or masks.shape != (len(inputs), *inputs.shape[2:])
         or 0 in inputs.shape
     ):
         raise IgsrError(

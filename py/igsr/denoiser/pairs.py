@@ -18,11 +18,11 @@ from ..fitting import fit_with_cameras
 from ..metrics import psnr
 from ..presets import preset_settings
 from ..splats import Splats
-from ..study.noisy_poses import AFFINE, MATRIX, TURN, Noise, noisy_view
+from ..study.noisy_poses import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
 from ..study.runs import Run, finished_runs
 from .buffers import photo_support, render_buffers
-from .inputs import PHOTOS, network_inputs
-from .pair_files import Bytes, packed, write_pairs
+from .inputs import COLOR, PHOTOS, network_inputs
+from .pair_files import Pairs, packed, write_pairs
 from .warping import photo_sources, warp_photos
 
 #: Kinds of fits. "sparse" has 3 to 12 photos; "underfit" stops early; "noise" has wrong cameras;
@@ -129,20 +129,24 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
     has_alpha = train[0].image.shape[2] == 4
     background = WHITE if not has_alpha or random.uniform() < 0.7 else tuple(random.uniform(size=3))
     fitted = [train[i] for i in random.permutation(len(train))[:FITTED_RENDERED]]
-    inputs, truth = rendered_pairs(splats, train, unseen + fitted, background, one.backend)
+    pairs = rendered_pairs(splats, train, unseen + fitted, background, one.backend)
     file = f"{name}-{one.recipe}-{one.number}-seed{one.seed}.npz"
-    write_pairs(out / file, inputs, truth)
+    write_pairs(out / file, pairs)
+    seen, true, masks = pairs.inputs[:, :COLOR], pairs.truth, pairs.masks
     before = [
-        psnr(np.moveaxis(seen[:3], 0, -1).copy(), np.moveaxis(true, 0, -1).copy())
-        for seen, true in zip(inputs, truth, strict=True)
+        psnr(np.moveaxis(seen[k], 0, -1), np.moveaxis(true[k], 0, -1), masks[k])
+        for k in range(len(unseen))
+        if masks[k].any()
     ]
+    if not before:
+        raise IgsrError(f"{capture.path}: the masks of the views to render leave no pixel.")
     return {
         "pairs": file,
         "recipe": one.recipe,
         "photos": len(train),
         "steps": steps,
-        "renders": len(inputs),
-        "psnr": float(np.mean(before[: len(unseen)])),
+        "renders": len(pairs.truth),
+        "psnr": float(np.mean(before)),
         **about,
     }
 
@@ -153,11 +157,20 @@ def rendered_pairs(
     views: Sequence[View],
     background: Sequence[float],
     backend: str,
-) -> tuple[list[Bytes], list[Bytes]]:
-    """What the network sees of each view, and the true pictures, both in 8 bits."""
+) -> Pairs:
+    """What the network sees of each view, and the true pictures.
+
+    Raises:
+        IgsrError: the views are not all of one size.
+    """
+    sizes = {(view.camera.width, view.camera.height) for view in views}
+    if len(sizes) > 1:
+        raise IgsrError(
+            f"views to render are of sizes {sorted(sizes)}; pairs need one, resize the photos."
+        )
     support = photo_support(splats, [view.camera for view in photos], backend)
     sources = photo_sources(splats, photos, background, backend)
-    inputs, truth = [], []
+    inputs, truth, masks = [], [], []
     for view in views:
         buffers = render_buffers(splats, view.camera, support, background, backend)
         others = [s for s, photo in zip(sources, photos, strict=True) if photo.name != view.name]
@@ -166,7 +179,8 @@ def rendered_pairs(
         warped = warp_photos(view.camera, buffers.depth, buffers.alpha, others, PHOTOS)
         inputs.append(packed(network_inputs(buffers, warped)))
         truth.append(np.moveaxis(over_background(view.image, background), -1, 0))
-    return inputs, truth
+        masks.append(np.ones(truth[-1].shape[1:], np.bool_) if view.mask is None else view.mask)
+    return Pairs(np.stack(inputs), np.stack(truth), np.stack(masks))
 
 
 def _hull(one: PairFit, train: list[View]) -> bool | None:
@@ -213,5 +227,6 @@ def _chosen(
         )
         size = least * (most / least) ** random.uniform()
         noise, steps = Noise(kind, float(size)), one.steps
-    # Noise on camera positions is in units of a scene like NeRF Synthetic's, 4 across.
-    return [noisy_view(v, noise, random) for v in train], unseen, steps, {"noise": str(noise)}
+    unit = noise_unit(train)
+    noisy = [noisy_view(view, noise, random, unit) for view in train]
+    return noisy, unseen, steps, {"noise": str(noise)}

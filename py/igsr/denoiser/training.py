@@ -326,6 +326,9 @@ def _crop(pairs: Pairs, side: int, random: np.random.Generator) -> tuple[Tensor,
     at = (view, slice(None), slice(top, top + side), slice(left, left + side))
     inputs = pairs.inputs[at] * SCALE[:, None, None] + OFFSET[:, None, None]
     truth = pairs.truth[at].astype(np.float32) / np.float32(255.0)
+    # Where the truth is unknown the render counts as right, and nothing is learned.
+    known = pairs.masks[view, at[2], at[3]]
+    truth = np.where(known, truth, inputs[:COLOR])
     short = [(0, 0), (0, max(0, side - height)), (0, max(0, side - width))]
     if height < side or width < side:
         inputs, truth = np.pad(inputs, short, mode="edge"), np.pad(truth, short, mode="edge")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ from .runs import Run, finished_runs
 Float64 = npt.NDArray[np.float64]
 
 VIEW_IDS = tuple(range(0, 100, 5))
+#: Of NeRF Synthetic's cameras from the origin, world units.
+VIEWING_DISTANCE = 4.03
 SCORES = ("psnr", "ssim", "flip")
 WAYS = ("raw", "aligned", "refined")
 POSES = ("fixed", "joint")
@@ -65,8 +67,28 @@ class PoseFit:
     backend: str
 
 
-def noisy_view(view: View, noise: Noise, random: np.random.Generator) -> View:
+def noise_unit(views: Sequence[View]) -> float:
+    """World units that stand for one of NeRF Synthetic's: noise on positions is in those.
+
+    Its cameras stand ``VIEWING_DISTANCE`` from what they look at; these look at the point nearest
+    to all their axes.
+    """
+    # Each axis contributes the part of an offset from it that is across it.
+    across = []
+    for view in views:
+        axis = view.camera.viewmat[2, :3]
+        across.append(np.eye(3) - np.outer(axis, axis))
+    centres = np.stack([view.camera.centre for view in views])
+    pulled = np.einsum("nij,nj->i", np.stack(across), centres - centres[0])
+    target = centres[0] + np.linalg.lstsq(np.sum(across, axis=0), pulled, rcond=1e-6)[0]
+    distance = float(np.mean(np.linalg.norm(centres - target, axis=1)))
+    return distance / VIEWING_DISTANCE if distance > 0.0 else 1.0
+
+
+def noisy_view(view: View, noise: Noise, random: np.random.Generator, unit: float = 1.0) -> View:
     """The view with noise on its camera; with "raw-affine" the photo is sheared as well.
+
+    ``unit`` scales the noise on the position (``noise_unit``).
 
     A camera-to-world matrix with noise is no longer rigid. Its shear and stretch can be written as
     another focal length, principal point and skew of a rigid camera at the same centre; the skew
@@ -79,7 +101,7 @@ def noisy_view(view: View, noise: Noise, random: np.random.Generator) -> View:
         axis *= np.radians(noise.size) / np.linalg.norm(axis)
         to_world[:3, :3] = _rotation(axis) @ to_world[:3, :3]
     elif noise.kind in (MATRIX, AFFINE):
-        to_world[:3, :4] += noise.size * random.normal(size=(3, 4))
+        to_world[:3, :4] += noise.size * random.normal(size=(3, 4)) * (1.0, 1.0, 1.0, unit)
     if noise.kind != AFFINE:
         u, _, vt = np.linalg.svd(to_world[:3, :3])
         return replace(view, camera=_camera(camera, (u @ vt).T, to_world[:3, 3], camera.K))
