@@ -34,6 +34,7 @@ class StudyChoice(str, enum.Enum):
     few_photos = "few-photos"
     pose_noise = "pose-noise"
     poses = "poses"
+    denoiser_table = "denoiser-table"
 
 
 def study_command(
@@ -43,7 +44,7 @@ def study_command(
             help="blender8: NeRF Synthetic from eight photos. few-photos: real captures from 3, 6 "
             "and 9 photos, or 3, 6 and 12 of the tankard. pose-noise: 20 views of NeRF Synthetic "
             "with noise on their poses, which are kept or fitted. poses: cameras found in photos "
-            "against the true ones."
+            "against the true ones. denoiser-table: renders of poor fits before and after."
         ),
     ],
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder that holds the scenes.")],
@@ -55,7 +56,8 @@ def study_command(
         typer.Option(
             "--scene",
             help="A folder in DATA; repeat it for several. Default: chair and lego; fern, "
-            "dtu_scan24 and tankard; for poses the sets of docs/pose_colmap.md.",
+            "dtu_scan24 and tankard; for poses the sets of docs/pose_colmap.md; for "
+            "denoiser-table all that have cameras.",
         ),
     ] = None,
     views: Annotated[
@@ -84,8 +86,33 @@ def study_command(
         str | None,
         typer.Option("--estimator", metavar="NAME", help="poses: what finds cameras. [colmap]"),
     ] = None,
+    kinds: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--kind",
+            help="denoiser-table: 3, 6, 9 (photos) or noise; repeat it for several. Default: all.",
+        ),
+    ] = None,
+    denoisers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--denoiser",
+            metavar="NAME=FILE",
+            help="denoiser-table: a further one beside igsr's; repeat it for several.",
+        ),
+    ] = None,
+    features: Annotated[
+        Path | None,
+        typer.Option(
+            "--features",
+            metavar="FILE",
+            help="denoiser-table: SqueezeNet 1.0's arrays (.npz), to score a perceptual distance "
+            "that is not LPIPS.",
+        ),
+    ] = None,
     seeds: Annotated[
-        int | None, typer.Option("--seeds", help="Fits of each kind. [3; poses: 1]")
+        int | None,
+        typer.Option("--seeds", help="Fits of each kind. [3; poses and denoiser-table: 1]"),
     ] = None,
     jobs: JobsOption = 1,
     ray: RayOption = False,
@@ -112,6 +139,12 @@ def study_command(
                     f"{row['photos']} placed in {row['seconds']:.0f} s; {left}"
                 )
                 return
+            if protocol is StudyChoice.denoiser_table:
+                console.print(
+                    f"{done} of {total}: {row['scene']} {row['kind']} seed {row['seed']}: "
+                    f"{row['renders']} renders in {row['seconds']:.0f} s; {left}"
+                )
+                return
             if protocol is StudyChoice.pose_noise:
                 kind = f"{row['noise']}, poses {row['poses']}"
                 psnr = row["refined"]["psnr"]
@@ -127,6 +160,7 @@ def study_command(
             StudyChoice.few_photos: study.few_photos,
             StudyChoice.pose_noise: study.pose_noise,
             StudyChoice.poses: study.poses,
+            StudyChoice.denoiser_table: study.denoiser_table,
         }
         run = studies[protocol]
         given: dict[str, Any] = {
@@ -136,13 +170,17 @@ def study_command(
             "noise": noise,
             "raw_affine": raw_affine or None,
             "estimator": estimator,
+            "kinds": kinds and tuple(kinds),
+            "denoisers": denoisers and _files_by_name(denoisers),
+            "features": features,
             "seeds": seeds,
             "backend": None if backend is BackendChoice.auto else backend,
         }
         given = {name: value for name, value in given.items() if value is not None}
         foreign = [name for name in given if name not in inspect.signature(run).parameters]
         if foreign:
-            option = {"scenes": "scene", "presets": "preset"}.get(foreign[0], foreign[0])
+            singular = ("scenes", "presets", "kinds", "denoisers")
+            option = foreign[0].removesuffix("s") if foreign[0] in singular else foreign[0]
             raise IgsrError(
                 f"--{option.replace('_', '-')} says nothing to {protocol.value}; leave it out."
             )
@@ -153,3 +191,18 @@ def study_command(
         print_json(report)
         return
     output_console().print((out / "study.md").read_text(encoding="utf-8"), markup=False)
+
+
+def _files_by_name(given: list[str]) -> dict[str, Path]:
+    """NAME=FILE options as a dictionary.
+
+    Raises:
+        IgsrError: one is of another form, or a name is given twice.
+    """
+    out: dict[str, Path] = {}
+    for text in given:
+        name, _, file = text.partition("=")
+        if not name or not file or name in out:
+            raise IgsrError(f"--denoiser must be NAME=FILE, each name once, not {text!r}.")
+        out[name] = Path(file)
+    return out

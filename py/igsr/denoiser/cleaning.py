@@ -52,14 +52,18 @@ class NetworkDenoiser:
 
     def __call__(self, render: Buffers, photos: Sequence[Source]) -> tuple[Float32, Float32]:
         """Clean one render; see ``denoise``."""
-        inputs = torch.from_numpy(network_inputs(render, _warped(render, photos)))
-        image, log_error = self._in_tiles(inputs[None])
-        picture = image[0].clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
-        error = log_error[0, 0].exp().numpy()
-        confidence = HALF_CONFIDENCE_ERROR / (HALF_CONFIDENCE_ERROR + error)
+        picture, confidence = self.clean(network_inputs(render, _warped(render, photos)))
         # A picture that was not finite has been guessed, not cleaned.
         broken = ~np.isfinite(render.color).all(axis=-1)
         return picture, np.where(broken, np.float32(0.0), confidence)
+
+    def clean(self, inputs: Float32) -> tuple[Float32, Float32]:
+        """Clean what ``network_inputs`` gave, [``CHANNELS``, H, W]; returns as ``denoise``."""
+        image, log_error = self._in_tiles(torch.from_numpy(inputs)[None])
+        picture = image[0].clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
+        error: Float32 = log_error[0, 0].exp().numpy()
+        confidence: Float32 = HALF_CONFIDENCE_ERROR / (HALF_CONFIDENCE_ERROR + error)
+        return picture, confidence
 
     def _in_tiles(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         height, width = inputs.shape[-2:]

@@ -3,6 +3,7 @@
 from .blender import blender8
 from .estimated_poses import poses
 from .noisy_poses import pose_noise
+from .poor_fits import denoiser_table
 from .real_captures import few_photos
 
-__all__ = ["blender8", "few_photos", "pose_noise", "poses"]
+__all__ = ["blender8", "denoiser_table", "few_photos", "pose_noise", "poses"]

@@ -1,0 +1,191 @@
+"""``igsr study denoiser-table``: the same renders before and after, and scores that are right."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+import igsr
+from igsr import presets
+from igsr.capture import Capture
+from igsr.denoiser.inputs import CHANNELS
+from igsr.denoiser.network import Architecture, DenoiserNetwork
+from igsr.denoiser.pair_files import Pairs, write_pairs
+from igsr.denoiser.weights import save_network
+from igsr.study import denoiser_table, poor_fits
+from igsr.study.poor_fits import Cleaning, PoorFit, poor_capture, run_cleaning, scenes_in
+
+SMALL = Architecture(4, (1, 0, 0))
+
+
+def weights(path, brighter=0.0, log_error=-3.0):
+    """A denoiser that adds ``brighter`` to every colour and expects the same error everywhere."""
+    network = DenoiserNetwork(SMALL)
+    with torch.no_grad():
+        # Before pixel shuffle each output has four channels; the offset of log errors is -3.
+        network.tail.bias[:12] = brighter
+        network.tail.bias[12:] = log_error + 3.0
+    save_network(network, path, {})
+    return str(path)
+
+
+def pairs(path, hidden=0):
+    """Two views whose left half is right and whose right half is 20 too dark."""
+    random = np.random.default_rng(0)
+    truth = random.integers(30, 200, (2, 3, 40, 48), dtype=np.uint8)
+    inputs = np.zeros((2, CHANNELS, 40, 48), np.uint8)
+    inputs[:, :3] = truth
+    inputs[:, :3, :, 24:] -= 20
+    masks = np.ones((2, 40, 48), np.bool_)
+    masks[..., :hidden] = False
+    write_pairs(path, Pairs(inputs, truth, masks))
+    return str(path)
+
+
+def test_a_denoiser_that_does_nothing_changes_no_score(tmp_path):
+    file = pairs(tmp_path / "pairs.npz")
+    before = run_cleaning("", Cleaning(file, None, None))
+    same = run_cleaning("", Cleaning(file, weights(tmp_path / "same.safetensors"), None))
+    half = np.square(20 / 255) / 2
+    assert before["psnr"] == pytest.approx(-10 * np.log10(half))
+    assert before["best_quarter"] == 100.0
+    assert before["perceptual"] is None
+    for name in poor_fits.SCORES:
+        assert same[name] == before[name]
+    found = same["confidence"]
+    assert found["mean_error"] == pytest.approx(10 / 255, rel=1e-5)
+    assert found["weighted_error"] == pytest.approx(10 / 255, rel=1e-5), "all weigh the same"
+    claimed = 0.05 / (0.05 + np.exp(-3.0))
+    assert sum(found["confidence"]) / sum(found["pixels"]) == pytest.approx(claimed, rel=1e-2)
+
+
+def test_what_was_right_counts_as_the_best_quarter(tmp_path):
+    file = pairs(tmp_path / "pairs.npz")
+    brighter = weights(tmp_path / "brighter.safetensors", brighter=10.2 / 255)
+    after = run_cleaning("", Cleaning(file, brighter, None))
+    # Right pixels become 10 too bright, wrong ones stay 10 too dark.
+    assert after["psnr"] == pytest.approx(-20 * np.log10(10 / 255), abs=0.05)
+    assert after["best_quarter"] == pytest.approx(-20 * np.log10(10 / 255), abs=0.05)
+
+
+def test_hidden_pixels_count_nowhere(tmp_path):
+    file = pairs(tmp_path / "pairs.npz", hidden=24)
+    before = run_cleaning("", Cleaning(file, None, None))
+    assert before["psnr"] == pytest.approx(-20 * np.log10(20 / 255))
+    assert before["best_quarter"] == pytest.approx(-20 * np.log10(20 / 255))
+    same = run_cleaning("", Cleaning(file, weights(tmp_path / "same.safetensors"), None))
+    assert sum(same["confidence"]["pixels"]) == 2 * 40 * 24
+
+
+def test_views_of_poor_fits():
+    made = scenes.capture(views=40, size=16)
+    few = poor_capture(made, PoorFit("ball", "3", 0, "cpu"))
+    assert [view.name for view in few.train_views] == [
+        made.train_views[i].name for i in (0, 14, 29)
+    ]
+    assert len(few.test_views) == 8, "of ten"
+    noisy = poor_capture(made, PoorFit("ball", "noise", 0, "cpu"))
+    assert len(noisy.train_views) == 20
+    assert noisy.points is None
+    by_name = {view.name: view for view in made.views}
+    for view in noisy.train_views:
+        assert not np.allclose(view.camera.viewmat, by_name[view.name].camera.viewmat, atol=1e-4)
+    for view in noisy.test_views:
+        assert np.array_equal(view.camera.viewmat, by_name[view.name].camera.viewmat)
+    again = poor_capture(made, PoorFit("ball", "noise", 0, "cpu"))
+    other = poor_capture(made, PoorFit("ball", "noise", 1, "cpu"))
+    first = noisy.train_views[0].camera.viewmat
+    assert np.array_equal(first, again.train_views[0].camera.viewmat)
+    assert not np.array_equal(first, other.train_views[0].camera.viewmat)
+
+    whole = Capture(made.path, [replace(view, split="train") for view in made.views])
+    assert len(poor_capture(whole, PoorFit("leaf", "6", 0, "cpu")).train_views) == 6
+    assert len(poor_capture(whole, PoorFit("leaf", "noise", 0, "cpu")).train_views) == 20
+    with pytest.raises(igsr.IgsrError, match="has 3 photos to fit, not 6"):
+        poor_capture(scenes.capture(views=4, size=16), PoorFit("ball", "6", 0, "cpu"))
+
+
+@pytest.fixture
+def data(tmp_path):
+    scenes.write_capture(tmp_path / "data/ball", scenes.capture(views=6, size=24))
+    scenes.write_capture(tmp_path / "data/more/cube", scenes.capture(views=6, size=24))
+    (tmp_path / "data/empty").mkdir()
+    return tmp_path / "data"
+
+
+def test_the_study(data, tmp_path, monkeypatch, igsr_here):
+    assert scenes_in(data) == ("ball", "more/cube")
+    monkeypatch.setattr(presets, "_FEW", replace(presets._FEW, steps=20, max_splats=200))
+    monkeypatch.setattr(poor_fits, "SHIPPED", tmp_path / "same.safetensors")
+    weights(tmp_path / "same.safetensors")
+    dark = weights(tmp_path / "dark.safetensors", brighter=-0.2)
+    study = ["study", "denoiser-table", data, "--out", tmp_path / "out", "--kind", "3"]
+    study += ["--denoiser", f"dark={dark}", "--json", "--backend", "cpu"]
+    done = igsr_here(*study, "--kind", "noise")
+    assert done.returncode == 0, done.stderr
+    assert "4 of 4: more/cube noise seed 0: 1 renders" in done.stderr
+    report = json.loads(done.stdout)
+    assert report == json.loads((tmp_path / "out/study.json").read_text())
+    ball = report["scenes"]["ball"]
+    assert ball["after"] == ball["before"]
+    assert ball["others"]["dark"]["psnr"] < ball["before"]["psnr"]
+    of_kinds = [ball["kinds"][kind]["before"]["psnr"] for kind in ("3", "noise")]
+    assert ball["before"]["psnr"] == pytest.approx(np.mean(of_kinds))
+    assert report["mean"]["noise"]["before"]["psnr"] == pytest.approx(
+        np.mean(
+            [
+                report["scenes"][name]["kinds"]["noise"]["before"]["psnr"]
+                for name in ("ball", "cube")
+            ]
+        )
+    )
+    assert "| ball | 3 | dark |" in (tmp_path / "out/study.md").read_text()
+    for picture in ("study.png", "confidence.png", "ball.png", "cube.png"):
+        assert (tmp_path / "out" / picture).stat().st_size > 1000
+
+    def again(*arguments):
+        raise AssertionError("fitted again")
+
+    monkeypatch.setattr(poor_fits, "run_fit", again)
+    weights(tmp_path / "same.safetensors", brighter=0.1)
+    changed = denoiser_table(data, tmp_path / "out", kinds=("3", "noise"))
+    assert changed["scenes"]["ball"]["before"] == ball["before"]
+    assert changed["scenes"]["ball"]["after"] != ball["after"], "other weights are scored again"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"kinds": ("4",)}, "kinds must be of 3, 6, 9, noise, not '4'"),
+        ({"kinds": ()}, "kinds must be of"),
+        ({"seeds": 0}, "at least 1"),
+        ({"scenes": ("ball", "more/ball")}, "two scenes are called ball"),
+        ({"scenes": ("nothing",)}, "nothing does not exist"),
+        ({"denoisers": {"igsr": "a"}}, "denoisers cannot be called igsr or before"),
+        ({"denoisers": {"before": "a"}}, "denoisers cannot be called igsr or before"),
+        ({"denoisers": {"mine": "nothing.safetensors"}}, "nothing.safetensors does not exist"),
+        ({"kinds": ("9",)}, "views must be from 1 to 5, not 9"),
+    ],
+)
+def test_bad_arguments(data, tmp_path, monkeypatch, options, message):
+    weights(tmp_path / "same.safetensors")
+    monkeypatch.setattr(poor_fits, "SHIPPED", tmp_path / "same.safetensors")
+    with pytest.raises(igsr.IgsrError, match=message):
+        denoiser_table(data, tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_arguments_of_the_command(data, tmp_path, igsr_here):
+    study = ["study", "denoiser-table", data, "--out", tmp_path / "out"]
+    done = igsr_here(*study, "--denoiser", "mine")
+    assert done.returncode == 1
+    assert "--denoiser must be NAME=FILE, each name once, not 'mine'" in done.stderr
+    done = igsr_here("study", "poses", data, "--out", tmp_path / "out", "--kind", "3")
+    assert "--kind says nothing to poses" in done.stderr
+    with pytest.raises(igsr.IgsrError, match="holds no folder of photos with cameras"):
+        scenes_in(data / "empty")
