@@ -153,7 +153,10 @@ def test_the_study(data, tmp_path, monkeypatch, igsr_here):
 
     monkeypatch.setattr(poor_fits, "run_fit", again)
     weights(tmp_path / "same.safetensors", brighter=0.1)
-    changed = denoiser_table(data, tmp_path / "out", kinds=("3", "noise"))
+    pairs(tmp_path / "pairs/a-sparse-0.npz")
+    changed = denoiser_table(data, tmp_path / "out", kinds=("3", "noise"), pairs=tmp_path / "pairs")
+    assert changed["artifacts"]["renders"] == {"real": 2, "synthetic": 2}
+    assert "octaves from the training pairs'" in (tmp_path / "out/study.md").read_text()
     assert changed["scenes"]["ball"]["before"] == ball["before"]
     assert changed["scenes"]["ball"]["after"] != ball["after"], "other weights are scored again"
 
@@ -169,6 +172,7 @@ def test_the_study(data, tmp_path, monkeypatch, igsr_here):
         ({"denoisers": {"igsr": "a"}}, "denoisers cannot be called igsr or before"),
         ({"denoisers": {"before": "a"}}, "denoisers cannot be called igsr or before"),
         ({"denoisers": {"mine": "nothing.safetensors"}}, "nothing.safetensors does not exist"),
+        ({"pairs": "nothing"}, "nothing holds no pairs of recipe sparse"),
         ({"kinds": ("9",)}, "views must be from 1 to 5, not 9"),
     ],
 )

@@ -110,6 +110,14 @@ def study_command(
             "that is not LPIPS.",
         ),
     ] = None,
+    pairs: Annotated[
+        Path | None,
+        typer.Option(
+            "--pairs",
+            metavar="PAIRS",
+            help="denoiser-table: training pairs, to say how alike their errors are.",
+        ),
+    ] = None,
     seeds: Annotated[
         int | None,
         typer.Option("--seeds", help="Fits of each kind. [3; poses and denoiser-table: 1]"),
@@ -173,6 +181,7 @@ def study_command(
             "kinds": kinds and tuple(kinds),
             "denoisers": denoisers and _files_by_name(denoisers),
             "features": features,
+            "pairs": pairs,
             "seeds": seeds,
             "backend": None if backend is BackendChoice.auto else backend,
         }

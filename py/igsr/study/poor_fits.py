@@ -32,6 +32,7 @@ from ..evaluation import default_background
 from ..fitting import fit_with_cameras
 from ..metrics import PSNR_CAP, score
 from ..presets import preset_settings
+from .artifact_likeness import likeness, plot_likeness
 from .noisy_poses import MATRIX, Noise, noise_unit, noisy_view
 from .poor_fit_pictures import plot_confidence, plot_gains, write_sheet
 from .real_captures import is_dtu
@@ -257,6 +258,7 @@ def denoiser_table(
     kinds: tuple[str, ...] = KINDS,
     denoisers: Mapping[str, str | os.PathLike[str]] | None = None,
     features: str | os.PathLike[str] | None = None,
+    pairs: str | os.PathLike[str] | None = None,
     seeds: int = 1,
     backend: str = "cpu",
     jobs: int = 1,
@@ -274,6 +276,8 @@ def denoiser_table(
         kinds: of poor fits, of ``KINDS``.
         denoisers: further ones, weights by name: the paper's losses trained on the same pairs.
         features: SqueezeNet's arrays (.npz), to score by ``SqueezeNetDistance`` as well.
+        pairs: folder of the training pairs, to compare their errors with those of the renders from
+            few photos here (``artifact_likeness``); also writes ``artifacts.png``.
         seeds: how many seeds, from 0.
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own with its share of the cores.
@@ -283,7 +287,8 @@ def denoiser_table(
     Returns:
         What ``study.json`` holds: "scenes" by the folder's name with "before", "after" (igsr's
         denoiser), "others" by name, each a mean over kinds and seeds, and "kinds" with the same for
-        each; "mean" over scenes of "sparse" and "noise"; "confidence"; "runs"; "protocol".
+        each; "mean" over scenes of "sparse" and "noise"; "confidence"; "artifacts" if ``pairs`` is
+        given; "runs"; "protocol".
 
     Raises:
         IgsrError: a scene cannot be read or has too few photos, a denoiser cannot be read, or a fit
@@ -305,6 +310,9 @@ def denoiser_table(
         raise IgsrError(f"denoisers cannot be called {OURS} or {BEFORE}; choose another name.")
     for path in weights.values():
         load_network(path)
+    training = [] if pairs is None else sorted(Path(pairs).glob("*-sparse-*.npz"))
+    if pairs is not None and not training:
+        raise IgsrError(f"{pairs} holds no pairs of recipe sparse; make some.")
     fits = [
         PoorFit(scene, kind, seed, backend)
         for scene in scenes
@@ -339,6 +347,11 @@ def denoiser_table(
         for row, scores in zip(rows, cleaned, strict=True):
             row[name] = scores
     report = _report(rows, short, kinds, tuple(weights), seeds, features is not None)
+    if training:
+        few = [read_pairs(out / "renders" / f"{one.name}.npz") for one in fits if one.kind != NOISE]
+        synthetic = [read_pairs(path) for path in training]
+        report["artifacts"] = likeness(few, synthetic)
+        plot_likeness(out / "artifacts.png", report["artifacts"], few, synthetic)
     with atomic_write(out / "study.json") as temporary:
         temporary.write_text(json.dumps(report, indent=2, allow_nan=False), encoding="utf-8")
     with atomic_write(out / "study.md") as temporary:
@@ -478,4 +491,14 @@ def markdown(report: dict[str, Any]) -> str:
         f"Mean absolute error of cleaned pixels {sure['mean_error']:.4f}, weighted by their "
         f"confidence {sure['weighted_error']:.4f}.",
     ]
+    if "artifacts" in report:
+        found = {
+            name: "unknown" if (apart := report["artifacts"][name]) is None else f"{apart:.2f}"
+            for name in ("distance", "within", "noise")
+        }
+        lines += [
+            "",
+            f"Errors of renders from few photos are {found['distance']} octaves from the training "
+            f"pairs' (two halves of those {found['within']} apart, white noise {found['noise']}).",
+        ]
     return "\n".join(lines) + "\n"
