@@ -106,9 +106,8 @@ def camera_holds(
     step = -covariance @ (slope / scale) / scale
     freedom = 2 * len(point) - 3 * (equations.point.max() + 1) - size
     variance = max(LEAST_ERROR**2, (error + slope @ step) / max(freedom, 1))
-    covariance = LEFT_OPEN**2 * variance * covariance / np.outer(scale, scale) + np.outer(
-        step, step
-    )
+    covariance *= LEFT_OPEN**2 * variance / np.outer(scale, scale)
+    covariance += np.outer(step, step)
 
     information, of_focal = np.zeros((count, 6, 6)), np.zeros(count)
     for k in np.flatnonzero(enough):
