@@ -55,6 +55,86 @@ def test_photos_come_unchanged_through_a_pinhole(tmp_path: Path) -> None:
         assert view.mask is None
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_tracks_are_colmap_s(text: bool, tmp_path: Path) -> None:
+    reconstruction = write_colmap(tmp_path, "PINHOLE", text=text)
+    points = load_capture(tmp_path).points
+    assert points is not None
+    tracks = points.tracks
+    assert tracks is not None
+    assert tracks.names == ["images/0.png", "images/1.png", "images/2.png"]
+    seen = zip(tracks.view.tolist(), points.xyz[tracks.point].tolist(), tracks.xy, strict=True)
+    found = {(f"images/{view}.png", *xyz, *xy) for view, xyz, xy in seen}
+    expected = {
+        (f"images/{image.name}", *reconstruction.points3D[p.point3D_id].xyz, *p.xy)
+        for image in reconstruction.images.values()
+        for p in image.points2D
+        if p.has_point3D()
+    }
+    assert len(expected) == 6
+    assert found == expected
+
+
+@pytest.mark.parametrize("model", MODEL_PARAMS)
+def test_tracks_are_those_of_the_photo_without_distortion(model: str, tmp_path: Path) -> None:
+    """What an observation is off by stays as it was, once distortion is undone."""
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 0, 3] = [-0.2, 0.0, 0.3]
+    viewmats[:, 2, 3] = 5.0  # the points lie at z = -2
+    reconstruction = write_colmap(tmp_path, model, viewmats=viewmats)
+    off = np.array([0.25, -0.5])
+    for image in reconstruction.images.values():
+        for feature in image.points2D:
+            if feature.has_point3D():
+                xyz = reconstruction.points3D[feature.point3D_id].xyz
+                feature.xy = image.camera.img_from_cam(image.cam_from_world() * xyz) + off
+    reconstruction.write_binary(tmp_path / "sparse/0")
+    capture = load_capture(tmp_path)
+    assert capture.points is not None
+    tracks = capture.points.tracks
+    assert tracks is not None
+    assert len(tracks.view) == 6
+    for view, point, xy in zip(tracks.view, tracks.point, tracks.xy, strict=True):
+        camera = capture.views[view].camera
+        local = camera.viewmat[:3] @ [*capture.points.xyz[point], 1.0]
+        pinhole = (camera.K @ local)[:2] / local[2]
+        np.testing.assert_allclose(xy - pinhole, off, atol=1e-9)
+
+
+def test_features_of_points_that_are_gone_are_passed_over(tmp_path: Path) -> None:
+    write_text_model(tmp_path, point="7 0 0 1 10 20 30 0.5 1 2")
+    images = tmp_path / "sparse/0/images.txt"
+    images.write_text("1 1 0 0 0 0 0 0 1 0.png\n1 2 -1 3 4 99 5.5 6.5 7\n")
+    points = load_capture(tmp_path).points
+    assert points is not None
+    assert points.tracks is not None
+    assert points.tracks.xy.tolist() == [[5.5, 6.5]]
+    assert points.tracks.point.tolist() == [0]
+    assert points.confidence == pytest.approx([1 / 1.5])
+    images.write_text("1 1 0 0 0 0 0 0 1 0.png\n1 2 -1 3 4 99\n")
+    points = load_capture(tmp_path).points
+    assert points is not None
+    assert points.tracks is None
+
+
+@pytest.mark.parametrize(
+    ("features", "words"),
+    [
+        ("1 2", r"images\.txt, line 2 is not of the form X Y POINT3D_ID"),
+        ("1 2 7 3", r"images\.txt, line 2 is not of the form X Y POINT3D_ID"),
+        ("1 two 7", r"images\.txt, line 2 is not of the form X Y POINT3D_ID"),
+        ("1 2 7.5", r"images\.txt, line 2 is not of the form X Y POINT3D_ID"),
+        ("1 2 99999999999999999999", r"images\.txt, line 2 is not of the form X Y POINT3D_ID"),
+        ("1 nan 7", r"images\.txt: 0\.png sees a point at no finite place"),
+    ],
+)
+def test_bad_features_are_one_sentence(features: str, words: str, tmp_path: Path) -> None:
+    write_text_model(tmp_path, point="7 0 0 1 10 20 30 0.5 1 0")
+    (tmp_path / "sparse/0/images.txt").write_text(f"1 1 0 0 0 0 0 0 1 0.png\n{features}\n")
+    with pytest.raises(IgsrError, match=words):
+        load_capture(tmp_path)
+
+
 def test_a_rig_s_cameras_have_their_own_poses(tmp_path: Path) -> None:
     """COLMAP stores rig and sensor apart; the view's pose is the product."""
     write_colmap(tmp_path)

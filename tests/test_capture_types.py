@@ -9,6 +9,7 @@ import pytest
 from capture_files import random_viewmats
 
 from igsr.capture import Camera, Capture, Points, View
+from igsr.capture.types import Tracks
 from igsr.errors import IgsrError
 
 K = np.array([[40.0, 0.0, 23.0], [0.0, 42.0, 17.0], [0.0, 0.0, 1.0]])
@@ -157,3 +158,24 @@ def test_extent_of_one_spot_does_not_vanish() -> None:
 def test_bad_confidences_are_refused(confidence: object, words: str) -> None:
     with pytest.raises(IgsrError, match=f"^confidence .*{words}"):
         Points(np.zeros((3, 3)), np.zeros((3, 3), dtype=np.uint8), confidence)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("view", "point", "xy", "words"),
+    [
+        ([0, 1], [0], [[1.0, 2.0]] * 2, "lists of one length"),
+        ([0], [0], [[1.0]], "two finite numbers"),
+        ([0], [0], [[1.0, np.inf]], "two finite numbers"),
+        ([2], [0], [[1.0, 2.0]], "index without a name"),
+        ([-1], [0], [[1.0, 2.0]], "index without a name"),
+        ([0], [3], [[1.0, 2.0]], "none of the points"),
+        ([0], [-1], [[1.0, 2.0]], "none of the points"),
+    ],
+)
+def test_tracks_belong_to_names_and_points(
+    view: list[int], point: list[int], xy: list[list[float]], words: str
+) -> None:
+    grey = np.zeros((3, 3), dtype=np.uint8)
+    arrays = np.array(view), np.array(point), np.array(xy)
+    with pytest.raises(IgsrError, match=words):
+        Points(np.zeros((3, 3)), grey, tracks=Tracks(["a", "b"], *arrays))

@@ -15,7 +15,7 @@ from PIL import Image
 
 from igsr.atomic_write import atomic_folder
 from igsr.capture import Camera, Capture, Points, View, load_capture
-from igsr.capture.types import intrinsic_matrix
+from igsr.capture.types import Tracks, intrinsic_matrix
 from igsr.capture.write_colmap import quaternion, write_colmap
 from igsr.capture.write_transforms import write_transforms
 from igsr.errors import IgsrError
@@ -92,6 +92,63 @@ def test_pycolmap_reads_what_we_write(tmp_path: Path, form: str) -> None:
         np.testing.assert_array_equal(image.camera.calibration_matrix(), view.camera.K)
     xyz = np.stack([model.points3D[i].xyz for i in range(1, 8)])
     np.testing.assert_array_equal(xyz, capture.points.xyz)
+
+
+def with_tracks(confidence: bool = True) -> Capture:
+    """Points 0 to 4 are seen, point 2 by one view alone; the third view sees none."""
+    capture = made_up(confidence)
+    names = [capture.views[index].name for index in (3, 0, 1)]
+    view = np.array([0, 0, 1, 1, 1, 2, 2, 0, 2])
+    point = np.array([4, 0, 1, 0, 2, 3, 1, 3, 4])
+    random = np.random.default_rng(3)
+    capture.points.tracks = Tracks(names, view, point, random.uniform(0.0, 30.0, (9, 2)))
+    if confidence:
+        # As confidences of tracks are: their lengths over one and an error.
+        capture.points.confidence[:5] = [2, 2, 1, 2, 2] / (1.0 + np.arange(5) / 3.0)
+    return capture
+
+
+def observations(points: Points, names: dict[str, str]) -> set[tuple[object, ...]]:
+    tracks = points.tracks
+    seen = zip(tracks.view, points.xyz[tracks.point].tolist(), tracks.xy.tolist(), strict=True)
+    return {(names[tracks.names[view]], *xyz, *xy) for view, xyz, xy in seen}
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("confidence", [False, True])
+def test_tracks_come_back(tmp_path: Path, text: bool, confidence: bool) -> None:
+    capture = with_tracks(confidence)
+    write_colmap(capture, tmp_path / "out", text=text)
+    written = ["a/1.png", "a/1.png.png", "out side/2.png", "line_break.png"]
+    read_as = {
+        view.name: f"images/{name}" for view, name in zip(capture.views, written, strict=True)
+    }
+    again = load_capture(tmp_path / "out").points
+    expected = observations(capture.points, read_as)
+    assert len(expected) == 9
+    assert observations(again, {name: name for name in again.tracks.names}) == expected
+    if confidence:
+        np.testing.assert_allclose(again.confidence, capture.points.confidence, 1e-12)
+    else:
+        assert again.confidence is None
+    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    for number, view in enumerate(capture.views, start=1):
+        for feature in model.images[number].points2D:
+            point = model.points3D[feature.point3D_id]
+            assert (read_as[view.name], *point.xyz, *feature.xy) in expected
+    elements = [model.points3D[number].track.elements for number in range(1, 8)]
+    assert list(map(len, elements)) == [2, 2, 1, 2, 2, 0, 0]
+    for number, track in enumerate(elements, start=1):
+        for element in track:
+            feature = model.images[element.image_id].points2D[element.point2D_idx]
+            assert feature.point3D_id == number
+
+
+def test_tracks_of_views_that_are_not_written_are_left_out(tmp_path: Path) -> None:
+    capture = with_tracks()
+    write_colmap(Capture(capture.path, capture.views[:2], capture.points), tmp_path / "out")
+    tracks = load_capture(tmp_path / "out").points.tracks
+    assert sorted(tracks.point.tolist()) == [0, 1, 1, 2, 3, 4]
 
 
 def test_what_pycolmap_wrote_has_no_confidence_of_ours(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from made_up_tracks import projected
 from PIL import Image
 
 import igsr
@@ -61,6 +62,14 @@ def test_cameras_and_points_are_right(found: Estimate) -> None:
     sure = found.points.confidence > np.median(found.points.confidence)
     assert distance[sure].mean() < distance[~sure].mean()
     assert found.points.rgb.std() > 20
+    tracks = found.points.tracks
+    assert tracks.names == [f"{i}.png" for i in range(6)]
+    off = [
+        np.linalg.norm(projected(found.cameras[view], found.points.xyz[[point]]) - xy)
+        for view, point, xy in zip(tracks.view, tracks.point, tracks.xy, strict=True)
+    ]
+    assert len(off) > 2 * len(distance)
+    assert np.median(off) < 1.0  # pixels
 
 
 def test_same_seed_same_bits_and_nothing_said(

@@ -199,6 +199,7 @@ class Fitter:
         state: dict[str, Any],
         config: dict[str, Any],
         backend: str,
+        holds: dict[str, Float64] | None = None,
     ) -> None:
         """A fit to V photos.
 
@@ -208,7 +209,11 @@ class Fitter:
         returned. ``config``: steps, seed, sh_degree, max_splats, density, dropout, hull,
         background; poses ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate
         (pixels a step), camera_decay, camera_warm_up (part of the steps), frozen (splats stay as
-        they are); an absent or None entry takes the default.
+        they are); an absent or None entry takes the default. ``holds`` say where the cameras that
+        are fitted are known to be, and how surely: viewmats [V, 4, 4] and intrinsics [V, 4] as
+        above, information [V, 6, 6] (the inverse of the covariance of a turn, in radians, about and
+        a move along the camera's axes) and focal_information [V] (of the focal length's logarithm),
+        zero where nothing is known.
         """
 
     def step(self, count: int) -> dict[str, Any]:

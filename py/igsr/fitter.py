@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
+from .camera_holds import CameraHolds
 from .capture import Camera, Capture, View
 from .capture.types import intrinsic_matrix
 from .errors import IgsrError
@@ -22,8 +23,11 @@ def fitter_of(
     state: dict[str, Any],
     settings: dict[str, Any],
     backend: str,
+    holds: CameraHolds | None = None,
 ) -> _core.Fitter:
     """A fit in progress of ``state``, relative to ``origin``, to the views; see ``_core.Fitter``.
+
+    Cameras that are fitted are held by ``holds``, of as many views.
 
     Raises:
         ValueError: a view, the state or a setting cannot be used; the message names it.
@@ -31,12 +35,34 @@ def fitter_of(
     return _core.Fitter(
         [np.ascontiguousarray(view.image) for view in views],
         [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
-        np.stack([viewmat_about(origin, view.camera.viewmat) for view in views]),
-        np.stack([intrinsics_of(view.camera.K) for view in views]),
+        *_arrays(views, origin),
         state,
         settings,
         backend,
+        None if holds is None else _hold_arrays(holds, origin),
     )
+
+
+def _arrays(
+    views: Sequence[View], origin: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Viewmats relative to the origin [V, 4, 4] and intrinsics [V, 4]."""
+    return (
+        np.stack([viewmat_about(origin, view.camera.viewmat) for view in views]),
+        np.stack([intrinsics_of(view.camera.K) for view in views]),
+    )
+
+
+def _hold_arrays(
+    holds: CameraHolds, origin: npt.NDArray[np.float64]
+) -> dict[str, npt.NDArray[np.float64]]:
+    viewmats, intrinsics = _arrays(holds.views, origin)
+    return {
+        "viewmats": viewmats,
+        "intrinsics": intrinsics,
+        "information": holds.information,
+        "focal_information": holds.focal_information,
+    }
 
 
 def fitted_cameras(

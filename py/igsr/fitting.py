@@ -17,7 +17,9 @@ import numpy.typing as npt
 
 from . import _core
 from .atomic_write import check_writable
+from .camera_holds import CameraHolds, camera_holds
 from .capture import Capture, View
+from .capture.types import Tracks
 from .checkpoint import load_checkpoint, save_checkpoint
 from .errors import IgsrError
 from .fitter import (
@@ -127,7 +129,8 @@ def fit(
         start: what the first splats are made from: "auto", "points", "hull", "sift", "rays" or
             "random"; see ``igsr.initialization.initial_splats``.
         poses: "fixed", or "joint": each camera is turned and moved with the splats. All together
-            stay where the given ones were on the whole: the scene keeps its place and size.
+            stay where the given ones were on the whole: the scene keeps its place and size. Where
+            the capture has tracks, each camera is held to what these say of it.
         focal: "fixed", "shared" (one factor to all cameras' focal lengths is fitted) or
             "per-camera".
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
@@ -254,11 +257,17 @@ def _fit(
         "backend": info["backend"],
         "instruction_set": info["instruction_set"],
         "igsr": _core.__version__,
-        "capture": fingerprint(views),
     }
+    moving = settings["poses"] != "fixed" or settings["focal"] != "fixed"
+    tracks = capture.points.tracks if moving and capture.points is not None else None
+    settings["capture"] = fingerprint(views, tracks)
+    # By the cameras as they were given, also where the fit goes on from others.
+    holds = None
+    if tracks is not None:
+        poses = settings["poses"] != "fixed"
+        holds = camera_holds(views, capture.points, poses=poses, focal=settings["focal"])
 
     seconds_before = 0.0
-    moving = settings["poses"] != "fixed" or settings["focal"] != "fixed"
     state: dict[str, Any] | None = None
     if resume and path is not None:
         state, saved = load_checkpoint(path)
@@ -279,7 +288,7 @@ def _fit(
             return go_on
 
         began = time.perf_counter()
-        capture = _with_rough_cameras(capture, settings, info, waiting)
+        capture = _with_rough_cameras(capture, settings, info, holds, waiting)
         seconds_before = time.perf_counter() - began
     if state is None:
         state, settings["started"] = _start(capture, settings)
@@ -288,7 +297,7 @@ def _fit(
         views = with_camera_rows(capture.train_views, state.pop(ROUGH, None))
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError("origin: must be three finite numbers")
-        fitter = fitter_of(views, origin, state, settings, info["backend"])
+        fitter = fitter_of(views, origin, state, settings, info["backend"], holds)
     except ValueError as error:
         if resume:
             raise IgsrError(f"The checkpoint {path} cannot be used: {error}.") from error
@@ -329,6 +338,7 @@ def _with_rough_cameras(
     capture: Capture,
     settings: dict[str, Any],
     info: dict[str, str],
+    holds: CameraHolds | None,
     progress: Callable[[Progress], bool | None] | None,
 ) -> Capture:
     """The capture with train cameras as a shorter fit to photos of half the size has them.
@@ -348,7 +358,10 @@ def _with_rough_cameras(
     try:
         state, rough["started"] = _start(small, rough)
         origin = state.pop("origin")
-        fitter = fitter_of(views, origin, state, rough, info["backend"])
+        if holds is not None:
+            # What is known of turns, moves and logarithms holds for pictures of any size.
+            holds = replace(holds, views=views)
+        fitter = fitter_of(views, origin, state, rough, info["backend"], holds)
     except (IgsrError, ValueError):
         return capture  # what cannot be started from at half size may be at full size
     _run(fitter, {}, rough, info, 0.0, progress, None)
@@ -361,8 +374,8 @@ def _with_rough_cameras(
     return with_train_cameras(capture, cameras)
 
 
-def fingerprint(views: list[View]) -> str:
-    """SHA-256 over the photos, masks and cameras: a fit may only go on with the same ones."""
+def fingerprint(views: list[View], tracks: Tracks | None = None) -> str:
+    """SHA-256 over photos, masks, cameras and tracks: a fit may only go on with the same ones."""
     digest = hashlib.sha256()
     for view in views:
         camera = view.camera
@@ -370,6 +383,9 @@ def fingerprint(views: list[View]) -> str:
             if array is not None:
                 digest.update(str((array.dtype.str, array.shape)).encode())
                 digest.update(np.ascontiguousarray(array).data)
+    if tracks is not None:
+        for array in (tracks.view, tracks.point, tracks.xy):
+            digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
@@ -421,7 +437,7 @@ def _check_same_settings(path: Path, saved: dict[str, Any], settings: dict[str, 
         if saved.get(name) != value:
             if name == "capture":
                 raise IgsrError(
-                    f"{path} was made from other photos, masks, cameras or another split; "
+                    f"{path} was made from other photos, masks, cameras, tracks or another split; "
                     "resume with the same or leave --resume out."
                 )
             raise IgsrError(

@@ -9,7 +9,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 use splat_render::fit::{
     Background, CameraConfig, CameraState, DensityControl, DensityStats, FitConfig, FitState,
-    Focal, Rates, SplatArrays, Target,
+    Focal, Hold, Rates, SplatArrays, Target,
 };
 
 use crate::arrays::{array, elements, entry, rows, shaped, shaped_rows};
@@ -194,6 +194,29 @@ fn camera_state_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Option<
     }))
 }
 
+/// Where cameras are known to be: `viewmats` [V, 4, 4], `intrinsics` [V, 4], `information` [V, 6, 6]
+/// about turn and move, `focal_information` [V] about the focal length's logarithm.
+fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<Hold>> {
+    let n = count as isize;
+    let viewmats = entry::<f64>(dict, "viewmats")?;
+    let viewmats = rows::<f64, 4>("viewmats", &viewmats, &[n, 4])?.as_chunks::<4>().0;
+    let intrinsics = entry::<f64>(dict, "intrinsics")?;
+    let intrinsics = rows::<f64, 4>("intrinsics", &intrinsics, &[n])?;
+    let information = entry::<f64>(dict, "information")?;
+    let information = rows::<f64, 6>("information", &information, &[n, 6])?.as_chunks::<6>().0;
+    let of_focal = entry::<f64>(dict, "focal_information")?;
+    let of_focal = elements("focal_information", &of_focal, &[n])?;
+    let each = viewmats.iter().zip(intrinsics).zip(information).zip(of_focal);
+    Ok(each
+        .map(|(((matrix, &[fx, fy, ..]), &pose), &log_focal)| Hold {
+            viewmat: viewmat(matrix),
+            focal: [fx, fy],
+            pose,
+            log_focal,
+        })
+        .collect())
+}
+
 /// The reverse of [`camera_state_from`].
 fn set_camera_state(dict: &Bound<'_, PyDict>, state: CameraState) -> PyResult<()> {
     let (py, n) = (dict.py(), state.viewmats.len());
@@ -268,9 +291,9 @@ impl Fitter {
 
 #[pymethods]
 impl Fitter {
-    /// A fit of `state` to photos.
+    /// A fit of `state` to photos; `holds` say where cameras are known to be, and how surely.
     #[new]
-    #[pyo3(signature = (images, masks, viewmats, intrinsics, state, config, backend))]
+    #[pyo3(signature = (images, masks, viewmats, intrinsics, state, config, backend, holds=None))]
     fn new<'py>(
         py: Python<'py>,
         images: &Bound<'py, PyList>,
@@ -280,17 +303,22 @@ impl Fitter {
         state: &Bound<'py, PyDict>,
         config: &Bound<'py, PyDict>,
         backend: &str,
+        holds: Option<&Bound<'py, PyDict>>,
     ) -> PyResult<Self> {
         let config = config_from(config)?;
         let targets = targets_from(images, masks)?;
         let sizes: Vec<(u32, u32)> = targets.iter().map(|t| (t.width, t.height)).collect();
         let cameras = cameras(viewmats, intrinsics, &sizes)?;
         let camera_state = camera_state_from(state, cameras.len())?;
+        let holds = holds.map(|holds| holds_from(holds, cameras.len())).transpose()?;
         let (state, step) = state_from(state)?;
         let device = fit_device(backend)?;
         py.detach(|| {
             let mut fitter =
                 splat_render::fit::Fitter::new(device, targets, cameras, state, step, config)?;
+            if let Some(holds) = holds {
+                fitter.hold_cameras(holds)?;
+            }
             if let Some(camera_state) = camera_state {
                 fitter.resume_cameras(camera_state)?;
             }

@@ -5,8 +5,8 @@ pycolmap, which reads a truncated file as zeros without a word and ends the whol
 the tests hold this reader against models that pycolmap wrote. Models of COLMAP 3.12 and later have
 rigs and frames too, but their images file still gives each image's own pose.
 
-Points without a track are not COLMAP's own: their error, where positive, is 1 / confidence, as
-``write_colmap`` has it.
+A point that photos see has its confidence from their number and its error. Points without a track
+are not COLMAP's own: their error, where positive, is 1 / confidence, as ``write_colmap`` has it.
 
 Source of the formats and camera models: https://colmap.github.io/format.html and cameras.html.
 """
@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 from igsr.capture.photos import Shot, is_file, load_views
-from igsr.capture.types import Camera, Capture, Points, intrinsic_matrix
+from igsr.capture.tracks import straightened, track_confidence
+from igsr.capture.types import Camera, Capture, Points, Tracks, intrinsic_matrix
 from igsr.capture.undistort import Lens
 from igsr.errors import IgsrError
 
@@ -84,6 +85,46 @@ class _ColmapImage:
     quat: tuple[float, ...]  # wxyz, world to camera
     translation: tuple[float, ...]
     camera_id: int
+    places: np.ndarray  # [N, 2] of its features, pixels
+    point_ids: np.ndarray  # int64 [N], -1 where a feature is of no point
+
+
+class _ColmapPoints:
+    """The points of a model, as they are read."""
+
+    def __init__(self) -> None:
+        self.ids: list[int] = []
+        self.xyz: list[tuple[float, ...]] = []
+        self.rgb: list[tuple[int, ...]] = []
+        self.errors: list[float] = []
+        self.lengths: list[int] = []
+
+    def add(
+        self,
+        identity: int,
+        xyz: tuple[float, ...],
+        rgb: tuple[int, ...],
+        error: float,
+        track_length: int,
+    ) -> None:
+        self.ids.append(identity)
+        self.xyz.append(xyz)
+        self.rgb.append(rgb)
+        self.errors.append(error)
+        self.lengths.append(track_length)
+
+    def points(self, path: Path) -> Points:
+        xyz = np.array(self.xyz, dtype=np.float64)
+        if not np.isfinite(xyz).all():
+            raise IgsrError(f"{path} has a point that is not finite; remove it")
+        error, length = np.array(self.errors), np.array(self.lengths, dtype=np.float64)
+        # Beyond these, 1 / error is no finite number.
+        told = (error > 1e-300) & (error < 1e300)
+        with np.errstate(divide="ignore"):
+            confidence = np.where(length > 0, track_confidence(length, error), 1.0 / error)
+        # COLMAP writes -1 where it has not computed an error.
+        known = np.where(length > 0, (error == 0.0) | told, told).all()
+        return Points(xyz, np.array(self.rgb, dtype=np.uint8), confidence if known else None)
 
 
 def find_model(path: Path) -> Path | None:
@@ -145,8 +186,42 @@ def load_colmap(path: Path, model: Path) -> Capture:
         shots.append(Shot(name, photo, camera, lens, "train", mask_path, images_path))
     points = None
     if is_file(points_path):
-        points = (_binary_points if binary else _text_points)(points_path)
+        listed = (_binary_points if binary else _text_points)(points_path)
+        if listed.ids:
+            points = listed.points(points_path)
+            points.tracks = _tracks(images_path, images, shots, listed.ids, points.xyz)
     return Capture(path, load_views(shots), points)
+
+
+def _tracks(
+    path: Path,
+    images: list[_ColmapImage],
+    shots: list[Shot],
+    ids: list[int],
+    xyz: np.ndarray,
+) -> Tracks | None:
+    """Where the images see the points, whose COLMAP ids are ``ids``; None where none is seen."""
+    number = np.array(ids, dtype=np.uint64).astype(np.int64)  # as those of the features wrap
+    order = np.argsort(number, kind="stable")
+    views, points, places = [], [], []
+    for index, image in enumerate(sorted(images, key=lambda image: image.name)):
+        at = order[np.searchsorted(number[order], image.point_ids).clip(0, len(ids) - 1)]
+        # Ids without a point are of features without one, or points that were taken out.
+        seen = (number[at] == image.point_ids) & (image.point_ids != -1)
+        if not np.isfinite(image.places[seen]).all():
+            raise IgsrError(
+                f"{path}: {image.name} sees a point at no finite place; run COLMAP again"
+            )
+        views.append(np.full(int(seen.sum()), index, dtype=np.int64))
+        points.append(at[seen])
+        places.append(image.places[seen])
+    if not any(map(len, views)):
+        return None
+    tracks = Tracks(
+        [shot.name for shot in shots],
+        *(np.concatenate(part) for part in (views, points, places)),
+    )
+    return straightened(tracks, xyz, [shot.camera for shot in shots], [shot.lens for shot in shots])
 
 
 def _intrinsics(camera: _ColmapCamera) -> tuple[np.ndarray, Lens]:
@@ -217,6 +292,11 @@ class _Bytes:
         self.need(size)
         self.offset += size
 
+    def table(self, layout: np.dtype[Any], count: int) -> np.ndarray:
+        start = self.offset
+        self.skip(layout.itemsize * count)
+        return np.frombuffer(self.data, layout, count, start)
+
     def name(self) -> str:
         end = self.data.find(b"\0", self.offset)
         if end < 0:
@@ -241,6 +321,7 @@ _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
 _POINT = struct.Struct("<Q3d3BdQ")
+_OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
 def _binary_cameras(path: Path) -> dict[int, _ColmapCamera]:
@@ -268,26 +349,26 @@ def _binary_images(path: Path) -> list[_ColmapImage]:
     for _ in range(_count(file)):
         _, *pose, camera_id = file.unpack(_IMAGE)
         name = file.name()
-        (observations,) = file.unpack(_COUNT)
-        file.skip(24 * observations)
-        images.append(_ColmapImage(name, tuple(pose[:4]), tuple(pose[4:]), camera_id))
+        (count,) = file.unpack(_COUNT)
+        seen = file.table(_OBSERVATION, count)
+        images.append(
+            _ColmapImage(
+                name, tuple(pose[:4]), tuple(pose[4:]), camera_id, seen["xy"], seen["point"]
+            )
+        )
     file.finish()
     return images
 
 
-def _binary_points(path: Path) -> Points | None:
+def _binary_points(path: Path) -> _ColmapPoints:
     file = _Bytes(path)
-    xyz: list[tuple[float, ...]] = []
-    rgb: list[tuple[int, ...]] = []
-    errors: list[float] = []
+    points = _ColmapPoints()
     for _ in range(_count(file)):
-        _, x, y, z, r, g, b, error, track_length = file.unpack(_POINT)
+        identity, x, y, z, r, g, b, error, track_length = file.unpack(_POINT)
         file.skip(8 * track_length)
-        xyz.append((x, y, z))
-        rgb.append((r, g, b))
-        errors.append(math.nan if track_length else error)
+        points.add(identity, (x, y, z), (r, g, b), error, track_length)
     file.finish()
-    return _points(path, xyz, rgb, errors)
+    return points
 
 
 # --- text -----------------------------------------------------------------------------------------
@@ -338,46 +419,40 @@ def _text_images(path: Path) -> list[_ColmapImage]:
         try:
             fields = line.split(maxsplit=9)
             pose = tuple(map(float, fields[1:8]))
-            image = _ColmapImage(fields[9], pose[:4], pose[4:], int(fields[8]))
+            name, camera_id = fields[9], int(fields[8])
         except (ValueError, IndexError) as error:
             raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from error
-        images.append(image)
-        next(lines, None)  # its observations, possibly none
+        number, line = next(lines, (number + 1, ""))  # its observations, possibly none
+        places, point_ids = _text_observations(path, number, line)
+        images.append(_ColmapImage(name, pose[:4], pose[4:], camera_id, places, point_ids))
     return images
 
 
-def _text_points(path: Path) -> Points | None:
-    xyz: list[tuple[float, ...]] = []
-    rgb: list[tuple[int, ...]] = []
-    errors: list[float] = []
+def _text_observations(path: Path, number: int, line: str) -> tuple[np.ndarray, np.ndarray]:
+    fields = line.split()
+    try:
+        places = np.array([fields[0::3], fields[1::3]], dtype=np.float64).T
+        point_ids = np.array(list(map(int, fields[2::3])), dtype=np.int64)
+        if len(fields) % 3:
+            raise ValueError
+    except (ValueError, OverflowError) as error:
+        raise _damaged(path, number, "X Y POINT3D_ID of each feature") from error
+    return places, point_ids
+
+
+def _text_points(path: Path) -> _ColmapPoints:
+    points = _ColmapPoints()
     for number, line in _lines(path):
         if not line:
             continue
         try:
-            _, x, y, z, r, g, b, *rest = line.split(maxsplit=8)
-            errors.append(float(rest[0]) if len(rest) == 1 else math.nan)
-            xyz.append((float(x), float(y), float(z)))
-            rgb.append((int(r), int(g), int(b)))
-            if not all(0 <= value <= 255 for value in rgb[-1]):
+            identity, x, y, z, r, g, b, error, *track = line.split()
+            xyz, rgb = (float(x), float(y), float(z)), (int(r), int(g), int(b))
+            if not (all(0 <= value <= 255 for value in rgb) and 0 <= int(identity) < 1 << 64):
                 raise ValueError
-        except ValueError as error:
-            raise _damaged(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from error
-    return _points(path, xyz, rgb, errors)
-
-
-def _points(
-    path: Path, xyz: list[tuple[float, ...]], rgb: list[tuple[int, ...]], errors: list[float]
-) -> Points | None:
-    """Points, ``errors`` NaN where they have tracks."""
-    if not xyz:
-        return None
-    error = np.array(errors, dtype=np.float64)
-    # Beyond these, 1 / error is no finite number.
-    told = (error > 1e-300) & (error < 1e300)
-    confidence = 1.0 / error if told.all() else None
-    points = Points(np.array(xyz, dtype=np.float64), np.array(rgb, dtype=np.uint8), confidence)
-    if not np.isfinite(points.xyz).all():
-        raise IgsrError(f"{path} has a point that is not finite; remove it")
+            points.add(int(identity), xyz, rgb, float(error), len(track) // 2)
+        except ValueError as wrong:
+            raise _damaged(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from wrong
     return points
 
 

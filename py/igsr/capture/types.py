@@ -101,6 +101,36 @@ class View:
 
 
 @dataclass(eq=False)
+class Tracks:
+    """Where photos see points: M observations.
+
+    Attributes:
+        names: of the photos, as the views' names.
+        view: int64 [M], which of ``names``.
+        point: int64 [M], which of the points.
+        xy: float64 [M, 2], pixels of the photo with lens distortion undone (centres at +0.5).
+
+    Raises:
+        IgsrError: shapes differ, an index has nothing to point to, or a place is not finite.
+    """
+
+    names: list[str]
+    view: np.ndarray
+    point: np.ndarray
+    xy: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check that the observations belong together."""
+        count = len(self.view)
+        if self.view.shape != (count,) or self.point.shape != (count,):
+            raise IgsrError("tracks: view and point must be lists of one length")
+        if self.xy.shape != (count, 2) or not np.isfinite(self.xy).all():
+            raise IgsrError(f"tracks: xy must be two finite numbers for each of {count}")
+        if count and not (self.view.min() >= 0 and self.view.max() < len(self.names)):
+            raise IgsrError("tracks: view has an index without a name")
+
+
+@dataclass(eq=False)
 class Points:
     """A point cloud in the world frame.
 
@@ -109,17 +139,24 @@ class Points:
         rgb: uint8 [P, 3].
         confidence: [P], how sure each place is, positive and in any unit: only the order counts.
             None where nothing is known of it.
+        tracks: where photos see the points, or None where that is not known. They say how well
+            the cameras are known, to fits that move cameras.
 
     Raises:
-        IgsrError: confidence has another shape or holds what is not a positive finite number.
+        IgsrError: confidence has another shape or holds what is not a positive finite number, or
+            a track is of none of the points.
     """
 
     xyz: np.ndarray
     rgb: np.ndarray
     confidence: np.ndarray | None = None
+    tracks: Tracks | None = None
 
     def __post_init__(self) -> None:
-        """Check the confidence against the points."""
+        """Check confidence and tracks against the points."""
+        seen = () if self.tracks is None else self.tracks.point
+        if len(seen) and not (np.min(seen) >= 0 and np.max(seen) < len(self.xyz)):
+            raise IgsrError("tracks: point has an index that is none of the points'")
         if self.confidence is None:
             return
         try:

@@ -1,8 +1,10 @@
 """Captures written as COLMAP writes them: ``sparse/0``, ``images/`` and ``masks/``.
 
-Cameras are PINHOLE, and there are no tracks. A point without a track has its confidence as an
-error, 1 / confidence (0 where none is known), which ``load_capture`` reads back. A mask has the
-photo's whole name and ``.png``, as COLMAP's feature extraction expects it.
+Cameras are PINHOLE. Of an image's features, only those of points are kept. A point with a track has
+the error that its confidence was made from (see ``track_confidence``; -1, as in COLMAP, where none
+is known); one without has its confidence as an error, 1 / confidence (0 where none is known).
+``load_capture`` reads both back. A mask has the photo's whole name and ``.png``, as COLMAP's
+feature extraction expects it.
 
 Source of the formats: https://colmap.github.io/format.html.
 """
@@ -58,7 +60,40 @@ def write_colmap(
         model = folder / "sparse" / "0"
         model.mkdir(parents=True)
         cameras = [view.camera for view in capture.views]
-        (_write_text if text else _write_binary)(model, cameras, names, capture.points)
+        seen = _Seen(capture)
+        (_write_text if text else _write_binary)(model, cameras, names, capture.points, seen)
+
+
+class _Seen:
+    """Where the views of a capture see its points.
+
+    Attributes:
+        places: per view float64 [N, 2], pixels.
+        ids: per view int64 [N], numbers of the points in the file, from 1.
+        tracks: per point int64 [L, 2]: the number of the image, from 1, and which of its features.
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        self.places = [np.zeros((0, 2))] * len(capture.views)
+        self.ids = [np.zeros(0, dtype=np.int64)] * len(capture.views)
+        self.tracks = [np.zeros((0, 2), dtype=np.int64)] * (
+            0 if capture.points is None else len(capture.points.xyz)
+        )
+        tracks = None if capture.points is None else capture.points.tracks
+        if tracks is None:
+            return
+        number_of = {name: number for number, name in enumerate(tracks.names)}
+        points, elements = [], []
+        for index, view in enumerate(capture.views):
+            mine = np.flatnonzero(tracks.view == number_of.get(view.name, -1))
+            self.places[index], self.ids[index] = tracks.xy[mine], tracks.point[mine] + 1
+            points.append(tracks.point[mine])
+            image = np.full(len(mine), index + 1)
+            elements.append(np.stack([image, np.arange(len(mine))], axis=1))
+        point = np.concatenate(points)
+        order = np.argsort(point, kind="stable")
+        ends = np.cumsum(np.bincount(point, minlength=len(self.tracks)))
+        self.tracks = np.split(np.concatenate(elements)[order], ends[:-1])
 
 
 def _at_size(mask: np.ndarray, camera: Camera) -> np.ndarray:
@@ -121,14 +156,16 @@ def quaternion(rotation: Float64) -> list[float]:
     return [float(value) for value in (row if row[0] >= 0.0 else -row)]
 
 
-def _errors(points: Points) -> Float64:
+def _errors(points: Points, seen: _Seen) -> Float64:
+    length = np.array(list(map(len, seen.tracks)))
     if points.confidence is None:
-        return np.zeros(len(points.xyz))
-    return np.asarray(1.0 / points.confidence)
+        return np.where(length > 0, -1.0, 0.0)
+    of_track = np.maximum(length / points.confidence - 1.0, 0.0)
+    return np.where(length > 0, of_track, 1.0 / points.confidence)
 
 
 def _write_binary(
-    model: Path, cameras: list[Camera], names: list[str], points: Points | None
+    model: Path, cameras: list[Camera], names: list[str], points: Points | None, seen: _Seen
 ) -> None:
     distinct, number_of = _distinct(cameras)
     with open(model / "cameras.bin", "wb") as file:
@@ -142,18 +179,22 @@ def _write_binary(
             zip(cameras, names, number_of, strict=True), start=1
         ):
             file.write(struct.pack("<I7dI", image, *_pose(camera), number))
-            file.write(name.encode() + b"\0" + struct.pack("<Q", 0))
-    count = 0 if points is None else len(points.xyz)
-    layout = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")]
-    table = np.zeros(count, dtype=np.dtype(layout))
-    if points is not None:
-        table["id"] = np.arange(1, count + 1)
-        table["xyz"], table["rgb"], table["error"] = points.xyz, points.rgb, _errors(points)
-    (model / "points3D.bin").write_bytes(struct.pack("<Q", count) + table.tobytes())
+            file.write(name.encode() + b"\0")
+            features = np.zeros(len(seen.ids[image - 1]), dtype=[("xy", "<f8", 2), ("id", "<i8")])
+            features["xy"], features["id"] = seen.places[image - 1], seen.ids[image - 1]
+            file.write(struct.pack("<Q", len(features)) + features.tobytes())
+    with open(model / "points3D.bin", "wb") as file:
+        file.write(struct.pack("<Q", 0 if points is None else len(points.xyz)))
+        if points is None:
+            return
+        rows = zip(points.xyz, points.rgb, _errors(points, seen), seen.tracks, strict=True)
+        for number, (xyz, rgb, error, track) in enumerate(rows, start=1):
+            file.write(struct.pack("<Q3d3BdQ", number, *xyz, *rgb, error, len(track)))
+            file.write(track.astype("<u4").tobytes())
 
 
 def _write_text(
-    model: Path, cameras: list[Camera], names: list[str], points: Points | None
+    model: Path, cameras: list[Camera], names: list[str], points: Points | None, seen: _Seen
 ) -> None:
     distinct, number_of = _distinct(cameras)
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
@@ -165,14 +206,17 @@ def _write_text(
     for image, (camera, name, number) in enumerate(
         zip(cameras, names, number_of, strict=True), start=1
     ):
-        lines += [f"{image} {' '.join(map(repr, _pose(camera)))} {number} {name}", ""]
+        features = zip(seen.places[image - 1].tolist(), seen.ids[image - 1].tolist(), strict=True)
+        observed = " ".join(f"{x!r} {y!r} {point}" for (x, y), point in features)
+        lines += [f"{image} {' '.join(map(repr, _pose(camera)))} {number} {name}", observed]
     _write_lines(model / "images.txt", lines)
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
     if points is not None:
-        rows = zip(points.xyz.tolist(), points.rgb.tolist(), _errors(points).tolist(), strict=True)
-        for point, (xyz, rgb, error) in enumerate(rows, start=1):
-            place = " ".join(map(repr, xyz))
-            lines.append(f"{point} {place} {' '.join(map(str, rgb))} {error!r}")
+        errors = _errors(points, seen).tolist()
+        rows = zip(points.xyz.tolist(), points.rgb.tolist(), errors, seen.tracks, strict=True)
+        for point, (xyz, rgb, error, track) in enumerate(rows, start=1):
+            row = [*map(repr, xyz), *map(str, rgb), repr(error), *map(str, track.ravel())]
+            lines.append(f"{point} {' '.join(row)}")
     _write_lines(model / "points3D.txt", lines)
 
 

@@ -28,7 +28,8 @@ from PIL import Image
 
 from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
-from igsr.capture.types import intrinsic_matrix
+from igsr.capture.tracks import straightened, track_confidence
+from igsr.capture.types import Tracks, intrinsic_matrix
 from igsr.capture.undistort import Lens
 from igsr.errors import IgsrError
 
@@ -442,6 +443,8 @@ def _estimate(photos: Sequence[Photo], model: Any | None, step: int) -> Estimate
             "may be wrong; look at the plot, or add photos between those that you have."
         )
     points = _points(photos, model, index_of)
+    if points is not None:
+        points.tracks = _tracks(photos, model, index_of, points.xyz, cameras, lenses)
     return Estimate(cameras, points, list(nothing), list(nothing), sentences, lenses)
 
 
@@ -466,5 +469,36 @@ def _points(photos: Sequence[Photo], model: Any, index_of: dict[int, int]) -> Po
     rgb = (colors / np.maximum(seen, 1.0)[:, None]).round().astype(np.uint8)
     errors = np.array([max(point.error, 0.0) for point in points])
     return Points(
-        np.stack([point.xyz for point in points]), rgb, np.maximum(seen, 1.0) / (1.0 + errors)
+        np.stack([point.xyz for point in points]),
+        rgb,
+        track_confidence(np.maximum(seen, 1.0), errors),
     )
+
+
+def _tracks(
+    photos: Sequence[Photo],
+    model: Any,
+    index_of: dict[int, int],
+    xyz: Float64,
+    cameras: Sequence[Camera | None],
+    lenses: Sequence[Lens | None],
+) -> Tracks:
+    """Where the photos that were placed see the points, with lens distortion undone."""
+    rows = {point_id: row for row, point_id in enumerate(sorted(model.point3D_ids()))}
+    view: list[int] = []
+    point: list[int] = []
+    places: list[Float64] = []
+    for number, image_id in enumerate(index_of):
+        for observed in model.images[image_id].get_observation_points2D():
+            view.append(number)
+            point.append(rows[observed.point3D_id])
+            places.append(observed.xy)
+    placed = list(index_of.values())
+    tracks = Tracks(
+        [photos[index].name for index in placed],
+        np.array(view, dtype=np.int64),
+        np.array(point, dtype=np.int64),
+        np.array(places, dtype=np.float64).reshape(-1, 2),
+    )
+    placed_cameras = [camera for camera in cameras if camera is not None]
+    return straightened(tracks, xyz, placed_cameras, [lenses[index] for index in placed])

@@ -11,11 +11,12 @@
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
 use super::device::CameraGradient;
+use super::hold::Hold;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 
 /// Degrees of freedom of a pose: turn (radians) about and move along x, y, z of the camera.
-const POSE: usize = 6;
+pub(super) const POSE: usize = 6;
 /// Depths, in units of the scene's, and picture positions, in units of its size, of the points whose
 /// motion in the picture measures a step.
 const DEPTHS: [f64; 3] = [0.8, 1.0, 1.25];
@@ -113,6 +114,8 @@ pub struct Cameras {
     now: Vec<Camera>,
     /// From steps in pixels to turns and moves.
     scales: Vec<[[f64; POSE]; POSE]>,
+    /// What else is known of each camera; empty where nothing is.
+    holds: Vec<Hold>,
     /// Pixels by which the picture moves where the logarithm of the focal length grows by 1.
     focal_pixels: Vec<f64>,
     config: CameraConfig,
@@ -131,13 +134,31 @@ impl Cameras {
             ..CameraState::default()
         };
         Self {
-            scales: all_scales(initial, &distances),
+            scales: all_scales(initial, &distances, &[]),
+            holds: Vec::new(),
             focal_pixels: initial.iter().map(focal_pixels).collect(),
             initial: initial.to_vec(),
             now: initial.to_vec(),
             config,
             state,
         }
+    }
+
+    /// Holds the cameras, one entry for each, from before their first step or [`Cameras::resume`].
+    pub fn hold(&mut self, holds: Vec<Hold>) -> Result<()> {
+        if holds.len() != self.initial.len() {
+            let count = self.initial.len();
+            return Err(Error::argument(
+                "holds",
+                format!("must have one entry for {count} cameras"),
+            ));
+        }
+        for (k, hold) in holds.iter().enumerate() {
+            hold.validate(k)?;
+        }
+        self.scales = all_scales(&self.initial, &self.state.distances, &holds);
+        self.holds = holds;
+        Ok(())
     }
 
     /// Goes on from a state that [`Cameras::state`] gave.
@@ -167,7 +188,7 @@ impl Cameras {
         if !state.distances.iter().all(|d| d.is_finite() && *d > 0.0) {
             return Err(Error::argument("cameras", "has a distance that is not positive"));
         }
-        self.scales = all_scales(&self.initial, &state.distances);
+        self.scales = all_scales(&self.initial, &state.distances, &self.holds);
         self.state = state;
         Ok(())
     }
@@ -224,6 +245,9 @@ impl Cameras {
                 Focal::Shared => mean_pixels,
                 _ => self.focal_pixels[k],
             };
+            let hold = self.holds.get(k).copied();
+            // A step is as long as the shorter of a pixel and what is known already.
+            let pixels = hold.map_or(pixels, |hold| pixels.hypot(hold.log_focal.sqrt()));
             let mut in_pixels = [0.0; POSE + 1];
             for (line, v) in scale.iter().zip(row) {
                 for (out, s) in in_pixels.iter_mut().zip(line) {
@@ -239,10 +263,16 @@ impl Cameras {
             let camera = &mut self.now[k];
             if self.config.poses {
                 move_by(camera, pose);
+                if let Some(hold) = hold {
+                    hold.pull_pose(camera, &scale, rate);
+                }
             }
             if self.config.focal != Focal::Fixed {
                 let factor = (moved[POSE] / pixels).exp();
                 (camera.fx, camera.fy) = (camera.fx * factor, camera.fy * factor);
+                if let Some(hold) = hold {
+                    hold.pull_focal(camera, pixels * pixels, rate);
+                }
             }
         }
         if self.config.anchored && self.config.poses {
@@ -290,7 +320,7 @@ fn tangent(camera: &Camera, v: &CameraGradient) -> [f64; 7] {
 }
 
 /// Turns and moves a camera by a tangent vector.
-fn move_by(camera: &mut Camera, [wx, wy, wz, tx, ty, tz]: [f64; POSE]) {
+pub(super) fn move_by(camera: &mut Camera, [wx, wy, wz, tx, ty, tz]: [f64; POSE]) {
     let turn = DQuat::from_scaled_axis(DVec3::new(wx, wy, wz));
     let rotation = (turn * DQuat::from_mat3(&camera.rotation())).normalize();
     let translation = turn * camera.translation() + DVec3::new(tx, ty, tz);
@@ -315,8 +345,9 @@ fn grid(camera: &Camera) -> Vec<(f64, f64)> {
         .collect()
 }
 
-fn all_scales(cameras: &[Camera], distances: &[f64]) -> Vec<[[f64; POSE]; POSE]> {
-    cameras.iter().zip(distances).map(|(camera, &d)| pixels_to_pose(camera, d)).collect()
+fn all_scales(cameras: &[Camera], distances: &[f64], holds: &[Hold]) -> Vec<[[f64; POSE]; POSE]> {
+    let each = cameras.iter().zip(distances).enumerate();
+    each.map(|(k, (camera, &d))| pixels_to_pose(camera, d, holds.get(k))).collect()
 }
 
 /// Median depth of the points that a camera has in its picture; of all before it, where it has none
@@ -344,8 +375,9 @@ pub fn scene_distance(camera: &Camera, means: &[[f32; 3]]) -> f64 {
 }
 
 /// A matrix from steps in pixels to poses: what it makes of a unit step moves points of the picture by
-/// one pixel in root mean square. A move comes with the turn that keeps the picture in place.
-fn pixels_to_pose(camera: &Camera, distance: f64) -> [[f64; POSE]; POSE] {
+/// one pixel in root mean square. A move comes with the turn that keeps the picture in place. Along
+/// what a hold knows to less than a pixel, it is that.
+fn pixels_to_pose(camera: &Camera, distance: f64, hold: Option<&Hold>) -> [[f64; POSE]; POSE] {
     let mut sum = [[0.0; POSE]; POSE];
     let points = grid(camera);
     let count = (points.len() * DEPTHS.len()) as f64;
@@ -371,6 +403,9 @@ fn pixels_to_pose(camera: &Camera, distance: f64) -> [[f64; POSE]; POSE] {
     for (i, line) in scaled.iter_mut().enumerate() {
         for (j, v) in line.iter_mut().enumerate() {
             *v = *v / (unit[i] * unit[j]) + if i == j { DAMPING } else { 0.0 };
+            if let Some(hold) = hold {
+                *v += hold.pose[i][j] / (unit[i] * unit[j]);
+            }
         }
     }
     let inverse = inverse_cholesky(scaled);
@@ -379,7 +414,7 @@ fn pixels_to_pose(camera: &Camera, distance: f64) -> [[f64; POSE]; POSE] {
 }
 
 /// L^-1 for a positive definite matrix L L^T.
-fn inverse_cholesky(matrix: [[f64; POSE]; POSE]) -> [[f64; POSE]; POSE] {
+pub(super) fn inverse_cholesky(matrix: [[f64; POSE]; POSE]) -> [[f64; POSE]; POSE] {
     let mut l = [[0.0; POSE]; POSE];
     for i in 0..POSE {
         for j in 0..=i {
@@ -467,6 +502,17 @@ mod tests {
             warm_up: 0.0,
             anchored: true,
         }
+    }
+
+    /// What a standard deviation in pixels along every way of moving leaves of information.
+    fn known(camera: &Camera, sigma: f64) -> Hold {
+        let mut pose = [[0.0; POSE]; POSE];
+        for (i, row) in pose.iter_mut().enumerate() {
+            let length = if i < 3 { camera.fx } else { camera.fx / 4.0 };
+            row[i] = (length / sigma).powi(2);
+        }
+        let log_focal = (focal_pixels(camera) / sigma).powi(2);
+        Hold { viewmat: camera.viewmat, focal: [camera.fx, camera.fy], pose, log_focal }
     }
 
     const POINTS: [[f64; 3]; 6] = [
@@ -602,6 +648,67 @@ mod tests {
         for (a, b) in lengths(&now).iter().zip(before) {
             assert!((a - b).abs() < 1e-9, "{b} became {a}");
         }
+    }
+
+    #[test]
+    fn held_cameras_stay_within_what_is_known_and_move_along_what_is_not() {
+        let truth = ring(4);
+        let off = CameraConfig { anchored: false, focal: Focal::PerCamera, ..config() };
+        let mut told = truth.clone();
+        for camera in &mut told {
+            move_by(camera, [0.01, -0.008, 0.006, 0.01, -0.02, 0.015]);
+            (camera.fx, camera.fy) = (1.02 * camera.fx, 1.02 * camera.fy);
+        }
+        // A hundredth of a pixel: the points pull by several, hard enough at any distance.
+        let surely: Vec<Hold> = told.iter().map(|camera| known(camera, 0.01)).collect();
+        let mut cameras = Cameras::new(&told, vec![4.0; 4], off);
+        cameras.hold(surely.clone()).unwrap();
+        fitted(&mut cameras, &truth, 400);
+        for (now, told) in cameras.now().iter().zip(&told) {
+            let turned = worst_angle(&[*now], &[*told]) * told.fx;
+            let moved = (now.center() - told.center()).length() * told.fx / 4.0;
+            let zoomed = (now.fx / told.fx).ln().abs() * focal_pixels(told);
+            assert!(turned.max(moved).max(zoomed) < 0.02, "{turned} {moved} {zoomed}");
+        }
+        // Nothing is known of the turns, nor of the focal lengths: these are found.
+        let mut turned = truth.clone();
+        turned.iter_mut().for_each(|camera| move_by(camera, [0.01, -0.008, 0.006, 0.0, 0.0, 0.0]));
+        let mut partly: Vec<Hold> = turned.iter().map(|camera| known(camera, 0.01)).collect();
+        for hold in &mut partly {
+            (0..3).for_each(|i| hold.pose[i][i] = 0.0);
+            hold.log_focal = 0.0;
+        }
+        let before = worst_angle(&turned, &truth);
+        let mut cameras = Cameras::new(&turned, vec![4.0; 4], off);
+        cameras.hold(partly).unwrap();
+        fitted(&mut cameras, &truth, 1000);
+        let after = worst_angle(cameras.now(), &truth);
+        assert!(after < 0.02 * before, "turns were {before:.2e} off and are {after:.2e}");
+        // Cameras that were brought elsewhere first come back to where they were told to be.
+        let mut cameras = Cameras::new(&truth, vec![4.0; 4], off);
+        cameras.hold(surely).unwrap();
+        (0..400).for_each(|_| cameras.step(0.0));
+        assert!(worst_angle(cameras.now(), &told) * 500.0 < 0.02);
+        assert!(cameras.now().iter().zip(&told).all(|(a, b)| (a.fx / b.fx - 1.0).abs() < 1e-4));
+    }
+
+    #[test]
+    fn holds_that_know_nothing_change_no_bit_and_wrong_ones_are_refused() {
+        let truth = ring(3);
+        let mut noisy = truth.clone();
+        move_by(&mut noisy[1], [0.01; 6]);
+        let off = CameraConfig { focal: Focal::Shared, ..config() };
+        let mut free = Cameras::new(&noisy, vec![4.0; 3], off);
+        let mut held = Cameras::new(&noisy, vec![4.0; 3], off);
+        let nothing = Hold { pose: [[0.0; POSE]; POSE], log_focal: 0.0, ..known(&truth[0], 1.0) };
+        held.hold(vec![nothing; 3]).unwrap();
+        fitted(&mut free, &truth, 7);
+        fitted(&mut held, &truth, 7);
+        assert_eq!(free.state(), held.state());
+        assert!(held.hold(vec![nothing; 2]).is_err());
+        assert!(held.hold(vec![Hold { log_focal: f64::NAN, ..nothing }; 3]).is_err());
+        assert!(held.hold(vec![Hold { log_focal: -1.0, ..nothing }; 3]).is_err());
+        assert!(held.hold(vec![Hold { focal: [0.0, 1.0], ..nothing }; 3]).is_err());
     }
 
     #[test]

@@ -11,6 +11,7 @@ use super::cameras::{CameraState, Cameras, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
 use super::device::{FitDevice, Rates, StepInput, Target};
+use super::hold::Hold;
 use super::hull::Hull;
 use super::params::FitState;
 use crate::camera::Camera;
@@ -161,6 +162,14 @@ impl Fitter {
             cameras.add(&gradients);
             cameras.state()
         }))
+    }
+
+    /// Holds cameras that are fitted by what else is known of them; before anything else.
+    pub fn hold_cameras(&mut self, holds: Vec<Hold>) -> Result<()> {
+        let Some(cameras) = self.moving.as_mut() else {
+            return Err(Error::argument("holds", "are of cameras that are not fitted"));
+        };
+        cameras.hold(holds)
     }
 
     /// Goes on with cameras where another fit's had come to.

@@ -5,6 +5,7 @@ mod config;
 mod density;
 mod device;
 mod fitter;
+mod hold;
 mod hull;
 mod initial;
 mod params;
@@ -17,5 +18,6 @@ pub use device::{
     noise_normal,
 };
 pub use fitter::{Fitter, scene_extent};
+pub use hold::Hold;
 pub use initial::splats_from_points;
 pub use params::{DensityStats, FitState, SplatArrays};

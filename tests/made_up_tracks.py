@@ -1,0 +1,33 @@
+"""Tracks of made-up captures: where photos see points that are known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from igsr.capture import Camera, Points, View
+from igsr.capture.types import Tracks
+
+
+def projected(camera: Camera, xyz: np.ndarray) -> np.ndarray:
+    """[P, 2] pixels, by the camera matrix."""
+    homogeneous = (xyz @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
+    return homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+def tracked(
+    views: Sequence[View], xyz: np.ndarray, noise: float = 0.0, miss: float = 0.0, seed: int = 0
+) -> Points:
+    """Points that each view sees, to ``noise`` pixels, but for a part of ``miss`` at random."""
+    random = np.random.default_rng(seed)
+    view, point, xy = [], [], []
+    for k, one in enumerate(views):
+        seen = np.flatnonzero(random.uniform(size=len(xyz)) >= miss)
+        places = projected(one.camera, xyz[seen])
+        view.append(np.full(len(seen), k))
+        point.append(seen)
+        xy.append(places + noise * random.normal(size=places.shape))
+    tracks = Tracks([one.name for one in views], *map(np.concatenate, (view, point, xy)))
+    grey = np.full((len(xyz), 3), 128, np.uint8)
+    return Points(xyz, grey, tracks=tracks)
