@@ -1,0 +1,150 @@
+//! The JSON and the buffers of a glTF file.
+
+use std::borrow::Cow;
+use std::path::{Component, Path};
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use serde_json::Value;
+
+use super::super::Format;
+use super::super::bytes::{Bytes, Named, u32_at};
+use super::super::limits;
+use super::{CHUNK_BINARY, CHUNK_JSON, MAGIC, TEXT_MAX};
+use crate::error::Result;
+
+/// Longest JSON of a `.glb`, whose data is elsewhere. In memory JSON takes up to 30 times as much.
+const JSON_MAX: usize = 16 << 20;
+
+/// A file's JSON and buffers.
+pub struct Document<'a> {
+    /// The JSON.
+    pub json: Value,
+    buffers: Vec<Cow<'a, [u8]>>,
+    named: Named<'a>,
+}
+
+impl<'a> Document<'a> {
+    /// Opens the file in `bytes`.
+    pub fn open(bytes: &'a [u8], format: Format, named: &Named<'a>) -> Result<Self> {
+        let (text, binary) =
+            if format == Format::Glb { split_glb(bytes, named)? } else { (bytes, None) };
+        let longest = if format == Format::Glb { JSON_MAX } else { TEXT_MAX };
+        if text.len() > longest {
+            return Err(named.bad(format!(
+                "has {} bytes of JSON, more than the {longest} that are read; write a .glb instead",
+                text.len()
+            )));
+        }
+        let json: Value = serde_json::from_slice(text)
+            .map_err(|e| named.bad(format!("holds JSON that cannot be read ({e})")))?;
+        let mut document = Self { json, buffers: Vec::new(), named: *named };
+        let mut left = limits::unpacked_max(bytes.len());
+        for k in 0..document.list("buffers").len() {
+            let buffer = document.buffer(k, binary, left)?;
+            left = left.saturating_sub(buffer.len() as u64);
+            document.buffers.push(buffer);
+        }
+        Ok(document)
+    }
+
+    /// An error about this file.
+    pub fn bad(&self, reason: impl Into<String>) -> crate::Error {
+        self.named.bad(reason)
+    }
+
+    /// The list `key` of the JSON; empty if there is none.
+    pub fn list(&self, key: &str) -> &[Value] {
+        self.json.get(key).and_then(Value::as_array).map_or(&[], Vec::as_slice)
+    }
+
+    /// Item `index` of the list `key`.
+    pub fn item(&self, key: &str, index: usize) -> Result<&Value> {
+        self.list(key)
+            .get(index)
+            .ok_or_else(|| self.bad(format!("refers to {key}[{index}], which it does not have")))
+    }
+
+    /// The bytes of a buffer view, and its stride if it gives one.
+    pub fn view(&self, index: usize) -> Result<(&[u8], Option<usize>)> {
+        let view = self.item("bufferViews", index)?;
+        let buffer = number(view, "buffer").and_then(|k| self.buffers.get(k));
+        let start = number(view, "byteOffset").unwrap_or(0);
+        let bytes = buffer
+            .zip(number(view, "byteLength"))
+            .and_then(|(buffer, length)| buffer.get(start..)?.get(..length))
+            .ok_or_else(|| {
+                self.bad(format!("has bufferViews[{index}] outside its buffer; it is truncated"))
+            })?;
+        Ok((bytes, number(view, "byteStride")))
+    }
+
+    /// The bytes of buffer `k`, of at most `most` bytes.
+    fn buffer(&self, k: usize, binary: Option<&'a [u8]>, most: u64) -> Result<Cow<'a, [u8]>> {
+        let buffer = self.item("buffers", k)?;
+        let length = number(buffer, "byteLength")
+            .ok_or_else(|| self.bad(format!("has buffers[{k}] without a byteLength")))?;
+        let bytes: Cow<'a, [u8]> = match (buffer.get("uri").and_then(Value::as_str), binary) {
+            (Some(uri), _) => match uri.split_once(";base64,") {
+                Some((kind, data)) if kind.starts_with("data:") => {
+                    Cow::Owned(STANDARD.decode(data).map_err(|e| {
+                        self.bad(format!("has buffers[{k}] that is no base64 ({e})"))
+                    })?)
+                }
+                _ => Cow::Owned(self.neighbour(uri, (length as u64).min(most))?),
+            },
+            (None, Some(binary)) if k == 0 => Cow::Borrowed(binary),
+            (None, _) => return Err(self.bad(format!("has buffers[{k}] without any bytes"))),
+        };
+        if bytes.len() < length {
+            return Err(self.bad(format!(
+                "has buffers[{k}] of {} bytes where {length} belong; it is truncated",
+                bytes.len()
+            )));
+        }
+        Ok(bytes)
+    }
+
+    /// The first `length` bytes of a file in the same folder or below it.
+    fn neighbour(&self, uri: &str, length: u64) -> Result<Vec<u8>> {
+        use std::io::Read;
+        let plain = Path::new(uri).components().all(|part| matches!(part, Component::Normal(_)));
+        if uri.contains(':') || uri.is_empty() || !plain {
+            return Err(self.bad(format!(
+                "refers to {uri:?}; only files in its own folder are opened: write a .glb instead"
+            )));
+        }
+        let path = self.named.0.with_file_name(uri);
+        let mut bytes = Vec::new();
+        std::fs::File::open(&path)
+            .and_then(|file| file.take(length).read_to_end(&mut bytes))
+            .map_err(|e| self.bad(format!("refers to {uri:?}, which cannot be read ({e})")))?;
+        Ok(bytes)
+    }
+}
+
+/// The JSON and, if any, the binary chunk of a `.glb`.
+fn split_glb<'a>(bytes: &'a [u8], named: &Named<'a>) -> Result<(&'a [u8], Option<&'a [u8]>)> {
+    let mut rest = Bytes::new(bytes, named);
+    let header = rest.take(12, "header")?;
+    if !header.starts_with(MAGIC) || u32_at(header, 4) != 2 {
+        return Err(named.bad("is no .glb of version 2; export it again"));
+    }
+    let (mut json, mut binary) = (None, None);
+    while rest.len() >= 8 {
+        let head = rest.take(8, "chunks")?;
+        let chunk = rest.take(u32_at(head, 0) as usize, "chunks")?;
+        let kind = &head[4..8];
+        if kind == CHUNK_JSON {
+            json.get_or_insert(chunk);
+        } else if kind == CHUNK_BINARY {
+            binary.get_or_insert(chunk);
+        }
+    }
+    Ok((json.ok_or_else(|| named.bad("has no JSON in it; it is truncated"))?, binary))
+}
+
+/// The count or index `key` of an object.
+pub fn number(object: &Value, key: &str) -> Option<usize> {
+    usize::try_from(object.get(key)?.as_u64()?).ok()
+}
