@@ -322,7 +322,8 @@ def _start(capture: Capture, settings: dict[str, Any]) -> tuple[dict[str, Any], 
         dense=settings["density"] == "fixed",
         exact_poses=settings["poses"] == "fixed",
     )
-    return dict(vars(splats)), [made_from, len(splats)]
+    state = {name: value for name, value in vars(splats).items() if name != "antialiased"}
+    return state, [made_from, len(splats)]
 
 
 def _with_rough_cameras(

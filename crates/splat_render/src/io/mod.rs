@@ -106,7 +106,7 @@ pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
             return Ok(notes);
         }
         Format::CompressedPly => compressed_ply::encode(file, &mut notes),
-        Format::Splat => splat::encode(file, &mut notes),
+        Format::Splat => splat::encode(file, &mut notes)?,
         Format::Spz => spz::encode(file, &mut notes)?,
         Format::Sog => sog::encode(file, &mut notes)?,
         Format::Glb | Format::Gltf => gltf::encode(file, format, &mut notes)?,
@@ -130,7 +130,7 @@ pub fn write_ply(path: &Path, file: &SplatFile) -> Result<()> {
     write_atomically(path, |out| ply::write(out, file))
 }
 
-/// An error in encoding, which only sizes beyond a format's fields can cause.
-fn too_large(what: &str) -> Error {
+/// The error of splats that a format has no way to hold.
+fn unfit(what: &str) -> Error {
     Error::argument("splats", format!("{what}; write a .ply, which has no such limit"))
 }

@@ -5,7 +5,7 @@
 use super::bytes::{Named, f32_at};
 use super::prepare::{Room, prepare, say_clipped};
 use super::quantize::{color_of_dc, dc_of_color, logit_of_byte, opacity_byte, to_f64, unit_byte};
-use super::{Format, Loaded, SplatFile};
+use super::{Format, Loaded, SplatFile, unfit};
 use crate::error::Result;
 use crate::fit::SplatArrays;
 
@@ -48,8 +48,11 @@ pub fn linear_scale(log: f32) -> f32 {
 }
 
 /// The whole file.
-pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Vec<u8> {
+pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let splats = prepare(file, &ROOM, notes);
+    if splats.is_empty() {
+        return Err(unfit("none are left to write, and a .splat of none would be an empty file"));
+    }
     let mut out = Vec::with_capacity(ROW * splats.len());
     let mut clipped = 0;
     for i in 0..splats.len() {
@@ -67,5 +70,5 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Vec<u8> {
         out.extend(quat.map(|c| (c / norm * 128.0 + 128.0).round() as u8));
     }
     say_clipped(notes, clipped, "colours", "0 to 1");
-    out
+    Ok(out)
 }

@@ -17,7 +17,7 @@ use super::frame::{sh_signs, turn_point, turn_quat};
 use super::limits::check_claim;
 use super::prepare::{Room, prepare, say_clipped};
 use super::quantize::{SmallestThree, logit_of_byte, opacity_byte, to_f32, to_f64, unit_byte};
-use super::{Format, Loaded, SplatFile, too_large};
+use super::{Format, Loaded, SplatFile, unfit};
 use crate::constants::SH_DEGREE_MAX;
 use crate::error::Result;
 use crate::fit::SplatArrays;
@@ -263,7 +263,7 @@ fn fraction_bits(splats: &SplatArrays) -> Result<u8> {
         .rev()
         .find(|&bits| (f64::from(largest) * f64::from(bits).exp2()).round() <= limit)
         .ok_or_else(|| {
-            too_large(&format!("a .spz holds positions up to {limit}, and one is at {largest}"))
+            unfit(&format!("a .spz holds positions up to {limit}, and one is at {largest}"))
         })
 }
 
@@ -271,7 +271,7 @@ fn fraction_bits(splats: &SplatArrays) -> Result<u8> {
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let splats = prepare(file, &ROOM, notes);
     let (n, stride) = (splats.len(), splats.stride());
-    let count = u32::try_from(n).map_err(|_| too_large("a .spz holds 2^32 splats"))?;
+    let count = u32::try_from(n).map_err(|_| unfit("a .spz holds 2^32 splats"))?;
     let bits = fraction_bits(&splats)?;
     if splats.sh_degree == SH_DEGREE_MAX {
         notes.push("Readers of .spz before 2026 know no SH of degree 4.".to_owned());
@@ -321,5 +321,5 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let mut gzip = GzEncoder::new(Vec::new(), Compression::default());
     let packed = gzip.write_all(&data).and_then(|()| gzip.finish());
     // Writing to memory does not fail.
-    packed.map_err(|e| too_large(&format!("cannot be compressed ({e})")))
+    packed.map_err(|e| unfit(&format!("cannot be compressed ({e})")))
 }

@@ -108,13 +108,14 @@ impl<'a> Document<'a> {
     /// The first `length` bytes of a file in the same folder or below it.
     fn neighbour(&self, uri: &str, length: u64) -> Result<Vec<u8>> {
         use std::io::Read;
-        let plain = Path::new(uri).components().all(|part| matches!(part, Component::Normal(_)));
-        if uri.contains(':') || uri.is_empty() || !plain {
+        let name = percent_decoded(uri);
+        let plain = Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
+        if name.contains([':', '\\', '\0']) || name.is_empty() || !plain {
             return Err(self.bad(format!(
                 "refers to {uri:?}; only files in its own folder are opened: write a .glb instead"
             )));
         }
-        let path = self.named.0.with_file_name(uri);
+        let path = self.named.0.with_file_name(name);
         let mut bytes = Vec::new();
         std::fs::File::open(&path)
             .and_then(|file| file.take(length).read_to_end(&mut bytes))
@@ -147,4 +148,23 @@ fn split_glb<'a>(bytes: &'a [u8], named: &Named<'a>) -> Result<(&'a [u8], Option
 /// The count or index `key` of an object.
 pub fn number(object: &Value, key: &str) -> Option<usize> {
     usize::try_from(object.get(key)?.as_u64()?).ok()
+}
+
+/// A URI's text with its %XX as the bytes that they stand for.
+fn percent_decoded(uri: &str) -> String {
+    let hex = |byte: u8| char::from(byte).to_digit(16);
+    let mut out = Vec::new();
+    let mut rest = uri.as_bytes();
+    while let [first, others @ ..] = rest {
+        rest = others;
+        if let (b'%', [high, low, after @ ..]) = (first, others) {
+            if let (Some(high), Some(low)) = (hex(*high), hex(*low)) {
+                out.push((high * 16 + low) as u8);
+                rest = after;
+                continue;
+            }
+        }
+        out.push(*first);
+    }
+    String::from_utf8_lossy(&out).into_owned()
 }

@@ -8,7 +8,7 @@ use super::super::frame;
 use super::super::prepare::{Room, prepare};
 use super::super::quantize::{sigmoid, to_f32, to_f64};
 use super::super::splat::linear_scale;
-use super::super::{Format, SplatFile, too_large};
+use super::super::{Format, SplatFile, unfit};
 use super::{
     ANTIALIASED, CHUNK_BINARY, CHUNK_JSON, COLOR_SPACE, EXTENSION, FLOAT, KERNEL, MAGIC, OPACITY,
     ROTATION, SCALE, SH_DEGREE, TEXT_MAX, sh_name,
@@ -133,7 +133,7 @@ fn glb(document: &Value, mut binary: Vec<u8>) -> Result<Vec<u8>> {
         &[(CHUNK_JSON, &text), (CHUNK_BINARY, &binary)]
     };
     let length = 12 + chunks.iter().map(|(_, chunk)| 8 + chunk.len()).sum::<usize>();
-    let length = u32::try_from(length).map_err(|_| too_large("a .glb holds 4 GiB"))?;
+    let length = u32::try_from(length).map_err(|_| unfit("a .glb holds 4 GiB"))?;
     let mut out = Vec::with_capacity(length as usize);
     out.extend(MAGIC);
     out.extend(2u32.to_le_bytes());
@@ -149,7 +149,7 @@ fn glb(document: &Value, mut binary: Vec<u8>) -> Result<Vec<u8>> {
 
 fn gltf(mut document: Value, binary: &[u8]) -> Result<Vec<u8>> {
     if binary.len() > TEXT_MAX / 2 {
-        return Err(too_large("a .gltf of so many would be too large to read again; write a .glb"));
+        return Err(unfit("a .gltf of so many would be too large to read again; write a .glb"));
     }
     if !binary.is_empty() {
         let data = STANDARD.encode(binary);

@@ -3,7 +3,7 @@
 use super::super::morton::morton_order;
 use super::super::prepare::{Room, prepare};
 use super::super::quantize::{SmallestThree, opacity_byte, to_f64, unit_byte};
-use super::super::{SplatFile, too_large};
+use super::super::{SplatFile, unfit};
 use super::codebook::{codebook, nearest};
 use super::images::{Image, webp, zipped};
 use super::meta::{Coded, Meta, Rest};
@@ -89,13 +89,13 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let mut files = Vec::new();
     for (name, image) in &images {
         let bytes = webp(image).ok_or_else(|| {
-            too_large(&format!("a .sog holds 16384 x 16384 of them, not {}", splats.len()))
+            unfit(&format!("a .sog holds 16384 x 16384 of them, not {}", splats.len()))
         })?;
         files.push((*name, bytes));
     }
     files.push((META, meta.write().into_bytes()));
     // Writing to memory does not fail.
-    zipped(&files).map_err(|e| too_large(&format!("cannot be zipped ({e})")))
+    zipped(&files).map_err(|e| unfit(&format!("cannot be zipped ({e})")))
 }
 
 fn pack_rest(splats: &SplatArrays, images: &mut Vec<(&str, Image)>) -> Rest {
