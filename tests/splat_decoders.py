@@ -123,7 +123,9 @@ def splat(content: bytes) -> Decoded:
 
 def ksplat(content: bytes) -> Decoded:
     """Of compression level 0 and one section only."""
-    assert content[0] == 0 and content[1] == 1 and content[20] == 0
+    assert content[0] == 0
+    assert content[1] == 1
+    assert content[20] == 0
     sections = struct.unpack_from("<I", content, 4)[0]
     count, _, _, buckets = struct.unpack_from("<4I", content, 4096)
     stored, degree = (
@@ -131,7 +133,8 @@ def ksplat(content: bytes) -> Decoded:
         struct.unpack_from("<H", content, 4096 + 40)[0],
     )
     partial = struct.unpack_from("<I", content, 4096 + 36)[0]
-    assert sections == 1 and degree == 0
+    assert sections == 1
+    assert degree == 0
     floats = ("mean", "<f4", 3), ("scale", "<f4", 3), ("quat", "<f4", 4), ("rgba", "u1", 4)
     start = 4096 + 1024 + 4 * partial + stored * buckets
     table = np.frombuffer(content, np.dtype(list(floats)), count, start)
@@ -149,7 +152,8 @@ def spz(content: bytes) -> Decoded:
     """Of versions 2 and 3: numpy brings no zstd for version 4."""
     content = gzip.decompress(content)
     magic, version, count, degree, fraction, _, _ = struct.unpack_from("<4sIIBBBB", content)
-    assert magic == b"NGSP" and version in (2, 3)
+    assert magic == b"NGSP"
+    assert version in (2, 3)
     start = 16
 
     def take(width: int):

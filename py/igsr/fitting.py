@@ -302,7 +302,7 @@ def _fit(
         save_checkpoint(path, state, {**settings, "seconds": seconds_before})
     if go_on:
         _run(fitter, kept, settings, info, seconds_before, progress, path)
-    splats = Splats(**fitter.splats(), origin=origin)
+    splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
     if not moving:
         return splats, capture
     return splats, with_train_cameras(capture, fitted_cameras(views, fitter, origin))

@@ -222,7 +222,7 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Vec<u8> {
     say_clipped(
         notes,
         scales.iter().filter(|s| s.abs() > SCALE_MAX).count(),
-        "log-scales",
+        "log-scale",
         &format!("{SCALE_MAX}"),
     );
     for scale in scales {
@@ -290,7 +290,7 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Vec<u8> {
             }
         }
     }
-    say_clipped(notes, clipped, "SH coefficients", &format!("{}", SH_RANGE / 2.0));
+    say_clipped(notes, clipped, "SH coefficient", &format!("{}", SH_RANGE / 2.0));
     out
 }
 

@@ -73,12 +73,16 @@ impl Format {
             (&[0x1f, 0x8b, 8], Self::Spz),
             (b"{", Self::Gltf),
         ];
+        let text = head.trim_ascii_start();
         let ending = Self::of_ending(named.0);
         // The first bytes of these two are numbers, which may look like a short mark by chance.
         let unmarked = matches!(ending, Some(Self::Splat | Self::Ksplat));
         let marked = marks
             .iter()
-            .find(|(mark, _)| head.starts_with(mark) && (!unmarked || mark.len() >= 4))
+            .find(|(mark, _)| match mark {
+                [b'{'] => text.starts_with(mark) && !unmarked,
+                _ => head.starts_with(mark) && (!unmarked || mark.len() >= 4),
+            })
             .map(|(_, format)| *format);
         match (marked, ending) {
             _ if head.is_empty() => Err(named.bad("is empty; give a file of splats")),

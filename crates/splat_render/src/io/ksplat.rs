@@ -76,13 +76,11 @@ pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
         given => given,
     };
     let sh_range = (range(36, -SH_HALF_RANGE), range(40, SH_HALF_RANGE));
-    let (reserved, used) = (u32_at(header, 4) as usize, u32_at(header, 8) as usize);
-    if used > reserved {
-        return Err(named.bad(format!("has {used} sections where {reserved} fit; it is damaged")));
-    }
+    // Writers leave the number of used sections at 0; unused ones hold no splats.
+    let reserved = u32_at(header, 4) as usize;
     let headers = data.take_rows(reserved, SECTION_HEADER, "section headers")?;
-    let mut sections = Vec::with_capacity(used);
-    for header in headers.chunks_exact(SECTION_HEADER).take(used) {
+    let mut sections = Vec::with_capacity(reserved);
+    for header in headers.chunks_exact(SECTION_HEADER) {
         sections.push(Section::take(&mut data, header, level, named)?);
     }
 

@@ -7,7 +7,7 @@ use crate::sh;
 /// Most splats that ids of 32 bits leave room for.
 pub const SPLATS_MAX: u64 = 1 << 30;
 /// Largest file that is read into memory whole. A `.ply` is not, and may be larger.
-const FILE_MAX: u64 = 4 << 30;
+pub const FILE_MAX: u64 = 4 << 30;
 /// Splats in memory per byte of file. Files of real scenes unpack to 4 to 20 times their size.
 const UNPACKED_PER_BYTE: u64 = 64;
 /// What any file may unpack to, so that small scenes of equal splats can be read.

@@ -80,13 +80,12 @@ pub fn counted(count: usize) -> String {
     format!("{count} splat{}", if count == 1 { "" } else { "s" })
 }
 
-/// Says that values were beyond a format's range, if any were.
+/// Says that values, which `what` names one of, were beyond a format's range, if any were.
 pub fn say_clipped(notes: &mut Vec<String>, count: usize, what: &str, range: &str) {
-    if count > 0 {
-        notes.push(format!(
-            "{count} {what} beyond {range} {} clipped.",
-            if count == 1 { "is" } else { "are" }
-        ));
+    match count {
+        0 => {}
+        1 => notes.push(format!("1 {what} beyond {range} is clipped.")),
+        _ => notes.push(format!("{count} {what}s beyond {range} are clipped.")),
     }
 }
 

@@ -69,6 +69,6 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
         // `as` saturates: 1 becomes 255.
         out.extend(quat.map(|c| (c / norm * 128.0 + 128.0).round() as u8));
     }
-    say_clipped(notes, clipped, "colours", "0 to 1");
+    say_clipped(notes, clipped, "colour", "0 to 1");
     Ok(out)
 }

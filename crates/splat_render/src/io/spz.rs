@@ -295,14 +295,14 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
         clipped += usize::from(!(0.0..=1.0).contains(&value));
         data.push(unit_byte(value));
     }
-    say_clipped(notes, clipped, "colour coefficients", "-3.3 to 3.3");
+    say_clipped(notes, clipped, "colour coefficient", "-3.3 to 3.3");
     clipped = 0;
     for scale in splats.scales.as_flattened() {
         let value = ((f64::from(*scale) + SCALE_OFFSET) * SCALE_STEPS).round();
         clipped += usize::from(!(0.0..=255.0).contains(&value));
         data.push(value as u8);
     }
-    say_clipped(notes, clipped, "log-scales", "-10 to 5.9");
+    say_clipped(notes, clipped, "log-scale", "-10 to 5.9");
     for quat in &splats.quats {
         data.extend(pack_rotation(turn_quat(*quat)).to_le_bytes());
     }
@@ -317,7 +317,7 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
             }
         }
     }
-    say_clipped(notes, clipped, "SH coefficients", "-1 to 1");
+    say_clipped(notes, clipped, "SH coefficient", "-1 to 1");
     let mut gzip = GzEncoder::new(Vec::new(), Compression::default());
     let packed = gzip.write_all(&data).and_then(|()| gzip.finish());
     // Writing to memory does not fail.

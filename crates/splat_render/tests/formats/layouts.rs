@@ -47,7 +47,6 @@ pub fn ksplat(file: &SplatFile, level: u16) -> Vec<u8> {
     };
     header[1] = 1;
     put(&mut header, 4, 1); // sections reserved
-    put(&mut header, 8, 1); // sections used
     put(&mut header, 12, n as u32);
     put(&mut header, 16, n as u32);
     header[20] = level as u8;

@@ -1,6 +1,7 @@
 //! The JSON and the buffers of a glTF file.
 
 use std::borrow::Cow;
+use std::collections::HashMap;
 use std::path::{Component, Path};
 
 use base64::Engine;
@@ -13,14 +14,16 @@ use super::super::limits;
 use super::{CHUNK_BINARY, CHUNK_JSON, MAGIC, TEXT_MAX};
 use crate::error::Result;
 
-/// Longest JSON of a `.glb`, whose data is elsewhere. In memory JSON takes up to 30 times as much.
-const JSON_MAX: usize = 16 << 20;
+/// Most values in the JSON. In memory each may take 80 times its text; splats take a few hundred.
+const VALUES_MAX: usize = 1 << 18;
 
 /// A file's JSON and buffers.
 pub struct Document<'a> {
     /// The JSON.
     pub json: Value,
-    buffers: Vec<Cow<'a, [u8]>>,
+    /// Place in `stores` of each buffer's bytes.
+    buffers: Vec<usize>,
+    stores: Vec<Cow<'a, [u8]>>,
     named: Named<'a>,
 }
 
@@ -29,23 +32,28 @@ impl<'a> Document<'a> {
     pub fn open(bytes: &'a [u8], format: Format, named: &Named<'a>) -> Result<Self> {
         let (text, binary) =
             if format == Format::Glb { split_glb(bytes, named)? } else { (bytes, None) };
-        let longest = if format == Format::Glb { JSON_MAX } else { TEXT_MAX };
-        if text.len() > longest {
+        if text.len() > TEXT_MAX || values(text) > VALUES_MAX {
             return Err(named.bad(format!(
-                "has {} bytes of JSON, more than the {longest} that are read; write a .glb instead",
-                text.len()
+                "has {} bytes of JSON with {} values, more than {TEXT_MAX} or {VALUES_MAX}; write \
+                 its splats alone, as .glb",
+                text.len(),
+                values(text)
             )));
         }
         let json: Value = serde_json::from_slice(text)
             .map_err(|e| named.bad(format!("holds JSON that cannot be read ({e})")))?;
-        let mut document = Self { json, buffers: Vec::new(), named: *named };
-        let mut left = limits::unpacked_max(bytes.len());
+        let mut document = Self { json, buffers: Vec::new(), stores: Vec::new(), named: *named };
+        let mut files = HashMap::new();
         for k in 0..document.list("buffers").len() {
-            let buffer = document.buffer(k, binary, left)?;
-            left = left.saturating_sub(buffer.len() as u64);
-            document.buffers.push(buffer);
+            let store = document.buffer(k, binary, &mut files)?;
+            document.buffers.push(store);
         }
         Ok(document)
+    }
+
+    /// Bytes of all buffers: what counts of splats are held against.
+    pub fn size(&self) -> usize {
+        self.stores.iter().map(|store| store.len()).sum()
     }
 
     /// An error about this file.
@@ -68,45 +76,60 @@ impl<'a> Document<'a> {
     /// The bytes of a buffer view, and its stride if it gives one.
     pub fn view(&self, index: usize) -> Result<(&[u8], Option<usize>)> {
         let view = self.item("bufferViews", index)?;
-        let buffer = number(view, "buffer").and_then(|k| self.buffers.get(k));
+        let store = number(view, "buffer").and_then(|k| self.stores.get(*self.buffers.get(k)?));
         let start = number(view, "byteOffset").unwrap_or(0);
-        let bytes = buffer
+        let bytes = store
             .zip(number(view, "byteLength"))
-            .and_then(|(buffer, length)| buffer.get(start..)?.get(..length))
+            .and_then(|(store, length)| store.get(start..)?.get(..length))
             .ok_or_else(|| {
                 self.bad(format!("has bufferViews[{index}] outside its buffer; it is truncated"))
             })?;
         Ok((bytes, number(view, "byteStride")))
     }
 
-    /// The bytes of buffer `k`, of at most `most` bytes.
-    fn buffer(&self, k: usize, binary: Option<&'a [u8]>, most: u64) -> Result<Cow<'a, [u8]>> {
+    /// The place in `stores` of buffer `k`'s bytes. Of other files, `files` knows the place: many
+    /// buffers may share one, which is in memory once.
+    fn buffer(
+        &mut self,
+        k: usize,
+        binary: Option<&'a [u8]>,
+        files: &mut HashMap<String, usize>,
+    ) -> Result<usize> {
         let buffer = self.item("buffers", k)?;
         let length = number(buffer, "byteLength")
             .ok_or_else(|| self.bad(format!("has buffers[{k}] without a byteLength")))?;
-        let bytes: Cow<'a, [u8]> = match (buffer.get("uri").and_then(Value::as_str), binary) {
-            (Some(uri), _) => match uri.split_once(";base64,") {
-                Some((kind, data)) if kind.starts_with("data:") => {
-                    Cow::Owned(STANDARD.decode(data).map_err(|e| {
-                        self.bad(format!("has buffers[{k}] that is no base64 ({e})"))
-                    })?)
+        let uri = buffer.get("uri").and_then(Value::as_str);
+        let inline = uri.and_then(|uri| uri.split_once(";base64,"));
+        let next = self.stores.len();
+        let (place, bytes) = match (uri, inline, binary) {
+            (_, Some((kind, data)), _) if kind.starts_with("data:") => {
+                let bytes = STANDARD
+                    .decode(data)
+                    .map_err(|e| self.bad(format!("has buffers[{k}] that is no base64 ({e})")))?;
+                (next, Some(Cow::Owned(bytes)))
+            }
+            (Some(uri), _, _) => match files.get(uri) {
+                Some(&place) => (place, None),
+                None => {
+                    files.insert(uri.to_owned(), next);
+                    (next, Some(Cow::Owned(self.neighbour(uri)?)))
                 }
-                _ => Cow::Owned(self.neighbour(uri, (length as u64).min(most))?),
             },
-            (None, Some(binary)) if k == 0 => Cow::Borrowed(binary),
-            (None, _) => return Err(self.bad(format!("has buffers[{k}] without any bytes"))),
+            (None, _, Some(binary)) if k == 0 => (next, Some(Cow::Borrowed(binary))),
+            _ => return Err(self.bad(format!("has buffers[{k}] without any bytes"))),
         };
-        if bytes.len() < length {
+        self.stores.extend(bytes);
+        let found = self.stores[place].len();
+        if found < length {
             return Err(self.bad(format!(
-                "has buffers[{k}] of {} bytes where {length} belong; it is truncated",
-                bytes.len()
+                "has buffers[{k}] of {found} bytes where {length} belong; it is truncated"
             )));
         }
-        Ok(bytes)
+        Ok(place)
     }
 
-    /// The first `length` bytes of a file in the same folder or below it.
-    fn neighbour(&self, uri: &str, length: u64) -> Result<Vec<u8>> {
+    /// The bytes of a file in the same folder or below it.
+    fn neighbour(&self, uri: &str) -> Result<Vec<u8>> {
         use std::io::Read;
         let name = percent_decoded(uri);
         let plain = Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
@@ -118,10 +141,25 @@ impl<'a> Document<'a> {
         let path = self.named.0.with_file_name(name);
         let mut bytes = Vec::new();
         std::fs::File::open(&path)
-            .and_then(|file| file.take(length).read_to_end(&mut bytes))
+            .and_then(|file| file.take(limits::FILE_MAX).read_to_end(&mut bytes))
             .map_err(|e| self.bad(format!("refers to {uri:?}, which cannot be read ({e})")))?;
         Ok(bytes)
     }
+}
+
+/// At most so many values are in a JSON text: each but the first follows a mark outside strings.
+fn values(text: &[u8]) -> usize {
+    let (mut count, mut quoted, mut escaped) = (1, false, false);
+    for byte in text {
+        match byte {
+            _ if escaped => escaped = false,
+            b'\\' if quoted => escaped = true,
+            b'"' => quoted = !quoted,
+            b',' | b'[' | b'{' if !quoted => count += 1,
+            _ => {}
+        }
+    }
+    count
 }
 
 /// The JSON and, if any, the binary chunk of a `.glb`.

@@ -53,7 +53,7 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
             let part = Part::new(&document, primitive, at)?;
             total += part.count as u64;
             // Nodes may show one mesh many times: the sum is what memory is taken for.
-            check_claim(named, total, part.degree, bytes.len())?;
+            check_claim(named, total, part.degree, document.size())?;
             parts.push(part);
         }
     }
@@ -69,7 +69,7 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
     }
 
     let degree = parts.iter().map(|part| part.degree).max().unwrap_or(0);
-    check_claim(named, total, degree, bytes.len())?;
+    check_claim(named, total, degree, document.size())?;
     let mut splats = SplatArrays::zeros(total as usize, degree);
     // The first shift is kept in f64 as the origin.
     let origin = parts.first().map_or(DVec3::ZERO, |part| part.at.translation);

@@ -8,10 +8,14 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::super::bytes::Named;
 use super::super::limits::unpacked_max;
+use super::META;
 use crate::error::Result;
 
 /// Pixels that an image may have beyond those that are used: writers round sizes up.
 const SPARE_PIXELS: u64 = 1 << 16;
+
+/// Longest meta.json that is read: real ones are 20 kB, and JSON takes many times its text.
+const META_MAX: u64 = 1 << 20;
 
 /// The zip of a `.sog`.
 pub struct Bundle<'a> {
@@ -30,20 +34,25 @@ impl<'a> Bundle<'a> {
         Ok(Self { zip, limit: unpacked_max(bytes.len()), named: *named })
     }
 
-    /// The bytes of the file `name`.
-    pub fn file(&mut self, name: &str) -> Result<Vec<u8>> {
+    /// The text of `meta.json`.
+    pub fn meta(&mut self) -> Result<Vec<u8>> {
+        self.file(META, META_MAX)
+    }
+
+    /// The first `limit` bytes of the file `name`.
+    fn file(&mut self, name: &str, limit: u64) -> Result<Vec<u8>> {
         let damaged = |e: &dyn std::fmt::Display| {
             self.named.bad(format!("has no readable '{name}' in it ({e}); export it again"))
         };
         let entry = self.zip.by_name(name).map_err(|e| damaged(&e))?;
         let mut bytes = Vec::new();
-        entry.take(self.limit).read_to_end(&mut bytes).map_err(|e| damaged(&e))?;
+        entry.take(limit).read_to_end(&mut bytes).map_err(|e| damaged(&e))?;
         Ok(bytes)
     }
 
     /// The image `name`, which is to have at least `used` pixels, or more by a little.
     pub fn image(&mut self, name: &str, used: usize) -> Result<Image> {
-        let bytes = self.file(name)?;
+        let bytes = self.file(name, self.limit)?;
         let damaged = |e: &dyn std::fmt::Display| {
             self.named
                 .bad(format!("has an image '{name}' that cannot be read ({e}); export it again"))

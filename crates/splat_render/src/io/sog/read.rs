@@ -6,14 +6,14 @@ use super::super::quantize::{SmallestThree, logit_of_byte, to_f32};
 use super::super::{Format, Loaded, SplatFile};
 use super::images::Bundle;
 use super::meta::{Meta, Rest};
-use super::{META, PALETTE_COLUMNS, ROTATION_TAG};
+use super::{PALETTE_COLUMNS, ROTATION_TAG};
 use crate::error::Result;
 use crate::fit::SplatArrays;
 
 /// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let mut bundle = Bundle::open(bytes, named)?;
-    let meta = Meta::read(&bundle.file(META)?, named)?;
+    let meta = Meta::read(&bundle.meta()?, named)?;
     let degree = meta.rest.as_ref().map_or(0, |rest| rest.degree);
     let n = check_claim(named, meta.count, degree, bytes.len())?;
     let mut splats = SplatArrays::zeros(n, degree);
