@@ -48,9 +48,8 @@ fn mutate(bytes: &mut Vec<u8>, numbers: &mut Numbers) {
                 let digits: Vec<usize> =
                     (0..bytes.len().min(4096)).filter(|&i| bytes[i].is_ascii_digit()).collect();
                 if let Some(&at) = digits.get(numbers.below(digits.len())) {
-                    let new: &[u8] = [b"0", b"-1", b"9", b"99999999", b"1e999", b"[]", b"null"]
-                        [numbers.below(7)];
-                    bytes.splice(at..=at, new.iter().copied());
+                    let new = ["0", "-1", "9", "99999999", "1e999", "[]", "null"][numbers.below(7)];
+                    bytes.splice(at..=at, new.bytes());
                 }
             }
             _ => {
@@ -77,7 +76,7 @@ fn run(name: &str, seed_bytes: &[u8], wrap: impl Fn(Vec<u8>) -> Vec<u8>) {
     for case in 0..cases {
         let mut bytes = seed_bytes.to_vec();
         if case > 0 {
-            mutate(&mut bytes, &mut Numbers(case as u64 * 0x9e37_79b9_7f4a_7c15 + 1));
+            mutate(&mut bytes, &mut Numbers((case as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15)));
         }
         let bytes = wrap(bytes);
         let started = Instant::now();

@@ -161,7 +161,7 @@ fn no_splats_and_one_splat_and_saturated_ones_are_scenes_too() {
             let (loaded, _) = by_way_of(&folder, ending, &file);
             assert_eq!(loaded.file.splats.len(), n, "{ending}");
         }
-        let mut file = scene(9, 1);
+        let mut file = scene(9, 0);
         for (i, opacity) in file.splats.opacities.iter_mut().enumerate() {
             *opacity = [-1e30, -200.0, -30.0, 30.0, 200.0, 1e30][i % 6];
             file.splats.quats[i] = [0.0, 0.0, 1e-5, -2.0];
