@@ -195,12 +195,12 @@ fn percent_decoded(uri: &str) -> String {
     let mut rest = uri.as_bytes();
     while let [first, others @ ..] = rest {
         rest = others;
-        if let (b'%', [high, low, after @ ..]) = (first, others) {
-            if let (Some(high), Some(low)) = (hex(*high), hex(*low)) {
-                out.push((high * 16 + low) as u8);
-                rest = after;
-                continue;
-            }
+        if let (b'%', [high, low, after @ ..]) = (first, others)
+            && let (Some(high), Some(low)) = (hex(*high), hex(*low))
+        {
+            out.push((high * 16 + low) as u8);
+            rest = after;
+            continue;
         }
         out.push(*first);
     }

@@ -89,12 +89,11 @@ fn check_extension(
     extension: &Value,
     notes: &mut Vec<String>,
 ) -> Result<()> {
-    if let Some(names) = extension.get("extensions").and_then(Value::as_object) {
-        if let Some(name) = names.keys().next() {
-            return Err(document.bad(format!(
-                "holds splats in the extension {name:?}, which cannot be read: export them without"
-            )));
-        }
+    let inner = extension.get("extensions").and_then(Value::as_object);
+    if let Some(name) = inner.and_then(|names| names.keys().next()) {
+        return Err(document.bad(format!(
+            "holds splats in the extension {name:?}, which cannot be read: export them without"
+        )));
     }
     match extension.get("kernel").and_then(Value::as_str) {
         None | Some(KERNEL) => {}
