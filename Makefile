@@ -1,5 +1,6 @@
 # make demo   sets everything up and fits the example capture
 # make test   sets everything up and runs every check
+# make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
 # make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
 #
 # Needs a Python (3.10 or newer), a Rust toolchain, a C linker and a package manager. Everything
@@ -24,7 +25,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test bench accuracy profile build wheel check-rust check-python vulkan example-capture clean
+.PHONY: demo test fuzz bench accuracy profile build wheel check-rust check-python vulkan example-capture clean
 .DELETE_ON_ERROR:
 
 # ---- what a user runs --------------------------------------------------------------------------
@@ -83,6 +84,13 @@ check-rust: build vulkan
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy $(PROFILE) --locked --workspace --all-targets -- -D warnings
 	$(CARGO) test $(PROFILE) $(CHECKED) --locked --workspace
+
+# The same seeded changes as in make test, and more of them. cargo-fuzz would need a nightly compiler.
+CASES ?= 100000
+
+fuzz:
+	IGSR_FUZZ_CASES=$(CASES) $(CARGO) test $(PROFILE) $(CHECKED) --locked --package splat_render \
+		--test formats mutations -- --nocapture
 
 check-python: build vulkan $(VENV)/.dev-ready
 	$(BIN)/ruff check .

@@ -232,11 +232,18 @@ class Fitter:
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Everything needed to go on bit for bit."""
 
-def read_ply(path: str) -> SplatArrays:
-    """Read an INRIA .ply; OSError says what is wrong with the file."""
+def read_splats(path: str) -> dict[str, Any]:
+    """Read a splat file of any format, told by its content.
 
-def write_ply(path: str, splats: dict[str, Any]) -> None:
-    """Write ``SplatArrays`` as an INRIA .ply, whole or not at all; OSError where that fails."""
+    ``SplatArrays``, antialiased (bool), format (its ending without a dot) and notes (list of
+    sentences on what was passed over); OSError says what is wrong with the file.
+    """
+
+def write_splats(path: str, splats: dict[str, Any]) -> list[str]:
+    """Write ``SplatArrays`` and antialiased in the format of the ending, whole or not at all.
+
+    Returns a sentence for each thing that the format cannot hold; OSError where that fails.
+    """
 
 def write_exr(path: str, color: Float32, alpha: Float32, depth: Float32) -> None:
     """Write channels R, G, B, A, Z in 32-bit float; OSError where that fails."""

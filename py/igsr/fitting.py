@@ -311,7 +311,7 @@ def _fit(
         save_checkpoint(path, state, {**settings, "seconds": seconds_before})
     if go_on:
         _run(fitter, kept, settings, info, seconds_before, progress, path)
-    splats = Splats(**fitter.splats(), origin=origin)
+    splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
     if not moving:
         return splats, capture
     return splats, with_train_cameras(capture, fitted_cameras(views, fitter, origin))
@@ -331,7 +331,8 @@ def _start(capture: Capture, settings: dict[str, Any]) -> tuple[dict[str, Any], 
         dense=settings["density"] == "fixed",
         exact_poses=settings["poses"] == "fixed",
     )
-    return dict(vars(splats)), [made_from, len(splats)]
+    state = {name: value for name, value in vars(splats).items() if name != "antialiased"}
+    return state, [made_from, len(splats)]
 
 
 def _with_rough_cameras(

@@ -174,7 +174,7 @@ def _placed_splats(
     )
     if confidence is not None:
         _follow_confidence(arrays, confidence)
-    return Splats(**arrays, origin=origin), start
+    return Splats(**arrays, origin=origin, antialiased=False), start
 
 
 def _at_most(most: int, count: int, random: Generator) -> npt.NDArray[np.int64]:

@@ -149,10 +149,13 @@ def refine_cameras(
     """
     if steps < 1:
         raise IgsrError(f"steps must be at least 1, not {steps}.")
+    if splats.antialiased:
+        raise IgsrError("Cameras cannot be refined to antialiased splats: fits draw without that.")
     if not views:
         return []
     total = steps * len(views)
-    state = {name: value for name, value in vars(splats).items() if name != "origin"}
+    apart = ("origin", "antialiased")
+    state = {name: value for name, value in vars(splats).items() if name not in apart}
     settings = {
         "steps": total,
         "sh_degree": splats.sh_degree,

@@ -100,7 +100,7 @@ def project(splats: Splats, camera: Camera, backend: str) -> dict[str, npt.NDArr
         near=_core.NEAR_PLANE,
         far=_core.FAR_PLANE,
         eps2d=_core.EPS2D,
-        antialiased=False,
+        antialiased=splats.antialiased,
         backend=backend,
     )
     return projected

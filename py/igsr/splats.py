@@ -1,9 +1,10 @@
-"""Splats: the Gaussians of one scene as numpy arrays, and the INRIA ``.ply`` that stores them."""
+"""Splats: the Gaussians of one scene as numpy arrays, and the files that store them."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+import warnings
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,9 @@ FloatArray = npt.NDArray[np.float32]
 
 #: Highest spherical-harmonics degree there is code for.
 MAX_SH_DEGREE = 4
+
+#: Endings of the files that :meth:`Splats.load` reads, in lower case.
+SPLAT_ENDINGS = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb", ".gltf")
 
 
 @dataclass
@@ -31,6 +35,8 @@ class Splats:
             colour = max(0, 0.5 + SH(direction from camera to mean)).
         origin: [3] float64, world position that ``means`` are relative to. It keeps scenes far
             from zero (map coordinates) precise in float32.
+        antialiased: whether they were trained with antialiased opacities (Mip-Splatting's 2D
+            filter), and so are to be drawn.
 
     Raises:
         IgsrError: an array has the wrong shape or dtype; the message names it.
@@ -42,6 +48,7 @@ class Splats:
     opacities: FloatArray
     sh: FloatArray
     origin: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    antialiased: bool = False
 
     def __post_init__(self) -> None:
         count = self.means.shape[0] if isinstance(self.means, np.ndarray) and self.means.ndim else 0
@@ -88,30 +95,42 @@ class Splats:
             return None
         return world.min(axis=0), world.max(axis=0)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an INRIA ``.ply``, the format 3D Gaussian Splatting viewers open.
+    def save(self, path: str | os.PathLike[str]) -> list[str]:
+        """Write a file in the format that the ending of ``path`` names.
 
-        The file appears whole or not at all: an older one of that name survives a failure.
+        ``.ply`` (INRIA's, which holds everything), ``.compressed.ply``, ``.splat``, ``.spz``,
+        ``.sog``, ``.glb`` or ``.gltf``. The file appears whole or not at all: an older one of that
+        name survives a failure.
+
+        Returns:
+            A sentence for each thing that the format cannot hold.
 
         Raises:
-            IgsrError: the file cannot be written.
+            IgsrError: the file cannot be written, or its ending is none of these.
         """
         try:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
-            _core.write_ply(os.fspath(path), vars(self))
+            return _core.write_splats(os.fspath(path), vars(self))
         except OSError as error:
             raise IgsrError(f"{error}.") from error
+        except ValueError as error:  # more than the format's fields can count
+            raise IgsrError(f"{path}: {error}.") from error
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Splats:
-        """Read an INRIA ``.ply`` of SH degree 0-4.
+        """Read a splat file: what :meth:`save` writes, or ``.ksplat``, told by its content.
+
+        Warns of what in the file is passed over.
 
         Raises:
-            IgsrError: there is no such file, or it is not a splat ``.ply``; the message says why.
+            IgsrError: there is no such file, or it is no splat file; the message says why.
         """
         if not Path(path).is_file():
             raise IgsrError(f"There is no splat file {path}.")
         try:
-            return Splats(**_core.read_ply(os.fspath(path)))
+            read = _core.read_splats(os.fspath(path))
         except OSError as error:
             raise IgsrError(f"{error}.") from error
+        for note in read["notes"]:
+            warnings.warn(f"{path}: {note}", stacklevel=2)
+        return Splats(**{part.name: read[part.name] for part in fields(Splats)})

@@ -44,7 +44,7 @@ mod _core {
     #[pymodule_export]
     use crate::fitter::{Fitter, splats_from_points};
     #[pymodule_export]
-    use crate::splat_files::{read_ply, write_ply};
+    use crate::splat_files::{read_splats, write_splats};
     #[pymodule_export]
     use crate::stages::{project, project_backward, rasterize, rasterize_backward};
 }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use splat_render::io::SplatFile;
@@ -10,23 +11,34 @@ use crate::arrays::{row, shaped};
 use crate::error::to_python;
 use crate::fitter::{set_splat_arrays, splat_arrays_from};
 
-/// Reads an INRIA .ply.
+/// Reads a splat file of any format. `notes` say what was passed over.
 #[pyfunction]
-pub fn read_ply<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, PyDict>> {
-    let file = py.detach(|| splat_render::io::read_ply(&path)).map_err(to_python)?;
+pub fn read_splats<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, PyDict>> {
+    let loaded = py.detach(|| splat_render::io::read_splats(&path)).map_err(to_python)?;
     let dict = PyDict::new(py);
-    set_splat_arrays(&dict, "", file.splats)?;
-    dict.set_item("origin", shaped(py, file.origin.to_vec(), &[3])?)?;
+    set_splat_arrays(&dict, "", loaded.file.splats)?;
+    dict.set_item("origin", shaped(py, loaded.file.origin.to_vec(), &[3])?)?;
+    dict.set_item("antialiased", loaded.file.antialiased)?;
+    dict.set_item("format", loaded.format.name())?;
+    dict.set_item("notes", loaded.notes)?;
     Ok(dict)
 }
 
-/// Writes an INRIA .ply, whole or not at all.
+/// Writes a splat file in the format of its ending, whole or not at all. Returns a sentence for
+/// each thing that the format cannot hold.
 #[pyfunction]
-pub fn write_ply(py: Python<'_>, path: PathBuf, splats: &Bound<'_, PyDict>) -> PyResult<()> {
-    let origin = splats
-        .get_item("origin")?
-        .ok_or_else(|| pyo3::exceptions::PyValueError::new_err("origin: is missing"))?;
-    let origin = row::<f64, 3>("origin", &origin)?;
-    let file = SplatFile { splats: splat_arrays_from(splats, "")?, origin };
-    py.detach(|| splat_render::io::write_ply(&path, &file)).map_err(to_python)
+pub fn write_splats(
+    py: Python<'_>,
+    path: PathBuf,
+    splats: &Bound<'_, PyDict>,
+) -> PyResult<Vec<String>> {
+    let entry = |name: &str| {
+        splats.get_item(name)?.ok_or_else(|| PyValueError::new_err(format!("{name}: is missing")))
+    };
+    let file = SplatFile {
+        splats: splat_arrays_from(splats, "")?,
+        origin: row::<f64, 3>("origin", &entry("origin")?)?,
+        antialiased: entry("antialiased")?.extract()?,
+    };
+    py.detach(|| splat_render::io::write_splats(&path, &file)).map_err(to_python)
 }

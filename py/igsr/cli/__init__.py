@@ -8,6 +8,7 @@ import typer
 
 from .bench import bench_command
 from .compact import compact_command
+from .convert import convert_command
 from .denoise import app as denoise_app
 from .evaluate import eval_command
 from .export import export_command
@@ -32,6 +33,7 @@ app.command("eval")(eval_command)
 app.command("info")(info_command)
 app.command("export")(export_command)
 app.command("compact")(compact_command)
+app.command("convert")(convert_command)
 app.add_typer(denoise_app, name="denoise")
 app.command("study")(study_command)
 app.command("synth")(synth_command)

@@ -11,7 +11,7 @@ import typer
 
 from .. import _core
 from ..capture import load_capture
-from ..splats import Splats
+from ..splats import SPLAT_ENDINGS, Splats
 from .shared import (
     JsonOption,
     one_sentence,
@@ -26,7 +26,7 @@ def info_command(
 ) -> None:
     """Describe a scene or a capture, and the backends of this machine."""
     with one_sentence():
-        report = _scene_info(path) if path.suffix.lower() == ".ply" else _capture_info(path)
+        report = _scene_info(path) if path.suffix.lower() in SPLAT_ENDINGS else _capture_info(path)
         report["backends"] = _backends()
     if as_json:
         print_json(report)
@@ -56,6 +56,7 @@ def _scene_info(path: Path) -> dict[str, Any]:
         "splats": len(splats),
         "not_finite": int((~finite).sum()),
         "sh_degree": splats.sh_degree,
+        "antialiased": splats.antialiased,
         "lowest_corner": None if bounds is None else bounds[0].tolist(),
         "highest_corner": None if bounds is None else bounds[1].tolist(),
         "origin": splats.origin.tolist(),

@@ -91,7 +91,10 @@ CaptureArgument = Annotated[
 ]
 
 
-SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A splat .ply file.")]
+SceneArgument = Annotated[
+    Path,
+    typer.Argument(metavar="SCENE", help="A splat file: .ply, .splat, .ksplat, .spz, .sog, .glb."),
+]
 
 
 @contextlib.contextmanager

@@ -54,7 +54,7 @@ def with_sh_degree(state: State, degree: int) -> State:
 
 def splats_of(state: State, origin: npt.NDArray[np.float64]) -> Splats:
     """The splats of a state."""
-    return Splats(**{name: state[name] for name in PARAMETERS}, origin=origin)
+    return Splats(**{name: state[name] for name in PARAMETERS}, origin=origin, antialiased=False)
 
 
 def refined(

@@ -112,6 +112,8 @@ def compact(
     _check_arguments(max_loss, capture, psnr, sh_degree, steps, seed, background)
     if backend == "reference":
         raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
+    if splats.antialiased:
+        raise IgsrError("Antialiased splats cannot be made fewer: fits draw without that.")
     try:
         info = _core.backend_info(_core.resolve_backend(backend))
     except ValueError as error:

@@ -1,12 +1,37 @@
-//! Splat files.
+//! Splat files: read whatever people have, write whatever they need; `docs/formats.md` says what
+//! each format holds.
+//!
+//! Files are untrusted. Every size that a file claims is held against the bytes that are there
+//! before memory is taken for it, and what is wrong is said in one sentence.
 
 mod atomic;
+mod bytes;
+mod compressed_ply;
+mod format;
+mod frame;
+mod gltf;
+mod ksplat;
+mod limits;
+mod morton;
 mod ply;
+mod ply_header;
+mod prepare;
+mod quantize;
+mod sh_rotation;
+mod sog;
+mod splat;
+mod spz;
 
 pub use atomic::write_atomically;
-pub use ply::{read_ply, write_ply};
+pub use format::Format;
 
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::path::Path;
+
+use crate::error::{Error, Result};
 use crate::fit::SplatArrays;
+use bytes::Named;
 
 /// Splats with the f64 point that their means are relative to.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -15,4 +40,97 @@ pub struct SplatFile {
     pub splats: SplatArrays,
     /// World position = origin + mean.
     pub origin: [f64; 3],
+    /// Whether they were trained with, and want, antialiased opacities.
+    pub antialiased: bool,
+}
+
+/// A file that was read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Loaded {
+    /// What it holds.
+    pub file: SplatFile,
+    /// What it was written in.
+    pub format: Format,
+    /// One sentence for each thing in it that was passed over.
+    pub notes: Vec<String>,
+}
+
+/// Reads a file of any format in [`Format`], told by its content, or by its ending where the
+/// content has no mark.
+pub fn read_splats(path: &Path) -> Result<Loaded> {
+    let named = Named(path);
+    let file = File::open(path).map_err(|e| named.bad(format!("cannot be opened ({e})")))?;
+    let unreadable = |e| named.bad(format!("cannot be read ({e})"));
+    let size = file.metadata().map_err(unreadable)?.len();
+    let mut reader = BufReader::new(file);
+    let format = Format::of(reader.fill_buf().map_err(unreadable)?, &named)?;
+    if format == Format::Ply {
+        return ply::read(&mut reader, size, &named);
+    }
+    limits::check_file_size(&named, size)?;
+    let mut bytes = Vec::new();
+    reader.read_to_end(&mut bytes).map_err(unreadable)?;
+    parse(&bytes, format, &named)
+}
+
+/// Reads what is in memory as [`read_splats`] reads a file; `path` is what errors call it, what
+/// tells formats without a mark, and where a `.gltf`'s other files are.
+pub fn parse_splats(bytes: &[u8], path: &Path) -> Result<Loaded> {
+    let named = Named(path);
+    parse(bytes, Format::of(bytes, &named)?, &named)
+}
+
+fn parse(mut bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> {
+    match format {
+        Format::Ply | Format::CompressedPly => {
+            let size = bytes.len() as u64;
+            ply::read(&mut bytes, size, named)
+        }
+        Format::Splat => splat::parse(bytes, named),
+        Format::Ksplat => ksplat::parse(bytes, named),
+        Format::Spz => spz::parse(bytes, named),
+        Format::Sog => sog::parse(bytes, named),
+        Format::Glb | Format::Gltf => gltf::parse(bytes, format, named),
+    }
+}
+
+/// Writes splats, whole or not at all, in the format of the ending. Returns one sentence for each
+/// thing that the format cannot hold.
+pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
+    let format = Format::to_write(path)?;
+    file.splats.validate()?;
+    let mut notes = Vec::new();
+    let bytes = match format {
+        Format::Ply => {
+            write_atomically(path, |out| ply::write(out, file))?;
+            return Ok(notes);
+        }
+        Format::CompressedPly => compressed_ply::encode(file, &mut notes),
+        Format::Splat => splat::encode(file, &mut notes)?,
+        Format::Spz => spz::encode(file, &mut notes)?,
+        Format::Sog => sog::encode(file, &mut notes)?,
+        Format::Glb | Format::Gltf => gltf::encode(file, format, &mut notes)?,
+        Format::Ksplat => return Err(Format::unwritable(path)),
+    };
+    write_atomically(path, |out| out.write_all(&bytes))?;
+    Ok(notes)
+}
+
+/// Reads a `.ply`, INRIA's or compressed, whatever it is called.
+pub fn read_ply(path: &Path) -> Result<SplatFile> {
+    let named = Named(path);
+    let file = File::open(path).map_err(|e| named.bad(format!("cannot be opened ({e})")))?;
+    let size = file.metadata().map_err(|e| named.bad(format!("cannot be read ({e})")))?.len();
+    Ok(ply::read(&mut BufReader::new(file), size, &named)?.file)
+}
+
+/// Writes INRIA's `.ply`, whatever the path is called.
+pub fn write_ply(path: &Path, file: &SplatFile) -> Result<()> {
+    file.splats.validate()?;
+    write_atomically(path, |out| ply::write(out, file))
+}
+
+/// The error of splats that a format has no way to hold.
+fn unfit(what: &str) -> Error {
+    Error::argument("splats", format!("{what}; write a .ply, which has no such limit"))
 }

@@ -1,0 +1,208 @@
+//! The JSON and the buffers of a glTF file.
+
+use std::borrow::Cow;
+use std::collections::HashMap;
+use std::path::{Component, Path};
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use serde_json::Value;
+
+use super::super::Format;
+use super::super::bytes::{Bytes, Named, u32_at};
+use super::super::limits;
+use super::{CHUNK_BINARY, CHUNK_JSON, MAGIC, TEXT_MAX};
+use crate::error::Result;
+
+/// Most values in the JSON. In memory each may take 80 times its text; splats take a few hundred.
+const VALUES_MAX: usize = 1 << 18;
+
+/// A file's JSON and buffers.
+pub struct Document<'a> {
+    /// The JSON.
+    pub json: Value,
+    /// Place in `stores` of each buffer's bytes.
+    buffers: Vec<usize>,
+    stores: Vec<Cow<'a, [u8]>>,
+    named: Named<'a>,
+}
+
+impl<'a> Document<'a> {
+    /// Opens the file in `bytes`.
+    pub fn open(bytes: &'a [u8], format: Format, named: &Named<'a>) -> Result<Self> {
+        let (text, binary) =
+            if format == Format::Glb { split_glb(bytes, named)? } else { (bytes, None) };
+        if text.len() > TEXT_MAX || values(text) > VALUES_MAX {
+            return Err(named.bad(format!(
+                "has {} bytes of JSON with {} values, more than {TEXT_MAX} or {VALUES_MAX}; write \
+                 its splats alone, as .glb",
+                text.len(),
+                values(text)
+            )));
+        }
+        let json: Value = serde_json::from_slice(text)
+            .map_err(|e| named.bad(format!("holds JSON that cannot be read ({e})")))?;
+        let mut document = Self { json, buffers: Vec::new(), stores: Vec::new(), named: *named };
+        let mut files = HashMap::new();
+        for k in 0..document.list("buffers").len() {
+            let store = document.buffer(k, binary, &mut files)?;
+            document.buffers.push(store);
+        }
+        Ok(document)
+    }
+
+    /// Bytes of all buffers: what counts of splats are held against.
+    pub fn size(&self) -> usize {
+        self.stores.iter().map(|store| store.len()).sum()
+    }
+
+    /// An error about this file.
+    pub fn bad(&self, reason: impl Into<String>) -> crate::Error {
+        self.named.bad(reason)
+    }
+
+    /// The list `key` of the JSON; empty if there is none.
+    pub fn list(&self, key: &str) -> &[Value] {
+        self.json.get(key).and_then(Value::as_array).map_or(&[], Vec::as_slice)
+    }
+
+    /// Item `index` of the list `key`.
+    pub fn item(&self, key: &str, index: usize) -> Result<&Value> {
+        self.list(key)
+            .get(index)
+            .ok_or_else(|| self.bad(format!("refers to {key}[{index}], which it does not have")))
+    }
+
+    /// The bytes of a buffer view, and its stride if it gives one.
+    pub fn view(&self, index: usize) -> Result<(&[u8], Option<usize>)> {
+        let view = self.item("bufferViews", index)?;
+        let store = number(view, "buffer").and_then(|k| self.stores.get(*self.buffers.get(k)?));
+        let start = number(view, "byteOffset").unwrap_or(0);
+        let bytes = store
+            .zip(number(view, "byteLength"))
+            .and_then(|(store, length)| store.get(start..)?.get(..length))
+            .ok_or_else(|| {
+                self.bad(format!("has bufferViews[{index}] outside its buffer; it is truncated"))
+            })?;
+        Ok((bytes, number(view, "byteStride")))
+    }
+
+    /// The place in `stores` of buffer `k`'s bytes. Of other files, `files` knows the place: many
+    /// buffers may share one, which is in memory once.
+    fn buffer(
+        &mut self,
+        k: usize,
+        binary: Option<&'a [u8]>,
+        files: &mut HashMap<String, usize>,
+    ) -> Result<usize> {
+        let buffer = self.item("buffers", k)?;
+        let length = number(buffer, "byteLength")
+            .ok_or_else(|| self.bad(format!("has buffers[{k}] without a byteLength")))?;
+        let uri = buffer.get("uri").and_then(Value::as_str);
+        let inline = uri.and_then(|uri| uri.split_once(";base64,"));
+        let next = self.stores.len();
+        let (place, bytes) = match (uri, inline, binary) {
+            (_, Some((kind, data)), _) if kind.starts_with("data:") => {
+                let bytes = STANDARD
+                    .decode(data)
+                    .map_err(|e| self.bad(format!("has buffers[{k}] that is no base64 ({e})")))?;
+                (next, Some(Cow::Owned(bytes)))
+            }
+            (Some(uri), _, _) => match files.get(uri) {
+                Some(&place) => (place, None),
+                None => {
+                    files.insert(uri.to_owned(), next);
+                    (next, Some(Cow::Owned(self.neighbour(uri)?)))
+                }
+            },
+            (None, _, Some(binary)) if k == 0 => (next, Some(Cow::Borrowed(binary))),
+            _ => return Err(self.bad(format!("has buffers[{k}] without any bytes"))),
+        };
+        self.stores.extend(bytes);
+        let found = self.stores[place].len();
+        if found < length {
+            return Err(self.bad(format!(
+                "has buffers[{k}] of {found} bytes where {length} belong; it is truncated"
+            )));
+        }
+        Ok(place)
+    }
+
+    /// The bytes of a file in the same folder or below it.
+    fn neighbour(&self, uri: &str) -> Result<Vec<u8>> {
+        use std::io::Read;
+        let name = percent_decoded(uri);
+        let plain = Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
+        if name.contains([':', '\\', '\0']) || name.is_empty() || !plain {
+            return Err(self.bad(format!(
+                "refers to {uri:?}; only files in its own folder are opened: write a .glb instead"
+            )));
+        }
+        let path = self.named.0.with_file_name(name);
+        let mut bytes = Vec::new();
+        std::fs::File::open(&path)
+            .and_then(|file| file.take(limits::FILE_MAX).read_to_end(&mut bytes))
+            .map_err(|e| self.bad(format!("refers to {uri:?}, which cannot be read ({e})")))?;
+        Ok(bytes)
+    }
+}
+
+/// At most so many values are in a JSON text: each but the first follows a mark outside strings.
+fn values(text: &[u8]) -> usize {
+    let (mut count, mut quoted, mut escaped) = (1, false, false);
+    for byte in text {
+        match byte {
+            _ if escaped => escaped = false,
+            b'\\' if quoted => escaped = true,
+            b'"' => quoted = !quoted,
+            b',' | b'[' | b'{' if !quoted => count += 1,
+            _ => {}
+        }
+    }
+    count
+}
+
+/// The JSON and, if any, the binary chunk of a `.glb`.
+fn split_glb<'a>(bytes: &'a [u8], named: &Named<'a>) -> Result<(&'a [u8], Option<&'a [u8]>)> {
+    let mut rest = Bytes::new(bytes, named);
+    let header = rest.take(12, "header")?;
+    if !header.starts_with(MAGIC) || u32_at(header, 4) != 2 {
+        return Err(named.bad("is no .glb of version 2; export it again"));
+    }
+    let (mut json, mut binary) = (None, None);
+    while rest.len() >= 8 {
+        let head = rest.take(8, "chunks")?;
+        let chunk = rest.take(u32_at(head, 0) as usize, "chunks")?;
+        let kind = &head[4..8];
+        if kind == CHUNK_JSON {
+            json.get_or_insert(chunk);
+        } else if kind == CHUNK_BINARY {
+            binary.get_or_insert(chunk);
+        }
+    }
+    Ok((json.ok_or_else(|| named.bad("has no JSON in it; it is truncated"))?, binary))
+}
+
+/// The count or index `key` of an object.
+pub fn number(object: &Value, key: &str) -> Option<usize> {
+    usize::try_from(object.get(key)?.as_u64()?).ok()
+}
+
+/// A URI's text with its %XX as the bytes that they stand for.
+fn percent_decoded(uri: &str) -> String {
+    let hex = |byte: u8| char::from(byte).to_digit(16);
+    let mut out = Vec::new();
+    let mut rest = uri.as_bytes();
+    while let [first, others @ ..] = rest {
+        rest = others;
+        if let (b'%', [high, low, after @ ..]) = (first, others)
+            && let (Some(high), Some(low)) = (hex(*high), hex(*low))
+        {
+            out.push((high * 16 + low) as u8);
+            rest = after;
+            continue;
+        }
+        out.push(*first);
+    }
+    String::from_utf8_lossy(&out).into_owned()
+}

@@ -1,0 +1,170 @@
+//! The text at the head of a `.ply`.
+
+use std::io::{BufRead, Read};
+
+use super::bytes::Named;
+use super::limits::SPLATS_MAX;
+use crate::error::Result;
+
+/// Longest header that is read: real ones are under 3 kB.
+const HEADER_MAX: u64 = 1 << 16;
+
+/// Types of properties that splat files have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// 32-bit float.
+    Float,
+    /// Unsigned 32-bit integer.
+    Uint,
+    /// Unsigned byte.
+    Uchar,
+    /// Anything else.
+    Other,
+}
+
+/// Bytes of a scalar type, and which it is; None if unknown.
+fn scalar(name: &str) -> Option<(usize, Kind)> {
+    Some(match name {
+        "uchar" | "uint8" => (1, Kind::Uchar),
+        "char" | "int8" => (1, Kind::Other),
+        "short" | "ushort" | "int16" | "uint16" => (2, Kind::Other),
+        "uint" | "uint32" => (4, Kind::Uint),
+        "int" | "int32" => (4, Kind::Other),
+        "float" | "float32" => (4, Kind::Float),
+        "double" | "float64" => (8, Kind::Other),
+        _ => return None,
+    })
+}
+
+/// A property of an element.
+pub struct Property {
+    /// Its name.
+    pub name: String,
+    /// Its type.
+    pub kind: Kind,
+    /// Its first byte within a row.
+    pub offset: usize,
+}
+
+/// A table of the file.
+pub struct Element {
+    /// Its name.
+    pub name: String,
+    /// Rows.
+    pub count: u64,
+    /// Bytes per row.
+    pub stride: usize,
+    /// Columns, in the file's order.
+    pub properties: Vec<Property>,
+    /// Whether a column holds lists, so that rows differ in size.
+    pub lists: bool,
+}
+
+impl Element {
+    /// First byte within a row of the column `name` of type `kind`.
+    pub fn offset(&self, name: &str, kind: Kind) -> Option<usize> {
+        self.properties.iter().find(|p| p.kind == kind && p.name == name).map(|p| p.offset)
+    }
+
+    /// Bytes of all rows.
+    pub fn size(&self) -> u64 {
+        self.count.saturating_mul(self.stride as u64)
+    }
+}
+
+/// What the header says.
+#[derive(Default)]
+pub struct Header {
+    /// Tables in the order of the file.
+    pub elements: Vec<Element>,
+    /// `comment origin X Y Z`, else zero.
+    pub origin: [f64; 3],
+    /// `comment antialiased`.
+    pub antialiased: bool,
+}
+
+impl Header {
+    /// Reads up to and with the line `end_header`.
+    pub fn read(reader: &mut impl BufRead, named: &Named<'_>) -> Result<Self> {
+        let mut limited = reader.take(HEADER_MAX);
+        let mut line = || -> Result<String> {
+            let mut bytes = Vec::new();
+            limited
+                .read_until(b'\n', &mut bytes)
+                .map_err(|e| named.bad(format!("cannot be read ({e})")))?;
+            if bytes.last() != Some(&b'\n') {
+                return Err(named.bad("ends within its header; it is not a whole .ply file"));
+            }
+            Ok(String::from_utf8_lossy(&bytes).trim_end().to_owned())
+        };
+        if line().ok().as_deref() != Some("ply") {
+            return Err(named.bad("does not start with 'ply'; give a .ply file of splats"));
+        }
+        let (mut header, mut format) = (Self::default(), false);
+        loop {
+            let line = line()?;
+            let words: Vec<&str> = line.split_whitespace().collect();
+            match words.as_slice() {
+                ["end_header"] => break,
+                ["format", kind, ..] => {
+                    format = true;
+                    if *kind != "binary_little_endian" {
+                        return Err(named.bad(format!(
+                            "is in the format {kind}; only binary_little_endian can be read"
+                        )));
+                    }
+                }
+                ["comment", "antialiased"] => header.antialiased = true,
+                ["comment", "origin", xyz @ ..] => {
+                    let values: Option<Vec<f64>> = xyz.iter().map(|v| v.parse().ok()).collect();
+                    header.origin = values
+                        .and_then(|v| <[f64; 3]>::try_from(v).ok())
+                        .filter(|v| v.iter().all(|c| c.is_finite()))
+                        .ok_or_else(|| named.bad("has an origin that is not three numbers"))?;
+                }
+                ["element", name, count] => {
+                    let count =
+                        count.parse().ok().filter(|&n| n <= SPLATS_MAX).ok_or_else(|| {
+                            named.bad(format!("claims {count} splats; at most 2^30 can be"))
+                        })?;
+                    header.elements.push(Element {
+                        name: (*name).to_owned(),
+                        count,
+                        stride: 0,
+                        properties: Vec::new(),
+                        lists: false,
+                    });
+                }
+                ["property", "list", ..] => {
+                    if let Some(element) = header.elements.last_mut() {
+                        element.lists = true;
+                    }
+                }
+                ["property", kind, name] => {
+                    let (size, kind) = scalar(kind).ok_or_else(|| {
+                        named.bad(format!("has a property of unknown type {kind}"))
+                    })?;
+                    if let Some(element) = header.elements.last_mut() {
+                        let offset = element.stride;
+                        element.properties.push(Property {
+                            name: (*name).to_owned(),
+                            kind,
+                            offset,
+                        });
+                        element.stride += size;
+                    }
+                }
+                _ => {}
+            }
+        }
+        if !format || header.elements.is_empty() {
+            return Err(named.bad("has no format or no vertex element in its header"));
+        }
+        Ok(header)
+    }
+
+    /// Whether a table of that name comes first.
+    pub fn starts_with(&self, name: &str) -> bool {
+        self.elements.first().is_some_and(|element| element.name == name)
+    }
+}

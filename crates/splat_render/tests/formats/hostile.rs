@@ -1,0 +1,189 @@
+//! Files that are cut short, claim what they do not hold, or are something else: one sentence that
+//! names the file, and little memory.
+
+use std::io::Write;
+use std::path::Path;
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use splat_render::io::parse_splats;
+
+use crate::layouts::{ksplat, sog_with, spz_4};
+use crate::memory::peak_of;
+use crate::scenes::{WRITABLE, bytes_of, folder, scene};
+
+/// Memory that no small file may take: what any file may unpack to, and as much again for copies.
+pub const MEMORY_MAX: usize = 160 << 20;
+
+/// The sentence about these bytes.
+fn refused(bytes: &[u8], name: &str) -> String {
+    let (result, peak) = peak_of(|| parse_splats(bytes, Path::new(name)));
+    assert!(peak < MEMORY_MAX, "{name} took {peak} bytes");
+    let error = result.expect_err(name).to_string();
+    assert!(error.starts_with(name), "{error}");
+    assert!(!error.contains('\n') && error.len() < 400, "{error}");
+    error
+}
+
+#[test]
+fn every_truncation_is_one_sentence() {
+    let folder = folder("cut");
+    let file = scene(3, 1);
+    let mut all: Vec<(String, Vec<u8>)> = WRITABLE
+        .iter()
+        .map(|ending| (format!("cut.{ending}"), bytes_of(&folder, ending, &file)))
+        .collect();
+    all.push(("cut.ksplat".into(), ksplat(&file, 1)));
+    all.push(("four.spz".into(), spz_4(&file.splats)));
+    for (name, bytes) in all {
+        for length in 0..bytes.len() {
+            // A .splat has no header: whole splats of it are a whole file.
+            if name != "cut.splat" || length % 32 != 0 || length == 0 {
+                refused(&bytes[..length], &name);
+            }
+        }
+        assert!(parse_splats(&bytes, Path::new(&name)).is_ok(), "{name}");
+    }
+}
+
+#[test]
+fn other_files_under_the_name_of_splats_are_refused() {
+    let jpeg = [&[0xff, 0xd8, 0xff, 0xe0, 0, 16][..], b"JFIF\0", &[7; 200]].concat();
+    for ending in WRITABLE.into_iter().chain(["ksplat"]) {
+        let name = format!("photo.{ending}");
+        assert!(!refused(&jpeg, &name).is_empty());
+        assert!(refused(b"", &name).contains("empty"));
+        refused(&[b'a'; 10], &name);
+        refused(&[0; 10], &name);
+        refused(b"{}", &name);
+        refused(b"[1, 2]", &name);
+        refused(b"PK\x05\x06 a zip of nothing ", &name);
+    }
+    assert!(refused(&jpeg, "photo.jpg").contains(".spz"));
+    assert!(refused(&jpeg, "photo.ply").contains("'ply'"));
+    let triangle = br#"{"asset":{"version":"2.0"},"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0}],
+        "meshes":[{"primitives":[{"attributes":{}}]}]}"#;
+    assert!(refused(triangle, "mesh.gltf").contains("no splats"));
+}
+
+#[test]
+fn four_billion_splats_are_refused_before_memory_is_taken() {
+    let folder = folder("claims");
+    let file = scene(3, 0);
+    let claim = |bytes: &mut [u8], at: usize, count: u32| {
+        bytes[at..at + 4].copy_from_slice(&count.to_le_bytes());
+    };
+    let replaced = |bytes: &[u8], from: &str, to: &str| {
+        let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+        [&bytes[..at], to.as_bytes(), &bytes[at + from.len()..]].concat()
+    };
+    for count in [4_000_000_000u32, 100_000_000, 5_000_000] {
+        let ply = bytes_of(&folder, "ply", &file);
+        refused(&replaced(&ply, "vertex 3", &format!("vertex {count}")), "a.ply");
+        let packed = bytes_of(&folder, "compressed.ply", &file);
+        let lie = replaced(&packed, "vertex 3", &format!("vertex {count}"));
+        refused(&lie, "a.ply");
+        let chunks = count.div_ceil(256);
+        refused(&replaced(&lie, "chunk 1", &format!("chunk {chunks}")), "a.ply");
+
+        let mut spz = spz_4(&file.splats);
+        claim(&mut spz, 8, count);
+        assert!(refused(&spz, "a.spz").contains(&count.to_string()));
+        let mut payload = b"NGSP\x03\0\0\0....\x03\x0c\0\0".to_vec();
+        claim(&mut payload, 8, count);
+        payload.resize(500, 0);
+        let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
+        gzip.write_all(&payload).unwrap();
+        assert!(refused(&gzip.finish().unwrap(), "a.spz").contains(&count.to_string()));
+
+        let mut header = ksplat(&file, 1);
+        claim(&mut header, 16, count);
+        assert!(refused(&header, "a.ksplat").contains(&count.to_string()));
+        for at in [0, 4, 8, 12, 32, 36] {
+            let mut section = ksplat(&file, 1);
+            claim(&mut section, 4096 + at, count);
+            // A larger bucket than it is stays a bucket that holds all splats.
+            if at != 8 {
+                refused(&section, "a.ksplat");
+            }
+        }
+        let mut sections = ksplat(&file, 1);
+        claim(&mut sections, 4, count);
+        refused(&sections, "a.ksplat");
+
+        let sog = bytes_of(&folder, "sog", &file);
+        let meta = |text: String| text.replace("\"count\":3", &format!("\"count\":{count}"));
+        assert!(refused(&sog_with(&sog, meta), "a.sog").contains("claims"));
+        let gltf = bytes_of(&folder, "gltf", &file);
+        refused(&replaced(&gltf, "\"count\":3", &format!("\"count\":{count}")), "a.gltf");
+    }
+}
+
+#[test]
+fn gigabytes_of_zeros_are_not_unpacked() {
+    // 256 MiB behind the header and four splats.
+    let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
+    gzip.write_all(b"NGSP\x03\0\0\0\x04\0\0\0\0\x0c\0\0").unwrap();
+    let zeros = vec![0; 1 << 20];
+    for _ in 0..256 {
+        gzip.write_all(&zeros).unwrap();
+    }
+    let bytes = gzip.finish().unwrap();
+    let (result, peak) = peak_of(|| parse_splats(&bytes, Path::new("zeros.spz")));
+    assert_eq!(result.unwrap().file.splats.len(), 4);
+    assert!(peak < 8 << 20, "{peak}");
+}
+
+#[test]
+fn json_that_nests_or_points_anywhere_is_refused() {
+    let deep = format!("{{\"a\":{}{}}}", "[".repeat(100_000), "]".repeat(100_000));
+    refused(deep.as_bytes(), "deep.gltf");
+    let nodes = |nodes: &str| {
+        format!(
+            r#"{{"asset":{{"version":"2.0"}},"extensionsUsed":["KHR_gaussian_splatting"],
+            "scenes":[{{"nodes":[0]}}],"nodes":{nodes},"meshes":[]}}"#
+        )
+    };
+    assert!(refused(nodes(r#"[{"children":[0]}]"#).as_bytes(), "loop.gltf").contains("twice"));
+    let two = nodes(r#"[{"children":[1,1]},{}]"#);
+    assert!(refused(two.as_bytes(), "two.gltf").contains("twice"));
+    assert!(refused(nodes(r#"[{"mesh":7}]"#).as_bytes(), "mesh.gltf").contains("meshes[7]"));
+    assert!(
+        refused(nodes(r#"[{"children":[99999999999]}]"#).as_bytes(), "far.gltf").contains("nodes")
+    );
+    let skewed = nodes(r#"[{"mesh":0,"scale":[1,2,1]}]"#);
+    assert!(refused(skewed.as_bytes(), "skewed.gltf").contains("nodes[0]"));
+    for uri in [
+        "../secret.bin",
+        "/etc/passwd",
+        "http://a/b",
+        "a/../../b",
+        "",
+        "file:///b",
+        "%2e%2e/b",
+        "a%5cb",
+    ] {
+        let text = format!(
+            r#"{{"asset":{{"version":"2.0"}},"buffers":[{{"byteLength":4,"uri":"{uri}"}}]}}"#
+        );
+        assert!(refused(text.as_bytes(), "uri.gltf").contains("folder"), "{uri}");
+    }
+}
+
+#[test]
+fn json_takes_little_memory_however_it_is_made() {
+    let maps = format!("{{\"nodes\":[{}{{}}]}}", "{\"a\":0},".repeat(1_000_000));
+    assert!(refused(maps.as_bytes(), "maps.gltf").contains("values"));
+    // 20 MB of numbers, deflated to a hundredth.
+    let sog = bytes_of(&folder("json"), "sog", &scene(3, 0));
+    let numbers = "0,".repeat(10_000_000);
+    let sog = sog_with(&sog, |meta| meta.replacen('{', &format!("{{\"a\":[{numbers}0],"), 1));
+    assert!(refused(&sog, "numbers.sog").contains("meta.json"));
+    // A thousand buffers of one file.
+    let folder = folder("shared");
+    std::fs::write(folder.join("a.bin"), vec![0; 1 << 20]).unwrap();
+    let buffers = vec![r#"{"byteLength":1048576,"uri":"a.bin"}"#; 1000].join(",");
+    let text = format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{buffers}]}}"#);
+    let name = folder.join("shared.gltf");
+    assert!(refused(text.as_bytes(), name.to_str().unwrap()).contains("no splats"));
+}

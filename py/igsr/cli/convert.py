@@ -1,0 +1,60 @@
+"""``igsr convert``: a splat file in another format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..atomic_write import check_writable
+from ..splats import Splats
+from .shared import (
+    JsonOption,
+    SceneArgument,
+    complain,
+    one_sentence,
+    output_console,
+    print_json,
+    warnings_as_sentences,
+)
+
+
+def convert_command(
+    scene: SceneArgument,
+    target: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TARGET",
+            help="File to write; its ending is the format: .ply, .compressed.ply, .splat, .spz, "
+            ".sog, .glb or .gltf.",
+        ),
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Write SCENE as TARGET, and say what TARGET's format cannot hold."""
+    with one_sentence(lambda: "Interrupted; nothing is written."), warnings_as_sentences():
+        check_writable(target)
+        splats = Splats.load(scene)
+        notes = splats.save(target)
+    size = target.stat().st_size
+    if as_json:
+        print_json(
+            {
+                "scene": str(scene),
+                "target": str(target),
+                "splats": len(splats),
+                "sh_degree": splats.sh_degree,
+                "antialiased": splats.antialiased,
+                "bytes_before": scene.stat().st_size,
+                "bytes": size,
+                "notes": notes,
+            }
+        )
+        return
+    for note in notes:
+        complain(note)
+    before = scene.stat().st_size
+    output_console().print(
+        f"{len(splats)} splats in {target}, {size} bytes ({size / max(before, 1):.2f} of {scene})"
+    )

@@ -1,0 +1,162 @@
+"""Splat files in every format, from Python: agreement with decoders in numpy, and ``convert``."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+import splat_decoders
+from typer.testing import CliRunner
+
+import igsr
+from igsr.cli import app
+from igsr.splats import SPLAT_ENDINGS
+
+WRITABLE = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "gltf")
+#: A folder of splat files that other programs wrote, for whoever has one.
+OTHERS = os.environ.get("IGSR_FORMAT_FILES")
+
+
+def unit(quats):
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    return quats * np.where(quats[:, :1] < 0, -1.0, 1.0)
+
+
+def assert_agrees(path: Path) -> int:
+    """Our reader and numpy's find the same splats in a file; how many."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ours = igsr.Splats.load(path)
+    theirs = splat_decoders.decode(path)
+    assert len(ours) == len(theirs["means"])
+    world = ours.means.astype(np.float64) + ours.origin
+    scale = max(1.0, float(np.abs(world).max(initial=0.0)))
+    assert np.abs(world - theirs["means"]).max(initial=0.0) <= 2e-7 * scale
+    assert np.abs(ours.scales - theirs["scales"]).max(initial=0.0) <= 2e-6
+    colors = 0.5 + splat_decoders.C0 * ours.sh[:, 0].astype(np.float64)
+    assert np.abs(colors - theirs["colors"]).max(initial=0.0) <= 1e-6
+    opacities = 1 / (1 + np.exp(-ours.opacities.astype(np.float64)))
+    # Bytes of 0 and 255 are a quarter of a step off, to have a logit.
+    assert np.abs(opacities - theirs["opacities"]).max(initial=0.0) <= 0.2501 / 255
+    dots = np.abs((unit(ours.quats.astype(np.float64)) * unit(theirs["quats"])).sum(axis=1))
+    assert dots.min(initial=1.0) >= 1 - 1e-6
+    assert ours.sh[:, 1:].shape == theirs["sh"].shape
+    assert np.abs(ours.sh[:, 1:] - theirs["sh"]).max(initial=0.0) <= 1e-6
+    return len(ours)
+
+
+@pytest.mark.parametrize("ending", [ending for ending in WRITABLE if ending != "gltf"])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_numpy_finds_in_our_files_what_we_find(tmp_path, ending, degree):
+    path = tmp_path / f"scene.{ending}"
+    splats = scenes.splats(degree=degree)
+    # Within what every format holds.
+    splats.sh = np.clip(splats.sh, -0.99, 0.99)
+    notes = splats.save(path)
+    assert bool(notes) == (ending == "splat" and degree > 0)
+    assert assert_agrees(path) == len(splats)
+
+
+@pytest.mark.skipif(OTHERS is None, reason="IGSR_FORMAT_FILES names no folder of splat files")
+def test_files_of_other_programs_agree_with_numpy():
+    files = [path for path in sorted(Path(OTHERS or "").iterdir()) if path.suffix in SPLAT_ENDINGS]
+    assert files
+    for path in files:
+        if path.suffix == ".spz" and path.read_bytes().startswith(b"NGSP"):
+            # Version 4, which numpy cannot unpack: it opens, and has what version 3 has.
+            assert len(igsr.Splats.load(path)) > 0
+            continue
+        assert assert_agrees(path) > 0, path
+
+
+def test_a_picture_survives_every_format(tmp_path):
+    splats = scenes.splats(degree=0)
+    camera = scenes.ring_camera(0.4)
+    before = igsr.render(splats, camera, backend="cpu").color
+    for ending in WRITABLE:
+        path = tmp_path / f"scene.{ending}"
+        splats.save(path)
+        after = igsr.render(igsr.Splats.load(path), camera, backend="cpu").color
+        # Log-scales of .spz are off by up to 1/32, and splats of equal depth change places.
+        assert np.abs(after - before).mean() < 5e-3, ending
+        assert before.max() > 0.3
+
+
+def test_antialiased_splats_come_back_and_are_drawn_so(tmp_path):
+    splats = scenes.splats(degree=0)
+    splats.scales -= 3.0
+    camera = scenes.ring_camera(0.4)
+    classic = igsr.render(splats, camera, backend="cpu").color
+    splats.antialiased = True
+    drawn = igsr.render(splats, camera, backend="cpu").color
+    assert np.abs(drawn - classic).max() > 0.05
+    for ending in WRITABLE:
+        path = tmp_path / f"scene.{ending}"
+        notes = splats.save(path)
+        assert igsr.Splats.load(path).antialiased == (ending != "splat")
+        assert any("antialiased" in note for note in notes) == (ending in ("splat", "glb", "gltf"))
+
+
+def test_fits_refuse_antialiased_splats():
+    splats = scenes.splats(degree=0)
+    splats.antialiased = True
+    with pytest.raises(igsr.IgsrError, match="ntialiased"):
+        igsr.compact(splats)
+    with pytest.raises(igsr.IgsrError, match="ntialiased"):
+        igsr.refine_cameras(splats, [], (0.0, 0.0, 0.0))
+
+
+def test_convert_says_what_is_lost(tmp_path):
+    scene, target = tmp_path / "scene.ply", tmp_path / "new" / "scene.splat"
+    splats = scenes.splats(degree=2, origin=(100.0, 0.0, 0.0))
+    splats.sh = np.clip(splats.sh, -1.5, 1.5)
+    splats.save(scene)
+    done = CliRunner().invoke(app, ["convert", str(scene), str(target)])
+    assert done.exit_code == 0, done.output
+    assert "view-dependent" in done.stderr
+    assert "origin" in done.stderr
+    assert f"40 splats in {target}" in done.stdout
+    done = CliRunner().invoke(app, ["convert", str(scene), str(target), "--json"])
+    report = json.loads(done.stdout)
+    assert report["splats"] == 40
+    assert len(report["notes"]) == 2
+    assert report["bytes"] == target.stat().st_size == 40 * 32
+    told = json.loads(CliRunner().invoke(app, ["info", str(target), "--json"]).stdout)
+    assert (told["splats"], told["sh_degree"], told["antialiased"]) == (40, 0, False)
+
+
+@pytest.mark.parametrize("name", ["scene.ksplat", "scene.obj", "scene"])
+def test_convert_refuses_other_endings(tmp_path, name):
+    scene = tmp_path / "scene.ply"
+    scenes.splats(degree=0).save(scene)
+    done = CliRunner().invoke(app, ["convert", str(scene), str(tmp_path / name)])
+    assert done.exit_code == 1
+    assert done.stderr.count("\n") == 1
+    assert ".spz" in done.stderr
+    assert not (tmp_path / name).exists()
+
+
+def test_convert_refuses_what_is_no_splat_file(tmp_path):
+    photo = tmp_path / "photo.ply"
+    photo.write_bytes(b"\xff\xd8\xff\xe0\x00\x10JFIF\x00" + bytes(300))
+    for path in (photo, tmp_path / "none.spz"):
+        done = CliRunner().invoke(app, ["convert", str(path), str(tmp_path / "scene.spz")])
+        assert done.exit_code == 1
+        assert done.stderr.count("\n") == 1
+        assert path.name in done.stderr
+    assert not (tmp_path / "scene.spz").exists()
+
+
+def test_notes_of_a_file_are_warnings(tmp_path):
+    path = tmp_path / "scene.gltf"
+    scenes.splats(degree=0).save(path)
+    document = json.loads(path.read_text())
+    document["meshes"][0]["primitives"].append({"attributes": {}})
+    path.write_text(json.dumps(document))
+    with pytest.warns(UserWarning, match="no splats"):
+        assert len(igsr.Splats.load(path)) == 40
