@@ -27,7 +27,7 @@ fn some(n: usize, degree: u32) -> SplatFile {
     for sh in &mut splats.sh {
         *sh = std::array::from_fn(|_| next());
     }
-    SplatFile { splats, origin: [0.0; 3] }
+    SplatFile { splats, origin: [0.0; 3], antialiased: false }
 }
 
 #[test]
