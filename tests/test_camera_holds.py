@@ -193,3 +193,58 @@ def test_a_held_fit_resumes_with_its_own_tracks_alone(made, tmp_path):
         np.testing.assert_array_equal(a.camera.K, b.camera.K)
     with pytest.raises(igsr.IgsrError, match="other photos, masks, cameras, tracks"):
         igsr.fit(capture, checkpoint=checkpoint, resume=True, **options)
+
+
+def least_ratio(found, expected, rows):
+    """The least factor by which information about any direction of the cameras has changed."""
+    ratios = []
+    for k in rows:
+        half = np.linalg.cholesky(expected.information[k])
+        inverse = np.linalg.inv(half)
+        ratios.append(np.linalg.eigvalsh(inverse @ found.information[k] @ inverse.T).min())
+    return min(ratios)
+
+
+@pytest.mark.parametrize("focal", ["fixed", "shared", "per-camera"])
+def test_two_cameras_are_held(focal):
+    found = camera_holds(VIEWS[:2], tracked(VIEWS[:2], XYZ, noise=0.5), poses=True, focal=focal)
+    for information in found.information:
+        assert np.linalg.eigvalsh(information).min() > 0.0
+
+
+@pytest.mark.parametrize("seen", [0, 1, 2])
+def test_a_camera_without_tracks_loosens_no_other(seen):
+    points = tracked(VIEWS, XYZ, noise=0.5)
+    expected = camera_holds(VIEWS, points, poses=True, focal="fixed")
+    more = [*VIEWS, replace(VIEWS[0], name="more.png", camera=scenes.ring_camera(-0.4, 64))]
+    tracks = points.tracks
+    place = projected(more[-1].camera, XYZ[:seen])
+    points = replace(
+        points,
+        tracks=replace(
+            tracks,
+            names=[*tracks.names, "more.png"],
+            view=np.append(tracks.view, np.full(seen, COUNT)),
+            point=np.append(tracks.point, np.arange(seen)),
+            xy=np.concatenate([tracks.xy, place]),
+        ),
+    )
+    found = camera_holds(more, points, poses=True, focal="fixed")
+    assert not found.information[COUNT].any()
+    assert least_ratio(found, expected, range(COUNT)) > 0.9
+
+
+def test_what_no_camera_can_have_seen_changes_little():
+    points = tracked(VIEWS, XYZ, noise=0.5)
+    expected = camera_holds(VIEWS, points, poses=True, focal="fixed")
+    for wrong in (1e200, 1e6):
+        xyz = XYZ.copy()
+        xyz[3] = wrong
+        found = camera_holds(VIEWS, replace(points, xyz=xyz), poses=True, focal="fixed")
+        assert least_ratio(found, expected, range(COUNT)) > 0.5
+    for wrong in (1e300, 100.0):
+        xy = points.tracks.xy.copy()
+        xy[5] += wrong
+        off = replace(points, tracks=replace(points.tracks, xy=xy))
+        found = camera_holds(VIEWS, off, poses=True, focal="fixed")
+        assert least_ratio(found, expected, range(COUNT)) > 0.5

@@ -19,7 +19,7 @@ from igsr.denoiser import (
 from igsr.denoiser.inputs import CHANNELS, COLOR
 from igsr.denoiser.losses import LOSSES, Loss, Prediction, error_likelihood, regret
 from igsr.denoiser.network import REACH, Architecture, DenoiserNetwork
-from igsr.denoiser.pair_files import Pairs, write_pairs
+from igsr.denoiser.pair_files import Pairs, read_pairs, write_pairs
 from igsr.denoiser.perceptual import SqueezeNetDistance, lpips_distance
 from igsr.denoiser.training import CHECKPOINT, LOG, WEIGHTS, Training, train
 from igsr.rendering import Render
@@ -327,6 +327,33 @@ def test_a_training_that_was_stopped_ends_with_the_same_weights(tmp_path, loss):
 def test_bad_settings_of_a_training(options, message):
     with pytest.raises(igsr.IgsrError, match=message):
         Training(**options)
+
+
+def test_nothing_is_learned_where_the_truth_is_hidden(tmp_path):
+    weights = []
+    for name, hidden_truth in (("a", 0), ("b", 255)):
+        for path in pair_files(tmp_path / name, count=2):
+            pairs = read_pairs(path)
+            pairs.masks[:, :20] = False
+            pairs.truth[:, :, :20] = hidden_truth
+            write_pairs(path, pairs)
+        files = sorted((tmp_path / name).glob("*.npz"))
+        weights.append(train(files, tmp_path / f"{name}-out", replace(TINY, steps=4), SMALL))
+    for one, other in zip(*(network.parameters() for network in weights), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_hidden_pixels_teach_no_confidence(tmp_path):
+    (path, _) = pair_files(tmp_path / "pairs", count=2)
+    pairs = read_pairs(path)
+    pairs.masks[:] = False
+    write_pairs(path, pairs)
+    files = sorted((tmp_path / "pairs").glob("*.npz"))
+    rested = replace(TINY, steps=3, weight_decay=0.0)
+    network = train(files, tmp_path / "out", rested, SMALL)
+    torch.manual_seed(rested.seed)
+    for one, other in zip(network.parameters(), DenoiserNetwork(SMALL).parameters(), strict=True):
+        assert torch.equal(one, other)
 
 
 def test_training_needs_two_files_of_pairs(tmp_path):

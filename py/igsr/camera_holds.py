@@ -31,6 +31,14 @@ LEAST_ERROR = 0.05
 #: Part of a standard deviation that is left to the colours. They pull all the time, and mostly one
 #: way: with a whole one, cameras that COLMAP had found were measurably worse after a fit.
 LEFT_OPEN = 0.25
+#: Observations further off than so many times the median, and by more than so many pixels, are of
+#: something else: squares would make one of them outweigh all others.
+OUTLIER, OUTLIER_PIXELS = 10.0, 4.0
+#: Depths beyond this many times the median, or below its inverse, are no places that cameras see.
+DEEPEST = 1e5
+#: What is known of a camera is limited to this many times what is known least of it (in units of
+#: its own deviations): of only two cameras, one direction is known by definition.
+MOST_KNOWN = 1e7
 #: Points that are eliminated at a time; bounds memory.
 AT_ONCE = 512
 #: Added to the information, as a part of it: along what no track shows, cameras are free.
@@ -88,8 +96,26 @@ def camera_holds(
     if points is None or seen is None:
         return None
     view, point, xy = seen
-    enough = np.bincount(view, minlength=count) >= FEWEST
-    equations = _linearised(views, points.xyz, view, point, xy, poses, focal)
+    enough = np.bincount(view, minlength=count) > 0
+    try:
+        with np.errstate(all="ignore"):
+            return _held(views, points.xyz, view, point, xy, enough, poses, focal)
+    except np.linalg.LinAlgError:
+        return None  # places and points that no camera can have seen hold nothing
+
+
+def _held(
+    views: Sequence[View],
+    xyz: Float64,
+    view: Int64,
+    point: Int64,
+    xy: Float64,
+    enough: npt.NDArray[np.bool_],
+    poses: bool,
+    focal: str,
+) -> CameraHolds | None:
+    count = len(views)
+    equations = _linearised(views, xyz, view, point, xy, poses, focal)
     normal = _without_points(equations)
     size = equations.width - 1
     slope, error = normal[:size, size], normal[size, size]
@@ -100,7 +126,8 @@ def camera_holds(
     if poses:
         # Turning, moving and scaling all together is seen by no photo, and is not what is asked.
         unseen = np.zeros((size, 7))
-        unseen[: 6 * count] = _gauge(views)
+        # Cameras without tracks have no part in it: they would loosen all others.
+        unseen[: 6 * count] = _gauge(views) * np.repeat(enough, 6)[:, None]
         unseen = np.linalg.qr(unseen * scale[:, None])[0]
     covariance = np.linalg.inv(scaled + unseen @ unseen.T) - unseen @ unseen.T
     step = -covariance @ (slope / scale) / scale
@@ -118,31 +145,54 @@ def camera_holds(
         of_focal[:] = 1.0 / covariance[-1, -1]
     elif focal == "per-camera":
         of_focal[enough] = 1.0 / np.diagonal(covariance)[-count:][enough]
+    if not (
+        np.isfinite(information).all() and np.isfinite(of_focal).all() and of_focal.min() >= 0.0
+    ):
+        return None
     return CameraHolds(views, information, of_focal)
 
 
 def _seen_by(
     views: Sequence[View], points: Points
 ) -> tuple[Int64, Int64, npt.NDArray[np.float64]] | None:
-    """View, point and place of observations of points that at least two of the views see."""
+    """View, point and place of observations of points that at least two of the views see.
+
+    Left out are what stands behind a camera, what is far off, and views with too few of the rest.
+    """
     tracks = points.tracks
     if tracks is None:
         return None
     index = {view.name: k for k, view in enumerate(views)}
     view_of = np.array([index.get(name, -1) for name in tracks.names], dtype=np.int64)
     view = view_of[tracks.view]
-    usable = view >= 0
-    for k, one in enumerate(views):
-        mine = np.flatnonzero(view == k)
-        depth = points.xyz[tracks.point[mine]] @ one.camera.viewmat[2, :3]
-        usable[mine] = depth + one.camera.viewmat[2, 3] > 0.0
+    depth, off = np.full(len(view), -1.0), np.full(len(view), np.inf)
+    with np.errstate(all="ignore"):
+        for k, one in enumerate(views):
+            mine = np.flatnonzero(view == k)
+            camera = one.camera
+            local = points.xyz[tracks.point[mine]] @ camera.viewmat[:3, :3].T
+            local += camera.viewmat[:3, 3]
+            place = local[:, :2] / local[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+            depth[mine] = local[:, 2]
+            off[mine] = np.linalg.norm(place - tracks.xy[mine], axis=1)
+    usable = (view >= 0) & (depth > 0.0) & np.isfinite(depth) & np.isfinite(off)
+    if not usable.any():
+        return None
+    middle = float(np.median(depth[usable]))
+    usable &= (depth < DEEPEST * middle) & (depth > middle / DEEPEST)
+    usable &= off <= max(OUTLIER_PIXELS, OUTLIER * float(np.median(off[usable])))
     # A point that one photo sees says nothing about it; one that a photo sees twice is no point.
     pairs = np.unique(
         np.stack([tracks.point[usable], view[usable]], axis=1), axis=0, return_index=True
     )[1]
     chosen = np.sort(np.flatnonzero(usable)[pairs])
-    often = np.bincount(tracks.point[chosen], minlength=len(points.xyz)) >= 2
-    chosen = chosen[often[tracks.point[chosen]]]
+    before = -1
+    while len(chosen) != before:
+        before = len(chosen)
+        seen_by = np.bincount(tracks.point[chosen], minlength=len(points.xyz))
+        sees = np.bincount(view[chosen], minlength=len(views))
+        keep = (seen_by[tracks.point[chosen]] >= 2) & (sees[view[chosen]] >= FEWEST)
+        chosen = chosen[keep]
     if not len(chosen):
         return None
     return view[chosen], tracks.point[chosen], tracks.xy[chosen]
@@ -237,5 +287,6 @@ def _gauge(views: Sequence[View]) -> Float64:
 def _inverse(covariance: Float64) -> Float64:
     """The symmetric inverse of a covariance whose entries have units of their own."""
     unit = np.sqrt(np.diagonal(covariance))
-    inverse = np.linalg.inv(covariance / np.outer(unit, unit)) / np.outer(unit, unit)
-    return np.asarray(0.5 * (inverse + inverse.T))
+    variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
+    variances = np.maximum(variances, variances[-1] / MOST_KNOWN)
+    return np.asarray((axes / variances) @ axes.T / np.outer(unit, unit))

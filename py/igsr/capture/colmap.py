@@ -432,7 +432,9 @@ def _text_observations(path: Path, number: int, line: str) -> tuple[np.ndarray, 
     fields = line.split()
     try:
         places = np.array([fields[0::3], fields[1::3]], dtype=np.float64).T
-        point_ids = np.array(list(map(int, fields[2::3])), dtype=np.int64)
+        # No point is -1, or the same 64 bits without a sign.
+        ids = [-1 if int(field) == (1 << 64) - 1 else int(field) for field in fields[2::3]]
+        point_ids = np.array(ids, dtype=np.int64)
         if len(fields) % 3:
             raise ValueError
     except (ValueError, OverflowError) as error:
@@ -446,11 +448,13 @@ def _text_points(path: Path) -> _ColmapPoints:
         if not line:
             continue
         try:
-            identity, x, y, z, r, g, b, error, *track = line.split()
+            identity, x, y, z, r, g, b, *rest = line.split()
+            # What other programs write may end here: the error is not known then.
+            error, track = float(rest[0]) if rest else math.nan, rest[1:]
             xyz, rgb = (float(x), float(y), float(z)), (int(r), int(g), int(b))
             if not (all(0 <= value <= 255 for value in rgb) and 0 <= int(identity) < 1 << 64):
                 raise ValueError
-            points.add(int(identity), xyz, rgb, float(error), len(track) // 2)
+            points.add(int(identity), xyz, rgb, error, len(track) // 2)
         except ValueError as wrong:
             raise _damaged(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from wrong
     return points

@@ -93,7 +93,8 @@ class _Seen:
         point = np.concatenate(points)
         order = np.argsort(point, kind="stable")
         ends = np.cumsum(np.bincount(point, minlength=len(self.tracks)))
-        self.tracks = np.split(np.concatenate(elements)[order], ends[:-1])
+        # Splitting nothing gives one part.
+        self.tracks = np.split(np.concatenate(elements)[order], ends[:-1])[: len(self.tracks)]
 
 
 def _at_size(mask: np.ndarray, camera: Camera) -> np.ndarray:

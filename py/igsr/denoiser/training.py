@@ -221,10 +221,14 @@ class _Learner:
         """One step; the parts of the loss before it."""
         rate = self.training.rate * _schedule(self.step, self.training.steps)
         inputs, truth = inputs.to(self.device), truth.to(self.device)
+        truth, known = truth[:, :COLOR], truth[:, COLOR:] > 0.5
         torch.manual_seed(self.training.seed * 1_000_003 + self.step)  # of the dropout
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             image, log_error = self.shared(inputs)
-        made = Prediction(inputs[:, :COLOR], image.float(), log_error.float(), truth)
+        # Where the truth is unknown everything is right as it is, and no gradient comes from there.
+        image = torch.where(known, image.float(), truth)
+        log_error = torch.where(known, log_error.float(), log_error.detach().float())
+        made = Prediction(inputs[:, :COLOR], image, log_error, truth)
         total, parts = self.loss(made)
         _stepped(self.adam, total, rate)
         if self.judge is not None and self.judge_adam is not None:
@@ -319,6 +323,10 @@ def _stacked(crops: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
 
 
 def _crop(pairs: Pairs, side: int, random: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Inputs [``CHANNELS``, side, side] and truth [4, side, side].
+
+    The truth's fourth channel is 1 where it is known; elsewhere it is the render.
+    """
     view = random.integers(len(pairs.truth))
     height, width = pairs.truth.shape[2:]
     top = random.integers(max(1, height - side + 1))
@@ -326,9 +334,8 @@ def _crop(pairs: Pairs, side: int, random: np.random.Generator) -> tuple[Tensor,
     at = (view, slice(None), slice(top, top + side), slice(left, left + side))
     inputs = pairs.inputs[at] * SCALE[:, None, None] + OFFSET[:, None, None]
     truth = pairs.truth[at].astype(np.float32) / np.float32(255.0)
-    # Where the truth is unknown the render counts as right, and nothing is learned.
     known = pairs.masks[view, at[2], at[3]]
-    truth = np.where(known, truth, inputs[:COLOR])
+    truth = np.concatenate([np.where(known, truth, inputs[:COLOR]), known[None].astype(np.float32)])
     short = [(0, 0), (0, max(0, side - height)), (0, max(0, side - width))]
     if height < side or width < side:
         inputs, truth = np.pad(inputs, short, mode="edge"), np.pad(truth, short, mode="edge")
@@ -353,7 +360,7 @@ def _augmented(inputs: Tensor, truth: Tensor, random: np.random.Generator) -> tu
     gain = float(np.exp(random.uniform(-0.4, 0.2)))
     for at in _COLORS:
         inputs[at : at + 3] = (gain * inputs[at : at + 3][order]).clamp(0.0, 1.0)
-    truth = (gain * truth[order]).clamp(0.0, 1.0)
+    truth[:COLOR] = (gain * truth[:COLOR][order]).clamp(0.0, 1.0)
     if random.uniform() < LACKING:
         inputs[COLOR : COLOR + BUFFERS] = 0.0
     if random.uniform() < LACKING:
@@ -377,8 +384,9 @@ def _validated(
     with torch.no_grad():
         for crop in crops:
             inputs, truth = (part.to(device) for part in _stacked([crop]))
+            truth, known = truth[:, :COLOR], truth[:, COLOR:] > 0.5
             image, log_error = network(inputs)
-            image = image.clamp(0.0, 1.0)
+            image = torch.where(known, image.clamp(0.0, 1.0), truth)
             render = inputs[:, :COLOR]
             scores = {
                 "validation_charbonnier": charbonnier(Prediction(render, image, log_error, truth)),

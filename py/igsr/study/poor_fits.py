@@ -310,6 +310,8 @@ def denoiser_table(
         raise IgsrError(f"denoisers cannot be called {OURS} or {BEFORE}; choose another name.")
     for path in weights.values():
         load_network(path)
+    if features is not None:
+        SqueezeNetDistance(features)
     training = [] if pairs is None else sorted(Path(pairs).glob("*-sparse-*.npz"))
     if pairs is not None and not training:
         raise IgsrError(f"{pairs} holds no pairs of recipe sparse; make some.")
@@ -328,9 +330,10 @@ def denoiser_table(
             settings = preset_settings("default", photos) | {"scored": SCORED_VIEWS}
             tasks.append(Run(one.name, one, settings))
     rows = finished_runs(out / "runs", tasks, partial(run_fit, out), str(data), jobs, on_run, ray)
+    perceptual = None if features is None else _hash(Path(features))
     columns: dict[str, Path | None] = {BEFORE: None, **weights}
     for name, file in columns.items():
-        hashed = None if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+        hashed = None if file is None else _hash(file)
         cleanings = [
             Run(
                 f"{one.name}-{name}",
@@ -339,7 +342,7 @@ def denoiser_table(
                     None if file is None else str(file),
                     None if features is None else str(features),
                 ),
-                {"weights": hashed, "perceptual": features is not None, "fit": row["settings"]},
+                {"weights": hashed, "perceptual": perceptual, "fit": row["settings"]},
             )
             for one, row in zip(fits, rows, strict=True)
         ]
@@ -366,6 +369,10 @@ def denoiser_table(
         }
         write_sheet(out / f"{name}.png", _sheet(shown, weights))
     return report
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _sheet(
