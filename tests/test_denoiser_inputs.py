@@ -1,5 +1,7 @@
 """What the denoiser looks at: buffers, photos warped to a render, network channels, pairs."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +13,8 @@ from igsr.capture import Camera, View
 from igsr.denoiser import Buffers, Source, Warped, photo_support, render_buffers, warp_photos
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
 from igsr.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
-from igsr.denoiser.pairs import make_pairs, rendered_pairs
+from igsr.denoiser.pair_renders import rendered_pairs
+from igsr.denoiser.pairs import make_pairs
 from igsr.evaluation import BLACK
 
 
@@ -244,3 +247,8 @@ def test_bad_arguments_of_pairs(tmp_path, options, message):
         make_pairs([tmp_path / "a"], tmp_path / "out", **options)
     with pytest.raises(igsr.IgsrError, match="two captures are called a"):
         make_pairs([tmp_path / "a", tmp_path / "b" / "a"], tmp_path / "out")
+
+
+def test_pairs_can_be_imported_first():
+    """Studies make pairs too; neither may need the other to be there already."""
+    subprocess.run([sys.executable, "-c", "import igsr.denoiser.pairs"], check=True)

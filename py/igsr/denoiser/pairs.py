@@ -13,17 +13,15 @@ import numpy as np
 
 from ..capture import Capture, View, load_capture
 from ..errors import IgsrError
-from ..evaluation import WHITE, over_background
+from ..evaluation import WHITE
 from ..fitting import fit_with_cameras
 from ..metrics import psnr
 from ..presets import preset_settings
-from ..splats import Splats
 from ..study.noisy_poses import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
 from ..study.runs import Run, finished_runs
-from .buffers import photo_support, render_buffers
-from .inputs import COLOR, PHOTOS, network_inputs
-from .pair_files import Pairs, packed, write_pairs
-from .warping import photo_sources, warp_photos
+from .inputs import COLOR
+from .pair_files import write_pairs
+from .pair_renders import rendered_pairs
 
 #: Kinds of fits. "sparse" has 3 to 12 photos; "underfit" stops early; "noise" has wrong cameras;
 #: "paper" is the paper's recipe, "scattered" its other one; "leave-one-out" leaves one photo of the
@@ -149,38 +147,6 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
         "psnr": float(np.mean(before)),
         **about,
     }
-
-
-def rendered_pairs(
-    splats: Splats,
-    photos: Sequence[View],
-    views: Sequence[View],
-    background: Sequence[float],
-    backend: str,
-) -> Pairs:
-    """What the network sees of each view, and the true pictures.
-
-    Raises:
-        IgsrError: the views are not all of one size.
-    """
-    sizes = {(view.camera.width, view.camera.height) for view in views}
-    if len(sizes) > 1:
-        raise IgsrError(
-            f"views to render are of sizes {sorted(sizes)}; pairs need one, resize the photos."
-        )
-    support = photo_support(splats, [view.camera for view in photos], backend)
-    sources = photo_sources(splats, photos, background, backend)
-    inputs, truth, masks = [], [], []
-    for view in views:
-        buffers = render_buffers(splats, view.camera, support, background, backend)
-        others = [s for s, photo in zip(sources, photos, strict=True) if photo.name != view.name]
-        assert buffers.depth is not None
-        assert buffers.alpha is not None
-        warped = warp_photos(view.camera, buffers.depth, buffers.alpha, others, PHOTOS)
-        inputs.append(packed(network_inputs(buffers, warped)))
-        truth.append(np.moveaxis(over_background(view.image, background), -1, 0))
-        masks.append(np.ones(truth[-1].shape[1:], np.bool_) if view.mask is None else view.mask)
-    return Pairs(np.stack(inputs), np.stack(truth), np.stack(masks))
 
 
 def _hull(one: PairFit, train: list[View]) -> bool | None:

@@ -24,7 +24,7 @@ from ..capture import Capture, load_capture
 from ..capture.folder import holds_cameras
 from ..denoiser.cleaning import NetworkDenoiser
 from ..denoiser.pair_files import OFFSET, SCALE, Pairs, read_pairs, write_pairs
-from ..denoiser.pairs import rendered_pairs
+from ..denoiser.pair_renders import rendered_pairs
 from ..denoiser.perceptual import SMALLEST_SIDE, SqueezeNetDistance
 from ..denoiser.weights import SHIPPED, load_network
 from ..errors import IgsrError

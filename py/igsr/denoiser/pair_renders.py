@@ -1,0 +1,48 @@
+"""Renders as the network sees them, beside the true pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..capture import View
+from ..errors import IgsrError
+from ..evaluation import over_background
+from ..splats import Splats
+from .buffers import photo_support, render_buffers
+from .inputs import PHOTOS, network_inputs
+from .pair_files import Pairs, packed
+from .warping import photo_sources, warp_photos
+
+
+def rendered_pairs(
+    splats: Splats,
+    photos: Sequence[View],
+    views: Sequence[View],
+    background: Sequence[float],
+    backend: str,
+) -> Pairs:
+    """What the network sees of each view, and the true pictures.
+
+    Raises:
+        IgsrError: the views are not all of one size.
+    """
+    sizes = {(view.camera.width, view.camera.height) for view in views}
+    if len(sizes) > 1:
+        raise IgsrError(
+            f"views to render are of sizes {sorted(sizes)}; pairs need one, resize the photos."
+        )
+    support = photo_support(splats, [view.camera for view in photos], backend)
+    sources = photo_sources(splats, photos, background, backend)
+    inputs, truth, masks = [], [], []
+    for view in views:
+        buffers = render_buffers(splats, view.camera, support, background, backend)
+        others = [s for s, photo in zip(sources, photos, strict=True) if photo.name != view.name]
+        assert buffers.depth is not None
+        assert buffers.alpha is not None
+        warped = warp_photos(view.camera, buffers.depth, buffers.alpha, others, PHOTOS)
+        inputs.append(packed(network_inputs(buffers, warped)))
+        truth.append(np.moveaxis(over_background(view.image, background), -1, 0))
+        masks.append(np.ones(truth[-1].shape[1:], np.bool_) if view.mask is None else view.mask)
+    return Pairs(np.stack(inputs), np.stack(truth), np.stack(masks))
