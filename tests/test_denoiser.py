@@ -16,9 +16,17 @@ from igsr.denoiser import (
     load_network,
     save_network,
 )
-from igsr.denoiser.inputs import CHANNELS, COLOR
-from igsr.denoiser.losses import LOSSES, Loss, Prediction, error_likelihood, regret
-from igsr.denoiser.network import REACH, Architecture, DenoiserNetwork
+from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTO, PHOTOS
+from igsr.denoiser.losses import (
+    LOSSES,
+    Loss,
+    Prediction,
+    error_likelihood,
+    perceptual_ratio,
+    regret,
+    squared_ratio,
+)
+from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetwork
 from igsr.denoiser.pair_files import Pairs, read_pairs, write_pairs
 from igsr.denoiser.perceptual import SqueezeNetDistance, lpips_distance
 from igsr.denoiser.training import CHECKPOINT, LOG, WEIGHTS, Training, train
@@ -38,13 +46,29 @@ def network(architecture=SMALL, seed=0):
 
 
 @pytest.mark.parametrize("photos", ["concatenated", "attention", "none"])
-def test_a_new_network_changes_nothing(photos):
+def test_a_new_network_changes_little(photos):
     inputs = torch.rand(2, CHANNELS, 9, 14)
+    valid = inputs[:, COLOR + BUFFERS + COLOR :: PHOTO]
+    valid[:] = (valid > 0.5).float()
     image, log_error = DenoiserNetwork(Architecture(4, (1, 1, 1), photos=photos))(inputs)
-    assert torch.equal(image, inputs[:, :COLOR])
+    expected, weights = inputs[:, :COLOR].clone(), torch.ones(2, 1, 9, 14)
+    if photos != "none":
+        for k in range(PHOTOS):
+            at = COLOR + BUFFERS + k * PHOTO
+            weight = np.exp(FIRST_LOGIT) * valid[:, k : k + 1]
+            expected += weight * inputs[:, at : at + COLOR]
+            weights += weight
+    assert torch.allclose(image, expected / weights, atol=1e-6)
     assert (log_error == -3.0).all()
     image, _ = DenoiserNetwork(Architecture(4, (1, 1, 1), residual=False))(inputs)
     assert not image.any()
+
+
+def test_photos_that_do_not_see_a_pixel_are_not_mixed_in():
+    inputs = torch.rand(1, CHANNELS, 8, 8)
+    inputs[:, COLOR + BUFFERS + COLOR :: PHOTO] = 0.0
+    image, _ = DenoiserNetwork(SMALL)(inputs)
+    assert torch.equal(image, inputs[:, :COLOR])
 
 
 def test_what_the_architecture_leaves_out_does_not_matter():
@@ -188,6 +212,32 @@ def test_regret_is_what_was_made_worse_only():
     assert regret(prediction(worse, truth, render)).item() == pytest.approx(0.2)
 
 
+def test_a_decibel_counts_the_same_in_good_and_bad_pictures():
+    truth = torch.full((2, 3, 8, 8), 0.5)
+    off = torch.tensor([0.3, 0.1]).reshape(2, 1, 1, 1)
+    gained = 10.0 ** (-1.0 / 20.0)
+    both = squared_ratio(prediction(truth + gained * off, truth, truth + off))
+    assert both.item() == pytest.approx(-0.23, abs=0.003)
+    bad = squared_ratio(prediction(truth[:1] + gained * 0.3, truth[:1], truth[:1] + 0.3))
+    assert bad.item() == pytest.approx(both.item(), rel=0.02)
+    # What cannot be seen is not worth a change elsewhere.
+    invisible = squared_ratio(prediction(truth + 1e-3, truth, truth))
+    assert 0.0 < invisible.item() < 0.02
+
+
+def test_the_perceptual_ratio_looks_at_some_pictures_of_a_batch():
+    truth = torch.full((4, 3, 8, 8), 0.5)
+    image = truth.clone()
+    image[:2] += 0.1
+    image[2:] += 10.0
+    image.requires_grad_()
+    value = perceptual_ratio(Prediction(truth + 0.2, image, image[:, :1], truth), mean_distance)
+    assert value.item() == pytest.approx(np.log(0.11 / 0.21), rel=1e-4)
+    value.backward()
+    assert image.grad[:2].abs().sum() > 0.0
+    assert image.grad[2:].abs().sum() == 0.0
+
+
 def test_the_likelihood_is_best_at_the_true_error_and_leaves_the_picture_alone():
     truth = torch.zeros(1, 3, 4, 4)
     image = torch.full_like(truth, 0.1, requires_grad=True)
@@ -214,7 +264,8 @@ def test_every_loss_has_its_parts_and_moves_the_network(name):
     image, log_error = made(inputs)
     total, parts = loss(Prediction(inputs[:, :COLOR], image, log_error, truth))
     expected = {
-        "default": {"charbonnier", "regret", "perceptual", "likelihood"},
+        "default": {"squared", "perceptual", "likelihood"},
+        "charbonnier": {"charbonnier", "perceptual", "likelihood"},
         "gan": {"gan", "likelihood"},
         "gan+lpips": {"gan", "perceptual", "likelihood"},
         "lpips": {"perceptual", "likelihood"},
@@ -230,7 +281,7 @@ def test_every_loss_has_its_parts_and_moves_the_network(name):
 
 
 def test_losses_that_cannot_be_had_are_refused():
-    with pytest.raises(igsr.IgsrError, match="loss must be one of default, gan"):
+    with pytest.raises(igsr.IgsrError, match="loss must be one of default, charbonnier, gan"):
         Loss("mse", None)
     with pytest.raises(igsr.IgsrError, match="loss lpips needs a perceptual distance"):
         Loss("lpips", None)

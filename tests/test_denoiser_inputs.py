@@ -15,6 +15,7 @@ from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_input
 from igsr.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
 from igsr.denoiser.pair_renders import rendered_pairs
 from igsr.denoiser.pairs import make_pairs
+from igsr.denoiser.warping import CONSIDERED
 from igsr.evaluation import BLACK
 
 
@@ -134,6 +135,17 @@ def test_hidden_masked_and_missing_photos_are_not_valid():
     assert not warped_of(buffers, []).valid.any()
     transparent = Buffers(truth, np.zeros_like(depth), depth, camera=camera())
     assert not warped_of(transparent, [source(0.1)]).valid.any(), "there is no surface"
+
+
+def test_of_many_photos_those_that_look_from_nearest_are_looked_up():
+    truth, depth = plane_photo(camera())
+    buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
+    near = [source(x) for x in np.linspace(-0.4, 0.4, CONSIDERED)]
+    far = [source(x) for x in (-1.2, 1.2, 1.5)]
+    few, many = warped_of(buffers, near, 3), warped_of(buffers, [far[0], *near, *far[1:]], 3)
+    assert few.valid[0].any()
+    for name in ("color", "valid", "angle"):
+        assert np.array_equal(getattr(few, name), getattr(many, name))
 
 
 def nothing_warped(height, width):

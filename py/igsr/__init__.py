@@ -12,6 +12,7 @@ from __future__ import annotations
 from ._core import __version__
 from .capture import Camera, Capture, Points, View, load_capture
 from .compaction import Compaction, compact
+from .denoiser import denoise
 from .errors import IgsrError
 from .evaluation import evaluate
 from .fitting import Progress, fit, fit_with_cameras
@@ -33,6 +34,7 @@ __all__ = [
     "View",
     "__version__",
     "compact",
+    "denoise",
     "estimate_poses",
     "evaluate",
     "fit",

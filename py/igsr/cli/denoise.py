@@ -56,6 +56,7 @@ class LossChoice(str, enum.Enum):
     """What training makes small."""
 
     default = "default"
+    charbonnier = "charbonnier"
     gan = "gan"
     gan_lpips = "gan+lpips"
     lpips = "lpips"

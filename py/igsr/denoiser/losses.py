@@ -1,4 +1,8 @@
-"""What a denoiser is trained to make small: the default and the three losses of the paper."""
+"""What a denoiser is trained to make small: the default and the three losses of the paper.
+
+The default counts ratios: a render that is nearly right and one that is all wrong weigh the same,
+as they do in mean decibels, and an error made there costs what it is worth.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +16,18 @@ from ..errors import IgsrError
 from .perceptual import Distance
 
 #: Names of ``--loss``. The last three are the paper's.
-LOSSES = ("default", "gan", "gan+lpips", "lpips")
-#: Parts of the default: a pixel's distance counts 1.
-PERCEPTUAL, REGRET, LIKELIHOOD = 0.05, 0.5, 0.1
+LOSSES = ("default", "charbonnier", "gan", "gan+lpips", "lpips")
+#: Parts of the default, beside the squared error's ratio, which counts 1.
+PERCEPTUAL, LIKELIHOOD = 0.5, 0.1
+#: Part of "charbonnier" that the perceptual distance has.
+CHARBONNIER_PERCEPTUAL = 0.05
 #: Below this the distance of two colours counts by its square (Charbonnier).
 CHARBONNIER = 1e-3
+#: Squared errors and perceptual distances that are not worth making smaller.
+SQUARED_FLOOR, PERCEPTUAL_FLOOR = 1e-4, 0.01
+#: The perceptual distance is taken of one in so many pictures of a batch: of all of them it would
+#: take half as long again as the network.
+PERCEPTUAL_OF = 3
 
 
 @dataclass(frozen=True)
@@ -42,6 +53,13 @@ def charbonnier(prediction: Prediction) -> Tensor:
     return ((difference.square() + CHARBONNIER**2).sqrt() - CHARBONNIER).mean()
 
 
+def squared_ratio(prediction: Prediction) -> Tensor:
+    """Mean over pictures of ln(squared error after / before): -0.23 is a decibel gained."""
+    after = (prediction.image - prediction.truth).square().mean(dim=(1, 2, 3))
+    before = (prediction.render - prediction.truth).square().mean(dim=(1, 2, 3))
+    return ((after + SQUARED_FLOOR) / (before + SQUARED_FLOOR)).log().mean()
+
+
 def regret(prediction: Prediction) -> Tensor:
     """Mean of how much further from the truth colours are than they were; 0 where nearer.
 
@@ -64,9 +82,22 @@ def error_likelihood(prediction: Prediction) -> Tensor:
 
 def perceptual(prediction: Prediction, distance: Distance) -> Tensor:
     """Mean distance by a perceptual metric of the clamped pictures."""
-    # The clamp lets gradients through: colours out of range must be able to come back.
-    image = prediction.image + (prediction.image.clamp(0.0, 1.0) - prediction.image).detach()
-    return distance(image, prediction.truth).mean()
+    return distance(_clamped(prediction.image), prediction.truth).mean()
+
+
+def perceptual_ratio(prediction: Prediction, distance: Distance) -> Tensor:
+    """Mean of ln(perceptual distance after / before) of a batch's first pictures."""
+    some = slice(-(-len(prediction.image) // PERCEPTUAL_OF))
+    truth = prediction.truth[some]
+    after = distance(_clamped(prediction.image[some]), truth)
+    with torch.no_grad():
+        before = distance(prediction.render[some], truth)
+    return ((after + PERCEPTUAL_FLOOR) / (before + PERCEPTUAL_FLOOR)).log().mean()
+
+
+def _clamped(image: Tensor) -> Tensor:
+    """``image`` in [0, 1]; gradients pass: colours out of range must be able to come back."""
+    return image + (image.clamp(0.0, 1.0) - image).detach()
 
 
 class Discriminator(nn.Module):
@@ -103,10 +134,10 @@ class Loss:
     """A loss by name; its parts are returned beside the total, for logs.
 
     Args:
-        name: of ``LOSSES``: "default" (Charbonnier, regret, perceptual distance if there is one,
-            and the predicted error's likelihood), "gan", "gan+lpips" ((1 - a) GAN + a LPIPS) or
-            "lpips". The likelihood is part of all: without it there is no confidence; its gradient
-            does not reach the picture.
+        name: of ``LOSSES``: "default" (the ratios of the squared error and, if there is one, of the
+            perceptual distance), "charbonnier" (absolute errors and that distance), "gan",
+            "gan+lpips" ((1 - a) GAN + a LPIPS) or "lpips". The predicted error's likelihood is part
+            of all: without it there is no confidence; its gradient does not reach the picture.
         distance: the perceptual one, where the loss has it.
         a: of "gan+lpips"; the paper has 0.9.
 
@@ -129,10 +160,14 @@ class Loss:
         """The total and its parts."""
         parts: dict[str, tuple[float, Tensor]] = {}
         if self.name == "default":
-            parts["charbonnier"] = 1.0, charbonnier(prediction)
-            parts["regret"] = REGRET, regret(prediction)
+            parts["squared"] = 1.0, squared_ratio(prediction)
             if self.distance is not None:
-                parts["perceptual"] = PERCEPTUAL, perceptual(prediction, self.distance)
+                parts["perceptual"] = PERCEPTUAL, perceptual_ratio(prediction, self.distance)
+        elif self.name == "charbonnier":
+            parts["charbonnier"] = 1.0, charbonnier(prediction)
+            if self.distance is not None:
+                distance = perceptual(prediction, self.distance)
+                parts["perceptual"] = CHARBONNIER_PERCEPTUAL, distance
         if self.discriminator is not None:
             weight = 1.0 if self.name == "gan" else 1.0 - self.a
             parts["gan"] = weight, F.softplus(-self.discriminator(prediction.image)).mean()

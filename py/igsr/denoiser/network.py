@@ -24,6 +24,12 @@ REACH = 96
 LEAST_LOG_ERROR, MOST_LOG_ERROR = -7.0, 0.0
 
 
+#: What blocks add at the start, as a part of what they compute. NAFNet's begin at 0, as the
+#: identity, and take hundreds of steps to wake.
+FIRST_SCALE = 0.3
+#: At the start a warped photo counts this much beside the render (as a logit).
+FIRST_LOGIT = -2.0
+
 #: Ways to look at the photos.
 PHOTO_WAYS = ("concatenated", "attention", "none")
 
@@ -35,7 +41,8 @@ class Architecture:
     Attributes:
         width: channels at half resolution; twice and four times as many below.
         blocks: blocks at a half (each way), a quarter (each way) and an eighth of the resolution.
-        residual: add the output to the render, or take it as the picture.
+        residual: add the output to a mean of the render and the warped photos, with weights that
+            are predicted for each pixel, or take it as the picture.
         buffers: look at the rasterizer's buffers.
         photos: "concatenated", "attention" (per pixel over the photos, in place of a fixed order)
             or "none".
@@ -84,9 +91,8 @@ class _Block(nn.Module):
         self.norm2 = _ChannelNorm(channels)
         self.expand2 = nn.Conv2d(channels, 2 * channels, 1)
         self.project2 = nn.Conv2d(channels, channels, 1)
-        # Blocks begin as the identity (NAFNet).
-        self.scale1 = nn.Parameter(torch.zeros(channels))
-        self.scale2 = nn.Parameter(torch.zeros(channels))
+        self.scale1 = nn.Parameter(torch.full((channels,), FIRST_SCALE))
+        self.scale2 = nn.Parameter(torch.full((channels,), FIRST_SCALE))
 
     def forward(self, x: Tensor) -> Tensor:
         inner = self.project1(_gate(self.depthwise(self.expand1(self.norm1(x)))))
@@ -122,7 +128,7 @@ class DenoiserNetwork(nn.Module):
     """
 
     def __init__(self, architecture: Architecture | None = None, dropout: float = 0.0) -> None:
-        """Build the layers; the last begins at zero, so that the render comes out unchanged."""
+        """Build the layers; the last begins at zero, so that little but the render comes out."""
         super().__init__()
         self.architecture = architecture or Architecture()
         width, (half, quarter, eighth) = self.architecture.width, self.architecture.blocks
@@ -140,7 +146,7 @@ class DenoiserNetwork(nn.Module):
         self.up_quarter = nn.Sequential(*(_Block(2 * width) for _ in range(quarter)))
         self.from_quarter = nn.Conv2d(2 * width, 4 * width, 1)
         self.up_half = nn.Sequential(*(_Block(width) for _ in range(half)))
-        self.tail = nn.Conv2d(width, 4 * (COLOR + 1), 3, padding=1)
+        self.tail = nn.Conv2d(width, 4 * (COLOR + 1 + PHOTOS), 3, padding=1)
         for parameter in self.tail.parameters():
             nn.init.zeros_(parameter)
 
@@ -174,8 +180,22 @@ class DenoiserNetwork(nn.Module):
         half = self.up_half(half + F.pixel_shuffle(self.from_quarter(quarter), 2))
         out = F.pixel_shuffle(self.tail(half), 2)[..., :height, :width]
         image = out[:, :COLOR]
-        if self.architecture.residual:
+        if self.architecture.residual and self.architecture.photos == "none":
             image = image + inputs[:, :COLOR]
+        elif self.architecture.residual:
+            image = image + _mixed(inputs, out[:, COLOR + 1 :] + FIRST_LOGIT)
         # At the start every picture is taken to be wrong by about a twentieth of the range.
-        log_error = (out[:, COLOR:] - 3.0).clamp(LEAST_LOG_ERROR, MOST_LOG_ERROR)
+        log_error = (out[:, COLOR : COLOR + 1] - 3.0).clamp(LEAST_LOG_ERROR, MOST_LOG_ERROR)
         return image, log_error
+
+
+def _mixed(inputs: Tensor, logits: Tensor) -> Tensor:
+    """Means [B, 3, H, W] of the render and the photos that are valid, by ``logits`` of the photos.
+
+    The render's own logit is 0.
+    """
+    photos = inputs[:, COLOR + BUFFERS :].unflatten(1, (PHOTOS, PHOTO))
+    logits = logits.masked_fill(photos[:, :, COLOR] < 0.5, -torch.inf)
+    weights = F.pad(logits, (0, 0, 0, 0, 1, 0)).softmax(dim=1)
+    colors = torch.cat([inputs[:, None, :COLOR], photos[:, :, :COLOR]], dim=1)
+    return (weights[:, :, None] * colors).sum(dim=1)

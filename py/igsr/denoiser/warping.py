@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from ..capture import Camera, View
 from ..evaluation import over_background
@@ -20,6 +21,10 @@ Float32 = npt.NDArray[np.float32]
 #: A photo sees a point if the depth rendered from the photo differs from the point's by no more
 #: than this part of it.
 SAME_DEPTH = 0.03
+#: Of more photos, the ones that look from nearest at the middle of what is seen are looked up.
+CONSIDERED = 8
+#: Stands for the cosine of an angle where a photo does not see a point.
+UNSEEN = -2.0
 #: Below this alpha a render has no surface to look up.
 SURFACE_ALPHA = 0.5
 
@@ -90,67 +95,86 @@ def warp_photos(
         keep: photos kept per pixel, K; where fewer see it, the rest is not valid.
     """
     height, width = depth.shape
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    K = camera.K
-    rays = np.stack(
-        [(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(rows)], axis=-1
-    )
-    to_world = np.linalg.inv(camera.viewmat)
-    points = (rays * depth[..., None].astype(np.float64)) @ to_world[:3, :3].T + to_world[:3, 3]
+    angle = np.full((keep, height, width), np.pi, np.float32)
+    color = np.zeros((keep, height, width, 3), np.float32)
     surface = alpha > SURFACE_ALPHA
-    here = _directions(points, camera.centre)
-    found = [_looked_up(source, points, surface, here) for source in sources]
-    angles = np.stack([angle for _, angle in found] or [np.full(depth.shape, np.pi, np.float32)])
-    colors = np.stack([color for color, _ in found] or [np.zeros((height, width, 3), np.float32)])
-    order = np.argsort(angles, axis=0, kind="stable")[:keep]
-    angle = np.take_along_axis(angles, order, axis=0)
-    color = np.take_along_axis(colors, order[..., None], axis=0)
-    missing = keep - len(angle)
-    if missing > 0:
-        angle = np.pad(angle, ((0, missing), (0, 0), (0, 0)), constant_values=np.float32(np.pi))
-        color = np.pad(color, ((0, missing), (0, 0), (0, 0), (0, 0)))
+    points = _surface_points(camera, depth, surface)
+    near = _nearest(sources, camera, points)
+    if points.shape[1] and near:
+        cosines, at = zip(*(_looked_up(source, camera, points) for source in near), strict=True)
+        best = torch.stack(cosines).topk(min(keep, len(near)), dim=0)
+        for k, (cosine, photo) in enumerate(zip(best.values, best.indices, strict=True)):
+            found = torch.zeros(points.shape[1], 3)
+            for index, source in enumerate(near):
+                chosen = torch.nonzero((photo == index) & (cosine > UNSEEN))[:, 0]
+                found[chosen] = _colors(source, at[index][:, chosen])
+            color[k, surface] = found.numpy()
+            seen = torch.where(cosine > UNSEEN, cosine.clamp(-1.0, 1.0).acos(), torch.pi)
+            angle[k, surface] = seen.numpy()
     return Warped(color, angle < np.float32(np.pi), angle)
 
 
-def _directions(
-    points: npt.NDArray[np.float64], centre: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    directions = points - centre
-    unit: npt.NDArray[np.float64] = directions / np.maximum(
-        np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12
-    )
-    return unit
+def _nearest(sources: Sequence[Source], camera: Camera, points: Tensor) -> list[Source]:
+    """The ``CONSIDERED`` sources that look at the middle of ``points`` from nearest."""
+    if len(sources) <= CONSIDERED or not points.shape[1]:
+        return list(sources)
+    to_world = np.linalg.inv(camera.viewmat)
+    middle = to_world[:3, :3] @ points.median(dim=1).values.double().numpy() + to_world[:3, 3]
+    here = _direction(camera, middle)
+    cosines = [float(_direction(source.camera, middle) @ here) for source in sources]
+    order = np.argsort(-np.array(cosines), kind="stable")[:CONSIDERED]
+    return [sources[i] for i in sorted(order)]
 
 
-def _looked_up(
-    source: Source,
-    points: npt.NDArray[np.float64],
-    surface: npt.NDArray[np.bool_],
-    here: npt.NDArray[np.float64],
-) -> tuple[Float32, Float32]:
-    """Colour [H, W, 3] and angle [H, W] of one photo; black and pi where it sees no point."""
-    camera = source.camera
-    inside = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = inside[..., 2]
-    front = surface & (z > 1e-6)
-    divisor = np.where(front, z, 1.0)
-    x = camera.K[0, 0] * inside[..., 0] / divisor + camera.K[0, 2]
-    y = camera.K[1, 1] * inside[..., 1] / divisor + camera.K[1, 2]
-    seen = front & (x > 0.0) & (x < camera.width) & (y > 0.0) & (y < camera.height)
-    column = np.clip(x, 0, camera.width - 1).astype(np.int64)
-    row = np.clip(y, 0, camera.height - 1).astype(np.int64)
-    seen &= np.abs(source.depth[row, column] - z) <= SAME_DEPTH * np.abs(z)
-    seen &= source.usable[row, column]
+def _direction(camera: Camera, point: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    direction: npt.NDArray[np.float64] = point - camera.centre
+    return direction / max(float(np.linalg.norm(direction)), 1e-30)
+
+
+def _surface_points(camera: Camera, depth: Float32, surface: npt.NDArray[np.bool_]) -> Tensor:
+    """Points [3, N] at the pixels where ``surface`` is, in the camera's axes."""
+    rows, columns = np.nonzero(surface)
+    K = camera.K
+    x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
+    rays = np.stack([x, y, np.ones_like(x)])
+    return torch.from_numpy((rays * depth[surface]).astype(np.float32))
+
+
+def _looked_up(source: Source, camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine [N] between the directions, ``UNSEEN`` where a photo sees no point; pixels [2, N]."""
+    photo = source.camera
+    # Points stay in a camera's axes: float32 has no room for a scene far from the world's origin.
+    between = torch.from_numpy(photo.viewmat @ np.linalg.inv(camera.viewmat)).float()
+    turned = between[:3, :3] @ points
+    inside = turned + between[:3, 3:]
+    z = inside[2]
+    front = z > 1e-6 * points[2]
+    inverse = 1.0 / torch.where(front, z, 1.0)
+    x = float(photo.K[0, 0]) * inside[0] * inverse + float(photo.K[0, 2])
+    y = float(photo.K[1, 1]) * inside[1] * inverse + float(photo.K[1, 2])
+    seen = front & (x > 0.0) & (x < photo.width) & (y > 0.0) & (y < photo.height)
+    pixel = torch.where(seen, y, 0.0).long() * photo.width + torch.where(seen, x, 0.0).long()
+    there = torch.from_numpy(source.depth).reshape(-1)[pixel]
+    seen &= (there - z).abs() <= SAME_DEPTH * z.abs()
+    seen &= torch.from_numpy(source.usable).reshape(-1)[pixel]
+    lengths = _dot(inside, inside) * _dot(turned, turned)
+    cosine = _dot(inside, turned) * lengths.clamp_min(1e-30).rsqrt()
+    return torch.where(seen, cosine, UNSEEN), torch.stack([x, y])
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _colors(source: Source, at: Tensor) -> Tensor:
+    """A photo's colours [N, 3] at ``at`` [2, N], pixels."""
     # grid_sample counts from -1 to 1 between the picture's outer edges.
-    grid = np.stack([2.0 * x / camera.width - 1.0, 2.0 * y / camera.height - 1.0], axis=-1)
-    grid = np.where(seen[..., None], grid, 2.0).astype(np.float32)
-    color = F.grid_sample(
+    size = torch.tensor([source.camera.width, source.camera.height])
+    found: Tensor = F.grid_sample(
         torch.from_numpy(source.color).permute(2, 0, 1)[None],
-        torch.from_numpy(grid)[None],
+        (2.0 * at.T / size - 1.0)[None, None],
         mode="bilinear",
         padding_mode="border",
         align_corners=False,
-    )[0].permute(1, 2, 0)
-    cosine = np.sum(here * _directions(points, camera.centre), axis=-1)
-    angle = np.where(seen, np.arccos(np.clip(cosine, -1.0, 1.0)), np.pi).astype(np.float32)
-    return np.where(seen[..., None], color.numpy(), np.float32(0.0)), angle
+    )
+    return found[0, :, 0].T

@@ -281,7 +281,7 @@ def denoiser_table(
         seeds: how many seeds, from 0.
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own with its share of the cores.
-        on_run: called with (done, all, the fit's row) after each fit, and again for each denoiser.
+        on_run: called with (done, all, the fit's row) after each fit.
         ray: fits run over a Ray cluster instead (``pip install 'igsr[ray]'``).
 
     Returns:
