@@ -48,8 +48,8 @@ def test_views_are_cleaned_with_the_weights_given(trained):
     assert files == [f"{name}{end}" for name in names for end in (".confidence.png", ".png")]
     picture = np.asarray(Image.open(out / "photos/00.png"))
     photo = np.asarray(Image.open(trained / "ball" / "photos/00.png"))
-    # A network that has hardly learnt changes hardly anything.
-    assert np.abs(picture.astype(int) - photo).mean() < 8.0
+    # A network that has hardly learnt gives the render and a little of the other photos.
+    assert np.abs(picture.astype(int) - photo).mean() < 12.0
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import capture_files
 import numpy as np
 import pytest
 import scenes
@@ -29,7 +30,8 @@ def weights(path, brighter=0.0, log_error=-3.0):
     with torch.no_grad():
         # Before pixel shuffle each output has four channels; the offset of log errors is -3.
         network.tail.bias[:12] = brighter
-        network.tail.bias[12:] = log_error + 3.0
+        network.tail.bias[12:16] = log_error + 3.0
+        network.tail.bias[16:] = -100.0  # photos do not count
     save_network(network, path, {})
     return str(path)
 
@@ -116,6 +118,13 @@ def data(tmp_path):
     scenes.write_capture(tmp_path / "data/more/cube", scenes.capture(views=6, size=24))
     (tmp_path / "data/empty").mkdir()
     return tmp_path / "data"
+
+
+def test_photos_in_a_folder_of_their_own_are_no_further_scene(tmp_path):
+    for name in ("leaf", "stone"):
+        (tmp_path / name / "images").mkdir(parents=True)
+        capture_files.write_transforms(tmp_path / name)
+    assert scenes_in(tmp_path) == ("leaf", "stone")
 
 
 def test_the_study(data, tmp_path, monkeypatch, igsr_here):

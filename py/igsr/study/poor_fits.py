@@ -101,12 +101,13 @@ def scenes_in(data: Path) -> tuple[str, ...]:
     Raises:
         IgsrError: there are none.
     """
-    found = [
-        folder.relative_to(data).as_posix()
-        for pattern in ("*", "*/*")
-        for folder in sorted(data.glob(pattern))
-        if folder.is_dir() and holds_cameras(folder)
-    ]
+    found: list[str] = []
+    for pattern in ("*", "*/*"):
+        for folder in sorted(data.glob(pattern)):
+            name = folder.relative_to(data)
+            # A capture's folder of photos is one too, of the same photos.
+            if name.parent.as_posix() not in found and folder.is_dir() and holds_cameras(folder):
+                found.append(name.as_posix())
     if not found:
         raise IgsrError(f"{data} holds no folder of photos with cameras; name another DATA.")
     return tuple(found)
