@@ -16,6 +16,7 @@ from igsr.denoiser import (
     load_network,
     save_network,
 )
+from igsr.denoiser.cleaning import UNSEEN_CHANGE
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTO, PHOTOS
 from igsr.denoiser.losses import (
     LOSSES,
@@ -29,7 +30,16 @@ from igsr.denoiser.losses import (
 from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetwork
 from igsr.denoiser.pair_files import Pairs, read_pairs, write_pairs
 from igsr.denoiser.perceptual import SqueezeNetDistance, lpips_distance
-from igsr.denoiser.training import CHECKPOINT, LOG, WEIGHTS, Training, train
+from igsr.denoiser.training import (
+    CHECKPOINT,
+    LOG,
+    RIGHT,
+    WEIGHTS,
+    Training,
+    _batch,
+    _Processes,
+    train,
+)
 from igsr.rendering import Render
 
 SMALL = Architecture(width=4, blocks=(1, 1, 1))
@@ -116,6 +126,16 @@ def test_any_size_comes_out_as_it_went_in(size):
     assert picture.dtype == confidence.dtype == np.float32
     assert 0.0 <= picture.min() <= picture.max() <= 1.0
     assert 0.0 <= confidence.min() <= confidence.max() <= 1.0
+
+
+def test_a_change_that_nobody_sees_is_not_made():
+    color = np.random.default_rng(0).uniform(0.1, 0.9, size=(20, 20, 3)).astype(np.float32)
+    for brighter, same in ((0.9 * UNSEEN_CHANGE, True), (1.1 * UNSEEN_CHANGE, False)):
+        made = DenoiserNetwork(SMALL).eval()
+        with torch.no_grad():
+            made.tail.bias[:12] = brighter
+        picture, _ = denoise(color, denoiser=NetworkDenoiser(made))
+        assert np.array_equal(picture, color) is same
 
 
 def test_pixels_that_are_not_numbers_are_filled_in_without_confidence():
@@ -405,6 +425,30 @@ def test_hidden_pixels_teach_no_confidence(tmp_path):
     torch.manual_seed(rested.seed)
     for one, other in zip(network.parameters(), DenoiserNetwork(SMALL).parameters(), strict=True):
         assert torch.equal(one, other)
+
+
+def test_a_training_can_go_on_from_weights(tmp_path):
+    pairs = pair_files(tmp_path / "pairs", count=2)
+    save_network(network(seed=3), tmp_path / "start.safetensors", {})
+    slow = replace(TINY, steps=1, rate=1e-9, weight_decay=0.0)
+    on = train(pairs, tmp_path / "out", slow, SMALL, start=tmp_path / "start.safetensors")
+    begun = load_network(tmp_path / "start.safetensors")
+    for one, other in zip(on.parameters(), begun.parameters(), strict=True):
+        assert torch.allclose(one, other, atol=1e-6)
+    with pytest.raises(igsr.IgsrError, match="start.safetensors is of Architecture"):
+        train(pairs, tmp_path / "out", slow, Architecture(8), start=tmp_path / "start.safetensors")
+
+
+def test_crops_that_are_right_already_are_drawn_again(tmp_path):
+    (path, _) = pair_files(tmp_path, count=2)
+    made = read_pairs(path)
+    inputs = made.inputs.copy()
+    inputs[0, :COLOR] = made.truth[0]  # one of the two views is right everywhere
+    training = replace(TINY, batch=64, augment=False)
+    pairs = [Pairs(inputs, made.truth, made.masks)]
+    crops, truth = _batch(pairs, training, 0, _Processes("cpu"))
+    drawn = (crops[:, :COLOR] - truth[:, :COLOR]).square().mean(dim=(1, 2, 3)) > RIGHT
+    assert 0.85 < drawn.float().mean() < 1.0, "half to the power of four stays right"
 
 
 def test_training_needs_two_files_of_pairs(tmp_path):

@@ -149,6 +149,10 @@ def train_command(
         BackboneChoice | None,
         typer.Option("--lpips", help="True LPIPS with this backbone, which is downloaded."),
     ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option("--start", metavar="FILE", help="Weights to go on from, such as igsr's own."),
+    ] = None,
     steps: Annotated[int, typer.Option("--steps", help="Batches.")] = 20_000,
     batch: Annotated[int, typer.Option("--batch", help="Crops per step.")] = 8,
     crop: Annotated[int, typer.Option("--crop", help="Side of a crop, pixels.")] = 128,
@@ -201,6 +205,7 @@ def train_command(
                 ),
                 Architecture(width=width, residual=residual, buffers=buffers, photos=photos),
                 distance=distance,
+                start=start,
                 device=device,
                 resume=resume,
                 progress=progress,

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..errors import IgsrError
 from ..rendering import Render
 from .buffers import Buffers
-from .inputs import PHOTOS, network_inputs
+from .inputs import COLOR, PHOTOS, network_inputs
 from .network import MULTIPLE, REACH, DenoiserNetwork
 from .warping import Source, Warped, warp_photos
 from .weights import load_network
@@ -23,6 +23,9 @@ Float32 = npt.NDArray[np.float32]
 
 #: Expected error, in units of the colours' range, at which the confidence is a half.
 HALF_CONFIDENCE_ERROR = 0.05
+#: Colours that would change by less than this, of 1, are left alone: a background that is right
+#: stays exactly so.
+UNSEEN_CHANGE = 1.5 / 255.0
 #: Pictures of more pixels go through the network in tiles of this side, without what is around.
 TILE = 768
 assert TILE % MULTIPLE == 0
@@ -60,7 +63,10 @@ class NetworkDenoiser:
     def clean(self, inputs: Float32) -> tuple[Float32, Float32]:
         """Clean what ``network_inputs`` gave, [``CHANNELS``, H, W]; returns as ``denoise``."""
         image, log_error = self._in_tiles(torch.from_numpy(inputs)[None])
-        picture = image[0].clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
+        render = torch.from_numpy(inputs[:COLOR])
+        change = (image[0] - render).abs().amax(dim=0)
+        cleaned = torch.where(change < UNSEEN_CHANGE, render, image[0])
+        picture = cleaned.clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
         error: Float32 = log_error[0, 0].exp().numpy()
         confidence: Float32 = HALF_CONFIDENCE_ERROR / (HALF_CONFIDENCE_ERROR + error)
         return picture, confidence

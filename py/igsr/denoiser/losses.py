@@ -18,7 +18,7 @@ from .perceptual import Distance
 #: Names of ``--loss``. The last three are the paper's.
 LOSSES = ("default", "charbonnier", "gan", "gan+lpips", "lpips")
 #: Parts of the default, beside the squared error's ratio, which counts 1.
-PERCEPTUAL, LIKELIHOOD = 0.5, 0.1
+PERCEPTUAL, LIKELIHOOD = 0.1, 0.1
 #: Part of "charbonnier" that the perceptual distance has.
 CHARBONNIER_PERCEPTUAL = 0.05
 #: Below this the distance of two colours counts by its square (Charbonnier).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -23,7 +24,7 @@ from .losses import Loss, Prediction, charbonnier, regret
 from .network import MULTIPLE, Architecture, DenoiserNetwork
 from .pair_files import OFFSET, SCALE, Pairs, read_pairs
 from .perceptual import Distance
-from .weights import save_network
+from .weights import load_network, save_network
 
 CHECKPOINT = "checkpoint.pt"
 LOG = "log.jsonl"
@@ -34,6 +35,9 @@ VALIDATION = 0.1
 VALIDATION_CROPS = 64
 #: Each crop lacks all the buffers, or the photos, this often: renders may come without.
 LACKING = 0.05
+#: A crop whose render is less wrong than this, in squared error, teaches nothing; others are drawn
+#: in its place, at most so many.
+RIGHT, DRAWN_AGAIN = 1e-5, 3
 #: The weights kept are a running mean over about the last tenth of the steps, at most over these.
 AVERAGED_STEPS = 500
 
@@ -97,6 +101,7 @@ def train(
     architecture: Architecture | None = None,
     *,
     distance: Distance | None = None,
+    start: str | os.PathLike[str] | None = None,
     device: str = "cpu",
     resume: bool = False,
     progress: Callable[[TrainingProgress], None] | None = None,
@@ -114,6 +119,8 @@ def train(
         training: how.
         architecture: which network.
         distance: perceptual, for the losses that have it.
+        start: weights to go on from, such as igsr's own for pairs of one's own captures; None
+            begins with random ones.
         device: torch's name of where to train; "cuda" has mixed precision.
         resume: go on from ``out``'s checkpoint, if there is one, to the same end.
         progress: called now and then.
@@ -121,8 +128,8 @@ def train(
         checkpoint_every: steps between checkpoints, and validations.
 
     Raises:
-        IgsrError: a file cannot be used, the checkpoint is of another training, or the loss is
-            not finite.
+        IgsrError: a file cannot be used, ``start`` is of another architecture, the checkpoint is
+            of another training, or the loss is not finite.
     """
     training, architecture = training or Training(), architecture or Architecture()
     out = Path(out)
@@ -137,9 +144,16 @@ def train(
     processes = _Processes(device)
     torch.manual_seed(training.seed)
     network = DenoiserNetwork(architecture, training.dropout)
+    if start is not None:
+        begun = load_network(start)
+        if begun.architecture != architecture:
+            raise IgsrError(f"{start} is of {begun.architecture}; train that, or without start.")
+        network.load_state_dict(begun.state_dict())
     loss = Loss(training.loss, distance, training.a)
     learner = _Learner(network, loss, training, processes)
     state = {"pairs": [Path(name).name for name in names], "training": asdict(training)}
+    if start is not None:
+        state["start"] = hashlib.sha256(Path(start).read_bytes()).hexdigest()
     state["architecture"] = json.loads(json.dumps(asdict(architecture)))
     if resume and (out / CHECKPOINT).is_file():
         learner.restore(out / CHECKPOINT, state)
@@ -311,7 +325,10 @@ def _batch(
     crops = []
     for k in mine:
         own = np.random.default_rng(int(seeds[k]))
-        crop = _crop(pairs[chosen[k]], training.crop, own)
+        for _ in range(1 + DRAWN_AGAIN):
+            crop = _crop(pairs[chosen[k]], training.crop, own)
+            if float((crop[0][:COLOR] - crop[1][:COLOR]).square().mean()) > RIGHT:
+                break
         crops.append(_augmented(*crop, own) if training.augment else crop)
     return _stacked(crops)
 
