@@ -193,7 +193,7 @@ class Fitter:
     def __init__(
         self,
         images: list[npt.NDArray[np.uint8]],
-        masks: list[npt.NDArray[np.bool_] | None],
+        masks: list[npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None],
         viewmats: Float64,
         intrinsics: Float64,
         state: dict[str, Any],
@@ -206,7 +206,8 @@ class Fitter:
         ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
         ``viewmats`` [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4]. ``state`` is
         either the parameters to start from (``SplatArrays`` without origin) or what ``state()``
-        returned. ``config``: steps, seed, sh_degree, max_splats, density, dropout, hull,
+        returned. ``config``: steps, first_step (the step
+        that a fit enters the schedule at), seed, sh_degree, max_splats, density, dropout, hull,
         background; poses ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate
         (pixels a step), camera_decay, camera_warm_up (part of the steps), frozen (splats stay as
         they are); an absent or None entry takes the default. ``holds`` say where the cameras that

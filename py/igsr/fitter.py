@@ -34,13 +34,20 @@ def fitter_of(
     """
     return _core.Fitter(
         [np.ascontiguousarray(view.image) for view in views],
-        [None if view.mask is None else np.ascontiguousarray(view.mask) for view in views],
+        [_counting(view) for view in views],
         *_arrays(views, origin),
         state,
         settings,
         backend,
         None if holds is None else _hold_arrays(holds, origin),
     )
+
+
+def _counting(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None:
+    """What the fitter takes as a view's mask: weights where the view has them."""
+    if view.weights is None:
+        return None if view.mask is None else np.ascontiguousarray(view.mask)
+    return np.ascontiguousarray(view.weights if view.mask is None else view.weights * view.mask)
 
 
 def _arrays(

@@ -7,7 +7,7 @@ import numbers
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,8 @@ from .splats import MAX_SH_DEGREE, Splats
 #: A killed run loses at most this much work.
 CHECKPOINT_STEPS = 500
 CHECKPOINT_SECONDS = 20.0
+#: What reports say of a fit that went on from splats that it was given.
+GIVEN = "given"
 #: Ways to control the number of splats.
 DENSITIES = ("mcmc", "original", "fixed")
 #: Whether cameras are fitted with the splats, and which of their focal lengths are.
@@ -93,7 +95,7 @@ def fit(
     density: str | None = None,
     dropout: float | None = None,
     hull: bool | None = None,
-    start: str | None = None,
+    start: str | Splats | None = None,
     poses: str | None = None,
     focal: str | None = None,
     background: tuple[float, float, float] | None = None,
@@ -127,7 +129,9 @@ def fit(
             (DropGaussian, Park et al. 2025); 0 to 0.9. Against over-fitting few photos.
         hull: whether splats are removed whose centre a photo with alpha shows empty.
         start: what the first splats are made from: "auto", "points", "hull", "sift", "rays" or
-            "random"; see ``igsr.initialization.initial_splats``.
+            "random"; see ``igsr.initialization.initial_splats``. Or splats, that a fit to some of
+            the photos ended with: rates and dropout then are those of the last ``steps`` of a fit
+            of the preset.
         poses: "fixed", or "joint": each camera is turned and moved with the splats. All together
             stay where the given ones were on the whole: the scene keeps its place and size. Where
             the capture has tracks, each camera is held to what these say of it.
@@ -182,7 +186,7 @@ def fit_with_cameras(
     density: str | None = None,
     dropout: float | None = None,
     hull: bool | None = None,
-    start: str | None = None,
+    start: str | Splats | None = None,
     poses: str | None = None,
     focal: str | None = None,
     background: tuple[float, float, float] | None = None,
@@ -232,8 +236,13 @@ def _fit(
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
+    warm = given["start"] if isinstance(given["start"], Splats) else None
+    if warm is not None:
+        given = given | {"start": GIVEN}
+        if given["sh_degree"] is None:
+            given["sh_degree"] = warm.sh_degree
     chosen = preset_settings(preset, len(views), **given)
-    _check_arguments(chosen, seed, background, checkpoint, resume)
+    _check_arguments(chosen, seed, background, checkpoint, resume, warm)
     check_photos(views)
     if backend == "reference":
         raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
@@ -259,6 +268,11 @@ def _fit(
         "igsr": _core.__version__,
     }
     moving = settings["poses"] != "fixed" or settings["focal"] != "fixed"
+    if warm is not None:
+        whole = max(settings["steps"], int(preset_settings(preset, len(views))["steps"]))
+        settings["first_step"] = whole - settings["steps"]
+        settings["steps"] = whole
+        settings["splats"] = _digest(vars(warm).values())
     tracks = capture.points.tracks if moving and capture.points is not None else None
     settings["capture"] = fingerprint(views, tracks)
     # By the cameras as they were given, also where the fit goes on from others.
@@ -277,7 +291,7 @@ def _fit(
     if path is not None:
         check_writable(path)
     go_on = True
-    rough = state is None and moving
+    rough = state is None and moving and warm is None
     if rough:
 
         def waiting(now: Progress) -> bool:
@@ -291,7 +305,7 @@ def _fit(
         capture = _with_rough_cameras(capture, settings, info, holds, waiting)
         seconds_before = time.perf_counter() - began
     if state is None:
-        state, settings["started"] = _start(capture, settings)
+        state, settings["started"] = _start(capture, settings, warm)
     origin = state.pop("origin", np.zeros(0))
     try:
         views = with_camera_rows(capture.train_views, state.pop(ROUGH, None))
@@ -317,11 +331,15 @@ def _fit(
     return splats, with_train_cameras(capture, fitted_cameras(views, fitter, origin))
 
 
-def _start(capture: Capture, settings: dict[str, Any]) -> tuple[dict[str, Any], list[str | int]]:
+def _start(
+    capture: Capture, settings: dict[str, Any], warm: Splats | None = None
+) -> tuple[dict[str, Any], list[str | int]]:
     """The splats that a fit with these settings starts from, by name of parameter.
 
     And what they were made from, with their number.
     """
+    if warm is not None:
+        return dict(vars(warm)), [GIVEN, len(warm)]
     splats, made_from = initial_splats(
         capture,
         settings["seed"],
@@ -377,15 +395,20 @@ def _with_rough_cameras(
 
 def fingerprint(views: list[View], tracks: Tracks | None = None) -> str:
     """SHA-256 over photos, masks, cameras and tracks: a fit may only go on with the same ones."""
-    digest = hashlib.sha256()
+    arrays: list[npt.NDArray[Any] | None] = []
     for view in views:
         camera = view.camera
-        for array in (camera.viewmat, camera.K, view.image, view.mask):
-            if array is not None:
-                digest.update(str((array.dtype.str, array.shape)).encode())
-                digest.update(np.ascontiguousarray(array).data)
+        arrays += [camera.viewmat, camera.K, view.image, view.mask, view.weights]
     if tracks is not None:
-        for array in (tracks.view, tracks.point, tracks.xy):
+        arrays += [tracks.view, tracks.point, tracks.xy]
+    return _digest(arrays)
+
+
+def _digest(arrays: Iterable[npt.NDArray[Any] | None]) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        if array is not None:
+            digest.update(str((array.dtype.str, array.shape)).encode())
             digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
@@ -396,6 +419,7 @@ def _check_arguments(
     background: object,
     checkpoint: object,
     resume: bool,
+    warm: Splats | None,
 ) -> None:
     limits: list[tuple[str, object, int, int]] = [
         ("steps", chosen["steps"], 1, 10_000_000),
@@ -410,7 +434,7 @@ def _check_arguments(
             raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
     for name, choices in (
         ("density", DENSITIES),
-        ("start", STARTS),
+        ("start", STARTS if warm is None else (GIVEN,)),
         ("poses", POSES),
         ("focal", FOCALS),
     ):
@@ -429,6 +453,16 @@ def _check_arguments(
             color = np.zeros(0)
         if color.shape != (3,) or not ((color >= 0.0) & (color <= 1.0)).all():
             raise IgsrError(f"background must be three numbers in 0..1, not {background!r}.")
+    if warm is not None and warm.sh_degree != chosen["sh_degree"]:
+        raise IgsrError(
+            f"start has splats of SH degree {warm.sh_degree}; sh_degree must be the same, not "
+            f"{chosen['sh_degree']}."
+        )
+    if warm is not None and not 1 <= len(warm) <= chosen["max_splats"]:
+        raise IgsrError(
+            f"start has {len(warm)} splats; give at least one, and no more than max_splats, "
+            f"{chosen['max_splats']}."
+        )
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
 

@@ -13,7 +13,8 @@ def halved(view: View) -> View:
     """The view with each 2 x 2 pixels averaged into one; an odd last row or column is left out.
 
     Colours are weighted by alpha where there is alpha, and by the mask where there is one: masked
-    pixels have no part in them. A pixel of the result is masked where all four were.
+    pixels have no part in them. A pixel of the result is masked where all four were; weights are
+    averaged.
     """
     camera = view.camera
     height, width = camera.height // 2, camera.width // 2
@@ -30,6 +31,9 @@ def halved(view: View) -> View:
     planes = [pooled(pixels[..., :3] * of_color) / np.maximum(pooled(of_color), 1e-9)]
     if pixels.shape[2] == 4:
         planes.append(pooled(pixels[..., 3:] * weight) / np.maximum(used, 1e-9))
+    weights = None
+    if view.weights is not None:
+        weights = pooled(view.weights[: 2 * height, : 2 * width])[..., 0].astype(np.float32)
     K = camera.K.copy()
     K[:2] /= 2.0
     return replace(
@@ -37,4 +41,5 @@ def halved(view: View) -> View:
         camera=replace(camera, K=K, width=width, height=height),
         image=np.floor(np.concatenate(planes, axis=2) + 0.5).astype(np.uint8),
         mask=None if view.mask is None else used[..., 0] > 0.0,
+        weights=weights,
     )

@@ -87,6 +87,7 @@ fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
         setting::<[f32; 3]>(config, "background")?.map_or(Background::Random, Background::Color);
     Ok(FitConfig {
         steps: setting(config, "steps")?.unwrap_or(default.steps),
+        first_step: setting(config, "first_step")?.unwrap_or(default.first_step),
         seed: setting(config, "seed")?.unwrap_or(default.seed),
         sh_degree: setting(config, "sh_degree")?.unwrap_or(default.sh_degree),
         max_splats: setting(config, "max_splats")?.unwrap_or(default.max_splats),
@@ -149,11 +150,11 @@ pub fn set_splat_arrays(
     dict.set_item(format!("{prefix}sh"), shaped_rows(py, splats.sh, &[n, stride])?)
 }
 
-/// The state in `dict`, fresh where it holds no moments, and the steps done.
-fn state_from(dict: &Bound<'_, PyDict>) -> PyResult<(FitState, u32)> {
+/// The state in `dict` and the steps done; fresh, at `first_step`, where it holds no moments.
+fn state_from(dict: &Bound<'_, PyDict>, first_step: u32) -> PyResult<(FitState, u32)> {
     let splats = splat_arrays_from(dict, "")?;
     if !dict.contains("step")? {
-        return Ok((FitState::new(splats), 0));
+        return Ok((FitState::new(splats), first_step));
     }
     let n = splats.len() as isize;
     let stat = |name: &str| -> PyResult<Vec<f32>> {
@@ -241,6 +242,20 @@ fn set_cameras(
     dict.set_item("camera_intrinsics", shaped_rows(py, intrinsics, &[n])?)
 }
 
+/// Weights of a photo's pixels from a mask (bool) or from weights (float32), [H, W].
+fn weights_from(name: &str, mask: &Bound<'_, PyAny>, size: [usize; 2]) -> PyResult<Vec<f32>> {
+    let size = size.map(|side| side as isize);
+    if let Ok(weights) = array::<f32>(name, mask) {
+        return Ok(elements(name, &weights, &size)?.to_vec());
+    }
+    array::<bool>(name, mask)?;
+    // numpy lets a bool hold any byte; Rust's bool may only be read as 0 or 1.
+    let bytes = mask.call_method1("view", (numpy::dtype::<u8>(mask.py()),))?;
+    let bytes = array::<u8>(name, &bytes)?;
+    let bytes = elements(name, &bytes, &size)?;
+    Ok(bytes.iter().map(|&counts| if counts == 0 { 0.0 } else { 1.0 }).collect())
+}
+
 fn targets_from(images: &Bound<'_, PyList>, masks: &Bound<'_, PyList>) -> PyResult<Vec<Target>> {
     if images.len() != masks.len() {
         return Err(PyValueError::new_err(format!(
@@ -260,13 +275,7 @@ fn targets_from(images: &Bound<'_, PyList>, masks: &Bound<'_, PyList>) -> PyResu
         let weights = if mask.is_none() {
             None
         } else {
-            let name = format!("masks[{i}]");
-            array::<bool>(&name, &mask)?;
-            // numpy lets a bool hold any byte; Rust's bool may only be read as 0 or 1.
-            let bytes = mask.call_method1("view", (numpy::dtype::<u8>(mask.py()),))?;
-            let bytes = array::<u8>(&name, &bytes)?;
-            let bytes = elements(&name, &bytes, &[height as isize, width as isize])?;
-            Some(bytes.iter().map(|&counts| if counts == 0 { 0.0 } else { 1.0 }).collect())
+            Some(weights_from(&format!("masks[{i}]"), &mask, [height, width])?)
         };
         let target = Target {
             width: width as u32,
@@ -311,7 +320,7 @@ impl Fitter {
         let cameras = cameras(viewmats, intrinsics, &sizes)?;
         let camera_state = camera_state_from(state, cameras.len())?;
         let holds = holds.map(|holds| holds_from(holds, cameras.len())).transpose()?;
-        let (state, step) = state_from(state)?;
+        let (state, step) = state_from(state, config.first_step)?;
         let device = fit_device(backend)?;
         py.detach(|| {
             let mut fitter =

@@ -67,9 +67,12 @@ class View:
             lens distortion already undone.
         mask: bool [H, W], True where the pixel may be used, or None where all may: the given mask
             and what undistortion could fill, joined.
+        weights: float32 [H, W], how much each pixel counts in fits beside a photo's, finite and
+            not negative, or None where all count 1. Only pictures that are not photos have them.
 
     Raises:
-        IgsrError: the image or mask has another dtype or shape than the camera's size asks for.
+        IgsrError: the image, mask or weights have another dtype or shape than the camera's size
+            asks for, or a weight is negative or not finite.
     """
 
     name: str
@@ -77,6 +80,7 @@ class View:
     split: str
     image: np.ndarray
     mask: np.ndarray | None = None
+    weights: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Check the pixels against the camera."""
@@ -84,6 +88,10 @@ class View:
         self._check("image", self.image, np.uint8, [(*size, 3), (*size, 4)])
         if self.mask is not None:
             self._check("mask", self.mask, np.bool_, [size])
+        if self.weights is not None:
+            self._check("weights", self.weights, np.float32, [size])
+            if not (np.isfinite(self.weights) & (self.weights >= 0.0)).all():
+                raise IgsrError(f"{self.name}: its weights must be finite and not negative")
 
     def _check(
         self, what: str, array: object, dtype: type[np.generic], shapes: list[tuple[int, ...]]

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::simd::dispatch;
 use super::ssim_window::{HALF, Rows};
-use crate::fit::SSIM_C;
+use crate::fit::{SSIM_C, Weight};
 
 /// Rows per task.
 const BAND: usize = 64;
@@ -225,9 +225,10 @@ impl Loss {
         ssim_weight: f32,
     ) -> f32 {
         let pixels = x[0].len();
-        let total: f64 = weights.map_or(pixels as f64, |w| w.iter().map(|&w| f64::from(w)).sum());
+        let all = Weight { sum: pixels as f64, count: pixels as f64 };
+        let Weight { sum, count } = weights.map_or(all, Weight::of);
         // A photo that is masked out everywhere asks for nothing.
-        let scale = if total > 0.0 { 1.0 / (3.0 * total) } else { 0.0 };
+        let scale = if count > 0.0 { 1.0 / (3.0 * count) } else { 0.0 };
         let band = BAND * width;
         let bands =
             |band_index: usize| band_index * BAND..((band_index + 1) * BAND).min(pixels / width);
@@ -282,8 +283,7 @@ impl Loss {
             .iter()
             .sum();
         let s = f64::from(ssim_weight);
-        let whole = if total > 0.0 { s } else { 0.0 };
-        ((1.0 - s) * l1 * scale + whole - s * ssim * scale) as f32
+        ((1.0 - s) * l1 * scale + s * (3.0 * sum - ssim) * scale) as f32
     }
 }
 
@@ -307,7 +307,7 @@ mod tests {
         for row in 0..height {
             for column in 0..width {
                 let w = weights.map_or(1.0, |w| f64::from(w[row * width + column]));
-                total += w;
+                total += f64::from(u8::from(w > 0.0));
                 for c in 0..3 {
                     let mut m = [0.0f64; 5];
                     for i in 0..11 {

@@ -32,6 +32,8 @@ pub enum Background {
 pub struct FitConfig {
     /// Number of steps of the whole fit; the centres' rate decays over it.
     pub steps: u32,
+    /// The step that moments began at, above 0 where a fit enters the schedule with splats of another.
+    pub first_step: u32,
     /// Seed of everything random.
     pub seed: u64,
     /// Degree of SH fitted, 0..=4.
@@ -63,6 +65,7 @@ impl Default for FitConfig {
     fn default() -> Self {
         Self {
             steps: 5000,
+            first_step: 0,
             seed: 0,
             sh_degree: 2,
             sh_interval: 1000,
@@ -91,6 +94,9 @@ impl FitConfig {
     pub fn validate(&self) -> Result<()> {
         if self.steps == 0 {
             return Err(Error::argument("steps", "must be at least 1"));
+        }
+        if self.first_step >= self.steps {
+            return Err(Error::argument("first_step", "must be less than steps"));
         }
         if self.sh_degree > SH_DEGREE_MAX {
             return Err(Error::argument(

@@ -17,8 +17,28 @@ pub struct Target {
     pub channels: u32,
     /// `[H * W * channels]`, row-major.
     pub pixels: Vec<u8>,
-    /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere.
+    /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere. The loss is a mean over
+    /// the pixels whose weight is not 0: a photo of small weights counts less than others.
     pub weights: Option<Vec<f32>>,
+}
+
+/// What a photo's pixels weigh.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Weight {
+    /// Sum of the weights.
+    pub sum: f64,
+    /// How many are not 0.
+    pub count: f64,
+}
+
+impl Weight {
+    /// Of a list of weights.
+    pub fn of(weights: &[f32]) -> Self {
+        Self {
+            sum: weights.iter().map(|&w| f64::from(w)).sum(),
+            count: weights.iter().filter(|w| **w > 0.0).count() as f64,
+        }
+    }
 }
 
 impl Target {
@@ -44,6 +64,12 @@ impl Target {
             }
         }
         Ok(())
+    }
+
+    /// Sum of the weights, and the number of pixels whose weight is not 0.
+    pub fn weight(&self) -> Weight {
+        let pixels = f64::from(self.width) * f64::from(self.height);
+        self.weights.as_deref().map_or(Weight { sum: pixels, count: pixels }, Weight::of)
     }
 
     /// The photo over `background` as three planes in 0..1.

@@ -93,6 +93,9 @@ impl Fitter {
                 ));
             }
         }
+        if step < config.first_step {
+            return Err(Error::argument("step", "is before the first step of this fit"));
+        }
         if state.splats.is_empty() {
             return Err(Error::argument("splats", "is empty; a fit starts from at least one"));
         }
@@ -221,7 +224,7 @@ impl Fitter {
                 (step / config.sh_interval).min(config.sh_degree)
             },
             rates,
-            step: step + 1,
+            step: step - config.first_step + 1,
             ssim_weight: config.ssim_weight,
             opacity_regularizer: if mcmc { MCMC.0 } else { 0.0 },
             scale_regularizer: if mcmc { MCMC.1 } else { 0.0 },

@@ -14,8 +14,8 @@ pub use cameras::{CameraConfig, CameraState, Cameras, Focal, scene_distance};
 pub use config::{Background, DensityControl, FitConfig};
 pub(crate) use device::dropout_threshold;
 pub use device::{
-    ADAM, CameraGradient, FitDevice, Rates, SSIM_C, SSIM_WINDOW, StepInput, Target, is_dropped,
-    noise_normal,
+    ADAM, CameraGradient, FitDevice, Rates, SSIM_C, SSIM_WINDOW, StepInput, Target, Weight,
+    is_dropped, noise_normal,
 };
 pub use fitter::{Fitter, scene_extent};
 pub use hold::Hold;

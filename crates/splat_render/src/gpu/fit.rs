@@ -29,7 +29,7 @@ use super::shaders::Kernel;
 use crate::error::{Error, Result};
 use crate::fit::{
     ADAM, CameraGradient, DensityStats, FitDevice, FitState, SplatArrays, StepInput, Target,
-    dropout_threshold,
+    Weight, dropout_threshold,
 };
 use crate::sh;
 use crate::stages::ProjectOptions;
@@ -64,8 +64,7 @@ struct Photo {
     frame: usize,
     rgba: wgpu::Buffer,
     weights: Option<wgpu::Buffer>,
-    /// Sum of the weights.
-    weight: f64,
+    weight: Weight,
 }
 
 /// Buffers for pictures of one size, and the commands of a step with them.
@@ -358,7 +357,8 @@ impl GpuFit {
         }
         let n = f64::from(scene.splats.splats.max(1));
         let bias = |beta: f32| 1.0 - f64::from(beta).powi(input.step.min(i32::MAX as u32) as i32);
-        let scale = if photo.weight > 0.0 { 1.0 / (3.0 * photo.weight) } else { 0.0 };
+        let count = photo.weight.count;
+        let scale = if count > 0.0 { 1.0 / (3.0 * count) } else { 0.0 };
         let ssim = f64::from(input.ssim_weight);
         let view = View {
             sh_degree: input.sh_degree.min(scene.sh_degree),
@@ -545,10 +545,7 @@ impl FitDevice for GpuFit {
                 .chunks_exact(target.channels as usize)
                 .map(|p| [p[0], p[1], p[2], p.get(3).copied().unwrap_or(255)])
                 .collect();
-            let weight = target
-                .weights
-                .as_ref()
-                .map_or(rgba.len() as f64, |weights| weights.iter().map(|&w| f64::from(w)).sum());
+            let weight = target.weight();
             let weights =
                 target.weights.as_ref().map(|w| self.gpu.upload("weights", w)).transpose()?;
             self.tiles = self.tiles.max(tile_count(width, height));
@@ -622,10 +619,11 @@ impl FitDevice for GpuFit {
         let loss = &self.frames[photo.frame].loss;
         let data = self.gpu.download(&[], &[(&loss.sums, loss.sum_bytes())])?;
         let [ssim, l1] = LossBuffers::total(&data[0]);
-        if photo.weight <= 0.0 {
+        let Weight { sum, count } = photo.weight;
+        if count == 0.0 {
             return Ok(0.0);
         }
-        let (s, scale) = (f64::from(ssim_weight), 1.0 / (3.0 * photo.weight));
-        Ok(((1.0 - s) * l1 * scale + s - s * ssim * scale) as f32)
+        let (s, scale) = (f64::from(ssim_weight), 1.0 / (3.0 * count));
+        Ok(((1.0 - s) * l1 * scale + s * (3.0 * sum - ssim) * scale) as f32)
     }
 }
