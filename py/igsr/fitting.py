@@ -272,7 +272,7 @@ def _fit(
         whole = max(settings["steps"], int(preset_settings(preset, len(views))["steps"]))
         settings["first_step"] = whole - settings["steps"]
         settings["steps"] = whole
-        settings["splats"] = _digest(vars(warm).values())
+        settings["splats"] = _digest(_arrays(warm).values())
     tracks = capture.points.tracks if moving and capture.points is not None else None
     settings["capture"] = fingerprint(views, tracks)
     # By the cameras as they were given, also where the fit goes on from others.
@@ -331,6 +331,11 @@ def _fit(
     return splats, with_train_cameras(capture, fitted_cameras(views, fitter, origin))
 
 
+def _arrays(splats: Splats) -> dict[str, Any]:
+    names = ("means", "quats", "scales", "opacities", "sh", "origin")
+    return {name: getattr(splats, name) for name in names}
+
+
 def _start(
     capture: Capture, settings: dict[str, Any], warm: Splats | None = None
 ) -> tuple[dict[str, Any], list[str | int]]:
@@ -339,7 +344,7 @@ def _start(
     And what they were made from, with their number.
     """
     if warm is not None:
-        return dict(vars(warm)), [GIVEN, len(warm)]
+        return _arrays(warm), [GIVEN, len(warm)]
     splats, made_from = initial_splats(
         capture,
         settings["seed"],
@@ -463,6 +468,8 @@ def _check_arguments(
             f"start has {len(warm)} splats; give at least one, and no more than max_splats, "
             f"{chosen['max_splats']}."
         )
+    if warm is not None and warm.antialiased:
+        raise IgsrError("start has antialiased splats, which igsr does not fit; give others.")
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
 

@@ -19,10 +19,11 @@ import numpy.typing as npt
 from .capture import Capture, View
 from .denoiser import Denoiser, photo_sources, photo_support, render_buffers
 from .errors import IgsrError
-from .evaluation import default_background, score_views
+from .evaluation import METRICS, default_background, evaluate, score_views
 from .fitting import Progress, fit
 from .pose import estimate_poses
 from .presets import preset_settings
+from .refinement_report import write_refinement
 from .selection import Candidate, candidate, select
 from .splats import Splats
 from .views import unseen_views
@@ -31,6 +32,8 @@ from .views import unseen_views
 CANDIDATES, CHOSEN = 16, 8
 #: A refit goes on from the splats that there are, with this part of a whole fit's steps.
 REFIT_STEPS = 0.25
+#: Fewer photos are not judged: each fold needs two to fit.
+FEWEST = 3
 #: Each of two folds leaves out one photo in so many, and fits with this part of the steps.
 FOLDS, LEFT_OUT, FOLD_STEPS = 2, 4, 0.2
 #: What an invented pixel counts at most beside a photo's in its first round, and by what this falls
@@ -48,7 +51,7 @@ class RefineProgress:
 
     Attributes:
         round: 0 is the fit to the photos alone.
-        doing: "fit", "look", "judge" or "refit".
+        doing: "fit", "look" (render and clean unseen views), "judge", "refit" or "test".
         done: part of all that may be to do, in [0, 1]; it ends early if a round does not help.
         seconds: so far.
     """
@@ -66,19 +69,25 @@ class Round:
     Attributes:
         chosen: the views that were added, the one worth most first.
         candidates: how many there were to choose from.
-        without: scores ("psnr", "ssim", "flip") of photos left out, by fits that took as many steps
-            without the round's views.
+        before: scores ("psnr", "ssim", "flip") of photos left out, by the fits as the round found
+            them.
+        without: the same by fits that took as many steps more without the round's views.
         left_out: the same by fits with them.
-        accepted: whether all became better; if not, the round's splats are not kept.
+        accepted: whether with them all are better than without and than before; if not, the
+            round's splats are not kept.
         splats: after the round; None where it was not accepted.
+        test: mean scores of the capture's test views by those, which decide nothing; None without
+            splats or views.
     """
 
     chosen: list[Candidate]
     candidates: int
+    before: dict[str, float]
     without: dict[str, float]
     left_out: dict[str, float]
     accepted: bool
     splats: Splats | None
+    test: dict[str, float | None] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,16 +97,20 @@ class Refined:
     Attributes:
         splats: after the last round that was accepted.
         first: after the fit to the photos alone, which is round 0.
+        first_test: mean scores of the capture's test views by those, if it has any.
         capture: photos and cameras.
         rounds: those that were tried, in order; only the last can be one that was not accepted.
-        stopped: why there was no further round.
+        stopped: why there was no further round; empty while there may be one.
+        seconds: that each part took, by the names of ``RefineProgress.doing``.
     """
 
     splats: Splats
     first: Splats
+    first_test: dict[str, float | None] | None
     capture: Capture
     rounds: list[Round]
     stopped: str
+    seconds: dict[str, float]
 
 
 @dataclass(eq=False)
@@ -118,6 +131,15 @@ class _Chain:
         ]
 
 
+@dataclass(eq=False)
+class _Fold:
+    """A chain of some of the photos, those that it leaves out, and their scores by it."""
+
+    chain: _Chain
+    left: list[View]
+    scores: list[dict[str, float]]
+
+
 def refine(
     photos: str | os.PathLike[str] | Capture,
     rounds: int | str = AUTO,
@@ -127,7 +149,7 @@ def refine(
     backend: str = "auto",
     seed: int = 0,
     denoiser: Denoiser | None = None,
-    work: str | os.PathLike[str] | None = None,
+    out: str | os.PathLike[str] | None = None,
     resume: bool = False,
 ) -> Refined:
     """Fit photos, and make the fit better from views that nobody photographed.
@@ -136,43 +158,54 @@ def refine(
         photos: a capture, or a folder of photos, whose cameras are found if it has none.
         rounds: at most so many, or "auto": until one does not help.
         progress: called now and then; returning False ends it with an ``IgsrError``, and what
-            is done so far stays in ``work``.
+            is done so far stays in ``out``.
         steps: of the first fit; None is the default preset's.
         backend: "auto", "cpu" or "gpu".
         seed: of everything random; same seed, same bits.
         denoiser: what cleans; None is the one that comes with igsr.
-        work: folder for the fits' checkpoints.
-        resume: go on from those in ``work``, to the same end.
+        out: folder for ``scene.ply``, ``rounds/``, ``report.json`` and ``report.html``
+            (``igsr.refinement_report``), written after every round, and ``checkpoints/``; None
+            writes nothing.
+        resume: go on from the checkpoints in ``out``, to the same end.
 
     Raises:
         IgsrError: an argument cannot be used, or as ``igsr.fit`` and ``igsr.estimate_poses``.
     """
     capture = photos if isinstance(photos, Capture) else estimate_poses(photos, seed=seed)
-    loop = _Loop(capture, rounds, progress, steps, backend, seed, denoiser, work, resume)
+    loop = _Loop(capture, rounds, progress, steps, backend, seed, denoiser, out, resume)
     whole = loop.fitted("whole", capture.train_views)
-    first = whole.splats
-    folds = [
-        (
-            loop.fitted(f"fold{k}", [v for i, v in enumerate(whole.photos) if i not in out], True),
-            out,
-        )
-        for k, out in enumerate(_left_out(len(whole.photos)))
-    ]
+    first, first_test = whole.splats, loop.tested(whole.splats)
+    folds: list[_Fold] = []
     done: list[Round] = []
-    while len(done) < loop.rounds:
+
+    def so_far(stopped: str) -> Refined:
+        refined = Refined(
+            whole.splats, first, first_test, capture, list(done), stopped, dict(loop.seconds)
+        )
+        loop.write(refined)
+        return refined
+
+    while True:
+        so_far("")
         number = len(done) + 1
-        chosen, candidates = loop.looked(number, whole)
-        if not chosen:
-            return Refined(whole.splats, first, capture, done, loop.why_none(candidates))
-        without, left_out = loop.judged(number, folds)
-        accepted = all(sign * (left_out[s] - without[s]) > 0.0 for s, sign in DECIDING.items())
+        chosen, why_none = loop.chosen(number, whole)
+        if why_none:
+            return so_far(why_none)
+        candidates = loop.candidates
+        folds = folds or loop.folds(whole)
+        before, without, left_out = loop.judged(number, folds)
+        accepted = _better(left_out, without) and _better(left_out, before)
         if accepted:
             loop.refitted(number, whole, chosen)
         splats = whole.splats if accepted else None
-        done.append(Round(chosen, candidates, without, left_out, accepted, splats))
+        test = loop.tested(splats)
+        done.append(Round(chosen, candidates, before, without, left_out, accepted, splats, test))
         if not accepted:
-            return Refined(whole.splats, first, capture, done, f"round {number} did not help")
-    return Refined(whole.splats, first, capture, done, f"{loop.rounds} rounds were asked for")
+            return so_far(f"round {number} did not make photos that were left out better")
+
+
+def _better(scores: dict[str, float], than: dict[str, float]) -> bool:
+    return all(sign * (scores[name] - than[name]) > 0.0 for name, sign in DECIDING.items())
 
 
 class _Loop:
@@ -187,7 +220,7 @@ class _Loop:
         backend: str,
         seed: int,
         denoiser: Denoiser | None,
-        work: str | os.PathLike[str] | None,
+        out: str | os.PathLike[str] | None,
         resume: bool,
     ) -> None:
         if rounds != AUTO and (not isinstance(rounds, int) or isinstance(rounds, bool)):
@@ -195,30 +228,54 @@ class _Loop:
         self.rounds = MOST_ROUNDS if isinstance(rounds, str) else rounds
         if self.rounds < 0:
             raise IgsrError(f"rounds must not be negative, not {rounds}.")
-        if resume and work is None:
-            raise IgsrError("resume needs work, the folder to go on from.")
+        if resume and out is None:
+            raise IgsrError("resume needs out, the folder to go on from.")
         if not capture.train_views:
             raise IgsrError(f"{capture.path} has no train views to fit.")
         self.capture, self.backend, self.seed, self.denoiser = capture, backend, seed, denoiser
         self.background = default_background(capture)
         photos = len(capture.train_views)
         self.steps = int(preset_settings("default", photos, steps=steps)["steps"])
-        self.work = None if work is None else Path(work)
+        self.out = None if out is None else Path(out)
         self.resume = resume
         self.progress = progress
-        self.started = time.monotonic()
+        self.started = self.noted = time.monotonic()
+        self.seconds: dict[str, float] = {}
         # In units of a whole fit; looking takes about as long as a refit.
         a_round = 2.0 * REFIT_STEPS + 2.0 * FOLDS * FOLD_STEPS
         self.all = 1.0 + FOLDS * FOLD_STEPS + self.rounds * a_round
-        self.done, self.round = 0.0, 0
+        self.done, self.round, self.candidates = 0.0, 0, 0
 
     def fitted(self, name: str, photos: list[View], short: bool = False) -> _Chain:
         """Photos fitted from the start."""
         steps = self._part(FOLD_STEPS) if short else self.steps
         return _Chain(name, photos, self._fit(name, "fit", photos, steps, None))
 
-    def looked(self, number: int, chain: _Chain) -> tuple[list[Candidate], int]:
-        """Unseen views of a chain, cleaned: those chosen, and how many there were."""
+    def folds(self, whole: _Chain) -> list[_Fold]:
+        """Fits that each leave photos out, which scores then are of."""
+        photos, out = whole.photos, []
+        for k in range(FOLDS):
+            left = photos[k * LEFT_OUT // FOLDS :: LEFT_OUT]
+            kept = [photo for photo in photos if not any(photo is one for one in left)]
+            chain = self.fitted(f"fold{k}", kept, short=True)
+            out.append(_Fold(chain, left, self._scores(chain.splats, left)))
+        return out
+
+    def chosen(self, number: int, whole: _Chain) -> tuple[list[Candidate], str]:
+        """The views that a round adds, or why there is none."""
+        if number > self.rounds:
+            return [], f"{self.rounds} rounds are done"
+        if len(whole.photos) < FEWEST:
+            return [], f"fewer than {FEWEST} photos leave none to judge a round by"
+        chosen = self.looked(number, whole)
+        if self.candidates == 0:
+            return [], "no view near the photos is unseen"
+        if not chosen:
+            return [], f"none of {self.candidates} unseen views can be trusted"
+        return chosen, ""
+
+    def looked(self, number: int, chain: _Chain) -> list[Candidate]:
+        """The unseen views of a chain that are worth most, cleaned."""
         self.round = number
         self._tell("look", 0.0)
         photos, splats = chain.photos, chain.splats
@@ -231,43 +288,37 @@ class _Loop:
             buffers = render_buffers(splats, view.camera, support, self.background, self.backend)
             found.append(candidate(view, buffers, sources, self.denoiser))
             self._tell("look", 0.0)
-        return select(found, CHOSEN), len(found)
+        self.candidates = len(found)
+        return select(found, CHOSEN)
 
-    def judged(
-        self, number: int, folds: Sequence[tuple[_Chain, list[int]]]
-    ) -> tuple[dict[str, float], dict[str, float]]:
-        """Scores of photos left out, without and with what each fold's own round adds.
+    def judged(self, number: int, folds: Sequence[_Fold]) -> list[dict[str, float]]:
+        """Mean scores of the photos left out: before, without and with each fold's own round.
 
         A fold goes on with its views: the next round is judged from there.
         """
-        scores: tuple[list[dict[str, float]], ...] = ([], [])
-        for chain, out in folds:
-            left = [self.capture.train_views[i] for i in out]
-            chosen, _ = self.looked(number, chain)
+        rows: list[list[dict[str, float]]] = [[], [], []]
+        for fold in folds:
+            chain = fold.chain
+            chosen = self.looked(number, chain)
             steps = self._part(FOLD_STEPS)
-            name = f"{chain.name}-round{number}"
-            plain = self._fit(
-                f"{name}-without", "judge", chain.with_views(number, []), steps, chain.splats
-            )
+            name = f"{chain.name}-round{number}-without"
+            plain = self._fit(name, "judge", chain.with_views(number, []), steps, chain.splats)
             self._add(number, chain, chosen, steps, "judge")
-            for splats, to in zip((plain, chain.splats), scores, strict=True):
-                for scored in score_views(splats, left, self.background, self.backend):
-                    to.append({name: float(scored.scores[name] or 0.0) for name in DECIDING})
-        without, left_out = (
-            {name: float(np.mean([row[name] for row in rows])) for name in DECIDING}
-            for rows in scores
-        )
-        return without, left_out
+            rows[0] += fold.scores
+            rows[1] += self._scores(plain, fold.left)
+            fold.scores = self._scores(chain.splats, fold.left)
+            rows[2] += fold.scores
+        return [{s: float(np.mean([one[s] for one in some])) for s in DECIDING} for some in rows]
+
+    def _scores(self, splats: Splats, left: list[View]) -> list[dict[str, float]]:
+        return [
+            {name: float(one.scores[name] or 0.0) for name in DECIDING}
+            for one in score_views(splats, left, self.background, self.backend)
+        ]
 
     def refitted(self, number: int, chain: _Chain, chosen: list[Candidate]) -> None:
         """Go on with all photos and the chosen views."""
         self._add(number, chain, chosen, self._part(REFIT_STEPS), "refit")
-
-    def why_none(self, candidates: int) -> str:
-        """Why no view was chosen."""
-        if candidates == 0:
-            return "there is no unseen view nearby"
-        return f"none of {candidates} unseen views can be trusted"
 
     def _add(
         self, number: int, chain: _Chain, chosen: list[Candidate], steps: int, doing: str
@@ -301,7 +352,7 @@ class _Loop:
             self._tell(doing, share * (now.step - first) / steps)
             return True
 
-        path = None if self.work is None else self.work / f"{name}.npz"
+        path = None if self.out is None else self.out / "checkpoints" / f"{name}.npz"
         splats = fit(
             Capture(self.capture.path, views, self.capture.points),
             steps,
@@ -315,20 +366,29 @@ class _Loop:
         self.done += share
         return splats
 
+    def tested(self, splats: Splats | None) -> dict[str, float | None] | None:
+        """Mean scores of the test views."""
+        if splats is None or not self.capture.test_views:
+            return None
+        scores = evaluate(splats, self.capture, "test", self.background, self.backend)
+        self._tell("test", 0.0)
+        return {metric: scores[metric] for metric in METRICS}
+
+    def write(self, refined: Refined) -> None:
+        """Put what there is so far into ``out``."""
+        if self.out is not None:
+            write_refinement(self.out, refined, self.backend, self.seed)
+
     def _tell(self, doing: str, doing_done: float) -> None:
+        now = time.monotonic()
+        self.seconds[doing] = self.seconds.get(doing, 0.0) + now - self.noted
+        self.noted = now
         if self.progress is None:
             return
         done = min(1.0, (self.done + doing_done) / self.all)
-        seconds = time.monotonic() - self.started
+        seconds = now - self.started
         if self.progress(RefineProgress(self.round, doing, done, seconds)) is False:
-            raise IgsrError("refinement was stopped; go on with resume.")
-
-
-def _left_out(photos: int) -> list[list[int]]:
-    """The photos that each fold leaves out, by number; no photo is in two."""
-    if photos < 3:
-        return []
-    return [list(range(k * LEFT_OUT // FOLDS, photos, LEFT_OUT)) for k in range(FOLDS)]
+            raise IgsrError("the refinement was stopped; go on with resume.")
 
 
 def _faded(view: View, rounds: int) -> View:

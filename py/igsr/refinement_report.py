@@ -1,0 +1,104 @@
+"""What a refinement leaves: models, chosen views, ``report.json`` and ``report.html``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from . import _core
+from .atomic_write import atomic_write
+from .refinement_page import write_page
+from .report import write_report
+from .splats import Splats
+
+if TYPE_CHECKING:
+    from .refinement import Refined, Round
+    from .selection import Candidate
+
+
+def write_refinement(out: Path, refined: Refined, backend: str, seed: int) -> None:
+    """Write a refinement as it stands.
+
+    ``scene.ply`` is the last accepted model. ``rounds/N/scene.ply`` is each round's, 0 the fit to
+    the photos alone; ``rounds/N/view-K.{before,after,trust}.png`` are the views that it added, the
+    trust white where a pixel counts most.
+
+    Raises:
+        IgsrError: a file cannot be written.
+    """
+    rows = [{"splats": len(refined.first), "test": refined.first_test}]
+    _save(refined.first, out / "rounds" / "0" / "scene.ply")
+    for number, one in enumerate(refined.rounds, 1):
+        folder = out / "rounds" / str(number)
+        rows.append(_row(one))
+        if one.splats is not None:
+            _save(one.splats, folder / "scene.ply")
+        for k, candidate in enumerate(one.chosen):
+            _write_view(folder, k, candidate)
+    refined.splats.save(out / "scene.ply")
+    report = {
+        "rounds": rows,
+        "stopped": refined.stopped,
+        "seconds": {part: round(seconds, 2) for part, seconds in refined.seconds.items()},
+        "peak_memory_bytes": _peak_memory(),
+        "photos": [view.name for view in refined.capture.train_views],
+        "splats": len(refined.splats),
+        "seed": seed,
+        "version": _core.__version__,
+        **_core.backend_info(_core.resolve_backend(backend)),
+    }
+    write_report(out / "report.json", report)
+    write_page(out / "report.html", refined, report)
+
+
+def _row(one: Round) -> dict[str, Any]:
+    return {
+        "splats": None if one.splats is None else len(one.splats),
+        "test": one.test,
+        "accepted": one.accepted,
+        "candidates": one.candidates,
+        "left_out": {"before": one.before, "without": one.without, "with": one.left_out},
+        "views": [
+            {
+                "angle": round(candidate.view.angle, 2),
+                "between": candidate.view.between,
+                "mean_trust": round(candidate.mean_trust, 4),
+                "worth": round(candidate.worth, 6),
+            }
+            for candidate in one.chosen
+        ],
+    }
+
+
+def _save(splats: Splats, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    splats.save(path)
+
+
+def _write_view(folder: Path, k: int, one: Candidate) -> None:
+    trust = np.rint(255.0 * np.clip(one.trust, 0.0, 1.0)).astype(np.uint8)
+    pictures: dict[str, npt.NDArray[np.uint8]] = {
+        "before": one.render,
+        "after": one.picture,
+        "trust": trust,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, picture in pictures.items():
+        path = folder / f"view-{k}.{name}.png"
+        with atomic_write(path) as temporary:
+            Image.fromarray(picture).save(temporary, format="PNG")
+
+
+def _peak_memory() -> int | None:
+    """Most bytes that this process has had in memory; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else 1024 * most
