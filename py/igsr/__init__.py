@@ -19,6 +19,7 @@ from .fitting import Progress, fit, fit_with_cameras
 from .pose import estimate_poses
 from .poses import refine_cameras
 from .rasterization import rasterization
+from .refinement import Refined, refine
 from .rendering import Render, render
 from .splats import Splats
 
@@ -29,6 +30,7 @@ __all__ = [
     "IgsrError",
     "Points",
     "Progress",
+    "Refined",
     "Render",
     "Splats",
     "View",
@@ -41,6 +43,7 @@ __all__ = [
     "fit_with_cameras",
     "load_capture",
     "rasterization",
+    "refine",
     "refine_cameras",
     "render",
 ]

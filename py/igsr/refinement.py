@@ -39,6 +39,8 @@ FOLDS, LEFT_OUT, FOLD_STEPS = 2, 4, 0.2
 #: What an invented pixel counts at most beside a photo's in its first round, and by what this falls
 #: from round to round: later renders know what earlier ones invented.
 VIEW_WEIGHT, VIEW_DECAY = 0.5, 0.5
+#: Colours nearer to the background than this, of 1, do not tell alpha from colour.
+COLOR_OF_BACKGROUND = 0.05
 #: Most rounds of "auto".
 AUTO, MOST_ROUNDS = "auto", 4
 #: Scores of photos left out that must become better, and their signs.
@@ -236,6 +238,8 @@ class _Loop:
         self.background = default_background(capture)
         photos = len(capture.train_views)
         self.steps = int(preset_settings("default", photos, steps=steps)["steps"])
+        if self.steps < 1:
+            raise IgsrError(f"steps must be at least 1, not {steps}.")
         self.out = None if out is None else Path(out)
         self.resume = resume
         self.progress = progress
@@ -335,7 +339,7 @@ class _Loop:
         """A cleaned view as the fit takes it; with alpha, as rendered, where the photos have it."""
         image = one.picture
         if self.capture.train_views[0].image.shape[2] == 4:
-            image = _straight(image, one.alpha, self.background)
+            image = _with_alpha(image, one.render, one.alpha, self.background)
         weights = np.float32(VIEW_WEIGHT) * one.trust
         return View(name, one.view.camera, "train", image, None, weights)
 
@@ -396,13 +400,26 @@ def _faded(view: View, rounds: int) -> View:
     return replace(view, weights=view.weights * np.float32(VIEW_DECAY**rounds))
 
 
-def _straight(
+def _with_alpha(
     picture: npt.NDArray[np.uint8],
+    render: npt.NDArray[np.uint8],
     alpha: npt.NDArray[np.float32],
     background: Sequence[float],
 ) -> npt.NDArray[np.uint8]:
-    """A picture over a background as RGBA with straight alpha, [H, W, 4]."""
-    share = np.clip(alpha, 0.0, 1.0)[..., None]
-    behind = np.asarray(background, np.float32) * (1.0 - share)
-    own = (picture.astype(np.float32) / 255.0 - behind) / np.maximum(share, 1.0 / 255.0)
+    """A cleaned picture over a background as RGBA with straight alpha, [H, W, 4].
+
+    Cleaning gives no alpha. Where it moved a pixel towards the background or away from it, alpha
+    moves along, as if the colour of what is before it had stayed; and alpha is never so small that
+    no colour could give the picture.
+    """
+    behind = np.asarray(background, np.float32)
+    before, after = (p.astype(np.float32) / 255.0 - behind for p in (render, picture))
+    squared = np.square(before).sum(axis=-1)
+    moved = (before * after).sum(axis=-1) / np.maximum(squared, 1e-6)
+    kept = np.where(squared > COLOR_OF_BACKGROUND**2, alpha * moved, alpha)
+    # The colour is behind + after / share, which must lie in [0, 1].
+    room = np.where(after > 0.0, 1.0 - behind, behind)
+    least = (np.abs(after) / np.maximum(room, 1e-6)).max(axis=-1)
+    share = np.clip(np.maximum(kept, least), 0.0, 1.0)[..., None]
+    own = behind + after / np.maximum(share, 1.0 / 255.0)
     return np.rint(255.0 * np.concatenate([np.clip(own, 0.0, 1.0), share], axis=2)).astype(np.uint8)

@@ -73,28 +73,34 @@ def unseen_views(
         for camera, distance in zip(known, distances, strict=True)
         if distance is not None
     ]
+    centres = np.array([camera.centre for camera, _ in looking]).reshape(-1, 3)
+    targets = np.array([_target(*one) for one in looking]).reshape(-1, 3)
     found: list[tuple[UnseenView, float]] = []
     for k, (camera, distance) in enumerate(looking):
         others = [one for i, (one, _) in enumerate(looking) if i != k]
         for candidate, between in _neighbourhood(camera, distance, others):
-            angle = _angle_to_nearest(candidate, looking)
+            angle = float(_angles(targets, centres, candidate.centre).min())
             if angle >= SEEN * STEP:
                 found.append((UnseenView(candidate, angle, between), distance))
     chosen: list[UnseenView] = []
     for between in (True, False):
         group = [pair for pair in found if pair[0].between == between]
-        while group and len(chosen) < count:
-            around = [camera for camera, _ in looking] + [view.camera for view in chosen]
-            apart = [
-                min(_angle(view.camera, other, distance) for other in around)
-                for view, distance in group
-            ]
+        new = np.array([view.camera.centre for view in chosen]).reshape(-1, 3)
+        around = np.concatenate([centres, new])
+        apart = np.array(
+            [_angles(_target(v.camera, d), v.camera.centre, around).min() for v, d in group]
+        )
+        while len(chosen) < count and len(apart) and apart.max() >= SEEN * STEP:
             best = int(np.argmax(apart))
-            view, distance = group.pop(best)
-            if apart[best] < SEEN * STEP:
-                break
-            if _is_outside(splats, view.camera, distance, backend):
-                chosen.append(view)
+            view, distance = group[best]
+            apart[best] = 0.0
+            if not _is_outside(splats, view.camera, distance, backend):
+                continue
+            chosen.append(view)
+            for i, (other, reach) in enumerate(group):
+                target = _target(other.camera, reach)
+                away = _angles(target, other.camera.centre, view.camera.centre)
+                apart[i] = min(apart[i], float(away))
     return chosen
 
 
@@ -157,16 +163,16 @@ def _looking(camera: Camera, centre: Float64, target: Float64, down: Float64) ->
 
 def _angle(camera: Camera, other: Camera, distance: float) -> float:
     """Degrees between where two cameras stand, seen from what the first looks at."""
-    target = _target(camera, distance)
-    here, there = camera.centre - target, other.centre - target
-    lengths = float(np.linalg.norm(here) * np.linalg.norm(there))
-    if lengths == 0.0:
-        return 180.0
-    return float(np.degrees(np.arccos(np.clip(here @ there / lengths, -1.0, 1.0))))
+    return float(_angles(_target(camera, distance), camera.centre, other.centre))
 
 
-def _angle_to_nearest(camera: Camera, known: Sequence[tuple[Camera, float]]) -> float:
-    return min(_angle(other, camera, distance) for other, distance in known)
+def _angles(target: Float64, centre: Float64, others: Float64) -> Float64:
+    """Degrees between ``centre`` and ``others``, seen from ``target``; [..., 3] broadcast."""
+    here, there = centre - target, others - target
+    lengths = np.linalg.norm(here, axis=-1) * np.linalg.norm(there, axis=-1)
+    cosine = np.sum(here * there, axis=-1) / np.where(lengths > 0.0, lengths, 1.0)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return np.where(lengths > 0.0, angle, 180.0)
 
 
 def _glance(camera: Camera) -> Camera:

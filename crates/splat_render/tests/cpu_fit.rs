@@ -186,6 +186,43 @@ fn another_seed_gives_other_bits() {
 }
 
 #[test]
+fn a_fit_that_enters_the_schedule_late_takes_a_first_step() {
+    let moved = |first_step: u32| -> f32 {
+        let (targets, cameras) = photos();
+        let state = start(1);
+        let config = FitConfig { first_step, ..config(DensityControl::Mcmc) };
+        let device = Box::new(CpuFit::default());
+        let mut fitter =
+            Fitter::new(device, targets, cameras, state.clone(), first_step, config).unwrap();
+        let after = run(&mut fitter, first_step + 1);
+        let pairs = after.splats.opacities.iter().zip(&state.splats.opacities);
+        pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    };
+    // Adam's first step is the rate, whatever the gradient; moments taken to be old give three.
+    let (begun, entered) = (moved(0), moved(550));
+    assert!(begun > 1e-3 && (entered / begun - 1.0).abs() < 0.02, "{begun} and {entered}");
+}
+
+#[test]
+fn pixels_of_half_the_weight_count_half() {
+    let loss = |weight: Option<f32>| {
+        let (mut targets, cameras) = photos();
+        for target in &mut targets {
+            target.weights = weight.map(|w| vec![w; target.pixels.len() / 4]);
+        }
+        let config = FitConfig { hull: false, ..config(DensityControl::Mcmc) };
+        let device = Box::new(CpuFit::default());
+        let mut fitter = Fitter::new(device, targets, cameras, start(1), 0, config).unwrap();
+        fitter.step().unwrap();
+        fitter.loss().unwrap()
+    };
+    let whole = loss(None);
+    assert_eq!(loss(Some(1.0)), whole);
+    assert!((loss(Some(0.5)) / whole - 0.5).abs() < 1e-4);
+    assert_eq!(loss(Some(0.0)), 0.0);
+}
+
+#[test]
 fn bad_arguments_are_named() {
     let (targets, cameras) = photos();
     let build = |targets: Vec<Target>, cameras: Vec<Camera>, state: &FitState, config| {
@@ -213,6 +250,10 @@ fn bad_arguments_are_named() {
     assert!(build(targets.clone(), flat, &state, good.clone()).contains("K"));
     let none = FitConfig { steps: 0, ..good.clone() };
     assert!(build(targets.clone(), cameras.clone(), &state, none).contains("steps"));
+    let late = FitConfig { first_step: 1000, ..good.clone() };
+    assert!(build(targets.clone(), cameras.clone(), &state, late).contains("first_step"));
+    let before = FitConfig { first_step: 10, ..good.clone() };
+    assert!(build(targets.clone(), cameras.clone(), &state, before).contains("step"));
     let degree = FitConfig { sh_degree: 2, ..good };
     assert!(build(targets, cameras, &state, degree).contains("SH degree"));
 }

@@ -51,9 +51,18 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
                 pixels.extend(color.map(byte));
             }
         }
-        let weights = (k % 3 == 2).then(|| {
-            (0..width * height).map(|_| if rng.random::<f32>() < 0.2 { 0.0 } else { 1.0 }).collect()
-        });
+        let weights =
+            (k % 3 == 2).then(|| {
+                (0..width * height)
+                    .map(|_| {
+                        if rng.random::<f32>() < 0.2 {
+                            0.0
+                        } else {
+                            0.2 + 0.8 * rng.random::<f32>()
+                        }
+                    })
+                    .collect()
+            });
         let channels = if rgba { 4 } else { 3 };
         targets.push(Target { width, height, channels, pixels, weights });
         cameras.push(camera);

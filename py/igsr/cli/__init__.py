@@ -15,6 +15,7 @@ from .export import export_command
 from .fit import fit_command
 from .info import info_command
 from .pose import pose_command
+from .refine import refine_command
 from .render import render_command
 from .study import study_command
 from .synth import synth_command
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 
 app.command("pose")(pose_command)
+app.command("refine")(refine_command)
 app.command("fit")(fit_command)
 app.command("render")(render_command)
 app.command("eval")(eval_command)

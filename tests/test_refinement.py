@@ -1,0 +1,241 @@
+"""The loop: what it accepts, what it rolls back, what it writes, and that it can be resumed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from PIL import Image
+
+import igsr
+from igsr import presets
+from igsr.rendering import render
+
+BALL = scenes.splats(60)
+WHITE = (1.0, 1.0, 1.0)
+STEPS = 1600
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_fits():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(presets, "_FEW", replace(presets._FEW, max_splats=400))
+        yield
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return scenes.capture(views=12, size=40, alpha=True, scene=BALL)
+
+
+def truthful(buffers, photos):
+    """A denoiser that knows the scene."""
+    color = render(BALL, buffers.camera, WHITE, backend="cpu").color
+    return np.clip(color, 0.0, 1.0), np.full(color.shape[:2], 0.95, np.float32)
+
+
+def lying(buffers, photos):
+    """A denoiser that makes all worse and is sure of it."""
+    return 1.0 - np.clip(buffers.color, 0.0, 1.0), np.full(buffers.color.shape[:2], 1.0, np.float32)
+
+
+def unsure(buffers, photos):
+    """A denoiser that trusts nothing."""
+    return np.clip(buffers.color, 0.0, 1.0), np.full(buffers.color.shape[:2], 0.05, np.float32)
+
+
+def refine(capture, rounds, denoiser, **options):
+    given = {"steps": STEPS, "backend": "cpu", **options}
+    return igsr.refine(capture, rounds, denoiser=denoiser, **given)
+
+
+def same(one, other):
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name))
+        for name in ("means", "quats", "scales", "opacities", "sh")
+    )
+
+
+@pytest.fixture(scope="module")
+def helped(capture, tmp_path_factory):
+    out = tmp_path_factory.mktemp("helped")
+    seen = []
+    refined = refine(capture, 2, truthful, out=out, progress=seen.append)
+    return refined, out, seen
+
+
+def test_rounds_that_help_are_accepted_and_make_views_better(helped):
+    refined, _, seen = helped
+    assert [one.accepted for one in refined.rounds] == [True, True]
+    assert refined.stopped == "2 rounds are done"
+    for one in refined.rounds:
+        for name, sign in (("psnr", 1), ("ssim", 1), ("flip", -1)):
+            assert sign * one.left_out[name] > sign * one.without[name]
+            assert sign * one.left_out[name] > sign * one.before[name]
+        assert 0 < len(one.chosen) <= one.candidates
+    psnr = [refined.first_test["psnr"], *(one.test["psnr"] for one in refined.rounds)]
+    assert psnr[0] + 0.1 < psnr[1] < psnr[2]
+    done = [now.done for now in seen]
+    assert done == sorted(done)
+    assert done[-1] <= 1.0
+    assert {now.doing for now in seen} == {"fit", "look", "judge", "refit", "test"}
+
+
+def test_everything_it_did_is_in_its_folder(helped):
+    refined, out, _ = helped
+    assert same(igsr.Splats.load(out / "scene.ply"), refined.splats)
+    assert same(igsr.Splats.load(out / "rounds/0/scene.ply"), refined.first)
+    assert same(igsr.Splats.load(out / "rounds/1/scene.ply"), refined.rounds[0].splats)
+    one = refined.rounds[1].chosen[0]
+    assert np.array_equal(np.asarray(Image.open(out / "rounds/2/view-0.after.png")), one.picture)
+    assert np.asarray(Image.open(out / "rounds/2/view-0.trust.png")).shape == one.trust.shape
+    report = json.loads((out / "report.json").read_text())
+    assert report["stopped"] == refined.stopped
+    assert report["rounds"][2]["left_out"]["with"] == refined.rounds[1].left_out
+    assert report["rounds"][2]["test"]["psnr"] == refined.rounds[1].test["psnr"]
+    assert set(report["seconds"]) == {"fit", "look", "judge", "refit", "test"}
+    page = (out / "report.html").read_text()
+    assert refined.stopped in page
+    assert "Round 2: accepted" in page
+    assert page.count("data:image/jpeg;base64,") == 9 + 3 * sum(
+        len(one.chosen) for one in refined.rounds
+    )
+    assert "http" not in page, "the page needs nothing from elsewhere"
+
+
+def test_a_round_that_does_not_help_is_rolled_back(capture, helped):
+    refined = refine(capture, "auto", lying)
+    assert [one.accepted for one in refined.rounds] == [False]
+    assert refined.stopped == "round 1 did not make photos that were left out better"
+    assert refined.splats is refined.first
+    assert same(refined.splats, helped[0].first)
+    assert refined.rounds[0].splats is refined.rounds[0].test is None
+
+
+def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(capture, helped):
+    refined = refine(capture, "auto", unsure)
+    assert not refined.rounds
+    assert "unseen views can be trusted" in refined.stopped
+    assert "judge" not in refined.seconds
+    assert same(refined.splats, helped[0].first)
+    none = refine(capture, 0, truthful)
+    assert none.stopped == "0 rounds are done"
+    assert same(none.splats, helped[0].first)
+    two = igsr.Capture(capture.path, capture.train_views[:2])
+    assert "fewer than 3 photos" in refine(two, 1, truthful).stopped
+
+
+@pytest.mark.parametrize("calls", [1, 9, 40])
+def test_stopped_at_any_moment_and_resumed_it_ends_the_same(capture, helped, tmp_path, calls):
+    left = [calls]
+
+    def stop(now):
+        left[0] -= 1
+        return left[0] > 0
+
+    with pytest.raises(igsr.IgsrError, match="was stopped; go on with resume"):
+        refine(capture, 2, truthful, out=tmp_path, progress=stop)
+    refined = refine(capture, 2, truthful, out=tmp_path, resume=True)
+    assert same(refined.splats, helped[0].splats)
+    assert [one.left_out for one in refined.rounds] == [one.left_out for one in helped[0].rounds]
+
+
+@pytest.mark.parametrize(
+    ("rounds", "options", "message"),
+    [
+        ("many", {}, 'rounds must be a whole number or "auto"'),
+        (-1, {}, "rounds must not be negative"),
+        (True, {}, "rounds must be a whole number"),
+        (1, {"resume": True}, "resume needs out"),
+        (1, {"backend": "reference"}, "backend reference renders but does not fit"),
+        (1, {"steps": 0}, "steps must be"),
+    ],
+)
+def test_bad_arguments(capture, rounds, options, message):
+    with pytest.raises(igsr.IgsrError, match=message):
+        refine(capture, rounds, truthful, **options)
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(capture, tmp_path):
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(igsr.IgsrError, match="out"):
+        refine(capture, 0, truthful, out=tmp_path / "out")
+
+
+def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(capture):
+    def fitted(**fields):
+        views = [replace(view, **fields) for view in capture.train_views]
+        made = igsr.Capture(capture.path, views)
+        # From given splats: masks also have a say in the first ones of a fit.
+        return igsr.fit(made, steps=20, backend="cpu", start=BALL)
+
+    size = (40, 40)
+    left = np.ones(size, np.float32)
+    left[:, :20] = 0.0
+    assert same(fitted(), fitted(weights=np.ones(size, np.float32)))
+    assert same(fitted(mask=left > 0), fitted(weights=left))
+    assert not same(fitted(), fitted(weights=left))
+    with pytest.raises(igsr.IgsrError, match="weights must be finite and not negative"):
+        replace(capture.views[0], weights=-left)
+    with pytest.raises(igsr.IgsrError, match="weights"):
+        replace(capture.views[0], weights=left[1:])
+
+
+def test_a_picture_of_small_weights_counts_less_than_a_photo(capture):
+    """Two pictures of one camera that disagree: the splats side with the heavier."""
+    view = capture.train_views[0]
+    white = replace(view, name="white.png", image=np.full((40, 40, 3), 255, np.uint8))
+    black = replace(view, name="black.png", image=np.zeros((40, 40, 3), np.uint8))
+    side = scenes.ring_camera(1.0, 40)
+    means = []
+    for weight in (0.1, 1.0):
+        weighed = replace(white, weights=np.full((40, 40), weight, np.float32))
+        pair = [black, weighed, replace(black, name="side.png", camera=side)]
+        splats = igsr.fit(
+            igsr.Capture(capture.path, pair),
+            steps=200,
+            backend="cpu",
+            start=BALL,
+            sh_degree=BALL.sh_degree,
+            dropout=0.0,
+        )
+        means.append(render(splats, view.camera, backend="cpu").color.mean())
+    assert means[0] < 0.5 * means[1]
+
+
+def test_a_warm_start_goes_on_from_splats(capture):
+    first = igsr.fit(capture, steps=100, backend="cpu")
+    on = igsr.fit(capture, steps=50, backend="cpu", start=first)
+    before, after = (igsr.evaluate(s, capture, "train")["psnr"] for s in (first, on))
+    assert after > before
+    assert len(on) >= len(first)
+    with pytest.raises(igsr.IgsrError, match="sh_degree must be the same, not 3"):
+        igsr.fit(capture, steps=5, backend="cpu", start=first, sh_degree=3)
+    with pytest.raises(igsr.IgsrError, match="give at least one, and no more than max_splats"):
+        igsr.fit(capture, steps=5, backend="cpu", start=first, max_splats=2)
+    with pytest.raises(igsr.IgsrError, match="antialiased"):
+        igsr.fit(capture, steps=5, backend="cpu", start=replace(first, antialiased=True))
+
+
+def test_the_command(capture, tmp_path, igsr_here, monkeypatch):
+    from igsr.denoiser import save_network
+    from igsr.denoiser.network import Architecture, DenoiserNetwork
+
+    scenes.write_capture(tmp_path / "ball", capture)
+    save_network(DenoiserNetwork(Architecture(4, (0, 0, 0))), tmp_path / "a.safetensors", {})
+    command = ["refine", tmp_path / "ball", "--out", tmp_path / "out", "--steps", "60"]
+    command += ["--weights", tmp_path / "a.safetensors", "--backend", "cpu", "--rounds", "1"]
+    done = igsr_here(*command)
+    assert done.returncode == 0, done.stderr
+    assert "rounds accepted; stopped: " in done.stdout
+    assert (tmp_path / "out/report.html").is_file()
+    again = igsr_here(*command, "--resume", "--json")
+    summary = json.loads(again.stdout)
+    assert summary["tried"] in (0, 1)
+    assert summary["splats"] == len(igsr.Splats.load(tmp_path / "out/scene.ply"))
+    bad = igsr_here(*command[:4], "--rounds", "some")
+    assert bad.returncode == 1
+    assert bad.stderr.startswith("--rounds must be a whole number or auto, not 'some'.")
