@@ -184,6 +184,7 @@ def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(capture):
         replace(capture.views[0], weights=left[1:])
 
 
+@pytest.mark.filterwarnings("ignore:.*one and the same camera", "ignore:.*black or wholly")
 def test_a_picture_of_small_weights_counts_less_than_a_photo(capture):
     """Two pictures of one camera that disagree: the splats side with the heavier."""
     view = capture.train_views[0]
