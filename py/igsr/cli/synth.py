@@ -27,7 +27,7 @@ def synth_command(
     test_views: Annotated[
         int, typer.Option("--test-views", help="Photos to score, per scene.")
     ] = 8,
-    spp: Annotated[int, typer.Option("--spp", help="Light paths per pixel, a square.")] = 36,
+    spp: Annotated[int, typer.Option("--spp", help="Light paths per pixel, a square.")] = 16,
     jobs: Annotated[
         int | None,
         typer.Option("--jobs", help="Scenes at a time, a core each. Default: all cores."),

@@ -42,7 +42,7 @@ from .photographs import choose_viewpoints, exposure
 from .surroundings import draw_description
 
 #: Goes up when the same seed begins to mean other scenes.
-RECIPE_VERSION = 1
+RECIPE_VERSION = 2
 #: Test cameras keep this part of the rig away from its edges: they lie between the others.
 TEST_MARGIN = 0.12
 
@@ -64,7 +64,7 @@ class CaptureSettings:
     size: int = 256
     views: int = 24
     test_views: int = 8
-    spp: int = 36
+    spp: int = 16
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -74,7 +74,7 @@ class CaptureSettings:
         _check_range("spp", self.spp, 1, 4096)
         if math.isqrt(self.spp) ** 2 != self.spp:
             raise IgsrError(
-                "spp must be a square such as 16, 36 or 64 (light paths lie in rows), "
+                "spp must be a square such as 9, 16 or 36 (light paths lie in rows), "
                 f"not {self.spp}."
             )
 

@@ -35,14 +35,16 @@ def one_threaded_mitsuba() -> Iterator[Any]:
     """Mitsuba with our variant set and one thread; afterwards as it was.
 
     Raises:
-        IgsrError: it is not installed.
+        IgsrError: it, or Open Image Denoise, is not installed.
     """
     try:
         import drjit
         import mitsuba
+        import pyoidn  # noqa: F401
     except ImportError as error:
         raise IgsrError(
-            "Procedural captures need Mitsuba 3; install it with: pip install 'igsr[synth]'."
+            "Procedural captures need Mitsuba 3 and Open Image Denoise; install them with: "
+            "pip install 'igsr[synth]'."
         ) from error
     variant, threads = mitsuba.variant(), drjit.thread_count()
     mitsuba.set_variant(VARIANT)
@@ -215,7 +217,10 @@ def sensor(viewpoint: Viewpoint, sampler: dict[str, Any]) -> Any:
 
 
 def take_photo(loaded: LoadedScene, viewpoint: Viewpoint, samples: int, seed: int) -> np.ndarray:
-    """Linear premultiplied RGBA, float32 [H, W, 4].
+    """Linear premultiplied RGBA, float32 [H, W, 4], without the light paths' noise.
+
+    Open Image Denoise takes that out of the colours, by the albedo and the normal of what each
+    pixel shows. A network that learns from these photos would learn to paint the noise.
 
     Args:
         loaded: the scene.
@@ -224,19 +229,31 @@ def take_photo(loaded: LoadedScene, viewpoint: Viewpoint, samples: int, seed: in
         seed: of the light paths.
     """
     import mitsuba as mi
+    import pyoidn
 
+    paths = {
+        "type": "path",
+        "max_depth": MAX_DEPTH,
+        "hide_emitters": loaded.transparent,
+        "block_size": BLOCK_SIZE,
+    }
     integrator = mi.load_dict(
         {
-            "type": "path",
-            "max_depth": MAX_DEPTH,
-            "hide_emitters": loaded.transparent,
+            "type": "aov",
+            "aovs": "albedo:albedo,normal:sh_normal",
             "block_size": BLOCK_SIZE,
+            "paths": paths,
         }
     )
     camera = sensor(viewpoint, {"type": "multijitter", "sample_count": samples, "seed": seed})
-    return np.array(
-        mi.render(loaded.scene, sensor=camera, integrator=integrator, spp=samples, seed=seed)
+    drawn = np.array(
+        mi.render(loaded.scene, sensor=camera, integrator=integrator, spp=samples, seed=seed),
+        dtype=np.float32,
     )
+    rgb, alpha, albedo, normal = np.split(drawn, [3, 4, 7], axis=-1)
+    finite = np.nan_to_num(rgb, nan=0.0, posinf=0.0, neginf=0.0)
+    clean = pyoidn.denoise(finite, albedo=np.clip(albedo, 0.0, 1.0), normal=normal, hdr=True)
+    return np.concatenate([clean, alpha], axis=-1)
 
 
 def first_hits(loaded: LoadedScene, viewpoint: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
