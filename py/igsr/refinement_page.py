@@ -15,7 +15,7 @@ from PIL import Image
 
 from .atomic_write import atomic_write
 from .capture import Camera
-from .evaluation import BLACK, over_background
+from .evaluation import default_background, over_background
 
 if TYPE_CHECKING:
     from .refinement import Refined, Round
@@ -206,8 +206,9 @@ def _frustum(camera: Camera, depth: float) -> npt.NDArray[np.float64]:
 
 
 def _photos(refined: Refined) -> str:
+    background = default_background(refined.capture)
     figures = [
-        _figure(over_background(view.image, BLACK), html.escape(view.name), THUMBNAIL)
+        _figure(over_background(view.image, background), html.escape(view.name), THUMBNAIL)
         for view in refined.capture.train_views
     ]
     return f'<h2>Photos</h2><div class="row">{"".join(figures)}</div>'
