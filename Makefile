@@ -25,7 +25,8 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test fuzz bench accuracy profile build wheel check-rust check-python vulkan example-capture clean
+.PHONY: demo test fuzz bench accuracy profile build wheel check-rust check-python vulkan display browser \
+	example-capture clean
 .DELETE_ON_ERROR:
 
 # ---- what a user runs --------------------------------------------------------------------------
@@ -80,7 +81,7 @@ example-capture: build
 
 test: check-rust check-python
 
-check-rust: build vulkan
+check-rust: build vulkan display
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy $(PROFILE) --locked --workspace --all-targets -- -D warnings
 	$(CARGO) test $(PROFILE) $(CHECKED) --locked --workspace
@@ -92,7 +93,7 @@ fuzz:
 	IGSR_FUZZ_CASES=$(CASES) $(CARGO) test $(PROFILE) $(CHECKED) --locked --package splat_render \
 		--test formats mutations -- --nocapture
 
-check-python: build vulkan $(VENV)/.dev-ready
+check-python: build vulkan browser $(VENV)/.dev-ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -104,6 +105,24 @@ VULKAN_ANSWERS := $(BIN)/python -c 'from igsr import _core; print("GPU tests run
 vulkan: build
 	@$(VULKAN_ANSWERS) 2>/dev/null || { \
 		$(call apt_install,mesa-vulkan-drivers libvulkan1,no GPU or software Vulkan driver answers) && $(VULKAN_ANSWERS); \
+	}
+
+# The report of a refinement is opened in a browser.
+browser:
+	@for name in chromium chromium-browser google-chrome chrome; do \
+		command -v $$name >/dev/null && exit 0; \
+	done; \
+	$(call apt_install,chromium,no browser opens the tests' pages)
+
+# The viewer's window is tested on a display of its own, with a made-up hand. The libraries are those
+# that winit opens windows with on X11.
+WINDOW_PACKAGES := xvfb xdotool libx11-6 libx11-xcb1 libxcursor1 libxi6 libxrandr2 libxkbcommon-x11-0
+
+display:
+	@[ "$$(uname -s)" != Linux ] || { command -v Xvfb && command -v xdotool && \
+		ldconfig -p | grep libxkbcommon-x11.so.0 && ldconfig -p | grep libXcursor.so.1 && \
+		ldconfig -p | grep libXi.so.6; } >/dev/null 2>&1 || { \
+		$(call apt_install,$(WINDOW_PACKAGES),the tests of the viewer need a display of their own); \
 	}
 
 # ---- setting up --------------------------------------------------------------------------------

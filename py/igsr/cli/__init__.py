@@ -19,6 +19,7 @@ from .refine import refine_command
 from .render import render_command
 from .study import study_command
 from .synth import synth_command
+from .view import PASSED_ON, view_command
 
 app = typer.Typer(
     help="Fit a Gaussian-splat scene from photos, with known cameras or without.",
@@ -33,6 +34,7 @@ app.command("fit")(fit_command)
 app.command("render")(render_command)
 app.command("eval")(eval_command)
 app.command("info")(info_command)
+app.command("view", context_settings=PASSED_ON)(view_command)
 app.command("export")(export_command)
 app.command("compact")(compact_command)
 app.command("convert")(convert_command)

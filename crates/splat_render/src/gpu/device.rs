@@ -120,21 +120,31 @@ fn list_limit(software: bool, subgroups: bool) -> u32 {
     }
 }
 
+/// wgpu as this crate opens it.
+pub fn instance() -> wgpu::Instance {
+    wgpu::Instance::new(wgpu::InstanceDescriptor {
+        // Debug layers are asked for by wgpu's environment variables alone.
+        flags: wgpu::InstanceFlags::empty().with_env(),
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    })
+}
+
+/// Adapters that can run the kernels, the best first.
+fn adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
+    let mut adapters = ready(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    adapters.retain(|a| {
+        let downlevel = a.get_downlevel_capabilities();
+        downlevel.flags.contains(wgpu::DownlevelFlags::COMPUTE_SHADERS)
+    });
+    adapters.sort_by_key(|a| rank(a.get_info().device_type));
+    adapters
+}
+
 impl Gpu {
     /// Opens the best adapter: a real GPU where there is one, else, if `software_allowed`, a
     /// software one such as lavapipe.
     pub fn new(software_allowed: bool) -> Result<Self> {
-        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
-            // Debug layers are asked for by wgpu's environment variables alone.
-            flags: wgpu::InstanceFlags::empty().with_env(),
-            ..wgpu::InstanceDescriptor::new_without_display_handle()
-        });
-        let mut adapters = ready(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
-        adapters.retain(|a| {
-            let downlevel = a.get_downlevel_capabilities();
-            downlevel.flags.contains(wgpu::DownlevelFlags::COMPUTE_SHADERS)
-        });
-        adapters.sort_by_key(|a| rank(a.get_info().device_type));
+        let mut adapters = adapters(&instance());
         let software_only =
             adapters.first().is_some_and(|a| a.get_info().device_type == wgpu::DeviceType::Cpu);
         if !software_allowed {
@@ -152,6 +162,28 @@ impl Gpu {
                 .to_owned(),
             ));
         };
+        Self::open(adapter)
+    }
+
+    /// Opens the best adapter of an [`instance`] that can show pictures on `surface`, a software one
+    /// where there is no other.
+    pub fn for_surface(
+        instance: &wgpu::Instance,
+        surface: &wgpu::Surface<'_>,
+    ) -> Result<(Self, wgpu::Adapter)> {
+        let mut adapters = adapters(instance);
+        adapters.retain(|a| a.is_surface_supported(surface));
+        let Some(adapter) = adapters.into_iter().next() else {
+            return Err(Error::Device(
+                "no Vulkan, Metal or DX12 adapter can draw in a window here; install a driver \
+                 (mesa-vulkan-drivers has one for machines without a GPU)"
+                    .to_owned(),
+            ));
+        };
+        Ok((Self::open(&adapter)?, adapter))
+    }
+
+    fn open(adapter: &wgpu::Adapter) -> Result<Self> {
         let info = adapter.get_info();
         let offered = adapter.limits();
         let software = info.device_type == wgpu::DeviceType::Cpu;
@@ -171,11 +203,9 @@ impl Gpu {
         let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("splat_render"),
             required_limits,
-            required_features: if subgroups {
-                wgpu::Features::SUBGROUP
-            } else {
-                wgpu::Features::empty()
-            },
+            // Who draws frames wants to know what they cost.
+            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY
+                | if subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
             memory_hints: wgpu::MemoryHints::Performance,
             ..Default::default()
         }))
@@ -260,6 +290,16 @@ impl Gpu {
         self.info.device_type == wgpu::DeviceType::Cpu
     }
 
+    /// The device, for who draws with what the kernels leave.
+    pub fn device(&self) -> &wgpu::Device {
+        &self.device
+    }
+
+    /// Where the kernels are submitted.
+    pub fn queue(&self) -> &wgpu::Queue {
+        &self.queue
+    }
+
     /// How many buffers, bind groups and pipelines were made so far, and how many bytes the buffers
     /// have, dropped ones included. A fit's step makes none.
     pub fn made(&self) -> (u64, u64) {
@@ -280,7 +320,7 @@ impl Gpu {
     }
 
     /// What wgpu reported since the last call.
-    pub(super) fn check(&self) -> Result<()> {
+    pub fn check(&self) -> Result<()> {
         let failure = self.failure.lock().ok().and_then(|mut f| f.take());
         failure.map_or(Ok(()), |what| Err(self.error(&what)))
     }
@@ -456,16 +496,25 @@ impl Gpu {
                 rest = &rest[1..];
                 continue;
             }
-            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-            for op in &rest[..run] {
-                if let Op::Dispatch { pipeline, bind_group, groups } = op {
-                    pass.set_pipeline(pipeline);
-                    pass.set_bind_group(0, bind_group, &[]);
-                    pass.dispatch_workgroups(groups[0], groups[1], 1);
-                }
-            }
-            drop(pass);
+            Self::record_pass(encoder, &rest[..run], None);
             rest = &rest[run..];
+        }
+    }
+
+    /// Records the dispatches among prepared commands as one pass.
+    pub(super) fn record_pass(
+        encoder: &mut wgpu::CommandEncoder,
+        ops: &[Op],
+        timestamp_writes: Option<wgpu::ComputePassTimestampWrites<'_>>,
+    ) {
+        let mut pass = encoder
+            .begin_compute_pass(&wgpu::ComputePassDescriptor { label: None, timestamp_writes });
+        for op in ops {
+            if let Op::Dispatch { pipeline, bind_group, groups } = op {
+                pass.set_pipeline(pipeline);
+                pass.set_bind_group(0, bind_group, &[]);
+                pass.dispatch_workgroups(groups[0], groups[1], 1);
+            }
         }
     }
 
@@ -508,7 +557,7 @@ impl Gpu {
     }
 
     /// A buffer that can be copied to and read by the host.
-    pub(super) fn readable(&self, bytes: u64) -> wgpu::Buffer {
+    pub fn readable(&self, bytes: u64) -> wgpu::Buffer {
         let size = bytes.max(4);
         self.count(size);
         self.device.create_buffer(&wgpu::BufferDescriptor {
@@ -520,7 +569,7 @@ impl Gpu {
     }
 
     /// Waits for all work and brings back the first `bytes` of each [`Self::readable`] buffer.
-    pub(super) fn read(&self, buffers: &[(&wgpu::Buffer, u64)]) -> Result<Vec<Vec<u8>>> {
+    pub fn read(&self, buffers: &[(&wgpu::Buffer, u64)]) -> Result<Vec<Vec<u8>>> {
         for (buffer, _) in buffers {
             let failure = Arc::clone(&self.failure);
             buffer.slice(..).map_async(wgpu::MapMode::Read, move |result| {

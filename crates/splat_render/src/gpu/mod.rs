@@ -14,10 +14,13 @@ mod project;
 mod project_backward;
 mod rasterize;
 mod rasterize_backward;
+mod resident;
 mod shaders;
 
-pub use device::Gpu;
+pub use device::{Gpu, instance};
 pub use fit::GpuFit;
+pub use resident::ResidentSplats;
+pub use shaders::shared_wgsl;
 
 use crate::camera::Camera;
 use crate::error::Result;

@@ -282,6 +282,12 @@ fn constants(rows: u32) -> String {
     out
 }
 
+/// The structs, constants and functions that all shaders share, for who draws with what the kernels
+/// leave: `Splat2d` above all.
+pub fn shared_wgsl() -> String {
+    constants(1) + SHARED
+}
+
 impl Source {
     /// The whole text that is compiled, with threads that own so many rows of pixels, and that are
     /// one subgroup per tile or not.

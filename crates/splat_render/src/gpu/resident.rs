@@ -1,0 +1,112 @@
+//! Splats that stay on the device and are projected and sorted for one camera after another, for
+//! who draws them with a graphics pipeline.
+
+use super::bin::{SplatBins, TileChunk};
+use super::device::{Gpu, Op};
+use super::layout::{Chunk, Splat2d, View};
+use super::project::{SplatBuffers, project_ops};
+use crate::camera::Camera;
+use crate::error::Result;
+use crate::stages::{Colors, ProjectOptions, SplatParams};
+
+/// Splats on the device, with the commands that project and sort them.
+#[derive(Debug)]
+pub struct ResidentSplats {
+    splats: SplatBuffers,
+    sh_degree: u32,
+    sh_stride: u32,
+    raw: bool,
+    view: wgpu::Buffer,
+    splats2d: wgpu::Buffer,
+    bins: SplatBins,
+    project: Vec<Op>,
+    sort: Vec<Op>,
+}
+
+impl ResidentSplats {
+    /// Copies splats to the device.
+    pub fn new(gpu: &Gpu, splats: &SplatParams<'_, f32>) -> Result<Self> {
+        splats.validate()?;
+        let buffers = SplatBuffers::upload(gpu, splats)?;
+        let count = buffers.splats;
+        let view = gpu.uniform(&View::of_picture(1, 1, [0.0; 3]));
+        let splats2d = gpu.bindable("splats2d", u64::from(count) * size_of::<Splat2d>() as u64)?;
+        let bins = SplatBins::new(gpu, count, 1)?;
+        let all = Chunk {
+            tile_begin: 0,
+            tile_end: 0,
+            capacity: 0,
+            splats: count,
+            index: 0,
+            is_first: 1,
+            is_last: 1,
+            list_begin: 0,
+            list_end: u32::MAX,
+        };
+        let (sh_degree, sh_stride) = match splats.colors {
+            Colors::Direct(_) => (0, 0),
+            Colors::Sh { degree, stride, .. } => (degree, stride as u32),
+        };
+        Ok(Self {
+            project: project_ops(gpu, &view, &buffers, &splats2d),
+            sort: bins.depth_ops(gpu, &view, &TileChunk::new(gpu, all), &splats2d),
+            sh_degree,
+            sh_stride,
+            raw: splats.raw,
+            splats: buffers,
+            view,
+            splats2d,
+            bins,
+        })
+    }
+
+    /// Number of splats.
+    pub fn len(&self) -> u32 {
+        self.splats.splats
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Records the project stage, with SH up to `sh_degree` or what was given, and the sort by depth,
+    /// each a pass with its timestamps. One camera per submission: the last one given counts for all
+    /// of it.
+    pub fn record(
+        &self,
+        gpu: &Gpu,
+        encoder: &mut wgpu::CommandEncoder,
+        camera: &Camera,
+        options: &ProjectOptions,
+        sh_degree: u32,
+        [project, sort]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 2],
+    ) -> Result<()> {
+        camera.validate()?;
+        let view = View {
+            sh_degree: sh_degree.min(self.sh_degree),
+            sh_stride: self.sh_stride,
+            raw: u32::from(self.raw),
+            ..View::of_view(camera, options, [0.0; 3])
+        };
+        gpu.queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view));
+        Gpu::record_pass(encoder, &self.project, project);
+        Gpu::record_pass(encoder, &self.sort, sort);
+        Ok(())
+    }
+
+    /// `[N]` of `Splat2d`, as the last [`Self::record`] leaves them.
+    pub fn splats2d(&self) -> &wgpu::Buffer {
+        &self.splats2d
+    }
+
+    /// `[N]` splats from front to back, culled ones last.
+    pub fn order(&self) -> &wgpu::Buffer {
+        self.bins.order()
+    }
+
+    /// `[N * GEOMETRY]` mean, scales, quaternion wxyz, opacity, as they were given.
+    pub fn geometry(&self) -> &wgpu::Buffer {
+        &self.splats.geometry
+    }
+}

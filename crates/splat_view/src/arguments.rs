@@ -1,0 +1,263 @@
+//! The command line.
+
+use std::ffi::OsString;
+use std::path::PathBuf;
+
+use lexopt::prelude::*;
+use splat_render::{Error, Result};
+
+/// What `--help` prints.
+pub const HELP: &str = "\
+Look at Gaussian splats.
+
+splat-view [OPTIONS] SCENE [SCENE...]
+
+SCENE is a splat file (.ply, .compressed.ply, .splat, .ksplat, .spz, .sog, .glb, .gltf) or the folder
+of an igsr fit or igsr refine; a folder is watched, and what changes in it is shown. Two scenes are
+compared.
+
+Without a window:
+  --screenshot FILE    draw one picture: .png, or .exr with depth
+  --frames DIR         draw --orbit N pictures of a full turn to DIR/0000.png and on
+  --time N             draw N frames as the window does, and print the time of each stage
+  --size WxH           of these pictures; default 1280x720, or the camera's own
+  --backend NAME       auto: a real GPU if one answers, else cpu; gpu: also a software one; cpu
+
+From where:
+  --cameras PATH       transforms.json, cameras.json, a COLMAP model or a folder that holds one;
+                       default: what lies in or beside SCENE
+  --camera N           the capture's camera N, from 0
+  --orbit DEG          turned so far about the middle; with --frames, the number of pictures
+  --up AXIS            x, y, z, -x, -y or -z; default: the cameras' own, else -y
+  --fov DEG            height of the view, 5 to 150; default 50
+  --near DISTANCE      nothing nearer is drawn; default 0.01
+  --background COLOR   white, black, grey or R,G,B in 0..1; default black
+
+  --help, --version";
+
+/// What computes the pictures that are drawn without a window.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Backend {
+    /// A real GPU if one answers, else the CPU.
+    Auto,
+    /// Any adapter, software ones too.
+    Gpu,
+    /// The CPU.
+    Cpu,
+}
+
+/// What the command line says.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Arguments {
+    /// Files and folders to show.
+    pub scenes: Vec<PathBuf>,
+    /// File for one picture.
+    pub screenshot: Option<PathBuf>,
+    /// Folder for pictures of a full turn.
+    pub frames: Option<PathBuf>,
+    /// Frames to time.
+    pub time: Option<u32>,
+    /// Width and height in pixels.
+    pub size: Option<[u32; 2]>,
+    /// What computes.
+    pub backend: Backend,
+    /// Where the capture's cameras are.
+    pub cameras: Option<PathBuf>,
+    /// Which of them to look from.
+    pub camera: Option<usize>,
+    /// Degrees about the middle, or a number of pictures.
+    pub orbit: Option<f64>,
+    /// What is up, a unit vector.
+    pub up: Option<[f64; 3]>,
+    /// Vertical field of view in degrees.
+    pub fov: Option<f64>,
+    /// Near plane in world units.
+    pub near: Option<f32>,
+    /// Behind the splats, RGB in 0..1.
+    pub background: [f32; 3],
+}
+
+/// What to do.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Asked {
+    /// Print [`HELP`].
+    Help,
+    /// Print the version.
+    Version,
+    /// Show or draw.
+    Run(Box<Arguments>),
+}
+
+/// Most pictures of a turn.
+const FRAMES_MAX: f64 = 100_000.0;
+
+impl Arguments {
+    /// Reads the command line, the program's name left out.
+    pub fn parse(words: impl IntoIterator<Item = OsString>) -> Result<Asked> {
+        let mut out = Self {
+            scenes: Vec::new(),
+            screenshot: None,
+            frames: None,
+            time: None,
+            size: None,
+            backend: Backend::Auto,
+            cameras: None,
+            camera: None,
+            orbit: None,
+            up: None,
+            fov: None,
+            near: None,
+            background: [0.0; 3],
+        };
+        let mut parser = lexopt::Parser::from_args(words);
+        let wrong = |error: lexopt::Error| {
+            Error::argument("splat-view", format!("{error}; splat-view --help lists what it takes"))
+        };
+        while let Some(word) = parser.next().map_err(wrong)? {
+            let name = match word {
+                Long(name) => name.to_owned(),
+                Short('h') => "help".to_owned(),
+                Value(path) => {
+                    out.scenes.push(path.into());
+                    continue;
+                }
+                word @ Short(_) => return Err(wrong(word.unexpected())),
+            };
+            let mut value = || parser.value().map_err(wrong);
+            match name.as_str() {
+                "help" => return Ok(Asked::Help),
+                "version" => return Ok(Asked::Version),
+                "screenshot" => out.screenshot = Some(value()?.into()),
+                "frames" => out.frames = Some(value()?.into()),
+                "cameras" => out.cameras = Some(value()?.into()),
+                "time" => {
+                    out.time = Some(number("--time", &value()?, 1.0, 10_000.0, true)? as u32);
+                }
+                "size" => out.size = Some(size(&value()?)?),
+                "backend" => out.backend = backend(&value()?)?,
+                "camera" => {
+                    out.camera = Some(number("--camera", &value()?, 0.0, 1e9, true)? as usize);
+                }
+                "orbit" => {
+                    out.orbit = Some(number("--orbit", &value()?, -1e6, 1e6, false)?);
+                }
+                "up" => out.up = Some(axis(&value()?)?),
+                "fov" => out.fov = Some(number("--fov", &value()?, 5.0, 150.0, false)?),
+                "near" => {
+                    out.near = Some(number("--near", &value()?, 1e-6, 1e9, false)? as f32);
+                }
+                "background" => out.background = color(&value()?)?,
+                _ => return Err(wrong(Long(&name).unexpected())),
+            }
+        }
+        out.check()?;
+        Ok(Asked::Run(Box::new(out)))
+    }
+
+    /// Whether no window is wanted.
+    pub fn is_headless(&self) -> bool {
+        self.screenshot.is_some() || self.frames.is_some() || self.time.is_some()
+    }
+
+    fn check(&self) -> Result<()> {
+        let kinds = [self.screenshot.is_some(), self.frames.is_some(), self.time.is_some()];
+        if kinds.iter().filter(|&&given| given).count() > 1 {
+            return Err(Error::argument(
+                "--screenshot, --frames, --time",
+                "only one can be done at a time; give one of them",
+            ));
+        }
+        if self.is_headless() && self.scenes.is_empty() {
+            return Err(Error::argument("SCENE", "is missing; give a splat file or a folder"));
+        }
+        let ending = |path: &PathBuf| path.extension().map(|e| e.to_ascii_lowercase());
+        if let Some(path) = &self.screenshot
+            && !ending(path).is_some_and(|ending| ending == "png" || ending == "exr")
+        {
+            return Err(Error::argument(
+                "--screenshot",
+                format!("must end in .png or .exr, not as {} does", path.display()),
+            ));
+        }
+        if self.frames.is_some() {
+            let count = self.orbit.unwrap_or(0.0);
+            if count.fract() != 0.0 || !(1.0..=FRAMES_MAX).contains(&count) {
+                return Err(Error::argument(
+                    "--orbit",
+                    "must be the number of pictures when --frames is given, such as 60",
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn text(name: &str, value: &OsString) -> Result<String> {
+    let bad = || Error::argument(name, format!("{value:?} is not text"));
+    value.to_str().map(str::to_owned).ok_or_else(bad)
+}
+
+fn number(name: &str, value: &OsString, least: f64, most: f64, whole: bool) -> Result<f64> {
+    let kind = if whole { "a whole number" } else { "a number" };
+    let text = text(name, value)?;
+    match text.trim().parse::<f64>() {
+        Ok(number) if (least..=most).contains(&number) && (!whole || number.fract() == 0.0) => {
+            Ok(number)
+        }
+        _ => Err(Error::argument(
+            name,
+            format!("must be {kind} from {least} to {most}, not {text:?}"),
+        )),
+    }
+}
+
+fn size(value: &OsString) -> Result<[u32; 2]> {
+    let most = splat_render::constants::SIDE_MAX;
+    let text = text("--size", value)?;
+    let side = |side: &str| side.parse().ok().filter(|s| (1..=most).contains(s));
+    text.split_once('x').and_then(|(w, h)| Some([side(w)?, side(h)?])).ok_or_else(|| {
+        Error::argument(
+            "--size",
+            format!("must be two sides from 1 to {most} such as 800x600, not {text:?}"),
+        )
+    })
+}
+
+fn backend(value: &OsString) -> Result<Backend> {
+    match value.to_str() {
+        Some("auto") => Ok(Backend::Auto),
+        Some("gpu") => Ok(Backend::Gpu),
+        Some("cpu") => Ok(Backend::Cpu),
+        _ => Err(Error::argument("--backend", format!("must be auto, gpu or cpu, not {value:?}"))),
+    }
+}
+
+fn axis(value: &OsString) -> Result<[f64; 3]> {
+    let text = text("--up", value)?;
+    let (sign, name) = text.strip_prefix('-').map_or((1.0, text.as_str()), |rest| (-1.0, rest));
+    let axis = ["x", "y", "z"].iter().position(|&axis| axis == name).ok_or_else(|| {
+        Error::argument("--up", format!("must be x, y, z, -x, -y or -z, not {text:?}"))
+    })?;
+    let mut up = [0.0; 3];
+    up[axis] = sign;
+    Ok(up)
+}
+
+fn color(value: &OsString) -> Result<[f32; 3]> {
+    let text = text("--background", value)?;
+    let named = [("black", 0.0), ("white", 1.0), ("grey", 0.5)];
+    if let Some((_, grey)) = named.iter().find(|(name, _)| *name == text) {
+        return Ok([*grey; 3]);
+    }
+    let parts: Vec<f32> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
+    match parts[..] {
+        [r, g, b] if parts.iter().all(|c| (0.0..=1.0).contains(c)) => Ok([r, g, b]),
+        _ => Err(Error::argument(
+            "--background",
+            format!(
+                "must be white, black, grey or three numbers in 0..1 such as 0.2,0.2,0.2, not \
+                 {text:?}"
+            ),
+        )),
+    }
+}

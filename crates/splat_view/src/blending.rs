@@ -1,0 +1,227 @@
+//! Splats to a canvas: projected and sorted by splat_render, drawn as quads that the blending unit
+//! lays over each other.
+
+use bytemuck::{Pod, Zeroable};
+use splat_render::gpu::{Gpu, ResidentSplats, shared_wgsl};
+use splat_render::io::SplatFile;
+use splat_render::{Camera, ProjectOptions, Result};
+
+use crate::display::{Display, Settings};
+use crate::stage_times::Stamps;
+use crate::viewpoint::relative_to;
+
+/// Half floats: all that is blended has few bits to lose, and the blending unit has them everywhere.
+pub const CANVAS: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;
+
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct Style {
+    world_to_camera: [[f32; 4]; 3],
+    size: [f32; 2],
+    splats: u32,
+    display: u32,
+    depth_unit: f32,
+    radius: f32,
+    padding: [f32; 2],
+}
+
+/// A model on the device.
+#[derive(Debug)]
+pub struct Drawable {
+    resident: ResidentSplats,
+    origin: [f64; 3],
+    antialiased: bool,
+    style: wgpu::Buffer,
+    bindings: wgpu::BindGroup,
+}
+
+/// The pipeline.
+#[derive(Debug)]
+pub struct Blending {
+    layout: wgpu::BindGroupLayout,
+    pipeline: wgpu::RenderPipeline,
+}
+
+/// A binding of a uniform buffer.
+pub fn uniform_layout(binding: u32, visibility: wgpu::ShaderStages) -> wgpu::BindGroupLayoutEntry {
+    wgpu::BindGroupLayoutEntry {
+        binding,
+        visibility,
+        ty: wgpu::BindingType::Buffer {
+            ty: wgpu::BufferBindingType::Uniform,
+            has_dynamic_offset: false,
+            min_binding_size: None,
+        },
+        count: None,
+    }
+}
+
+/// A uniform buffer for one `T`.
+pub fn uniform<T>(gpu: &Gpu) -> wgpu::Buffer {
+    gpu.device().create_buffer(&wgpu::BufferDescriptor {
+        label: None,
+        size: size_of::<T>() as u64,
+        usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+        mapped_at_creation: false,
+    })
+}
+
+impl Blending {
+    /// Compiles it.
+    pub fn new(gpu: &Gpu) -> Self {
+        let device = gpu.device();
+        let storage = |binding| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility: wgpu::ShaderStages::VERTEX,
+            ty: wgpu::BindingType::Buffer {
+                ty: wgpu::BufferBindingType::Storage { read_only: true },
+                has_dynamic_offset: false,
+                min_binding_size: None,
+            },
+            count: None,
+        };
+        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+            label: Some("blend"),
+            entries: &[
+                uniform_layout(0, wgpu::ShaderStages::VERTEX_FRAGMENT),
+                storage(1),
+                storage(2),
+                storage(3),
+            ],
+        });
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some("blend"),
+            source: wgpu::ShaderSource::Wgsl((shared_wgsl() + include_str!("blend.wgsl")).into()),
+        });
+        let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: Some("blend"),
+            bind_group_layouts: &[Some(&layout)],
+            immediate_size: 0,
+        });
+        let pipeline = device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+            label: Some("blend"),
+            layout: Some(&pipeline_layout),
+            vertex: wgpu::VertexState {
+                module: &module,
+                entry_point: Some("corner"),
+                compilation_options: Default::default(),
+                buffers: &[],
+            },
+            primitive: wgpu::PrimitiveState {
+                topology: wgpu::PrimitiveTopology::TriangleStrip,
+                ..Default::default()
+            },
+            depth_stencil: None,
+            multisample: Default::default(),
+            fragment: Some(wgpu::FragmentState {
+                module: &module,
+                entry_point: Some("shade"),
+                compilation_options: Default::default(),
+                targets: &[Some(wgpu::ColorTargetState {
+                    format: CANVAS,
+                    blend: Some(wgpu::BlendState::PREMULTIPLIED_ALPHA_BLENDING),
+                    write_mask: wgpu::ColorWrites::ALL,
+                })],
+            }),
+            multiview_mask: None,
+            cache: None,
+        });
+        Self { layout, pipeline }
+    }
+
+    /// Copies a model to the device.
+    pub fn upload(&self, gpu: &Gpu, file: &SplatFile) -> Result<Drawable> {
+        let resident = ResidentSplats::new(gpu, &file.splats.params(file.splats.sh_degree))?;
+        let style = uniform::<Style>(gpu);
+        let buffers = [&style, resident.splats2d(), resident.order(), resident.geometry()];
+        let entries: Vec<_> = (0..)
+            .zip(buffers)
+            .map(|(binding, buffer)| wgpu::BindGroupEntry {
+                binding,
+                resource: buffer.as_entire_binding(),
+            })
+            .collect();
+        let bindings = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("blend"),
+            layout: &self.layout,
+            entries: &entries,
+        });
+        gpu.check()?;
+        Ok(Drawable {
+            resident,
+            origin: file.origin,
+            antialiased: file.antialiased,
+            style,
+            bindings,
+        })
+    }
+
+    /// Records a model's picture onto a canvas, columns `begin..end` of it, with what of depth counts
+    /// as one. One picture per model and submission.
+    pub fn record(
+        &self,
+        gpu: &Gpu,
+        encoder: &mut wgpu::CommandEncoder,
+        model: &Drawable,
+        camera: &Camera,
+        settings: &Settings,
+        depth_unit: f32,
+        canvas: &wgpu::TextureView,
+        [begin, end]: [u32; 2],
+        stamps: &Stamps<'_>,
+    ) -> Result<()> {
+        let camera = relative_to(*camera, model.origin);
+        let options = ProjectOptions {
+            near: settings.near,
+            antialiased: model.antialiased,
+            ..ProjectOptions::default()
+        };
+        model.resident.record(
+            gpu,
+            encoder,
+            &camera,
+            &options,
+            settings.sh_degree,
+            [stamps.compute(0), stamps.compute(1)],
+        )?;
+        let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
+        let style = Style {
+            world_to_camera: [row(0), row(1), row(2)],
+            size: [camera.width as f32, camera.height as f32],
+            splats: model.resident.len(),
+            display: settings.display as u32,
+            depth_unit,
+            radius: settings.radius,
+            padding: [0.0; 2],
+        };
+        gpu.queue().write_buffer(&model.style, 0, bytemuck::bytes_of(&style));
+        let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+            label: Some("blend"),
+            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+                view: canvas,
+                depth_slice: None,
+                resolve_target: None,
+                ops: wgpu::Operations {
+                    load: wgpu::LoadOp::Clear(wgpu::Color::TRANSPARENT),
+                    store: wgpu::StoreOp::Store,
+                },
+            })],
+            timestamp_writes: stamps.render(2),
+            ..Default::default()
+        });
+        if !model.resident.is_empty() && begin < end {
+            pass.set_scissor_rect(begin, 0, end - begin, camera.height);
+            pass.set_pipeline(&self.pipeline);
+            pass.set_bind_group(0, &model.bindings, &[]);
+            pass.draw(0..4, 0..model.resident.len());
+        }
+        Ok(())
+    }
+}
+
+impl Settings {
+    /// Whether canvases hold depths.
+    pub fn is_depth(&self) -> bool {
+        self.display == Display::Depth
+    }
+}

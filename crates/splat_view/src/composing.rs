@@ -1,0 +1,157 @@
+//! Canvases over the background, to a window or to a picture.
+
+use bytemuck::{Pod, Zeroable};
+use splat_render::gpu::Gpu;
+
+use crate::blending::{CANVAS, uniform, uniform_layout};
+
+/// How canvases are put together.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub struct Look {
+    /// Behind the splats.
+    pub background: [f32; 3],
+    /// First pixel column of the second canvas.
+    pub divider: f32,
+    /// 1 where the canvases hold depths.
+    pub is_depth: u32,
+    /// Depths at the ends of the colours, in the canvases' unit.
+    pub depth_range: [f32; 2],
+    /// To the size that WGSL gives it.
+    pub padding: f32,
+}
+
+/// What splats are drawn to, for one model or two side by side.
+#[derive(Debug)]
+pub struct Canvases {
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// The second is the first where there is one model.
+    pub textures: [wgpu::Texture; 2],
+    /// Of `textures`.
+    pub views: [wgpu::TextureView; 2],
+    look: wgpu::Buffer,
+    bindings: wgpu::BindGroup,
+}
+
+/// The pipeline, for targets of one format.
+#[derive(Debug)]
+pub struct Composing {
+    layout: wgpu::BindGroupLayout,
+    pipeline: wgpu::RenderPipeline,
+}
+
+impl Composing {
+    /// Compiles it.
+    pub fn new(gpu: &Gpu, format: wgpu::TextureFormat) -> Self {
+        let device = gpu.device();
+        let texture = |binding| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility: wgpu::ShaderStages::FRAGMENT,
+            ty: wgpu::BindingType::Texture {
+                sample_type: wgpu::TextureSampleType::Float { filterable: false },
+                view_dimension: wgpu::TextureViewDimension::D2,
+                multisampled: false,
+            },
+            count: None,
+        };
+        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+            label: Some("compose"),
+            entries: &[uniform_layout(0, wgpu::ShaderStages::FRAGMENT), texture(1), texture(2)],
+        });
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some("compose"),
+            source: wgpu::ShaderSource::Wgsl(include_str!("compose.wgsl").into()),
+        });
+        let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: Some("compose"),
+            bind_group_layouts: &[Some(&layout)],
+            immediate_size: 0,
+        });
+        let pipeline = device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+            label: Some("compose"),
+            layout: Some(&pipeline_layout),
+            vertex: wgpu::VertexState {
+                module: &module,
+                entry_point: Some("cover"),
+                compilation_options: Default::default(),
+                buffers: &[],
+            },
+            primitive: Default::default(),
+            depth_stencil: None,
+            multisample: Default::default(),
+            fragment: Some(wgpu::FragmentState {
+                module: &module,
+                entry_point: Some("compose"),
+                compilation_options: Default::default(),
+                targets: &[Some(format.into())],
+            }),
+            multiview_mask: None,
+            cache: None,
+        });
+        Self { layout, pipeline }
+    }
+
+    /// Canvases of a size, for one model or two.
+    pub fn canvases(&self, gpu: &Gpu, size: [u32; 2], two: bool) -> Canvases {
+        let texture = || {
+            gpu.device().create_texture(&wgpu::TextureDescriptor {
+                label: Some("canvas"),
+                size: wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 },
+                mip_level_count: 1,
+                sample_count: 1,
+                dimension: wgpu::TextureDimension::D2,
+                format: CANVAS,
+                usage: wgpu::TextureUsages::RENDER_ATTACHMENT
+                    | wgpu::TextureUsages::TEXTURE_BINDING
+                    | wgpu::TextureUsages::COPY_SRC,
+                view_formats: &[],
+            })
+        };
+        let first = texture();
+        let textures = [first.clone(), if two { texture() } else { first }];
+        let views = textures.each_ref().map(|texture| texture.create_view(&Default::default()));
+        let look = uniform::<Look>(gpu);
+        let view = |view| wgpu::BindingResource::TextureView(view);
+        let bindings = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("compose"),
+            layout: &self.layout,
+            entries: &[
+                wgpu::BindGroupEntry { binding: 0, resource: look.as_entire_binding() },
+                wgpu::BindGroupEntry { binding: 1, resource: view(&views[0]) },
+                wgpu::BindGroupEntry { binding: 2, resource: view(&views[1]) },
+            ],
+        });
+        Canvases { size, textures, views, look, bindings }
+    }
+
+    /// Records the picture.
+    pub fn record(
+        &self,
+        gpu: &Gpu,
+        encoder: &mut wgpu::CommandEncoder,
+        canvases: &Canvases,
+        look: &Look,
+        target: &wgpu::TextureView,
+        timestamp_writes: Option<wgpu::RenderPassTimestampWrites<'_>>,
+    ) {
+        gpu.queue().write_buffer(&canvases.look, 0, bytemuck::bytes_of(look));
+        let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+            label: Some("compose"),
+            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+                view: target,
+                depth_slice: None,
+                resolve_target: None,
+                ops: wgpu::Operations {
+                    load: wgpu::LoadOp::Clear(wgpu::Color::BLACK),
+                    store: wgpu::StoreOp::Store,
+                },
+            })],
+            timestamp_writes,
+            ..Default::default()
+        });
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &canvases.bindings, &[]);
+        pass.draw(0..3, 0..1);
+    }
+}

@@ -1,0 +1,59 @@
+//! What of the splats is shown.
+
+/// Kinds of pictures, in the order of the constants in `blend.wgsl`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(u32)]
+pub enum Display {
+    /// As they are rendered.
+    #[default]
+    Splats,
+    /// A dot for each.
+    Points,
+    /// Each as a solid ellipse, 1.5 standard deviations wide.
+    Ellipses,
+    /// Expected depth in false colour.
+    Depth,
+    /// The shortest axes, in camera axes.
+    Normals,
+}
+
+impl Display {
+    /// All of them, with what people read.
+    pub const ALL: [(Self, &str); 5] = [
+        (Self::Splats, "Splats"),
+        (Self::Points, "Points"),
+        (Self::Ellipses, "Ellipses"),
+        (Self::Depth, "Depth"),
+        (Self::Normals, "Normals"),
+    ];
+}
+
+/// How a picture is drawn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Settings {
+    /// What is shown.
+    pub display: Display,
+    /// Highest SH degree that is evaluated.
+    pub sh_degree: u32,
+    /// Vertical field of view, radians.
+    pub fov: f64,
+    /// Nothing nearer is drawn, world units.
+    pub near: f32,
+    /// Behind the splats, RGB in 0..1.
+    pub background: [f32; 3],
+    /// Radius of points in pixels.
+    pub radius: f32,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            display: Display::Splats,
+            sh_degree: splat_render::constants::SH_DEGREE_MAX,
+            fov: 50f64.to_radians(),
+            near: splat_render::constants::NEAR,
+            background: [0.0; 3],
+            radius: 1.5,
+        }
+    }
+}

@@ -1,0 +1,238 @@
+//! Pictures without a window, by splat_render's own rasterizer: the same as `igsr render` draws.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+use splat_render::cpu::Cpu;
+use splat_render::gpu::Gpu;
+use splat_render::{Camera, Error, Image, ProjectOptions, Projected, Result, Stages};
+
+use crate::arguments::{Arguments, Backend};
+use crate::display::Settings;
+use crate::model::Model;
+use crate::painter::{Painter, Shot};
+use crate::picture_files::{to_bytes, write_exr, write_png};
+use crate::scene_view::{cameras_of, first_view, up};
+use crate::sources::find_sources;
+use crate::stage_times::STAGES;
+use crate::viewpoint::{Viewpoint, fitted, relative_to};
+
+/// Of pictures where nothing says otherwise.
+const SIZE: [u32; 2] = [1280, 720];
+
+/// What the pictures are of.
+struct Scene {
+    model: Model,
+    camera: Camera,
+    viewpoint: Viewpoint,
+    settings: Settings,
+    up: glam::DVec3,
+}
+
+/// Does what the command line asks for without a window.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let scene = Scene::new(arguments)?;
+    if let Some(frames) = arguments.time {
+        return time(&scene, frames);
+    }
+    let stages = stages(arguments.backend)?;
+    if let Some(path) = &arguments.screenshot {
+        let mut camera = scene.camera;
+        if let Some(degrees) = arguments.orbit {
+            camera = scene.turned(degrees);
+        }
+        let image = scene.draw(&*stages, &camera)?;
+        return write(path, &image);
+    }
+    if let Some(folder) = &arguments.frames {
+        let unwritable = |e| Error::file(folder, format!("cannot be made ({e}); name another"));
+        std::fs::create_dir_all(folder).map_err(unwritable)?;
+        let count = arguments.orbit.unwrap_or(1.0) as u32;
+        for i in 0..count {
+            let camera = scene.turned(360.0 * f64::from(i) / f64::from(count));
+            let image = scene.draw(&*stages, &camera)?;
+            write(&folder.join(format!("{i:04}.png")), &image)?;
+        }
+    }
+    Ok(())
+}
+
+/// What draws; says so where it is not what one would expect.
+fn stages(backend: Backend) -> Result<Box<dyn Stages<f32>>> {
+    match backend {
+        Backend::Cpu => Ok(Box::new(Cpu)),
+        Backend::Gpu => Ok(Box::new(Gpu::new(true)?)),
+        Backend::Auto => match Gpu::new(false) {
+            Ok(gpu) => Ok(Box::new(gpu)),
+            Err(_) => {
+                eprintln!("No GPU answers; the CPU draws.");
+                Ok(Box::new(Cpu))
+            }
+        },
+    }
+}
+
+impl Scene {
+    fn new(arguments: &Arguments) -> Result<Self> {
+        let path = &arguments.scenes[0];
+        let source = find_sources(path)?.remove(0);
+        let model = Model::read(&source.path)?;
+        let (cameras, note) = cameras_of(arguments.cameras.as_deref(), Some(path))?;
+        for note in model.notes.iter().chain(&note) {
+            eprintln!("{note}");
+        }
+        let up = up(arguments, &cameras);
+        let fov = arguments.fov.map(f64::to_radians);
+        let mut settings = Settings { background: arguments.background, ..Settings::default() };
+        settings.near = arguments.near.unwrap_or(settings.near);
+        settings.fov = fov.unwrap_or(settings.fov);
+        let mut viewpoint = first_view(&model, &cameras, up, settings.fov);
+        let mut camera = viewpoint.camera(arguments.size.unwrap_or(SIZE), settings.fov);
+        if let Some(number) = arguments.camera {
+            let Some(found) = cameras.get(number) else {
+                return Err(Error::argument(
+                    "--camera",
+                    match cameras.len() {
+                        0 => "no cameras were found; name them with --cameras".to_owned(),
+                        count => format!("must be less than {count}, the number of cameras"),
+                    },
+                ));
+            };
+            let own = [found.camera.width, found.camera.height];
+            camera = fitted(&found.camera, arguments.size.unwrap_or(own));
+            viewpoint = Viewpoint::of_camera(&found.camera, model.center, model.radius);
+        }
+        Ok(Self { model, camera, viewpoint, settings, up })
+    }
+
+    /// The camera, so many degrees about the middle.
+    fn turned(&self, degrees: f64) -> Camera {
+        let mut viewpoint = self.viewpoint;
+        viewpoint.orbit(degrees.to_radians(), 0.0, self.up);
+        Camera { viewmat: viewpoint.viewmat(), ..self.camera }
+    }
+
+    fn project(&self, stages: &dyn Stages<f32>, camera: &Camera) -> Result<Projected<f32>> {
+        let file = &self.model.file;
+        let options = ProjectOptions {
+            near: self.settings.near,
+            antialiased: file.antialiased,
+            ..ProjectOptions::default()
+        };
+        let camera = relative_to(*camera, file.origin);
+        let params = file.splats.params(self.settings.sh_degree);
+        stages.project(&params, &camera, &options)
+    }
+
+    fn draw(&self, stages: &dyn Stages<f32>, camera: &Camera) -> Result<Image<f32>> {
+        stages.rasterize(&self.project(stages, camera)?, self.settings.background)
+    }
+}
+
+fn write(path: &Path, image: &Image<f32>) -> Result<()> {
+    if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("exr")) {
+        return write_exr(path, image);
+    }
+    write_png(path, [image.width, image.height], &to_bytes(image))
+}
+
+/// Draws frames as the window does and prints what each stage takes, and how far the picture is from
+/// the rasterizer's.
+fn time(scene: &Scene, frames: u32) -> Result<()> {
+    let gpu = Arc::new(Gpu::new(true)?);
+    println!("{} splats on {}", scene.model.file.splats.len(), gpu.name());
+    let format = wgpu::TextureFormat::Rgba8Unorm;
+    let mut painter = Painter::new(Arc::clone(&gpu), format)?;
+    let model = painter.upload(&scene.model.file)?;
+    let [width, height] = [scene.camera.width, scene.camera.height];
+    let target = gpu.device().create_texture(&wgpu::TextureDescriptor {
+        label: Some("frame"),
+        size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format,
+        usage: wgpu::TextureUsages::RENDER_ATTACHMENT,
+        view_formats: &[],
+    });
+    let target = target.create_view(&Default::default());
+    let mut stages: Vec<[f32; STAGES.len()]> = Vec::new();
+    let mut whole = Vec::new();
+    // The first frame compiles.
+    for i in 0..=frames {
+        let started = Instant::now();
+        let camera = scene.turned(f64::from(i));
+        let shot = scene.shot(camera, &model);
+        let mut encoder = gpu.device().create_command_encoder(&Default::default());
+        let written = painter.record(&mut encoder, &shot, &target)?;
+        painter.times.resolve(&mut encoder, written);
+        gpu.queue().submit([encoder.finish()]);
+        painter.times.submitted();
+        gpu.device()
+            .poll(wgpu::PollType::wait_indefinitely())
+            .map_err(|e| Error::Device(format!("{} did not finish ({e})", gpu.name())))?;
+        gpu.check()?;
+        if i > 0 {
+            whole.push(started.elapsed().as_secs_f32() * 1e3);
+            stages.extend(painter.times.latest());
+        } else {
+            painter.times.latest();
+        }
+    }
+    println!("median milliseconds of {frames} frames at {width}x{height}");
+    for (stage, name) in STAGES.iter().enumerate() {
+        let took: Vec<f32> = stages.iter().map(|times| times[stage]).collect();
+        // A second model and the panel are the window's alone.
+        if took.iter().any(|&ms| ms > 0.0) {
+            println!("{name:>12} {:9.2}", median(took));
+        }
+    }
+    // Submitting, and what the driver's timestamps leave out.
+    let rest = whole.iter().zip(&stages).map(|(whole, times)| whole - times.iter().sum::<f32>());
+    println!("{:>12} {:9.2}", "rest", median(rest.collect()));
+    println!("{:>12} {:9.2}", "whole", median(whole));
+    let shot = scene.shot(scene.camera, &model);
+    let seen = painter.picture(&shot)?;
+    // The first picture compiles.
+    let mut exact = scene.draw(&*gpu, &scene.camera)?;
+    let mut took = Vec::new();
+    for _ in 0..frames {
+        let projected = scene.project(&*gpu, &scene.camera)?;
+        let started = Instant::now();
+        exact = gpu.rasterize(&projected, scene.settings.background)?;
+        took.push(started.elapsed().as_secs_f32() * 1e3);
+    }
+    println!(
+        "{:>12} {:9.2} sort, bin and rasterize, with upload and read-back",
+        "rasterizer",
+        median(took)
+    );
+    let bytes = to_bytes(&exact);
+    let seen = seen.chunks_exact(4).flat_map(|p| &p[..3]);
+    let apart: Vec<u32> = seen.zip(&bytes).map(|(&a, &b)| u32::from(a.abs_diff(b))).collect();
+    println!(
+        "off the rasterizer's picture by {} of 255 at most, {:.4} on average",
+        apart.iter().max().unwrap_or(&0),
+        f64::from(apart.iter().sum::<u32>()) / apart.len().max(1) as f64
+    );
+    Ok(())
+}
+
+impl Scene {
+    fn shot<'a>(&'a self, camera: Camera, model: &'a crate::blending::Drawable) -> Shot<'a> {
+        Shot {
+            camera,
+            settings: &self.settings,
+            left: Some(model),
+            right: None,
+            divider: 1.0,
+            depths: [0.0, 1.0],
+        }
+    }
+}
+
+fn median(mut values: Vec<f32>) -> f32 {
+    values.sort_by(f32::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(f32::NAN)
+}

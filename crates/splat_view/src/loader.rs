@@ -1,0 +1,68 @@
+//! Reads models beside the window, which goes on drawing.
+
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, Sender, channel};
+
+use splat_render::Result;
+
+use crate::model::Model;
+use crate::sources::{Stamp, stamp};
+
+/// A model that was read, or why not.
+#[derive(Debug)]
+pub struct Loaded {
+    /// The side it is for, 0 or 1.
+    pub side: usize,
+    /// The file.
+    pub path: PathBuf,
+    /// The file's stamp before it was read.
+    pub stamp: Option<Stamp>,
+    /// The model.
+    pub model: Result<Model>,
+}
+
+/// What is being read, one model at a time for each side.
+#[derive(Debug)]
+pub struct Loader {
+    sender: Sender<Loaded>,
+    receiver: Receiver<Loaded>,
+    /// The file that each side waits for.
+    waits: [Option<PathBuf>; 2],
+}
+
+impl Loader {
+    /// With nothing to read yet.
+    pub fn new() -> Self {
+        let (sender, receiver) = channel();
+        Self { sender, receiver, waits: [None, None] }
+    }
+
+    /// Whether a side waits for a model.
+    pub fn is_busy(&self, side: usize) -> bool {
+        self.waits[side].is_some()
+    }
+
+    /// Reads a file for a side; `wake` is called when it is there.
+    pub fn load(&mut self, side: usize, path: &Path, wake: impl FnOnce() + Send + 'static) {
+        self.waits[side] = Some(path.to_owned());
+        let (path, sender) = (path.to_owned(), self.sender.clone());
+        std::thread::spawn(move || {
+            let stamp = stamp(&path);
+            let model = Model::read(&path);
+            // Nobody receives once the window is closed.
+            let _ = sender.send(Loaded { side, path, stamp, model });
+            wake();
+        });
+    }
+
+    /// The next model that was read and is still wanted.
+    pub fn next(&mut self) -> Option<Loaded> {
+        loop {
+            let loaded = self.receiver.try_recv().ok()?;
+            if self.waits[loaded.side].as_ref() == Some(&loaded.path) {
+                self.waits[loaded.side] = None;
+                return Some(loaded);
+            }
+        }
+    }
+}

@@ -1,0 +1,256 @@
+//! A frame from models to a window or a picture.
+
+use std::sync::Arc;
+
+use half::f16;
+use splat_render::gpu::Gpu;
+use splat_render::io::SplatFile;
+use splat_render::{Camera, Result};
+
+use crate::blending::{Blending, Drawable};
+use crate::composing::{Canvases, Composing, Look};
+use crate::display::{Display, Settings};
+use crate::stage_times::{COMPOSE, PANEL, SECOND, STAGES, StageTimes, Stamps};
+
+/// Of pictures that are read back.
+const PICTURE: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
+/// Bytes that rows of a copied texture are a multiple of.
+const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
+
+/// What a frame shows.
+#[derive(Debug, Clone, Copy)]
+pub struct Shot<'a> {
+    /// From where, with the size of the picture.
+    pub camera: Camera,
+    /// How.
+    pub settings: &'a Settings,
+    /// The model, on the left where there are two.
+    pub left: Option<&'a Drawable>,
+    /// The other, on the right.
+    pub right: Option<&'a Drawable>,
+    /// Where the right one begins, in parts of the width.
+    pub divider: f32,
+    /// Depths at the ends of the colours that show them, world units.
+    pub depths: [f32; 2],
+}
+
+/// Pipelines and canvases on one device.
+#[derive(Debug)]
+pub struct Painter {
+    gpu: Arc<Gpu>,
+    blending: Blending,
+    composing: Composing,
+    to_picture: Composing,
+    canvases: Option<Canvases>,
+    /// Of the frames shown.
+    pub times: StageTimes,
+}
+
+impl Painter {
+    /// For targets of a format.
+    pub fn new(gpu: Arc<Gpu>, format: wgpu::TextureFormat) -> Result<Self> {
+        let painter = Self {
+            blending: Blending::new(&gpu),
+            composing: Composing::new(&gpu, format),
+            to_picture: Composing::new(&gpu, PICTURE),
+            canvases: None,
+            times: StageTimes::new(&gpu),
+            gpu,
+        };
+        painter.gpu.check()?;
+        Ok(painter)
+    }
+
+    /// The device.
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
+    }
+
+    /// Copies a model to the device.
+    pub fn upload(&self, file: &SplatFile) -> Result<Drawable> {
+        self.blending.upload(&self.gpu, file)
+    }
+
+    /// Records a frame, and which stages it has.
+    pub fn record(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        shot: &Shot<'_>,
+        target: &wgpu::TextureView,
+    ) -> Result<[bool; STAGES.len()]> {
+        self.fit(shot);
+        let Some(canvases) = &self.canvases else { return Ok([false; STAGES.len()]) };
+        let times = &self.times;
+        let stamps = [times.stamps(0), times.stamps(SECOND)];
+        let mut written = blend(&self.gpu, &self.blending, encoder, canvases, shot, &stamps)?;
+        let compose = times.stamps(COMPOSE).render(0);
+        written[COMPOSE] = compose.is_some();
+        self.composing.record(&self.gpu, encoder, canvases, &look(shot), target, compose);
+        Ok(written)
+    }
+
+    /// Where egui's pass writes its timestamps.
+    pub fn panel_stamps(&self) -> Option<wgpu::RenderPassTimestampWrites<'_>> {
+        self.times.stamps(PANEL).render(0)
+    }
+
+    /// The frame as RGBA bytes.
+    pub fn picture(&mut self, shot: &Shot<'_>) -> Result<Vec<u8>> {
+        self.fit(shot);
+        let Some(canvases) = &self.canvases else { return Ok(Vec::new()) };
+        let [width, height] = canvases.size;
+        let texture = self.gpu.device().create_texture(&wgpu::TextureDescriptor {
+            label: Some("picture"),
+            size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format: PICTURE,
+            usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
+            view_formats: &[],
+        });
+        let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
+        let none = [Stamps::none(); 2];
+        blend(&self.gpu, &self.blending, &mut encoder, canvases, shot, &none)?;
+        let target = texture.create_view(&Default::default());
+        self.to_picture.record(&self.gpu, &mut encoder, canvases, &look(shot), &target, None);
+        let row = (4 * width).next_multiple_of(ROW);
+        let bytes = u64::from(row) * u64::from(height);
+        let readable = self.gpu.readable(bytes);
+        copy(&mut encoder, &texture, [0, 0], [width, height], &readable, row);
+        self.gpu.queue().submit([encoder.finish()]);
+        let data = self.gpu.read(&[(&readable, bytes)])?;
+        let rows = data[0].chunks_exact(row as usize);
+        Ok(rows.flat_map(|row| row[..4 * width as usize].iter().copied()).collect())
+    }
+
+    /// The expected depth at a pixel; None where nothing is.
+    pub fn depth_at(&mut self, shot: &Shot<'_>, pixel: [u32; 2]) -> Result<Option<f64>> {
+        let settings = Settings { display: Display::Depth, ..*shot.settings };
+        let shot = Shot { settings: &settings, ..*shot };
+        self.fit(&shot);
+        let Some(canvases) = &self.canvases else { return Ok(None) };
+        let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
+        let none = [Stamps::none(); 2];
+        blend(&self.gpu, &self.blending, &mut encoder, canvases, &shot, &none)?;
+        let is_right = shot.right.is_some() && pixel[0] >= column(&shot);
+        let readable = self.gpu.readable(8);
+        let texture = &canvases.textures[usize::from(is_right)];
+        copy(&mut encoder, texture, pixel, [1, 1], &readable, ROW);
+        self.gpu.queue().submit([encoder.finish()]);
+        let data = self.gpu.read(&[(&readable, 8)])?;
+        let texel: [u16; 4] = bytemuck::pod_read_unaligned(&data[0]);
+        let [depth, .., alpha] = texel.map(|bits| f16::from_bits(bits).to_f64());
+        // Fainter than half, nobody sees what is there.
+        Ok((alpha > 0.5).then(|| depth / alpha * f64::from(unit(&shot))))
+    }
+
+    /// Makes the canvases those that the frame needs.
+    fn fit(&mut self, shot: &Shot<'_>) {
+        let size = [shot.camera.width, shot.camera.height];
+        let two = shot.right.is_some();
+        let fits = self.canvases.as_ref().is_some_and(|canvases| {
+            canvases.size == size && (!two || canvases.textures[0] != canvases.textures[1])
+        });
+        if !fits {
+            self.canvases = Some(self.composing.canvases(&self.gpu, size, two));
+        }
+    }
+}
+
+/// First column of pixels of the right model.
+fn column(shot: &Shot<'_>) -> u32 {
+    (shot.divider.clamp(0.0, 1.0) * shot.camera.width as f32).round() as u32
+}
+
+/// What of depth a canvas counts as one.
+fn unit(shot: &Shot<'_>) -> f32 {
+    shot.depths[1].max(f32::MIN_POSITIVE)
+}
+
+fn look(shot: &Shot<'_>) -> Look {
+    let unit = unit(shot);
+    Look {
+        background: shot.settings.background,
+        divider: if shot.right.is_some() { column(shot) as f32 } else { f32::MAX },
+        is_depth: u32::from(shot.settings.is_depth()),
+        depth_range: shot.depths.map(|depth| depth / unit),
+        padding: 0.0,
+    }
+}
+
+fn blend(
+    gpu: &Gpu,
+    blending: &Blending,
+    encoder: &mut wgpu::CommandEncoder,
+    canvases: &Canvases,
+    shot: &Shot<'_>,
+    stamps: &[Stamps<'_>; 2],
+) -> Result<[bool; STAGES.len()]> {
+    let mut written = [false; STAGES.len()];
+    let middle = if shot.right.is_some() { column(shot) } else { canvases.size[0] };
+    let sides = [(shot.left, [0, middle]), (shot.right, [middle, canvases.size[0]])];
+    for (side, (model, columns)) in sides.into_iter().enumerate() {
+        let view = &canvases.views[side];
+        if let Some(model) = model {
+            blending.record(
+                gpu,
+                encoder,
+                model,
+                &shot.camera,
+                shot.settings,
+                unit(shot),
+                view,
+                columns,
+                &stamps[side],
+            )?;
+            written[side * SECOND..][..SECOND].fill(stamps[side].are_written());
+        } else if side == 0 {
+            clear(encoder, view);
+        }
+    }
+    Ok(written)
+}
+
+fn clear(encoder: &mut wgpu::CommandEncoder, view: &wgpu::TextureView) {
+    encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+        label: Some("clear"),
+        color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+            view,
+            depth_slice: None,
+            resolve_target: None,
+            ops: wgpu::Operations {
+                load: wgpu::LoadOp::Clear(wgpu::Color::TRANSPARENT),
+                store: wgpu::StoreOp::Store,
+            },
+        })],
+        ..Default::default()
+    });
+}
+
+fn copy(
+    encoder: &mut wgpu::CommandEncoder,
+    texture: &wgpu::Texture,
+    [x, y]: [u32; 2],
+    [width, height]: [u32; 2],
+    buffer: &wgpu::Buffer,
+    row: u32,
+) {
+    encoder.copy_texture_to_buffer(
+        wgpu::TexelCopyTextureInfo {
+            texture,
+            mip_level: 0,
+            origin: wgpu::Origin3d { x, y, z: 0 },
+            aspect: wgpu::TextureAspect::All,
+        },
+        wgpu::TexelCopyBufferInfo {
+            buffer,
+            layout: wgpu::TexelCopyBufferLayout {
+                offset: 0,
+                bytes_per_row: Some(row),
+                rows_per_image: None,
+            },
+        },
+        wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+    );
+}

@@ -1,0 +1,212 @@
+//! The panel: what can be chosen, and what there is to know.
+
+use egui::{ComboBox, ScrollArea, Slider, Ui};
+use glam::DVec3;
+
+use crate::display::Display;
+use crate::stage_times::{SECOND, STAGES};
+use crate::viewer::{Action, Moving, Viewer};
+
+/// What can be up.
+const AXES: [(DVec3, &str); 6] = [
+    (DVec3::NEG_Y, "-y"),
+    (DVec3::Y, "y"),
+    (DVec3::Z, "z"),
+    (DVec3::NEG_Z, "-z"),
+    (DVec3::X, "x"),
+    (DVec3::NEG_X, "-x"),
+];
+/// Keys and gestures, as the panel lists them.
+const KEYS: &str = "\
+drag: turn; right drag or shift: pan; wheel: zoom
+double click: look there
+W A S D Q E, arrows: move, turn; shift: faster
+1-5 display   V orbit, fly, first person   F all
+C cameras   [ ] camera by camera   H panel
+P screenshot   shift P with depth (EXR)
+K mark a place   R record   Esc stop";
+
+/// Shows it.
+pub fn panel(
+    viewer: &mut Viewer,
+    ui: &mut Ui,
+    times: Option<[f32; STAGES.len()]>,
+    actions: &mut Vec<Action>,
+) {
+    ScrollArea::vertical().show(ui, |ui| {
+        models(viewer, ui, actions);
+        ui.separator();
+        display(viewer, ui);
+        ui.separator();
+        camera(viewer, ui, actions);
+        if !viewer.cameras.is_empty() {
+            ui.separator();
+            capture(viewer, ui, actions);
+        }
+        ui.separator();
+        files(viewer, ui, actions);
+        ui.separator();
+        statistics(viewer, ui, times);
+        ui.collapsing("Keys", |ui| ui.small(KEYS));
+        if !viewer.message.is_empty() {
+            ui.separator();
+            ui.label(&viewer.message);
+        }
+    });
+}
+
+fn choice(viewer: &Viewer, ui: &mut Ui, side: usize, actions: &mut Vec<Action>) {
+    let chosen = viewer.number_of(side);
+    let text = viewer.chosen[side].as_deref().map_or("none".to_owned(), |p| viewer.name_of(p));
+    ComboBox::from_id_salt(("model", side)).selected_text(text).show_ui(ui, |ui| {
+        if side == 1 && ui.selectable_label(chosen.is_none(), "none").clicked() {
+            actions.push(Action::Choose(side, None));
+        }
+        for (number, source) in viewer.sources.iter().enumerate() {
+            if ui.selectable_label(chosen == Some(number), &source.name).clicked() {
+                actions.push(Action::Choose(side, Some(number)));
+            }
+        }
+    });
+}
+
+fn models(viewer: &Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
+    if viewer.sources.is_empty() {
+        ui.label("Drop a splat file or the folder of a fit here.");
+        return;
+    }
+    ui.horizontal(|ui| {
+        ui.label("Model");
+        choice(viewer, ui, 0, actions);
+    });
+    if viewer.sources.len() > 1 {
+        ui.horizontal(|ui| {
+            ui.label("Beside it");
+            choice(viewer, ui, 1, actions);
+        });
+    }
+}
+
+fn display(viewer: &mut Viewer, ui: &mut Ui) {
+    ui.horizontal_wrapped(|ui| {
+        for (display, name) in Display::ALL {
+            ui.selectable_value(&mut viewer.settings.display, display, name);
+        }
+    });
+    if viewer.settings.display == Display::Points {
+        ui.add(Slider::new(&mut viewer.settings.radius, 0.5..=8.0).text("radius, px"));
+    }
+    let stored = viewer.shown.iter().flatten().map(|s| s.model.file.splats.sh_degree).max();
+    if let Some(stored) = stored.filter(|&degree| degree > 0) {
+        let degree = &mut viewer.settings.sh_degree;
+        *degree = (*degree).min(stored);
+        ui.add(Slider::new(degree, 0..=stored).text("SH degree"));
+    }
+    ui.horizontal(|ui| {
+        ui.color_edit_button_rgb(&mut viewer.settings.background);
+        ui.label("background");
+    });
+}
+
+fn camera(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
+    ui.horizontal_wrapped(|ui| {
+        for (moving, name) in Moving::ALL {
+            ui.selectable_value(&mut viewer.moving, moving, name);
+        }
+    });
+    let mut degrees = viewer.settings.fov.to_degrees();
+    if ui.add(Slider::new(&mut degrees, 5.0..=150.0).text("field of view")).changed() {
+        viewer.at_camera = None;
+        viewer.settings.fov = degrees.to_radians();
+    }
+    let far = (4.0 * viewer.extent().1) as f32;
+    let range = 1e-4 * far..=far;
+    ui.add(Slider::new(&mut viewer.settings.near, range).logarithmic(true).text("near"));
+    ui.horizontal(|ui| {
+        let found = AXES.iter().find(|(axis, _)| axis.dot(viewer.up) > 0.999);
+        let text = found.map_or("the cameras'", |(_, name)| name);
+        ComboBox::from_label("is up").width(60.0).selected_text(text).show_ui(ui, |ui| {
+            for (axis, name) in AXES {
+                if ui.selectable_label(viewer.up == axis, name).clicked() {
+                    viewer.up = axis;
+                    actions.push(Action::Frame);
+                }
+            }
+        });
+        if ui.button("All (F)").clicked() {
+            actions.push(Action::Frame);
+        }
+    });
+}
+
+fn capture(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
+    ui.checkbox(&mut viewer.shows_cameras, format!("{} cameras", viewer.cameras.len()));
+    let at = viewer.at_camera;
+    ScrollArea::vertical().id_salt("cameras").max_height(110.0).show(ui, |ui| {
+        for (number, camera) in viewer.cameras.iter().enumerate() {
+            let name = format!("{number}  {}", camera.name);
+            if ui.selectable_label(at == Some(number), name).clicked() {
+                actions.push(Action::Jump(number));
+            }
+        }
+    });
+    if at.and_then(|i| viewer.cameras[i].photo.as_ref()).is_some() {
+        ui.add(Slider::new(&mut viewer.photo_strength, 0.0..=1.0).text("photo"));
+    }
+}
+
+fn files(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
+    ui.horizontal(|ui| {
+        if ui.button("Screenshot (P)").clicked() {
+            actions.push(Action::Screenshot);
+        }
+        if ui.button("EXR").on_hover_text("with alpha and depth").clicked() {
+            actions.push(Action::SaveExr);
+        }
+    });
+    ui.horizontal(|ui| {
+        if ui.button(format!("Mark place {} (K)", viewer.path.keys.len() + 1)).clicked() {
+            viewer.path.keys.push(viewer.viewpoint);
+        }
+        if !viewer.path.keys.is_empty() && ui.button("Forget all").clicked() {
+            viewer.path.keys.clear();
+        }
+    });
+    if viewer.path.keys.len() > 1 {
+        let between = &mut viewer.pictures_between;
+        ui.add(Slider::new(between, 1..=600).logarithmic(true).text("pictures each"));
+        let total = viewer.path.pictures(viewer.pictures_between);
+        match viewer.recording {
+            Some(number) => {
+                ui.label(format!("picture {number} of {total} (Esc stops)"));
+            }
+            None if ui.button(format!("Record {total} pictures (R)")).clicked() => {
+                actions.push(Action::Record);
+            }
+            None => {}
+        }
+    }
+}
+
+fn statistics(viewer: &Viewer, ui: &mut Ui, times: Option<[f32; STAGES.len()]>) {
+    for shown in viewer.shown.iter().flatten() {
+        let splats = shown.model.file.splats.len();
+        ui.label(format!("{splats} splats: {}", viewer.name_of(&shown.path)));
+    }
+    ui.label(format!("frame {:.1} ms", viewer.frame_ms));
+    let Some(times) = times else {
+        ui.label("this device tells no times of stages");
+        return;
+    };
+    egui::Grid::new("times").show(ui, |ui| {
+        for (stage, name) in STAGES.iter().enumerate() {
+            if times[stage] > 0.0 {
+                let side = if (SECOND..2 * SECOND).contains(&stage) { ", right" } else { "" };
+                ui.label(format!("{name}{side}"));
+                ui.label(format!("{:.2} ms", times[stage]));
+                ui.end_row();
+            }
+        }
+    });
+    ui.small(&viewer.device);
+}

@@ -1,0 +1,239 @@
+//! What the window knows: models, the view, the capture, and what of it may change.
+
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use splat_render::{Camera, Result};
+
+use crate::blending::Drawable;
+use crate::camera_path::CameraPath;
+use crate::capture::CaptureCamera;
+use crate::display::Settings;
+use crate::model::Model;
+use crate::painter::{Painter, Shot};
+use crate::sources::{Source, Stamp};
+use crate::viewpoint::{Viewpoint, fitted};
+
+/// How keys and drags move the camera.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Moving {
+    /// Drags turn about a point.
+    #[default]
+    Orbit,
+    /// Drags turn on the spot, keys move along the gaze.
+    Fly,
+    /// Drags turn on the spot, keys move on the level.
+    FirstPerson,
+}
+
+impl Moving {
+    /// All of them, with what people read.
+    pub const ALL: [(Self, &str); 3] =
+        [(Self::Orbit, "Orbit"), (Self::Fly, "Fly"), (Self::FirstPerson, "First person")];
+}
+
+/// A model that is drawn.
+#[derive(Debug)]
+pub struct Shown {
+    /// Its file.
+    pub path: PathBuf,
+    /// The file's stamp when it was read.
+    pub stamp: Option<Stamp>,
+    /// In memory, for files with depth and to be looked at.
+    pub model: Model,
+    /// On the device.
+    pub drawable: Drawable,
+}
+
+/// What panel, keys and gestures ask the window to do.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Action {
+    /// Show a source on a side; none takes the right side away.
+    Choose(usize, Option<usize>),
+    /// Show all of the scene.
+    Frame,
+    /// Look from the capture's camera.
+    Jump(usize),
+    /// Move the middle of orbits to what is at a pixel.
+    Focus([u32; 2]),
+    /// Save what is seen.
+    Screenshot,
+    /// Save the render with alpha and depth.
+    SaveExr,
+    /// Draw the path's pictures to files.
+    Record,
+    /// Stop doing so.
+    StopRecording,
+}
+
+/// The state of the window.
+#[derive(Debug)]
+pub struct Viewer {
+    /// Models that can be chosen.
+    pub sources: Vec<Source>,
+    /// A folder whose models come and change.
+    pub folder: Option<PathBuf>,
+    /// The files chosen for the left and the right side.
+    pub chosen: [Option<PathBuf>; 2],
+    /// What is drawn there.
+    pub shown: [Option<Shown>; 2],
+    /// Where the right side begins, in parts of the width.
+    pub divider: f32,
+    /// Whether the pointer holds the divider.
+    pub holds_divider: bool,
+    /// How it is drawn.
+    pub settings: Settings,
+    /// From where.
+    pub viewpoint: Viewpoint,
+    /// Whether a model or a camera has set `viewpoint`.
+    pub is_placed: bool,
+    /// What is up.
+    pub up: DVec3,
+    /// How it is moved.
+    pub moving: Moving,
+    /// The capture's cameras.
+    pub cameras: Vec<CaptureCamera>,
+    /// The one that is looked from.
+    pub at_camera: Option<usize>,
+    /// Whether they are drawn.
+    pub shows_cameras: bool,
+    /// How much of the photo is laid over the picture from its camera.
+    pub photo_strength: f32,
+    /// Places marked for a recording.
+    pub path: CameraPath,
+    /// Pictures from each place to the next.
+    pub pictures_between: u32,
+    /// Number of the picture that a recording is at.
+    pub recording: Option<u32>,
+    /// Where its pictures go.
+    pub recording_folder: PathBuf,
+    /// The last thing that happened, or went wrong.
+    pub message: String,
+    /// Whether the panel is there.
+    pub shows_panel: bool,
+    /// Name of the device.
+    pub device: String,
+    /// Milliseconds from the start of a frame to its submission and show.
+    pub frame_ms: f32,
+}
+
+impl Viewer {
+    /// With nothing to show.
+    pub fn new(settings: Settings, device: String) -> Self {
+        Self {
+            sources: Vec::new(),
+            folder: None,
+            chosen: [None, None],
+            shown: [None, None],
+            divider: 0.5,
+            holds_divider: false,
+            settings,
+            viewpoint: Viewpoint::framing(DVec3::ZERO, 1.0, DVec3::NEG_Y, settings.fov),
+            is_placed: false,
+            up: DVec3::NEG_Y,
+            moving: Moving::default(),
+            cameras: Vec::new(),
+            at_camera: None,
+            shows_cameras: false,
+            photo_strength: 0.0,
+            path: CameraPath::default(),
+            pictures_between: 30,
+            recording: None,
+            recording_folder: PathBuf::new(),
+            message: String::new(),
+            shows_panel: true,
+            device,
+            frame_ms: 0.0,
+        }
+    }
+
+    /// Middle and radius of what is shown.
+    pub fn extent(&self) -> (DVec3, f64) {
+        let shown = self.shown.iter().flatten().next();
+        shown.map_or((DVec3::ZERO, 1.0), |shown| (shown.model.center, shown.model.radius))
+    }
+
+    /// The camera of a picture of a size: the capture's own where one looks from it.
+    pub fn camera(&self, size: [u32; 2]) -> Camera {
+        match self.at_camera.and_then(|i| self.cameras.get(i)) {
+            Some(at) => fitted(&at.camera, size),
+            None => self.viewpoint.camera(size, self.settings.fov),
+        }
+    }
+
+    /// Looks from the capture's camera.
+    pub fn jump(&mut self, number: usize) {
+        let Some(at) = self.cameras.get(number) else { return };
+        let (center, radius) = self.extent();
+        self.viewpoint = Viewpoint::of_camera(&at.camera, center, radius);
+        self.at_camera = Some(number);
+        self.message = format!("Camera {number}: {}", at.name);
+    }
+
+    /// Leaves the capture's camera, whose lens goes on.
+    pub fn leave_camera(&mut self, size: [u32; 2]) {
+        if self.at_camera.is_some() {
+            let camera = self.camera(size);
+            self.settings.fov = 2.0 * (0.5 * f64::from(size[1]) / camera.fy).atan();
+            self.at_camera = None;
+        }
+    }
+
+    /// Shows all of the scene.
+    pub fn frame(&mut self) {
+        let (center, radius) = self.extent();
+        self.viewpoint = Viewpoint::framing(center, radius, self.up, self.settings.fov);
+    }
+
+    /// What a frame of a size shows.
+    pub fn shot(&self, size: [u32; 2]) -> Shot<'_> {
+        let drawable = |side: usize| self.shown[side].as_ref().map(|shown| &shown.drawable);
+        let camera = self.camera(size);
+        let (center, radius) = self.extent();
+        let middle = camera.viewmat.transform_point3(center).z;
+        let near = (middle - 2.0 * radius).max(f64::from(self.settings.near));
+        Shot {
+            camera,
+            settings: &self.settings,
+            left: drawable(0),
+            right: drawable(1),
+            divider: self.divider,
+            depths: [near as f32, (middle + 2.0 * radius).max(near * 2.0) as f32],
+        }
+    }
+
+    /// What is under a pixel becomes the middle of orbits and of the picture.
+    pub fn focus(
+        &mut self,
+        painter: &mut Painter,
+        size: [u32; 2],
+        pixel: [u32; 2],
+    ) -> Result<bool> {
+        let shot = self.shot(size);
+        let camera = shot.camera;
+        let Some(depth) = painter.depth_at(&shot, pixel)? else { return Ok(false) };
+        let [x, y] = pixel.map(|p| f64::from(p) + 0.5);
+        let ray = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0);
+        let target = camera.viewmat.inverse().transform_point3(ray * depth);
+        self.leave_camera(size);
+        self.viewpoint.focus(target);
+        Ok(true)
+    }
+
+    /// A side's source, by its number in the list.
+    pub fn number_of(&self, side: usize) -> Option<usize> {
+        let chosen = self.chosen[side].as_deref()?;
+        self.sources.iter().position(|source| source.path == chosen)
+    }
+
+    /// What a file is called.
+    pub fn name_of(&self, path: &Path) -> String {
+        let found = self.sources.iter().find(|source| source.path == path);
+        found.map_or_else(|| path.display().to_string(), |source| source.name.clone())
+    }
+
+    /// Whether there are two sides.
+    pub fn compares(&self) -> bool {
+        self.shown[1].is_some()
+    }
+}

@@ -1,0 +1,152 @@
+//! What the tests share: made-up scenes, folders that vanish, and the program.
+
+#![allow(dead_code, reason = "each test file uses its own part")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use splat_render::fit::SplatArrays;
+use splat_render::io::{SplatFile, write_splats};
+
+/// A new folder that goes away with this.
+pub struct Folder(pub PathBuf);
+
+impl Folder {
+    pub fn new() -> Self {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let name = format!("splat-view-test-{}-{number}", std::process::id());
+        let path = std::env::temp_dir().join(name);
+        std::fs::create_dir_all(&path).expect("a folder for the test");
+        Self(path)
+    }
+
+    pub fn join(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Numbers in 0..1 that are the same in every run.
+pub struct Numbers(u64);
+
+impl Numbers {
+    pub fn next(&mut self) -> f32 {
+        self.0 =
+            self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 40) as f32 / (1u64 << 24) as f32
+    }
+
+    fn about(&mut self, middle: f32, spread: f32) -> f32 {
+        middle + spread * (2.0 * self.next() - 1.0)
+    }
+}
+
+/// Splats of SH degree 1 in a ball about the origin, of colours about `tint`.
+pub fn ball(count: usize, seed: u64, tint: [f32; 3]) -> SplatFile {
+    let mut n = Numbers(seed);
+    let mut splats = SplatArrays { sh_degree: 1, ..SplatArrays::default() };
+    while splats.len() < count {
+        let at = [n.about(0.0, 1.0), n.about(0.0, 1.0), n.about(0.0, 1.0)];
+        if at.iter().map(|v| v * v).sum::<f32>() > 1.0 {
+            continue;
+        }
+        splats.means.push(at);
+        let quat = std::array::from_fn(|_| n.about(0.0, 1.0));
+        splats.quats.push(quat);
+        splats.scales.push(std::array::from_fn(|_| n.about(-2.6, 0.8)));
+        splats.opacities.push(n.about(0.5, 2.5));
+        splats.sh.push(tint.map(|v| n.about((v - 0.5) / 0.282, 0.5)));
+        for _ in 0..3 {
+            splats.sh.push(std::array::from_fn(|_| n.about(0.0, 0.3)));
+        }
+    }
+    SplatFile { splats, origin: [0.0; 3], antialiased: false }
+}
+
+/// Writes splats in the format of the ending.
+pub fn write(path: &Path, file: &SplatFile) {
+    std::fs::create_dir_all(path.parent().expect("a folder")).expect("folder");
+    write_splats(path, file).expect("a splat file");
+}
+
+/// The program, without any display.
+pub fn program() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_splat-view"));
+    // What Mesa says where there is no desktop.
+    command.env_remove("DISPLAY").env_remove("WAYLAND_DISPLAY").env("NODEVICE_SELECT", "1");
+    command
+}
+
+/// Runs the program, and asserts that it ends well.
+pub fn run(arguments: &[&dyn AsRef<std::ffi::OsStr>]) -> Output {
+    let output = program().args(arguments).output().expect("splat-view starts");
+    assert!(
+        output.status.success(),
+        "{arguments:?}: {}",
+        said(&output),
+        arguments = words(arguments)
+    );
+    output
+}
+
+fn words(arguments: &[&dyn AsRef<std::ffi::OsStr>]) -> Vec<String> {
+    arguments.iter().map(|a| a.as_ref().to_string_lossy().into_owned()).collect()
+}
+
+/// What the program said, without what drivers say.
+pub fn said(output: &Output) -> String {
+    let text = String::from_utf8_lossy(&output.stderr);
+    text.lines().filter(|line| !line.contains("XDG_RUNTIME_DIR")).collect::<Vec<_>>().join("\n")
+}
+
+/// Asserts that the program ended with one sentence that holds the words.
+pub fn refused(output: &Output, words: &[&str]) {
+    let text = said(output);
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert_eq!(text.lines().count(), 1, "not one sentence: {text}");
+    assert!(text.ends_with('.') && !text.contains("panicked"), "{text}");
+    for word in words {
+        assert!(text.contains(word), "{word} is not in: {text}");
+    }
+}
+
+/// An 8-bit RGB picture.
+#[derive(Clone, PartialEq)]
+pub struct Picture {
+    pub size: [usize; 2],
+    pub rgb: Vec<u8>,
+}
+
+/// Reads a PNG that the program wrote.
+pub fn read_png(path: &Path) -> Picture {
+    let bytes = std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().expect("a PNG");
+    let mut rgb = vec![0; reader.output_buffer_size().expect("a size")];
+    let info = reader.next_frame(&mut rgb).expect("pixels");
+    assert_eq!(info.color_type, png::ColorType::Rgb);
+    Picture { size: [info.width as usize, info.height as usize], rgb }
+}
+
+impl Picture {
+    /// Columns `begin..end`.
+    pub fn columns(&self, begin: usize, end: usize) -> Self {
+        let row = |row: &[u8]| row[3 * begin..3 * end].to_vec();
+        let rgb = self.rgb.chunks_exact(3 * self.size[0]).flat_map(row).collect();
+        Self { size: [end - begin, self.size[1]], rgb }
+    }
+
+    /// Largest and mean difference of a byte.
+    pub fn apart(&self, other: &Self) -> (u8, f64) {
+        assert_eq!(self.size, other.size);
+        let each = self.rgb.iter().zip(&other.rgb).map(|(a, b)| a.abs_diff(*b));
+        let sum: u64 = each.clone().map(u64::from).sum();
+        (each.max().unwrap_or(0), sum as f64 / self.rgb.len() as f64)
+    }
+}

@@ -1,0 +1,340 @@
+//! Pictures without a window.
+
+mod common;
+
+use std::path::Path;
+
+use common::{Folder, ball, program, read_png, refused, run, said, write};
+use glam::{DMat4, DVec3};
+use splat_render::cpu::Cpu;
+use splat_render::io::SplatFile;
+use splat_render::{Camera, Image, ProjectOptions, Stages};
+
+/// A camera 4 units off, with its middle elsewhere than the picture's.
+fn camera() -> Camera {
+    Camera {
+        viewmat: DMat4::from_translation(DVec3::new(0.1, -0.2, 4.0))
+            * DMat4::from_rotation_y(0.6)
+            * DMat4::from_rotation_x(0.3),
+        fx: 110.0,
+        fy: 100.0,
+        cx: 60.0,
+        cy: 35.0,
+        width: 120,
+        height: 80,
+    }
+}
+
+/// The camera as a transforms.json has it: camera-to-world, y up and z back.
+fn write_transforms(path: &Path, camera: &Camera) {
+    let to_world = camera.viewmat.inverse() * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
+    let rows: Vec<[f64; 4]> = (0..4).map(|i| to_world.row(i).to_array()).collect();
+    let text = format!(
+        "{{\"fl_x\": {}, \"fl_y\": {}, \"cx\": {}, \"cy\": {}, \"w\": {}, \"h\": {}, \
+         \"frames\": [{{\"file_path\": \"a.png\", \"transform_matrix\": {rows:?}}}]}}",
+        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+    );
+    std::fs::write(path, text).expect("transforms.json");
+}
+
+fn drawn(file: &SplatFile, camera: &Camera) -> Image<f32> {
+    let params = file.splats.params(4);
+    let projected = Cpu.project(&params, camera, &ProjectOptions::default()).expect("project");
+    Cpu.rasterize(&projected, [0.0; 3]).expect("rasterize")
+}
+
+fn bytes(image: &Image<f32>) -> Vec<u8> {
+    image.color.iter().flatten().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
+}
+
+#[test]
+fn a_capture_s_camera_draws_what_the_rasterizer_draws_on_cpu_and_gpu() {
+    let folder = Folder::new();
+    let (scene, out) = (folder.join("scene.ply"), folder.join("out.png"));
+    let file = ball(300, 1, [0.6, 0.4, 0.3]);
+    write(&scene, &file);
+    write_transforms(&folder.join("transforms.json"), &camera());
+    let expected = bytes(&drawn(&file, &camera()));
+    for backend in ["cpu", "gpu"] {
+        run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &backend]);
+        let picture = read_png(&out);
+        assert_eq!(picture.size, [120, 80]);
+        let off = picture.rgb.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max();
+        assert!(off <= Some(1), "{backend} is off by {off:?}");
+    }
+    assert!(expected.iter().any(|&v| v > 60), "the scene is dark");
+}
+
+#[test]
+fn exr_holds_colour_alpha_and_expected_depth() {
+    let folder = Folder::new();
+    let (scene, out) = (folder.join("scene.ply"), folder.join("out.exr"));
+    let file = ball(200, 2, [0.5; 3]);
+    write(&scene, &file);
+    write_transforms(&folder.join("cameras.json"), &camera());
+    run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &"cpu"]);
+    let image = exr::prelude::read_first_flat_layer_from_file(&out).expect("an EXR");
+    let names: Vec<String> =
+        image.layer_data.channel_data.list.iter().map(|c| c.name.to_string()).collect();
+    assert_eq!(names, ["A", "B", "G", "R", "Z"]);
+    let channel = |i: usize| -> Vec<f32> {
+        image.layer_data.channel_data.list[i].sample_data.values_as_f32().collect()
+    };
+    let expected = drawn(&file, &camera());
+    let depth: Vec<f32> = expected
+        .depth
+        .iter()
+        .zip(&expected.alpha)
+        .map(|(d, a)| if *a > 0.0 { d / a } else { 0.0 })
+        .collect();
+    assert_eq!(channel(0), expected.alpha);
+    assert_eq!(channel(3), expected.color.iter().map(|c| c[0]).collect::<Vec<_>>());
+    assert_eq!(channel(4), depth);
+    assert!(depth.iter().any(|d| (2.5..5.5).contains(d)));
+}
+
+#[test]
+fn sizes_orbits_and_backgrounds_are_as_asked() {
+    let folder = Folder::new();
+    let (scene, out) = (folder.join("scene.splat"), folder.join("out.png"));
+    write(&scene, &ball(300, 3, [0.3, 0.5, 0.7]));
+    let draw = |arguments: &[&dyn AsRef<std::ffi::OsStr>]| {
+        let mut all: Vec<&dyn AsRef<std::ffi::OsStr>> =
+            vec![&scene, &"--screenshot", &out, &"--size", &"90x60", &"--backend", &"cpu"];
+        all.extend(arguments);
+        run(&all);
+        read_png(&out)
+    };
+    let first = draw(&[]);
+    assert_eq!(first.size, [90, 60]);
+    assert!(draw(&[&"--orbit", &"40"]).apart(&first).1 > 2.0, "an orbit changes nothing");
+    assert!(draw(&[&"--orbit", &"360"]).apart(&first).0 <= 1, "a full turn does not return");
+    assert!(draw(&[&"--up", &"z"]).apart(&first).1 > 2.0, "up changes nothing");
+    let corner = &draw(&[&"--background", &"0.2,0.4,1"]).rgb[..3];
+    assert_eq!(corner, [51, 102, 255]);
+    // Seen from farther away with the lens narrower, all of it is in the picture, and larger than a dot.
+    let lit = first.rgb.chunks_exact(3).filter(|p| p.iter().any(|&v| v > 20)).count();
+    assert!((90 * 60 / 10..90 * 60).contains(&lit), "{lit} pixels are lit");
+}
+
+#[test]
+fn frames_of_a_full_turn_are_all_different() {
+    let folder = Folder::new();
+    let (scene, frames) = (folder.join("scene.ply"), folder.join("frames"));
+    write(&scene, &ball(200, 4, [0.5, 0.3, 0.6]));
+    run(&[
+        &scene,
+        &"--frames",
+        &frames,
+        &"--orbit",
+        &"4",
+        &"--size",
+        &"60x40",
+        &"--backend",
+        &"cpu",
+    ]);
+    let mut names: Vec<String> = std::fs::read_dir(&frames)
+        .expect("frames")
+        .map(|e| e.expect("entry").file_name().to_string_lossy().into_owned())
+        .collect();
+    names.sort();
+    assert_eq!(names, ["0000.png", "0001.png", "0002.png", "0003.png"]);
+    let pictures: Vec<_> = names.iter().map(|name| read_png(&frames.join(name))).collect();
+    for (i, one) in pictures.iter().enumerate() {
+        for other in &pictures[..i] {
+            assert!(one.apart(other).1 > 1.0, "two frames are alike");
+        }
+    }
+}
+
+#[test]
+fn splats_that_are_not_finite_are_left_out_and_counted() {
+    let folder = Folder::new();
+    let (clean, dirty) = (folder.join("clean.ply"), folder.join("dirty.ply"));
+    let file = ball(100, 5, [0.4; 3]);
+    write(&clean, &file);
+    let mut with = file.clone();
+    let mut broken = ball(3, 6, [1.0; 3]);
+    broken.splats.means[0][1] = f32::NAN;
+    broken.splats.scales[1][0] = f32::INFINITY;
+    broken.splats.sh[2 * 4] = [f32::NAN; 3];
+    with.splats.append(&broken.splats);
+    write(&dirty, &with);
+    write_transforms(&folder.join("transforms.json"), &camera());
+    let draw = |scene: &Path| {
+        let out = scene.with_extension("png");
+        let output = run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &"cpu"]);
+        (read_png(&out), said(&output))
+    };
+    let (dirty_picture, notes) = draw(&dirty);
+    assert!(draw(&clean).0 == dirty_picture, "broken splats change the picture");
+    assert!(notes.contains("3 of 103 splats"), "{notes}");
+}
+
+#[test]
+fn files_that_hold_no_splats_are_refused_in_one_sentence() {
+    let folder = Folder::new();
+    let header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n\
+                  property float x\nproperty float y\nproperty float z\nend_header\n";
+    let bad: [(&str, &[u8], &str); 5] = [
+        ("empty.ply", b"", "is empty"),
+        ("short.ply", b"0123456789", "ply"),
+        ("photo.ply", b"\xff\xd8\xff\xe0\x00\x10JFIF\x00\x01\x01\x00\x00\x01\x00\x01", "ply"),
+        ("claims.ply", header.as_bytes(), "claims.ply"),
+        ("checkpoint.npz", b"PK\x03\x04 but not more", "checkpoint"),
+    ];
+    for (name, bytes, word) in bad {
+        let scene = folder.join(name);
+        std::fs::write(&scene, bytes).expect("file");
+        let out = folder.join("out.png");
+        let output = program().arg(&scene).arg("--screenshot").arg(&out).output().expect("start");
+        refused(&output, &[name, word]);
+        assert!(!out.exists(), "{name} left a picture");
+        // The same where a window was asked for: it is said before any is opened.
+        refused(&program().arg(&scene).output().expect("start"), &[name, word]);
+    }
+    let nothing = program().arg(folder.join("no.ply")).output().expect("start");
+    refused(&nothing, &["no.ply", "cannot be opened"]);
+    let none = Folder::new();
+    let no_scene = program().arg(&none.0).args(["--time", "1"]).output().expect("start");
+    refused(&no_scene, &["holds no scene.ply"]);
+}
+
+#[test]
+fn arguments_that_make_no_sense_are_refused_in_one_sentence() {
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, &ball(10, 7, [0.5; 3]));
+    let out = folder.join("out.png");
+    let out = out.to_str().expect("text");
+    let bad: [(&[&str], &[&str]); 9] = [
+        (&["--size", "0x3"], &["--size", "800x600"]),
+        (&["--size", "99999x3"], &["--size"]),
+        (&["--camera", "0"], &["--camera", "--cameras"]),
+        (&["--frames", "x"], &["--screenshot, --frames"]),
+        (&["--fov", "NaN"], &["--fov"]),
+        (&["--background", "1,2"], &["--background"]),
+        (&["--backend", "cuda"], &["--backend", "cuda"]),
+        (&["--nonsense"], &["--nonsense"]),
+        (&["--cameras", out], &["out.png"]),
+    ];
+    for (arguments, words) in bad {
+        let mut command = program();
+        command.arg(&scene).args(["--screenshot", out]).args(arguments);
+        refused(&command.output().expect("start"), words);
+    }
+    let wrong = program().arg(&scene).args(["--screenshot", "a.jpg"]).output().expect("start");
+    refused(&wrong, &["--screenshot", ".png or .exr"]);
+    let frames = program().arg(&scene).args(["--frames", out]).output().expect("start");
+    refused(&frames, &["--orbit"]);
+}
+
+#[test]
+fn without_an_adapter_the_cpu_draws_and_gpu_is_refused() {
+    let folder = Folder::new();
+    let (scene, out) = (folder.join("scene.ply"), folder.join("out.png"));
+    write(&scene, &ball(50, 8, [0.5; 3]));
+    let command = |backend: &str| {
+        let mut command = program();
+        command.env("VK_DRIVER_FILES", "/nothing").env("VK_ICD_FILENAMES", "/nothing");
+        command.arg(&scene).arg("--screenshot").arg(&out);
+        command.args(["--size", "40x30", "--backend", backend]).output().expect("start")
+    };
+    // Metal and DX12 need no file that could be hidden.
+    if cfg!(target_os = "linux") {
+        refused(&command("gpu"), &["backend gpu", "no Vulkan"]);
+        let drawn = command("auto");
+        assert!(drawn.status.success(), "{}", said(&drawn));
+        assert!(said(&drawn).contains("the CPU draws"), "{}", said(&drawn));
+        assert_eq!(read_png(&out).size, [40, 30]);
+    }
+}
+
+#[test]
+fn without_a_display_one_sentence_says_what_to_do() {
+    if cfg!(target_os = "linux") {
+        let folder = Folder::new();
+        let scene = folder.join("scene.ply");
+        write(&scene, &ball(10, 9, [0.5; 3]));
+        let output = program().arg(&scene).output().expect("start");
+        refused(&output, &["no display answers", "--screenshot"]);
+    }
+}
+
+/// A checkpoint as numpy's savez writes it.
+fn write_checkpoint(path: &Path, file: &SplatFile) {
+    use std::io::Write;
+    let mut zip = zip::ZipWriter::new(std::fs::File::create(path).expect("file"));
+    let stored =
+        zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    let mut member = |name: &str, kind: &str, shape: &str, data: Vec<u8>| {
+        let mut header =
+            format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({shape}), }}");
+        while !(header.len() + 11).is_multiple_of(64) {
+            header.push(' ');
+        }
+        header.push('\n');
+        zip.start_file(format!("{name}.npy"), stored).expect("member");
+        zip.write_all(b"\x93NUMPY\x01\x00").expect("write");
+        zip.write_all(&(header.len() as u16).to_le_bytes()).expect("write");
+        zip.write_all(header.as_bytes()).expect("write");
+        zip.write_all(&data).expect("write");
+    };
+    let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+    let (s, n) = (&file.splats, file.splats.len());
+    member("means", "<f4", &format!("{n}, 3"), floats(s.means.as_flattened()));
+    member("quats", "<f4", &format!("{n}, 4"), floats(s.quats.as_flattened()));
+    member("scales", "<f4", &format!("{n}, 3"), floats(s.scales.as_flattened()));
+    member("opacities", "<f4", &format!("{n},"), floats(&s.opacities));
+    member("sh", "<f4", &format!("{n}, {}, 3", s.stride()), floats(s.sh.as_flattened()));
+    let origin = file.origin.iter().flat_map(|v| v.to_le_bytes()).collect();
+    member("origin", "<f8", "3,", origin);
+    zip.finish().expect("zip");
+}
+
+#[test]
+fn a_fit_s_folder_shows_its_checkpoint_as_it_shows_the_same_scene() {
+    let folder = Folder::new();
+    let mut file = ball(150, 10, [0.4, 0.6, 0.3]);
+    // Means are relative to an origin that f32 could not hold them at.
+    file.origin = [1e7, -2e7, 5.0];
+    write(&folder.join("a/scene.ply"), &file);
+    std::fs::create_dir_all(folder.join("b")).expect("folder");
+    write_checkpoint(&folder.join("b/checkpoint.npz"), &file);
+    let draw = |name: &str| {
+        let out = folder.join(&format!("{name}.png"));
+        let arguments = ["--size", "80x60", "--backend", "cpu"];
+        let [a, b, c, d] = arguments;
+        run(&[&folder.join(name), &"--screenshot", &out, &a, &b, &c, &d]);
+        read_png(&out)
+    };
+    let scene = draw("a");
+    assert!(scene == draw("b"));
+    assert!(scene.rgb.iter().any(|&v| v > 60), "nothing is seen so far from the world's origin");
+}
+
+/// Bound on what the blending unit's picture is off the rasterizer's, in 255ths; docs/viewer.md has it.
+const BLENDED_MOST: f64 = 3.0;
+const BLENDED_MEAN: f64 = 0.5;
+
+#[test]
+fn the_window_s_way_to_draw_agrees_with_the_rasterizer_and_is_timed() {
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, &ball(3000, 11, [0.5, 0.4, 0.6]));
+    let output = run(&[&scene, &"--time", &"2", &"--size", &"160x120"]);
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    let off: Vec<f64> = text
+        .lines()
+        .find(|line| line.starts_with("off the rasterizer's picture"))
+        .unwrap_or_else(|| panic!("no comparison in: {text}"))
+        .split(|c: char| !c.is_ascii_digit() && c != '.')
+        .filter_map(|word| word.parse().ok())
+        .collect();
+    let [most, _, mean] = off[..] else { panic!("{text}") };
+    println!("{text}");
+    assert!(most <= BLENDED_MOST && mean <= BLENDED_MEAN, "{text}");
+    for stage in ["project", "sort", "draw", "compose", "whole"] {
+        assert!(text.lines().any(|line| line.trim_start().starts_with(stage)), "{stage}: {text}");
+    }
+}

@@ -1,0 +1,352 @@
+//! The window driven for real: Xvfb is the display, xdotool the hand, a software adapter may draw.
+
+#![cfg(target_os = "linux")]
+
+mod common;
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use common::{Folder, Picture, ball, program, read_png, run, write};
+
+/// Longest that anything may take on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(120);
+/// The window's first size; small, since a software adapter draws.
+const SIZE: [usize; 2] = [320, 240];
+/// Bounds on what a window's picture is off the rasterizer's, in 255ths: docs/viewer.md has them.
+const MOST: u8 = 3;
+const MEAN: f64 = 0.5;
+
+/// A display of its own.
+struct Xvfb {
+    server: Child,
+    name: String,
+    folder: Folder,
+}
+
+impl Xvfb {
+    fn start() -> Self {
+        let folder = Folder::new();
+        let mut server = Command::new("Xvfb")
+            .args([
+                "-displayfd",
+                "1",
+                "-screen",
+                "0",
+                "640x480x24",
+                "-noreset",
+                "-nolisten",
+                "tcp",
+                "-fbdir",
+            ])
+            .arg(&folder.0)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("these tests need Xvfb: install the package xvfb");
+        let mut name = String::new();
+        let mut out = BufReader::new(server.stdout.take().expect("its output"));
+        out.read_line(&mut name).expect("Xvfb says which display it is");
+        Self { server, name: format!(":{}", name.trim()), folder }
+    }
+
+    fn xdotool(&self, arguments: &[&str]) -> String {
+        let output = Command::new("xdotool")
+            .env("DISPLAY", &self.name)
+            .args(arguments)
+            .output()
+            .expect("these tests need xdotool: install the package xdotool");
+        let text = String::from_utf8_lossy(&output.stdout).trim().to_owned();
+        assert!(output.status.success(), "xdotool {arguments:?}: {text}");
+        text
+    }
+
+    /// What the display shows in its upper left corner, from the file that Xvfb keeps it in.
+    fn seen(&self, [width, height]: [usize; 2]) -> Picture {
+        let bytes = std::fs::read(self.folder.join("Xvfb_screen0")).expect("the screen");
+        let word = |i: usize| {
+            let word: [u8; 4] = bytes[4 * i..4 * i + 4].try_into().expect("a word");
+            u32::from_be_bytes(word) as usize
+        };
+        // XWD: size of the header, ..., bytes of a line (13th), ..., number of colours (20th).
+        let (start, line) = (word(0) + 12 * word(19), word(12));
+        let pixel = |x: usize, y: usize| {
+            let at = start + y * line + 4 * x;
+            [bytes[at + 2], bytes[at + 1], bytes[at]]
+        };
+        let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| pixel(x, y))).collect();
+        Picture { size: [width, height], rgb }
+    }
+}
+
+impl Drop for Xvfb {
+    fn drop(&mut self) {
+        let _ = self.server.kill();
+        let _ = self.server.wait();
+    }
+}
+
+/// The viewer on that display.
+struct Viewer<'a> {
+    xvfb: &'a Xvfb,
+    program: Child,
+    window: String,
+    folder: &'a Path,
+    shots: u32,
+}
+
+impl<'a> Viewer<'a> {
+    fn start(xvfb: &'a Xvfb, folder: &'a Path, arguments: &[&str]) -> Self {
+        let program = program()
+            .env("DISPLAY", &xvfb.name)
+            .current_dir(folder)
+            .args(arguments)
+            .args(["--size", &format!("{}x{}", SIZE[0], SIZE[1])])
+            .stdout(Stdio::null())
+            .spawn()
+            .expect("splat-view starts");
+        let window = xvfb.xdotool(&["search", "--sync", "--onlyvisible", "--name", "splat-view"]);
+        let mut viewer = Self { xvfb, program, window, folder, shots: 0 };
+        // No window manager gives it the keyboard.
+        viewer.xvfb.xdotool(&["windowfocus", "--sync", &viewer.window]);
+        viewer.xvfb.xdotool(&["mousemove", "100", "120"]);
+        // The panel away, so that all of the window is picture.
+        viewer.key("h");
+        viewer
+    }
+
+    fn key(&mut self, key: &str) {
+        self.xvfb.xdotool(&["key", key]);
+    }
+
+    /// Drags with a button in steps, as a hand does.
+    fn drag(&mut self, button: &str, [from, to]: [[i32; 2]; 2]) {
+        let x = self.xvfb;
+        let at = |part: i32| [0, 1].map(|i| (from[i] + (to[i] - from[i]) * part / 8).to_string());
+        let moved = |part: i32| {
+            let [a, b] = at(part);
+            x.xdotool(&["mousemove", &a, &b]);
+            std::thread::sleep(Duration::from_millis(40));
+        };
+        moved(0);
+        x.xdotool(&["mousedown", button]);
+        (1..=8).for_each(moved);
+        x.xdotool(&["mouseup", button]);
+    }
+
+    /// A screenshot by key.
+    fn shot(&mut self) -> Picture {
+        // What came before is in it: keys are handled in their order.
+        self.key("p");
+        self.shots += 1;
+        let path = self.folder.join(format!("splat-view-{:03}.png", self.shots));
+        self.wait_for(&format!("{}", path.display()), |_| path.exists());
+        read_png(&path)
+    }
+
+    /// Waits until the display shows a picture.
+    fn shows(&mut self, picture: &Picture) {
+        // The display's file has the pointer in it.
+        self.xvfb.xdotool(&["mousemove", "620", "460"]);
+        let xvfb = self.xvfb;
+        self.wait_for("the picture on the display", |_| {
+            xvfb.seen(picture.size).apart(picture).0 <= 1
+        });
+        self.xvfb.xdotool(&["mousemove", "100", "120"]);
+    }
+
+    fn wait_for(&mut self, what: &str, mut done: impl FnMut(&mut Self) -> bool) {
+        let started = Instant::now();
+        while !done(self) {
+            if let Ok(Some(status)) = self.program.try_wait() {
+                panic!("splat-view ended ({status}) before {what}");
+            }
+            assert!(started.elapsed() < PATIENCE, "{what} did not come");
+            std::thread::sleep(Duration::from_millis(30));
+        }
+    }
+
+    /// Shots until one is as wanted.
+    fn shot_when(&mut self, what: &str, mut wanted: impl FnMut(&Picture) -> bool) -> Picture {
+        let started = Instant::now();
+        loop {
+            let picture = self.shot();
+            if wanted(&picture) {
+                return picture;
+            }
+            assert!(started.elapsed() < PATIENCE, "{what} did not come");
+        }
+    }
+}
+
+impl Drop for Viewer<'_> {
+    fn drop(&mut self) {
+        let _ = self.program.kill();
+        let _ = self.program.wait();
+    }
+}
+
+/// The rasterizer's picture of a scene as it is first seen.
+fn rasterized(scene: &Path, [width, height]: [usize; 2]) -> Picture {
+    let out = scene.with_extension("expected.png");
+    let size = format!("{width}x{height}");
+    run(&[&scene, &"--screenshot", &out, &"--size", &size, &"--backend", &"cpu"]);
+    read_png(&out)
+}
+
+fn agree(name: &str, one: &Picture, other: &Picture) {
+    let (most, mean) = one.apart(other);
+    println!("{name}: {most} at most, {mean:.4} on average");
+    assert!(most <= MOST && mean <= MEAN, "{name}: off by {most}, on average {mean}");
+}
+
+fn differ(name: &str, one: &Picture, other: &Picture) {
+    let (_, mean) = one.apart(other);
+    assert!(mean > 1.0, "{name}: the pictures are alike ({mean})");
+}
+
+fn scenes(folder: &Folder) -> [PathBuf; 2] {
+    let tints = [[0.8, 0.3, 0.2], [0.2, 0.4, 0.8]];
+    [0, 1].map(|i| {
+        let path = folder.join(&format!("scene{i}.ply"));
+        write(&path, &ball(600, 20, tints[i]));
+        path
+    })
+}
+
+#[test]
+fn a_window_draws_orbits_zooms_resizes_and_shows_what_it_saves() {
+    let (xvfb, folder) = (Xvfb::start(), Folder::new());
+    let [scene, _] = scenes(&folder);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply"]);
+    let first = viewer.shot();
+    assert_eq!(first.size, SIZE);
+    agree("first view", &first, &rasterized(&scene, SIZE));
+    // The window shows the same, pixel by pixel.
+    viewer.shows(&first);
+
+    viewer.drag("1", [[100, 120], [180, 130]]);
+    let turned = viewer.shot();
+    differ("an orbit", &first, &turned);
+    viewer.shows(&turned);
+    viewer.drag("3", [[100, 120], [160, 150]]);
+    let panned = viewer.shot();
+    differ("a pan", &turned, &panned);
+    // The pan has moved the picture with the pointer: to the right and down.
+    let middle = |p: &Picture| {
+        let light = |i: usize| f64::from(p.rgb[3 * i]) + f64::from(p.rgb[3 * i + 2]);
+        let pixels = p.size[0] * p.size[1];
+        let total: f64 = (0..pixels).map(light).sum();
+        let sum = |at: &dyn Fn(usize) -> usize| {
+            (0..pixels).map(|i| light(i) * at(i) as f64).sum::<f64>() / total
+        };
+        [sum(&|i| i % p.size[0]), sum(&|i| i / p.size[0])]
+    };
+    let (before, after) = (middle(&turned), middle(&panned));
+    assert!(after[0] > before[0] + 15.0 && after[1] > before[1] + 5.0, "{before:?} {after:?}");
+    xvfb.xdotool(&["mousemove", "100", "120", "click", "--repeat", "5", "4"]);
+    let mut last = panned;
+    // The wheel is smoothed over some frames.
+    let zoomed = viewer.shot_when("the end of the zoom", |shot| {
+        let rests = shot.apart(&last).1 == 0.0;
+        last = shot.clone();
+        rests
+    });
+    let lit = |p: &Picture| p.rgb.chunks_exact(3).filter(|p| p.iter().any(|&v| v > 20)).count();
+    assert!(lit(&zoomed) > lit(&turned), "zooming in shows no more: {}", lit(&zoomed));
+
+    viewer.key("f");
+    agree("all of the scene again", &viewer.shot(), &rasterized(&scene, SIZE));
+    let size = [400, 200];
+    xvfb.xdotool(&["windowsize", "--sync", &viewer.window, "400", "200"]);
+    let resized = viewer.shot_when("the new size", |shot| shot.size == size);
+    agree("after the resize", &resized, &rasterized(&scene, size));
+    viewer.shows(&resized);
+    // Double click on a splat beside the middle brings it there.
+    xvfb.xdotool(&["mousemove", "230", "110", "click", "--repeat", "2", "--delay", "20", "1"]);
+    let focused = viewer.shot_when("the focus", |shot| shot.apart(&resized).1 > 1.0);
+    assert!(middle(&focused)[0] < middle(&resized)[0] - 5.0, "the scene did not move to the left");
+}
+
+#[test]
+fn every_display_is_another_and_keys_move_the_camera() {
+    let (xvfb, folder) = (Xvfb::start(), Folder::new());
+    scenes(&folder);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply", "--background", "white"]);
+    let mut seen: Vec<Picture> = Vec::new();
+    for key in ["1", "2", "3", "4", "5"] {
+        viewer.key(key);
+        let picture = viewer.shot();
+        for other in &seen {
+            differ(&format!("display {key}"), other, &picture);
+        }
+        assert_eq!(picture.rgb[..3], [255; 3], "display {key} covers the background");
+        seen.push(picture);
+    }
+    viewer.key("1");
+    let before = viewer.shot();
+    assert!(before == seen[0], "back to splats is not the same picture");
+    xvfb.xdotool(&["keydown", "d"]);
+    std::thread::sleep(Duration::from_millis(300));
+    xvfb.xdotool(&["keyup", "d"]);
+    differ("D moves", &before, &viewer.shot());
+    // Two places marked, and the path between them recorded.
+    viewer.key("k");
+    viewer.drag("1", [[100, 120], [150, 120]]);
+    viewer.key("k");
+    viewer.key("r");
+    let last = folder.join("splat-view-path-001/0030.png");
+    viewer.wait_for("the path's last picture", |_| last.exists());
+    let path =
+        |number: u32| read_png(&folder.join(&format!("splat-view-path-001/{number:04}.png")));
+    differ("the path's ends", &path(0), &path(30));
+    viewer.xvfb.xdotool(&["key", "shift+p"]);
+    let exr = folder.join("splat-view-001.exr");
+    viewer.wait_for("the EXR", |_| exr.exists());
+    let image = exr::prelude::read_first_flat_layer_from_file(&exr).expect("an EXR");
+    assert_eq!(image.layer_data.channel_data.list.len(), 5);
+}
+
+#[test]
+fn two_models_are_compared_at_a_divider_and_changed_files_appear() {
+    let (xvfb, folder) = (Xvfb::start(), Folder::new());
+    let [left, right] = scenes(&folder);
+    let expected = [&left, &right].map(|scene| rasterized(scene, SIZE));
+    differ("the two models", &expected[0], &expected[1]);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply", "scene1.ply"]);
+    let halves = |picture: &Picture, at: usize| {
+        agree("left", &picture.columns(0, at), &expected[0].columns(0, at));
+        agree("right", &picture.columns(at, SIZE[0]), &expected[1].columns(at, SIZE[0]));
+    };
+    halves(&viewer.shot(), 160);
+    viewer.drag("1", [[160, 50], [80, 50]]);
+    halves(&viewer.shot(), 80);
+    // The left file is written again: it is read again, and the camera stays.
+    write(&left, &ball(600, 20, [0.2, 0.4, 0.8]));
+    let again = rasterized(&right, SIZE);
+    let changed = viewer.shot_when("the changed file", |shot| {
+        shot.columns(0, 80).apart(&again.columns(0, 80)).1 < MEAN
+    });
+    agree("changed", &changed, &again);
+    // A broken file leaves what was there.
+    std::fs::write(&left, "ply\nthis is none").expect("write");
+    std::thread::sleep(Duration::from_secs(1));
+    agree("broken", &viewer.shot(), &again);
+}
+
+#[test]
+fn a_refinement_s_folder_opens_and_a_new_scene_in_it_appears() {
+    let (xvfb, folder) = (Xvfb::start(), Folder::new());
+    let [red, blue] = scenes(&folder);
+    let (red, blue) = (rasterized(&red, SIZE), rasterized(&blue, SIZE));
+    write(&folder.join("out/rounds/0/scene.ply"), &ball(600, 20, [0.8, 0.3, 0.2]));
+    write(&folder.join("out/scene.ply"), &ball(600, 20, [0.8, 0.3, 0.2]));
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &["out"]);
+    agree("round 0", &viewer.shot(), &red);
+    write(&folder.join("out/rounds/1/scene.ply"), &ball(600, 20, [0.2, 0.4, 0.8]));
+    write(&folder.join("out/scene.ply"), &ball(600, 20, [0.2, 0.4, 0.8]));
+    let changed = viewer.shot_when("round 1", |shot| shot.apart(&blue).1 < MEAN);
+    agree("round 1", &changed, &blue);
+}
