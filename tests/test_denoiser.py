@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from feature_files import squeezenet_file
 
 import igsr
 from igsr.denoiser import (
@@ -17,7 +18,7 @@ from igsr.denoiser import (
     save_network,
 )
 from igsr.denoiser.cleaning import UNSEEN_CHANGE
-from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTO, PHOTOS
+from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
 from igsr.denoiser.losses import (
     LOSSES,
     Loss,
@@ -63,7 +64,7 @@ def test_a_new_network_changes_little(photos):
     image, log_error = DenoiserNetwork(Architecture(4, (1, 1, 1), photos=photos))(inputs)
     expected, weights = inputs[:, :COLOR].clone(), torch.ones(2, 1, 9, 14)
     if photos != "none":
-        for k in range(PHOTOS):
+        for k in range(CHOICES):
             at = COLOR + BUFFERS + k * PHOTO
             weight = np.exp(FIRST_LOGIT) * valid[:, k : k + 1]
             expected += weight * inputs[:, at : at + COLOR]
@@ -217,6 +218,14 @@ def test_damaged_files_of_weights_are_refused_in_a_sentence(tmp_path):
     refused("holds the weight more")
     path.unlink()
     refused("does not exist")
+
+
+def test_without_weights_of_its_own_igsr_says_what_to_give(monkeypatch, tmp_path):
+    from igsr.denoiser import weights
+
+    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "denoiser.safetensors")
+    with pytest.raises(igsr.IgsrError, match=r"no weights of its own.*--weights FILE"):
+        load_network()
 
 
 def prediction(image, truth, render=None, log_error=-3.0):
@@ -454,26 +463,6 @@ def test_crops_that_are_right_already_are_drawn_again(tmp_path):
 def test_training_needs_two_files_of_pairs(tmp_path):
     with pytest.raises(igsr.IgsrError, match="at least two files of pairs"):
         train(pair_files(tmp_path, count=1), tmp_path / "out", TINY, SMALL)
-
-
-def squeezenet_file(path):
-    from igsr.denoiser.perceptual import _FIRES
-
-    random = np.random.default_rng(0)
-    shapes = {"conv1": (96, 3, 7, 7)}
-    channels = 96
-    for number, (squeezed, expanded) in _FIRES.items():
-        shapes[f"fire{number}/conv1x1_1"] = (squeezed, channels, 1, 1)
-        shapes[f"fire{number}/conv1x1_2"] = (expanded, squeezed, 1, 1)
-        shapes[f"fire{number}/conv3x3_2"] = (expanded, squeezed, 3, 3)
-        channels = 2 * expanded
-    arrays = {}
-    for name, shape in shapes.items():
-        scale = np.sqrt(2.0 / np.prod(shape[1:]))
-        arrays[f"{name}.weight"] = (scale * random.normal(size=shape)).astype(np.float32)
-        arrays[f"{name}.bias"] = np.zeros(shape[0], np.float32)
-    np.savez(path, **arrays)
-    return arrays
 
 
 def test_the_feature_distance_grows_with_blur_and_carries_gradients(tmp_path):

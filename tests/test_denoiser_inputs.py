@@ -163,6 +163,29 @@ def test_what_is_lacking_or_not_finite_is_zero_in_the_channels():
     assert not inputs[COLOR:].any()
 
 
+def test_the_background_is_a_choice_where_there_is_one():
+    color = np.full((8, 8, 3), 0.9, np.float32)
+    at = COLOR + BUFFERS + PHOTOS * 5
+    behind = np.array([0.2, 0.4, 0.6], np.float32)
+    inputs = network_inputs(Buffers(color, background=behind), nothing_warped(8, 8))
+    assert np.allclose(inputs[at : at + 5, 0, 0], [0.2, 0.4, 0.6, 1.0, 0.0])
+    assert np.ptp(inputs[at:], axis=(1, 2)).max() == 0.0, "the same everywhere"
+    assert not network_inputs(Buffers(color), nothing_warped(8, 8))[at:].any()
+    with pytest.raises(igsr.IgsrError, match=r"background must be \[3\], not \[2\]"):
+        Buffers(color, background=behind[:2])
+
+
+def test_renders_know_the_background_that_photos_with_alpha_have():
+    scene, view = scenes.splats(40), scenes.ring_camera(0.0, size=24)
+    seen = np.ones(40, np.float32)
+    white = render_buffers(scene, view, seen, (1.0, 1.0, 1.0), "cpu")
+    none = render_buffers(scene, view, seen, backend="cpu")
+    assert white.background.tolist() == [1.0, 1.0, 1.0]
+    assert none.background is None
+    gap = (1.0 - none.alpha)[..., None]
+    assert np.allclose(white.color, none.color + gap, atol=1e-5), "none is drawn over black"
+
+
 def test_depth_is_relative_so_that_units_do_not_matter():
     color, depth = plane_photo(camera())
     depth = depth + np.linspace(0, 1, 32, dtype=np.float32)[:, None]

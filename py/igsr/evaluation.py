@@ -45,6 +45,11 @@ def default_background(capture: Capture) -> tuple[float, float, float]:
     return WHITE if any(view.image.shape[2] == 4 for view in capture.views) else BLACK
 
 
+def known_background(views: Sequence[View]) -> tuple[float, float, float] | None:
+    """White behind photos with alpha; None where photos have none, and show what there is."""
+    return WHITE if any(view.image.shape[2] == 4 for view in views) else None
+
+
 def default_split(capture: Capture) -> str:
     """ "test" if the capture has test views, else "train"."""
     return "test" if capture.test_views else "train"

@@ -15,7 +15,7 @@ from rich.progress import Progress as ProgressBar
 
 from ..atomic_write import atomic_write
 from ..errors import IgsrError
-from ..evaluation import default_background, default_split, views_of_split
+from ..evaluation import default_background, default_split, known_background, views_of_split
 from ..splats import Splats
 from .shared import (
     BackendChoice,
@@ -279,7 +279,7 @@ def apply_command(
         denoiser = NetworkDenoiser(load_network(weights))
         splats = Splats.load(scene)
         capture = load(capture_path, holdout)
-        background = default_background(capture)
+        background, behind = default_background(capture), known_background(capture.views)
         on = resolved(backend)
         views = views_of_split(capture, split.value if split else default_split(capture))
         photos = capture.train_views
@@ -287,7 +287,7 @@ def apply_command(
         sources = photo_sources(splats, photos, background, on)
         files = []
         for view in views:
-            buffers = render_buffers(splats, view.camera, support, background, on)
+            buffers = render_buffers(splats, view.camera, support, behind, on)
             others = [
                 source
                 for source, photo in zip(sources, photos, strict=True)

@@ -40,6 +40,8 @@ class Buffers:
         footprint: [H, W], log2 of the splats' mean standard deviation in pixels.
         support: [H, W], mean number of photos that see the splats shown.
         camera: the view's.
+        background: [3], the colour that stands behind the scene, in [0, 1]; None where there is
+            none, as behind photos without alpha.
 
     Raises:
         IgsrError: an array has another shape than the colour's picture.
@@ -53,6 +55,7 @@ class Buffers:
     footprint: Float32 | None = None
     support: Float32 | None = None
     camera: Camera | None = None
+    background: Float32 | None = None
 
     def __post_init__(self) -> None:
         """Check that all are of one picture."""
@@ -64,6 +67,8 @@ class Buffers:
             shape = (*size, 3) if name == "normal" else size
             if array is not None and array.shape != shape:
                 raise IgsrError(f"{name} must be {list(shape)} as color, not {list(array.shape)}")
+        if self.background is not None and self.background.shape != (3,):
+            raise IgsrError(f"background must be [3], not {list(self.background.shape)}")
         if self.camera is not None and (self.camera.height, self.camera.width) != size:
             raise IgsrError(
                 f"camera is of a {self.camera.width}x{self.camera.height} picture, color is "
@@ -75,7 +80,7 @@ def render_buffers(
     splats: Splats,
     camera: Camera,
     support: Float32,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] | None = None,
     backend: str = "auto",
 ) -> Buffers:
     """Render a view with everything the denoiser looks at.
@@ -84,7 +89,8 @@ def render_buffers(
         splats: the scene.
         camera: pinhole camera, OpenCV axes, world frame of the capture.
         support: [N], of ``photo_support``.
-        background: RGB in [0, 1] behind the splats.
+        background: RGB in [0, 1] that stands behind the scene, where photos have alpha; None draws
+            over black, which stands for nothing.
         backend: "auto", "cpu", "gpu" or "reference".
 
     Raises:
@@ -105,7 +111,7 @@ def render_buffers(
         )
         return {name: value.astype(np.float32, copy=False) for name, value in image.items()}
 
-    image = drawn(projected["colors"], background)
+    image = drawn(projected["colors"], (0.0, 0.0, 0.0) if background is None else background)
     alpha = image["alpha"]
     weight = np.divide(1.0, alpha, out=np.zeros_like(alpha), where=alpha > EMPTY)
     depth = image["depth"] * weight
@@ -142,6 +148,7 @@ def render_buffers(
         footprint=features[..., 0],
         support=features[..., 2],
         camera=camera,
+        background=None if background is None else np.asarray(background, np.float32),
     )
 
 

@@ -15,15 +15,18 @@ PHOTOS = 2
 #: Channels by where they come from; the colour always comes first.
 COLOR, BUFFERS = 3, 8
 PHOTO = 5
-CHANNELS = COLOR + BUFFERS + PHOTOS * PHOTO
+#: Colours that a pixel may have beside the render's: the photos' and the background's.
+CHOICES = PHOTOS + 1
+CHANNELS = COLOR + BUFFERS + CHOICES * PHOTO
 
 
 def network_inputs(buffers: Buffers, warped: Warped) -> Float32:
     """One render as the network's channels, float32 [``CHANNELS``, H, W], all about 0 to 1 in size.
 
     Colour, clamped to [0, 1]; alpha; depth as its ratio to the picture's median, less one; its
-    relative deviation; the normal; the footprint; the support; and for each photo its colour,
-    whether it is valid, and its angle. What ``buffers`` lacks (None) is zero, as where nothing is
+    relative deviation; the normal; the footprint; the support; for each photo its colour, whether
+    it is valid, and its angle; and likewise the background: a floater before it is mended by
+    taking its colour, whatever that is. What ``buffers`` lacks (None) is zero, as where nothing is
     drawn.
     """
     height, width = buffers.color.shape[:2]
@@ -48,6 +51,10 @@ def network_inputs(buffers: Buffers, warped: Warped) -> Float32:
         out[at : at + 3] = np.moveaxis(warped.color[k], -1, 0) * valid
         out[at + 3] = valid
         out[at + 4] = np.where(valid, 1.0 - warped.angle[k] / np.pi, 0.0)
+    if buffers.background is not None:
+        at = COLOR + BUFFERS + PHOTOS * PHOTO
+        out[at : at + 3] = np.clip(buffers.background, 0.0, 1.0)[:, None, None]
+        out[at + 3] = 1.0
     return out
 
 

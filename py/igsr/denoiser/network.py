@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import IgsrError
-from .inputs import BUFFERS, CHANNELS, COLOR, PHOTO, PHOTOS
+from .inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
 
 #: Pictures are padded to multiples of this: one step of pixel shuffle and two of the U-Net.
 MULTIPLE = 8
@@ -22,14 +22,13 @@ MULTIPLE = 8
 REACH = 96
 #: Errors are predicted as logarithms within these bounds, in units of the colours' range.
 LEAST_LOG_ERROR, MOST_LOG_ERROR = -7.0, 0.0
-
-
 #: What blocks add at the start, as a part of what they compute. NAFNet's begin at 0, as the
 #: identity, and take hundreds of steps to wake.
 FIRST_SCALE = 0.3
+#: Added to the variance that features are divided by.
+NORM_FLOOR = 1e-6
 #: At the start a warped photo counts this much beside the render (as a logit).
 FIRST_LOGIT = -2.0
-
 #: Ways to look at the photos.
 PHOTO_WAYS = ("concatenated", "attention", "none")
 
@@ -60,45 +59,35 @@ class Architecture:
             raise IgsrError(f"photos must be one of {', '.join(PHOTO_WAYS)}, not {self.photos!r}.")
 
 
-class _ChannelNorm(nn.Module):
-    """Layer normalisation over the channels of each pixel."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(channels))
-        self.bias = nn.Parameter(torch.zeros(channels))
-
-    def forward(self, x: Tensor) -> Tensor:
-        mean = x.mean(dim=1, keepdim=True)
-        centred = x - mean
-        variance = centred.square().mean(dim=1, keepdim=True)
-        normal = centred * torch.rsqrt(variance + 1e-6)
-        return normal * self.weight[:, None, None] + self.bias[:, None, None]
-
-
 def _gate(x: Tensor) -> Tensor:
-    first, second = x.chunk(2, dim=1)
+    first, second = x.chunk(2, dim=-1)
     return first * second
 
 
 class _Block(nn.Module):
+    """NAFNet's block. What looks at single pixels is linear over the last dimension: with the
+    channels last in memory that takes a third less time than convolutions of one pixel."""
+
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm1 = _ChannelNorm(channels)
-        self.expand1 = nn.Conv2d(channels, 2 * channels, 1)
+        self.norm1 = nn.LayerNorm(channels, eps=NORM_FLOOR)
+        self.expand1 = nn.Linear(channels, 2 * channels)
         self.depthwise = nn.Conv2d(2 * channels, 2 * channels, 3, padding=1, groups=2 * channels)
-        self.project1 = nn.Conv2d(channels, channels, 1)
-        self.norm2 = _ChannelNorm(channels)
-        self.expand2 = nn.Conv2d(channels, 2 * channels, 1)
-        self.project2 = nn.Conv2d(channels, channels, 1)
+        self.project1 = nn.Linear(channels, channels)
+        self.norm2 = nn.LayerNorm(channels, eps=NORM_FLOOR)
+        self.expand2 = nn.Linear(channels, 2 * channels)
+        self.project2 = nn.Linear(channels, channels)
         self.scale1 = nn.Parameter(torch.full((channels,), FIRST_SCALE))
         self.scale2 = nn.Parameter(torch.full((channels,), FIRST_SCALE))
 
     def forward(self, x: Tensor) -> Tensor:
-        inner = self.project1(_gate(self.depthwise(self.expand1(self.norm1(x)))))
-        x = x + inner * self.scale1[:, None, None]
-        inner = self.project2(_gate(self.expand2(self.norm2(x))))
-        return x + inner * self.scale2[:, None, None]
+        x = x.permute(0, 2, 3, 1)
+        inner = self.expand1(self.norm1(x)).permute(0, 3, 1, 2)
+        inner = _gate(self.depthwise(inner).permute(0, 2, 3, 1))
+        x = x + self.project1(inner) * self.scale1
+        inner = _gate(self.expand2(self.norm2(x)))
+        x = x + self.project2(inner) * self.scale2
+        return x.permute(0, 3, 1, 2)
 
 
 class _PhotoAttention(nn.Module):
@@ -112,9 +101,9 @@ class _PhotoAttention(nn.Module):
 
     def forward(self, render: Tensor, photos: Tensor) -> Tensor:
         batch, _, height, width = photos.shape
-        each = photos.reshape(batch * PHOTOS, -1, height, width)
-        key = self.key(each).reshape(batch, PHOTOS, -1, height, width)
-        value = self.value(each).reshape(batch, PHOTOS, -1, height, width)
+        each = photos.reshape(batch * CHOICES, -1, height, width)
+        key = self.key(each).reshape(batch, CHOICES, -1, height, width)
+        value = self.value(each).reshape(batch, CHOICES, -1, height, width)
         fit = (self.query(render)[:, None] * key).sum(dim=2) / key.shape[2] ** 0.5
         return (fit.softmax(dim=1)[:, :, None] * value).sum(dim=1)
 
@@ -134,7 +123,7 @@ class DenoiserNetwork(nn.Module):
         width, (half, quarter, eighth) = self.architecture.width, self.architecture.blocks
         attention = self.architecture.photos == "attention"
         self.attention = _PhotoAttention(width) if attention else None
-        channels = 4 * (COLOR + BUFFERS) + (width if attention else 4 * PHOTOS * PHOTO)
+        channels = 4 * (COLOR + BUFFERS) + (width if attention else 4 * CHOICES * PHOTO)
         self.head = nn.Conv2d(channels, width, 3, padding=1)
         self.down_half = nn.Sequential(*(_Block(width) for _ in range(half)))
         self.to_quarter = nn.Conv2d(width, 2 * width, 2, stride=2)
@@ -146,7 +135,7 @@ class DenoiserNetwork(nn.Module):
         self.up_quarter = nn.Sequential(*(_Block(2 * width) for _ in range(quarter)))
         self.from_quarter = nn.Conv2d(2 * width, 4 * width, 1)
         self.up_half = nn.Sequential(*(_Block(width) for _ in range(half)))
-        self.tail = nn.Conv2d(width, 4 * (COLOR + 1 + PHOTOS), 3, padding=1)
+        self.tail = nn.Conv2d(width, 4 * (COLOR + 1 + CHOICES), 3, padding=1)
         for parameter in self.tail.parameters():
             nn.init.zeros_(parameter)
 
@@ -194,7 +183,7 @@ def _mixed(inputs: Tensor, logits: Tensor) -> Tensor:
 
     The render's own logit is 0.
     """
-    photos = inputs[:, COLOR + BUFFERS :].unflatten(1, (PHOTOS, PHOTO))
+    photos = inputs[:, COLOR + BUFFERS :].unflatten(1, (CHOICES, PHOTO))
     logits = logits.masked_fill(photos[:, :, COLOR] < 0.5, -torch.inf)
     weights = F.pad(logits, (0, 0, 0, 0, 1, 0)).softmax(dim=1)
     colors = torch.cat([inputs[:, None, :COLOR], photos[:, :, :COLOR]], dim=1)

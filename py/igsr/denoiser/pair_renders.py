@@ -8,7 +8,7 @@ import numpy as np
 
 from ..capture import View
 from ..errors import IgsrError
-from ..evaluation import over_background
+from ..evaluation import BLACK, over_background
 from ..splats import Splats
 from .buffers import photo_support, render_buffers
 from .inputs import PHOTOS, network_inputs
@@ -20,10 +20,12 @@ def rendered_pairs(
     splats: Splats,
     photos: Sequence[View],
     views: Sequence[View],
-    background: Sequence[float],
+    background: Sequence[float] | None,
     backend: str,
 ) -> Pairs:
     """What the network sees of each view, and the true pictures.
+
+    ``background`` is what stands behind photos with alpha; None for photos without.
 
     Raises:
         IgsrError: the views are not all of one size.
@@ -34,7 +36,8 @@ def rendered_pairs(
             f"views to render are of sizes {sorted(sizes)}; pairs need one, resize the photos."
         )
     support = photo_support(splats, [view.camera for view in photos], backend)
-    sources = photo_sources(splats, photos, background, backend)
+    behind = BLACK if background is None else background
+    sources = photo_sources(splats, photos, behind, backend)
     inputs, truth, masks = [], [], []
     for view in views:
         buffers = render_buffers(splats, view.camera, support, background, backend)
@@ -43,6 +46,6 @@ def rendered_pairs(
         assert buffers.alpha is not None
         warped = warp_photos(view.camera, buffers.depth, buffers.alpha, others, PHOTOS)
         inputs.append(packed(network_inputs(buffers, warped)))
-        truth.append(np.moveaxis(over_background(view.image, background), -1, 0))
+        truth.append(np.moveaxis(over_background(view.image, behind), -1, 0))
         masks.append(np.ones(truth[-1].shape[1:], np.bool_) if view.mask is None else view.mask)
     return Pairs(np.stack(inputs), np.stack(truth), np.stack(masks))

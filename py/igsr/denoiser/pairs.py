@@ -125,7 +125,9 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
         given, backend=one.backend, seed=one.seed + one.number, steps=steps, hull=_hull(one, train)
     )
     has_alpha = train[0].image.shape[2] == 4
-    background = WHITE if not has_alpha or random.uniform() < 0.7 else tuple(random.uniform(size=3))
+    background: tuple[float, ...] | None = None
+    if has_alpha:
+        background = WHITE if random.uniform() < 0.7 else tuple(random.uniform(size=3))
     fitted = [train[i] for i in random.permutation(len(train))[:FITTED_RENDERED]]
     pairs = rendered_pairs(splats, train, unseen + fitted, background, one.backend)
     file = f"{name}-{one.recipe}-{one.number}-seed{one.seed}.npz"

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -170,3 +171,15 @@ def lpips_distance(backbone: Backbone) -> Distance:
         return values.reshape(len(first))
 
     return distance
+
+
+def picture_distance(
+    distance: Distance, first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]
+) -> float:
+    """The distance of two pictures, uint8 [H, W, 3]."""
+    one, other = (
+        torch.from_numpy(np.moveaxis(picture, -1, 0)[None].astype(np.float32) / 255.0)
+        for picture in (first, second)
+    )
+    with torch.inference_mode():
+        return float(distance(one, other))

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from .. import _core
 from ..atomic_write import atomic_write
 from ..errors import IgsrError
-from .inputs import BUFFERS, COLOR, PHOTO, PHOTOS
+from .inputs import BUFFERS, CHOICES, COLOR, PHOTO
 from .losses import Loss, Prediction, charbonnier, regret
 from .network import MULTIPLE, Architecture, DenoiserNetwork
 from .pair_files import OFFSET, SCALE, Pairs, read_pairs
@@ -360,7 +360,7 @@ def _crop(pairs: Pairs, side: int, random: np.random.Generator) -> tuple[Tensor,
 
 
 #: Channels that hold colours, three each.
-_COLORS = (0, *(COLOR + BUFFERS + k * PHOTO for k in range(PHOTOS)))
+_COLORS = (0, *(COLOR + BUFFERS + k * PHOTO for k in range(CHOICES)))
 _NORMAL_X, _NORMAL_Y = COLOR + 3, COLOR + 4
 
 

@@ -50,6 +50,11 @@ def load_network(path: str | os.PathLike[str] | None = None) -> DenoiserNetwork:
     Raises:
         IgsrError: the file is missing, no denoiser of igsr's, truncated, or lacks a weight.
     """
+    if path is None and not SHIPPED.is_file():
+        raise IgsrError(
+            "this igsr has no weights of its own for the denoiser; give --weights FILE "
+            "(denoiser= in Python), which igsr denoise train makes (docs/denoiser.md)"
+        )
     path = SHIPPED if path is None else Path(path)
     try:
         with safe_open(path, framework="pt") as file:

@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import os
 import shutil
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from PIL import Image
 
 from ..atomic_write import check_writable
 from ..errors import IgsrError
+from ..worker_processes import worker_processes
 from .cameras import Viewpoint, draw_rig
 from .mitsuba_scene import (
     LoadedScene,
@@ -145,9 +145,7 @@ def synthesize(
         for index in missing:
             keep(index, make_scene(folder, seed, index, settings))
     elif missing:
-        # Mitsuba's threads do not survive a fork.
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(jobs, len(missing)), context) as pool:
+        with worker_processes(min(jobs, len(missing))) as pool:
             pending = {
                 pool.submit(make_scene, folder, seed, index, settings): index for index in missing
             }
