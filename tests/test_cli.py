@@ -59,6 +59,7 @@ def fitted(capture_path, tmp_path_factory):
 def test_fit_writes_scene_report_views_and_checkpoint(fitted):
     out, result = fitted
     assert sorted(path.name for path in out.iterdir()) == [
+        "cameras.json",
         "checkpoint.npz",
         "report.json",
         "scene.ply",

@@ -12,6 +12,8 @@ from PIL import Image
 
 import igsr
 from igsr import presets
+from igsr.pose import registry
+from igsr.pose.estimate import Estimate
 from igsr.rendering import render
 
 BALL = scenes.splats(60)
@@ -40,6 +42,11 @@ def truthful(buffers, photos):
 def lying(buffers, photos):
     """A denoiser that makes all worse and is sure of it."""
     return 1.0 - np.clip(buffers.color, 0.0, 1.0), np.full(buffers.color.shape[:2], 1.0, np.float32)
+
+
+def contented(buffers, photos):
+    """A denoiser that finds all as it should be: nothing is left to learn, or all is black."""
+    return np.clip(buffers.color, 0.0, 1.0), np.full(buffers.color.shape[:2], 1.0, np.float32)
 
 
 def unsure(buffers, photos):
@@ -78,6 +85,7 @@ def test_rounds_that_help_are_accepted_and_make_views_better(helped):
         assert 0 < len(one.chosen) <= one.candidates
     psnr = [refined.first_test["psnr"], *(one.test["psnr"] for one in refined.rounds)]
     assert psnr[0] + 0.1 < psnr[1] < psnr[2]
+    assert all(one.kept > 0.9 for one in refined.rounds)
     done = [now.done for now in seen]
     assert done == sorted(done)
     assert done[-1] <= 1.0
@@ -92,6 +100,8 @@ def test_everything_it_did_is_in_its_folder(helped):
     one = refined.rounds[1].chosen[0]
     assert np.array_equal(np.asarray(Image.open(out / "rounds/2/view-0.after.png")), one.picture)
     assert np.asarray(Image.open(out / "rounds/2/view-0.trust.png")).shape == one.trust.shape
+    cameras = json.loads((out / "cameras.json").read_text())["frames"]
+    assert len(cameras) == len(refined.capture.train_views)
     report = json.loads((out / "report.json").read_text())
     assert report["stopped"] == refined.stopped
     assert report["rounds"][2]["left_out"]["with"] == refined.rounds[1].left_out
@@ -106,9 +116,23 @@ def test_everything_it_did_is_in_its_folder(helped):
     assert "http" not in page, "the page needs nothing from elsewhere"
 
 
-def test_a_round_that_does_not_help_is_rolled_back(capture, helped):
+def test_a_denoiser_that_photos_disprove_adds_nothing(capture, helped):
     refined = refine(capture, "auto", lying)
+    assert not refined.rounds
+    assert "no nearer to photos that were left out (0.00 of what it changes" in refined.stopped
+    assert same(refined.splats, helped[0].first)
+
+
+def test_a_round_that_does_not_help_is_rolled_back(capture, helped):
+    photographed = [view.camera.viewmat for view in capture.views]
+
+    def lying_where_nobody_was(buffers, photos):
+        here = any(np.array_equal(buffers.camera.viewmat, viewmat) for viewmat in photographed)
+        return truthful(buffers, photos) if here else lying(buffers, photos)
+
+    refined = refine(capture, "auto", lying_where_nobody_was)
     assert [one.accepted for one in refined.rounds] == [False]
+    assert refined.rounds[0].kept > 0.9
     assert refined.stopped == "round 1 did not make photos that were left out better"
     assert refined.splats is refined.first
     assert same(refined.splats, helped[0].first)
@@ -121,6 +145,10 @@ def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(capture, helped):
     assert "unseen views can be trusted" in refined.stopped
     assert "judge" not in refined.seconds
     assert same(refined.splats, helped[0].first)
+    content = refine(capture, "auto", contented)
+    assert not content.rounds
+    assert content.stopped.endswith("unseen views can be trusted to add anything")
+    assert "judge" not in content.seconds
     none = refine(capture, 0, truthful)
     assert none.stopped == "0 rounds are done"
     assert same(none.splats, helped[0].first)
@@ -163,6 +191,45 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(capture, tmp_path):
     (tmp_path / "out").write_text("a file")
     with pytest.raises(igsr.IgsrError, match="out"):
         refine(capture, 0, truthful, out=tmp_path / "out")
+
+
+def test_on_a_full_disk_what_is_done_stays_and_it_goes_on_from_there(
+    capture, helped, tmp_path, monkeypatch
+):
+    save = Image.Image.save
+
+    def full(image, file, **options):
+        if options["format"] == "PNG":
+            raise OSError(28, "No space left on device")
+        save(image, file, **options)
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(igsr.IgsrError, match=r"Cannot write .*png: No space left on device"):
+        refine(capture, 2, truthful, out=tmp_path)
+    assert same(igsr.Splats.load(tmp_path / "rounds/0/scene.ply"), helped[0].first)
+    monkeypatch.setattr(Image.Image, "save", save)
+    assert same(refine(capture, 2, truthful, out=tmp_path, resume=True).splats, helped[0].splats)
+
+
+def test_photos_that_cannot_be_placed_are_left_out_with_a_warning(tmp_path, monkeypatch):
+    made = scenes.capture(views=8, size=40)
+    for view in made.views:
+        path = tmp_path / "photos" / f"{view.name[-6:-4]}.png"
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(view.image).save(path)
+
+    def every_other(photos, *, seed=0, progress=None):
+        cameras = [v.camera if k % 2 else None for k, v in enumerate(made.views)]
+        nothing = [None] * len(photos)
+        return Estimate(cameras, None, nothing, nothing, ["4 of 8 photos could not be placed."])
+
+    known = registry.Entry(lambda: every_other, lambda options: True)
+    for name in registry.ESTIMATORS:
+        monkeypatch.setitem(registry.ESTIMATORS, name, known)
+    with pytest.warns(UserWarning, match="4 of 8 photos could not be placed"):
+        refined = igsr.refine(tmp_path / "photos", 1, steps=40, backend="cpu", denoiser=unsure)
+    assert len(refined.capture.train_views) == 4
+    assert "unseen views can be trusted" in refined.stopped
 
 
 def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(capture):
@@ -229,14 +296,27 @@ def test_the_command(capture, tmp_path, igsr_here, monkeypatch):
     save_network(DenoiserNetwork(Architecture(4, (0, 0, 0))), tmp_path / "a.safetensors", {})
     command = ["refine", tmp_path / "ball", "--out", tmp_path / "out", "--steps", "60"]
     command += ["--weights", tmp_path / "a.safetensors", "--backend", "cpu", "--rounds", "1"]
+    stale, own = tmp_path / "out/rounds/7/scene.ply", tmp_path / "out/rounds/8/notes.txt"
+    for path in (stale, own):
+        path.parent.mkdir(parents=True)
+        path.write_text("of before")
     done = igsr_here(*command)
     assert done.returncode == 0, done.stderr
+    assert not stale.parent.exists()
+    assert own.exists()
     assert "rounds accepted; stopped: " in done.stdout
     assert (tmp_path / "out/report.html").is_file()
     again = igsr_here(*command, "--resume", "--json")
     summary = json.loads(again.stdout)
-    assert summary["tried"] in (0, 1)
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert summary["tried"] == len(report["rounds"]) - 1
+    assert summary["stopped"] == report["stopped"] != ""
     assert summary["splats"] == len(igsr.Splats.load(tmp_path / "out/scene.ply"))
+    next((tmp_path / "ball").rglob("*.png")).unlink()
+    lacking = igsr_here(*command[:2], "--out", tmp_path / "other", *command[4:])
+    assert lacking.returncode == 1
+    assert len(lacking.stderr.splitlines()) == 1
+    assert ".png" in lacking.stderr
     bad = igsr_here(*command[:4], "--rounds", "some")
     assert bad.returncode == 1
     assert bad.stderr.startswith("--rounds must be a whole number or auto, not 'some'.")

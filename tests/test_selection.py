@@ -10,7 +10,16 @@ import scenes
 
 from igsr.denoiser import Buffers
 from igsr.denoiser.cleaning import HALF_CONFIDENCE_ERROR
-from igsr.selection import LEAST_TRUST, PHOTO_ERROR, candidate, select, trust_of
+from igsr.selection import (
+    LEAST_TRUST,
+    LEAST_WORTH,
+    PHOTO_ERROR,
+    candidate,
+    select,
+    shrinkage,
+    shrunk,
+    trust_of,
+)
 from igsr.views import UnseenView
 
 VIEW = UnseenView(scenes.ring_camera(0.0, size=8), 12.0, True)
@@ -45,10 +54,28 @@ def test_a_view_is_worth_what_it_changes_where_it_can_be_trusted():
     assert there.mean_trust == pytest.approx(0.5)
 
 
+def test_of_a_change_that_goes_too_far_the_right_part_is_kept():
+    render = np.full((8, 8, 3), 0.4, np.float32)
+    picture = render.copy()
+    picture[:, :4] = 0.8
+    one = candidate(VIEW, Buffers(render), [], cleaning(picture, np.ones((8, 8), np.float32)))
+    truth = one.render.copy()
+    truth[:, :4] += 51  # half of the change
+    found = shrinkage(one, truth)
+    assert found.kept == pytest.approx(0.5, abs=1e-3)
+    half = shrunk(one, found.kept)
+    assert np.abs(half.picture.astype(int) - truth).max() <= 1
+    assert half.worth == pytest.approx(0.5 * one.worth, rel=1e-2)
+    assert (found + shrinkage(one, one.picture)).kept == pytest.approx(0.75, abs=1e-3)
+    assert shrinkage(one, 2 * one.render - one.picture).kept == 0.0, "the wrong way"
+    assert shrinkage(one, one.picture, np.zeros((8, 8), np.bool_)).kept == 0.0, "nothing is known"
+
+
 def test_the_most_worth_first_and_none_that_cannot_be_trusted():
     picture = np.zeros((8, 8, 3), np.float32)
     one = candidate(VIEW, Buffers(picture), [], cleaning(picture, np.ones((8, 8), np.float32)))
     known = [replace(one, worth=worth) for worth in (0.1, 0.3, 0.2)]
     doubtful = replace(one, worth=0.9, trust=np.full((8, 8), 0.9 * LEAST_TRUST, np.float32))
     assert [view.worth for view in select([*known, doubtful], 2)] == [0.3, 0.2]
-    assert select([doubtful], 2) == []
+    right = replace(one, worth=0.9 * LEAST_WORTH)
+    assert select([doubtful, right], 2) == []

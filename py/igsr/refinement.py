@@ -16,17 +16,24 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from .capture import Capture, View
+from .capture import Camera, Capture, View
 from .denoiser import Denoiser, photo_sources, photo_support, render_buffers
 from .errors import IgsrError
-from .evaluation import METRICS, default_background, evaluate, score_views
+from .evaluation import (
+    METRICS,
+    default_background,
+    evaluate,
+    known_background,
+    over_background,
+    score_views,
+)
 from .fitting import Progress, fit
-from .pose import estimate_poses
+from .pose import AUTO, estimate_poses
 from .presets import preset_settings
 from .refinement_report import write_refinement
-from .selection import Candidate, candidate, select
+from .selection import Candidate, Shrinkage, candidate, select, shrinkage, shrunk
 from .splats import Splats
-from .views import unseen_views
+from .views import UnseenView, unseen_views
 
 #: Unseen views rendered in a round, and how many of them are added at most.
 CANDIDATES, CHOSEN = 16, 8
@@ -39,10 +46,16 @@ FOLDS, LEFT_OUT, FOLD_STEPS = 2, 4, 0.2
 #: What an invented pixel counts at most beside a photo's in its first round, and by what this falls
 #: from round to round: later renders know what earlier ones invented.
 VIEW_WEIGHT, VIEW_DECAY = 0.5, 0.5
+#: Of what cleaning changes, photos left out must find this part right for a round to begin.
+LEAST_KEPT = 0.25
 #: Colours nearer to the background than this, of 1, do not tell alpha from colour.
 COLOR_OF_BACKGROUND = 0.05
 #: Most rounds of "auto".
-AUTO, MOST_ROUNDS = "auto", 4
+MOST_ROUNDS = 4
+#: Where to look from: the splats, the known cameras, how many views at most, and what renders.
+Look = Callable[[Splats, Sequence[Camera], int, str], Sequence[UnseenView]]
+#: Which of the cleaned views to add, and how many at most.
+Choose = Callable[[Sequence[Candidate], int], list[Candidate]]
 #: Scores of photos left out that must become better, and their signs.
 DECIDING = {"psnr": 1.0, "ssim": 1.0, "flip": -1.0}
 
@@ -71,12 +84,13 @@ class Round:
     Attributes:
         chosen: the views that were added, the one worth most first.
         candidates: how many there were to choose from.
+        kept: the part of what cleaning changed that was kept, in [0, 1], as photos left out tell.
         before: scores ("psnr", "ssim", "flip") of photos left out, by the fits as the round found
             them.
         without: the same by fits that took as many steps more without the round's views.
-        left_out: the same by fits with them.
+        left_out: the same by fits with them. All three are empty where rounds are not judged.
         accepted: whether with them all are better than without and than before; if not, the
-            round's splats are not kept.
+            round's splats are not kept. Always where rounds are not judged.
         splats: after the round; None where it was not accepted.
         test: mean scores of the capture's test views by those, which decide nothing; None without
             splats or views.
@@ -84,6 +98,7 @@ class Round:
 
     chosen: list[Candidate]
     candidates: int
+    kept: float
     before: dict[str, float]
     without: dict[str, float]
     left_out: dict[str, float]
@@ -153,6 +168,9 @@ def refine(
     denoiser: Denoiser | None = None,
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    look: Look = unseen_views,
+    choose: Choose = select,
+    judge: bool = True,
 ) -> Refined:
     """Fit photos, and make the fit better from views that nobody photographed.
 
@@ -169,12 +187,17 @@ def refine(
             (``igsr.refinement_report``), written after every round, and ``checkpoints/``; None
             writes nothing.
         resume: go on from the checkpoints in ``out``, to the same end.
+        look: where to look from; the paper's experiments have cameras that are given.
+        choose: which of the cleaned views to add.
+        judge: whether photos that are left out decide about a round; without, all are accepted.
 
     Raises:
         IgsrError: an argument cannot be used, or as ``igsr.fit`` and ``igsr.estimate_poses``.
     """
     capture = photos if isinstance(photos, Capture) else estimate_poses(photos, seed=seed)
-    loop = _Loop(capture, rounds, progress, steps, backend, seed, denoiser, out, resume)
+    loop = _Loop(
+        capture, rounds, progress, steps, backend, seed, denoiser, out, resume, look, choose, judge
+    )
     whole = loop.fitted("whole", capture.train_views)
     first, first_test = whole.splats, loop.tested(whole.splats)
     folds: list[_Fold] = []
@@ -194,14 +217,28 @@ def refine(
         if why_none:
             return so_far(why_none)
         candidates = loop.candidates
-        folds = folds or loop.folds(whole)
-        before, without, left_out = loop.judged(number, folds)
-        accepted = _better(left_out, without) and _better(left_out, before)
+        before: dict[str, float] = {}
+        without, left_out, accepted = before, before, True
+        kept = 1.0
+        if judge:
+            folds = folds or loop.folds(whole)
+            measured = [loop.shrinkage(fold) for fold in folds]
+            kept = sum(measured, Shrinkage()).kept
+            if kept < LEAST_KEPT:
+                return so_far(
+                    f"cleaning brings views no nearer to photos that were left out ({kept:.2f} of "
+                    "what it changes is right)"
+                )
+            chosen = [shrunk(one, kept) for one in chosen]
+            before, without, left_out = loop.judged(number, folds, measured)
+            accepted = _better(left_out, without) and _better(left_out, before)
         if accepted:
             loop.refitted(number, whole, chosen)
         splats = whole.splats if accepted else None
         test = loop.tested(splats)
-        done.append(Round(chosen, candidates, before, without, left_out, accepted, splats, test))
+        done.append(
+            Round(chosen, candidates, kept, before, without, left_out, accepted, splats, test)
+        )
         if not accepted:
             return so_far(f"round {number} did not make photos that were left out better")
 
@@ -224,6 +261,9 @@ class _Loop:
         denoiser: Denoiser | None,
         out: str | os.PathLike[str] | None,
         resume: bool,
+        look: Look,
+        choose: Choose,
+        judge: bool,
     ) -> None:
         if rounds != AUTO and (not isinstance(rounds, int) or isinstance(rounds, bool)):
             raise IgsrError(f'rounds must be a whole number or "auto", not {rounds!r}.')
@@ -236,6 +276,7 @@ class _Loop:
             raise IgsrError(f"{capture.path} has no train views to fit.")
         self.capture, self.backend, self.seed, self.denoiser = capture, backend, seed, denoiser
         self.background = default_background(capture)
+        self.behind = known_background(capture.views)
         photos = len(capture.train_views)
         self.steps = int(preset_settings("default", photos, steps=steps)["steps"])
         if self.steps < 1:
@@ -243,11 +284,12 @@ class _Loop:
         self.out = None if out is None else Path(out)
         self.resume = resume
         self.progress = progress
+        self.look, self.choose, self.fewest = look, choose, FEWEST if judge else 1
         self.started = self.noted = time.monotonic()
         self.seconds: dict[str, float] = {}
         # In units of a whole fit; looking takes about as long as a refit.
-        a_round = 2.0 * REFIT_STEPS + 2.0 * FOLDS * FOLD_STEPS
-        self.all = 1.0 + FOLDS * FOLD_STEPS + self.rounds * a_round
+        folds = FOLDS * FOLD_STEPS if judge else 0.0
+        self.all = 1.0 + folds + self.rounds * 2.0 * (REFIT_STEPS + folds)
         self.done, self.round, self.candidates = 0.0, 0, 0
 
     def fitted(self, name: str, photos: list[View], short: bool = False) -> _Chain:
@@ -268,42 +310,60 @@ class _Loop:
     def chosen(self, number: int, whole: _Chain) -> tuple[list[Candidate], str]:
         """The views that a round adds, or why there is none."""
         if number > self.rounds:
-            return [], f"{self.rounds} rounds are done"
-        if len(whole.photos) < FEWEST:
-            return [], f"fewer than {FEWEST} photos leave none to judge a round by"
+            return [], "1 round is done" if self.rounds == 1 else f"{self.rounds} rounds are done"
+        if len(whole.photos) < self.fewest:
+            return [], f"fewer than {self.fewest} photos leave none to judge a round by"
         chosen = self.looked(number, whole)
         if self.candidates == 0:
             return [], "no view near the photos is unseen"
         if not chosen:
-            return [], f"none of {self.candidates} unseen views can be trusted"
+            return [], f"none of {self.candidates} unseen views can be trusted to add anything"
         return chosen, ""
 
     def looked(self, number: int, chain: _Chain) -> list[Candidate]:
         """The unseen views of a chain that are worth most, cleaned."""
         self.round = number
         self._tell("look", 0.0)
+        cameras = [view.camera for view in chain.photos]
+        cameras += [view.camera for view, _ in chain.added]
+        views = self.look(chain.splats, cameras, CANDIDATES, self.backend)
+        found = self._cleaned(chain, views)
+        self.candidates = len(found)
+        return self.choose(found, CHOSEN)
+
+    def _cleaned(self, chain: _Chain, views: Sequence[UnseenView]) -> list[Candidate]:
         photos, splats = chain.photos, chain.splats
-        cameras = [view.camera for view in photos] + [view.camera for view, _ in chain.added]
-        views = unseen_views(splats, cameras, CANDIDATES, self.backend)
         support = photo_support(splats, [view.camera for view in photos], self.backend)
         sources = photo_sources(splats, photos, self.background, self.backend)
         found = []
         for view in views:
-            buffers = render_buffers(splats, view.camera, support, self.background, self.backend)
+            buffers = render_buffers(splats, view.camera, support, self.behind, self.backend)
             found.append(candidate(view, buffers, sources, self.denoiser))
             self._tell("look", 0.0)
-        self.candidates = len(found)
-        return select(found, CHOSEN)
+        return found
 
-    def judged(self, number: int, folds: Sequence[_Fold]) -> list[dict[str, float]]:
+    def shrinkage(self, fold: _Fold) -> Shrinkage:
+        """How much of what cleaning changes in the photos that a fold leaves out is right."""
+        views = [UnseenView(view.camera, 0.0, between=False) for view in fold.left]
+        measured = Shrinkage()
+        for one, view in zip(self._cleaned(fold.chain, views), fold.left, strict=True):
+            photo = over_background(view.image, self.background)
+            measured += shrinkage(one, photo, view.mask)
+        return measured
+
+    def judged(
+        self, number: int, folds: Sequence[_Fold], measured: Sequence[Shrinkage]
+    ) -> list[dict[str, float]]:
         """Mean scores of the photos left out: before, without and with each fold's own round.
 
-        A fold goes on with its views: the next round is judged from there.
+        A fold goes on with its views: the next round is judged from there. What the photos that it
+        leaves out have ``measured`` it does not use: that is for the other folds.
         """
         rows: list[list[dict[str, float]]] = [[], [], []]
-        for fold in folds:
+        for k, fold in enumerate(folds):
             chain = fold.chain
-            chosen = self.looked(number, chain)
+            others = sum((one for i, one in enumerate(measured) if i != k), Shrinkage())
+            chosen = [shrunk(one, others.kept) for one in self.looked(number, chain)]
             steps = self._part(FOLD_STEPS)
             name = f"{chain.name}-round{number}-without"
             plain = self._fit(name, "judge", chain.with_views(number, []), steps, chain.splats)
@@ -336,7 +396,7 @@ class _Loop:
         chain.added += [(view, number) for view in views]
 
     def _view(self, name: str, one: Candidate) -> View:
-        """A cleaned view as the fit takes it; with alpha, as rendered, where the photos have it."""
+        """A cleaned view as the fit takes it; with alpha where the photos have it."""
         image = one.picture
         if self.capture.train_views[0].image.shape[2] == 4:
             image = _with_alpha(image, one.render, one.alpha, self.background)

@@ -121,7 +121,9 @@ def _scores(rows: list[dict[str, Any]]) -> str:
     known = False
     for number, row in enumerate(rows):
         lines: list[tuple[str, dict[str, float] | None]] = []
-        if number:
+        if number and not row["left_out"]["with"]:
+            lines = [(f"{number}, not judged", None)]
+        elif number:
             verdict = "accepted" if row["accepted"] else "rolled back"
             style = "good" if row["accepted"] else "bad"
             lines = [
@@ -216,9 +218,13 @@ def _photos(refined: Refined) -> str:
 
 def _round(number: int, one: Round) -> str:
     verdict = "accepted" if one.accepted else "rolled back"
+    judged = ""
+    if one.left_out:
+        judged = f"By photos that were left out, {100.0 * one.kept:.0f} % of each change is right."
     out = [
         f"<h2>Round {number}: {verdict}</h2><p>{len(one.chosen)} of {one.candidates} unseen views "
-        'were chosen: as rendered, cleaned, and where they are trusted.</p><div class="views">'
+        f"were chosen: as rendered, cleaned, and where they are trusted. {judged}"
+        '</p><div class="views">'
     ]
     for candidate in one.chosen:
         place = "between photos" if candidate.view.between else "beyond the photos"

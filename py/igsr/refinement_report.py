@@ -13,7 +13,7 @@ from PIL import Image
 from . import _core
 from .atomic_write import atomic_write
 from .refinement_page import write_page
-from .report import write_report
+from .report import write_cameras, write_report
 from .splats import Splats
 
 if TYPE_CHECKING:
@@ -24,23 +24,26 @@ if TYPE_CHECKING:
 def write_refinement(out: Path, refined: Refined, backend: str, seed: int) -> None:
     """Write a refinement as it stands.
 
-    ``scene.ply`` is the last accepted model. ``rounds/N/scene.ply`` is each round's, 0 the fit to
-    the photos alone; ``rounds/N/view-K.{before,after,trust}.png`` are the views that it added, the
-    trust white where a pixel counts most.
+    ``scene.ply`` is the last accepted model, ``cameras.json`` has the photos' cameras.
+    ``rounds/N/scene.ply`` is each round's, 0 the fit to the photos alone;
+    ``rounds/N/view-K.{before,after,trust}.png`` are the views that it added, the trust white where
+    a pixel counts most. Such files of an earlier run that this one does not write are removed.
 
     Raises:
         IgsrError: a file cannot be written.
     """
     rows = [{"splats": len(refined.first), "test": refined.first_test}]
-    _save(refined.first, out / "rounds" / "0" / "scene.ply")
+    written = [_save(refined.first, out / "rounds" / "0" / "scene.ply")]
     for number, one in enumerate(refined.rounds, 1):
         folder = out / "rounds" / str(number)
         rows.append(_row(one))
         if one.splats is not None:
-            _save(one.splats, folder / "scene.ply")
+            written.append(_save(one.splats, folder / "scene.ply"))
         for k, candidate in enumerate(one.chosen):
-            _write_view(folder, k, candidate)
+            written += _write_view(folder, k, candidate)
+    _remove_others(out / "rounds", set(written))
     refined.splats.save(out / "scene.ply")
+    write_cameras(out / "cameras.json", refined.capture.train_views)
     report = {
         "rounds": rows,
         "stopped": refined.stopped,
@@ -62,6 +65,7 @@ def _row(one: Round) -> dict[str, Any]:
         "test": one.test,
         "accepted": one.accepted,
         "candidates": one.candidates,
+        "kept": round(one.kept, 4),
         "left_out": {"before": one.before, "without": one.without, "with": one.left_out},
         "views": [
             {
@@ -75,12 +79,13 @@ def _row(one: Round) -> dict[str, Any]:
     }
 
 
-def _save(splats: Splats, path: Path) -> None:
+def _save(splats: Splats, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     splats.save(path)
+    return path
 
 
-def _write_view(folder: Path, k: int, one: Candidate) -> None:
+def _write_view(folder: Path, k: int, one: Candidate) -> list[Path]:
     trust = np.rint(255.0 * np.clip(one.trust, 0.0, 1.0)).astype(np.uint8)
     pictures: dict[str, npt.NDArray[np.uint8]] = {
         "before": one.render,
@@ -88,10 +93,22 @@ def _write_view(folder: Path, k: int, one: Candidate) -> None:
         "trust": trust,
     }
     folder.mkdir(parents=True, exist_ok=True)
-    for name, picture in pictures.items():
-        path = folder / f"view-{k}.{name}.png"
+    paths = [folder / f"view-{k}.{name}.png" for name in pictures]
+    for path, picture in zip(paths, pictures.values(), strict=True):
         with atomic_write(path) as temporary:
             Image.fromarray(picture).save(temporary, format="PNG")
+    return paths
+
+
+def _remove_others(rounds: Path, written: set[Path]) -> None:
+    """Remove the models and views of an earlier run's rounds, and no other file."""
+    for pattern in ("scene.ply", "view-*.before.png", "view-*.after.png", "view-*.trust.png"):
+        for path in rounds.glob(f"[0-9]*/{pattern}"):
+            if path not in written:
+                path.unlink()
+    for folder in rounds.glob("[0-9]*"):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def _peak_memory() -> int | None:

@@ -8,7 +8,7 @@ be trusted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,8 @@ Float32 = npt.NDArray[np.float32]
 PHOTO_ERROR = 0.03
 #: A view whose pixels count less than this on average is not one to learn from.
 LEAST_TRUST = 0.15
+#: Nor is one that is worth less than this: an eighth of a level of 8 bits, trusted everywhere.
+LEAST_WORTH = 0.0005
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +91,57 @@ def trust_of(confidence: Float32) -> Float32:
 
 def select(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
     """The ``count`` views that are worth most, of those that can be trusted; the best first."""
-    trusted = [one for one in candidates if one.mean_trust >= LEAST_TRUST]
-    return sorted(trusted, key=lambda one: one.worth, reverse=True)[:count]
+    some = [one for one in candidates if one.mean_trust >= LEAST_TRUST and one.worth >= LEAST_WORTH]
+    return sorted(some, key=lambda one: one.worth, reverse=True)[:count]
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """How much of what cleaning changes is right, measured where the truth is known.
+
+    Attributes:
+        towards: sum over pixels of the change times what would have been right to change.
+        squared: sum of the squared change.
+    """
+
+    towards: float = 0.0
+    squared: float = 0.0
+
+    def __add__(self, other: Shrinkage) -> Shrinkage:
+        """Of all pixels of both."""
+        return Shrinkage(self.towards + other.towards, self.squared + other.squared)
+
+    @property
+    def kept(self) -> float:
+        """The part of each change that leaves the least squared error, in [0, 1]."""
+        if self.squared <= 0.0:
+            return 0.0
+        return min(1.0, max(0.0, self.towards / self.squared))
+
+
+def shrinkage(
+    one: Candidate, truth: npt.NDArray[np.uint8], mask: npt.NDArray[np.bool_] | None = None
+) -> Shrinkage:
+    """How much of what cleaning changed in a view is right, given its photo.
+
+    Args:
+        one: the view, cleaned.
+        truth: uint8 [H, W, 3].
+        mask: bool [H, W], pixels that count; None is all.
+    """
+    render, change = (p.astype(np.float64) / 255.0 for p in (one.render, one.picture))
+    change -= render
+    right = truth / 255.0 - render
+    if mask is not None:
+        change, right = change[mask], right[mask]
+    return Shrinkage(float((change * right).sum()), float(np.square(change).sum()))
+
+
+def shrunk(one: Candidate, kept: float) -> Candidate:
+    """The view with a part of what cleaning changed, in [0, 1]."""
+    render = one.render.astype(np.float32)
+    picture = np.rint(render + kept * (one.picture - render)).astype(np.uint8)
+    return replace(one, picture=picture, worth=kept * one.worth)
 
 
 def _bytes(colors: Float32) -> npt.NDArray[np.uint8]:

@@ -134,7 +134,7 @@ def fit_command(
         PosesChoice | None,
         typer.Option(
             "--poses",
-            help="joint: the photos' cameras are fitted too and written to cameras.json.",
+            help="joint: the photos' cameras are fitted too.",
         ),
     ] = None,
     focal: Annotated[
@@ -214,10 +214,7 @@ def fit_command(
         scores, sheet = scored(splats, fitted, split, color, name, shown=not as_json)
         scores["protocol"]["holdout"] = holdout
         moved = fitted is not capture
-        if moved:
-            write_cameras(out / "cameras.json", fitted.train_views)
-        else:  # another fit's would not belong to this scene
-            (out / "cameras.json").unlink(missing_ok=True)
+        write_cameras(out / "cameras.json", fitted.train_views)
         if last:
             seconds, started = last[-1].seconds, last[-1].started
         else:
@@ -257,7 +254,7 @@ def fit_command(
     if "refined" in report:
         console.print(f"with refined cameras: {score_line(report['refined'])}")
     console.print(protocol_line(report["protocol"]), style="dim")
-    names = ["scene.ply", "report.json", "views.png", *(["cameras.json"] if moved else [])]
+    names = ["scene.ply", "report.json", "views.png", "cameras.json"]
     console.print("  ".join(str(out / name) for name in names), style="dim")
 
 

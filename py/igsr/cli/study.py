@@ -35,6 +35,19 @@ class StudyChoice(str, enum.Enum):
     pose_noise = "pose-noise"
     poses = "poses"
     denoiser_table = "denoiser-table"
+    table2 = "table2"
+    table3 = "table3"
+    sweep = "sweep"
+    refinement_ablation = "refinement-ablation"
+
+
+#: Studies of the loop, whose runs have rounds.
+LOOPS = (
+    StudyChoice.table2,
+    StudyChoice.table3,
+    StudyChoice.sweep,
+    StudyChoice.refinement_ablation,
+)
 
 
 def study_command(
@@ -44,7 +57,9 @@ def study_command(
             help="blender8: NeRF Synthetic from eight photos. few-photos: real captures from 3, 6 "
             "and 9 photos, or 3, 6 and 12 of the tankard. pose-noise: 20 views of NeRF Synthetic "
             "with noise on their poses, which are kept or fitted. poses: cameras found in photos "
-            "against the true ones. denoiser-table: renders of poor fits before and after."
+            "against the true ones. denoiser-table: renders of poor fits before and after. table2, "
+            "table3, sweep: rounds of igsr refine beside those of the paper. refinement-ablation: "
+            "one round with parts of it taken out."
         ),
     ],
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder that holds the scenes.")],
@@ -57,7 +72,8 @@ def study_command(
             "--scene",
             help="A folder in DATA; repeat it for several. Default: chair and lego; fern, "
             "dtu_scan24 and tankard; for poses the sets of docs/pose_colmap.md; for "
-            "denoiser-table all that have cameras.",
+            "denoiser-table all that have cameras; chair, or tankard for table3, and fern too for "
+            "refinement-ablation.",
         ),
     ] = None,
     views: Annotated[
@@ -65,7 +81,7 @@ def study_command(
         typer.Option(
             "--views",
             help="Repeat it for several. blender8: 75 or 76, the view that codes differ in; "
-            "few-photos: a number of photos. Default: all.",
+            "few-photos and sweep: a number of photos. Default: all.",
         ),
     ] = None,
     presets: Annotated[
@@ -101,13 +117,31 @@ def study_command(
             help="denoiser-table: a further one beside igsr's; repeat it for several.",
         ),
     ] = None,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            help="table2, table3 and refinement-ablation: what goes on from a fit; repeat it for "
+            "several. ours, no-denoiser, no-trust, no-selection, no-outward, improvement, absolute "
+            "or absolute-before.",
+        ),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            "--weights", metavar="FILE", help="Studies of the loop: the denoiser. Default: igsr's."
+        ),
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option("--steps", help="Studies of the loop: of the first fit.")
+    ] = None,
     features: Annotated[
         Path | None,
         typer.Option(
             "--features",
             metavar="FILE",
-            help="denoiser-table: SqueezeNet 1.0's arrays (.npz), to score a perceptual distance "
-            "that is not LPIPS.",
+            help="denoiser-table and studies of the loop: SqueezeNet 1.0's arrays (.npz), to score "
+            "a perceptual distance that is not LPIPS.",
         ),
     ] = None,
     pairs: Annotated[
@@ -120,7 +154,10 @@ def study_command(
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option("--seeds", help="Fits of each kind. [3; poses and denoiser-table: 1]"),
+        typer.Option(
+            "--seeds",
+            help="Fits of each kind. [3; poses, denoiser-table, sweep, refinement-ablation: 1]",
+        ),
     ] = None,
     jobs: JobsOption = 1,
     ray: RayOption = False,
@@ -147,6 +184,18 @@ def study_command(
                     f"{row['photos']} placed in {row['seconds']:.0f} s; {left}"
                 )
                 return
+            if protocol in LOOPS:
+                last = {
+                    name: f"{method['rounds'][-1]['psnr']:.2f}"
+                    for name, method in row["methods"].items()
+                }
+                first = next(iter(row["methods"].values()))["rounds"][0]["psnr"]
+                told = ", ".join(f"{name} {psnr}" for name, psnr in last.items())
+                console.print(
+                    f"{done} of {total}: {row['scene']} {row['layout']} {row['photos']} seed "
+                    f"{row['seed']}: {first:.2f} dB, then {told}; {left}"
+                )
+                return
             if protocol is StudyChoice.denoiser_table:
                 console.print(
                     f"{done} of {total}: {row['scene']} {row['kind']} seed {row['seed']}: "
@@ -169,6 +218,10 @@ def study_command(
             StudyChoice.pose_noise: study.pose_noise,
             StudyChoice.poses: study.poses,
             StudyChoice.denoiser_table: study.denoiser_table,
+            StudyChoice.table2: study.table2,
+            StudyChoice.table3: study.table3,
+            StudyChoice.sweep: study.sweep,
+            StudyChoice.refinement_ablation: study.refinement_ablation,
         }
         run = studies[protocol]
         given: dict[str, Any] = {
@@ -182,13 +235,16 @@ def study_command(
             "denoisers": denoisers and _files_by_name(denoisers),
             "features": features,
             "pairs": pairs,
+            "methods": methods and tuple(methods),
+            "weights": weights,
+            "steps": steps,
             "seeds": seeds,
             "backend": None if backend is BackendChoice.auto else backend,
         }
         given = {name: value for name, value in given.items() if value is not None}
         foreign = [name for name in given if name not in inspect.signature(run).parameters]
         if foreign:
-            singular = ("scenes", "presets", "kinds", "denoisers")
+            singular = ("scenes", "presets", "kinds", "denoisers", "methods")
             option = foreign[0].removesuffix("s") if foreign[0] in singular else foreign[0]
             raise IgsrError(
                 f"--{option.replace('_', '-')} says nothing to {protocol.value}; leave it out."

@@ -77,14 +77,13 @@ def write_sheet(path: Path, rows: Mapping[str, Mapping[str, npt.NDArray[np.uint8
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(rows), len(first), squeeze=False)
     for line, (row, pictures) in zip(axes, rows.items(), strict=True):
-        for axis, (column, picture) in zip(line, pictures.items(), strict=True):
+        line[0].set_ylabel(row, fontsize=8)
+        for axis, picture in zip(line, pictures.values(), strict=True):
             axis.imshow(picture)
             axis.set_xticks([])
             axis.set_yticks([])
-            if line is axes[0]:
-                axis.set_title(column, fontsize=8)
-            if axis is line[0]:
-                axis.set_ylabel(row, fontsize=8)
+    for axis, column in zip(axes[0], first, strict=True):
+        axis.set_title(column, fontsize=8)
     _save(figure, path)
 
 

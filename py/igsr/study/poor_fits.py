@@ -6,7 +6,6 @@ rendered, cleaned and scored, so that a denoiser is judged on what it is for.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -25,10 +24,10 @@ from ..capture.folder import holds_cameras
 from ..denoiser.cleaning import NetworkDenoiser
 from ..denoiser.pair_files import OFFSET, SCALE, Pairs, read_pairs, write_pairs
 from ..denoiser.pair_renders import rendered_pairs
-from ..denoiser.perceptual import SMALLEST_SIDE, SqueezeNetDistance
+from ..denoiser.perceptual import SMALLEST_SIDE, SqueezeNetDistance, picture_distance
 from ..denoiser.weights import SHIPPED, load_network
 from ..errors import IgsrError
-from ..evaluation import default_background
+from ..evaluation import known_background
 from ..fitting import fit_with_cameras
 from ..metrics import PSNR_CAP, score
 from ..presets import preset_settings
@@ -36,7 +35,7 @@ from .artifact_likeness import likeness, plot_likeness
 from .noisy_poses import MATRIX, Noise, noise_unit, noisy_view
 from .poor_fit_pictures import plot_confidence, plot_gains, write_sheet
 from .real_captures import is_dtu
-from .runs import Run, finished_runs
+from .runs import Run, file_hash, finished_runs
 from .views import dtu_views, llff_views
 
 Float64 = npt.NDArray[np.float64]
@@ -160,7 +159,7 @@ def run_fit(out: Path, data: str, one: PoorFit) -> dict[str, Any]:
     splats, _ = fit_with_cameras(
         capture, backend=one.backend, seed=one.seed, hull=hull, progress=progress
     )
-    background = default_background(capture)
+    background = known_background(capture.views)
     pairs = rendered_pairs(splats, capture.train_views, capture.test_views, background, one.backend)
     write_pairs(out / "renders" / f"{one.name}.npz", pairs)
     return {
@@ -199,7 +198,7 @@ def run_cleaning(data: str, one: Cleaning) -> dict[str, Any]:
         scores["best_quarter"] = _best_quarter(before, after, truth, mask)
         if distance is not None and min(mask.shape) >= SMALLEST_SIDE:
             shown = mask[..., None]
-            scores["perceptual"] = _distance(distance, after * shown, truth * shown)
+            scores["perceptual"] = picture_distance(distance, after * shown, truth * shown)
         rows.append(scores)
     out: dict[str, Any] = {"views": rows}
     for name in SCORES:
@@ -236,19 +235,6 @@ def _best_quarter(
     best = was <= np.quantile(was, 0.25)
     error = float(squares(after)[best].mean())
     return PSNR_CAP if error == 0.0 else min(PSNR_CAP, -10.0 * float(np.log10(error)))
-
-
-def _distance(
-    distance: SqueezeNetDistance, first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]
-) -> float:
-    import torch
-
-    one, other = (
-        torch.from_numpy(np.moveaxis(picture, -1, 0)[None].astype(np.float32) / 255.0)
-        for picture in (first, second)
-    )
-    with torch.inference_mode():
-        return float(distance(one, other))
 
 
 def denoiser_table(
@@ -331,10 +317,10 @@ def denoiser_table(
             settings = preset_settings("default", photos) | {"scored": SCORED_VIEWS}
             tasks.append(Run(one.name, one, settings))
     rows = finished_runs(out / "runs", tasks, partial(run_fit, out), str(data), jobs, on_run, ray)
-    perceptual = None if features is None else _hash(Path(features))
+    perceptual = None if features is None else file_hash(Path(features))
     columns: dict[str, Path | None] = {BEFORE: None, **weights}
     for name, file in columns.items():
-        hashed = None if file is None else _hash(file)
+        hashed = None if file is None else file_hash(file)
         cleanings = [
             Run(
                 f"{one.name}-{name}",
@@ -370,10 +356,6 @@ def denoiser_table(
         }
         write_sheet(out / f"{name}.png", _sheet(shown, weights))
     return report
-
-
-def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _sheet(

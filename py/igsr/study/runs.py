@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import multiprocessing
 import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 from .. import _core
 from ..atomic_write import atomic_write
 from ..errors import IgsrError
+from ..worker_processes import THREADS, worker_processes
 
 
 @dataclass(frozen=True)
@@ -25,13 +26,9 @@ class Run:
     settings: dict[str, Any]
 
 
-#: Environment variables that say how many threads to start.
-THREADS = ("RAYON_NUM_THREADS", "OMP_NUM_THREADS")
-
-
-def _share_cores(threads: int) -> None:
-    """In a worker, before anything starts threads."""
-    os.environ.update(dict.fromkeys(THREADS, str(threads)))
+def file_hash(path: Path) -> str:
+    """Of a file that a run's result depends on, for its settings."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def finished_runs(
@@ -86,9 +83,7 @@ def finished_runs(
             keep(run, work(data, run.what))
     elif missing:
         threads = max(1, (os.cpu_count() or 1) // jobs)
-        # Threads do not survive a fork.
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, context, _share_cores, (threads,)) as pool:
+        with worker_processes(jobs, threads) as pool:
             pending = {pool.submit(work, data, run.what): run for run in missing}
             try:
                 for done in as_completed(pending):

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
-from ..capture import Capture
+from ..capture import Camera, Capture
 from ..errors import IgsrError
 
 #: Every how many photos LLFF's protocol holds one out.
@@ -76,3 +77,31 @@ def _split(capture: Capture, train: Sequence[int], test: Sequence[int]) -> Captu
     views = [replace(by_name[i], split="train") for i in train]
     views += [replace(by_name[i], split="test") for i in test]
     return Capture(capture.path, views, capture.points)
+
+
+def localized(cameras: Sequence[Camera], count: int) -> list[int]:
+    """The ``count`` cameras that look most like camera 0 does, that one first."""
+    looks = _looks(cameras)
+    return [int(i) for i in np.argsort(-(looks @ looks[0]), kind="stable")[:count]]
+
+
+def scattered(cameras: Sequence[Camera], count: int) -> list[int]:
+    """``count`` cameras that look as differently as can be: farthest points from camera 0 on."""
+    looks = _looks(cameras)
+    chosen = [0]
+    nearest = looks @ looks[0]
+    while len(chosen) < min(count, len(cameras)):
+        nearest[chosen] = np.inf
+        chosen.append(int(np.argmin(nearest)))
+        nearest = np.maximum(nearest, looks @ looks[chosen[-1]])
+    return chosen
+
+
+def spread_out(total: int, count: int) -> list[int]:
+    """``count`` of ``total`` indices, evenly spaced, both ends among them."""
+    return [int(i) for i in np.linspace(0, total - 1, min(count, total)).round()]
+
+
+def _looks(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
+    """Which way each camera looks, [N, 3], of length 1."""
+    return np.stack([camera.viewmat[2, :3] for camera in cameras]).astype(np.float64)
