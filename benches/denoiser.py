@@ -69,7 +69,7 @@ def main() -> None:
     view = ring_camera(0.1, arguments.size)
 
     drawing, buffers = least(
-        arguments.repeats, lambda: render_buffers(scene, view, support, BACKGROUND, "cpu")
+        arguments.repeats, lambda: render_buffers(scene, view, support, None, "cpu")
     )
     assert buffers.depth is not None
     assert buffers.alpha is not None

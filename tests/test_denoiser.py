@@ -63,12 +63,11 @@ def test_a_new_network_changes_little(photos):
     valid[:] = (valid > 0.5).float()
     image, log_error = DenoiserNetwork(Architecture(4, (1, 1, 1), photos=photos))(inputs)
     expected, weights = inputs[:, :COLOR].clone(), torch.ones(2, 1, 9, 14)
-    if photos != "none":
-        for k in range(CHOICES):
-            at = COLOR + BUFFERS + k * PHOTO
-            weight = np.exp(FIRST_LOGIT) * valid[:, k : k + 1]
-            expected += weight * inputs[:, at : at + COLOR]
-            weights += weight
+    for k in range(CHOICES - 1 if photos == "none" else 0, CHOICES):
+        at = COLOR + BUFFERS + k * PHOTO
+        weight = np.exp(FIRST_LOGIT) * valid[:, k : k + 1]
+        expected += weight * inputs[:, at : at + COLOR]
+        weights += weight
     assert torch.allclose(image, expected / weights, atol=1e-6)
     assert (log_error == -3.0).all()
     image, _ = DenoiserNetwork(Architecture(4, (1, 1, 1), residual=False))(inputs)
@@ -90,7 +89,7 @@ def test_what_the_architecture_leaves_out_does_not_matter():
         made = network(Architecture(4, (1, 1, 1), **flags))
         assert torch.equal(made(inputs)[0], made(other)[0]) is same
     other = inputs.clone()
-    other[:, COLOR + 8 :] = 0.5
+    other[:, COLOR + BUFFERS : CHANNELS - PHOTO] = 0.5
     for photos, same in (("none", True), ("attention", False), ("concatenated", False)):
         made = network(Architecture(4, (1, 1, 1), photos=photos))
         assert torch.equal(made(inputs)[0], made(other)[0]) is same

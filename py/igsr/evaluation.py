@@ -42,7 +42,7 @@ class ScoredView:
 
 def default_background(capture: Capture) -> tuple[float, float, float]:
     """White where photos have alpha, as the NeRF-Synthetic papers score; else black."""
-    return WHITE if any(view.image.shape[2] == 4 for view in capture.views) else BLACK
+    return known_background(capture.views) or BLACK
 
 
 def known_background(views: Sequence[View]) -> tuple[float, float, float] | None:

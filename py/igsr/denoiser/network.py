@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import IgsrError
-from .inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
+from .inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO, PHOTOS
 
 #: Pictures are padded to multiples of this: one step of pixel shuffle and two of the U-Net.
 MULTIPLE = 8
@@ -44,7 +44,7 @@ class Architecture:
             are predicted for each pixel, or take it as the picture.
         buffers: look at the rasterizer's buffers.
         photos: "concatenated", "attention" (per pixel over the photos, in place of a fixed order)
-            or "none".
+            or "none", which leaves the background alone to choose beside the render.
     """
 
     width: int = 32
@@ -65,8 +65,11 @@ def _gate(x: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """NAFNet's block. What looks at single pixels is linear over the last dimension: with the
-    channels last in memory that takes a third less time than convolutions of one pixel."""
+    """NAFNet's block.
+
+    What looks at single pixels is linear over the last dimension: with the channels last in memory
+    that takes a third less time than convolutions of one pixel.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -158,7 +161,9 @@ class DenoiserNetwork(nn.Module):
         if not self.architecture.buffers:
             render = torch.cat([render[:, :COLOR], torch.zeros_like(render[:, COLOR:])], dim=1)
         if self.architecture.photos == "none":
-            photos = torch.zeros_like(photos)
+            behind = photos[:, PHOTOS * PHOTO :]
+            photos = torch.cat([torch.zeros_like(photos[:, : PHOTOS * PHOTO]), behind], dim=1)
+        mixed = torch.cat([render, photos], dim=1)[..., :height, :width]
         render, photos = F.pixel_unshuffle(render, 2), F.pixel_unshuffle(photos, 2)
         if self.attention is not None:
             photos = self.attention(render, photos)
@@ -169,10 +174,8 @@ class DenoiserNetwork(nn.Module):
         half = self.up_half(half + F.pixel_shuffle(self.from_quarter(quarter), 2))
         out = F.pixel_shuffle(self.tail(half), 2)[..., :height, :width]
         image = out[:, :COLOR]
-        if self.architecture.residual and self.architecture.photos == "none":
-            image = image + inputs[:, :COLOR]
-        elif self.architecture.residual:
-            image = image + _mixed(inputs, out[:, COLOR + 1 :] + FIRST_LOGIT)
+        if self.architecture.residual:
+            image = image + _mixed(mixed, out[:, COLOR + 1 :] + FIRST_LOGIT)
         # At the start every picture is taken to be wrong by about a twentieth of the range.
         log_error = (out[:, COLOR : COLOR + 1] - 3.0).clamp(LEAST_LOG_ERROR, MOST_LOG_ERROR)
         return image, log_error
