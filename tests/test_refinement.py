@@ -24,7 +24,7 @@ STEPS = 1600
 @pytest.fixture(scope="module", autouse=True)
 def small_fits():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(presets, "_FEW", replace(presets._FEW, max_splats=400))
+        patch.setattr(presets, "_FEW", replace(presets._FEW, max_splats=1000))
         yield
 
 

@@ -28,6 +28,7 @@ from .evaluation import (
     score_views,
 )
 from .fitting import Progress, fit
+from .halved import halved
 from .pose import AUTO, estimate_poses
 from .presets import preset_settings
 from .refinement_report import write_refinement
@@ -41,8 +42,11 @@ CANDIDATES, CHOSEN = 16, 8
 REFIT_STEPS = 0.25
 #: Fewer photos are not judged: each fold needs two to fit.
 FEWEST = 3
-#: Each of two folds leaves out one photo in so many, and fits with this part of the steps.
+#: Each of two folds leaves out one photo in so many, and redoes rounds with this part of the steps.
 FOLDS, LEFT_OUT, FOLD_STEPS = 2, 4, 0.2
+#: Folds fit photos of half the size, unless their smaller side is then shorter than so many pixels:
+#: whole fits for a quarter of the time. Short ones of whole photos are unlike what is judged.
+FOLD_SIDE = 64
 #: What an invented pixel counts at most beside a photo's in its first round, and by what this falls
 #: from round to round: later renders know what earlier ones invented.
 VIEW_WEIGHT, VIEW_DECAY = 0.5, 0.5
@@ -89,8 +93,8 @@ class Round:
             them.
         without: the same by fits that took as many steps more without the round's views.
         left_out: the same by fits with them. All three are empty where rounds are not judged.
-        accepted: whether with them all are better than without and than before; if not, the
-            round's splats are not kept. Always where rounds are not judged.
+        accepted: whether with them all are better than before, and their mean better than without;
+            if not, the round's splats are not kept. Always where rounds are not judged.
         splats: after the round; None where it was not accepted.
         test: mean scores of the capture's test views by those, which decide nothing; None without
             splats or views.
@@ -231,7 +235,7 @@ def refine(
                 )
             chosen = [shrunk(one, kept) for one in chosen]
             before, without, left_out = loop.judged(number, folds, measured)
-            accepted = _better(left_out, without) and _better(left_out, before)
+            accepted = _all_better(left_out, before) and _error(left_out) < _error(without)
         if accepted:
             loop.refitted(number, whole, chosen)
         splats = whole.splats if accepted else None
@@ -243,8 +247,17 @@ def refine(
             return so_far(f"round {number} did not make photos that were left out better")
 
 
-def _better(scores: dict[str, float], than: dict[str, float]) -> bool:
+def _all_better(scores: dict[str, float], than: dict[str, float]) -> bool:
     return all(sign * (scores[name] - than[name]) > 0.0 for name, sign in DECIDING.items())
+
+
+def _error(scores: dict[str, float]) -> float:
+    """Geometric mean of the root of the squared error, 1 - SSIM and FLIP.
+
+    What views do beyond as many steps without them is small beside what each score varies by.
+    """
+    errors = (10.0 ** (-scores["psnr"] / 20.0), 1.0 - scores["ssim"], scores["flip"])
+    return float(np.cbrt(np.prod(errors)))
 
 
 class _Loop:
@@ -288,22 +301,22 @@ class _Loop:
         self.started = self.noted = time.monotonic()
         self.seconds: dict[str, float] = {}
         # In units of a whole fit; looking takes about as long as a refit.
-        folds = FOLDS * FOLD_STEPS if judge else 0.0
-        self.all = 1.0 + folds + self.rounds * 2.0 * (REFIT_STEPS + folds)
+        views = capture.train_views
+        fold = _share(_folded(views), views) * FOLDS if judge else 0.0
+        self.all = 1.0 + fold + self.rounds * 2.0 * (REFIT_STEPS + fold * FOLD_STEPS)
         self.done, self.round, self.candidates = 0.0, 0, 0
 
-    def fitted(self, name: str, photos: list[View], short: bool = False) -> _Chain:
+    def fitted(self, name: str, photos: list[View]) -> _Chain:
         """Photos fitted from the start."""
-        steps = self._part(FOLD_STEPS) if short else self.steps
-        return _Chain(name, photos, self._fit(name, "fit", photos, steps, None))
+        return _Chain(name, photos, self._fit(name, "fit", photos, self.steps, None))
 
     def folds(self, whole: _Chain) -> list[_Fold]:
         """Fits that each leave photos out, which scores then are of."""
-        photos, out = whole.photos, []
+        photos, out = _folded(whole.photos), []
         for k in range(FOLDS):
             left = photos[k * LEFT_OUT // FOLDS :: LEFT_OUT]
             kept = [photo for photo in photos if not any(photo is one for one in left)]
-            chain = self.fitted(f"fold{k}", kept, short=True)
+            chain = self.fitted(f"fold{k}", kept)
             out.append(_Fold(chain, left, self._scores(chain.splats, left)))
         return out
 
@@ -409,7 +422,7 @@ class _Loop:
     def _fit(
         self, name: str, doing: str, views: list[View], steps: int, start: Splats | None
     ) -> Splats:
-        share = steps / self.steps
+        share = steps / self.steps * _share(views, self.capture.train_views)
 
         def progress(now: Progress) -> bool:
             first = now.steps - steps
@@ -453,6 +466,21 @@ class _Loop:
         seconds = now - self.started
         if self.progress(RefineProgress(self.round, doing, done, seconds)) is False:
             raise IgsrError("the refinement was stopped; go on with resume.")
+
+
+def _folded(photos: Sequence[View]) -> list[View]:
+    """Photos as folds fit them."""
+    sides = [min(photo.camera.width, photo.camera.height) for photo in photos]
+    return [halved(photo) for photo in photos] if min(sides) >= 2 * FOLD_SIDE else list(photos)
+
+
+def _share(views: Sequence[View], of: Sequence[View]) -> float:
+    """Pixels of a view beside one of others: a step takes about this part of the time."""
+
+    def pixels(some: Sequence[View]) -> float:
+        return sum(v.camera.width * v.camera.height for v in some) / len(some)
+
+    return pixels(views) / pixels(of)
 
 
 def _faded(view: View, rounds: int) -> View:
