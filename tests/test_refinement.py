@@ -114,6 +114,21 @@ def test_everything_it_did_is_in_its_folder(helped):
         len(one.chosen) for one in refined.rounds
     )
     assert "http" not in page, "the page needs nothing from elsewhere"
+    # Photo, before and after of three test views; after is nearer to the photo.
+    sheet = np.asarray(Image.open(out / "views.png"), np.float32)
+    views = len(refined.capture.test_views)
+    assert views == 3
+    width, height = 190 + 6, (sheet.shape[0] - 12) // views
+    photo, before, after = (
+        np.stack(
+            [
+                sheet[12 + v * height + 24 : 12 + v * height + 64, 12 + k * width :][:, :40]
+                for v in range(views)
+            ]
+        )
+        for k in range(3)
+    )
+    assert np.abs(photo - after).mean() < np.abs(photo - before).mean()
 
 
 def test_a_denoiser_that_photos_disprove_adds_nothing(capture, helped):
@@ -296,6 +311,7 @@ def test_the_command(capture, tmp_path, igsr_here, monkeypatch):
     save_network(DenoiserNetwork(Architecture(4, (0, 0, 0))), tmp_path / "a.safetensors", {})
     command = ["refine", tmp_path / "ball", "--out", tmp_path / "out", "--steps", "60"]
     command += ["--weights", tmp_path / "a.safetensors", "--backend", "cpu", "--rounds", "1"]
+    command += ["--photos", "5"]
     stale, own = tmp_path / "out/rounds/7/scene.ply", tmp_path / "out/rounds/8/notes.txt"
     for path in (stale, own):
         path.parent.mkdir(parents=True)
@@ -309,9 +325,14 @@ def test_the_command(capture, tmp_path, igsr_here, monkeypatch):
     again = igsr_here(*command, "--resume", "--json")
     summary = json.loads(again.stdout)
     report = json.loads((tmp_path / "out/report.json").read_text())
+    assert len(report["photos"]) == 5
     assert summary["tried"] == len(report["rounds"]) - 1
     assert summary["stopped"] == report["stopped"] != ""
     assert summary["splats"] == len(igsr.Splats.load(tmp_path / "out/scene.ply"))
+    bad = igsr_here(*command[:4], "--photos", "99")
+    assert bad.returncode == 1
+    assert "the train photos of" in bad.stderr
+    assert bad.stderr.startswith("--photos must be from 1 to ")
     next((tmp_path / "ball").rglob("*.png")).unlink()
     lacking = igsr_here(*command[:2], "--out", tmp_path / "other", *command[4:])
     assert lacking.returncode == 1

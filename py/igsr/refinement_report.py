@@ -12,8 +12,9 @@ from PIL import Image
 
 from . import _core
 from .atomic_write import atomic_write
+from .evaluation import default_background, score_views
 from .refinement_page import write_page
-from .report import write_cameras, write_report
+from .report import rounds_sheet, save_sheet, sheet_names, write_cameras, write_report
 from .splats import Splats
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ def write_refinement(out: Path, refined: Refined, backend: str, seed: int) -> No
     ``rounds/N/scene.ply`` is each round's, 0 the fit to the photos alone;
     ``rounds/N/view-K.{before,after,trust}.png`` are the views that it added, the trust white where
     a pixel counts most. Such files of an earlier run that this one does not write are removed.
+    ``views.png`` has test views before the first round and after the last, if there is one.
 
     Raises:
         IgsrError: a file cannot be written.
@@ -56,7 +58,23 @@ def write_refinement(out: Path, refined: Refined, backend: str, seed: int) -> No
         **_core.backend_info(_core.resolve_backend(backend)),
     }
     write_report(out / "report.json", report)
+    _write_views(out / "views.png", refined, backend)
     write_page(out / "report.html", refined, report)
+
+
+def _write_views(path: Path, refined: Refined, backend: str) -> None:
+    """Test views before the first round and after the last that was accepted."""
+    shown = sheet_names([view.name for view in refined.capture.test_views])
+    views = [view for view in refined.capture.test_views if view.name in shown]
+    if not views or not any(one.accepted for one in refined.rounds):
+        path.unlink(missing_ok=True)
+        return
+    background = default_background(refined.capture)
+    before, after = (
+        list(score_views(splats, views, background, backend))
+        for splats in (refined.first, refined.splats)
+    )
+    save_sheet(path, rounds_sheet(before, after))
 
 
 def _row(one: Round) -> dict[str, Any]:

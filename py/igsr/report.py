@@ -93,11 +93,39 @@ def error_picture(scored: ScoredView) -> npt.NDArray[np.uint8]:
 
 def contact_sheet(views: Sequence[ScoredView]) -> Image.Image:
     """Photo, render and error of each view side by side, labelled with its name and PSNR."""
-    if not views:
+    return _sheet(
+        [
+            [
+                (one.photo, one.name),
+                (one.render, f"render  {one.scores['psnr']:.2f} dB"),
+                (error_picture(one), f"error  (white: {ERROR_WHITE:g} and more)"),
+            ]
+            for one in views
+        ]
+    )
+
+
+def rounds_sheet(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> Image.Image:
+    """Photo, render of the first fit and render after the last round, of each view."""
+    return _sheet(
+        [
+            [
+                (one.photo, one.name),
+                (one.render, f"before  {one.scores['psnr']:.2f} dB"),
+                (other.render, f"after  {other.scores['psnr']:.2f} dB"),
+            ]
+            for one, other in zip(before, after, strict=True)
+        ]
+    )
+
+
+def _sheet(rows_of_panels: Sequence[Sequence[tuple[npt.NDArray[np.uint8], str]]]) -> Image.Image:
+    """Pictures of each view side by side, each under its label."""
+    if not rows_of_panels:
         raise ValueError("views: a contact sheet needs at least one")
     # One column of triples grows too tall to look at from about three views on.
-    columns = 1 if len(views) <= 3 else 2
-    blocks = [_block(view) for view in views]
+    columns = 1 if len(rows_of_panels) <= 3 else 2
+    blocks = [_block(panels) for panels in rows_of_panels]
     column_width = max(block.width for block in blocks)
     rows = [blocks[i : i + columns] for i in range(0, len(blocks), columns)]
     row_heights = [max(block.height for block in row) for row in rows]
@@ -111,31 +139,27 @@ def contact_sheet(views: Sequence[ScoredView]) -> Image.Image:
     return sheet
 
 
-def write_contact_sheet(path: Path, views: Sequence[ScoredView]) -> None:
-    """Write the contact sheet as PNG, whole or not at all.
+def save_sheet(path: Path, sheet: Image.Image) -> None:
+    """Write a contact sheet as PNG, whole or not at all.
 
     Raises:
         IgsrError: the file cannot be written.
     """
-    sheet = contact_sheet(views)
     with atomic_write(path) as temporary:
         sheet.save(temporary, format="PNG", optimize=True)
 
 
-def _block(scored: ScoredView) -> Image.Image:
-    """The three pictures of one view with a line of text above each."""
-    height, width = scored.photo.shape[:2]
+def _block(panels: Sequence[tuple[npt.NDArray[np.uint8], str]]) -> Image.Image:
+    """The pictures of one view, of one size, with a line of text above each."""
+    height, width = panels[0][0].shape[:2]
     shrink = min(1.0, PANEL_SIDE / max(height, width))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     font = ImageFont.load_default(size=14)
-    panels = [
-        (scored.photo, scored.name),
-        (scored.render, f"render  {scored.scores['psnr']:.2f} dB"),
-        (error_picture(scored), f"error  (white: {ERROR_WHITE:g} and more)"),
-    ]
     # A thumbnail of 16 pixels still needs room for its label.
     panel_width = max(size[0], 190)
-    block = Image.new("RGB", (3 * panel_width + 2 * GAP, LABEL_HEIGHT + size[1]), PAPER)
+    count = len(panels)
+    full = count * panel_width + (count - 1) * GAP
+    block = Image.new("RGB", (full, LABEL_HEIGHT + size[1]), PAPER)
     draw = ImageDraw.Draw(block)
     for index, (picture, label) in enumerate(panels):
         left = index * (panel_width + GAP)

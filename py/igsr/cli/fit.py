@@ -20,7 +20,7 @@ from ..fitting import Progress, fit_with_cameras
 from ..pose import AUTO
 from ..poses import refine_cameras
 from ..presets import preset_settings
-from ..report import write_cameras, write_contact_sheet, write_report
+from ..report import contact_sheet, save_sheet, write_cameras, write_report
 from ..splats import Splats
 from .pose import (
     CameraFinder,
@@ -234,7 +234,7 @@ def fit_command(
             "protocol": scores["protocol"],
             "views": scores["views"],
         }
-        write_contact_sheet(out / "views.png", sheet)
+        save_sheet(out / "views.png", contact_sheet(sheet))
         write_report(out / "report.json", report)
         if (moved or found) and split == "test":
             # Photos that were not fitted have the cameras they were given, which may be as wrong

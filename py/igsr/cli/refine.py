@@ -37,6 +37,7 @@ from .shared import (
 )
 
 if TYPE_CHECKING:
+    from ..capture import Capture
     from ..refinement import RefineProgress
 
 #: What each part of a round does, for the bar.
@@ -61,6 +62,10 @@ def refine_command(
         str, typer.Option("--rounds", help="At most so many, or auto: until one does not help.")
     ] = AUTO,
     holdout: HoldoutOption = None,
+    most: Annotated[
+        int | None,
+        typer.Option("--photos", help="Use so many of the train photos, evenly spaced."),
+    ] = None,
     steps: Annotated[int | None, typer.Option("--steps", help="Of the first fit.")] = None,
     backend: BackendOption = BackendChoice.auto,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
@@ -85,7 +90,7 @@ def refine_command(
         lambda: f"Interrupted; what is done is in {out}, the same command with --resume goes on."
     ):
         name = resolved(backend)
-        most = _rounds(rounds)
+        most_rounds = _rounds(rounds)
         denoiser = NetworkDenoiser(load_network(weights))
         with warnings_as_sentences():
             capture, _ = capture_to_fit(
@@ -98,8 +103,8 @@ def refine_command(
             )
         with _bar(shown=not as_json) as show, warnings_as_sentences():
             refined = refine(
-                capture,
-                most,
+                capture if most is None else _some_photos(capture, most),
+                most_rounds,
                 show,
                 steps=steps,
                 backend=name,
@@ -132,6 +137,20 @@ def refine_command(
         console.print(f"PSNR of the test views by round: {steps_of} dB")
     names = ("scene.ply", "report.html", "report.json")
     console.print("  ".join(str(out / file) for file in names), style="dim")
+
+
+def _some_photos(capture: Capture, count: int) -> Capture:
+    """The capture with ``count`` of its train views, evenly spaced, and its test views."""
+    from ..capture import Capture
+
+    train = capture.train_views
+    if not 1 <= count <= len(train):
+        raise IgsrError(
+            f"--photos must be from 1 to {len(train)}, the train photos of {capture.path}, "
+            f"not {count}."
+        )
+    ids = [(2 * k + 1) * len(train) // (2 * count) for k in range(count)]
+    return Capture(capture.path, [train[i] for i in ids] + capture.test_views, capture.points)
 
 
 def _rounds(text: str) -> int | str:
