@@ -49,7 +49,7 @@ FOLDS, LEFT_OUT, FOLD_STEPS = 2, 4, 0.2
 FOLD_SIDE = 64
 #: What an invented pixel counts at most beside a photo's in its first round, and by what this falls
 #: from round to round: later renders know what earlier ones invented.
-VIEW_WEIGHT, VIEW_DECAY = 0.5, 0.5
+VIEW_WEIGHT, VIEW_DECAY = 1.0, 0.5
 #: Of what cleaning changes, photos left out must find this part right for a round to begin.
 LEAST_KEPT = 0.25
 #: Colours nearer to the background than this, of 1, do not tell alpha from colour.
