@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -179,3 +180,13 @@ def test_tracks_belong_to_names_and_points(
     arrays = np.array(view), np.array(point), np.array(xy)
     with pytest.raises(IgsrError, match=words):
         Points(np.zeros((3, 3)), grey, tracks=Tracks(["a", "b"], *arrays))
+
+
+def test_a_background_is_a_colour_behind_a_picture_without_alpha() -> None:
+    view = capture(["a.png"]).views[0]
+    assert replace(view, background=(0.0, 0.5, 1.0)).background == (0.0, 0.5, 1.0)
+    for background in ((0.0, 0.5), (0.0, 0.5, 1.5), (0.0, np.nan, 1.0)):
+        with pytest.raises(IgsrError, match=r"a.png: its background must be three numbers in \[0"):
+            replace(view, background=background)
+    with pytest.raises(IgsrError, match=r"a.png: only an image without alpha has a background"):
+        replace(view, image=np.zeros((2, 3, 4), np.uint8), background=(1.0, 1.0, 1.0))

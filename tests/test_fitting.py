@@ -127,6 +127,20 @@ def test_masked_pixels_do_not_reach_the_fit(capture):
     assert inside < 0.2 * np.abs(start.means - spoiled.means).max()
 
 
+def test_pictures_are_compared_over_what_stood_behind_them(capture):
+    def before(color):
+        views = [dataclasses.replace(view, background=color) for view in capture.views]
+        return igsr.Capture(capture.path, views)
+
+    green = (0.2, 0.9, 0.1)
+    expected = small_fit(capture, steps=20, background=green)
+    assert same(small_fit(before(green), steps=20), expected)
+    assert same(small_fit(before(green), steps=20, background=(0.0, 0.0, 1.0)), expected)
+    assert not same(small_fit(capture, steps=20), expected)
+    prints = {fitting.fingerprint(before(color).train_views) for color in (None, green)}
+    assert len(prints) == 2
+
+
 def test_masks_of_any_byte_are_masks(capture):
     def masked(mask):
         views = [dataclasses.replace(view, mask=mask) for view in capture.views]

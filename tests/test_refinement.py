@@ -18,7 +18,7 @@ from igsr.rendering import render
 
 BALL = scenes.splats(60)
 WHITE = (1.0, 1.0, 1.0)
-STEPS = 1600
+STEPS = 800
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -98,7 +98,8 @@ def test_table2_has_a_row_per_method_and_goes_on_where_it_stopped(data):
     rows = report["runs"][0]["methods"]
     assert rows["improvement"]["rounds"][1]["added"] == 2
     text = (data / "out/study.md").read_text()
-    assert "| ball | localized 10 | ours | 1 |" in text
+    assert "| ball | localized 10 | ours | 0 |" in text
+    assert "| ball | localized 10 | improvement | 1 |" in text
     assert "11.259" in text, "the paper's figures stand beside"
     for name in ("study", "ball-localized10", "ball-scattered10"):
         assert (data / f"out/{name}.png").stat().st_size > 5000

@@ -4,6 +4,7 @@ Arrays are C-contiguous. ``Real`` is float32, or float64 for the backend "refere
 ``working_dtype``). N is the number of splats, K of SH coefficients per splat, H x W the picture.
 """
 
+from collections.abc import Sequence
 from typing import Any, TypedDict
 
 import numpy as np
@@ -194,6 +195,7 @@ class Fitter:
         self,
         images: list[npt.NDArray[np.uint8]],
         masks: list[npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None],
+        backgrounds: Sequence[tuple[float, float, float] | None],
         viewmats: Float64,
         intrinsics: Float64,
         state: dict[str, Any],
@@ -204,7 +206,8 @@ class Fitter:
         """A fit to V photos.
 
         ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
-        ``viewmats`` [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4]. ``state`` is
+        ``backgrounds`` RGB that stood behind an image without alpha, or None. ``viewmats`` are
+        [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4]. ``state`` is
         either the parameters to start from (``SplatArrays`` without origin) or what ``state()``
         returned. ``config``: steps, first_step (where in the schedule a fit begins), seed,
         sh_degree, max_splats, density, dropout, hull, background; poses ("fixed", "joint"), focal

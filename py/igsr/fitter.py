@@ -35,6 +35,7 @@ def fitter_of(
     return _core.Fitter(
         [np.ascontiguousarray(view.image) for view in views],
         [_counting(view) for view in views],
+        [view.background for view in views],
         *_arrays(views, origin),
         state,
         settings,

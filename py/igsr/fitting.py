@@ -404,6 +404,7 @@ def fingerprint(views: list[View], tracks: Tracks | None = None) -> str:
     for view in views:
         camera = view.camera
         arrays += [camera.viewmat, camera.K, view.image, view.mask, view.weights]
+        arrays.append(None if view.background is None else np.asarray(view.background))
     if tracks is not None:
         arrays += [tracks.view, tracks.point, tracks.xy]
     return _digest(arrays)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from .capture import Camera, Capture, View
 from .denoiser import Denoiser, photo_sources, photo_support, render_buffers
@@ -52,8 +51,6 @@ FOLD_SIDE = 64
 VIEW_WEIGHT, VIEW_DECAY = 1.0, 0.5
 #: Of what cleaning changes, photos left out must find this part right for a round to begin.
 LEAST_KEPT = 0.25
-#: Colours nearer to the background than this, of 1, do not tell alpha from colour.
-COLOR_OF_BACKGROUND = 0.05
 #: Most rounds of "auto".
 MOST_ROUNDS = 4
 #: Where to look from: the splats, the known cameras, how many views at most, and what renders.
@@ -409,12 +406,9 @@ class _Loop:
         chain.added += [(view, number) for view in views]
 
     def _view(self, name: str, one: Candidate) -> View:
-        """A cleaned view as the fit takes it; with alpha where the photos have it."""
-        image = one.picture
-        if self.capture.train_views[0].image.shape[2] == 4:
-            image = _with_alpha(image, one.render, one.alpha, self.background)
+        """A cleaned view as the fit takes it: over what stands behind photos with alpha."""
         weights = np.float32(VIEW_WEIGHT) * one.trust
-        return View(name, one.view.camera, "train", image, None, weights)
+        return View(name, one.view.camera, "train", one.picture, None, weights, self.behind)
 
     def _part(self, part: float) -> int:
         return max(1, round(part * self.steps))
@@ -486,28 +480,3 @@ def _share(views: Sequence[View], of: Sequence[View]) -> float:
 def _faded(view: View, rounds: int) -> View:
     assert view.weights is not None
     return replace(view, weights=view.weights * np.float32(VIEW_DECAY**rounds))
-
-
-def _with_alpha(
-    picture: npt.NDArray[np.uint8],
-    render: npt.NDArray[np.uint8],
-    alpha: npt.NDArray[np.float32],
-    background: Sequence[float],
-) -> npt.NDArray[np.uint8]:
-    """A cleaned picture over a background as RGBA with straight alpha, [H, W, 4].
-
-    Cleaning gives no alpha. Where it moved a pixel towards the background or away from it, alpha
-    moves along, as if the colour of what is before it had stayed; and alpha is never so small that
-    no colour could give the picture.
-    """
-    behind = np.asarray(background, np.float32)
-    before, after = (p.astype(np.float32) / 255.0 - behind for p in (render, picture))
-    squared = np.square(before).sum(axis=-1)
-    moved = (before * after).sum(axis=-1) / np.maximum(squared, 1e-6)
-    kept = np.where(squared > COLOR_OF_BACKGROUND**2, alpha * moved, alpha)
-    # The colour is behind + after / share, which must lie in [0, 1].
-    room = np.where(after > 0.0, 1.0 - behind, behind)
-    least = (np.abs(after) / np.maximum(room, 1e-6)).max(axis=-1)
-    share = np.clip(np.maximum(kept, least), 0.0, 1.0)[..., None]
-    own = behind + after / np.maximum(share, 1.0 / 255.0)
-    return np.rint(255.0 * np.concatenate([np.clip(own, 0.0, 1.0), share], axis=2)).astype(np.uint8)

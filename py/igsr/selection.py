@@ -36,7 +36,6 @@ class Candidate:
         view: where from.
         render: uint8 [H, W, 3], before.
         picture: uint8 [H, W, 3], after.
-        alpha: float32 [H, W], rendered.
         trust: float32 [H, W] in [0, 1]: how much each pixel counts beside a photo's.
         worth: mean over the pixels of trust times what cleaning changed, in units of the colours'
             range.
@@ -45,7 +44,6 @@ class Candidate:
     view: UnseenView
     render: npt.NDArray[np.uint8]
     picture: npt.NDArray[np.uint8]
-    alpha: Float32
     trust: Float32
     worth: float
 
@@ -73,9 +71,8 @@ def candidate(
     trust = trust_of(confidence)
     seen = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
     change = np.abs(cleaned - seen).mean(axis=-1)
-    alpha = np.ones(trust.shape, np.float32) if buffers.alpha is None else buffers.alpha
     worth = float((trust * change).mean())
-    return Candidate(view, _bytes(seen), _bytes(cleaned), alpha, trust, worth)
+    return Candidate(view, _bytes(seen), _bytes(cleaned), trust, worth)
 
 
 def trust_of(confidence: Float32) -> Float32:

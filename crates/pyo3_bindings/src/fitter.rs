@@ -256,13 +256,18 @@ fn weights_from(name: &str, mask: &Bound<'_, PyAny>, size: [usize; 2]) -> PyResu
     Ok(bytes.iter().map(|&counts| if counts == 0 { 0.0 } else { 1.0 }).collect())
 }
 
-fn targets_from(images: &Bound<'_, PyList>, masks: &Bound<'_, PyList>) -> PyResult<Vec<Target>> {
-    if images.len() != masks.len() {
-        return Err(PyValueError::new_err(format!(
-            "masks: has {} entries for {} images",
-            masks.len(),
-            images.len()
-        )));
+fn targets_from(
+    images: &Bound<'_, PyList>,
+    masks: &Bound<'_, PyList>,
+    backgrounds: &[Option<[f32; 3]>],
+) -> PyResult<Vec<Target>> {
+    for (name, entries) in [("masks", masks.len()), ("backgrounds", backgrounds.len())] {
+        if images.len() != entries {
+            return Err(PyValueError::new_err(format!(
+                "{name}: has {entries} entries for {} images",
+                images.len()
+            )));
+        }
     }
     let mut targets = Vec::with_capacity(images.len());
     for (i, (image, mask)) in images.iter().zip(masks.iter()).enumerate() {
@@ -283,6 +288,7 @@ fn targets_from(images: &Bound<'_, PyList>, masks: &Bound<'_, PyList>) -> PyResu
             channels: channels as u32,
             pixels: pixels.to_vec(),
             weights,
+            background: backgrounds[i],
         };
         target.validate(i).map_err(to_python)?;
         targets.push(target);
@@ -302,11 +308,12 @@ impl Fitter {
 impl Fitter {
     /// A fit of `state` to photos; `holds` say where cameras are known to be, and how surely.
     #[new]
-    #[pyo3(signature = (images, masks, viewmats, intrinsics, state, config, backend, holds=None))]
+    #[pyo3(signature = (images, masks, backgrounds, viewmats, intrinsics, state, config, backend, holds=None))]
     fn new<'py>(
         py: Python<'py>,
         images: &Bound<'py, PyList>,
         masks: &Bound<'py, PyList>,
+        backgrounds: Vec<Option<[f32; 3]>>,
         viewmats: &Bound<'py, PyAny>,
         intrinsics: &Bound<'py, PyAny>,
         state: &Bound<'py, PyDict>,
@@ -315,7 +322,7 @@ impl Fitter {
         holds: Option<&Bound<'py, PyDict>>,
     ) -> PyResult<Self> {
         let config = config_from(config)?;
-        let targets = targets_from(images, masks)?;
+        let targets = targets_from(images, masks, &backgrounds)?;
         let sizes: Vec<(u32, u32)> = targets.iter().map(|t| (t.width, t.height)).collect();
         let cameras = cameras(viewmats, intrinsics, &sizes)?;
         let camera_state = camera_state_from(state, cameras.len())?;

@@ -29,7 +29,14 @@ fn photos() -> (Vec<Target>, Vec<Camera>) {
                 let straight = c.map(|c| byte(c / a.max(1e-6)));
                 [straight[0], straight[1], straight[2], byte(a)]
             });
-            Target { width: 40, height: 30, channels: 4, pixels: pixels.collect(), weights: None }
+            Target {
+                width: 40,
+                height: 30,
+                channels: 4,
+                pixels: pixels.collect(),
+                weights: None,
+                background: None,
+            }
         })
         .collect();
     (targets, cameras)

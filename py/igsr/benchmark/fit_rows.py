@@ -249,6 +249,7 @@ def fitter(shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) 
     return _core.Fitter(
         [shot.photo],
         [mask],
+        [None],
         scene.viewmat[None],
         scene.intrinsics[None],
         _state(scene),

@@ -69,10 +69,13 @@ class View:
             and what undistortion could fill, joined.
         weights: float32 [H, W], how much each pixel counts in fits beside a photo's, finite and
             not negative, or None where all count 1. Only pictures that are not photos have them.
+        background: RGB in [0, 1] that stood behind what ``image`` shows without alpha, where that
+            is known: fits compare it to renders over that. None for photos.
 
     Raises:
         IgsrError: the image, mask or weights have another dtype or shape than the camera's size
-            asks for, or a weight is negative or not finite.
+            asks for, a weight is negative or not finite, or the background is no colour or stands
+            behind an image with alpha.
     """
 
     name: str
@@ -81,6 +84,7 @@ class View:
     image: np.ndarray
     mask: np.ndarray | None = None
     weights: np.ndarray | None = None
+    background: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         """Check the pixels against the camera."""
@@ -92,6 +96,12 @@ class View:
             self._check("weights", self.weights, np.float32, [size])
             if not (np.isfinite(self.weights) & (self.weights >= 0.0)).all():
                 raise IgsrError(f"{self.name}: its weights must be finite and not negative")
+        if self.background is not None:
+            color = np.asarray(self.background, np.float64)
+            if color.shape != (3,) or not ((color >= 0.0) & (color <= 1.0)).all():
+                raise IgsrError(f"{self.name}: its background must be three numbers in [0, 1]")
+            if self.image.shape[2] == 4:
+                raise IgsrError(f"{self.name}: only an image without alpha has a background")
 
     def _check(
         self, what: str, array: object, dtype: type[np.generic], shapes: list[tuple[int, ...]]

@@ -452,7 +452,7 @@ def _write_run_sheet(out: Path, one: Refinement, methods: Sequence[Rounds]) -> N
     for how in methods:
         row = {"truth": truth, "round 0": first}
         shown = first
-        for number in range(1, how.rounds + 1):
+        for number in range(1, max(each.rounds for each in methods) + 1):
             after = _picture(folder / how.name / f"round{number}.png")
             shown = shown if after is None else after
             row[f"round {number}"] = shown

@@ -20,6 +20,9 @@ pub struct Target {
     /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere. The loss is a mean over
     /// the pixels whose weight is not 0: a photo of small weights counts less than others.
     pub weights: Option<Vec<f32>>,
+    /// RGB in 0..=1 that stood behind what an image without alpha shows, where that is known: it is
+    /// compared to renders over it.
+    pub background: Option<[f32; 3]>,
 }
 
 /// What a photo's pixels weigh.
@@ -54,6 +57,9 @@ impl Target {
         }
         if self.pixels.len() != pixels * self.channels as usize {
             return bad("does not hold width x height pixels".into());
+        }
+        if self.background.is_some_and(|color| color.iter().any(|c| !(0.0..=1.0).contains(c))) {
+            return bad("stood before a background that does not lie in 0..=1".into());
         }
         if let Some(weights) = &self.weights {
             if weights.len() != pixels {

@@ -43,6 +43,8 @@ pub struct Fitter {
     /// The cameras, where they are fitted; `cameras` follows them.
     moving: Option<Cameras>,
     has_alpha: Vec<bool>,
+    /// What stood behind each picture, where that is known.
+    behind: Vec<Option<[f32; 3]>>,
     hull: Option<Hull>,
     extent: f32,
     order: Vec<usize>,
@@ -106,6 +108,7 @@ impl Fitter {
             ));
         }
         let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
+        let behind = targets.iter().map(|t| t.background).collect();
         let hull = config.hull.then(|| Hull::new(&targets));
         device.set_targets(targets)?;
         let splats = state.splats.len();
@@ -122,6 +125,7 @@ impl Fitter {
             config,
             cameras,
             has_alpha,
+            behind,
             hull,
             order: Vec::new(),
             splats,
@@ -201,10 +205,10 @@ impl Fitter {
         let step = self.step;
         let view = self.view(step);
         let config = &self.config;
-        let background = match config.background {
-            Background::Color(color) => color,
-            Background::Random if !self.has_alpha[view] => [0.0; 3],
-            Background::Random => {
+        let background = match (self.behind[view], config.background) {
+            (Some(color), _) | (None, Background::Color(color)) => color,
+            (None, Background::Random) if !self.has_alpha[view] => [0.0; 3],
+            (None, Background::Random) => {
                 let mut rng = self.rng(Draw::Background, u64::from(step));
                 std::array::from_fn(|_| rng.random::<f32>())
             }
