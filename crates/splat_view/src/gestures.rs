@@ -32,7 +32,8 @@ pub fn pointer(
     let camera = viewer.camera(size);
     // World units at the pivot for a point of a drag.
     let reach = f64::from(scale) * moved.distance / camera.fy;
-    let touch = ui.input(|i| i.multi_touch());
+    // Fingers that came down on the panel are the panel's.
+    let touch = ui.input(|i| i.multi_touch()).filter(|_| response.is_pointer_button_down_on());
     let delta = ui.input(|i| i.pointer.delta());
     let (dx, dy) = (f64::from(delta.x), f64::from(delta.y));
     if let Some(touch) = touch {
@@ -146,6 +147,15 @@ pub fn keys(viewer: &mut Viewer, ui: &Ui, size: [u32; 2], actions: &mut Vec<Acti
     if pressed(Key::F) {
         actions.push(Action::Frame);
     }
+    let count = viewer.cameras.len();
+    let next = |step: usize| viewer.at_camera.map_or(0, |at| (at + step) % count);
+    if count > 0 && pressed(Key::CloseBracket) {
+        actions.push(Action::Jump(next(1)));
+    }
+    if count > 0 && pressed(Key::OpenBracket) {
+        actions.push(Action::Jump(next(count - 1)));
+    }
+    // After all that changes the view, which may come in the same frame on a slow device.
     // With the modifiers of that very press: Shift may be up again before the frame.
     let with_shift = ui.input(|i| {
         i.events.iter().find_map(|event| match event {
@@ -164,12 +174,174 @@ pub fn keys(viewer: &mut Viewer, ui: &Ui, size: [u32; 2], actions: &mut Vec<Acti
     if pressed(Key::Escape) {
         actions.push(Action::StopRecording);
     }
-    let count = viewer.cameras.len();
-    let next = |step: usize| viewer.at_camera.map_or(0, |at| (at + step) % count);
-    if count > 0 && pressed(Key::CloseBracket) {
-        actions.push(Action::Jump(next(1)));
+}
+
+#[cfg(test)]
+mod tests {
+    use egui::{
+        CentralPanel, Id, Panel, Pos2, RawInput, Rect, Sense, TouchDeviceId, TouchId, TouchPhase,
+    };
+    use egui::{Context, Modifiers, Vec2, pos2};
+
+    use super::*;
+    use crate::display::Settings;
+    use crate::viewpoint::Viewpoint;
+
+    const SIZE: [u32; 2] = [400, 300];
+
+    /// A window of points as large as pixels, without the window.
+    struct Hand {
+        context: Context,
+        viewer: Viewer,
+        time: f64,
     }
-    if count > 0 && pressed(Key::OpenBracket) {
-        actions.push(Action::Jump(next(count - 1)));
+
+    impl Hand {
+        fn new() -> Self {
+            let mut viewer = Viewer::new(Settings::default(), String::new());
+            viewer.viewpoint = Viewpoint::framing(glam::DVec3::ZERO, 1.0, viewer.up, 1.0);
+            let mut hand = Self { context: Context::default(), viewer, time: 0.0 };
+            // egui knows what lies under the pointer from the frame before.
+            hand.frame(Vec::new());
+            hand
+        }
+
+        fn frame(&mut self, events: Vec<Event>) -> Vec<Action> {
+            self.time += 0.02;
+            let mut actions = Vec::new();
+            let input = RawInput {
+                screen_rect: Some(Rect::from_min_size(Pos2::ZERO, Vec2::new(400.0, 300.0))),
+                time: Some(self.time),
+                events,
+                ..RawInput::default()
+            };
+            let viewer = &mut self.viewer;
+            let _ = self.context.run_ui(input, |ui| {
+                Panel::right("panel").exact_size(100.0).show(ui, |ui| {
+                    ui.interact(ui.max_rect(), Id::unique("list"), Sense::click_and_drag());
+                });
+                CentralPanel::no_frame().show(ui, |ui| {
+                    let all = ui.max_rect();
+                    let response = ui.interact(all, Id::unique("splats"), Sense::click_and_drag());
+                    pointer(viewer, ui, &response, SIZE, &mut actions);
+                    keys(viewer, ui, SIZE, &mut actions);
+                });
+            });
+            actions
+        }
+
+        /// Fingers as egui-winit tells of them: the first is a mouse, too. One after the other comes down.
+        fn fingers(&mut self, phase: TouchPhase, places: &[Pos2]) {
+            if phase == TouchPhase::Start && places.len() > 1 {
+                self.fingers(phase, &places[..1]);
+            }
+            let button = |pressed| Event::PointerButton {
+                pos: places[0],
+                button: PointerButton::Primary,
+                pressed,
+                modifiers: Modifiers::NONE,
+            };
+            let mut events = Vec::new();
+            let is_second = phase == TouchPhase::Start && places.len() > 1;
+            for (id, &pos) in places.iter().enumerate().skip(usize::from(is_second)) {
+                let (device_id, id) = (TouchDeviceId(0), TouchId(id as u64));
+                events.push(Event::Touch { device_id, id, phase, pos, force: None });
+            }
+            match phase {
+                TouchPhase::Start if is_second => {}
+                TouchPhase::Start => events.extend([Event::PointerMoved(places[0]), button(true)]),
+                TouchPhase::Move => events.push(Event::PointerMoved(places[0])),
+                _ => events.extend([button(false), Event::PointerGone]),
+            }
+            self.frame(events);
+        }
+    }
+
+    /// Where a point of the world is in the picture.
+    fn seen(viewpoint: &Viewpoint, point: glam::DVec3) -> [f64; 2] {
+        let camera = viewpoint.camera(SIZE, Settings::default().fov);
+        let p = camera.viewmat.transform_point3(point);
+        [camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy]
+    }
+
+    #[test]
+    fn one_finger_turns_and_two_pan_what_lies_at_the_middle_with_them() {
+        let mut hand = Hand::new();
+        let before = hand.viewer.viewpoint;
+        let at = |x: f32, y: f32| pos2(x, y);
+        hand.fingers(TouchPhase::Start, &[at(100.0, 100.0)]);
+        for step in 1..=5 {
+            hand.fingers(TouchPhase::Move, &[at(100.0 + 8.0 * step as f32, 100.0)]);
+        }
+        hand.fingers(TouchPhase::End, &[at(140.0, 100.0)]);
+        let turned = hand.viewer.viewpoint;
+        let angle = before.forward().angle_between(turned.forward());
+        assert!((angle - 40.0 * TURN).abs() < 0.05, "one finger turned by {angle}");
+        assert!(turned.pivot().distance(before.pivot()) < 1e-9, "one finger moved the middle");
+
+        hand.fingers(TouchPhase::Start, &[at(100.0, 100.0), at(200.0, 100.0)]);
+        for step in 1..=5 {
+            let (x, y) = (10.0 * step as f32, 6.0 * step as f32);
+            hand.fingers(TouchPhase::Move, &[at(100.0 + x, 100.0 + y), at(200.0 + x, 100.0 + y)]);
+        }
+        hand.fingers(TouchPhase::End, &[at(150.0, 130.0), at(250.0, 130.0)]);
+        let panned = hand.viewer.viewpoint;
+        let (from, to) = (seen(&turned, turned.pivot()), seen(&panned, turned.pivot()));
+        assert!((to[0] - from[0] - 50.0).abs() < 1.0, "{from:?} {to:?}");
+        assert!((to[1] - from[1] - 30.0).abs() < 1.0, "{from:?} {to:?}");
+        assert!((panned.distance / turned.distance - 1.0).abs() < 1e-6, "a pan is no zoom");
+        assert!(panned.forward().distance(turned.forward()) < 1e-9, "a pan is no turn");
+    }
+
+    #[test]
+    fn fingers_on_the_panel_are_the_panel_s() {
+        let mut hand = Hand::new();
+        let before = hand.viewer.viewpoint;
+        hand.fingers(TouchPhase::Start, &[pos2(350.0, 100.0), pos2(350.0, 140.0)]);
+        for step in 1..=5 {
+            let y = 10.0 * step as f32;
+            hand.fingers(TouchPhase::Move, &[pos2(350.0, 100.0), pos2(350.0, 140.0 + y)]);
+        }
+        hand.fingers(TouchPhase::End, &[pos2(350.0, 100.0), pos2(350.0, 190.0)]);
+        assert_eq!(hand.viewer.viewpoint, before);
+    }
+
+    #[test]
+    fn fingers_that_part_come_nearer_as_much_and_so_do_pinches_and_the_wheel() {
+        let mut hand = Hand::new();
+        let before = hand.viewer.viewpoint;
+        let apart = |half: f32| [pos2(200.0 - half, 150.0), pos2(200.0 + half, 150.0)];
+        hand.fingers(TouchPhase::Start, &apart(40.0));
+        for step in 1..=5 {
+            hand.fingers(TouchPhase::Move, &apart(40.0 + 8.0 * step as f32));
+        }
+        hand.fingers(TouchPhase::End, &apart(80.0));
+        let nearer = hand.viewer.viewpoint;
+        assert!((before.distance / nearer.distance - 2.0).abs() < 0.02, "{}", nearer.distance);
+        assert!(nearer.pivot().distance(before.pivot()) < 1e-9, "the middle moved");
+
+        // A pinch on a touch pad.
+        hand.frame(vec![Event::PointerMoved(pos2(200.0, 150.0))]);
+        hand.frame(vec![Event::Zoom(0.5)]);
+        let farther = hand.viewer.viewpoint;
+        assert!((farther.distance / nearer.distance - 2.0).abs() < 1e-6, "{}", farther.distance);
+        hand.frame(vec![Event::MouseWheel {
+            unit: egui::MouseWheelUnit::Line,
+            source: egui::MouseWheelSource::Wheel,
+            delta: Vec2::new(0.0, 1.0),
+            phase: TouchPhase::Move,
+            modifiers: Modifiers::NONE,
+        }]);
+        for _ in 0..30 {
+            hand.frame(Vec::new());
+        }
+        let notch = farther.distance / hand.viewer.viewpoint.distance;
+        assert!((1.02..1.2).contains(&notch), "a notch of the wheel zooms by {notch}");
+        // In flight the same goes ahead, and the middle with it.
+        hand.viewer.moving = Moving::Fly;
+        let still = hand.viewer.viewpoint;
+        hand.frame(vec![Event::Zoom(1.5)]);
+        let ahead = (hand.viewer.viewpoint.position - still.position).dot(still.forward());
+        assert!(ahead > 0.0 && hand.viewer.viewpoint.distance == still.distance, "{ahead}");
     }
 }
