@@ -93,3 +93,78 @@ pub fn read_photo(path: &Path) -> Result<Photo> {
     };
     Ok(Photo { size, rgba })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+
+    fn file(name: &str, bytes: &[u8]) -> PathBuf {
+        let name = format!("splat-view-photo-{}-{name}", std::process::id());
+        let path = std::env::temp_dir().join(name);
+        std::fs::write(&path, bytes).expect("file");
+        path
+    }
+
+    fn png(color: png::ColorType, depth: png::BitDepth, data: &[u8]) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, 2, 1);
+        encoder.set_color(color);
+        encoder.set_depth(depth);
+        if color == png::ColorType::Indexed {
+            encoder.set_palette(vec![10, 20, 30, 40, 50, 60]);
+        }
+        let mut writer = encoder.write_header().expect("header");
+        writer.write_image_data(data).expect("pixels");
+        writer.finish().expect("end");
+        bytes
+    }
+
+    #[test]
+    fn every_kind_of_png_becomes_rgba() {
+        use png::BitDepth::{Eight, Sixteen};
+        use png::ColorType::{Grayscale, GrayscaleAlpha, Indexed, Rgb, Rgba};
+        let grey = [7, 7, 7, 255, 9, 9, 9, 255];
+        let kinds: [(_, _, &[u8], [u8; 8]); 6] = [
+            (Grayscale, Eight, &[7, 9], grey),
+            (Grayscale, Sixteen, &[7, 7, 9, 9], grey),
+            (GrayscaleAlpha, Eight, &[7, 1, 9, 2], [7, 7, 7, 1, 9, 9, 9, 2]),
+            (Rgb, Eight, &[1, 2, 3, 4, 5, 6], [1, 2, 3, 255, 4, 5, 6, 255]),
+            (Rgba, Eight, &[1, 2, 3, 4, 5, 6, 7, 8], [1, 2, 3, 4, 5, 6, 7, 8]),
+            (Indexed, Eight, &[1, 0], [40, 50, 60, 255, 10, 20, 30, 255]),
+        ];
+        for (color, depth, data, expected) in kinds {
+            let path = file("kind.png", &png(color, depth, data));
+            assert_eq!(photo_size(&path).expect("size"), [2, 1], "{color:?}");
+            let photo = read_photo(&path).expect("photo");
+            assert_eq!((photo.size, &photo.rgba[..]), ([2, 1], &expected[..]), "{color:?}");
+            std::fs::remove_file(path).expect("clean");
+        }
+    }
+
+    #[test]
+    fn a_jpeg_is_read_and_what_is_none_is_refused_by_name() {
+        // 16x8: the left half (200, 40, 30), the right one (20, 60, 180).
+        let bytes = include_bytes!("../tests/photo.jpg");
+        let path = file("a.jpg", bytes);
+        assert_eq!(photo_size(&path).expect("size"), [16, 8]);
+        let photo = read_photo(&path).expect("photo");
+        assert_eq!((photo.size, photo.rgba.len()), ([16, 8], 16 * 8 * 4));
+        for (x, expected) in [(3, [200, 40, 30, 255]), (12, [20, 60, 180, 255])] {
+            let pixel = &photo.rgba[4 * (16 * 4 + x)..][..4];
+            let off = pixel.iter().zip(expected).map(|(a, b): (&u8, u8)| a.abs_diff(b)).max();
+            assert!(off <= Some(6), "{pixel:?} at {x}");
+        }
+        std::fs::remove_file(path).expect("clean");
+        let wide = png(png::ColorType::Grayscale, png::BitDepth::Eight, &[1, 2]);
+        for (name, bytes) in [("empty", &b""[..]), ("text", b"no photo"), ("cut.png", &wide[..30])]
+        {
+            let path = file(name, bytes);
+            let error = read_photo(&path).expect_err(name).to_string();
+            assert!(error.contains(name) && error.contains("no PNG or JPEG"), "{error}");
+            photo_size(&path).expect_err(name);
+            std::fs::remove_file(path).expect("clean");
+        }
+    }
+}
