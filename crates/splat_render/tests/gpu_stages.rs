@@ -2,15 +2,16 @@
 
 mod common;
 
+use std::ops::Range;
 use std::sync::OnceLock;
 
 use common::conformance::{Bounds, OPTIONS, end_to_end, project_stages, rasterize_stages};
 use common::*;
 use rand::Rng;
-use splat_render::gpu::Gpu;
+use splat_render::gpu::{Gpu, ResidentPicture, ResidentSplats};
 use splat_render::reference::Reference;
 use splat_render::stages::{ImageGradients, Projected};
-use splat_render::{ProjectOptions, Stages};
+use splat_render::{Camera, ProjectOptions, Stages};
 
 /// Any adapter will do, lavapipe included; none at all fails the test with the error's sentence.
 fn gpu() -> &'static Gpu {
@@ -141,6 +142,79 @@ fn parts_of_the_work_give_the_same_bits() {
     // 60 tiles and 3 000 splats at 64 per workgroup: the last row of a dispatch is ragged.
     let spilled = run(&Gpu::new(true).unwrap().with_group_limit(7));
     assert!(whole == spilled, "workgroups in a second dimension changed the result");
+}
+
+/// Columns of a resident picture: colour without background, transmittance.
+fn resident_picture(
+    gpu: &Gpu,
+    picture: &mut ResidentPicture,
+    splats: &ResidentSplats,
+    camera: &Camera,
+    columns: Range<u32>,
+) -> splat_render::Result<Vec<[f32; 4]>> {
+    let mut encoder = gpu.device().create_command_encoder(&Default::default());
+    let bytes = 16 * u64::from(columns.end - columns.start) * u64::from(camera.height);
+    let (options, none) = (ProjectOptions::default(), [const { None }; 4]);
+    picture.record(gpu, &mut encoder, splats, camera, &options, 2, columns, none)?;
+    let readable = gpu.readable(bytes);
+    encoder.copy_buffer_to_buffer(picture.picture(), 0, &readable, 0, bytes);
+    gpu.queue().submit([encoder.finish()]);
+    Ok(bytemuck::pod_collect_to_vec(&gpu.read(&[(&readable, bytes)])?[0]))
+}
+
+/// The same by the stages.
+fn picture_by_stages(gpu: &Gpu, scene: &Scene<f32>, camera: &Camera) -> Vec<[f32; 4]> {
+    let projected = gpu.project(&scene.params(), camera, &ProjectOptions::default()).unwrap();
+    let image = gpu.rasterize(&projected, [0.0; 3]).unwrap();
+    let pixels = image.color.iter().zip(&image.transmittance);
+    pixels.map(|(c, t)| [c[0], c[1], c[2], *t]).collect()
+}
+
+#[test]
+fn resident_pictures_are_those_of_the_stages() {
+    let mut rng = rng(13);
+    let scene = random_scene(&mut rng, 3000, Some(2));
+    let cameras = [(150, 90), (64, 48), (131, 77)].map(|(w, h)| random_camera(&mut rng, w, h));
+    let large = random_camera(&mut rng, 151, 90);
+    for gpu in [gpu(), plain()] {
+        let splats = ResidentSplats::new(gpu, &scene.params()).unwrap();
+        let mut picture = ResidentPicture::new(gpu, 150, 90).unwrap();
+        let mut draw = |camera: &Camera, columns: Range<u32>| {
+            resident_picture(gpu, &mut picture, &splats, camera, columns)
+        };
+        for camera in &cameras {
+            let expected = picture_by_stages(gpu, &scene, camera);
+            let drawn = draw(camera, 0..camera.width).unwrap();
+            assert!(drawn == expected, "not the stages' picture");
+            // Tiles lie elsewhere, and centres are rounded otherwise.
+            let part = draw(camera, 21..camera.width - 5).unwrap();
+            let row = |row: &[[f32; 4]]| row[21..camera.width as usize - 5].to_vec();
+            let cut: Vec<_> = expected.chunks(camera.width as usize).flat_map(row).collect();
+            assert_eq!(part.len(), cut.len());
+            let off = part.as_flattened().iter().zip(cut.as_flattened());
+            let off = off.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(off < 5e-4, "columns are off by {off}");
+        }
+        for columns in [0..151, 9..9] {
+            let error = draw(&large, columns).unwrap_err().to_string();
+            assert!(error.starts_with("columns: "), "{error}");
+        }
+    }
+}
+
+#[test]
+fn resident_pictures_whose_pairs_do_not_fit_are_made_in_parts() {
+    let mut rng = rng(14);
+    let mut scene = random_scene(&mut rng, 1300, Some(2));
+    // Each on all 16 tiles: 20 800 pairs, where the least binding limit there is holds 16 384.
+    scene.scales.as_flattened_mut().fill(1.0);
+    scene.opacities.fill(-3.0);
+    let camera = random_camera(&mut rng, 64, 64);
+    let limited = Gpu::new(true).unwrap().with_binding_limit(65_536);
+    let splats = ResidentSplats::new(&limited, &scene.params()).unwrap();
+    let mut picture = ResidentPicture::new(&limited, 64, 64).unwrap();
+    let drawn = resident_picture(&limited, &mut picture, &splats, &camera, 0..64).unwrap();
+    assert!(drawn == picture_by_stages(gpu(), &scene, &camera), "parts changed the picture");
 }
 
 #[test]

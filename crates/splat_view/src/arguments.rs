@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use lexopt::prelude::*;
 use splat_render::{Error, Result};
 
+use crate::display::Drawing;
+
 /// What `--help` prints.
 pub const HELP: &str = "\
 Look at Gaussian splats.
@@ -22,6 +24,10 @@ Without a window:
   --time N             draw N frames as the window does, and print the time of each stage
   --size WxH           of these pictures; default 1280x720, or the camera's own
   --backend NAME       auto: a real GPU if one answers, else cpu; gpu: also a software one; cpu
+
+In the window and for --time:
+  --draw NAME          rasterize: as --screenshot does; blend: by the GPU's blending unit; auto,
+                       the default: rasterize on software adapters, else blend
 
 From where:
   --cameras PATH       transforms.json, cameras.json, a COLMAP model or a folder that holds one;
@@ -61,6 +67,8 @@ pub struct Arguments {
     pub size: Option<[u32; 2]>,
     /// What computes.
     pub backend: Backend,
+    /// What draws in the window.
+    pub drawing: Drawing,
     /// Where the capture's cameras are.
     pub cameras: Option<PathBuf>,
     /// Which of them to look from.
@@ -101,6 +109,7 @@ impl Arguments {
             time: None,
             size: None,
             backend: Backend::Auto,
+            drawing: Drawing::Auto,
             cameras: None,
             camera: None,
             orbit: None,
@@ -135,6 +144,7 @@ impl Arguments {
                 }
                 "size" => out.size = Some(size(&value()?)?),
                 "backend" => out.backend = backend(&value()?)?,
+                "draw" => out.drawing = drawing(&value()?)?,
                 "camera" => {
                     out.camera = Some(number("--camera", &value()?, 0.0, 1e9, true)? as usize);
                 }
@@ -169,6 +179,12 @@ impl Arguments {
         }
         if self.is_headless() && self.scenes.is_empty() {
             return Err(Error::argument("SCENE", "is missing; give a splat file or a folder"));
+        }
+        if self.drawing != Drawing::Auto && self.is_headless() && self.time.is_none() {
+            return Err(Error::argument(
+                "--draw",
+                "is for the window and --time; pictures without a window are always rasterized",
+            ));
         }
         let ending = |path: &PathBuf| path.extension().map(|e| e.to_ascii_lowercase());
         if let Some(path) = &self.screenshot
@@ -230,6 +246,13 @@ fn backend(value: &OsString) -> Result<Backend> {
         Some("cpu") => Ok(Backend::Cpu),
         _ => Err(Error::argument("--backend", format!("must be auto, gpu or cpu, not {value:?}"))),
     }
+}
+
+fn drawing(value: &OsString) -> Result<Drawing> {
+    let found = Drawing::ALL.iter().find(|(_, name)| value.to_str() == Some(name));
+    found.map(|(drawing, _)| *drawing).ok_or_else(|| {
+        Error::argument("--draw", format!("must be auto, rasterize or blend, not {value:?}"))
+    })
 }
 
 fn axis(value: &OsString) -> Result<[f64; 3]> {

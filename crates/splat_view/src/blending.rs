@@ -1,5 +1,5 @@
-//! Splats to a canvas: projected and sorted by splat_render, drawn as quads that the blending unit
-//! lays over each other.
+//! Splats to a canvas by the blending unit: projected and sorted by splat_render, drawn as quads that
+//! are laid over each other.
 
 use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::{Gpu, ResidentSplats, shared_wgsl};
@@ -7,7 +7,7 @@ use splat_render::io::SplatFile;
 use splat_render::{Camera, ProjectOptions, Result};
 
 use crate::display::{Display, Settings};
-use crate::stage_times::Stamps;
+use crate::stage_times::{BLEND, PROJECT, SORT, Stamps};
 use crate::viewpoint::relative_to;
 
 /// Half floats: all that is blended has few bits to lose, and the blending unit has them everywhere.
@@ -33,6 +33,23 @@ pub struct Drawable {
     antialiased: bool,
     style: wgpu::Buffer,
     bindings: wgpu::BindGroup,
+}
+
+impl Drawable {
+    /// Its splats.
+    pub fn splats(&self) -> &ResidentSplats {
+        &self.resident
+    }
+
+    /// The camera relative to its origin, and how its splats are projected.
+    pub fn seen_from(&self, camera: &Camera, settings: &Settings) -> (Camera, ProjectOptions) {
+        let options = ProjectOptions {
+            near: settings.near,
+            antialiased: self.antialiased,
+            ..ProjectOptions::default()
+        };
+        (relative_to(*camera, self.origin), options)
+    }
 }
 
 /// The pipeline.
@@ -170,19 +187,14 @@ impl Blending {
         [begin, end]: [u32; 2],
         stamps: &Stamps<'_>,
     ) -> Result<()> {
-        let camera = relative_to(*camera, model.origin);
-        let options = ProjectOptions {
-            near: settings.near,
-            antialiased: model.antialiased,
-            ..ProjectOptions::default()
-        };
+        let (camera, options) = model.seen_from(camera, settings);
         model.resident.record(
             gpu,
             encoder,
             &camera,
             &options,
             settings.sh_degree,
-            [stamps.compute(0), stamps.compute(1)],
+            [stamps.compute(PROJECT), stamps.compute(SORT)],
         )?;
         let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
         let style = Style {
@@ -206,7 +218,7 @@ impl Blending {
                     store: wgpu::StoreOp::Store,
                 },
             })],
-            timestamp_writes: stamps.render(2),
+            timestamp_writes: stamps.render(BLEND),
             ..Default::default()
         });
         if !model.resident.is_empty() && begin < end {

@@ -28,11 +28,31 @@ impl Display {
     ];
 }
 
+/// What draws splats as they are rendered; the other displays are the blending unit's.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Drawing {
+    /// The rasterizer on software adapters, where it is the faster one, else the blending unit.
+    #[default]
+    Auto,
+    /// splat_render's rasterizer.
+    Rasterizer,
+    /// The blending unit.
+    Blending,
+}
+
+impl Drawing {
+    /// All of them, with what people read.
+    pub const ALL: [(Self, &str); 3] =
+        [(Self::Auto, "auto"), (Self::Rasterizer, "rasterize"), (Self::Blending, "blend")];
+}
+
 /// How a picture is drawn.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
     /// What is shown.
     pub display: Display,
+    /// What draws it.
+    pub drawing: Drawing,
     /// Highest SH degree that is evaluated.
     pub sh_degree: u32,
     /// Vertical field of view, radians.
@@ -49,6 +69,7 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             display: Display::Splats,
+            drawing: Drawing::Auto,
             sh_degree: splat_render::constants::SH_DEGREE_MAX,
             fov: 50f64.to_radians(),
             near: splat_render::constants::NEAR,

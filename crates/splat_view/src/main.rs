@@ -17,6 +17,7 @@ mod painter;
 mod panel;
 mod photo;
 mod picture_files;
+mod rasterizing;
 mod scene_view;
 mod sources;
 mod stage_times;

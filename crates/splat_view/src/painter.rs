@@ -9,8 +9,12 @@ use splat_render::{Camera, Result};
 
 use crate::blending::{Blending, Drawable};
 use crate::composing::{Canvases, Composing, Look};
-use crate::display::{Display, Settings};
-use crate::stage_times::{COMPOSE, PANEL, SECOND, STAGES, StageTimes, Stamps};
+use crate::display::{Display, Drawing, Settings};
+use crate::rasterizing::{Rasterizing, Room};
+use crate::stage_times::{
+    BIN, BLEND, CANVAS, COMPOSE, PANEL, PROJECT, RASTERIZE, SECOND, SORT, STAGES, StageTimes,
+    Stamps, Written,
+};
 
 /// Of pictures that are read back.
 const PICTURE: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
@@ -39,9 +43,12 @@ pub struct Shot<'a> {
 pub struct Painter {
     gpu: Arc<Gpu>,
     blending: Blending,
+    rasterizing: Rasterizing,
     composing: Composing,
     to_picture: Composing,
     canvases: Option<Canvases>,
+    /// What the rasterizer needs for a canvas; both sides' pictures are made in it, one by one.
+    room: Option<Room>,
     /// Of the frames shown.
     pub times: StageTimes,
 }
@@ -51,9 +58,11 @@ impl Painter {
     pub fn new(gpu: Arc<Gpu>, format: wgpu::TextureFormat) -> Result<Self> {
         let painter = Self {
             blending: Blending::new(&gpu),
+            rasterizing: Rasterizing::new(&gpu),
             composing: Composing::new(&gpu, format),
             to_picture: Composing::new(&gpu, PICTURE),
             canvases: None,
+            room: None,
             times: StageTimes::new(&gpu),
             gpu,
         };
@@ -71,19 +80,18 @@ impl Painter {
         self.blending.upload(&self.gpu, file)
     }
 
-    /// Records a frame, and which stages it has.
+    /// Records a frame, and which stages it has. Part of the work may be submitted at once.
     pub fn record(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
         shot: &Shot<'_>,
         target: &wgpu::TextureView,
-    ) -> Result<[bool; STAGES.len()]> {
-        self.fit(shot);
-        let Some(canvases) = &self.canvases else { return Ok([false; STAGES.len()]) };
-        let times = &self.times;
-        let stamps = [times.stamps(0), times.stamps(SECOND)];
-        let mut written = blend(&self.gpu, &self.blending, encoder, canvases, shot, &stamps)?;
-        let compose = times.stamps(COMPOSE).render(0);
+    ) -> Result<Written> {
+        self.fit(shot)?;
+        self.times.begin(&self.gpu);
+        let mut written = self.draw(encoder, shot, true)?;
+        let Some(canvases) = &self.canvases else { return Ok(written) };
+        let compose = self.times.stamps(COMPOSE).render(0);
         written[COMPOSE] = compose.is_some();
         self.composing.record(&self.gpu, encoder, canvases, &look(shot), target, compose);
         Ok(written)
@@ -96,9 +104,8 @@ impl Painter {
 
     /// The frame as RGBA bytes.
     pub fn picture(&mut self, shot: &Shot<'_>) -> Result<Vec<u8>> {
-        self.fit(shot);
-        let Some(canvases) = &self.canvases else { return Ok(Vec::new()) };
-        let [width, height] = canvases.size;
+        self.fit(shot)?;
+        let [width, height] = [shot.camera.width, shot.camera.height];
         let texture = self.gpu.device().create_texture(&wgpu::TextureDescriptor {
             label: Some("picture"),
             size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
@@ -110,8 +117,8 @@ impl Painter {
             view_formats: &[],
         });
         let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
-        let none = [Stamps::none(); 2];
-        blend(&self.gpu, &self.blending, &mut encoder, canvases, shot, &none)?;
+        self.draw(&mut encoder, shot, false)?;
+        let Some(canvases) = &self.canvases else { return Ok(Vec::new()) };
         let target = texture.create_view(&Default::default());
         self.to_picture.record(&self.gpu, &mut encoder, canvases, &look(shot), &target, None);
         let row = (4 * width).next_multiple_of(ROW);
@@ -128,11 +135,10 @@ impl Painter {
     pub fn depth_at(&mut self, shot: &Shot<'_>, pixel: [u32; 2]) -> Result<Option<f64>> {
         let settings = Settings { display: Display::Depth, ..*shot.settings };
         let shot = Shot { settings: &settings, ..*shot };
-        self.fit(&shot);
-        let Some(canvases) = &self.canvases else { return Ok(None) };
+        self.fit(&shot)?;
         let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
-        let none = [Stamps::none(); 2];
-        blend(&self.gpu, &self.blending, &mut encoder, canvases, &shot, &none)?;
+        self.draw(&mut encoder, &shot, false)?;
+        let Some(canvases) = &self.canvases else { return Ok(None) };
         let is_right = shot.right.is_some() && pixel[0] >= column(&shot);
         let readable = self.gpu.readable(8);
         let texture = &canvases.textures[usize::from(is_right)];
@@ -145,8 +151,8 @@ impl Painter {
         Ok((alpha > 0.5).then(|| depth / alpha * f64::from(unit(&shot))))
     }
 
-    /// Makes the canvases those that the frame needs.
-    fn fit(&mut self, shot: &Shot<'_>) {
+    /// Makes canvases and the rasterizer's room those that the frame needs.
+    fn fit(&mut self, shot: &Shot<'_>) -> Result<()> {
         let size = [shot.camera.width, shot.camera.height];
         let two = shot.right.is_some();
         let fits = self.canvases.as_ref().is_some_and(|canvases| {
@@ -155,6 +161,85 @@ impl Painter {
         if !fits {
             self.canvases = Some(self.composing.canvases(&self.gpu, size, two));
         }
+        if self.rasterizes(shot.settings) && self.room.as_ref().is_none_or(|r| r.size != size) {
+            // The old one's memory first.
+            self.room = None;
+            match self.rasterizing.room(&self.gpu, size) {
+                Ok(room) => self.room = Some(room),
+                Err(error) if shot.settings.drawing == Drawing::Rasterizer => return Err(error),
+                // Then the blending unit draws, which needs no such room.
+                Err(_) => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether the rasterizer is to draw.
+    fn rasterizes(&self, settings: &Settings) -> bool {
+        settings.display == Display::Splats
+            && match settings.drawing {
+                Drawing::Auto => self.gpu.is_software(),
+                Drawing::Rasterizer => true,
+                Drawing::Blending => false,
+            }
+    }
+
+    /// Records the models' pictures onto their canvases, and says which stages have timestamps.
+    fn draw(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        shot: &Shot<'_>,
+        is_timed: bool,
+    ) -> Result<Written> {
+        let mut written = [false; STAGES.len()];
+        let rasterizes = self.rasterizes(shot.settings);
+        let Some(canvases) = &self.canvases else { return Ok(written) };
+        let middle = if shot.right.is_some() { column(shot) } else { canvases.size[0] };
+        let sides = [(shot.left, [0, middle]), (shot.right, [middle, canvases.size[0]])];
+        for (side, (model, columns)) in sides.into_iter().enumerate() {
+            let canvas = &canvases.views[side];
+            let Some(model) = model.filter(|_| columns[0] < columns[1]) else {
+                if side == 0 {
+                    clear(encoder, canvas);
+                }
+                continue;
+            };
+            let first = side * SECOND;
+            let stamps = if is_timed { self.times.stamps(first) } else { Stamps::none() };
+            let mut stages = &[PROJECT, SORT, BIN, RASTERIZE, CANVAS][..];
+            let rasterized = match self.room.as_mut().filter(|_| rasterizes) {
+                None => false,
+                Some(room) => {
+                    let (camera, settings) = (&shot.camera, shot.settings);
+                    let drawn = self
+                        .rasterizing
+                        .draw(&self.gpu, model, room, camera, settings, canvas, columns, &stamps);
+                    match drawn {
+                        Err(error) if settings.drawing == Drawing::Rasterizer => return Err(error),
+                        // Too many splats in one place: the blending unit draws them all the same.
+                        drawn => drawn.is_ok(),
+                    }
+                }
+            };
+            if !rasterized {
+                stages = &[PROJECT, SORT, BLEND];
+                self.blending.record(
+                    &self.gpu,
+                    encoder,
+                    model,
+                    &shot.camera,
+                    shot.settings,
+                    unit(shot),
+                    canvas,
+                    columns,
+                    &stamps,
+                )?;
+            }
+            for stage in stages {
+                written[first + stage] = stamps.are_written();
+            }
+        }
+        Ok(written)
     }
 }
 
@@ -177,39 +262,6 @@ fn look(shot: &Shot<'_>) -> Look {
         depth_range: shot.depths.map(|depth| depth / unit),
         padding: 0.0,
     }
-}
-
-fn blend(
-    gpu: &Gpu,
-    blending: &Blending,
-    encoder: &mut wgpu::CommandEncoder,
-    canvases: &Canvases,
-    shot: &Shot<'_>,
-    stamps: &[Stamps<'_>; 2],
-) -> Result<[bool; STAGES.len()]> {
-    let mut written = [false; STAGES.len()];
-    let middle = if shot.right.is_some() { column(shot) } else { canvases.size[0] };
-    let sides = [(shot.left, [0, middle]), (shot.right, [middle, canvases.size[0]])];
-    for (side, (model, columns)) in sides.into_iter().enumerate() {
-        let view = &canvases.views[side];
-        if let Some(model) = model {
-            blending.record(
-                gpu,
-                encoder,
-                model,
-                &shot.camera,
-                shot.settings,
-                unit(shot),
-                view,
-                columns,
-                &stamps[side],
-            )?;
-            written[side * SECOND..][..SECOND].fill(stamps[side].are_written());
-        } else if side == 0 {
-            clear(encoder, view);
-        }
-    }
-    Ok(written)
 }
 
 fn clear(encoder: &mut wgpu::CommandEncoder, view: &wgpu::TextureView) {

@@ -3,7 +3,7 @@
 use egui::{ComboBox, ScrollArea, Slider, Ui};
 use glam::DVec3;
 
-use crate::display::Display;
+use crate::display::{Display, Drawing};
 use crate::stage_times::{SECOND, STAGES};
 use crate::viewer::{Action, Moving, Viewer};
 
@@ -93,6 +93,14 @@ fn display(viewer: &mut Viewer, ui: &mut Ui) {
             ui.selectable_value(&mut viewer.settings.display, display, name);
         }
     });
+    if viewer.settings.display == Display::Splats {
+        ui.horizontal(|ui| {
+            ui.label("drawn by");
+            for (drawing, name) in Drawing::ALL {
+                ui.selectable_value(&mut viewer.settings.drawing, drawing, name);
+            }
+        });
+    }
     if viewer.settings.display == Display::Points {
         ui.add(Slider::new(&mut viewer.settings.radius, 0.5..=8.0).text("radius, px"));
     }

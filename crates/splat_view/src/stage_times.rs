@@ -5,20 +5,56 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use splat_render::gpu::Gpu;
 
-/// The stages of a frame: the first three for each of two models.
-pub const STAGES: [&str; 8] =
-    ["project", "sort", "draw", "project", "sort", "draw", "compose", "panel"];
+/// The stages of a frame: the first six for each of two models. A model is drawn by blending, or
+/// by bin, rasterize and canvas.
+pub const STAGES: [&str; 14] = [
+    "project",
+    "sort",
+    "blend",
+    "bin",
+    "rasterize",
+    "canvas",
+    "project",
+    "sort",
+    "blend",
+    "bin",
+    "rasterize",
+    "canvas",
+    "compose",
+    "panel",
+];
+/// Splats to 2D splats.
+pub const PROJECT: usize = 0;
+/// By depth.
+pub const SORT: usize = 1;
+/// 2D splats to a canvas, by the blending unit.
+pub const BLEND: usize = 2;
+/// Lists of splats for each tile.
+pub const BIN: usize = 3;
+/// 2D splats to the rasterizer's picture.
+pub const RASTERIZE: usize = 4;
+/// That picture to a canvas.
+pub const CANVAS: usize = 5;
 /// Where the second model's begin.
-pub const SECOND: usize = 3;
+pub const SECOND: usize = 6;
 /// The two canvases to one picture.
-pub const COMPOSE: usize = 6;
+pub const COMPOSE: usize = 12;
 /// What egui paints.
-pub const PANEL: usize = 7;
+pub const PANEL: usize = 13;
 
-const COUNT: u32 = 2 * STAGES.len() as u32;
-const BYTES: u64 = COUNT as u64 * 8;
+/// Which stages a frame has.
+pub type Written = [bool; STAGES.len()];
+
+/// The query for where a frame begins.
+const BEGIN: usize = STAGES.len();
+const COUNT: usize = STAGES.len() + 1;
+/// What a query's place in a buffer is a multiple of, for resolving it there.
+const ALIGNMENT: u64 = wgpu::QUERY_RESOLVE_BUFFER_ALIGNMENT;
 
 /// Timestamps of a frame. A device without them has no times.
+///
+/// Each stage writes one when it ends, and has taken what has passed since the last one before. Those
+/// at the beginning of passes say less: on llvmpipe they are written after the pass's first dispatch.
 #[derive(Debug)]
 pub struct StageTimes {
     queries: Option<Queries>,
@@ -33,7 +69,7 @@ struct Queries {
     /// Milliseconds of one tick.
     tick: f64,
     /// Stages of the frame whose times are under way.
-    written: [bool; STAGES.len()],
+    written: Written,
     is_pending: bool,
     is_mapped: Arc<AtomicBool>,
 }
@@ -56,28 +92,25 @@ impl<'a> Stamps<'a> {
         self.set.is_some()
     }
 
-    fn indices(&self, stage: usize) -> [Option<u32>; 2] {
-        let begin = 2 * (self.first + stage) as u32;
-        [Some(begin), Some(begin + 1)]
+    fn index(&self, stage: usize) -> Option<u32> {
+        Some((self.first + stage) as u32)
     }
 
     /// For a compute pass.
     pub fn compute(&self, stage: usize) -> Option<wgpu::ComputePassTimestampWrites<'a>> {
-        let [begin, end] = self.indices(stage);
         self.set.map(|query_set| wgpu::ComputePassTimestampWrites {
             query_set,
-            beginning_of_pass_write_index: begin,
-            end_of_pass_write_index: end,
+            beginning_of_pass_write_index: None,
+            end_of_pass_write_index: self.index(stage),
         })
     }
 
     /// For a render pass.
     pub fn render(&self, stage: usize) -> Option<wgpu::RenderPassTimestampWrites<'a>> {
-        let [begin, end] = self.indices(stage);
         self.set.map(|query_set| wgpu::RenderPassTimestampWrites {
             query_set,
-            beginning_of_pass_write_index: begin,
-            end_of_pass_write_index: end,
+            beginning_of_pass_write_index: None,
+            end_of_pass_write_index: self.index(stage),
         })
     }
 }
@@ -91,15 +124,15 @@ impl StageTimes {
                 set: device.create_query_set(&wgpu::QuerySetDescriptor {
                     label: Some("stage times"),
                     ty: wgpu::QueryType::Timestamp,
-                    count: COUNT,
+                    count: COUNT as u32,
                 }),
                 resolved: device.create_buffer(&wgpu::BufferDescriptor {
                     label: Some("stage times"),
-                    size: BYTES,
+                    size: COUNT as u64 * ALIGNMENT,
                     usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
                     mapped_at_creation: false,
                 }),
-                readable: gpu.readable(BYTES),
+                readable: gpu.readable(COUNT as u64 * ALIGNMENT),
                 tick: f64::from(gpu.queue().get_timestamp_period()) * 1e-6,
                 written: [false; STAGES.len()],
                 is_pending: false,
@@ -115,17 +148,27 @@ impl StageTimes {
         Stamps { set, first }
     }
 
+    /// Submits where a frame begins, ahead of all its work.
+    pub fn begin(&self, gpu: &Gpu) {
+        let Some(timestamp_writes) = self.stamps(BEGIN).compute(0) else { return };
+        let mut encoder = gpu.device().create_command_encoder(&Default::default());
+        encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+            label: Some("begin"),
+            timestamp_writes: Some(timestamp_writes),
+        });
+        gpu.queue().submit([encoder.finish()]);
+    }
+
     /// Records the read-back of the stages that the frame had.
-    pub fn resolve(&mut self, encoder: &mut wgpu::CommandEncoder, written: [bool; STAGES.len()]) {
+    pub fn resolve(&mut self, encoder: &mut wgpu::CommandEncoder, written: Written) {
         let Some(q) = self.queries.as_mut().filter(|q| !q.is_pending) else { return };
         q.written = written;
-        for (stage, _) in written.iter().enumerate().filter(|(_, written)| **written) {
-            let begin = 2 * stage as u32;
-            // Only what was written may be resolved; offsets must be multiples of 256 bytes, so each
-            // stage is copied to its place by itself.
-            encoder.resolve_query_set(&q.set, begin..begin + 2, &q.resolved, 0);
-            encoder.copy_buffer_to_buffer(&q.resolved, 0, &q.readable, u64::from(begin) * 8, 16);
+        // Only what was written may be resolved.
+        for query in (0..COUNT).filter(|&query| query == BEGIN || written[query]) {
+            let at = query as u64 * ALIGNMENT;
+            encoder.resolve_query_set(&q.set, query as u32..query as u32 + 1, &q.resolved, at);
         }
+        encoder.copy_buffer_to_buffer(&q.resolved, 0, &q.readable, 0, COUNT as u64 * ALIGNMENT);
     }
 
     /// Asks for the times of the frame just submitted.
@@ -150,12 +193,20 @@ impl StageTimes {
             && q.is_mapped.swap(false, Ordering::Acquire)
         {
             if let Ok(view) = q.readable.get_mapped_range(..) {
-                let ticks: Vec<u64> = bytemuck::pod_collect_to_vec(&view[..]);
-                let took = |stage: usize| {
-                    let ticks = ticks[2 * stage + 1].saturating_sub(ticks[2 * stage]);
-                    if q.written[stage] { (ticks as f64 * q.tick) as f32 } else { 0.0 }
+                let tick = |query: usize| {
+                    let bytes = &view[query * ALIGNMENT as usize..][..8];
+                    bytemuck::pod_read_unaligned::<u64>(bytes)
                 };
-                self.last = Some(std::array::from_fn(took));
+                let mut stages: Vec<usize> = (0..BEGIN).filter(|&i| q.written[i]).collect();
+                stages.sort_by_key(|&stage| tick(stage));
+                let mut times = [0.0; STAGES.len()];
+                let mut before = tick(BEGIN);
+                for stage in stages {
+                    let ticks = tick(stage).saturating_sub(before);
+                    times[stage] = (ticks as f64 * q.tick) as f32;
+                    before = tick(stage);
+                }
+                self.last = Some(times);
             }
             q.readable.unmap();
             q.is_pending = false;

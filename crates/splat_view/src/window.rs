@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use egui::{CentralPanel, FullOutput, Panel, Sense, TextureHandle, ViewportId};
-use splat_render::gpu::{Gpu, instance};
+use splat_render::gpu::Gpu;
 use splat_render::{Error, ProjectOptions, Result, Stages};
 use winit::application::ApplicationHandler;
 use winit::dpi::LogicalSize;
@@ -14,7 +14,8 @@ use winit::event_loop::{ActiveEventLoop, ControlFlow, EventLoop, EventLoopProxy}
 use winit::window::{Window, WindowId};
 
 use crate::arguments::Arguments;
-use crate::display::Settings;
+use crate::capture::CaptureCamera;
+use crate::display::{Drawing, Settings};
 use crate::loader::{Loaded, Loader};
 use crate::model::Model;
 use crate::painter::Painter;
@@ -101,6 +102,8 @@ struct Open {
     arguments: Arguments,
     /// The photo of a camera.
     photo: Option<(usize, TextureHandle)>,
+    /// The file of a scene that was dropped and is not shown yet, and the cameras found with it.
+    dropped: Option<(PathBuf, Vec<CaptureCamera>)>,
     looked: Instant,
     /// When to draw again, if nothing happens before.
     due: Option<Instant>,
@@ -117,10 +120,7 @@ impl App {
         let failed = |what: String| Error::Device(format!("no window can be opened ({what})"));
         let window = event_loop.create_window(attributes).map_err(|e| failed(e.to_string()))?;
         let window = Arc::new(window);
-        let instance = instance();
-        let surface =
-            instance.create_surface(Arc::clone(&window)).map_err(|e| failed(e.to_string()))?;
-        let (gpu, adapter) = Gpu::for_surface(&instance, &surface)?;
+        let (gpu, adapter, surface) = Gpu::for_window(Arc::clone(&window))?;
         let gpu = Arc::new(gpu);
         let size = window.inner_size();
         let mut config = surface
@@ -147,6 +147,7 @@ impl App {
         let mut settings =
             Settings { background: self.arguments.background, ..Settings::default() };
         settings.near = self.arguments.near.unwrap_or(settings.near);
+        settings.drawing = self.arguments.drawing;
         settings.fov = self.arguments.fov.map_or(settings.fov, f64::to_radians);
         let mut open = Open {
             viewer: Viewer::new(settings, gpu.name()),
@@ -161,6 +162,7 @@ impl App {
             proxy: self.proxy.clone(),
             arguments: self.arguments.clone(),
             photo: None,
+            dropped: None,
             looked: Instant::now(),
             due: None,
         };
@@ -300,6 +302,16 @@ impl Open {
             }
         };
         viewer.message = model.notes.join(" ");
+        if let Some((_, cameras)) = self.dropped.take_if(|(dropped, _)| *dropped == path) {
+            // Another scene with its own cameras or none, unless it is to be compared.
+            viewer.is_placed &= viewer.compares();
+            if !viewer.compares() || !cameras.is_empty() {
+                viewer.up = up(&self.arguments, &cameras);
+                viewer.cameras = cameras;
+                viewer.at_camera = None;
+                self.photo = None;
+            }
+        }
         if !viewer.is_placed {
             viewer.viewpoint = first_view(&model, &viewer.cameras, viewer.up, viewer.settings.fov);
             viewer.is_placed = true;
@@ -367,15 +379,9 @@ impl Open {
                 let first = found[0].path.clone();
                 self.viewer.sources.retain(|s| !found.contains(s));
                 self.viewer.sources.splice(0..0, found);
-                // Another scene, unless it is to be compared.
-                self.viewer.is_placed &= self.viewer.compares();
-                if let Ok((cameras, _)) = cameras_of(None, Some(path))
-                    && !cameras.is_empty()
-                {
-                    self.viewer.up = up(&self.arguments, &cameras);
-                    self.viewer.cameras = cameras;
-                    self.viewer.at_camera = None;
-                }
+                let cameras = cameras_of(self.arguments.cameras.as_deref(), Some(path));
+                let (cameras, _) = cameras.unwrap_or_default();
+                self.dropped = Some((first.clone(), cameras));
                 self.choose(0, Some(first));
             }
             Err(error) => self.viewer.message = error.to_string(),
@@ -463,7 +469,15 @@ impl Open {
             let size = [texture.texture.width(), texture.texture.height()];
             let shot = self.viewer.shot(size);
             let mut encoder = device.create_command_encoder(&Default::default());
-            let mut written = self.painter.record(&mut encoder, &shot, &target)?;
+            let mut written = match self.painter.record(&mut encoder, &shot, &target) {
+                // What was asked for has no room here: what has is taken, and why is said.
+                Err(error) if self.viewer.settings.drawing == Drawing::Rasterizer => {
+                    self.viewer.message = error.to_string();
+                    self.viewer.settings.drawing = Drawing::Auto;
+                    self.painter.record(&mut encoder, &self.viewer.shot(size), &target)?
+                }
+                written => written?,
+            };
             let scale = output.pixels_per_point;
             let jobs = self.egui.tessellate(output.shapes, scale);
             let screen =
@@ -519,7 +533,7 @@ impl Open {
                 }
             }
             Action::Screenshot => self.screenshot()?,
-            Action::SaveExr => self.save_exr()?,
+            Action::SaveExr => self.save_exr(),
             Action::Record => self.start_recording(),
             Action::StopRecording => self.viewer.recording = None,
         }
@@ -537,8 +551,8 @@ impl Open {
     }
 
     /// Saves the left model as splat_render's rasterizer draws it, with alpha and depth.
-    fn save_exr(&mut self) -> Result<()> {
-        let Some(shown) = &self.viewer.shown[0] else { return Ok(()) };
+    fn save_exr(&mut self) {
+        let Some(shown) = &self.viewer.shown[0] else { return };
         let file = &shown.model.file;
         let settings = &self.viewer.settings;
         let options = ProjectOptions {
@@ -548,11 +562,12 @@ impl Open {
         };
         let camera = relative_to(self.viewer.camera(self.size()), file.origin);
         let gpu = self.painter.gpu();
-        let projected = gpu.project(&file.splats.params(settings.sh_degree), &camera, &options)?;
-        let image = gpu.rasterize(&projected, settings.background)?;
+        let image = gpu
+            .project(&file.splats.params(settings.sh_degree), &camera, &options)
+            .and_then(|projected| gpu.rasterize(&projected, settings.background));
         let path = free_name("splat-view", ".exr");
-        self.viewer.message = said(&path, write_exr(&path, &image));
-        Ok(())
+        let written = image.and_then(|image| write_exr(&path, &image));
+        self.viewer.message = said(&path, written);
     }
 
     fn start_recording(&mut self) {

@@ -207,7 +207,7 @@ fn arguments_that_make_no_sense_are_refused_in_one_sentence() {
     write(&scene, &ball(10, 7, [0.5; 3]));
     let out = folder.join("out.png");
     let out = out.to_str().expect("text");
-    let bad: [(&[&str], &[&str]); 9] = [
+    let bad: [(&[&str], &[&str]); 11] = [
         (&["--size", "0x3"], &["--size", "800x600"]),
         (&["--size", "99999x3"], &["--size"]),
         (&["--camera", "0"], &["--camera", "--cameras"]),
@@ -215,6 +215,8 @@ fn arguments_that_make_no_sense_are_refused_in_one_sentence() {
         (&["--fov", "NaN"], &["--fov"]),
         (&["--background", "1,2"], &["--background"]),
         (&["--backend", "cuda"], &["--backend", "cuda"]),
+        (&["--draw", "blend"], &["--draw", "--time"]),
+        (&["--draw", "paint"], &["--draw", "paint"]),
         (&["--nonsense"], &["--nonsense"]),
         (&["--cameras", out], &["out.png"]),
     ];
@@ -313,28 +315,45 @@ fn a_fit_s_folder_shows_its_checkpoint_as_it_shows_the_same_scene() {
     assert!(scene.rgb.iter().any(|&v| v > 60), "nothing is seen so far from the world's origin");
 }
 
-/// Bound on what the blending unit's picture is off the rasterizer's, in 255ths; docs/viewer.md has it.
-const BLENDED_MOST: f64 = 3.0;
-const BLENDED_MEAN: f64 = 0.5;
+/// Bounds on what the ways to draw in the window are off the rasterizer's picture, in 255ths;
+/// docs/viewer.md has them.
+const OFF: [(&str, f64, f64); 2] = [("rasterize", 1.0, 0.1), ("blend", 3.0, 0.5)];
 
 #[test]
-fn the_window_s_way_to_draw_agrees_with_the_rasterizer_and_is_timed() {
+fn both_ways_to_draw_agree_with_the_rasterizer_and_are_timed() {
     let folder = Folder::new();
     let scene = folder.join("scene.ply");
     write(&scene, &ball(3000, 11, [0.5, 0.4, 0.6]));
-    let output = run(&[&scene, &"--time", &"2", &"--size", &"160x120"]);
-    let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    let off: Vec<f64> = text
-        .lines()
-        .find(|line| line.starts_with("off the rasterizer's picture"))
-        .unwrap_or_else(|| panic!("no comparison in: {text}"))
-        .split(|c: char| !c.is_ascii_digit() && c != '.')
-        .filter_map(|word| word.parse().ok())
-        .collect();
-    let [most, _, mean] = off[..] else { panic!("{text}") };
-    println!("{text}");
-    assert!(most <= BLENDED_MOST && mean <= BLENDED_MEAN, "{text}");
-    for stage in ["project", "sort", "draw", "compose", "whole"] {
-        assert!(text.lines().any(|line| line.trim_start().starts_with(stage)), "{stage}: {text}");
+    for (way, most, mean) in OFF {
+        let output = run(&[
+            &scene,
+            &"--time",
+            &"2",
+            &"--size",
+            &"161x120",
+            &"--background",
+            &"0.2,0.4,0.6",
+            &"--draw",
+            &way,
+        ]);
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        let off: Vec<f64> = text
+            .lines()
+            .find(|line| line.starts_with("off the rasterizer's picture"))
+            .unwrap_or_else(|| panic!("no comparison in: {text}"))
+            .split(|c: char| !c.is_ascii_digit() && c != '.')
+            .filter_map(|word| word.parse().ok())
+            .collect();
+        println!("{text}");
+        assert!(off.len() == 3 && off[0] <= most && off[2] <= mean, "{way}: {text}");
+        let lines = text.lines().filter(|line| line.starts_with(' '));
+        let (stages, times): (Vec<&str>, Vec<f64>) = lines
+            .filter_map(|line| line.trim().split_once(' '))
+            .filter_map(|(stage, ms)| Some((stage, ms.trim().parse::<f64>().ok()?)))
+            .unzip();
+        let own = if way == "blend" { &["blend"][..] } else { &["bin", "rasterize", "canvas"] };
+        let expected = [&["project", "sort"], own, &["compose", "rest", "whole"]].concat();
+        assert_eq!(stages, expected, "{way}");
+        assert!(times.iter().all(|&ms| ms >= 0.0), "stages take more than the whole: {text}");
     }
 }

@@ -121,7 +121,7 @@ fn list_limit(software: bool, subgroups: bool) -> u32 {
 }
 
 /// wgpu as this crate opens it.
-pub fn instance() -> wgpu::Instance {
+fn instance() -> wgpu::Instance {
     wgpu::Instance::new(wgpu::InstanceDescriptor {
         // Debug layers are asked for by wgpu's environment variables alone.
         flags: wgpu::InstanceFlags::empty().with_env(),
@@ -165,22 +165,28 @@ impl Gpu {
         Self::open(adapter)
     }
 
-    /// Opens the best adapter of an [`instance`] that can show pictures on `surface`, a software one
-    /// where there is no other.
-    pub fn for_surface(
-        instance: &wgpu::Instance,
-        surface: &wgpu::Surface<'_>,
-    ) -> Result<(Self, wgpu::Adapter)> {
-        let mut adapters = adapters(instance);
-        adapters.retain(|a| a.is_surface_supported(surface));
-        let Some(adapter) = adapters.into_iter().next() else {
-            return Err(Error::Device(
-                "no Vulkan, Metal or DX12 adapter can draw in a window here; install a driver \
-                 (mesa-vulkan-drivers has one for machines without a GPU)"
-                    .to_owned(),
-            ));
-        };
-        Ok((Self::open(&adapter)?, adapter))
+    /// Opens the best adapter that can show pictures in a window, a software one where there is no
+    /// other, and the window's surface on it.
+    pub fn for_window(
+        window: impl Into<wgpu::SurfaceTarget<'static>>,
+    ) -> Result<(Self, wgpu::Adapter, wgpu::Surface<'static>)> {
+        let instance = instance();
+        let mut adapters = adapters(&instance);
+        // Without a driver there is no surface either, and wgpu's error for that names nothing.
+        if !adapters.is_empty() {
+            let surface = instance
+                .create_surface(window)
+                .map_err(|e| Error::Device(format!("no window can be opened ({e})")))?;
+            adapters.retain(|a| a.is_surface_supported(&surface));
+            if let Some(adapter) = adapters.into_iter().next() {
+                return Ok((Self::open(&adapter)?, adapter, surface));
+            }
+        }
+        Err(Error::Device(
+            "no Vulkan, Metal or DX12 adapter can draw in a window here; install a driver \
+             (mesa-vulkan-drivers has one for machines without a GPU)"
+                .to_owned(),
+        ))
     }
 
     fn open(adapter: &wgpu::Adapter) -> Result<Self> {

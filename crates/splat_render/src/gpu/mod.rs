@@ -15,11 +15,13 @@ mod project_backward;
 mod rasterize;
 mod rasterize_backward;
 mod resident;
+mod resident_picture;
 mod shaders;
 
-pub use device::{Gpu, instance};
+pub use device::Gpu;
 pub use fit::GpuFit;
 pub use resident::ResidentSplats;
+pub use resident_picture::ResidentPicture;
 pub use shaders::shared_wgsl;
 
 use crate::camera::Camera;

@@ -1,5 +1,5 @@
 //! Splats that stay on the device and are projected and sorted for one camera after another, for
-//! who draws them with a graphics pipeline.
+//! who draws them with a graphics pipeline or to a [`ResidentPicture`](super::ResidentPicture).
 
 use super::bin::{SplatBins, TileChunk};
 use super::device::{Gpu, Op};
@@ -16,9 +16,9 @@ pub struct ResidentSplats {
     sh_degree: u32,
     sh_stride: u32,
     raw: bool,
-    view: wgpu::Buffer,
-    splats2d: wgpu::Buffer,
-    bins: SplatBins,
+    pub(super) view: wgpu::Buffer,
+    pub(super) splats2d: wgpu::Buffer,
+    pub(super) bins: SplatBins,
     project: Vec<Op>,
     sort: Vec<Op>,
 }
@@ -83,16 +83,31 @@ impl ResidentSplats {
         [project, sort]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 2],
     ) -> Result<()> {
         camera.validate()?;
-        let view = View {
+        self.record_view(gpu, encoder, &self.view(camera, options, sh_degree), [project, sort]);
+        Ok(())
+    }
+
+    /// What the kernels are told of a camera.
+    pub(super) fn view(&self, camera: &Camera, options: &ProjectOptions, sh_degree: u32) -> View {
+        View {
             sh_degree: sh_degree.min(self.sh_degree),
             sh_stride: self.sh_stride,
             raw: u32::from(self.raw),
             ..View::of_view(camera, options, [0.0; 3])
-        };
-        gpu.queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view));
+        }
+    }
+
+    /// [`Self::record`] with what the kernels are told.
+    pub(super) fn record_view(
+        &self,
+        gpu: &Gpu,
+        encoder: &mut wgpu::CommandEncoder,
+        view: &View,
+        [project, sort]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 2],
+    ) {
+        gpu.queue.write_buffer(&self.view, 0, bytemuck::bytes_of(view));
         Gpu::record_pass(encoder, &self.project, project);
         Gpu::record_pass(encoder, &self.sort, sort);
-        Ok(())
     }
 
     /// `[N]` of `Splat2d`, as the last [`Self::record`] leaves them.

@@ -1,0 +1,157 @@
+//! Pictures that stay on the device: resident splats, binned and rasterized for one camera after
+//! another. Of each, only the number of (splat, tile) pairs is read back: it decides how much room
+//! they need.
+
+use std::ops::Range;
+
+use super::bin::{PairBins, TileChunk, pair_limit, tile_count};
+use super::device::Gpu;
+use super::layout::{Chunk, ChunkCount, StatusHead, View};
+use super::rasterize::rasterize_ops;
+use super::resident::ResidentSplats;
+use crate::camera::Camera;
+use crate::constants::TILE;
+use crate::error::{Error, Result};
+use crate::stages::ProjectOptions;
+
+/// A picture on the device, with room for what lies between it and the splats.
+#[derive(Debug)]
+pub struct ResidentPicture {
+    width: u32,
+    height: u32,
+    picture: wgpu::Buffer,
+    depths: wgpu::Buffer,
+    pairs: PairBins,
+    /// Pairs that `pairs` has room for.
+    capacity: u32,
+    counted: wgpu::Buffer,
+}
+
+impl ResidentPicture {
+    /// For pictures of so many pixels or fewer.
+    pub fn new(gpu: &Gpu, width: u32, height: u32) -> Result<Self> {
+        let pixels = u64::from(width) * u64::from(height);
+        Ok(Self {
+            width,
+            height,
+            picture: gpu.bindable("picture", 16 * pixels)?,
+            depths: gpu.bindable("depths", 4 * pixels)?,
+            pairs: PairBins::new(gpu, 0, tile_count(width, height))?,
+            capacity: 0,
+            counted: gpu.readable(size_of::<ChunkCount>() as u64),
+        })
+    }
+
+    /// `[H * W]` colour without background, and final transmittance, row-major.
+    pub fn picture(&self) -> &wgpu::Buffer {
+        &self.picture
+    }
+
+    /// Draws the columns of what a camera sees: submits project, sort and a count of the pairs, waits
+    /// for the count, and records to `encoder` what is left to do. The stages project, sort, bin and
+    /// rasterize each have their timestamps, of their last pass; where the pairs of all tiles do not fit
+    /// one binding, rasterize has the bin stages of later parts in it.
+    pub fn record(
+        &mut self,
+        gpu: &Gpu,
+        encoder: &mut wgpu::CommandEncoder,
+        splats: &ResidentSplats,
+        camera: &Camera,
+        options: &ProjectOptions,
+        sh_degree: u32,
+        columns: Range<u32>,
+        [project, sort, mut bin, mut rasterize]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 4],
+    ) -> Result<()> {
+        camera.validate()?;
+        let width = columns.end.saturating_sub(columns.start);
+        let fits = tile_count(width, camera.height) <= tile_count(self.width, self.height)
+            && u64::from(width) * u64::from(camera.height)
+                <= u64::from(self.width) * u64::from(self.height);
+        if width == 0 || columns.end > camera.width || !fits {
+            return Err(Error::argument(
+                "columns",
+                format!(
+                    "{columns:?} of a picture of {}x{} are none or more than there is room for, \
+                     {}x{}",
+                    camera.width, camera.height, self.width, self.height
+                ),
+            ));
+        }
+        let whole = splats.view(camera, options, sh_degree);
+        let view = View {
+            principal: [whole.principal[0] - columns.start as f32, whole.principal[1]],
+            width,
+            tiles_x: width.div_ceil(TILE),
+            ..whole
+        };
+        let tiles = tile_count(width, camera.height);
+        let all = Chunk {
+            tile_begin: 0,
+            tile_end: tiles,
+            capacity: u32::MAX,
+            splats: splats.len(),
+            index: 0,
+            is_first: 1,
+            is_last: 1,
+            list_begin: 0,
+            list_end: u32::MAX,
+        };
+        let (view_buffer, splats2d, bins) = (&splats.view, &splats.splats2d, &splats.bins);
+        let count = bins.count_ops(gpu, view_buffer, &TileChunk::new(gpu, all), splats2d);
+        let mut first = gpu.device.create_command_encoder(&Default::default());
+        splats.record_view(gpu, &mut first, &view, [project, sort]);
+        Gpu::record_pass(&mut first, &count, None);
+        let bytes = size_of::<ChunkCount>() as u64;
+        let head = size_of::<StatusHead>() as u64;
+        first.copy_buffer_to_buffer(&bins.status, head, &self.counted, 0, bytes);
+        gpu.queue.submit([first.finish()]);
+        let data = gpu.read(&[(&self.counted, bytes)])?;
+        let ChunkCount { total, .. } = bytemuck::pod_read_unaligned(&data[0]);
+
+        let is_whole = total <= pair_limit(gpu, 1);
+        let (ranges, most) = if is_whole {
+            (std::iter::once(0..tiles).collect(), total)
+        } else {
+            bins.plan(gpu, view_buffer, splats2d, tiles, 1)?
+        };
+        if most > self.capacity {
+            // Some more than this frame needs, so that not every frame of an approach makes room.
+            let room = (most.saturating_add(most / 4)).min(pair_limit(gpu, 1));
+            self.pairs = PairBins::new(gpu, room, tile_count(self.width, self.height))?;
+            self.capacity = room;
+        }
+        let last = ranges.len() - 1;
+        for (i, range) in ranges.iter().enumerate() {
+            let chunk = TileChunk::new(
+                gpu,
+                Chunk {
+                    tile_begin: range.start,
+                    tile_end: range.end,
+                    capacity: self.capacity,
+                    is_first: u32::from(i == 0),
+                    is_last: u32::from(i == last),
+                    ..all
+                },
+            );
+            // The whole picture's pairs are counted already.
+            let mut ops = Vec::new();
+            if !is_whole {
+                ops = bins.count_ops(gpu, view_buffer, &chunk, splats2d);
+            }
+            ops.extend(bins.pair_ops(gpu, view_buffer, &chunk, splats2d, &self.pairs));
+            Gpu::record_pass(encoder, &ops, bin.take());
+            let ops = rasterize_ops(
+                gpu,
+                view_buffer,
+                &chunk,
+                splats2d,
+                &self.pairs,
+                &self.picture,
+                &self.depths,
+            );
+            let stamps = if i == last { rasterize.take() } else { None };
+            Gpu::record_pass(encoder, &ops, stamps);
+        }
+        gpu.check()
+    }
+}

@@ -1,0 +1,158 @@
+//! Splats to a canvas by splat_render's rasterizer: the picture is made on the device and stays there.
+
+use bytemuck::{Pod, Zeroable};
+use splat_render::gpu::{Gpu, ResidentPicture};
+use splat_render::{Camera, Result};
+
+use crate::blending::{CANVAS, Drawable, uniform, uniform_layout};
+use crate::display::Settings;
+use crate::stage_times::{BIN, CANVAS as CANVAS_STAGE, PROJECT, RASTERIZE, SORT, Stamps};
+
+/// Columns of a canvas.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct Place {
+    begin: u32,
+    width: u32,
+}
+
+/// What pictures for a canvas are made in.
+#[derive(Debug)]
+pub struct Room {
+    /// Width and height in pixels of the largest picture.
+    pub size: [u32; 2],
+    picture: ResidentPicture,
+    place: wgpu::Buffer,
+    bindings: wgpu::BindGroup,
+}
+
+/// The pipeline from the picture to the canvas.
+#[derive(Debug)]
+pub struct Rasterizing {
+    layout: wgpu::BindGroupLayout,
+    pipeline: wgpu::RenderPipeline,
+}
+
+impl Rasterizing {
+    /// Compiles it.
+    pub fn new(gpu: &Gpu) -> Self {
+        let device = gpu.device();
+        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+            label: Some("canvas"),
+            entries: &[
+                uniform_layout(0, wgpu::ShaderStages::FRAGMENT),
+                wgpu::BindGroupLayoutEntry {
+                    binding: 1,
+                    visibility: wgpu::ShaderStages::FRAGMENT,
+                    ty: wgpu::BindingType::Buffer {
+                        ty: wgpu::BufferBindingType::Storage { read_only: true },
+                        has_dynamic_offset: false,
+                        min_binding_size: None,
+                    },
+                    count: None,
+                },
+            ],
+        });
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some("canvas"),
+            source: wgpu::ShaderSource::Wgsl(include_str!("canvas.wgsl").into()),
+        });
+        let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: Some("canvas"),
+            bind_group_layouts: &[Some(&layout)],
+            immediate_size: 0,
+        });
+        let pipeline = device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+            label: Some("canvas"),
+            layout: Some(&pipeline_layout),
+            vertex: wgpu::VertexState {
+                module: &module,
+                entry_point: Some("cover"),
+                compilation_options: Default::default(),
+                buffers: &[],
+            },
+            primitive: Default::default(),
+            depth_stencil: None,
+            multisample: Default::default(),
+            fragment: Some(wgpu::FragmentState {
+                module: &module,
+                entry_point: Some("lay"),
+                compilation_options: Default::default(),
+                targets: &[Some(CANVAS.into())],
+            }),
+            multiview_mask: None,
+            cache: None,
+        });
+        Self { layout, pipeline }
+    }
+
+    /// Room for pictures up to a size.
+    pub fn room(&self, gpu: &Gpu, size: [u32; 2]) -> Result<Room> {
+        let picture = ResidentPicture::new(gpu, size[0], size[1])?;
+        let place = uniform::<Place>(gpu);
+        let buffers = [&place, picture.picture()];
+        let entries: Vec<_> = (0..)
+            .zip(buffers)
+            .map(|(binding, buffer)| wgpu::BindGroupEntry {
+                binding,
+                resource: buffer.as_entire_binding(),
+            })
+            .collect();
+        let bindings = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("canvas"),
+            layout: &self.layout,
+            entries: &entries,
+        });
+        Ok(Room { size, picture, place, bindings })
+    }
+
+    /// Draws a model's picture onto a canvas, columns `begin..end` of it, which are not none. It is
+    /// submitted, so that the room is free for the next one.
+    pub fn draw(
+        &self,
+        gpu: &Gpu,
+        model: &Drawable,
+        room: &mut Room,
+        camera: &Camera,
+        settings: &Settings,
+        canvas: &wgpu::TextureView,
+        [begin, end]: [u32; 2],
+        stamps: &Stamps<'_>,
+    ) -> Result<()> {
+        let (camera, options) = model.seen_from(camera, settings);
+        let mut encoder = gpu.device().create_command_encoder(&Default::default());
+        room.picture.record(
+            gpu,
+            &mut encoder,
+            model.splats(),
+            &camera,
+            &options,
+            settings.sh_degree,
+            begin..end,
+            [PROJECT, SORT, BIN, RASTERIZE].map(|stage| stamps.compute(stage)),
+        )?;
+        let columns = Place { begin, width: end - begin };
+        gpu.queue().write_buffer(&room.place, 0, bytemuck::bytes_of(&columns));
+        let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+            label: Some("canvas"),
+            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+                view: canvas,
+                depth_slice: None,
+                resolve_target: None,
+                ops: wgpu::Operations {
+                    load: wgpu::LoadOp::Clear(wgpu::Color::TRANSPARENT),
+                    store: wgpu::StoreOp::Store,
+                },
+            })],
+            timestamp_writes: stamps.render(CANVAS_STAGE),
+            ..Default::default()
+        });
+        pass.set_scissor_rect(begin, 0, end - begin, camera.height);
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &room.bindings, &[]);
+        pass.draw(0..3, 0..1);
+        drop(pass);
+        gpu.queue().submit([encoder.finish()]);
+        gpu.check()
+    }
+}
