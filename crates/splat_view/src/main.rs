@@ -31,11 +31,24 @@ use std::process::ExitCode;
 use arguments::{Arguments, Asked, HELP};
 use splat_render::Result;
 
+/// Keeps Mesa's layer that asks the desktop which GPU to take from printing an error where there is no
+/// desktop to ask, unless something is set for it.
+fn quiet_layers() {
+    let set = ["NODEVICE_SELECT", "MESA_VK_DEVICE_SELECT"];
+    if set.iter().all(|name| std::env::var_os(name).is_none()) {
+        // SAFETY: the program has one thread so far.
+        unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
+    }
+}
+
 fn run() -> Result<()> {
     match Arguments::parse(std::env::args_os().skip(1))? {
         Asked::Help => println!("{HELP}"),
         Asked::Version => println!("splat-view {}", env!("CARGO_PKG_VERSION")),
-        Asked::Run(arguments) if arguments.is_headless() => headless::run(&arguments)?,
+        Asked::Run(arguments) if arguments.is_headless() => {
+            quiet_layers();
+            headless::run(&arguments)?;
+        }
         Asked::Run(arguments) => window::run(*arguments)?,
     }
     Ok(())

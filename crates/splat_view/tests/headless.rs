@@ -56,7 +56,10 @@ fn a_capture_s_camera_draws_what_the_rasterizer_draws_on_cpu_and_gpu() {
     write_transforms(&folder.join("transforms.json"), &camera());
     let expected = bytes(&drawn(&file, &camera()));
     for backend in ["cpu", "gpu"] {
-        run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &backend]);
+        let output =
+            run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &backend]);
+        // Mesa's, of a desktop that pictures do not need.
+        assert!(!said(&output).contains("XDG_RUNTIME_DIR"), "{}", said(&output));
         let picture = read_png(&out);
         assert_eq!(picture.size, [120, 80]);
         let off = picture.rgb.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max();
@@ -313,6 +316,155 @@ fn a_fit_s_folder_shows_its_checkpoint_as_it_shows_the_same_scene() {
     let scene = draw("a");
     assert!(scene == draw("b"));
     assert!(scene.rgb.iter().any(|&v| v > 60), "nothing is seen so far from the world's origin");
+}
+
+/// The camera of a headless picture, as a folder of cameras has it.
+fn from_camera(scene: &Path, cameras: &Path, number: &str) -> common::Picture {
+    let out = scene.with_extension("png");
+    let arguments: [&dyn AsRef<std::ffi::OsStr>; 9] = [
+        &scene,
+        &"--screenshot",
+        &out,
+        &"--backend",
+        &"cpu",
+        &"--cameras",
+        &cameras,
+        &"--camera",
+        &number,
+    ];
+    run(&arguments);
+    read_png(&out)
+}
+
+/// World-to-camera rotation wxyz and translation, as COLMAP has them.
+fn colmap_pose(camera: &Camera) -> [f64; 7] {
+    let q = glam::DQuat::from_mat4(&camera.viewmat);
+    let t = camera.viewmat.w_axis;
+    [q.w, q.x, q.y, q.z, t.x, t.y, t.z]
+}
+
+#[test]
+fn cameras_of_every_kind_draw_the_same_picture() {
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, &ball(300, 12, [0.6, 0.4, 0.3]));
+    let make = |name: &str| {
+        let path = folder.join(name);
+        std::fs::create_dir_all(&path).expect("folder");
+        path
+    };
+    // What igsr writes, with the middle off the picture's: COLMAP's models have that too.
+    let camera = camera();
+    let igsr = folder.join("igsr.json");
+    write_transforms(&igsr, &camera);
+    let expected = from_camera(&scene, &igsr, "0");
+    assert!(expected.rgb.iter().any(|&v| v > 60), "the scene is dark");
+    let [w, x, y, z, a, b, c] = colmap_pose(&camera);
+    // Cameras come by name: b.png is the second, whatever its number.
+    let text = make("text");
+    let lenses = "# Camera list\n7 PINHOLE 120 80 110 100 60 35\n2 SIMPLE_PINHOLE 50 50 40 25 25\n";
+    std::fs::write(text.join("cameras.txt"), lenses).expect("cameras.txt");
+    let poses = format!(
+        "# Image list\n4 {w} {x} {y} {z} {a} {b} {c} 7 b.png\n1.5 2.5 -1 3 4 17\n\
+         9 1 0 0 0 0 0 9 2 a.png\n\n"
+    );
+    std::fs::write(text.join("images.txt"), poses).expect("images.txt");
+    assert!(from_camera(&scene, &text, "1").apart(&expected).0 <= 1, "COLMAP as text");
+
+    // The binary model in sparse/0, its lens one with distortion, which is left out.
+    let binary = make("binary");
+    let model = make("binary/sparse/0");
+    let mut bytes = 2u64.to_le_bytes().to_vec();
+    let mut lens = |id: u32, kind: u32, size: [u64; 2], params: &[f64]| {
+        bytes.extend(id.to_le_bytes());
+        bytes.extend(kind.to_le_bytes());
+        bytes.extend(size.iter().flat_map(|v| v.to_le_bytes()));
+        bytes.extend(params.iter().flat_map(|v| v.to_le_bytes()));
+    };
+    lens(2, 0, [50, 50], &[40.0, 25.0, 25.0]);
+    lens(7, 4, [120, 80], &[110.0, 100.0, 60.0, 35.0, 0.01, 0.0, 0.0, 0.0]);
+    std::fs::write(model.join("cameras.bin"), &bytes).expect("cameras.bin");
+    let mut bytes = 2u64.to_le_bytes().to_vec();
+    let mut pose = |id: u32, pose: [f64; 7], lens: u32, name: &str, points: u64| {
+        bytes.extend(id.to_le_bytes());
+        bytes.extend(pose.iter().flat_map(|v| v.to_le_bytes()));
+        bytes.extend(lens.to_le_bytes());
+        bytes.extend(name.bytes().chain([0]));
+        bytes.extend(points.to_le_bytes());
+        bytes.extend(vec![1; 24 * points as usize]);
+    };
+    pose(4, colmap_pose(&camera), 7, "b.png", 3);
+    pose(9, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.0], 2, "a.png", 0);
+    std::fs::write(model.join("images.bin"), &bytes).expect("images.bin");
+    assert!(from_camera(&scene, &binary, "1").apart(&expected).0 <= 1, "COLMAP as binary");
+    std::fs::write(model.join("images.bin"), &bytes[..100]).expect("images.bin");
+    let mut command = program();
+    command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(&binary);
+    refused(&command.output().expect("start"), &["images.bin", "damaged"]);
+
+    // INRIA's and NeRF-Synthetic's know no middle but the picture's, the latter one focal length.
+    let middle = Camera { fy: 110.0, cy: 40.0, ..camera };
+    write_transforms(&igsr, &middle);
+    let expected = from_camera(&scene, &igsr, "0");
+    let to_world = middle.viewmat.inverse();
+    let rows: Vec<Vec<f64>> = (0..3).map(|i| to_world.row(i).to_array()[..3].to_vec()).collect();
+    let position = middle.center().to_array();
+    let inria = make("inria").join("cameras.json");
+    let text = format!(
+        "[{{\"id\": 0, \"img_name\": \"b\", \"width\": 120, \"height\": 80, \
+         \"position\": {position:?}, \"rotation\": {rows:?}, \"fy\": 110.0, \"fx\": 110.0}}]"
+    );
+    std::fs::write(&inria, text).expect("cameras.json");
+    let drawn = from_camera(&scene, &folder.join("inria"), "0");
+    assert!(drawn.apart(&expected).0 <= 1, "INRIA's");
+
+    let nerf = make("nerf");
+    let opengl = to_world * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
+    let rows: Vec<[f64; 4]> = (0..4).map(|i| opengl.row(i).to_array()).collect();
+    let angle = 2.0 * (60.0f64 / 110.0).atan();
+    let text = format!(
+        "{{\"camera_angle_x\": {angle}, \"frames\": [{{\"file_path\": \"./train/r_0\", \
+         \"transform_matrix\": {rows:?}}}]}}"
+    );
+    std::fs::write(nerf.join("transforms_train.json"), text).expect("transforms_train.json");
+    // The size is the photo's.
+    let photo = make("nerf/train").join("r_0.png");
+    let mut encoder = png::Encoder::new(std::fs::File::create(photo).expect("photo"), 120, 80);
+    encoder.set_color(png::ColorType::Grayscale);
+    let mut writer = encoder.write_header().expect("header");
+    writer.write_image_data(&[9; 120 * 80]).expect("pixels");
+    writer.finish().expect("end");
+    let drawn = from_camera(&scene, &nerf, "0");
+    assert!(drawn.apart(&expected).0 <= 1, "NeRF-Synthetic's");
+}
+
+#[test]
+fn every_format_opens_and_shows_the_scene() {
+    let folder = Folder::new();
+    let file = ball(400, 13, [0.3, 0.6, 0.5]);
+    let draw = |name: &str| {
+        let (scene, out) = (folder.join(name), folder.join("out.png"));
+        write(&scene, &file);
+        run(&[&scene, &"--screenshot", &out, &"--size", &"120x90", &"--backend", &"cpu"]);
+        read_png(&out)
+    };
+    let expected = draw("scene.ply");
+    assert!(expected.rgb.iter().any(|&v| v > 60), "the scene is dark");
+    // Largest mean differences, in 255ths: of .splat, which has no view-dependent colour, and of the
+    // others, which round.
+    let formats = [
+        ("a.splat", 12.0),
+        ("a.spz", 3.0),
+        ("a.sog", 3.0),
+        ("a.compressed.ply", 3.0),
+        ("a.glb", 0.2),
+        ("a.gltf", 0.2),
+    ];
+    for (name, most) in formats {
+        let (_, mean) = draw(name).apart(&expected);
+        println!("{name}: {mean:.3} on average");
+        assert!(mean <= most, "{name} is off by {mean} on average");
+    }
 }
 
 /// Bounds on what the ways to draw in the window are off the rasterizer's picture, in 255ths;
