@@ -9,15 +9,20 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{Folder, Picture, ball, program, read_png, run, write};
+use common::dragging::drop_file;
+use common::{Folder, Picture, ball, program, read_png, refused, run, write};
+use glam::{DMat4, DVec3};
 
 /// Longest that anything may take on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(120);
 /// The window's first size; small, since a software adapter draws.
 const SIZE: [usize; 2] = [320, 240];
-/// Bounds on what a window's picture is off the rasterizer's, in 255ths: docs/viewer.md has them.
+/// Bounds on what a window's picture is off the rasterizer's, in 255ths, whatever draws it:
+/// docs/viewer.md has them.
 const MOST: u8 = 3;
 const MEAN: f64 = 0.5;
+/// The same where the rasterizer draws in the window, too.
+const RASTERIZED_MOST: u8 = 1;
 
 /// A display of its own.
 struct Xvfb {
@@ -189,10 +194,18 @@ impl Drop for Viewer<'_> {
 }
 
 /// The rasterizer's picture of a scene as it is first seen.
-fn rasterized(scene: &Path, [width, height]: [usize; 2]) -> Picture {
+fn rasterized(scene: &Path, size: [usize; 2]) -> Picture {
+    rasterized_with(scene, size, &[])
+}
+
+/// The same with further arguments.
+fn rasterized_with(scene: &Path, [width, height]: [usize; 2], more: &[&str]) -> Picture {
     let out = scene.with_extension("expected.png");
     let size = format!("{width}x{height}");
-    run(&[&scene, &"--screenshot", &out, &"--size", &size, &"--backend", &"cpu"]);
+    let mut arguments: Vec<&dyn AsRef<std::ffi::OsStr>> =
+        vec![&scene, &"--screenshot", &out, &"--size", &size, &"--backend", &"cpu"];
+    arguments.extend(more.iter().map(|word| word as &dyn AsRef<std::ffi::OsStr>));
+    run(&arguments);
     read_png(&out)
 }
 
@@ -220,10 +233,12 @@ fn scenes(folder: &Folder) -> [PathBuf; 2] {
 fn a_window_draws_orbits_zooms_resizes_and_shows_what_it_saves() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply"]);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply", "--draw", "rasterize"]);
     let first = viewer.shot();
     assert_eq!(first.size, SIZE);
     agree("first view", &first, &rasterized(&scene, SIZE));
+    let (most, _) = first.apart(&rasterized(&scene, SIZE));
+    assert!(most <= RASTERIZED_MOST, "the rasterizer's picture is off by {most}");
     // The window shows the same, pixel by pixel.
     viewer.shows(&first);
 
@@ -273,8 +288,10 @@ fn a_window_draws_orbits_zooms_resizes_and_shows_what_it_saves() {
 #[test]
 fn every_display_is_another_and_keys_move_the_camera() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
-    scenes(&folder);
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply", "--background", "white"]);
+    let [scene, _] = scenes(&folder);
+    let arguments = ["scene0.ply", "--background", "0.2,0.4,0.6", "--draw", "blend"];
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &arguments);
+    agree("blended", &viewer.shot(), &rasterized_with(&scene, SIZE, &arguments[1..3]));
     let mut seen: Vec<Picture> = Vec::new();
     for key in ["1", "2", "3", "4", "5"] {
         viewer.key(key);
@@ -282,7 +299,7 @@ fn every_display_is_another_and_keys_move_the_camera() {
         for other in &seen {
             differ(&format!("display {key}"), other, &picture);
         }
-        assert_eq!(picture.rgb[..3], [255; 3], "display {key} covers the background");
+        assert_eq!(picture.rgb[..3], [51, 102, 153], "display {key} covers the background");
         seen.push(picture);
     }
     viewer.key("1");
@@ -349,4 +366,93 @@ fn a_refinement_s_folder_opens_and_a_new_scene_in_it_appears() {
     write(&folder.join("out/scene.ply"), &ball(600, 20, [0.2, 0.4, 0.8]));
     let changed = viewer.shot_when("round 1", |shot| shot.apart(&blue).1 < MEAN);
     agree("round 1", &changed, &blue);
+}
+
+/// World to camera of three cameras: two near, and one behind that sees them.
+fn cameras() -> [DMat4; 3] {
+    [(0.35, 4.0), (-0.6, 5.0), (0.0, 9.0)].map(|(angle, distance)| {
+        DMat4::from_translation(DVec3::new(0.0, 0.0, distance)) * DMat4::from_rotation_y(angle)
+    })
+}
+
+/// Of all of them: focal length, and the window's width and height.
+const LENS: [f64; 3] = [260.0, SIZE[0] as f64, SIZE[1] as f64];
+
+fn write_cameras(path: &Path) {
+    let frame = |viewmat: &DMat4| {
+        let to_world = viewmat.inverse() * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
+        let rows: Vec<[f64; 4]> = (0..4).map(|i| to_world.row(i).to_array()).collect();
+        format!("{{\"file_path\": \"a.png\", \"transform_matrix\": {rows:?}}}")
+    };
+    let frames = cameras().each_ref().map(frame).join(", ");
+    let [focal, w, h] = LENS;
+    let text = format!("{{\"fl_x\": {focal}, \"w\": {w}, \"h\": {h}, \"frames\": [{frames}]}}");
+    std::fs::write(path, text).expect("cameras");
+}
+
+#[test]
+fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
+    let (xvfb, folder) = (Xvfb::start(), Folder::new());
+    let [scene, _] = scenes(&folder);
+    write_cameras(&folder.join("cameras.json"));
+    let expected = ["0", "1", "2"].map(|n| rasterized_with(&scene, SIZE, &["--camera", n]));
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply"]);
+    for (key, camera) in [("bracketright", 0), ("bracketright", 1), ("bracketleft", 0)] {
+        viewer.key(key);
+        agree(&format!("{key} to camera {camera}"), &viewer.shot(), &expected[camera]);
+    }
+    viewer.key("bracketleft");
+    agree("around to the last camera", &viewer.shot(), &expected[2]);
+    // A click at the first camera's frustum, where the last one sees it.
+    viewer.key("c");
+    let [first, _, last] = cameras();
+    let at = last.transform_point3(first.inverse().w_axis.truncate());
+    let [focal, w, h] = LENS;
+    let place = [focal * at.x / at.z + 0.5 * w, focal * at.y / at.z + 0.5 * h];
+    let [x, y] = place.map(|v| (v.round() as i32).to_string());
+    xvfb.xdotool(&["mousemove", &x, &y, "click", "1"]);
+    let jumped = viewer.shot_when("the first camera's view", |shot| {
+        shot.apart(&expected[0]).1 < MEAN && shot.apart(&expected[2]).1 > MEAN
+    });
+    agree("after the click", &jumped, &expected[0]);
+
+    // Another scene, which has no cameras.
+    let other = folder.join("other place/scene.ply");
+    write(&other, &ball(500, 21, [0.3, 0.7, 0.4]));
+    let alone = rasterized(&other, SIZE);
+    differ("the dropped scene", &alone, &expected[0]);
+    drop_file(&xvfb.name, viewer.window.parse().expect("a number"), &other);
+    let dropped = viewer.shot_when("the dropped scene", |shot| shot.apart(&alone).1 < MEAN);
+    agree("dropped", &dropped, &alone);
+    // The first drag goes on from there.
+    viewer.drag("3", [[100, 120], [101, 120]]);
+    assert!(viewer.shot().apart(&alone).1 < 3.0, "the camera jumps at the first drag");
+
+    // A path of 91 pictures, stopped early.
+    viewer.key("k");
+    for to in [150, 60, 120] {
+        viewer.drag("1", [[100, 120], [to, 120]]);
+        viewer.key("k");
+    }
+    viewer.key("r");
+    let path = folder.join("splat-view-path-001");
+    viewer.wait_for("the first picture", |_| path.join("0000.png").exists());
+    viewer.key("Escape");
+    viewer.shot();
+    let count = || std::fs::read_dir(&path).expect("pictures").count();
+    let stopped = count();
+    assert!((1..91).contains(&stopped), "{stopped} pictures");
+    std::thread::sleep(Duration::from_millis(300));
+    assert_eq!(count(), stopped, "the recording goes on");
+}
+
+#[test]
+fn without_an_adapter_one_sentence_says_so() {
+    let (xvfb, folder) = (Xvfb::start(), Folder::new());
+    scenes(&folder);
+    let mut command = program();
+    command.env("DISPLAY", &xvfb.name).env("XDG_RUNTIME_DIR", &folder.0);
+    command.env("VK_DRIVER_FILES", "/nothing").env("VK_ICD_FILENAMES", "/nothing");
+    let output = command.arg(folder.join("scene0.ply")).output().expect("start");
+    refused(&output, &["no Vulkan, Metal or DX12 adapter", "mesa-vulkan-drivers"]);
 }
