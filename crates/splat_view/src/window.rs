@@ -111,12 +111,13 @@ struct Open {
 
 impl App {
     fn open(&mut self, event_loop: &ActiveEventLoop) -> Result<Open> {
-        let attributes = Window::default_attributes().with_title("splat-view").with_inner_size(
-            match self.arguments.size {
-                Some([width, height]) => winit::dpi::PhysicalSize::new(width, height).into(),
-                None => winit::dpi::Size::from(LogicalSize::new(1280.0, 720.0)),
-            },
-        );
+        let size = match self.arguments.size {
+            Some([width, height]) => winit::dpi::PhysicalSize::new(width, height).into(),
+            None => winit::dpi::Size::from(LogicalSize::new(1280.0, 720.0)),
+        };
+        let attributes = Window::default_attributes().with_title("splat-view");
+        // Seen once something can draw in it.
+        let attributes = attributes.with_inner_size(size).with_visible(false);
         let failed = |what: String| Error::Device(format!("no window can be opened ({what})"));
         let window = event_loop.create_window(attributes).map_err(|e| failed(e.to_string()))?;
         let window = Arc::new(window);
@@ -169,6 +170,7 @@ impl App {
         if let Some(start) = self.start.take() {
             open.begin(start)?;
         }
+        open.window.set_visible(true);
         open.window.request_redraw();
         Ok(open)
     }
