@@ -246,6 +246,14 @@ def test_photos_that_cannot_be_placed_are_left_out_with_a_warning(tmp_path, monk
     assert len(refined.capture.train_views) == 4
     assert "unseen views can be trusted" in refined.stopped
 
+    given = {"steps": 40, "backend": "cpu", "denoiser": unsure, "out": tmp_path / "out"}
+    with pytest.warns(UserWarning, match="4 of 8 photos could not be placed"):
+        first = igsr.refine(tmp_path / "photos", 1, **given)
+    for name in list(registry.ESTIMATORS):
+        monkeypatch.delitem(registry.ESTIMATORS, name)
+    again = igsr.refine(tmp_path / "photos", 1, **given, resume=True)
+    assert same(first.splats, again.splats), "cameras that were found are not looked for again"
+
 
 def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(capture):
     def fitted(**fields):

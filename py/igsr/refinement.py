@@ -15,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .capture import Camera, Capture, View
+from .capture import Camera, Capture, View, load_capture
+from .capture.folder import holds_cameras
+from .capture.write_colmap import write_colmap
 from .denoiser import Denoiser, photo_sources, photo_support, render_buffers
 from .errors import IgsrError
 from .evaluation import (
@@ -41,7 +43,8 @@ CANDIDATES, CHOSEN = 16, 8
 REFIT_STEPS = 0.25
 #: Fewer photos are not judged: each fold needs two to fit.
 FEWEST = 3
-#: Each of two folds leaves out one photo in so many, and redoes rounds with this part of the steps.
+#: Each of two folds leaves out one photo in so many, the outermost by turns, and redoes rounds with
+#: this part of the steps.
 FOLDS, LEFT_OUT, FOLD_STEPS = 2, 4, 0.2
 #: Folds fit photos of half the size, unless their smaller side is then shorter than so many pixels:
 #: whole fits for a quarter of the time. Short ones of whole photos are unlike what is judged.
@@ -185,8 +188,8 @@ def refine(
         seed: of everything random; same seed, same bits.
         denoiser: what cleans; None is the one that comes with igsr.
         out: folder for ``scene.ply``, ``rounds/``, ``report.json`` and ``report.html``
-            (``igsr.refinement_report``), written after every round, and ``checkpoints/``; None
-            writes nothing.
+            (``igsr.refinement_report``), written after every round, ``checkpoints/``, and
+            ``capture/`` with cameras that had to be found; None writes nothing.
         resume: go on from the checkpoints in ``out``, to the same end.
         look: where to look from; the paper's experiments have cameras that are given.
         choose: which of the cleaned views to add.
@@ -195,7 +198,7 @@ def refine(
     Raises:
         IgsrError: an argument cannot be used, or as ``igsr.fit`` and ``igsr.estimate_poses``.
     """
-    capture = photos if isinstance(photos, Capture) else estimate_poses(photos, seed=seed)
+    capture = photos if isinstance(photos, Capture) else _posed(photos, out, resume, seed)
     loop = _Loop(
         capture, rounds, progress, steps, backend, seed, denoiser, out, resume, look, choose, judge
     )
@@ -242,6 +245,18 @@ def refine(
         )
         if not accepted:
             return so_far(f"round {number} did not make photos that were left out better")
+
+
+def _posed(
+    photos: str | os.PathLike[str], out: str | os.PathLike[str] | None, resume: bool, seed: int
+) -> Capture:
+    """Photos with cameras. What is fitted is what lies in ``out``, so that resuming finds it."""
+    if out is None or holds_cameras(photos):
+        return estimate_poses(photos, seed=seed)
+    kept = Path(out) / "capture"
+    if not (resume and holds_cameras(kept)):
+        write_colmap(estimate_poses(photos, seed=seed), kept, replace=True)
+    return load_capture(kept)
 
 
 def _all_better(scores: dict[str, float], than: dict[str, float]) -> bool:
@@ -309,10 +324,13 @@ class _Loop:
 
     def folds(self, whole: _Chain) -> list[_Fold]:
         """Fits that each leave photos out, which scores then are of."""
-        photos, out = _folded(whole.photos), []
+        photos = _folded(whole.photos)
+        outer, count = _outermost_first(photos), -(-len(photos) // LEFT_OUT)
+        out = []
         for k in range(FOLDS):
-            left = photos[k * LEFT_OUT // FOLDS :: LEFT_OUT]
-            kept = [photo for photo in photos if not any(photo is one for one in left)]
+            left_out = set(outer[k::FOLDS][:count])
+            left = [photo for i, photo in enumerate(photos) if i in left_out]
+            kept = [photo for i, photo in enumerate(photos) if i not in left_out]
             chain = self.fitted(f"fold{k}", kept)
             out.append(_Fold(chain, left, self._scores(chain.splats, left)))
         return out
@@ -466,6 +484,17 @@ def _folded(photos: Sequence[View]) -> list[View]:
     """Photos as folds fit them."""
     sides = [min(photo.camera.width, photo.camera.height) for photo in photos]
     return [halved(photo) for photo in photos] if min(sides) >= 2 * FOLD_SIDE else list(photos)
+
+
+def _outermost_first(photos: Sequence[View]) -> list[int]:
+    """Indices of photos, those whose cameras stand farthest from the middle of all first.
+
+    What rounds add lies mostly further out than the photos do. Photos between others are shown well
+    as it is, and say little of that.
+    """
+    centres = np.stack([photo.camera.centre for photo in photos])
+    far = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
+    return [int(i) for i in np.argsort(-far, kind="stable")]
 
 
 def _share(views: Sequence[View], of: Sequence[View]) -> float:
