@@ -85,7 +85,7 @@ def test_rounds_that_help_are_accepted_and_make_views_better(helped):
         assert 0 < len(one.chosen) <= one.candidates
     psnr = [refined.first_test["psnr"], *(one.test["psnr"] for one in refined.rounds)]
     assert psnr[0] + 0.1 < psnr[1] < psnr[2]
-    assert all(one.kept > 0.9 for one in refined.rounds)
+    assert all(one.right > 0.9 for one in refined.rounds)
     done = [now.done for now in seen]
     assert done == sorted(done)
     assert done[-1] <= 1.0
@@ -147,7 +147,7 @@ def test_a_round_that_does_not_help_is_rolled_back(capture, helped):
 
     refined = refine(capture, "auto", lying_where_nobody_was)
     assert [one.accepted for one in refined.rounds] == [False]
-    assert refined.rounds[0].kept > 0.9
+    assert refined.rounds[0].right > 0.9
     assert refined.stopped == "round 1 did not make photos that were left out better"
     assert refined.splats is refined.first
     assert same(refined.splats, helped[0].first)

@@ -33,7 +33,7 @@ from .halved import halved
 from .pose import AUTO, estimate_poses
 from .presets import preset_settings
 from .refinement_report import write_refinement
-from .selection import Candidate, Shrinkage, candidate, select, shrinkage, shrunk
+from .selection import Candidate, Rightness, candidate, rightness, select
 from .splats import Splats
 from .views import UnseenView, unseen_views
 
@@ -43,9 +43,9 @@ CANDIDATES, CHOSEN = 16, 8
 REFIT_STEPS = 0.25
 #: Fewer photos are not judged: each fold needs two to fit.
 FEWEST = 3
-#: Each of two folds leaves out one photo in so many, the outermost by turns, and redoes rounds with
-#: this part of the steps.
-FOLDS, LEFT_OUT, FOLD_STEPS = 2, 4, 0.2
+#: Each of two folds leaves out one photo in so many, and redoes rounds with this part of the steps.
+#: With more left out, cleaning helps the folds' fits, which are worse, where it helps no whole one.
+FOLDS, LEFT_OUT, FOLD_STEPS = 2, 8, 0.2
 #: Folds fit photos of half the size, unless their smaller side is then shorter than so many pixels:
 #: whole fits for a quarter of the time. Short ones of whole photos are unlike what is judged.
 FOLD_SIDE = 64
@@ -53,7 +53,7 @@ FOLD_SIDE = 64
 #: from round to round: later renders know what earlier ones invented.
 VIEW_WEIGHT, VIEW_DECAY = 1.0, 0.5
 #: Of what cleaning changes, photos left out must find this part right for a round to begin.
-LEAST_KEPT = 0.25
+LEAST_RIGHT = 0.25
 #: Most rounds of "auto".
 MOST_ROUNDS = 4
 #: Where to look from: the splats, the known cameras, how many views at most, and what renders.
@@ -88,7 +88,7 @@ class Round:
     Attributes:
         chosen: the views that were added, the one worth most first.
         candidates: how many there were to choose from.
-        kept: the part of what cleaning changed that was kept, in [0, 1], as photos left out tell.
+        right: the part of what cleaning changes that is right, in [0, 1], as photos left out tell.
         before: scores ("psnr", "ssim", "flip") of photos left out, by the fits as the round found
             them.
         without: the same by fits that took as many steps more without the round's views.
@@ -102,7 +102,7 @@ class Round:
 
     chosen: list[Candidate]
     candidates: int
-    kept: float
+    right: float
     before: dict[str, float]
     without: dict[str, float]
     left_out: dict[str, float]
@@ -223,25 +223,23 @@ def refine(
         candidates = loop.candidates
         before: dict[str, float] = {}
         without, left_out, accepted = before, before, True
-        kept = 1.0
+        right = 1.0
         if judge:
             folds = folds or loop.folds(whole)
-            measured = [loop.shrinkage(fold) for fold in folds]
-            kept = sum(measured, Shrinkage()).kept
-            if kept < LEAST_KEPT:
+            right = sum((loop.rightness(fold) for fold in folds), Rightness()).share
+            if right < LEAST_RIGHT:
                 return so_far(
-                    f"cleaning brings views no nearer to photos that were left out ({kept:.2f} of "
+                    f"cleaning brings views no nearer to photos that were left out ({right:.2f} of "
                     "what it changes is right)"
                 )
-            chosen = [shrunk(one, kept) for one in chosen]
-            before, without, left_out = loop.judged(number, folds, measured)
+            before, without, left_out = loop.judged(number, folds)
             accepted = _all_better(left_out, before) and _error(left_out) < _error(without)
         if accepted:
             loop.refitted(number, whole, chosen)
         splats = whole.splats if accepted else None
         test = loop.tested(splats)
         done.append(
-            Round(chosen, candidates, kept, before, without, left_out, accepted, splats, test)
+            Round(chosen, candidates, right, before, without, left_out, accepted, splats, test)
         )
         if not accepted:
             return so_far(f"round {number} did not make photos that were left out better")
@@ -324,13 +322,10 @@ class _Loop:
 
     def folds(self, whole: _Chain) -> list[_Fold]:
         """Fits that each leave photos out, which scores then are of."""
-        photos = _folded(whole.photos)
-        outer, count = _outermost_first(photos), -(-len(photos) // LEFT_OUT)
-        out = []
+        photos, out = _folded(whole.photos), []
         for k in range(FOLDS):
-            left_out = set(outer[k::FOLDS][:count])
-            left = [photo for i, photo in enumerate(photos) if i in left_out]
-            kept = [photo for i, photo in enumerate(photos) if i not in left_out]
+            left = photos[k * LEFT_OUT // FOLDS :: LEFT_OUT]
+            kept = [photo for photo in photos if not any(photo is one for one in left)]
             chain = self.fitted(f"fold{k}", kept)
             out.append(_Fold(chain, left, self._scores(chain.splats, left)))
         return out
@@ -370,28 +365,24 @@ class _Loop:
             self._tell("look", 0.0)
         return found
 
-    def shrinkage(self, fold: _Fold) -> Shrinkage:
+    def rightness(self, fold: _Fold) -> Rightness:
         """How much of what cleaning changes in the photos that a fold leaves out is right."""
         views = [UnseenView(view.camera, 0.0, between=False) for view in fold.left]
-        measured = Shrinkage()
+        measured = Rightness()
         for one, view in zip(self._cleaned(fold.chain, views), fold.left, strict=True):
             photo = over_background(view.image, self.background)
-            measured += shrinkage(one, photo, view.mask)
+            measured += rightness(one, photo, view.mask)
         return measured
 
-    def judged(
-        self, number: int, folds: Sequence[_Fold], measured: Sequence[Shrinkage]
-    ) -> list[dict[str, float]]:
+    def judged(self, number: int, folds: Sequence[_Fold]) -> list[dict[str, float]]:
         """Mean scores of the photos left out: before, without and with each fold's own round.
 
-        A fold goes on with its views: the next round is judged from there. What the photos that it
-        leaves out have ``measured`` it does not use: that is for the other folds.
+        A fold goes on with its views: the next round is judged from there.
         """
         rows: list[list[dict[str, float]]] = [[], [], []]
-        for k, fold in enumerate(folds):
+        for fold in folds:
             chain = fold.chain
-            others = sum((one for i, one in enumerate(measured) if i != k), Shrinkage())
-            chosen = [shrunk(one, others.kept) for one in self.looked(number, chain)]
+            chosen = self.looked(number, chain)
             steps = self._part(FOLD_STEPS)
             name = f"{chain.name}-round{number}-without"
             plain = self._fit(name, "judge", chain.with_views(number, []), steps, chain.splats)
@@ -484,17 +475,6 @@ def _folded(photos: Sequence[View]) -> list[View]:
     """Photos as folds fit them."""
     sides = [min(photo.camera.width, photo.camera.height) for photo in photos]
     return [halved(photo) for photo in photos] if min(sides) >= 2 * FOLD_SIDE else list(photos)
-
-
-def _outermost_first(photos: Sequence[View]) -> list[int]:
-    """Indices of photos, those whose cameras stand farthest from the middle of all first.
-
-    What rounds add lies mostly further out than the photos do. Photos between others are shown well
-    as it is, and say little of that.
-    """
-    centres = np.stack([photo.camera.centre for photo in photos])
-    far = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
-    return [int(i) for i in np.argsort(-far, kind="stable")]
 
 
 def _share(views: Sequence[View], of: Sequence[View]) -> float:

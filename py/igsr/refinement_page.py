@@ -220,7 +220,7 @@ def _round(number: int, one: Round) -> str:
     verdict = "accepted" if one.accepted else "rolled back"
     judged = ""
     if one.left_out:
-        judged = f"By photos that were left out, {100.0 * one.kept:.0f} % of each change is right."
+        judged = f"By photos that were left out, {100.0 * one.right:.0f} % of each change is right."
     out = [
         f"<h2>Round {number}: {verdict}</h2><p>{len(one.chosen)} of {one.candidates} unseen views "
         f"were chosen: as rendered, cleaned, and where they are trusted. {judged}"

@@ -83,7 +83,7 @@ def _row(one: Round) -> dict[str, Any]:
         "test": one.test,
         "accepted": one.accepted,
         "candidates": one.candidates,
-        "kept": round(one.kept, 4),
+        "right": round(one.right, 4),
         "left_out": {"before": one.before, "without": one.without, "with": one.left_out},
         "views": [
             {

@@ -8,7 +8,7 @@ be trusted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -93,33 +93,35 @@ def select(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
 
 
 @dataclass(frozen=True)
-class Shrinkage:
+class Rightness:
     """How much of what cleaning changes is right, measured where the truth is known.
 
     Attributes:
-        towards: sum over pixels of the change times what would have been right to change.
-        squared: sum of the squared change.
+        towards: sum over pixels of trust times the change times what would have been right.
+        squared: sum of trust times the squared change.
     """
 
     towards: float = 0.0
     squared: float = 0.0
 
-    def __add__(self, other: Shrinkage) -> Shrinkage:
+    def __add__(self, other: Rightness) -> Rightness:
         """Of all pixels of both."""
-        return Shrinkage(self.towards + other.towards, self.squared + other.squared)
+        return Rightness(self.towards + other.towards, self.squared + other.squared)
 
     @property
-    def kept(self) -> float:
-        """The part of each change that leaves the least squared error, in [0, 1]."""
+    def share(self) -> float:
+        """The part of each change that would leave the least squared error, in [0, 1]."""
         if self.squared <= 0.0:
             return 0.0
         return min(1.0, max(0.0, self.towards / self.squared))
 
 
-def shrinkage(
+def rightness(
     one: Candidate, truth: npt.NDArray[np.uint8], mask: npt.NDArray[np.bool_] | None = None
-) -> Shrinkage:
+) -> Rightness:
     """How much of what cleaning changed in a view is right, given its photo.
+
+    Pixels count as a fit would count them: what is not trusted may be wrong.
 
     Args:
         one: the view, cleaned.
@@ -129,16 +131,10 @@ def shrinkage(
     render, change = (p.astype(np.float64) / 255.0 for p in (one.render, one.picture))
     change -= render
     right = truth / 255.0 - render
-    if mask is not None:
-        change, right = change[mask], right[mask]
-    return Shrinkage(float((change * right).sum()), float(np.square(change).sum()))
-
-
-def shrunk(one: Candidate, kept: float) -> Candidate:
-    """The view with a part of what cleaning changed, in [0, 1]."""
-    render = one.render.astype(np.float32)
-    picture = np.rint(render + kept * (one.picture - render)).astype(np.uint8)
-    return replace(one, picture=picture, worth=kept * one.worth)
+    weight = one.trust if mask is None else one.trust * mask
+    towards = (change * right).sum(axis=-1, dtype=np.float64)
+    squared = np.square(change).sum(axis=-1, dtype=np.float64)
+    return Rightness(float((weight * towards).sum()), float((weight * squared).sum()))
 
 
 def _bytes(colors: Float32) -> npt.NDArray[np.uint8]:
