@@ -53,7 +53,7 @@ FOLD_SIDE = 64
 #: from round to round: later renders know what earlier ones invented.
 VIEW_WEIGHT, VIEW_DECAY = 1.0, 0.5
 #: Of what cleaning changes, photos left out must find this part right for a round to begin.
-LEAST_RIGHT = 0.25
+LEAST_RIGHT = 0.1
 #: Most rounds of "auto".
 MOST_ROUNDS = 4
 #: Where to look from: the splats, the known cameras, how many views at most, and what renders.
