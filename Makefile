@@ -1,4 +1,4 @@
-# make demo   sets everything up and fits the example capture
+# make demo   sets everything up and makes a scene of eight photos of the example capture
 # make test   sets everything up and runs every check
 # make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
 # make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
@@ -32,11 +32,12 @@ RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o
 # ---- what a user runs --------------------------------------------------------------------------
 
 demo: build
-	$(BIN)/igsr fit $(EXAMPLE) --out out/demo
+	$(BIN)/igsr refine $(EXAMPLE) --photos 8 --out out/demo
 	@printf '%s\n' '' 'The demo wrote' \
 		'  out/demo/scene.ply    the splats: any splat viewer opens it' \
+		'  out/demo/report.html  what each round did, in a browser' \
 		'  out/demo/report.json  the scores on the held-out views' \
-		'  out/demo/views.png    photo, render and error side by side'
+		'  out/demo/views.png    photos, and renders before the rounds and after, if one helped'
 
 # What to measure on, and the files that two of the workloads need.
 BACKENDS ?= cpu
