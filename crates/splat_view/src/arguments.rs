@@ -22,7 +22,7 @@ Without a window:
   --screenshot FILE    draw one picture: .png, or .exr with depth
   --frames DIR         draw --orbit N pictures of a full turn to DIR/0000.png and on
   --time N             draw N frames as the window does, and print the time of each stage
-  --size WxH           of these pictures; default 1280x720, or the camera's own
+  --size WxH           of these pictures and the window; default 1280x720, or the camera's own
   --backend NAME       auto: a real GPU if one answers, else cpu; gpu: also a software one; cpu
 
 In the window and for --time:
@@ -36,7 +36,7 @@ From where:
   --orbit DEG          turned so far about the middle; with --frames, the number of pictures
   --up AXIS            x, y, z, -x, -y or -z; default: the cameras' own, else -y
   --fov DEG            height of the view, 5 to 150; default 50
-  --near DISTANCE      nothing nearer is drawn; default 0.01
+  --near DISTANCE      nothing nearer is drawn; default 0.01, or a 20th of a smaller scene's radius
   --background COLOR   white, black, grey or R,G,B in 0..1; default black
 
   --help, --version";
@@ -179,6 +179,16 @@ impl Arguments {
         }
         if self.is_headless() && self.scenes.is_empty() {
             return Err(Error::argument("SCENE", "is missing; give a splat file or a folder"));
+        }
+        if self.is_headless() && self.scenes.len() > 1 {
+            return Err(Error::argument(
+                "SCENE",
+                format!(
+                    "must be one where no window is wanted, not {}; leave {} out",
+                    self.scenes.len(),
+                    self.scenes[1].display()
+                ),
+            ));
         }
         if self.drawing != Drawing::Auto && self.is_headless() && self.time.is_none() {
             return Err(Error::argument(

@@ -35,7 +35,11 @@ pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     let degree = (0..=SH_DEGREE_MAX).find(|&d| sh::coeffs(d) == stride);
     let sh_degree = degree.ok_or_else(|| bad(format!("{stride} SH coefficients")))?;
     // Captures at the world's origin have none.
-    let origin = read_doubles(&mut archive, "origin").map_err(&bad)?;
+    let origin = match read_doubles(&mut archive, "origin").map_err(&bad)?[..] {
+        [] => [0.0; 3],
+        [x, y, z] if [x, y, z].iter().all(|v| v.is_finite()) => [x, y, z],
+        _ => return Err(bad("its origin is not three finite numbers".to_owned())),
+    };
     let rows = |values: Vec<f32>| values.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect();
     let splats = SplatArrays {
         means: rows(means),
@@ -49,11 +53,7 @@ pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     if lengths != [n; 4] || splats.sh.len() != n * stride {
         return Err(bad("its arrays are of different lengths".to_owned()));
     }
-    Ok(SplatFile {
-        splats,
-        origin: <[f64; 3]>::try_from(origin).unwrap_or_default(),
-        antialiased: false,
-    })
+    Ok(SplatFile { splats, origin, antialiased: false })
 }
 
 type Reason = String;

@@ -28,6 +28,9 @@ pub fn read_json(path: &Path) -> Result<Vec<CaptureCamera>> {
     let Some(frames) = frames else {
         return Err(Error::file(path, "has no \"frames\"; give a transforms.json or cameras.json"));
     };
+    if frames.is_empty() {
+        return Err(Error::file(path, "names no cameras; give a file with some, or none"));
+    }
     let read = |(i, frame): (usize, &Value)| {
         let camera = if frame.get("transform_matrix").is_some() {
             transform(frame, &root, folder)
@@ -35,14 +38,17 @@ pub fn read_json(path: &Path) -> Result<Vec<CaptureCamera>> {
             inria(frame)
         };
         camera.ok_or_else(|| {
-            Error::file(path, format!("frame {i} lacks a matrix, a focal length or a size"))
+            Error::file(
+                path,
+                format!("frame {i} lacks a matrix of numbers, a focal length or a size"),
+            )
         })
     };
     frames.iter().enumerate().map(read).collect()
 }
 
 fn vector(value: &Value) -> Option<DVec3> {
-    let row: Vec<f64> = value.as_array()?.iter().filter_map(Value::as_f64).collect();
+    let row = value.as_array()?.iter().map(Value::as_f64).collect::<Option<Vec<f64>>>()?;
     (row.len() >= 3).then(|| DVec3::new(row[0], row[1], row[2]))
 }
 
