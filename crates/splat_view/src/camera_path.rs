@@ -1,5 +1,7 @@
 //! A path that the camera takes through places that were marked.
 
+use std::path::PathBuf;
+
 use glam::DVec3;
 
 use crate::viewpoint::Viewpoint;
@@ -29,9 +31,9 @@ impl CameraPath {
         }
     }
 
-    /// Where the camera is `t` places after the first. There must be one.
-    pub fn at(&self, t: f64) -> Viewpoint {
-        let last = self.keys.len() - 1;
+    /// Where the camera is `t` places after the first; None where there is no place.
+    pub fn at(&self, t: f64) -> Option<Viewpoint> {
+        let last = self.keys.len().checked_sub(1)?;
         let segment = (t.max(0.0) as usize).min(last.saturating_sub(1));
         let part = (t - segment as f64).clamp(0.0, 1.0);
         let key = |i: isize| &self.keys[(segment as isize + i).clamp(0, last as isize) as usize];
@@ -39,7 +41,38 @@ impl CameraPath {
         let points = [-1, 0, 1, 2].map(|i| key(i).pivot());
         let pivot = cubic(points[0], points[1], points[2], points[3], part);
         out.focus(pivot);
-        out
+        Some(out)
+    }
+}
+
+/// A path whose pictures are being drawn to files.
+#[derive(Debug, Clone)]
+pub struct Recording {
+    /// A copy: places are marked and forgotten meanwhile.
+    path: CameraPath,
+    /// Pictures from each place to the next, as they were when it began.
+    between: u32,
+    /// Where the pictures go.
+    pub folder: PathBuf,
+    /// Number of the next picture.
+    pub next: u32,
+}
+
+impl Recording {
+    /// Of a path as it is now, `between` pictures from each place to the next.
+    pub fn new(path: &CameraPath, between: u32, folder: PathBuf) -> Self {
+        Self { path: path.clone(), between: between.max(1), folder, next: 0 }
+    }
+
+    /// Pictures in all.
+    pub fn total(&self) -> u32 {
+        self.path.pictures(self.between)
+    }
+
+    /// From where the next picture is taken; None after the last.
+    pub fn place(&self) -> Option<Viewpoint> {
+        let is_left = self.next < self.total();
+        self.path.at(f64::from(self.next) / f64::from(self.between)).filter(|_| is_left)
     }
 }
 
@@ -47,23 +80,41 @@ impl CameraPath {
 mod tests {
     use super::*;
 
+    fn place(x: f64) -> Viewpoint {
+        Viewpoint::looking(DVec3::new(x, 0.3 * x * x, -5.0), DVec3::new(x, 0.0, 0.0), -DVec3::Y)
+    }
+
+    #[test]
+    fn a_recording_goes_on_when_its_places_are_forgotten_and_ends_after_its_last() {
+        let mut path = CameraPath { keys: vec![place(0.0), place(1.0)] };
+        let mut recording = Recording::new(&path, 4, PathBuf::new());
+        path.keys.clear();
+        assert!(path.at(0.0).is_none());
+        let mut places = Vec::new();
+        while let Some(place) = recording.place() {
+            places.push(place);
+            recording.next += 1;
+        }
+        assert_eq!((places.len(), recording.total()), (5, 5));
+        assert!(places[4].position.distance(place(1.0).position) < 1e-9);
+    }
+
     #[test]
     fn the_path_passes_its_places_and_moves_smoothly_between() {
-        let place = |x: f64| {
-            Viewpoint::looking(DVec3::new(x, 0.3 * x * x, -5.0), DVec3::new(x, 0.0, 0.0), -DVec3::Y)
-        };
         let path = CameraPath { keys: vec![place(0.0), place(1.0), place(3.0)] };
         assert_eq!(path.pictures(10), 21);
         for (i, key) in path.keys.iter().enumerate() {
-            let there = path.at(i as f64);
+            let there = path.at(i as f64).expect("a place");
             assert!(there.position.distance(key.position) < 1e-9, "misses place {i}");
         }
-        let steps: Vec<DVec3> = (0..=40).map(|i| path.at(f64::from(i) / 20.0).pivot()).collect();
+        let at = |t: f64| path.at(t).expect("a place").pivot();
+        let steps: Vec<DVec3> = (0..=40).map(|i| at(f64::from(i) / 20.0)).collect();
         let lengths: Vec<f64> = steps.windows(2).map(|s| s[1].distance(s[0])).collect();
         let jump = lengths.windows(2).map(|l| (l[1] - l[0]).abs()).fold(0.0, f64::max);
         assert!(jump < 0.02, "the speed jumps by {jump} of about 0.1 at a place");
         let alone = CameraPath { keys: vec![place(2.0)] };
         assert_eq!(alone.pictures(10), 1);
-        assert!(alone.at(0.0).position.distance(place(2.0).position) < 1e-9);
+        let there = alone.at(0.0).expect("a place");
+        assert!(there.position.distance(place(2.0).position) < 1e-9);
     }
 }

@@ -11,9 +11,9 @@ use splat_render::{Camera, Error, Image, ProjectOptions, Projected, Result, Stag
 use crate::arguments::{Arguments, Backend};
 use crate::display::Settings;
 use crate::model::Model;
-use crate::painter::{Painter, Shot};
+use crate::painter::{Painter, Shot, check_size};
 use crate::picture_files::{to_bytes, write_exr, write_png};
-use crate::scene_view::{cameras_of, first_view, up};
+use crate::scene_view::{cameras_of, first_view, near, up};
 use crate::sources::find_sources;
 use crate::stage_times::STAGES;
 use crate::viewpoint::{Viewpoint, fitted, relative_to};
@@ -85,7 +85,7 @@ impl Scene {
         let up = up(arguments, &cameras);
         let fov = arguments.fov.map(f64::to_radians);
         let mut settings = Settings { background: arguments.background, ..Settings::default() };
-        settings.near = arguments.near.unwrap_or(settings.near);
+        settings.near = arguments.near.unwrap_or_else(|| near(&model));
         settings.drawing = arguments.drawing;
         settings.fov = fov.unwrap_or(settings.fov);
         let mut viewpoint = first_view(&model, &cameras, up, settings.fov);
@@ -142,6 +142,7 @@ fn write(path: &Path, image: &Image<f32>) -> Result<()> {
 /// the rasterizer's.
 fn time(scene: &Scene, frames: u32) -> Result<()> {
     let gpu = Arc::new(Gpu::new(true)?);
+    check_size(&gpu, [scene.camera.width, scene.camera.height])?;
     println!("{} splats on {}", scene.model.file.splats.len(), gpu.name());
     let format = wgpu::TextureFormat::Rgba8Unorm;
     let mut painter = Painter::new(Arc::clone(&gpu), format)?;

@@ -55,6 +55,11 @@ impl Loader {
         });
     }
 
+    /// A side waits for nothing any more; what is being read for it is not shown.
+    pub fn forget(&mut self, side: usize) {
+        self.waits[side] = None;
+    }
+
     /// The next model that was read and is still wanted.
     pub fn next(&mut self) -> Option<Loaded> {
         loop {
@@ -64,5 +69,29 @@ impl Loader {
                 return Some(loaded);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_forgotten_while_it_was_read_is_not_shown() {
+        let mut loader = Loader::new();
+        let (there, done) = channel();
+        for (side, name) in [(1, "no such file"), (0, "nor this")] {
+            let there = there.clone();
+            loader.load(side, Path::new(name), move || there.send(()).expect("a test waits"));
+            if side == 1 {
+                loader.forget(side);
+                assert!(!loader.is_busy(side));
+            }
+        }
+        for _ in 0..2 {
+            done.recv().expect("both are read");
+        }
+        assert_eq!(loader.next().expect("the other side's").side, 0);
+        assert!(loader.next().is_none());
     }
 }

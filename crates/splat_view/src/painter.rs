@@ -5,7 +5,7 @@ use std::sync::Arc;
 use half::f16;
 use splat_render::gpu::Gpu;
 use splat_render::io::SplatFile;
-use splat_render::{Camera, Result};
+use splat_render::{Camera, Error, Result};
 
 use crate::blending::{Blending, Drawable};
 use crate::composing::{Canvases, Composing, Look};
@@ -20,6 +20,26 @@ use crate::stage_times::{
 const PICTURE: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
 /// Bytes that rows of a copied texture are a multiple of.
 const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
+
+/// Longest side of a texture, and so of a frame.
+pub fn side_max(gpu: &Gpu) -> u32 {
+    gpu.device().limits().max_texture_dimension_2d
+}
+
+/// Refuses frames that a device has no texture for.
+pub fn check_size(gpu: &Gpu, [width, height]: [u32; 2]) -> Result<()> {
+    let most = side_max(gpu);
+    if width.max(height) <= most {
+        return Ok(());
+    }
+    Err(Error::argument(
+        "--size",
+        format!(
+            "frames have sides up to {most} on {}, not {width}x{height}; give smaller ones",
+            gpu.name()
+        ),
+    ))
+}
 
 /// What a frame shows.
 #[derive(Debug, Clone, Copy)]
@@ -159,7 +179,11 @@ impl Painter {
             canvases.size == size && (!two || canvases.textures[0] != canvases.textures[1])
         });
         if !fits {
-            self.canvases = Some(self.composing.canvases(&self.gpu, size, two));
+            // The old ones' memory first; those that the device had no room for are not kept.
+            self.canvases = None;
+            let canvases = self.composing.canvases(&self.gpu, size, two);
+            self.gpu.check()?;
+            self.canvases = Some(canvases);
         }
         if self.rasterizes(shot.settings) && self.room.as_ref().is_none_or(|r| r.size != size) {
             // The old one's memory first.

@@ -1,9 +1,10 @@
 //! The panel: what can be chosen, and what there is to know.
 
-use egui::{ComboBox, ScrollArea, Slider, Ui};
+use egui::{ComboBox, ScrollArea, Slider, SliderClamping, Ui};
 use glam::DVec3;
 
 use crate::display::{Display, Drawing};
+use crate::sources::label;
 use crate::stage_times::{SECOND, STAGES};
 use crate::viewer::{Action, Moving, Viewer};
 
@@ -63,7 +64,8 @@ fn choice(viewer: &Viewer, ui: &mut Ui, side: usize, actions: &mut Vec<Action>) 
             actions.push(Action::Choose(side, None));
         }
         for (number, source) in viewer.sources.iter().enumerate() {
-            if ui.selectable_label(chosen == Some(number), &source.name).clicked() {
+            let name = label(source, &viewer.sources);
+            if ui.selectable_label(chosen == Some(number), name).clicked() {
                 actions.push(Action::Choose(side, Some(number)));
             }
         }
@@ -106,9 +108,11 @@ fn display(viewer: &mut Viewer, ui: &mut Ui) {
     }
     let stored = viewer.shown.iter().flatten().map(|s| s.model.file.splats.sh_degree).max();
     if let Some(stored) = stored.filter(|&degree| degree > 0) {
-        let degree = &mut viewer.settings.sh_degree;
-        *degree = (*degree).min(stored);
-        ui.add(Slider::new(degree, 0..=stored).text("SH degree"));
+        // What was asked for stays for models that have more.
+        let mut degree = viewer.settings.sh_degree.min(stored);
+        if ui.add(Slider::new(&mut degree, 0..=stored).text("SH degree")).changed() {
+            viewer.settings.sh_degree = degree;
+        }
     }
     ui.horizontal(|ui| {
         ui.color_edit_button_rgb(&mut viewer.settings.background);
@@ -129,7 +133,9 @@ fn camera(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
     }
     let far = (4.0 * viewer.extent().1) as f32;
     let range = 1e-4 * far..=far;
-    ui.add(Slider::new(&mut viewer.settings.near, range).logarithmic(true).text("near"));
+    // One that --near gave may lie outside, and stays until it is moved.
+    let near = Slider::new(&mut viewer.settings.near, range).logarithmic(true);
+    ui.add(near.clamping(SliderClamping::Edits).text("near"));
     ui.horizontal(|ui| {
         let found = AXES.iter().find(|(axis, _)| axis.dot(viewer.up) > 0.999);
         let text = found.map_or("the cameras'", |(_, name)| name);
@@ -180,18 +186,14 @@ fn files(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
             viewer.path.keys.clear();
         }
     });
-    if viewer.path.keys.len() > 1 {
+    if let Some(recording) = &viewer.recording {
+        ui.label(format!("picture {} of {} (Esc stops)", recording.next, recording.total()));
+    } else if viewer.path.keys.len() > 1 {
         let between = &mut viewer.pictures_between;
         ui.add(Slider::new(between, 1..=600).logarithmic(true).text("pictures each"));
         let total = viewer.path.pictures(viewer.pictures_between);
-        match viewer.recording {
-            Some(number) => {
-                ui.label(format!("picture {number} of {total} (Esc stops)"));
-            }
-            None if ui.button(format!("Record {total} pictures (R)")).clicked() => {
-                actions.push(Action::Record);
-            }
-            None => {}
+        if ui.button(format!("Record {total} pictures (R)")).clicked() {
+            actions.push(Action::Record);
         }
     }
 }
@@ -217,4 +219,28 @@ fn statistics(viewer: &Viewer, ui: &mut Ui, times: Option<[f32; STAGES.len()]>) 
         }
     });
     ui.small(&viewer.device);
+}
+
+#[cfg(test)]
+mod tests {
+    use egui::{CentralPanel, Context, RawInput};
+
+    use super::*;
+    use crate::display::Settings;
+
+    #[test]
+    fn the_panel_leaves_a_near_plane_outside_its_slider_as_it_is() {
+        for near in [1e-6, 7.0, 1e6] {
+            let settings = Settings { near, ..Settings::default() };
+            let mut viewer = Viewer::new(settings, String::new());
+            let context = Context::default();
+            for _ in 0..2 {
+                let _ = context.run_ui(RawInput::default(), |ui| {
+                    CentralPanel::default()
+                        .show(ui, |ui| panel(&mut viewer, ui, None, &mut Vec::new()));
+                });
+            }
+            assert_eq!(viewer.settings.near, near);
+        }
+    }
 }

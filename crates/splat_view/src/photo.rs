@@ -23,6 +23,48 @@ pub struct Photo {
     pub rgba: Vec<u8>,
 }
 
+impl Photo {
+    /// The photo with no side longer than `most`: what is longer is averaged.
+    #[must_use]
+    pub fn within(self, most: usize) -> Self {
+        let [width, height] = self.size;
+        let longest = width.max(height);
+        if longest <= most {
+            return self;
+        }
+        let size = self.size.map(|side| (side * most / longest).max(1));
+        // The pixels of a side that a smaller one's pixel stands for.
+        let part = |i: usize, was: usize, is: usize| {
+            let begin = i * was / is;
+            begin..((i + 1) * was / is).max(begin + 1)
+        };
+        let mut rgba = Vec::with_capacity(4 * size[0] * size[1]);
+        for y in 0..size[1] {
+            let rows = part(y, height, size[1]);
+            for x in 0..size[0] {
+                let columns = part(x, width, size[0]);
+                let (mut sum, mut alphas) = ([0u64; 3], 0u64);
+                for row in rows.clone() {
+                    let from = 4 * (row * width + columns.start);
+                    for pixel in self.rgba[from..from + 4 * columns.len()].chunks_exact(4) {
+                        let alpha = u64::from(pixel[3]);
+                        alphas += alpha;
+                        // What cannot be seen has no colour to give.
+                        for (sum, &value) in sum.iter_mut().zip(pixel) {
+                            *sum += alpha * u64::from(value);
+                        }
+                    }
+                }
+                let count = (rows.len() * columns.len()) as u64;
+                let weight = alphas.max(1);
+                rgba.extend(sum.map(|sum| ((sum + weight / 2) / weight) as u8));
+                rgba.push(((alphas + count / 2) / count) as u8);
+            }
+        }
+        Self { size, rgba }
+    }
+}
+
 fn bytes(path: &Path) -> Result<Vec<u8>> {
     let unreadable = |e: std::io::Error| Error::file(path, format!("cannot be read ({e})"));
     let file = File::open(path).map_err(unreadable)?;
@@ -141,6 +183,21 @@ mod tests {
             assert_eq!((photo.size, &photo.rgba[..]), ([2, 1], &expected[..]), "{color:?}");
             std::fs::remove_file(path).expect("clean");
         }
+    }
+
+    #[test]
+    fn a_photo_that_is_too_large_is_averaged_and_another_left_as_it_is() {
+        let pixel = |x: u8, y: u8| [10 * x, 100 + 10 * y, 50, 255];
+        let rgba: Vec<u8> = (0..2).flat_map(|y| (0..6).flat_map(move |x| pixel(x, y))).collect();
+        let photo = Photo { size: [6, 2], rgba: rgba.clone() };
+        assert_eq!(photo.clone().within(6).rgba, rgba);
+        let small = photo.within(3);
+        assert_eq!(small.size, [3, 1]);
+        assert_eq!(small.rgba, [5, 105, 50, 255, 25, 105, 50, 255, 45, 105, 50, 255]);
+        // Thinner than what stays of it, and seen through.
+        let line = Photo { size: [4, 1], rgba: [[9, 9, 9, 255], [77, 0, 0, 0]].concat().repeat(2) };
+        let line = line.within(2);
+        assert_eq!((line.size, line.rgba), ([2, 1], [9, 9, 9, 128].repeat(2)));
     }
 
     #[test]

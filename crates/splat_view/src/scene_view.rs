@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 use splat_render::Result;
+use splat_render::constants::NEAR;
 
 use crate::arguments::Arguments;
 use crate::capture::{CaptureCamera, find_cameras, read_cameras};
@@ -12,6 +13,8 @@ use crate::viewpoint::{Viewpoint, up_of};
 
 /// What is up where no camera says: COLMAP's and so most captures' y is down.
 const UP: DVec3 = DVec3::NEG_Y;
+/// The near plane of small scenes, in parts of their radius.
+const NEAR_PART: f64 = 0.05;
 
 /// A capture's cameras, those that were named or those that lie in or beside a scene. Cameras that
 /// nobody named and that cannot be read are left out, with a sentence.
@@ -45,6 +48,13 @@ fn beside(scene: &Path) -> Option<PathBuf> {
 pub fn up(arguments: &Arguments, cameras: &[CaptureCamera]) -> DVec3 {
     let said = arguments.up.map(DVec3::from);
     said.or_else(|| up_of(cameras.iter().map(|c| &c.camera))).unwrap_or(UP)
+}
+
+/// The near plane of a scene: the renderer's, but nearer for scenes so small that it would lie beyond
+/// them. All of a scene is seen from about three times its radius.
+pub fn near(model: &Model) -> f32 {
+    let own = (NEAR_PART * model.radius) as f32;
+    own.clamp(f32::MIN_POSITIVE, NEAR)
 }
 
 /// The first view of a scene: the capture's first camera, else all of the scene.

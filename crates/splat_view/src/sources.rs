@@ -12,6 +12,32 @@ pub struct Source {
     pub name: String,
     /// The file.
     pub path: PathBuf,
+    /// The folder that was named, or the one that the file lies in.
+    pub folder: PathBuf,
+}
+
+/// What people read of a source: its folder, too, where another one has its name.
+pub fn label(source: &Source, among: &[Source]) -> String {
+    let alike = |other: &&Source| other.name == source.name && other.path != source.path;
+    let mut twins = among.iter().filter(alike).peekable();
+    if twins.peek().is_none() {
+        return source.name.clone();
+    }
+    let short = folder_name(&source.folder);
+    let folder = if twins.any(|other| folder_name(&other.folder) == short) {
+        source.folder.display().to_string()
+    } else {
+        short
+    };
+    format!("{folder}: {}", source.name)
+}
+
+/// The last part of a folder's path, also of one such as `.` or `..`.
+fn folder_name(folder: &Path) -> String {
+    let last = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
+    last(folder)
+        .or_else(|| last(&folder.canonicalize().ok()?))
+        .unwrap_or_else(|| folder.display().to_string())
 }
 
 /// When a file was written, and its length.
@@ -28,30 +54,32 @@ pub fn stamp(path: &Path) -> Option<Stamp> {
 pub fn find_sources(path: &Path) -> Result<Vec<Source>> {
     if !path.is_dir() {
         let name = path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
-        return Ok(vec![Source { name, path: path.to_owned() }]);
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        let folder = folder.unwrap_or(Path::new(".")).to_owned();
+        return Ok(vec![Source { name, path: path.to_owned(), folder }]);
     }
     let mut sources = Vec::new();
-    let scene = path.join("scene.ply");
-    if scene.is_file() {
-        sources.push(Source { name: "scene".to_owned(), path: scene });
-    }
+    let mut add = |name: String, file: PathBuf| {
+        if file.is_file() {
+            sources.push(Source { name, path: file, folder: path.to_owned() });
+        }
+    };
+    add("scene".to_owned(), path.join("scene.ply"));
     let rounds = names(&path.join("rounds"));
     let mut rounds: Vec<u32> = rounds.iter().filter_map(|name| name.parse().ok()).collect();
     rounds.sort_unstable();
     for round in rounds {
         let file = path.join("rounds").join(round.to_string()).join("scene.ply");
-        if file.is_file() {
-            sources.push(Source { name: format!("round {round}"), path: file });
-        }
+        add(format!("round {round}"), file);
     }
     let mut checkpoints = vec![path.join("checkpoint.npz")];
     let kept = path.join("checkpoints");
     let mut kept_names = names(&kept);
     kept_names.sort();
     checkpoints.extend(kept_names.iter().filter(|n| n.ends_with(".npz")).map(|n| kept.join(n)));
-    for file in checkpoints.into_iter().filter(|file| file.is_file()) {
+    for file in checkpoints {
         let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        sources.push(Source { name: stem, path: file });
+        add(stem, file);
     }
     if sources.is_empty() {
         return Err(Error::file(
@@ -139,6 +167,25 @@ mod tests {
         assert_eq!(stamp(&folder), None);
         fs::remove_dir_all(folder).expect("clean");
         assert_eq!(stamp(&path), None);
+    }
+
+    #[test]
+    fn sources_of_one_name_are_told_apart_by_their_folders() {
+        let folder = folder(
+            "alike",
+            &["a/scene.ply", "b/scene.ply", "b/rounds/0/scene.ply", "c/a/scene.ply"],
+        );
+        let labels = |folders: &[&str]| -> Vec<String> {
+            let found = folders.iter().map(|name| find_sources(&folder.join(name)));
+            let sources: Vec<_> = found.flat_map(|found| found.expect("sources")).collect();
+            sources.iter().map(|source| label(source, &sources)).collect()
+        };
+        assert_eq!(labels(&["b"]), ["scene", "round 0"]);
+        assert_eq!(labels(&["a", "b"]), ["a: scene", "b: scene", "round 0"]);
+        assert_eq!(labels(&["a/scene.ply", "b/scene.ply"]), ["a: scene.ply", "b: scene.ply"]);
+        let whole = ["a", "c/a"].map(|name| format!("{}: scene", folder.join(name).display()));
+        assert_eq!(labels(&["a", "c/a"]), whole);
+        fs::remove_dir_all(folder).expect("clean");
     }
 
     #[test]

@@ -6,12 +6,12 @@ use glam::DVec3;
 use splat_render::{Camera, Result};
 
 use crate::blending::Drawable;
-use crate::camera_path::CameraPath;
+use crate::camera_path::{CameraPath, Recording};
 use crate::capture::CaptureCamera;
 use crate::display::Settings;
 use crate::model::Model;
 use crate::painter::{Painter, Shot};
-use crate::sources::{Source, Stamp};
+use crate::sources::{Source, Stamp, label};
 use crate::viewpoint::{Viewpoint, fitted};
 
 /// How keys and drags move the camera.
@@ -103,10 +103,8 @@ pub struct Viewer {
     pub path: CameraPath,
     /// Pictures from each place to the next.
     pub pictures_between: u32,
-    /// Number of the picture that a recording is at.
-    pub recording: Option<u32>,
-    /// Where its pictures go.
-    pub recording_folder: PathBuf,
+    /// The recording under way.
+    pub recording: Option<Recording>,
     /// The last thing that happened, or went wrong.
     pub message: String,
     /// Whether the panel is there.
@@ -139,7 +137,6 @@ impl Viewer {
             path: CameraPath::default(),
             pictures_between: 30,
             recording: None,
-            recording_folder: PathBuf::new(),
             message: String::new(),
             shows_panel: true,
             device,
@@ -229,7 +226,7 @@ impl Viewer {
     /// What a file is called.
     pub fn name_of(&self, path: &Path) -> String {
         let found = self.sources.iter().find(|source| source.path == path);
-        found.map_or_else(|| path.display().to_string(), |source| source.name.clone())
+        found.map_or_else(|| path.display().to_string(), |source| label(source, &self.sources))
     }
 
     /// Whether there are two sides.

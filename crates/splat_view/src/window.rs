@@ -14,16 +14,17 @@ use winit::event_loop::{ActiveEventLoop, ControlFlow, EventLoop, EventLoopProxy}
 use winit::window::{Window, WindowId};
 
 use crate::arguments::Arguments;
+use crate::camera_path::Recording;
 use crate::capture::CaptureCamera;
 use crate::display::{Drawing, Settings};
 use crate::loader::{Loaded, Loader};
 use crate::model::Model;
-use crate::painter::Painter;
+use crate::painter::{Painter, check_size, side_max};
 use crate::photo::read_photo;
 use crate::picture_files::{without_alpha, write_exr, write_png};
-use crate::scene_view::{cameras_of, first_view, up};
+use crate::scene_view::{cameras_of, first_view, near, up};
 use crate::sources::{Source, find_sources, stamp};
-use crate::stage_times::PANEL;
+use crate::stage_times::{PANEL, STAGES};
 use crate::viewer::{Action, Shown, Viewer};
 use crate::viewpoint::relative_to;
 use crate::{gestures, overlay, panel};
@@ -41,16 +42,42 @@ struct Wake;
 pub fn run(arguments: Arguments) -> Result<()> {
     // Before the window: what cannot be read is said where it was asked for.
     let start = Start::read(&arguments)?;
-    let event_loop = EventLoop::<Wake>::with_user_event().build().map_err(|e| {
-        Error::Device(format!(
-            "no display answers ({e}); start splat-view on a desktop, or draw without a window: \
-             --screenshot FILE"
-        ))
-    })?;
+    let event_loop =
+        EventLoop::<Wake>::with_user_event().build().map_err(|_| Error::Device(no_display()))?;
     let proxy = event_loop.create_proxy();
     let mut app = App { arguments, start: Some(start), proxy, open: None, failure: None };
-    event_loop.run_app(&mut app).map_err(|e| Error::Device(format!("the window failed: {e}")))?;
+    event_loop
+        .run_app(&mut app)
+        .map_err(|e| Error::Device(format!("the window failed ({}); open it again", reason(&e))))?;
     app.failure.map_or(Ok(()), Err)
+}
+
+/// Why there is no window, and what to do.
+fn no_display() -> String {
+    let why = if cfg!(all(unix, not(target_os = "macos"))) {
+        let set = |name: &&str| {
+            let value = std::env::var_os(name).filter(|value| !value.is_empty())?;
+            Some(format!("{name}={}", value.display()))
+        };
+        let set: Vec<String> = ["WAYLAND_DISPLAY", "DISPLAY"].iter().filter_map(set).collect();
+        match set.is_empty() {
+            true => ": neither WAYLAND_DISPLAY nor DISPLAY is set".to_owned(),
+            false => format!(" at {}", set.join(" or ")),
+        }
+    } else {
+        String::new()
+    };
+    format!(
+        "no display answers{why}; start splat-view on a desktop, or draw without a window: \
+         --screenshot FILE"
+    )
+}
+
+/// What winit says, without the file and line of its source that it begins with.
+fn reason(error: &impl std::fmt::Display) -> String {
+    let text = error.to_string();
+    let rest = text.strip_prefix("os error at ").and_then(|text| text.split_once(": "));
+    rest.map_or(text.as_str(), |(_, reason)| reason).to_owned()
 }
 
 /// What is shown first.
@@ -119,13 +146,17 @@ impl App {
         // Seen once something can draw in it.
         let attributes = attributes.with_inner_size(size).with_visible(false);
         let failed = |what: String| Error::Device(format!("no window can be opened ({what})"));
-        let window = event_loop.create_window(attributes).map_err(|e| failed(e.to_string()))?;
+        let window = event_loop.create_window(attributes).map_err(|e| failed(reason(&e)))?;
         let window = Arc::new(window);
         let (gpu, adapter, surface) = Gpu::for_window(Arc::clone(&window))?;
         let gpu = Arc::new(gpu);
+        if let Some(size) = self.arguments.size {
+            check_size(&gpu, size)?;
+        }
+        let most = side_max(&gpu);
         let size = window.inner_size();
         let mut config = surface
-            .get_default_config(&adapter, size.width.max(1), size.height.max(1))
+            .get_default_config(&adapter, size.width.clamp(1, most), size.height.clamp(1, most))
             .ok_or_else(|| failed(format!("{} shows nothing in it", gpu.name())))?;
         // Colours are as they are seen, and so is what egui blends.
         let formats = surface.get_capabilities(&adapter).formats;
@@ -135,14 +166,13 @@ impl App {
         let painter = Painter::new(Arc::clone(&gpu), config.format)?;
         let egui = egui::Context::default();
         egui.set_theme(egui::Theme::Dark);
-        let most = gpu.device().limits().max_texture_dimension_2d as usize;
         let input = egui_winit::State::new(
             egui.clone(),
             ViewportId::ROOT,
             event_loop,
             Some(window.scale_factor() as f32),
             None,
-            Some(most),
+            Some(most as usize),
         );
         let panels = egui_wgpu::Renderer::new(gpu.device(), config.format, Default::default());
         let mut settings =
@@ -205,9 +235,8 @@ impl ApplicationHandler<Wake> for App {
                 Ok(())
             }
             WindowEvent::Resized(size) => {
-                open.resize(size.width, size.height);
                 // At once: a frame of the old size would be stretched.
-                open.frame()
+                open.resize(size.width, size.height).and_then(|()| open.frame())
             }
             WindowEvent::DroppedFile(path) => {
                 open.dropped(&path);
@@ -219,10 +248,9 @@ impl ApplicationHandler<Wake> for App {
         self.end(event_loop, result);
     }
 
-    fn user_event(&mut self, event_loop: &ActiveEventLoop, _: Wake) {
+    fn user_event(&mut self, _: &ActiveEventLoop, _: Wake) {
         let Some(open) = &mut self.open else { return };
-        let result = open.receive();
-        self.end(event_loop, result);
+        open.receive();
     }
 
     fn about_to_wait(&mut self, event_loop: &ActiveEventLoop) {
@@ -253,7 +281,7 @@ impl Open {
         for (side, (source, model)) in start.models.into_iter().enumerate() {
             self.viewer.chosen[side] = Some(source.path.clone());
             let stamp = stamp(&source.path);
-            self.show(Loaded { side, path: source.path, stamp, model: Ok(model) })?;
+            self.show(Loaded { side, path: source.path, stamp, model: Ok(model) });
         }
         if let Some(note) = note {
             self.viewer.message = note;
@@ -277,15 +305,44 @@ impl Open {
         [self.config.width, self.config.height]
     }
 
-    fn resize(&mut self, width: u32, height: u32) {
-        if width > 0 && height > 0 && [width, height] != self.size() {
-            (self.config.width, self.config.height) = (width, height);
-            self.surface.configure(self.painter.gpu().device(), &self.config);
+    fn resize(&mut self, width: u32, height: u32) -> Result<()> {
+        // Desktops of many screens have room for windows that no texture is as large as.
+        let most = side_max(self.painter.gpu());
+        let size = [width, height].map(|side| side.min(most));
+        if size.contains(&0) || size == self.size() {
+            return Ok(());
+        }
+        [self.config.width, self.config.height] = size;
+        self.configure()
+    }
+
+    /// Makes the surface what `config` says; without one there is no window to go on with.
+    fn configure(&self) -> Result<()> {
+        let gpu = self.painter.gpu();
+        self.surface.configure(gpu.device(), &self.config);
+        gpu.check().map_err(|e| {
+            Error::Device(format!("the window can be drawn in no longer ({e}); open it again"))
+        })
+    }
+
+    /// Says in the panel what went wrong, and goes on; without a device nothing does.
+    fn say(&mut self, result: Result<()>) -> Result<()> {
+        match result {
+            Err(error) if !self.painter.gpu().is_lost() => {
+                let text = error.to_string();
+                // What goes wrong in every frame is said once.
+                if self.viewer.message != text {
+                    self.viewer.message = text;
+                    self.window.request_redraw();
+                }
+                Ok(())
+            }
+            result => result,
         }
     }
 
     /// Puts a model that was read on its side.
-    fn show(&mut self, loaded: Loaded) -> Result<()> {
+    fn show(&mut self, loaded: Loaded) {
         let Loaded { side, path, stamp, model } = loaded;
         let viewer = &mut self.viewer;
         let model = match model {
@@ -293,14 +350,14 @@ impl Open {
             // A file that cannot be read leaves what was there.
             Err(error) => {
                 viewer.message = error.to_string();
-                return Ok(());
+                return;
             }
         };
         let drawable = match self.painter.upload(&model.file) {
             Ok(drawable) => drawable,
             Err(error) => {
                 viewer.message = error.to_string();
-                return Ok(());
+                return;
             }
         };
         viewer.message = model.notes.join(" ");
@@ -317,18 +374,19 @@ impl Open {
         if !viewer.is_placed {
             viewer.viewpoint = first_view(&model, &viewer.cameras, viewer.up, viewer.settings.fov);
             viewer.is_placed = true;
+            if self.arguments.near.is_none() {
+                viewer.settings.near = near(&model);
+            }
         }
         viewer.shown[side] = Some(Shown { path, stamp, model, drawable });
         self.window.request_redraw();
-        Ok(())
     }
 
     /// Takes what the loader has read.
-    fn receive(&mut self) -> Result<()> {
+    fn receive(&mut self) {
         while let Some(loaded) = self.loader.next() {
-            self.show(loaded)?;
+            self.show(loaded);
         }
-        Ok(())
     }
 
     fn load(&mut self, side: usize, path: &Path) {
@@ -343,7 +401,11 @@ impl Open {
         self.viewer.chosen[side].clone_from(&path);
         match path {
             Some(path) => self.load(side, &path),
-            None => self.viewer.shown[side] = None,
+            None => {
+                // Nor what may be under way to it.
+                self.loader.forget(side);
+                self.viewer.shown[side] = None;
+            }
         }
     }
 
@@ -421,7 +483,8 @@ impl Open {
             });
         });
         for action in actions {
-            self.act(action)?;
+            let done = self.act(action);
+            self.say(done)?;
         }
         self.load_photo();
         let platform = std::mem::take(&mut output.platform_output);
@@ -430,7 +493,8 @@ impl Open {
         self.due = delay.and_then(|delay| started.checked_add(delay));
         self.draw(output)?;
         if self.viewer.recording.is_some() {
-            self.record_picture()?;
+            let done = self.record_picture();
+            self.say(done)?;
             self.window.request_redraw();
         }
         // How a frame's times got on: they are read in the next one.
@@ -462,7 +526,7 @@ impl Open {
             Current::Outdated | Current::Lost => (None, true),
             Current::Timeout | Current::Occluded => (None, false),
             Current::Validation => {
-                gpu.check()?;
+                self.say(gpu.check())?;
                 (None, true)
             }
         };
@@ -471,14 +535,25 @@ impl Open {
             let size = [texture.texture.width(), texture.texture.height()];
             let shot = self.viewer.shot(size);
             let mut encoder = device.create_command_encoder(&Default::default());
-            let mut written = match self.painter.record(&mut encoder, &shot, &target) {
+            let recorded = match self.painter.record(&mut encoder, &shot, &target) {
                 // What was asked for has no room here: what has is taken, and why is said.
                 Err(error) if self.viewer.settings.drawing == Drawing::Rasterizer => {
                     self.viewer.message = error.to_string();
                     self.viewer.settings.drawing = Drawing::Auto;
-                    self.painter.record(&mut encoder, &self.viewer.shot(size), &target)?
+                    self.painter.record(&mut encoder, &self.viewer.shot(size), &target)
                 }
-                written => written?,
+                recorded => recorded,
+            };
+            let (mut written, load) = match recorded {
+                Ok(written) => (written, wgpu::LoadOp::Load),
+                // The panel alone, which says why.
+                Err(error) => {
+                    self.say(Err(error))?;
+                    encoder = device.create_command_encoder(&Default::default());
+                    // It may have failed before this, and times without a beginning are an error.
+                    self.painter.times.begin(&gpu);
+                    ([false; STAGES.len()], wgpu::LoadOp::Clear(wgpu::Color::BLACK))
+                }
             };
             let scale = output.pixels_per_point;
             let jobs = self.egui.tessellate(output.shapes, scale);
@@ -493,7 +568,7 @@ impl Open {
                     view: &target,
                     depth_slice: None,
                     resolve_target: None,
-                    ops: wgpu::Operations { load: wgpu::LoadOp::Load, store: wgpu::StoreOp::Store },
+                    ops: wgpu::Operations { load, store: wgpu::StoreOp::Store },
                 })],
                 timestamp_writes,
                 ..Default::default()
@@ -509,12 +584,12 @@ impl Open {
             self.panels.free_texture(id);
         }
         if is_stale {
-            self.surface.configure(device, &self.config);
+            self.configure()?;
             self.window.request_redraw();
         }
         // Callbacks of finished work run here.
         let _ = device.poll(wgpu::PollType::Poll);
-        gpu.check()
+        self.say(gpu.check())
     }
 
     fn act(&mut self, action: Action) -> Result<()> {
@@ -581,8 +656,8 @@ impl Open {
         let folder = free_name("splat-view-path", "");
         match std::fs::create_dir(&folder) {
             Ok(()) => {
-                viewer.recording = Some(0);
-                viewer.recording_folder = folder;
+                let recording = Recording::new(&viewer.path, viewer.pictures_between, folder);
+                viewer.recording = Some(recording);
             }
             Err(error) => {
                 viewer.message = format!("{}: cannot be made ({error})", folder.display());
@@ -590,24 +665,23 @@ impl Open {
         }
     }
 
-    /// Draws and saves the recording's next picture.
+    /// Draws and saves the recording's next picture; one that fails ends it.
     fn record_picture(&mut self) -> Result<()> {
         let size = self.size();
         let viewer = &mut self.viewer;
-        let Some(number) = viewer.recording else { return Ok(()) };
-        let total = viewer.path.pictures(viewer.pictures_between);
+        let Some(mut recording) = viewer.recording.take() else { return Ok(()) };
+        let Some(place) = recording.place() else { return Ok(()) };
         viewer.leave_camera(size);
-        viewer.viewpoint = viewer.path.at(f64::from(number) / f64::from(viewer.pictures_between));
+        viewer.viewpoint = place;
+        let path = recording.folder.join(format!("{:04}.png", recording.next));
         let rgba = self.painter.picture(&viewer.shot(size))?;
-        let path = viewer.recording_folder.join(format!("{number:04}.png"));
-        if let Err(error) = write_png(&path, size, &without_alpha(&rgba)) {
-            viewer.message = error.to_string();
-            viewer.recording = None;
-        } else if number + 1 < total {
-            viewer.recording = Some(number + 1);
+        write_png(&path, size, &without_alpha(&rgba))?;
+        recording.next += 1;
+        let total = recording.total();
+        if recording.next < total {
+            viewer.recording = Some(recording);
         } else {
-            viewer.recording = None;
-            viewer.message = format!("{total} pictures in {}", viewer.recording_folder.display());
+            viewer.message = format!("{total} pictures in {}", recording.folder.display());
         }
         Ok(())
     }
@@ -625,6 +699,7 @@ impl Open {
         };
         match read_photo(path) {
             Ok(photo) => {
+                let photo = photo.within(side_max(self.painter.gpu()) as usize);
                 let image = egui::ColorImage::from_rgba_unmultiplied(photo.size, &photo.rgba);
                 let texture = self.egui.load_texture("photo", image, Default::default());
                 self.photo = Some((number, texture));

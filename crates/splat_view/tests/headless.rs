@@ -210,7 +210,7 @@ fn arguments_that_make_no_sense_are_refused_in_one_sentence() {
     write(&scene, &ball(10, 7, [0.5; 3]));
     let out = folder.join("out.png");
     let out = out.to_str().expect("text");
-    let bad: [(&[&str], &[&str]); 11] = [
+    let bad: [(&[&str], &[&str]); 12] = [
         (&["--size", "0x3"], &["--size", "800x600"]),
         (&["--size", "99999x3"], &["--size"]),
         (&["--camera", "0"], &["--camera", "--cameras"]),
@@ -222,6 +222,7 @@ fn arguments_that_make_no_sense_are_refused_in_one_sentence() {
         (&["--draw", "paint"], &["--draw", "paint"]),
         (&["--nonsense"], &["--nonsense"]),
         (&["--cameras", out], &["out.png"]),
+        (&["another.ply"], &["SCENE", "another.ply"]),
     ];
     for (arguments, words) in bad {
         let mut command = program();
@@ -262,7 +263,10 @@ fn without_a_display_one_sentence_says_what_to_do() {
         let scene = folder.join("scene.ply");
         write(&scene, &ball(10, 9, [0.5; 3]));
         let output = program().arg(&scene).output().expect("start");
-        refused(&output, &["no display answers", "--screenshot"]);
+        refused(&output, &["no display answers", "WAYLAND_DISPLAY nor DISPLAY", "--screenshot"]);
+        assert!(!said(&output).contains(".rs"), "winit's source is named: {}", said(&output));
+        let nobody = program().env("DISPLAY", ":none").arg(&scene).output().expect("start");
+        refused(&nobody, &["no display answers at DISPLAY=:none", "--screenshot"]);
     }
 }
 
@@ -316,6 +320,76 @@ fn a_fit_s_folder_shows_its_checkpoint_as_it_shows_the_same_scene() {
     let scene = draw("a");
     assert!(scene == draw("b"));
     assert!(scene.rgb.iter().any(|&v| v > 60), "nothing is seen so far from the world's origin");
+}
+
+#[test]
+fn a_checkpoint_whose_origin_is_not_finite_is_refused() {
+    let folder = Folder::new();
+    let path = folder.join("checkpoint.npz");
+    for origin in [f64::NAN, f64::INFINITY] {
+        let mut file = ball(10, 14, [0.5; 3]);
+        file.origin[1] = origin;
+        write_checkpoint(&path, &file);
+        let mut command = program();
+        command.arg(&path).args(["--screenshot", "x.png", "--backend", "cpu"]);
+        refused(&command.output().expect("start"), &["checkpoint.npz", "origin"]);
+    }
+}
+
+#[test]
+fn json_without_cameras_or_with_other_than_numbers_is_refused_by_name_and_frame() {
+    let folder = Folder::new();
+    let (scene, cameras) = (folder.join("scene.ply"), folder.join("cameras.json"));
+    write(&scene, &ball(10, 15, [0.5; 3]));
+    let inria = |rotation: &str| {
+        format!(
+            "[{{\"width\": 9, \"height\": 9, \"fx\": 9, \"fy\": 9, \"position\": [0, 0, 3], \
+             \"rotation\": {rotation}}}]"
+        )
+    };
+    let bad = inria("[[1, null, 0, 0], [0, 1, 0], [0, 0, 1]]");
+    for (text, word) in [("[]", "names no cameras"), (&bad, "frame 0 lacks a matrix of numbers")] {
+        std::fs::write(&cameras, text).expect("cameras");
+        let mut command = program();
+        command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(&cameras);
+        refused(&command.output().expect("start"), &["cameras.json", word]);
+    }
+    std::fs::write(&cameras, inria("[[1, 0, 0], [0, 1, 0], [0, 0, 1]]")).expect("cameras");
+    assert_eq!(from_camera(&scene, &cameras, "0").size, [9, 9]);
+}
+
+#[test]
+fn a_small_scene_is_seen_as_a_large_one_is() {
+    let folder = Folder::new();
+    let (scene, small) = (folder.join("scene.ply"), folder.join("small.ply"));
+    let mut file = ball(300, 16, [0.6, 0.4, 0.3]);
+    write(&scene, &file);
+    let factor = 2.5e-3f32;
+    file.splats.means.as_flattened_mut().iter_mut().for_each(|v| *v *= factor);
+    file.splats.scales.as_flattened_mut().iter_mut().for_each(|v| *v += factor.ln());
+    write(&small, &file);
+    let draw = |scene: &Path, more: &[&str]| {
+        let out = scene.with_extension("png");
+        let mut arguments: Vec<&dyn AsRef<std::ffi::OsStr>> =
+            vec![&scene, &"--screenshot", &out, &"--size", &"90x60", &"--backend", &"cpu"];
+        arguments.extend(more.iter().map(|word| word as &dyn AsRef<std::ffi::OsStr>));
+        run(&arguments);
+        read_png(&out)
+    };
+    let (large, small_one) = (draw(&scene, &[]), draw(&small, &[]));
+    assert!(large.apart(&small_one).1 < 0.1, "off by {:?}", large.apart(&small_one));
+    // What was asked for stays.
+    assert!(draw(&small, &["--near", "0.01"]).rgb.iter().all(|&v| v == 0), "near is nothing");
+}
+
+#[test]
+fn frames_larger_than_any_texture_are_refused() {
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, &ball(10, 17, [0.5; 3]));
+    let mut command = program();
+    command.arg(&scene).args(["--time", "1", "--size", "9000x4"]);
+    refused(&command.output().expect("start"), &["--size", "up to 8192", "9000x4"]);
 }
 
 /// The camera of a headless picture, as a folder of cameras has it.

@@ -447,6 +447,23 @@ fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
 }
 
 #[test]
+fn windows_larger_than_any_texture_are_refused_when_asked_for_and_else_go_on() {
+    let (xvfb, folder) = (Xvfb::start(), Folder::new());
+    let [scene, _] = scenes(&folder);
+    let mut command = program();
+    command.env("DISPLAY", &xvfb.name).env("XDG_RUNTIME_DIR", &folder.0);
+    command.args(["--size", "9000x40"]).arg(&scene);
+    refused(&command.output().expect("start"), &["--size", "up to 8192", "9000x40"]);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply"]);
+    xvfb.xdotool(&["windowsize", "--sync", &viewer.window, "9000", "40"]);
+    viewer.shot_when("the largest size", |shot| shot.size == [8192, 40]);
+    let size = [200, 100];
+    xvfb.xdotool(&["windowsize", "--sync", &viewer.window, "200", "100"]);
+    let again = viewer.shot_when("a usual size", |shot| shot.size == size);
+    agree("after the largest size", &again, &rasterized(&scene, size));
+}
+
+#[test]
 fn without_an_adapter_one_sentence_says_so() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     scenes(&folder);

@@ -5,7 +5,7 @@ use std::future::Future;
 use std::num::NonZeroU64;
 use std::ops::Range;
 use std::pin::pin;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::task::{Context, Poll, Waker};
 
@@ -39,6 +39,8 @@ pub struct Gpu {
     layouts: Vec<wgpu::BindGroupLayout>,
     /// First error that wgpu reported since the last check.
     failure: Arc<Mutex<Option<String>>>,
+    /// Whether the device was lost, after which nothing works on it.
+    lost: Arc<AtomicBool>,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
     /// Most bytes that a storage binding may have.
@@ -233,8 +235,11 @@ impl Gpu {
             );
         }));
         let seen = Arc::clone(&failure);
+        let lost = Arc::new(AtomicBool::new(false));
+        let is_lost = Arc::clone(&lost);
         device.set_device_lost_callback(move |reason, message| {
             if reason != wgpu::DeviceLostReason::Destroyed {
+                is_lost.store(true, Ordering::Relaxed);
                 note(&seen, format!("was lost ({message})"));
             }
         });
@@ -246,6 +251,7 @@ impl Gpu {
             pipelines: Kernel::ALL.iter().map(|_| OnceLock::new()).collect(),
             layouts,
             failure,
+            lost,
             made: Default::default(),
             binding_limit,
             groups_max: GROUPS_MAX,
@@ -294,6 +300,11 @@ impl Gpu {
     /// Whether the adapter runs on the CPU.
     pub fn is_software(&self) -> bool {
         self.info.device_type == wgpu::DeviceType::Cpu
+    }
+
+    /// Whether the device was lost: no later call on it succeeds.
+    pub fn is_lost(&self) -> bool {
+        self.lost.load(Ordering::Relaxed)
     }
 
     /// The device, for who draws with what the kernels leave.
@@ -603,8 +614,9 @@ impl Gpu {
 
 fn note(failure: &Mutex<Option<String>>, what: String) {
     if let Ok(mut failure) = failure.lock() {
-        // The first failure is the cause, what follows its consequences.
-        failure.get_or_insert(what);
+        // The first failure is the cause, what follows its consequences. wgpu's text has many lines,
+        // this crate's errors have one.
+        failure.get_or_insert_with(|| what.split_whitespace().collect::<Vec<_>>().join(" "));
     }
 }
 
