@@ -223,24 +223,56 @@ fn statistics(viewer: &Viewer, ui: &mut Ui, times: Option<[f32; STAGES.len()]>) 
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use egui::{CentralPanel, Context, RawInput};
+    use splat_render::fit::SplatArrays;
+    use splat_render::gpu::Gpu;
+    use splat_render::io::SplatFile;
 
     use super::*;
     use crate::display::Settings;
+    use crate::model::Model;
+    use crate::painter::Painter;
+    use crate::viewer::Shown;
+
+    /// What is set after two frames that nobody touches the panel in.
+    fn untouched(mut viewer: Viewer) -> Settings {
+        let context = Context::default();
+        for _ in 0..2 {
+            let _ = context.run_ui(RawInput::default(), |ui| {
+                CentralPanel::default()
+                    .show(ui, |ui| panel(&mut viewer, ui, None, &mut Vec::new()));
+            });
+        }
+        viewer.settings
+    }
 
     #[test]
-    fn the_panel_leaves_a_near_plane_outside_its_slider_as_it_is() {
+    fn a_near_plane_outside_its_slider_stays_until_it_is_moved() {
         for near in [1e-6, 7.0, 1e6] {
             let settings = Settings { near, ..Settings::default() };
-            let mut viewer = Viewer::new(settings, String::new());
-            let context = Context::default();
-            for _ in 0..2 {
-                let _ = context.run_ui(RawInput::default(), |ui| {
-                    CentralPanel::default()
-                        .show(ui, |ui| panel(&mut viewer, ui, None, &mut Vec::new()));
-                });
-            }
-            assert_eq!(viewer.settings.near, near);
+            assert_eq!(untouched(Viewer::new(settings, String::new())), settings);
         }
+    }
+
+    #[test]
+    fn the_sh_degree_outlasts_a_model_of_a_lower_one() {
+        let gpu = Arc::new(Gpu::new(true).expect("an adapter, a software one will do"));
+        let painter = Painter::new(gpu, wgpu::TextureFormat::Rgba8Unorm).expect("a painter");
+        let splats = SplatArrays {
+            means: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            scales: vec![[0.0; 3]],
+            opacities: vec![0.0],
+            sh: vec![[0.0; 3]; 4],
+            sh_degree: 1,
+        };
+        let file = SplatFile { splats, origin: [0.0; 3], antialiased: false };
+        let drawable = painter.upload(&file).expect("a splat has room");
+        let model = Model { file, center: DVec3::ZERO, radius: 1.0, notes: Vec::new() };
+        let mut viewer = Viewer::new(Settings::default(), String::new());
+        viewer.shown[0] = Some(Shown { path: "a.ply".into(), stamp: None, model, drawable });
+        assert_eq!(untouched(viewer), Settings::default());
     }
 }
