@@ -226,7 +226,8 @@ impl ApplicationHandler<Wake> for App {
     fn window_event(&mut self, event_loop: &ActiveEventLoop, _: WindowId, event: WindowEvent) {
         let Some(open) = &mut self.open else { return };
         let response = open.input.on_window_event(&open.window, &event);
-        if response.repaint {
+        // A frame that asked for the next one would keep a window busy in which nothing moves.
+        if response.repaint && event != WindowEvent::RedrawRequested {
             open.window.request_redraw();
         }
         let result = match event {
@@ -386,6 +387,8 @@ impl Open {
     fn receive(&mut self) {
         while let Some(loaded) = self.loader.next() {
             self.show(loaded);
+            // Also to say why one cannot be shown.
+            self.window.request_redraw();
         }
     }
 
@@ -524,7 +527,11 @@ impl Open {
             Current::Success(texture) => (Some(texture), false),
             Current::Suboptimal(texture) => (Some(texture), true),
             Current::Outdated | Current::Lost => (None, true),
-            Current::Timeout | Current::Occluded => (None, false),
+            Current::Timeout => {
+                self.window.request_redraw();
+                (None, false)
+            }
+            Current::Occluded => (None, false),
             Current::Validation => {
                 self.say(gpu.check())?;
                 (None, true)
@@ -540,6 +547,7 @@ impl Open {
                 Err(error) if self.viewer.settings.drawing == Drawing::Rasterizer => {
                     self.viewer.message = error.to_string();
                     self.viewer.settings.drawing = Drawing::Auto;
+                    self.window.request_redraw();
                     self.painter.record(&mut encoder, &self.viewer.shot(size), &target)
                 }
                 recorded => recorded,
@@ -708,6 +716,7 @@ impl Open {
             Err(error) => {
                 viewer.message = error.to_string();
                 viewer.photo_strength = 0.0;
+                self.window.request_redraw();
             }
         }
     }
