@@ -11,7 +11,7 @@ import scenes
 from PIL import Image
 
 import igsr
-from igsr import presets
+from igsr import presets, refinement
 from igsr.pose import registry
 from igsr.pose.estimate import Estimate
 from igsr.rendering import render
@@ -249,10 +249,15 @@ def test_photos_that_cannot_be_placed_are_left_out_with_a_warning(tmp_path, monk
     given = {"steps": 40, "backend": "cpu", "denoiser": unsure, "out": tmp_path / "out"}
     with pytest.warns(UserWarning, match="4 of 8 photos could not be placed"):
         first = igsr.refine(tmp_path / "photos", 1, **given)
-    for name in list(registry.ESTIMATORS):
-        monkeypatch.delitem(registry.ESTIMATORS, name)
+
+    def once_more(photos, *, seed=0, progress=None):
+        raise AssertionError("cameras are looked for again")
+
+    unwanted = registry.Entry(lambda: once_more, lambda options: True)
+    for name in registry.ESTIMATORS:
+        monkeypatch.setitem(registry.ESTIMATORS, name, unwanted)
     again = igsr.refine(tmp_path / "photos", 1, **given, resume=True)
-    assert same(first.splats, again.splats), "cameras that were found are not looked for again"
+    assert same(first.splats, again.splats)
 
 
 def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(capture):
@@ -349,3 +354,31 @@ def test_the_command(capture, tmp_path, igsr_here, monkeypatch):
     bad = igsr_here(*command[:4], "--rounds", "some")
     assert bad.returncode == 1
     assert bad.stderr.startswith("--rounds must be a whole number or auto, not 'some'.")
+
+
+def test_photos_that_lie_where_cameras_would_be_kept_stay(tmp_path):
+    photo = tmp_path / "capture" / "0.png"
+    photo.parent.mkdir()
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(photo)
+    with pytest.raises(igsr.IgsrError, match="lies where the fit would write"):
+        igsr.refine(tmp_path / "capture", out=tmp_path, backend="cpu", denoiser=unsure)
+    assert photo.is_file()
+
+
+@pytest.mark.parametrize("count", [3, 4, 6, 9])
+def test_each_fold_leaves_out_photos_that_no_other_does(capture, count, monkeypatch):
+    fewer = igsr.Capture(capture.path, capture.train_views[:count])
+    left = []
+    real = refinement._Loop.folds
+
+    def watched(loop, whole):
+        folds = real(loop, whole)
+        left.extend([view.name for view in fold.left] for fold in folds)
+        assert all(len(fold.left) + len(fold.chain.photos) == count for fold in folds)
+        return folds
+
+    monkeypatch.setattr(refinement._Loop, "folds", watched)
+    refine(fewer, 1, lying, steps=40)
+    assert len(left) == 2
+    assert all(left)
+    assert not set(left[0]) & set(left[1])

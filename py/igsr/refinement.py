@@ -30,7 +30,7 @@ from .evaluation import (
 )
 from .fitting import Progress, fit
 from .halved import halved
-from .pose import AUTO, estimate_poses
+from .pose import AUTO, estimate_poses, kept_cameras
 from .presets import preset_settings
 from .refinement_report import write_refinement
 from .selection import Candidate, Rightness, candidate, rightness, select
@@ -49,9 +49,9 @@ FOLDS, LEFT_OUT, FOLD_STEPS = 2, 8, 0.2
 #: Folds fit photos of half the size, unless their smaller side is then shorter than so many pixels:
 #: whole fits for a quarter of the time. Short ones of whole photos are unlike what is judged.
 FOLD_SIDE = 64
-#: What an invented pixel counts at most beside a photo's in its first round, and by what this falls
-#: from round to round: later renders know what earlier ones invented.
-VIEW_WEIGHT, VIEW_DECAY = 1.0, 0.5
+#: An invented pixel counts beside a photo's as it can be trusted, and by this factor less in each
+#: later round: later renders know what earlier ones invented.
+VIEW_DECAY = 0.5
 #: Of what cleaning changes, photos left out must find this part right for a round to begin.
 LEAST_RIGHT = 0.1
 #: Most rounds of "auto".
@@ -196,7 +196,8 @@ def refine(
         judge: whether photos that are left out decide about a round; without, all are accepted.
 
     Raises:
-        IgsrError: an argument cannot be used, or as ``igsr.fit`` and ``igsr.estimate_poses``.
+        IgsrError: an argument cannot be used, photos lie in ``out/capture``, or as ``igsr.fit`` and
+            ``igsr.estimate_poses``.
     """
     capture = photos if isinstance(photos, Capture) else _posed(photos, out, resume, seed)
     loop = _Loop(
@@ -251,7 +252,7 @@ def _posed(
     """Photos with cameras. What is fitted is what lies in ``out``, so that resuming finds it."""
     if out is None or holds_cameras(photos):
         return estimate_poses(photos, seed=seed)
-    kept = Path(out) / "capture"
+    kept = kept_cameras(Path(photos), Path(out))
     if not (resume and holds_cameras(kept)):
         write_colmap(estimate_poses(photos, seed=seed), kept, replace=True)
     return load_capture(kept)
@@ -323,8 +324,9 @@ class _Loop:
     def folds(self, whole: _Chain) -> list[_Fold]:
         """Fits that each leave photos out, which scores then are of."""
         photos, out = _folded(whole.photos), []
+        every = min(LEFT_OUT, len(photos))  # so that each fold leaves one out
         for k in range(FOLDS):
-            left = photos[k * LEFT_OUT // FOLDS :: LEFT_OUT]
+            left = photos[k * every // FOLDS :: every]
             kept = [photo for photo in photos if not any(photo is one for one in left)]
             chain = self.fitted(f"fold{k}", kept)
             out.append(_Fold(chain, left, self._scores(chain.splats, left)))
@@ -416,8 +418,8 @@ class _Loop:
 
     def _view(self, name: str, one: Candidate) -> View:
         """A cleaned view as the fit takes it: over what stands behind photos with alpha."""
-        weights = np.float32(VIEW_WEIGHT) * one.trust
-        return View(name, one.view.camera, "train", one.picture, None, weights, self.behind)
+        camera, picture = one.view.camera, one.picture
+        return View(name, camera, "train", picture, None, one.trust, self.behind)
 
     def _part(self, part: float) -> int:
         return max(1, round(part * self.steps))

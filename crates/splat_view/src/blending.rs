@@ -7,6 +7,7 @@ use splat_render::io::SplatFile;
 use splat_render::{Camera, ProjectOptions, Result};
 
 use crate::display::{Display, Settings};
+use crate::pipelines::{Pipeline, storage_layout, uniform, uniform_layout};
 use crate::stage_times::{BLEND, PROJECT, SORT, Stamps};
 use crate::viewpoint::relative_to;
 
@@ -54,96 +55,30 @@ impl Drawable {
 
 /// The pipeline.
 #[derive(Debug)]
-pub struct Blending {
-    layout: wgpu::BindGroupLayout,
-    pipeline: wgpu::RenderPipeline,
-}
-
-/// A binding of a uniform buffer.
-pub fn uniform_layout(binding: u32, visibility: wgpu::ShaderStages) -> wgpu::BindGroupLayoutEntry {
-    wgpu::BindGroupLayoutEntry {
-        binding,
-        visibility,
-        ty: wgpu::BindingType::Buffer {
-            ty: wgpu::BufferBindingType::Uniform,
-            has_dynamic_offset: false,
-            min_binding_size: None,
-        },
-        count: None,
-    }
-}
-
-/// A uniform buffer for one `T`.
-pub fn uniform<T>(gpu: &Gpu) -> wgpu::Buffer {
-    gpu.device().create_buffer(&wgpu::BufferDescriptor {
-        label: None,
-        size: size_of::<T>() as u64,
-        usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-        mapped_at_creation: false,
-    })
-}
+pub struct Blending(Pipeline);
 
 impl Blending {
     /// Compiles it.
     pub fn new(gpu: &Gpu) -> Self {
-        let device = gpu.device();
-        let storage = |binding| wgpu::BindGroupLayoutEntry {
-            binding,
-            visibility: wgpu::ShaderStages::VERTEX,
-            ty: wgpu::BindingType::Buffer {
-                ty: wgpu::BufferBindingType::Storage { read_only: true },
-                has_dynamic_offset: false,
-                min_binding_size: None,
-            },
-            count: None,
-        };
-        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-            label: Some("blend"),
-            entries: &[
+        let storage = |binding| storage_layout(binding, wgpu::ShaderStages::VERTEX);
+        Self(Pipeline::new(
+            gpu,
+            "blend",
+            shared_wgsl() + include_str!("blend.wgsl"),
+            ["corner", "shade"],
+            &[
                 uniform_layout(0, wgpu::ShaderStages::VERTEX_FRAGMENT),
                 storage(1),
                 storage(2),
                 storage(3),
             ],
-        });
-        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some("blend"),
-            source: wgpu::ShaderSource::Wgsl((shared_wgsl() + include_str!("blend.wgsl")).into()),
-        });
-        let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-            label: Some("blend"),
-            bind_group_layouts: &[Some(&layout)],
-            immediate_size: 0,
-        });
-        let pipeline = device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-            label: Some("blend"),
-            layout: Some(&pipeline_layout),
-            vertex: wgpu::VertexState {
-                module: &module,
-                entry_point: Some("corner"),
-                compilation_options: Default::default(),
-                buffers: &[],
+            wgpu::PrimitiveTopology::TriangleStrip,
+            wgpu::ColorTargetState {
+                format: CANVAS,
+                blend: Some(wgpu::BlendState::PREMULTIPLIED_ALPHA_BLENDING),
+                write_mask: wgpu::ColorWrites::ALL,
             },
-            primitive: wgpu::PrimitiveState {
-                topology: wgpu::PrimitiveTopology::TriangleStrip,
-                ..Default::default()
-            },
-            depth_stencil: None,
-            multisample: Default::default(),
-            fragment: Some(wgpu::FragmentState {
-                module: &module,
-                entry_point: Some("shade"),
-                compilation_options: Default::default(),
-                targets: &[Some(wgpu::ColorTargetState {
-                    format: CANVAS,
-                    blend: Some(wgpu::BlendState::PREMULTIPLIED_ALPHA_BLENDING),
-                    write_mask: wgpu::ColorWrites::ALL,
-                })],
-            }),
-            multiview_mask: None,
-            cache: None,
-        });
-        Self { layout, pipeline }
+        ))
     }
 
     /// Copies a model to the device.
@@ -151,18 +86,7 @@ impl Blending {
         let resident = ResidentSplats::new(gpu, &file.splats.params(file.splats.sh_degree))?;
         let style = uniform::<Style>(gpu);
         let buffers = [&style, resident.splats2d(), resident.order(), resident.geometry()];
-        let entries: Vec<_> = (0..)
-            .zip(buffers)
-            .map(|(binding, buffer)| wgpu::BindGroupEntry {
-                binding,
-                resource: buffer.as_entire_binding(),
-            })
-            .collect();
-        let bindings = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some("blend"),
-            layout: &self.layout,
-            entries: &entries,
-        });
+        let bindings = self.0.bind(gpu, buffers.map(wgpu::Buffer::as_entire_binding));
         gpu.check()?;
         Ok(Drawable {
             resident,
@@ -223,9 +147,7 @@ impl Blending {
         });
         if !model.resident.is_empty() && begin < end {
             pass.set_scissor_rect(begin, 0, end - begin, camera.height);
-            pass.set_pipeline(&self.pipeline);
-            pass.set_bind_group(0, &model.bindings, &[]);
-            pass.draw(0..4, 0..model.resident.len());
+            self.0.draw(&mut pass, &model.bindings, 4, model.resident.len());
         }
         Ok(())
     }

@@ -3,7 +3,8 @@
 use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::Gpu;
 
-use crate::blending::{CANVAS, uniform, uniform_layout};
+use crate::blending::CANVAS;
+use crate::pipelines::{Pipeline, uniform, uniform_layout};
 
 /// How canvases are put together.
 #[repr(C)]
@@ -36,15 +37,11 @@ pub struct Canvases {
 
 /// The pipeline, for targets of one format.
 #[derive(Debug)]
-pub struct Composing {
-    layout: wgpu::BindGroupLayout,
-    pipeline: wgpu::RenderPipeline,
-}
+pub struct Composing(Pipeline);
 
 impl Composing {
     /// Compiles it.
     pub fn new(gpu: &Gpu, format: wgpu::TextureFormat) -> Self {
-        let device = gpu.device();
         let texture = |binding| wgpu::BindGroupLayoutEntry {
             binding,
             visibility: wgpu::ShaderStages::FRAGMENT,
@@ -55,41 +52,15 @@ impl Composing {
             },
             count: None,
         };
-        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-            label: Some("compose"),
-            entries: &[uniform_layout(0, wgpu::ShaderStages::FRAGMENT), texture(1), texture(2)],
-        });
-        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some("compose"),
-            source: wgpu::ShaderSource::Wgsl(include_str!("compose.wgsl").into()),
-        });
-        let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-            label: Some("compose"),
-            bind_group_layouts: &[Some(&layout)],
-            immediate_size: 0,
-        });
-        let pipeline = device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-            label: Some("compose"),
-            layout: Some(&pipeline_layout),
-            vertex: wgpu::VertexState {
-                module: &module,
-                entry_point: Some("cover"),
-                compilation_options: Default::default(),
-                buffers: &[],
-            },
-            primitive: Default::default(),
-            depth_stencil: None,
-            multisample: Default::default(),
-            fragment: Some(wgpu::FragmentState {
-                module: &module,
-                entry_point: Some("compose"),
-                compilation_options: Default::default(),
-                targets: &[Some(format.into())],
-            }),
-            multiview_mask: None,
-            cache: None,
-        });
-        Self { layout, pipeline }
+        Self(Pipeline::new(
+            gpu,
+            "compose",
+            include_str!("compose.wgsl").into(),
+            ["cover", "compose"],
+            &[uniform_layout(0, wgpu::ShaderStages::FRAGMENT), texture(1), texture(2)],
+            wgpu::PrimitiveTopology::TriangleList,
+            format.into(),
+        ))
     }
 
     /// Canvases of a size, for one model or two.
@@ -113,15 +84,8 @@ impl Composing {
         let views = textures.each_ref().map(|texture| texture.create_view(&Default::default()));
         let look = uniform::<Look>(gpu);
         let view = |view| wgpu::BindingResource::TextureView(view);
-        let bindings = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some("compose"),
-            layout: &self.layout,
-            entries: &[
-                wgpu::BindGroupEntry { binding: 0, resource: look.as_entire_binding() },
-                wgpu::BindGroupEntry { binding: 1, resource: view(&views[0]) },
-                wgpu::BindGroupEntry { binding: 2, resource: view(&views[1]) },
-            ],
-        });
+        let bindings =
+            self.0.bind(gpu, [look.as_entire_binding(), view(&views[0]), view(&views[1])]);
         Canvases { size, textures, views, look, bindings }
     }
 
@@ -150,8 +114,6 @@ impl Composing {
             timestamp_writes,
             ..Default::default()
         });
-        pass.set_pipeline(&self.pipeline);
-        pass.set_bind_group(0, &canvases.bindings, &[]);
-        pass.draw(0..3, 0..1);
+        self.0.draw(&mut pass, &canvases.bindings, 3, 1);
     }
 }

@@ -17,6 +17,7 @@ mod painter;
 mod panel;
 mod photo;
 mod picture_files;
+mod pipelines;
 mod rasterizing;
 mod scene_view;
 mod sources;

@@ -4,8 +4,9 @@ use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::{Gpu, ResidentPicture};
 use splat_render::{Camera, Result};
 
-use crate::blending::{CANVAS, Drawable, uniform, uniform_layout};
+use crate::blending::{CANVAS, Drawable};
 use crate::display::Settings;
+use crate::pipelines::{Pipeline, storage_layout, uniform, uniform_layout};
 use crate::stage_times::{BIN, CANVAS as CANVAS_STAGE, PROJECT, RASTERIZE, SORT, Stamps};
 
 /// Columns of a canvas.
@@ -28,62 +29,21 @@ pub struct Room {
 
 /// The pipeline from the picture to the canvas.
 #[derive(Debug)]
-pub struct Rasterizing {
-    layout: wgpu::BindGroupLayout,
-    pipeline: wgpu::RenderPipeline,
-}
+pub struct Rasterizing(Pipeline);
 
 impl Rasterizing {
     /// Compiles it.
     pub fn new(gpu: &Gpu) -> Self {
-        let device = gpu.device();
-        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-            label: Some("canvas"),
-            entries: &[
-                uniform_layout(0, wgpu::ShaderStages::FRAGMENT),
-                wgpu::BindGroupLayoutEntry {
-                    binding: 1,
-                    visibility: wgpu::ShaderStages::FRAGMENT,
-                    ty: wgpu::BindingType::Buffer {
-                        ty: wgpu::BufferBindingType::Storage { read_only: true },
-                        has_dynamic_offset: false,
-                        min_binding_size: None,
-                    },
-                    count: None,
-                },
-            ],
-        });
-        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some("canvas"),
-            source: wgpu::ShaderSource::Wgsl(include_str!("canvas.wgsl").into()),
-        });
-        let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-            label: Some("canvas"),
-            bind_group_layouts: &[Some(&layout)],
-            immediate_size: 0,
-        });
-        let pipeline = device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-            label: Some("canvas"),
-            layout: Some(&pipeline_layout),
-            vertex: wgpu::VertexState {
-                module: &module,
-                entry_point: Some("cover"),
-                compilation_options: Default::default(),
-                buffers: &[],
-            },
-            primitive: Default::default(),
-            depth_stencil: None,
-            multisample: Default::default(),
-            fragment: Some(wgpu::FragmentState {
-                module: &module,
-                entry_point: Some("lay"),
-                compilation_options: Default::default(),
-                targets: &[Some(CANVAS.into())],
-            }),
-            multiview_mask: None,
-            cache: None,
-        });
-        Self { layout, pipeline }
+        let stage = wgpu::ShaderStages::FRAGMENT;
+        Self(Pipeline::new(
+            gpu,
+            "canvas",
+            include_str!("canvas.wgsl").into(),
+            ["cover", "lay"],
+            &[uniform_layout(0, stage), storage_layout(1, stage)],
+            wgpu::PrimitiveTopology::TriangleList,
+            CANVAS.into(),
+        ))
     }
 
     /// Room for pictures up to a size.
@@ -91,18 +51,7 @@ impl Rasterizing {
         let picture = ResidentPicture::new(gpu, size[0], size[1])?;
         let place = uniform::<Place>(gpu);
         let buffers = [&place, picture.picture()];
-        let entries: Vec<_> = (0..)
-            .zip(buffers)
-            .map(|(binding, buffer)| wgpu::BindGroupEntry {
-                binding,
-                resource: buffer.as_entire_binding(),
-            })
-            .collect();
-        let bindings = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some("canvas"),
-            layout: &self.layout,
-            entries: &entries,
-        });
+        let bindings = self.0.bind(gpu, buffers.map(wgpu::Buffer::as_entire_binding));
         Ok(Room { size, picture, place, bindings })
     }
 
@@ -148,9 +97,7 @@ impl Rasterizing {
             ..Default::default()
         });
         pass.set_scissor_rect(begin, 0, end - begin, camera.height);
-        pass.set_pipeline(&self.pipeline);
-        pass.set_bind_group(0, &room.bindings, &[]);
-        pass.draw(0..3, 0..1);
+        self.0.draw(&mut pass, &room.bindings, 3, 1);
         drop(pass);
         gpu.queue().submit([encoder.finish()]);
         gpu.check()

@@ -20,7 +20,7 @@ from ..capture.folder import holds_cameras
 from ..capture.photo_folder import FRAMES, has_photos
 from ..capture.write_colmap import write_colmap
 from ..errors import IgsrError
-from ..pose import AUTO, capture_of, estimate, photos_of
+from ..pose import AUTO, capture_of, estimate, kept_cameras, photos_of
 from ..pose.registry import ESTIMATORS
 from .shared import (
     JsonOption,
@@ -101,9 +101,7 @@ def capture_to_fit(
                 f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
             )
         return load(path, holdout), False
-    kept = out / "capture"
-    if kept.resolve() in (path.resolve(), *path.resolve().parents):
-        raise IgsrError(f"{path} lies where the fit would write {kept}; name another --out")
+    kept = kept_cameras(path, out)
     if resume and holds_cameras(kept):
         complain(f"The cameras found before are used, from {kept}")
     else:

@@ -62,7 +62,7 @@ def refine_command(
         str, typer.Option("--rounds", help="At most so many, or auto: until one does not help.")
     ] = AUTO,
     holdout: HoldoutOption = None,
-    most: Annotated[
+    photo_count: Annotated[
         int | None,
         typer.Option("--photos", help="Use so many of the train photos, evenly spaced."),
     ] = None,
@@ -90,7 +90,7 @@ def refine_command(
         lambda: f"Interrupted; what is done is in {out}, the same command with --resume goes on."
     ):
         name = resolved(backend)
-        most_rounds = _rounds(rounds)
+        most = _rounds(rounds)
         denoiser = NetworkDenoiser(load_network(weights))
         with warnings_as_sentences():
             capture, _ = capture_to_fit(
@@ -103,8 +103,8 @@ def refine_command(
             )
         with _bar(shown=not as_json) as show, warnings_as_sentences():
             refined = refine(
-                capture if most is None else _some_photos(capture, most),
-                most_rounds,
+                capture if photo_count is None else _some_photos(capture, photo_count),
+                most,
                 show,
                 steps=steps,
                 backend=name,

@@ -22,7 +22,15 @@ from igsr.errors import IgsrError
 from .estimate import Estimate, Estimator, Progress
 from .registry import ESTIMATORS
 
-__all__ = ["AUTO", "Estimate", "Estimator", "capture_of", "estimate", "estimate_poses"]
+__all__ = [
+    "AUTO",
+    "Estimate",
+    "Estimator",
+    "capture_of",
+    "estimate",
+    "estimate_poses",
+    "kept_cameras",
+]
 
 
 #: The first of ``ESTIMATORS`` that can run here.
@@ -65,6 +73,18 @@ def estimate_poses(
         warnings.warn(sentence, stacklevel=2)
     path = Path(photos) if isinstance(photos, (str, os.PathLike)) else Path("photos")
     return capture_of(path, loaded, found)
+
+
+def kept_cameras(photos: Path, out: Path) -> Path:
+    """Where the cameras of photos are kept that are found for what goes to ``out``.
+
+    Raises:
+        IgsrError: the photos lie there themselves, and would be replaced.
+    """
+    kept = out / "capture"
+    if kept.resolve() in (photos.resolve(), *photos.resolve().parents):
+        raise IgsrError(f"{photos} lies where the fit would write {kept}; name another --out")
+    return kept
 
 
 def photos_of(
