@@ -14,7 +14,7 @@ from igsr.denoiser import Buffers, Source, Warped, photo_support, render_buffers
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
 from igsr.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
 from igsr.denoiser.pair_renders import rendered_pairs
-from igsr.denoiser.pairs import make_pairs
+from igsr.denoiser.pairs import FITTED_RENDERED, make_pairs
 from igsr.denoiser.warping import CONSIDERED
 from igsr.evaluation import BLACK
 
@@ -267,6 +267,18 @@ def test_pairs_of_every_recipe_are_the_same_again_and_not_made_twice(tmp_path, r
     written = (tmp_path / "a" / rows[0]["pairs"]).stat().st_mtime_ns
     assert make_pairs([tmp_path / "ball"], tmp_path / "a", **options) == rows
     assert (tmp_path / "a" / rows[0]["pairs"]).stat().st_mtime_ns == written
+
+
+@pytest.mark.parametrize("recipe", ["noise", "sparse"])
+def test_after_noise_all_views_are_rendered_from_where_they_are(tmp_path, recipe):
+    made = scenes.capture(views=6, size=24)
+    scenes.write_capture(tmp_path / "ball", made)
+    options = {"recipes": [recipe], "steps": 4, "views": 9, "backend": "cpu"}
+    (row,) = make_pairs([tmp_path / "ball"], tmp_path / "out", **options)
+    unseen = 6 if recipe == "noise" else 6 - row["photos"]
+    assert row["renders"] == unseen + FITTED_RENDERED
+    shown = read_pairs(tmp_path / "out" / row["pairs"]).truth[:unseen]
+    assert len(np.unique(shown, axis=0)) == unseen
 
 
 @pytest.mark.parametrize(

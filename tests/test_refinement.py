@@ -382,3 +382,36 @@ def test_each_fold_leaves_out_photos_that_no_other_does(capture, count, monkeypa
     assert len(left) == 2
     assert all(left)
     assert not set(left[0]) & set(left[1])
+
+
+@pytest.mark.filterwarnings("ignore:.*one and the same camera")
+def test_views_that_are_no_photos_change_neither_settings_nor_first_splats(capture):
+    photos = capture.train_views[:3]
+    weights = np.ones((40, 40), np.float32)
+    views = [
+        replace(view, name=f"{k}-{view.name}", weights=weights)
+        for k in range(3)
+        for view in capture.train_views
+    ]
+
+    def begun(some):
+        seen = []
+
+        def stop(now):
+            seen.append(now)
+            return False
+
+        igsr.fit(igsr.Capture(capture.path, some), backend="cpu", progress=stop)
+        return seen[0].steps, seen[0].started
+
+    assert len(views) > presets.FEW_PHOTOS
+    assert begun(photos + views) == begun(photos)
+    assert begun(views) != begun(photos)
+
+
+def test_from_scratch_the_views_are_fitted_as_the_photos_were(capture, helped):
+    refined = refine(capture, 1, truthful, from_scratch=True)
+    assert same(refined.first, helped[0].first)
+    assert refined.rounds[0].left_out == helped[0].rounds[0].left_out
+    assert not same(refined.splats, helped[0].rounds[0].splats)
+    assert refined.rounds[0].test["psnr"] > refined.first_test["psnr"] + 0.2

@@ -116,8 +116,8 @@ def fit(
             roughly; returning False ends the fit early, with the splats as they are then.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu".
         seed: of everything random.
-        preset: "default" (other settings for up to 20 photos than for more), "3dgs" or
-            "instantsplat"; see ``igsr.presets``.
+        preset: "default" (other settings for up to 20 photos than for more; views with weights are
+            no photos), "3dgs" or "instantsplat"; see ``igsr.presets``.
         max_splats: most splats there may be.
         sh_degree: degree of the colours' spherical harmonics, 0-4.
         density: how splats are added and removed: "mcmc" (relocation and growth under the cap,
@@ -241,7 +241,8 @@ def _fit(
         given = given | {"start": GIVEN}
         if given["sh_degree"] is None:
             given["sh_degree"] = warm.sh_degree
-    chosen = preset_settings(preset, len(views), **given)
+    photos = len(_photos(views))
+    chosen = preset_settings(preset, photos, **given)
     _check_arguments(chosen, seed, background, checkpoint, resume, warm)
     check_photos(views)
     if backend == "reference":
@@ -269,7 +270,7 @@ def _fit(
     }
     moving = settings["poses"] != "fixed" or settings["focal"] != "fixed"
     if warm is not None:
-        whole = max(settings["steps"], int(preset_settings(preset, len(views))["steps"]))
+        whole = max(settings["steps"], int(preset_settings(preset, photos)["steps"]))
         settings["first_step"] = whole - settings["steps"]
         settings["steps"] = whole
         settings["splats"] = _digest(_arrays(warm).values())
@@ -331,6 +332,14 @@ def _fit(
     return splats, with_train_cameras(capture, fitted_cameras(views, fitter, origin))
 
 
+def _photos(views: list[View]) -> list[View]:
+    """What the settings and the first splats go by; all views where none is a photo.
+
+    Others show what a fit to the photos made up.
+    """
+    return [view for view in views if view.weights is None] or views
+
+
 def _arrays(splats: Splats) -> dict[str, Any]:
     names = ("means", "quats", "scales", "opacities", "sh", "origin")
     return {name: getattr(splats, name) for name in names}
@@ -346,7 +355,7 @@ def _start(
     if warm is not None:
         return _arrays(warm), [GIVEN, len(warm)]
     splats, made_from = initial_splats(
-        capture,
+        replace(capture, views=_photos(capture.train_views)),
         settings["seed"],
         settings["max_splats"],
         settings["sh_degree"],

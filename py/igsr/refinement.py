@@ -175,6 +175,7 @@ def refine(
     look: Look = unseen_views,
     choose: Choose = select,
     judge: bool = True,
+    from_scratch: bool = False,
 ) -> Refined:
     """Fit photos, and make the fit better from views that nobody photographed.
 
@@ -194,6 +195,8 @@ def refine(
         look: where to look from; the paper's experiments have cameras that are given.
         choose: which of the cleaned views to add.
         judge: whether photos that are left out decide about a round; without, all are accepted.
+        from_scratch: refit as the first fit did, in place of going on from the splats that there
+            are with a quarter of its steps. What judges a round goes on from splats all the same.
 
     Raises:
         IgsrError: an argument cannot be used, photos lie in ``out/capture``, or as ``igsr.fit`` and
@@ -201,7 +204,19 @@ def refine(
     """
     capture = photos if isinstance(photos, Capture) else _posed(photos, out, resume, seed)
     loop = _Loop(
-        capture, rounds, progress, steps, backend, seed, denoiser, out, resume, look, choose, judge
+        capture,
+        rounds,
+        progress,
+        steps,
+        backend,
+        seed,
+        denoiser,
+        out,
+        resume,
+        look,
+        choose,
+        judge,
+        from_scratch,
     )
     whole = loop.fitted("whole", capture.train_views)
     first, first_test = whole.splats, loop.tested(whole.splats)
@@ -288,6 +303,7 @@ class _Loop:
         look: Look,
         choose: Choose,
         judge: bool,
+        from_scratch: bool,
     ) -> None:
         if rounds != AUTO and (not isinstance(rounds, int) or isinstance(rounds, bool)):
             raise IgsrError(f'rounds must be a whole number or "auto", not {rounds!r}.')
@@ -309,12 +325,15 @@ class _Loop:
         self.resume = resume
         self.progress = progress
         self.look, self.choose, self.fewest = look, choose, FEWEST if judge else 1
+        self.from_scratch = from_scratch
+        self.refit_steps = 1.0 if from_scratch else REFIT_STEPS
         self.started = self.noted = time.monotonic()
         self.seconds: dict[str, float] = {}
         # In units of a whole fit; looking takes about as long as a refit.
         views = capture.train_views
         fold = _share(_folded(views), views) * FOLDS if judge else 0.0
-        self.all = 1.0 + fold + self.rounds * 2.0 * (REFIT_STEPS + fold * FOLD_STEPS)
+        looked = REFIT_STEPS + fold * FOLD_STEPS
+        self.all = 1.0 + fold + self.rounds * (looked + self.refit_steps + fold * FOLD_STEPS)
         self.done, self.round, self.candidates = 0.0, 0, 0
 
     def fitted(self, name: str, photos: list[View]) -> _Chain:
@@ -388,7 +407,7 @@ class _Loop:
             steps = self._part(FOLD_STEPS)
             name = f"{chain.name}-round{number}-without"
             plain = self._fit(name, "judge", chain.with_views(number, []), steps, chain.splats)
-            self._add(number, chain, chosen, steps, "judge")
+            self._add(number, chain, chosen, steps, chain.splats, "judge")
             rows[0] += fold.scores
             rows[1] += self._scores(plain, fold.left)
             fold.scores = self._scores(chain.splats, fold.left)
@@ -402,18 +421,25 @@ class _Loop:
         ]
 
     def refitted(self, number: int, chain: _Chain, chosen: list[Candidate]) -> None:
-        """Go on with all photos and the chosen views."""
-        self._add(number, chain, chosen, self._part(REFIT_STEPS), "refit")
+        """Fit all photos and the chosen views."""
+        start = None if self.from_scratch else chain.splats
+        self._add(number, chain, chosen, self._part(self.refit_steps), start, "refit")
 
     def _add(
-        self, number: int, chain: _Chain, chosen: list[Candidate], steps: int, doing: str
+        self,
+        number: int,
+        chain: _Chain,
+        chosen: list[Candidate],
+        steps: int,
+        start: Splats | None,
+        doing: str,
     ) -> None:
         views = [
             self._view(f"{chain.name}-round{number}-{k}.png", one) for k, one in enumerate(chosen)
         ]
         fitted = chain.with_views(number, views)
         name = f"{chain.name}-round{number}"
-        chain.splats = self._fit(name, doing, fitted, steps, chain.splats)
+        chain.splats = self._fit(name, doing, fitted, steps, start)
         chain.added += [(view, number) for view in views]
 
     def _view(self, name: str, one: Candidate) -> View:

@@ -23,13 +23,13 @@ from .inputs import COLOR
 from .pair_files import write_pairs
 from .pair_renders import rendered_pairs
 
-#: Kinds of fits. "sparse" has 3 to 12 photos; "underfit" stops early; "noise" has wrong cameras;
+#: Kinds of fits. "sparse" has 3 to 16 photos; "underfit" stops early; "noise" has wrong cameras;
 #: "paper" is the paper's recipe, "scattered" its other one; "leave-one-out" leaves one photo of the
 #: capture out of each fit, for a capture of one's own.
 DEFAULT_RECIPES = ("sparse", "underfit", "noise")
 RECIPES = (*DEFAULT_RECIPES, "paper", "scattered", "leave-one-out")
 #: Photos of a "sparse" or "underfit" fit.
-FEW = (3, 4, 5, 6, 8, 9, 12)
+FEW = (3, 4, 5, 6, 8, 9, 12, 16)
 #: Photos of a fit with noise (the paper has 20), and of the paper's "many scattered views".
 NOISY_PHOTOS, SCATTERED_PHOTOS = 20, 60
 #: Steps of "paper", and of "scattered": few for so many photos.
@@ -75,7 +75,8 @@ def make_pairs(
             whose row is there is not done again.
         recipes: names of ``RECIPES``.
         fits: fits per capture and recipe ("leave-one-out" has one per photo instead).
-        views: unseen views rendered per fit; as many as there are, if fewer.
+        views: unseen views rendered per fit, after noise also fitted ones from their true cameras;
+            as many as there are, if fewer.
         steps: of each fit, where the recipe does not say; None is the default preset's.
         seed: of everything that is drawn.
         backend: what fits and renders.
@@ -196,5 +197,7 @@ def _chosen(
         size = least * (most / least) ** random.uniform()
         noise, steps = Noise(kind, float(size)), one.steps
     unit = noise_unit(train)
+    # No photo was fitted from where it is: as in the paper, all views may be rendered.
+    unseen = [views[i] for i in (*order[count:], *order[:count])][: one.views]
     noisy = [noisy_view(view, noise, random, unit) for view in train]
     return noisy, unseen, steps, {"noise": str(noise)}
