@@ -41,6 +41,14 @@ def refused(result, *words, code=1):
     assert result.stdout == ""
 
 
+def test_it_says_which_igsr_it_is():
+    result = igsr_command("--version")
+    assert (result.returncode, result.stdout) == (0, f"igsr {igsr.__version__}\n")
+    without = igsr_command()
+    assert without.returncode == 2
+    assert "refine" in without.stdout
+
+
 @pytest.fixture(scope="module")
 def capture_path(tmp_path_factory):
     return scenes.write_capture(

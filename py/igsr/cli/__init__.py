@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from typing import Annotated
 
 import typer
 
+from .._core import __version__
 from .bench import bench_command
 from .compact import compact_command
 from .convert import convert_command
@@ -27,6 +29,23 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"igsr {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Say which igsr this is."),
+    ] = False,
+) -> None:
+    pass
+
 
 app.command("pose")(pose_command)
 app.command("refine")(refine_command)
