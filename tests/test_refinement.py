@@ -80,7 +80,6 @@ def test_rounds_that_help_are_accepted_and_make_views_better(helped):
     assert refined.stopped == "2 rounds are done"
     for one in refined.rounds:
         for name, sign in (("psnr", 1), ("ssim", 1), ("flip", -1)):
-            assert sign * one.left_out[name] > sign * one.without[name]
             assert sign * one.left_out[name] > sign * one.before[name]
         assert 0 < len(one.chosen) <= one.candidates
     psnr = [refined.first_test["psnr"], *(one.test["psnr"] for one in refined.rounds)]
@@ -409,9 +408,12 @@ def test_views_that_are_no_photos_change_neither_settings_nor_first_splats(captu
     assert begun(views) != begun(photos)
 
 
-def test_from_scratch_the_views_are_fitted_as_the_photos_were(capture, helped):
-    refined = refine(capture, 1, truthful, from_scratch=True)
-    assert same(refined.first, helped[0].first)
-    assert refined.rounds[0].left_out == helped[0].rounds[0].left_out
-    assert not same(refined.splats, helped[0].rounds[0].splats)
-    assert refined.rounds[0].test["psnr"] > refined.first_test["psnr"] + 0.2
+def test_a_round_fits_photos_and_views_from_the_start(capture, helped):
+    refined = helped[0]
+    views = list(refined.capture.train_views)
+    for k, one in enumerate(refined.rounds[0].chosen):
+        camera, picture = one.view.camera, one.picture
+        views.append(igsr.View(f"whole-round1-{k}.png", camera, "train", picture, None, one.trust))
+    given = [*views[:9], *(replace(view, background=WHITE) for view in views[9:])]
+    fitted = igsr.fit(igsr.Capture(capture.path, given), STEPS, backend="cpu")
+    assert same(fitted, refined.rounds[0].splats)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -39,19 +39,16 @@ from .views import UnseenView, unseen_views
 
 #: Unseen views rendered in a round, and how many of them are added at most.
 CANDIDATES, CHOSEN = 16, 8
-#: A refit goes on from the splats that there are, with this part of a whole fit's steps.
-REFIT_STEPS = 0.25
 #: Fewer photos are not judged: each fold needs two to fit.
 FEWEST = 3
-#: Each of two folds leaves out one photo in so many, and redoes rounds with this part of the steps.
-#: With more left out, cleaning helps the folds' fits, which are worse, where it helps no whole one.
-FOLDS, LEFT_OUT, FOLD_STEPS = 2, 8, 0.2
+#: Each of two folds leaves out one photo in so many. With more left out, cleaning helps the folds'
+#: fits, which are worse, where it helps no whole one.
+FOLDS, LEFT_OUT = 2, 8
 #: Folds fit photos of half the size, unless their smaller side is then shorter than so many pixels:
 #: whole fits for a quarter of the time. Short ones of whole photos are unlike what is judged.
 FOLD_SIDE = 64
-#: An invented pixel counts beside a photo's as it can be trusted, and by this factor less in each
-#: later round: later renders know what earlier ones invented.
-VIEW_DECAY = 0.5
+#: Looking takes about this part of a whole fit's time.
+LOOK_SHARE = 0.1
 #: Of what cleaning changes, photos left out must find this part right for a round to begin.
 LEAST_RIGHT = 0.1
 #: Most rounds of "auto".
@@ -89,12 +86,11 @@ class Round:
         chosen: the views that were added, the one worth most first.
         candidates: how many there were to choose from.
         right: the part of what cleaning changes that is right, in [0, 1], as photos left out tell.
-        before: scores ("psnr", "ssim", "flip") of photos left out, by the fits as the round found
-            them.
-        without: the same by fits that took as many steps more without the round's views.
-        left_out: the same by fits with them. All three are empty where rounds are not judged.
-        accepted: whether with them all are better than before, and their mean better than without;
-            if not, the round's splats are not kept. Always where rounds are not judged.
+        before: scores ("psnr", "ssim", "flip") of photos left out, by fits without the round's
+            views.
+        left_out: the same by fits with them. Both are empty where rounds are not judged.
+        accepted: whether with them all are better; if not, the round's splats are not kept. Always
+            where rounds are not judged.
         splats: after the round; None where it was not accepted.
         test: mean scores of the capture's test views by those, which decide nothing; None without
             splats or views.
@@ -104,7 +100,6 @@ class Round:
     candidates: int
     right: float
     before: dict[str, float]
-    without: dict[str, float]
     left_out: dict[str, float]
     accepted: bool
     splats: Splats | None
@@ -136,20 +131,21 @@ class Refined:
 
 @dataclass(eq=False)
 class _Chain:
-    """Splats of some of the photos, with the views that their rounds have added."""
+    """Splats of some of the photos, and where the views are from that their rounds have added."""
 
     name: str
     photos: list[View]
     splats: Splats
-    added: list[tuple[View, int]] = field(default_factory=list)
+    added: list[UnseenView] = field(default_factory=list)
 
-    def with_views(self, round_: int, views: Sequence[View]) -> list[View]:
-        """Photos, and views of this round and of those before, which count less."""
-        return [
-            *self.photos,
-            *(_faded(view, round_ - since) for view, since in self.added),
-            *views,
-        ]
+
+@dataclass(frozen=True, eq=False)
+class _Looked:
+    """Cleaned views of a chain: the best unseen ones of ``candidates``, and those added before."""
+
+    chosen: list[Candidate]
+    again: list[Candidate]
+    candidates: int
 
 
 @dataclass(eq=False)
@@ -175,7 +171,6 @@ def refine(
     look: Look = unseen_views,
     choose: Choose = select,
     judge: bool = True,
-    from_scratch: bool = False,
 ) -> Refined:
     """Fit photos, and make the fit better from views that nobody photographed.
 
@@ -195,8 +190,6 @@ def refine(
         look: where to look from; the paper's experiments have cameras that are given.
         choose: which of the cleaned views to add.
         judge: whether photos that are left out decide about a round; without, all are accepted.
-        from_scratch: refit as the first fit did, in place of going on from the splats that there
-            are with a quarter of its steps. What judges a round goes on from splats all the same.
 
     Raises:
         IgsrError: an argument cannot be used, photos lie in ``out/capture``, or as ``igsr.fit`` and
@@ -204,19 +197,7 @@ def refine(
     """
     capture = photos if isinstance(photos, Capture) else _posed(photos, out, resume, seed)
     loop = _Loop(
-        capture,
-        rounds,
-        progress,
-        steps,
-        backend,
-        seed,
-        denoiser,
-        out,
-        resume,
-        look,
-        choose,
-        judge,
-        from_scratch,
+        capture, rounds, progress, steps, backend, seed, denoiser, out, resume, look, choose, judge
     )
     whole = loop.fitted("whole", capture.train_views)
     first, first_test = whole.splats, loop.tested(whole.splats)
@@ -233,13 +214,11 @@ def refine(
     while True:
         so_far("")
         number = len(done) + 1
-        chosen, why_none = loop.chosen(number, whole)
-        if why_none:
+        looked, why_none = loop.looked_for(number, whole)
+        if looked is None:
             return so_far(why_none)
-        candidates = loop.candidates
         before: dict[str, float] = {}
-        without, left_out, accepted = before, before, True
-        right = 1.0
+        left_out, accepted, right = before, True, 1.0
         if judge:
             folds = folds or loop.folds(whole)
             right = sum((loop.rightness(fold) for fold in folds), Rightness()).share
@@ -248,14 +227,14 @@ def refine(
                     f"cleaning brings views no nearer to photos that were left out ({right:.2f} of "
                     "what it changes is right)"
                 )
-            before, without, left_out = loop.judged(number, folds)
-            accepted = _all_better(left_out, before) and _error(left_out) < _error(without)
+            before, left_out = loop.judged(number, folds)
+            accepted = _all_better(left_out, before)
         if accepted:
-            loop.refitted(number, whole, chosen)
+            loop.refit(number, whole, looked, "refit")
         splats = whole.splats if accepted else None
         test = loop.tested(splats)
         done.append(
-            Round(chosen, candidates, right, before, without, left_out, accepted, splats, test)
+            Round(looked.chosen, looked.candidates, right, before, left_out, accepted, splats, test)
         )
         if not accepted:
             return so_far(f"round {number} did not make photos that were left out better")
@@ -277,15 +256,6 @@ def _all_better(scores: dict[str, float], than: dict[str, float]) -> bool:
     return all(sign * (scores[name] - than[name]) > 0.0 for name, sign in DECIDING.items())
 
 
-def _error(scores: dict[str, float]) -> float:
-    """Geometric mean of the root of the squared error, 1 - SSIM and FLIP.
-
-    What views do beyond as many steps without them is small beside what each score varies by.
-    """
-    errors = (10.0 ** (-scores["psnr"] / 20.0), 1.0 - scores["ssim"], scores["flip"])
-    return float(np.cbrt(np.prod(errors)))
-
-
 class _Loop:
     """The parts of ``refine``, each with what they share."""
 
@@ -303,7 +273,6 @@ class _Loop:
         look: Look,
         choose: Choose,
         judge: bool,
-        from_scratch: bool,
     ) -> None:
         if rounds != AUTO and (not isinstance(rounds, int) or isinstance(rounds, bool)):
             raise IgsrError(f'rounds must be a whole number or "auto", not {rounds!r}.')
@@ -325,20 +294,17 @@ class _Loop:
         self.resume = resume
         self.progress = progress
         self.look, self.choose, self.fewest = look, choose, FEWEST if judge else 1
-        self.from_scratch = from_scratch
-        self.refit_steps = 1.0 if from_scratch else REFIT_STEPS
         self.started = self.noted = time.monotonic()
         self.seconds: dict[str, float] = {}
-        # In units of a whole fit; looking takes about as long as a refit.
+        # In units of a whole fit.
         views = capture.train_views
-        fold = _share(_folded(views), views) * FOLDS if judge else 0.0
-        looked = REFIT_STEPS + fold * FOLD_STEPS
-        self.all = 1.0 + fold + self.rounds * (looked + self.refit_steps + fold * FOLD_STEPS)
-        self.done, self.round, self.candidates = 0.0, 0, 0
+        folds = _share(_folded(views), views) * FOLDS if judge else 0.0
+        self.all = (1.0 + folds) * (1.0 + self.rounds * (LOOK_SHARE + 1.0))
+        self.done, self.round = 0.0, 0
 
     def fitted(self, name: str, photos: list[View]) -> _Chain:
         """Photos fitted from the start."""
-        return _Chain(name, photos, self._fit(name, "fit", photos, self.steps, None))
+        return _Chain(name, photos, self._fit(name, "fit", photos))
 
     def folds(self, whole: _Chain) -> list[_Fold]:
         """Fits that each leave photos out, which scores then are of."""
@@ -351,29 +317,29 @@ class _Loop:
             out.append(_Fold(chain, left, self._scores(chain.splats, left)))
         return out
 
-    def chosen(self, number: int, whole: _Chain) -> tuple[list[Candidate], str]:
-        """The views that a round adds, or why there is none."""
+    def looked_for(self, number: int, whole: _Chain) -> tuple[_Looked | None, str]:
+        """What a round may add, or why there is nothing."""
         if number > self.rounds:
-            return [], "1 round is done" if self.rounds == 1 else f"{self.rounds} rounds are done"
+            return None, "1 round is done" if self.rounds == 1 else f"{self.rounds} rounds are done"
         if len(whole.photos) < self.fewest:
-            return [], f"fewer than {self.fewest} photos leave none to judge a round by"
-        chosen = self.looked(number, whole)
-        if self.candidates == 0:
-            return [], "no view near the photos is unseen"
-        if not chosen:
-            return [], f"none of {self.candidates} unseen views can be trusted to add anything"
-        return chosen, ""
+            return None, f"fewer than {self.fewest} photos leave none to judge a round by"
+        looked = self._looked(number, whole)
+        if looked.candidates == 0:
+            return None, "no view near the photos is unseen"
+        if not looked.chosen:
+            some = looked.candidates
+            return None, f"none of {some} unseen views can be trusted to add anything"
+        return looked, ""
 
-    def looked(self, number: int, chain: _Chain) -> list[Candidate]:
-        """The unseen views of a chain that are worth most, cleaned."""
+    def _looked(self, number: int, chain: _Chain) -> _Looked:
         self.round = number
         self._tell("look", 0.0)
-        cameras = [view.camera for view in chain.photos]
-        cameras += [view.camera for view, _ in chain.added]
-        views = self.look(chain.splats, cameras, CANDIDATES, self.backend)
-        found = self._cleaned(chain, views)
-        self.candidates = len(found)
-        return self.choose(found, CHOSEN)
+        known = [photo.camera for photo in chain.photos] + [view.camera for view in chain.added]
+        unseen = self.look(chain.splats, known, CANDIDATES, self.backend)
+        cleaned = self._cleaned(chain, [*unseen, *chain.added])
+        count = len(unseen)
+        self.done += LOOK_SHARE * _share(chain.photos, self.capture.train_views)
+        return _Looked(self.choose(cleaned[:count], CHOSEN), cleaned[count:], count)
 
     def _cleaned(self, chain: _Chain, views: Sequence[UnseenView]) -> list[Candidate]:
         photos, splats = chain.photos, chain.splats
@@ -396,22 +362,16 @@ class _Loop:
         return measured
 
     def judged(self, number: int, folds: Sequence[_Fold]) -> list[dict[str, float]]:
-        """Mean scores of the photos left out: before, without and with each fold's own round.
+        """Mean scores of the photos left out, before and after each fold's own round.
 
-        A fold goes on with its views: the next round is judged from there.
+        A fold keeps its views: the next round is judged from there.
         """
-        rows: list[list[dict[str, float]]] = [[], [], []]
+        rows: list[list[dict[str, float]]] = [[], []]
         for fold in folds:
-            chain = fold.chain
-            chosen = self.looked(number, chain)
-            steps = self._part(FOLD_STEPS)
-            name = f"{chain.name}-round{number}-without"
-            plain = self._fit(name, "judge", chain.with_views(number, []), steps, chain.splats)
-            self._add(number, chain, chosen, steps, chain.splats, "judge")
             rows[0] += fold.scores
-            rows[1] += self._scores(plain, fold.left)
-            fold.scores = self._scores(chain.splats, fold.left)
-            rows[2] += fold.scores
+            self.refit(number, fold.chain, self._looked(number, fold.chain), "judge")
+            fold.scores = self._scores(fold.chain.splats, fold.left)
+            rows[1] += fold.scores
         return [{s: float(np.mean([one[s] for one in some])) for s in DECIDING} for some in rows]
 
     def _scores(self, splats: Splats, left: list[View]) -> list[dict[str, float]]:
@@ -420,54 +380,38 @@ class _Loop:
             for one in score_views(splats, left, self.background, self.backend)
         ]
 
-    def refitted(self, number: int, chain: _Chain, chosen: list[Candidate]) -> None:
-        """Fit all photos and the chosen views."""
-        start = None if self.from_scratch else chain.splats
-        self._add(number, chain, chosen, self._part(self.refit_steps), start, "refit")
+    def refit(self, number: int, chain: _Chain, looked: _Looked, doing: str) -> None:
+        """Fit the photos and the views from the start, as the photos alone were.
 
-    def _add(
-        self,
-        number: int,
-        chain: _Chain,
-        chosen: list[Candidate],
-        steps: int,
-        start: Splats | None,
-        doing: str,
-    ) -> None:
-        views = [
-            self._view(f"{chain.name}-round{number}-{k}.png", one) for k, one in enumerate(chosen)
-        ]
-        fitted = chain.with_views(number, views)
+        What the first fit made up where no photo told better is not what this one begins with.
+        """
         name = f"{chain.name}-round{number}"
-        chain.splats = self._fit(name, doing, fitted, steps, start)
-        chain.added += [(view, number) for view in views]
+        views = [
+            self._view(f"{name}-{k}.png", one)
+            for k, one in enumerate((*looked.chosen, *looked.again))
+        ]
+        chain.splats = self._fit(name, doing, [*chain.photos, *views])
+        chain.added += [one.view for one in looked.chosen]
 
     def _view(self, name: str, one: Candidate) -> View:
         """A cleaned view as the fit takes it: over what stands behind photos with alpha."""
         camera, picture = one.view.camera, one.picture
         return View(name, camera, "train", picture, None, one.trust, self.behind)
 
-    def _part(self, part: float) -> int:
-        return max(1, round(part * self.steps))
-
-    def _fit(
-        self, name: str, doing: str, views: list[View], steps: int, start: Splats | None
-    ) -> Splats:
-        share = steps / self.steps * _share(views, self.capture.train_views)
+    def _fit(self, name: str, doing: str, views: list[View]) -> Splats:
+        share = _share(views, self.capture.train_views)
 
         def progress(now: Progress) -> bool:
-            first = now.steps - steps
-            self._tell(doing, share * (now.step - first) / steps)
+            self._tell(doing, share * now.step / now.steps)
             return True
 
         path = None if self.out is None else self.out / "checkpoints" / f"{name}.npz"
         splats = fit(
             Capture(self.capture.path, views, self.capture.points),
-            steps,
+            self.steps,
             progress,
             self.backend,
             self.seed,
-            start=start,
             checkpoint=path,
             resume=self.resume and path is not None and path.is_file(),
         )
@@ -512,8 +456,3 @@ def _share(views: Sequence[View], of: Sequence[View]) -> float:
         return sum(v.camera.width * v.camera.height for v in some) / len(some)
 
     return pixels(views) / pixels(of)
-
-
-def _faded(view: View, rounds: int) -> View:
-    assert view.weights is not None
-    return replace(view, weights=view.weights * np.float32(VIEW_DECAY**rounds))

@@ -128,7 +128,6 @@ def _scores(rows: list[dict[str, Any]]) -> str:
             style = "good" if row["accepted"] else "bad"
             lines = [
                 (f"{number}, left-out photos before", row["left_out"]["before"]),
-                (f"{number}, as many steps without views", row["left_out"]["without"]),
                 (
                     f'{number}, with views: <span class="{style}">{verdict}</span>',
                     row["left_out"]["with"],

@@ -84,7 +84,7 @@ def _row(one: Round) -> dict[str, Any]:
         "accepted": one.accepted,
         "candidates": one.candidates,
         "right": round(one.right, 4),
-        "left_out": {"before": one.before, "without": one.without, "with": one.left_out},
+        "left_out": {"before": one.before, "with": one.left_out},
         "views": [
             {
                 "angle": round(candidate.view.angle, 2),

@@ -67,10 +67,6 @@ def refine_command(
         typer.Option("--photos", help="Use so many of the train photos, evenly spaced."),
     ] = None,
     steps: Annotated[int | None, typer.Option("--steps", help="Of the first fit.")] = None,
-    from_scratch: Annotated[
-        bool,
-        typer.Option("--from-scratch", help="Refit from the start, not from the round before."),
-    ] = False,
     backend: BackendOption = BackendChoice.auto,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
     weights: Annotated[
@@ -116,7 +112,6 @@ def refine_command(
                 denoiser=denoiser,
                 out=out,
                 resume=resume,
-                from_scratch=from_scratch,
             )
     accepted = sum(one.accepted for one in refined.rounds)
     tests = [refined.first_test, *(one.test for one in refined.rounds if one.accepted)]

@@ -196,9 +196,7 @@ def run_refinement(given: Given, data: str, one: Refinement) -> dict[str, Any]:
                 row["splats"] = len(done.splats)
             else:
                 row = rows[-1] | row
-            row["left_out"] = {"before": done.before, "without": done.without} | {
-                "with": done.left_out
-            }
+            row["left_out"] = {"before": done.before, "with": done.left_out}
             rows.append(row)
         methods[how.name] = {
             "rounds": rows,
