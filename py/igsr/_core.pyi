@@ -196,6 +196,7 @@ class Fitter:
         images: list[npt.NDArray[np.uint8]],
         masks: list[npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None],
         backgrounds: Sequence[tuple[float, float, float] | None],
+        turns: Sequence[int],
         viewmats: Float64,
         intrinsics: Float64,
         state: dict[str, Any],
@@ -206,17 +207,18 @@ class Fitter:
         """A fit to V photos.
 
         ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
-        ``backgrounds`` RGB that stood behind an image without alpha, or None. ``viewmats`` are
-        [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4]. ``state`` is
-        either the parameters to start from (``SplatArrays`` without origin) or what ``state()``
-        returned. ``config``: steps, first_step (where in the schedule a fit begins), seed,
-        sh_degree, max_splats, density, dropout, hull, background; poses ("fixed", "joint"), focal
-        ("fixed", "shared", "per-camera"), camera_rate (pixels a step), camera_decay, camera_warm_up
-        (part of the steps), frozen (splats stay as they are); an absent or None entry takes the
-        default. ``holds`` say where the cameras that are fitted are known to be, and how surely:
-        viewmats [V, 4, 4] and intrinsics [V, 4] as above, information [V, 6, 6] (the inverse of
-        the covariance of a turn, in radians, about and a move along the camera's axes) and
-        focal_information [V] (of the focal length's logarithm), zero where nothing is known.
+        ``backgrounds`` RGB that stood behind an image without alpha, or None, ``turns`` how many
+        steps of a round are of it, at least 1. ``viewmats`` are [V, 4, 4] relative to the splats'
+        origin, ``intrinsics`` [V, 4]. ``state`` is either the parameters to start from
+        (``SplatArrays`` without origin) or what ``state()`` returned. ``config``: steps, first_step
+        (where in the schedule a fit begins), seed, sh_degree, max_splats, density, dropout, hull,
+        background; poses ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate
+        (pixels a step), camera_decay, camera_warm_up (part of the steps), frozen (splats stay as
+        they are); an absent or None entry takes the default. ``holds`` say where the cameras that
+        are fitted are known to be, and how surely: viewmats [V, 4, 4] and intrinsics [V, 4] as
+        above, information [V, 6, 6] (the inverse of the covariance of a turn, in radians, about and
+        a move along the camera's axes) and focal_information [V] (of the focal length's logarithm),
+        zero where nothing is known.
         """
 
     def step(self, count: int) -> dict[str, Any]:

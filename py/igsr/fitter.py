@@ -16,6 +16,10 @@ from .capture.types import intrinsic_matrix
 from .errors import IgsrError
 from .rendering import intrinsics_of, viewmat_about
 
+#: Steps on photos, at least, for one on a view that is none, where there are both: what such views
+#: teach they teach soon, and what photos show is right.
+PHOTO_STEPS = 5
+
 
 def fitter_of(
     views: Sequence[View],
@@ -36,12 +40,21 @@ def fitter_of(
         [np.ascontiguousarray(view.image) for view in views],
         [_counting(view) for view in views],
         [view.background for view in views],
+        _turns(views),
         *_arrays(views, origin),
         state,
         settings,
         backend,
         None if holds is None else _hold_arrays(holds, origin),
     )
+
+
+def _turns(views: Sequence[View]) -> list[int]:
+    """How many steps of a round are of each view."""
+    photos = sum(view.weights is None for view in views)
+    others = len(views) - photos
+    each = max(1, -(-PHOTO_STEPS * others // max(1, photos)))
+    return [each if view.weights is None else 1 for view in views]
 
 
 def _counting(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None:

@@ -260,8 +260,11 @@ fn targets_from(
     images: &Bound<'_, PyList>,
     masks: &Bound<'_, PyList>,
     backgrounds: &[Option<[f32; 3]>],
+    turns: &[u32],
 ) -> PyResult<Vec<Target>> {
-    for (name, entries) in [("masks", masks.len()), ("backgrounds", backgrounds.len())] {
+    for (name, entries) in
+        [("masks", masks.len()), ("backgrounds", backgrounds.len()), ("turns", turns.len())]
+    {
         if images.len() != entries {
             return Err(PyValueError::new_err(format!(
                 "{name}: has {entries} entries for {} images",
@@ -289,6 +292,7 @@ fn targets_from(
             pixels: pixels.to_vec(),
             weights,
             background: backgrounds[i],
+            turns: turns[i],
         };
         target.validate(i).map_err(to_python)?;
         targets.push(target);
@@ -308,12 +312,13 @@ impl Fitter {
 impl Fitter {
     /// A fit of `state` to photos; `holds` say where cameras are known to be, and how surely.
     #[new]
-    #[pyo3(signature = (images, masks, backgrounds, viewmats, intrinsics, state, config, backend, holds=None))]
+    #[pyo3(signature = (images, masks, backgrounds, turns, viewmats, intrinsics, state, config, backend, holds=None))]
     fn new<'py>(
         py: Python<'py>,
         images: &Bound<'py, PyList>,
         masks: &Bound<'py, PyList>,
         backgrounds: Vec<Option<[f32; 3]>>,
+        turns: Vec<u32>,
         viewmats: &Bound<'py, PyAny>,
         intrinsics: &Bound<'py, PyAny>,
         state: &Bound<'py, PyDict>,
@@ -322,7 +327,7 @@ impl Fitter {
         holds: Option<&Bound<'py, PyDict>>,
     ) -> PyResult<Self> {
         let config = config_from(config)?;
-        let targets = targets_from(images, masks, &backgrounds)?;
+        let targets = targets_from(images, masks, &backgrounds, &turns)?;
         let sizes: Vec<(u32, u32)> = targets.iter().map(|t| (t.width, t.height)).collect();
         let cameras = cameras(viewmats, intrinsics, &sizes)?;
         let camera_state = camera_state_from(state, cameras.len())?;

@@ -36,6 +36,7 @@ fn photos() -> (Vec<Target>, Vec<Camera>) {
                 pixels: pixels.collect(),
                 weights: None,
                 background: None,
+                turns: 1,
             }
         })
         .collect();
@@ -124,6 +125,25 @@ fn a_resumed_fit_ends_with_the_same_bits() {
             assert!(!camera.viewmat.abs_diff_eq(*viewmat, 1e-4), "a camera stood still");
         }
     }
+}
+
+#[test]
+fn a_photo_of_two_turns_is_fitted_as_often_as_two_photos() {
+    let (targets, cameras) = photos();
+    let fitted = |turns: &[(usize, u32)]| {
+        let targets = turns.iter().map(|&(k, turns)| Target { turns, ..targets[k].clone() });
+        // All of one camera: how far the scene reaches goes by the cameras that there are.
+        let cameras = vec![cameras[0]; turns.len()];
+        let config = FitConfig { cameras: None, ..config(DensityControl::Mcmc) };
+        let device = Box::new(CpuFit::default());
+        Fitter::new(device, targets.collect(), cameras, start(1), 0, config)
+            .map(|mut fitter| run(&mut fitter, 20))
+    };
+    let once = fitted(&[(0, 1), (1, 1), (2, 1)]).unwrap();
+    let twice = fitted(&[(0, 2), (1, 1), (2, 1)]).unwrap();
+    assert!(twice == fitted(&[(0, 1), (0, 1), (1, 1), (2, 1)]).unwrap());
+    assert!(twice != once);
+    assert!(fitted(&[(0, 0), (1, 1)]).unwrap_err().to_string().contains("images[0]: has no turn"));
 }
 
 /// One step that changes no splat, and what it says of its camera.

@@ -64,7 +64,15 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
                     .collect()
             });
         let channels = if rgba { 4 } else { 3 };
-        targets.push(Target { width, height, channels, pixels, weights, background: None });
+        targets.push(Target {
+            width,
+            height,
+            channels,
+            pixels,
+            weights,
+            background: None,
+            turns: 1,
+        });
         cameras.push(camera);
     }
     let start = FitState::new(arrays(random_scene(&mut rng, splats, Some(1))));

@@ -250,6 +250,7 @@ def fitter(shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) 
         [shot.photo],
         [mask],
         [None],
+        [1],
         scene.viewmat[None],
         scene.intrinsics[None],
         _state(scene),

@@ -23,6 +23,8 @@ pub struct Target {
     /// RGB in 0..=1 that stood behind what an image without alpha shows, where that is known: it is
     /// compared to renders over it.
     pub background: Option<[f32; 3]>,
+    /// How many steps of a round are of it, at least 1.
+    pub turns: u32,
 }
 
 /// What a photo's pixels weigh.
@@ -60,6 +62,9 @@ impl Target {
         }
         if self.background.is_some_and(|color| color.iter().any(|c| !(0.0..=1.0).contains(c))) {
             return bad("stood before a background that does not lie in 0..=1".into());
+        }
+        if self.turns == 0 {
+            return bad("has no turn; give at least one".into());
         }
         if let Some(weights) = &self.weights {
             if weights.len() != pixels {

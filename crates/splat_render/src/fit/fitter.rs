@@ -3,6 +3,8 @@
 //! Nothing random carries over from step to step: every draw comes from the seed and the step's
 //! number, so a fit resumed from a saved state goes on with the same bits.
 
+use std::iter::repeat_n;
+
 use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
@@ -47,6 +49,8 @@ pub struct Fitter {
     behind: Vec<Option<[f32; 3]>>,
     hull: Option<Hull>,
     extent: f32,
+    /// The photos of a round of steps, each as often as it has turns, and their order in this one.
+    round: Vec<usize>,
     order: Vec<usize>,
     splats: usize,
     step: u32,
@@ -109,6 +113,11 @@ impl Fitter {
         }
         let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
         let behind = targets.iter().map(|t| t.background).collect();
+        let round = targets
+            .iter()
+            .enumerate()
+            .flat_map(|(k, target)| repeat_n(k, target.turns as usize))
+            .collect();
         let hull = config.hull.then(|| Hull::new(&targets));
         device.set_targets(targets)?;
         let splats = state.splats.len();
@@ -127,6 +136,7 @@ impl Fitter {
             has_alpha,
             behind,
             hull,
+            round,
             order: Vec::new(),
             splats,
             step,
@@ -189,12 +199,13 @@ impl Fitter {
         Ok(())
     }
 
-    /// The photo of step `step` (from 0): every photo once per round, in a new order each round.
+    /// The photo of step `step` (from 0): every photo takes its turns in a round, in a new order each
+    /// round.
     fn view(&mut self, step: u32) -> usize {
-        let n = self.cameras.len() as u32;
+        let n = self.round.len() as u32;
         if self.order.is_empty() || step.is_multiple_of(n) {
             let mut rng = self.rng(Draw::Order, u64::from(step / n));
-            self.order = (0..n as usize).collect();
+            self.order.clone_from(&self.round);
             self.order.shuffle(&mut rng);
         }
         self.order[(step % n) as usize]
@@ -248,7 +259,7 @@ impl Fitter {
         let Some(cameras) = self.moving.as_mut().filter(|cameras| cameras.moving(progress)) else {
             return Ok(());
         };
-        if self.step.is_multiple_of(self.cameras.len() as u32) {
+        if self.step.is_multiple_of(self.round.len() as u32) {
             cameras.add(&self.device.camera_gradients()?);
             cameras.step(progress);
             self.cameras = cameras.now().to_vec();

@@ -95,7 +95,15 @@ mod tests {
         for k in 0..(width * height) as usize {
             pixels[4 * k + 3] = if k % width as usize >= 10 { 255 } else { 0 };
         }
-        let target = Target { width, height, channels: 4, pixels, weights: None, background: None };
+        let target = Target {
+            width,
+            height,
+            channels: 4,
+            pixels,
+            weights: None,
+            background: None,
+            turns: 1,
+        };
         let hull = Hull::new(std::slice::from_ref(&target));
         assert!(hull.contains([0.2, 0.0, 1.0], &[camera]));
         // One pixel beyond the edge is not sure to be empty; two are.
