@@ -38,7 +38,7 @@ from .splats import Splats
 from .views import UnseenView, unseen_views
 
 #: Unseen views rendered in a round, and how many of them are added at most.
-CANDIDATES, CHOSEN = 16, 8
+CANDIDATES, CHOSEN = 24, 16
 #: Fewer photos are not judged: each fold needs two to fit.
 FEWEST = 3
 #: Each of two folds leaves out one photo in so many. With more left out, cleaning helps the folds'

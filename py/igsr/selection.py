@@ -21,7 +21,7 @@ Float32 = npt.NDArray[np.float32]
 
 #: Error of a photo's colours as splats see them: noise, and what the model cannot show. A pixel
 #: that is expected to be as wrong counts half.
-PHOTO_ERROR = 0.03
+PHOTO_ERROR = 0.06
 #: A view whose pixels count less than this on average is not one to learn from.
 LEAST_TRUST = 0.15
 #: Nor is one that is worth less than this: an eighth of a level of 8 bits, trusted everywhere.
