@@ -68,7 +68,8 @@ class View:
         mask: bool [H, W], True where the pixel may be used, or None where all may: the given mask
             and what undistortion could fill, joined.
         weights: float32 [H, W], how much each pixel counts in fits beside a photo's, finite and
-            not negative, or None where all count 1. Only pictures that are not photos have them.
+            not negative, or None where all count 1. Only pictures that are not photos have them:
+            fits go by the photos, and have five steps on those for one on such pictures.
         background: RGB in [0, 1] that stood behind what ``image`` shows without alpha, where that
             is known: fits compare it to renders over that. None for photos.
 
