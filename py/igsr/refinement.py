@@ -44,8 +44,9 @@ FEWEST = 3
 #: Each of two folds leaves out one photo in so many. With more left out, cleaning helps the folds'
 #: fits, which are worse, where it helps no whole one.
 FOLDS, LEFT_OUT = 2, 8
-#: Folds fit photos of half the size, unless their smaller side is then shorter than so many pixels:
-#: whole fits for a quarter of the time. Short ones of whole photos are unlike what is judged.
+#: Folds fit photos of half the size, unless their smaller side is then shorter than so many pixels,
+#: with as many splats per pixel: whole fits for a part of the time. Short ones of whole photos are
+#: unlike what is judged.
 FOLD_SIDE = 64
 #: Looking takes about this part of a whole fit's time.
 LOOK_SHARE = 0.1
@@ -287,7 +288,8 @@ class _Loop:
         self.background = default_background(capture)
         self.behind = known_background(capture.views)
         photos = len(capture.train_views)
-        self.steps = int(preset_settings("default", photos, steps=steps)["steps"])
+        settings = preset_settings("default", photos, steps=steps)
+        self.steps, self.max_splats = int(settings["steps"]), int(settings["max_splats"])
         if self.steps < 1:
             raise IgsrError(f"steps must be at least 1, not {steps}.")
         self.out = None if out is None else Path(out)
@@ -399,7 +401,8 @@ class _Loop:
         return View(name, camera, "train", picture, None, one.trust, self.behind)
 
     def _fit(self, name: str, doing: str, views: list[View]) -> Splats:
-        share = _share(views, self.capture.train_views)
+        photos = [view for view in views if view.weights is None]
+        share = _share(photos, self.capture.train_views)
 
         def progress(now: Progress) -> bool:
             self._tell(doing, share * now.step / now.steps)
@@ -412,6 +415,7 @@ class _Loop:
             progress,
             self.backend,
             self.seed,
+            max_splats=max(1, round(share * self.max_splats)),
             checkpoint=path,
             resume=self.resume and path is not None and path.is_file(),
         )
