@@ -58,8 +58,8 @@ MOST_ROUNDS = 4
 Look = Callable[[Splats, Sequence[Camera], int, str], Sequence[UnseenView]]
 #: Which of the cleaned views to add, and how many at most.
 Choose = Callable[[Sequence[Candidate], int], list[Candidate]]
-#: Scores of photos left out that must become better, and their signs.
-DECIDING = {"psnr": 1.0, "ssim": 1.0, "flip": -1.0}
+#: Scores of photos left out that decide about a round.
+DECIDING = ("psnr", "ssim", "flip")
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class Round:
         before: scores ("psnr", "ssim", "flip") of photos left out, by fits without the round's
             views.
         left_out: the same by fits with them. Both are empty where rounds are not judged.
-        accepted: whether with them all are better; if not, the round's splats are not kept. Always
-            where rounds are not judged.
+        accepted: whether with them the geometric mean of root squared error, 1 - SSIM and FLIP is
+            less; if not, the round's splats are not kept. Always where rounds are not judged.
         splats: after the round; None where it was not accepted.
         test: mean scores of the capture's test views by those, which decide nothing; None without
             splats or views.
@@ -229,7 +229,7 @@ def refine(
                     "what it changes is right)"
                 )
             before, left_out = loop.judged(number, folds)
-            accepted = _all_better(left_out, before)
+            accepted = _error(left_out) < _error(before)
         if accepted:
             loop.refit(number, whole, looked, "refit")
         splats = whole.splats if accepted else None
@@ -253,8 +253,13 @@ def _posed(
     return load_capture(kept)
 
 
-def _all_better(scores: dict[str, float], than: dict[str, float]) -> bool:
-    return all(sign * (scores[name] - than[name]) > 0.0 for name, sign in DECIDING.items())
+def _error(scores: dict[str, float]) -> float:
+    """Geometric mean of the root of the squared error, 1 - SSIM and FLIP.
+
+    Of a few photos one of them may go the other way by chance.
+    """
+    errors = (10.0 ** (-scores["psnr"] / 20.0), 1.0 - scores["ssim"], scores["flip"])
+    return float(np.cbrt(np.prod(errors)))
 
 
 class _Loop:
