@@ -36,7 +36,8 @@ tr + tr td { border-top: 1px solid var(--line); }
 .row { display: flex; flex-wrap: wrap; gap: .6rem; margin: .6rem 0; }
 figure { margin: 0; } figcaption { font-size: 12px; opacity: .75; }
 img { display: block; max-width: 100%; border-radius: 3px; }
-.views { display: grid; grid-template-columns: repeat(3, 1fr); gap: .5rem; max-width: 980px; }
+.views { display: grid; grid-template-columns: repeat(6, 1fr); gap: .5rem; }
+@media (max-width: 800px) { .views { grid-template-columns: repeat(3, 1fr); } }
 .good { color: var(--good); } .bad { color: var(--bad); }
 canvas { border: 1px solid var(--line); border-radius: 4px; touch-action: none; max-width: 100%; }
 """
@@ -182,7 +183,7 @@ def _cameras(refined: Refined) -> str:
     added = [
         one.view.camera for round_ in refined.rounds if round_.accepted for one in round_.chosen
     ]
-    centres = np.stack([camera.centre for camera in known])
+    centres = np.stack([camera.centre for camera in (*known, *added)])
     middle = centres.mean(axis=0)
     size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-9)
     drawn = [
