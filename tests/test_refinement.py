@@ -385,6 +385,35 @@ def test_each_fold_leaves_out_photos_that_no_other_does(capture, count, monkeypa
     assert not set(left[0]) & set(left[1])
 
 
+def test_folds_of_halved_photos_have_as_many_splats_per_pixel(capture, monkeypatch):
+    monkeypatch.setattr(refinement, "FOLD_SIDE", 16)
+    counts = []
+    real = refinement._Loop.folds
+
+    def watched(loop, whole):
+        folds = real(loop, whole)
+        counts.append([len(chain.splats) for chain in (whole, *(fold.chain for fold in folds))])
+        return folds
+
+    monkeypatch.setattr(refinement._Loop, "folds", watched)
+    refine(capture, 1, lying, steps=400)
+    ((whole, *folds),) = counts
+    assert 250 < whole <= 1000
+    assert all(0 < fold <= 250 for fold in folds)
+
+
+def test_a_round_is_judged_by_three_errors_together():
+    def error(psnr, ssim, flip):
+        return refinement._error({"psnr": psnr, "ssim": ssim, "flip": flip})
+
+    assert error(20.0, 0.9, 0.1) == pytest.approx(0.1)
+    before = error(26.755, 0.9279, 0.0780)
+    assert error(26.850, 0.9297, 0.0782) < before, "a little more FLIP does not outweigh the rest"
+    assert error(26.750, 0.9279, 0.0780) > before
+    assert error(26.755, 0.9278, 0.0780) > before
+    assert error(26.755, 0.9279, 0.0781) > before
+
+
 @pytest.mark.filterwarnings("ignore:.*one and the same camera")
 def test_views_that_are_no_photos_change_neither_settings_nor_first_splats(capture):
     photos = capture.train_views[:3]
