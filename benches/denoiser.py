@@ -64,7 +64,7 @@ def main() -> None:
     for k, camera in enumerate(cameras):
         image = render(scene, camera, BACKGROUND, "cpu").to_uint8()
         photos.append(View(f"{k}.png", camera, "train", image))
-    support = photo_support(scene, cameras, "cpu")
+    support = photo_support(scene, photos, "cpu")
     sources = photo_sources(scene, photos, BACKGROUND, "cpu")
     view = ring_camera(0.1, arguments.size)
 

@@ -10,7 +10,16 @@ import scenes
 
 import igsr
 from igsr.capture import Camera, View
-from igsr.denoiser import Buffers, Source, Warped, photo_support, render_buffers, warp_photos
+from igsr.denoiser import (
+    Buffers,
+    Source,
+    Warped,
+    photo_sources,
+    photo_support,
+    render_buffers,
+    warp_photos,
+    warping,
+)
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
 from igsr.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
 from igsr.denoiser.pair_renders import rendered_pairs
@@ -41,8 +50,12 @@ def splats(means, scales, opacity=0.95, quats=(1.0, 0.0, 0.0, 0.0)):
 
 def test_buffers_are_what_is_known_of_a_flat_splat():
     flat = splats([[0.0, 0.0, 0.0]], [2.0, 2.0, 0.01])
-    seen = photo_support(flat, [camera(), camera(0.5), camera(50.0)], "cpu")
+    empty = np.zeros((32, 32, 3), np.uint8)
+    photos = [View(f"{x}.png", camera(x), "train", empty) for x in (0.0, 0.5, 50.0)]
+    seen = photo_support(flat, photos, "cpu")
     assert seen.tolist() == [2.0], "the third photo looks past it"
+    masked = replace(photos[0], mask=np.zeros((32, 32), np.bool_))
+    assert photo_support(flat, [masked, *photos[1:]], "cpu").tolist() == [1.0]
     buffers = render_buffers(flat, camera(), seen, (1.0, 1.0, 1.0), "cpu")
     drawn = igsr.render(flat, camera(), (1.0, 1.0, 1.0), "cpu")
     assert np.array_equal(buffers.color, drawn.color)
@@ -299,3 +312,45 @@ def test_bad_arguments_of_pairs(tmp_path, options, message):
 def test_pairs_can_be_imported_first():
     """Studies make pairs too; neither may need the other to be there already."""
     subprocess.run([sys.executable, "-c", "import igsr.denoiser.pairs"], check=True)
+
+
+def test_a_large_picture_is_looked_up_in_bands_of_rows(monkeypatch):
+    scene = scenes.splats(60)
+    photos = scenes.capture(views=6, size=40, scene=scene).views
+    sources = photo_sources(scene, photos, BLACK, "cpu")
+    view = scenes.ring_camera(0.1, 40)
+    buffers = render_buffers(scene, view, photo_support(scene, photos, "cpu"), backend="cpu")
+    whole = warp_photos(view, buffers.depth, buffers.alpha, sources, PHOTOS)
+    monkeypatch.setattr(warping, "BAND", 7 * 40)
+    bands = warp_photos(view, buffers.depth, buffers.alpha, sources, PHOTOS)
+    assert whole.valid.any()
+    for name in ("color", "valid", "angle"):
+        assert np.array_equal(getattr(whole, name), getattr(bands, name))
+
+
+def test_no_splats_are_an_empty_picture():
+    none = splats(np.zeros((0, 3)), 0.1)
+    photos = scenes.capture(views=2, size=32).views
+    buffers = render_buffers(none, camera(), photo_support(none, photos, "cpu"), backend="cpu")
+    assert not buffers.color.any()
+    picture, confidence = igsr.denoise(buffers, photo_sources(none, photos, BLACK, "cpu"))
+    assert np.isfinite(picture).all()
+    assert np.isfinite(confidence).all()
+
+
+def test_one_far_pixel_leaves_the_depth_of_the_others():
+    depth = np.full((8, 8), 2.0, np.float32)
+    depth[0, 0] = 1e5
+    depth[0, 1] = 0.0
+    depth[3, 3] = 4.0
+    nothing = Warped(np.zeros((0, 8, 8, 3)), np.zeros((0, 8, 8), bool), np.zeros((0, 8, 8)))
+    buffers = Buffers(color=np.zeros((8, 8, 3), np.float32), depth=depth)
+    channel = network_inputs(buffers, nothing)[4]
+    assert channel[3, 3] == pytest.approx(1.0)
+    assert channel[3, 4] == 0.0
+    assert channel[0, 1] == 0.0
+
+
+def test_a_picture_in_bytes_is_refused_as_colour():
+    with pytest.raises(igsr.IgsrError, match="color must be of floats"):
+        Buffers(color=np.zeros((8, 8, 3), np.uint8))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -185,6 +186,97 @@ def test_stopped_at_any_moment_and_resumed_it_ends_the_same(capture, helped, tmp
     assert [one.left_out for one in refined.rounds] == [one.left_out for one in helped[0].rounds]
 
 
+def test_what_lies_there_stays_until_resuming_has_more(capture, helped, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(helped[1], out)
+
+    def contents():
+        files = (path for path in out.rglob("*") if path.is_file())
+        return {path: path.read_bytes() for path in files}
+
+    before = contents()
+    with pytest.raises(igsr.IgsrError, match="was made from other photos"):
+        refine(capture, 2, lambda *given: (truthful(*given)[0] * 0.99, truthful(*given)[1]),
+               out=out, resume=True)  # fmt: skip
+    with pytest.raises(igsr.IgsrError, match="was stopped"):
+        refine(capture, 2, truthful, out=out, resume=True, progress=lambda now: now.round < 2)
+    assert contents() == before
+    seconds = json.loads((out / "report.json").read_text())["seconds"]
+    refine(capture, 2, truthful, out=out, resume=True)
+    resumed = json.loads((out / "report.json").read_text())["seconds"]
+    assert resumed["fit"] >= seconds["fit"] > 0.0, "what was done before took time too"
+    after = contents()
+    for name in ("scene.ply", "rounds/2/scene.ply", "rounds/2/view-0.after.png"):
+        assert after[out / name] == before[out / name]
+
+
+def test_without_resume_nothing_of_an_earlier_run_is_in_the_way(capture, tmp_path):
+    out = tmp_path / "out"
+    refine(capture, 1, truthful, out=out, steps=40, judge=False)
+    others = out / "checkpoints/of-my-own.npz"
+    others.write_bytes(b"mine")
+
+    def stop(now):
+        return now.doing != "look"
+
+    with pytest.raises(igsr.IgsrError, match="was stopped"):
+        refine(capture, 1, truthful, out=out, steps=60, judge=False, progress=stop)
+    assert not (out / "checkpoints/whole-round1.npz").exists()
+    assert others.read_bytes() == b"mine"
+    resumed = refine(capture, 1, truthful, out=out, steps=60, judge=False, resume=True)
+    assert len(resumed.rounds) == 1
+
+
+def test_a_fit_that_is_stopped_is_saved(capture, tmp_path):
+    def stop(now):
+        return now.done == 0.0
+
+    with pytest.raises(igsr.IgsrError, match="was stopped"):
+        refine(capture, 0, truthful, out=tmp_path, steps=400, progress=stop)
+    assert (tmp_path / "checkpoints/whole.npz").is_file()
+
+
+def test_folds_are_fitted_as_all_photos_are(capture, monkeypatch):
+    """With a photo more than few photos, its folds have few: they are fitted as many, too."""
+    monkeypatch.setattr(presets, "FEW_PHOTOS", 8)
+    assert len(capture.train_views) == 9
+    settings = []
+    real = refinement.fit
+
+    def watched(made, **given):
+        settings.append((len(made.views), given["density"], given["sh_degree"], given["dropout"]))
+        return real(made, **given)
+
+    monkeypatch.setattr(refinement, "fit", watched)
+    refine(capture, 1, lying, steps=40)
+    assert [photos for photos, *_ in settings] == [9, 8, 8] or settings[1][0] < 9
+    assert {tuple(some) for _, *some in settings} == {("original", 2, 0.0)}
+
+
+def test_what_masks_leave_out_is_not_learned(capture):
+    """Photos of one half alone: views say nothing of what only the other half would have shown."""
+    half = np.zeros((40, 40), np.bool_)
+    half[:, :20] = True
+    views = [replace(view, mask=half) for view in capture.train_views]
+    trusted = []
+    real = igsr.refinement.select
+
+    def choose(found, count):
+        trusted.append([one.trust for one in found])
+        return real(found, count)
+
+    def sure(buffers, photos):
+        return truthful(buffers, photos)[0], np.full(buffers.color.shape[:2], 1.0, np.float32)
+
+    given = {"judge": False, "choose": choose}
+    refine(igsr.Capture(capture.path, views), 1, sure, **given)
+    refine(igsr.Capture(capture.path, capture.train_views), 1, sure, **given)
+    masked, whole = (np.stack(some) for some in trusted)
+    assert (whole == whole.max()).all(), "without masks what the denoiser says counts"
+    assert masked.min() == 0.0
+    assert 0.1 < (masked > 0.5).mean() < 0.9
+
+
 @pytest.mark.parametrize(
     ("rounds", "options", "message"),
     [
@@ -193,12 +285,17 @@ def test_stopped_at_any_moment_and_resumed_it_ends_the_same(capture, helped, tmp
         (True, {}, "rounds must be a whole number"),
         (1, {"resume": True}, "resume needs out"),
         (1, {"backend": "reference"}, "backend reference renders but does not fit"),
-        (1, {"steps": 0}, "steps must be"),
+        (1, {"steps": 0}, "steps must be a whole number from 1, not 0"),
+        (1, {"steps": 2.9}, "steps must be a whole number from 1, not 2.9"),
+        (1, {"steps": "many"}, "steps must be"),
     ],
 )
-def test_bad_arguments(capture, rounds, options, message):
+def test_bad_arguments(capture, rounds, options, message, monkeypatch):
     with pytest.raises(igsr.IgsrError, match=message):
         refine(capture, rounds, truthful, **options)
+    monkeypatch.setattr(refinement, "_posed", lambda *_: pytest.fail("cameras are looked for"))
+    with pytest.raises(igsr.IgsrError, match=message):
+        refine("a folder", rounds, truthful, **options)
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence(capture, tmp_path):
@@ -257,6 +354,13 @@ def test_photos_that_cannot_be_placed_are_left_out_with_a_warning(tmp_path, monk
         monkeypatch.setitem(registry.ESTIMATORS, name, unwanted)
     again = igsr.refine(tmp_path / "photos", 1, **given, resume=True)
     assert same(first.splats, again.splats)
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    missing = sorted(path.name for path in (tmp_path / "photos").iterdir())[::2]
+    assert report["not_placed"] == missing
+    assert ", ".join(missing) in (tmp_path / "out/report.html").read_text()
+    (tmp_path / "photos" / missing[0]).unlink()
+    with pytest.raises(igsr.IgsrError, match="has the cameras of other photos than"):
+        igsr.refine(tmp_path / "photos", 1, **given, resume=True)
 
 
 def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(capture):
@@ -372,8 +476,8 @@ def test_each_fold_leaves_out_photos_that_no_other_does(capture, count, monkeypa
     left = []
     real = refinement._Loop.folds
 
-    def watched(loop, whole):
-        folds = real(loop, whole)
+    def watched(loop):
+        folds = real(loop)
         left.extend([view.name for view in fold.left] for fold in folds)
         assert all(len(fold.left) + len(fold.chain.photos) == count for fold in folds)
         return folds
@@ -390,14 +494,14 @@ def test_folds_of_halved_photos_have_as_many_splats_per_pixel(capture, monkeypat
     counts = []
     real = refinement._Loop.folds
 
-    def watched(loop, whole):
-        folds = real(loop, whole)
-        counts.append([len(chain.splats) for chain in (whole, *(fold.chain for fold in folds))])
+    def watched(loop):
+        folds = real(loop)
+        counts.extend(len(fold.chain.splats) for fold in folds)
         return folds
 
     monkeypatch.setattr(refinement._Loop, "folds", watched)
-    refine(capture, 1, lying, steps=400)
-    ((whole, *folds),) = counts
+    whole, folds = len(refine(capture, 1, lying, steps=400).first), counts
+    assert len(folds) == 2
     assert 250 < whole <= 1000
     assert all(0 < fold <= 250 for fold in folds)
 

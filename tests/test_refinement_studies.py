@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +17,11 @@ from igsr import presets, study
 from igsr.capture import Capture
 from igsr.denoiser.network import Architecture, DenoiserNetwork
 from igsr.denoiser.weights import save_network
+from igsr.selection import Candidate
 from igsr.study import refinements
 from igsr.study.refinements import METHODS, Refinement, split
 from igsr.study.views import localized, scattered
+from igsr.views import UnseenView
 
 BALL = scenes.splats(60)
 
@@ -110,6 +113,46 @@ def test_table2_has_a_row_per_method_and_goes_on_where_it_stopped(data):
     )
     assert again == report
     assert not ran
+
+
+def test_other_settings_begin_anew_and_pictures_may_be_gone(data):
+    options = {"scenes": ("ball",), "methods": ("ours",), "seeds": 1}
+    options |= {"weights": data / "a.safetensors"}
+    study.table3(data / "data", data / "out", **options, steps=40)
+    left = data / "out/rounds/ball-localized4-seed0-cpu/first.png"
+    left.with_name("old.png").write_bytes(left.read_bytes())
+    report = study.table3(data / "data", data / "out", **options, steps=50)
+    assert left.is_file()
+    assert not left.with_name("old.png").exists()
+    shutil.rmtree(data / "out/rounds")
+    with pytest.warns(UserWarning, match="no sheet of ball-localized4-seed0-cpu is drawn"):
+        assert study.table3(data / "data", data / "out", **options, steps=50) == report
+
+
+def test_the_papers_choice_is_blind_where_masks_are():
+    made = ball(8, alpha=False)
+    shown = np.zeros((40, 40), np.bool_)
+    shown[:, 20:] = True
+    views = [replace(view, mask=shown) for view in made.views[:2]]
+    black = np.zeros((40, 40, 3), np.uint8)
+
+    def found(view, wrong):
+        # One is right where the mask is, the other where it is not.
+        picture = view.image.copy()
+        picture[:, 20 * wrong : 20 * wrong + 20] = 255 - picture[:, 20 * wrong : 20 * wrong + 20]
+        unseen = UnseenView(view.camera, 0.0, between=False)
+        return Candidate(unseen, black, picture, np.ones((40, 40), np.float32), 1.0)
+
+    given = [found(views[0], 1), found(views[1], 0)]
+
+    def distance(_, one, other):
+        return float(np.abs(one.astype(float) - other).mean())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refinements, "picture_distance", distance)
+        how = refinements.Rounds("one", "absolute", 1, 1, judge=False)
+        (best,) = refinements._by_truth(views, made, how, None, given, 1)
+    assert best is given[1]
 
 
 def test_the_papers_choice_is_by_the_true_picture(data, monkeypatch):

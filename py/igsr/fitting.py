@@ -245,12 +245,7 @@ def _fit(
     chosen = preset_settings(preset, photos, **given)
     _check_arguments(chosen, seed, background, checkpoint, resume, warm)
     check_photos(views)
-    if backend == "reference":
-        raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
-    try:
-        info = _core.backend_info(_core.resolve_backend(backend))
-    except ValueError as error:
-        raise IgsrError(f"{error}.") from error
+    info = check_fits(backend)
     path = None if checkpoint is None else Path(checkpoint)
     settings: dict[str, Any] = {
         "steps": int(chosen["steps"]),
@@ -428,6 +423,21 @@ def _digest(arrays: Iterable[npt.NDArray[Any] | None]) -> str:
     return digest.hexdigest()
 
 
+def check_fits(backend: str) -> dict[str, str]:
+    """What a backend is, which must be one that fits.
+
+    Raises:
+        IgsrError: there is none of that name, or it does not fit.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    if backend == "reference":
+        raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
+    try:
+        return _core.backend_info(_core.resolve_backend(backend))
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
+
+
 def _check_arguments(
     chosen: dict[str, Any],
     seed: object,
@@ -550,7 +560,8 @@ def _run(
                 save()
                 saved_step, saved_at = step, time.perf_counter()
         try:
-            save()
+            if step > saved_step:
+                save()
         except IgsrError as error:
             # The splats are finished: losing them to a full disk would be the greater harm.
             warnings.warn(str(error), stacklevel=4)

@@ -28,11 +28,11 @@ from .evaluation import (
     over_background,
     score_views,
 )
-from .fitting import Progress, fit
+from .fitting import Progress, check_fits, fit
 from .halved import halved
-from .pose import AUTO, estimate_poses, kept_cameras
+from .pose import AUTO, estimate_poses, found_before, kept_cameras, note_photos
 from .presets import preset_settings
-from .refinement_report import write_refinement
+from .refinement_report import seconds_so_far, write_refinement
 from .selection import Candidate, Rightness, candidate, rightness, select
 from .splats import Splats
 from .views import UnseenView, unseen_views
@@ -58,6 +58,7 @@ MOST_ROUNDS = 4
 Look = Callable[[Splats, Sequence[Camera], int, str], Sequence[UnseenView]]
 #: Which of the cleaned views to add, and how many at most.
 Choose = Callable[[Sequence[Candidate], int], list[Candidate]]
+STOPPED = "the refinement was stopped; go on with resume."
 #: Scores of photos left out that decide about a round.
 DECIDING = ("psnr", "ssim", "flip")
 
@@ -84,7 +85,8 @@ class Round:
     """What one round did.
 
     Attributes:
-        chosen: the views that were added, the one worth most first.
+        chosen: the views that were added, the one worth most first. Those of earlier rounds were
+            rendered and cleaned anew, and are not in it.
         candidates: how many there were to choose from.
         right: the part of what cleaning changes that is right, in [0, 1], as photos left out tell.
         before: scores ("psnr", "ssim", "flip") of photos left out, by fits without the round's
@@ -118,7 +120,8 @@ class Refined:
         capture: photos and cameras.
         rounds: those that were tried, in order; only the last can be one that was not accepted.
         stopped: why there was no further round; empty while there may be one.
-        seconds: that each part took, by the names of ``RefineProgress.doing``.
+        seconds: that each part took, by the names of ``RefineProgress.doing``, with what earlier
+            calls took that this one went on from.
     """
 
     splats: Splats
@@ -132,10 +135,14 @@ class Refined:
 
 @dataclass(eq=False)
 class _Chain:
-    """Splats of some of the photos, and where the views are from that their rounds have added."""
+    """Splats of some of the photos, and where the views are from that their rounds have added.
+
+    ``share`` is the part of the photos' pixels that is fitted, which a step's time goes by.
+    """
 
     name: str
     photos: list[View]
+    share: float
     splats: Splats
     added: list[UnseenView] = field(default_factory=list)
 
@@ -177,17 +184,18 @@ def refine(
 
     Args:
         photos: a capture, or a folder of photos, whose cameras are found if it has none.
-        rounds: at most so many, or "auto": until one does not help.
+        rounds: at most so many, or "auto": until one does not help, and at most four.
         progress: called now and then; returning False ends it with an ``IgsrError``, and what
             is done so far stays in ``out``.
-        steps: of the first fit; None is the default preset's.
+        steps: of each fit; None is the default preset's.
         backend: "auto", "cpu" or "gpu".
         seed: of everything random; same seed, same bits.
         denoiser: what cleans; None is the one that comes with igsr.
         out: folder for ``scene.ply``, ``rounds/``, ``report.json`` and ``report.html``
             (``igsr.refinement_report``), written after every round, ``checkpoints/``, and
             ``capture/`` with cameras that had to be found; None writes nothing.
-        resume: go on from the checkpoints in ``out``, to the same end.
+        resume: go on from the checkpoints in ``out``, to the same end; what lies there is left as
+            it is until there is more. Without, checkpoints of an earlier run are removed.
         look: where to look from; the paper's experiments have cameras that are given.
         choose: which of the cleaned views to add.
         judge: whether photos that are left out decide about a round; without, all are accepted.
@@ -196,6 +204,7 @@ def refine(
         IgsrError: an argument cannot be used, photos lie in ``out/capture``, or as ``igsr.fit`` and
             ``igsr.estimate_poses``.
     """
+    check_arguments(rounds, steps, backend, out, resume)
     capture = photos if isinstance(photos, Capture) else _posed(photos, out, resume, seed)
     loop = _Loop(
         capture, rounds, progress, steps, backend, seed, denoiser, out, resume, look, choose, judge
@@ -221,7 +230,7 @@ def refine(
         before: dict[str, float] = {}
         left_out, accepted, right = before, True, 1.0
         if judge:
-            folds = folds or loop.folds(whole)
+            folds = folds or loop.folds()
             right = sum((loop.rightness(fold) for fold in folds), Rightness()).share
             if right < LEAST_RIGHT:
                 return so_far(
@@ -241,6 +250,30 @@ def refine(
             return so_far(f"round {number} did not make photos that were left out better")
 
 
+def check_arguments(
+    rounds: int | str,
+    steps: int | None,
+    backend: str,
+    out: str | os.PathLike[str] | None,
+    resume: bool,
+) -> None:
+    """Find what cannot be used before cameras are looked for.
+
+    Raises:
+        IgsrError: an argument of ``refine`` cannot be used.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    if rounds != AUTO and (not isinstance(rounds, int) or isinstance(rounds, bool)):
+        raise IgsrError(f'rounds must be a whole number or "auto", not {rounds!r}.')
+    if isinstance(rounds, int) and rounds < 0:
+        raise IgsrError(f"rounds must not be negative, not {rounds}.")
+    if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool) or steps < 1):
+        raise IgsrError(f"steps must be a whole number from 1, not {steps!r}.")
+    check_fits(backend)
+    if resume and out is None:
+        raise IgsrError("resume needs out, the folder to go on from.")
+
+
 def _posed(
     photos: str | os.PathLike[str], out: str | os.PathLike[str] | None, resume: bool, seed: int
 ) -> Capture:
@@ -248,8 +281,9 @@ def _posed(
     if out is None or holds_cameras(photos):
         return estimate_poses(photos, seed=seed)
     kept = kept_cameras(Path(photos), Path(out))
-    if not (resume and holds_cameras(kept)):
+    if not (resume and found_before(Path(photos), kept)):
         write_colmap(estimate_poses(photos, seed=seed), kept, replace=True)
+        note_photos(Path(photos), kept)
     return load_capture(kept)
 
 
@@ -280,47 +314,46 @@ class _Loop:
         choose: Choose,
         judge: bool,
     ) -> None:
-        if rounds != AUTO and (not isinstance(rounds, int) or isinstance(rounds, bool)):
-            raise IgsrError(f'rounds must be a whole number or "auto", not {rounds!r}.')
         self.rounds = MOST_ROUNDS if isinstance(rounds, str) else rounds
-        if self.rounds < 0:
-            raise IgsrError(f"rounds must not be negative, not {rounds}.")
-        if resume and out is None:
-            raise IgsrError("resume needs out, the folder to go on from.")
         if not capture.train_views:
             raise IgsrError(f"{capture.path} has no train views to fit.")
         self.capture, self.backend, self.seed, self.denoiser = capture, backend, seed, denoiser
         self.background = default_background(capture)
         self.behind = known_background(capture.views)
-        photos = len(capture.train_views)
-        settings = preset_settings("default", photos, steps=steps)
-        self.steps, self.max_splats = int(settings["steps"]), int(settings["max_splats"])
-        if self.steps < 1:
-            raise IgsrError(f"steps must be at least 1, not {steps}.")
+        views = capture.train_views
+        # All fits have those of the first: a fold's fewer photos are to be fitted as all of them.
+        settings = preset_settings("default", len(views), steps=steps)
+        self.settings = {
+            name: settings[name] for name in ("steps", "sh_degree", "density", "dropout")
+        }
+        self.max_splats = int(settings["max_splats"])
         self.out = None if out is None else Path(out)
         self.resume = resume
+        self.further = not resume
+        if self.out is not None and not resume:
+            _remove_checkpoints(self.out)
         self.progress = progress
         self.look, self.choose, self.fewest = look, choose, FEWEST if judge else 1
         self.started = self.noted = time.monotonic()
-        self.seconds: dict[str, float] = {}
+        self.seconds = seconds_so_far(self.out) if resume and self.out is not None else {}
         # In units of a whole fit.
-        views = capture.train_views
-        folds = _share(_folded(views), views) * FOLDS if judge else 0.0
+        self.folded, self.fold_share = _folded(views)
+        folds = self.fold_share * FOLDS if judge else 0.0
         self.all = (1.0 + folds) * (1.0 + self.rounds * (LOOK_SHARE + 1.0))
         self.done, self.round = 0.0, 0
 
-    def fitted(self, name: str, photos: list[View]) -> _Chain:
+    def fitted(self, name: str, photos: list[View], share: float = 1.0) -> _Chain:
         """Photos fitted from the start."""
-        return _Chain(name, photos, self._fit(name, "fit", photos))
+        return _Chain(name, photos, share, self._fit(name, "fit", photos, share))
 
-    def folds(self, whole: _Chain) -> list[_Fold]:
+    def folds(self) -> list[_Fold]:
         """Fits that each leave photos out, which scores then are of."""
-        photos, out = _folded(whole.photos), []
+        photos, out = self.folded, []
         every = min(LEFT_OUT, len(photos))  # so that each fold leaves one out
         for k in range(FOLDS):
             left = photos[k * every // FOLDS :: every]
             kept = [photo for photo in photos if not any(photo is one for one in left)]
-            chain = self.fitted(f"fold{k}", kept)
+            chain = self.fitted(f"fold{k}", kept, self.fold_share)
             out.append(_Fold(chain, left, self._scores(chain.splats, left)))
         return out
 
@@ -340,23 +373,23 @@ class _Loop:
 
     def _looked(self, number: int, chain: _Chain) -> _Looked:
         self.round = number
-        self._tell("look", 0.0)
+        self._tell("look")
         known = [photo.camera for photo in chain.photos] + [view.camera for view in chain.added]
         unseen = self.look(chain.splats, known, CANDIDATES, self.backend)
         cleaned = self._cleaned(chain, [*unseen, *chain.added])
         count = len(unseen)
-        self.done += LOOK_SHARE * _share(chain.photos, self.capture.train_views)
+        self.done += LOOK_SHARE * chain.share
         return _Looked(self.choose(cleaned[:count], CHOSEN), cleaned[count:], count)
 
     def _cleaned(self, chain: _Chain, views: Sequence[UnseenView]) -> list[Candidate]:
         photos, splats = chain.photos, chain.splats
-        support = photo_support(splats, [view.camera for view in photos], self.backend)
+        support = photo_support(splats, photos, self.backend)
         sources = photo_sources(splats, photos, self.background, self.backend)
         found = []
         for view in views:
             buffers = render_buffers(splats, view.camera, support, self.behind, self.backend)
             found.append(candidate(view, buffers, sources, self.denoiser))
-            self._tell("look", 0.0)
+            self._tell("look")
         return found
 
     def rightness(self, fold: _Fold) -> Rightness:
@@ -382,10 +415,12 @@ class _Loop:
         return [{s: float(np.mean([one[s] for one in some])) for s in DECIDING} for some in rows]
 
     def _scores(self, splats: Splats, left: list[View]) -> list[dict[str, float]]:
-        return [
+        scores = [
             {name: float(one.scores[name] or 0.0) for name in DECIDING}
             for one in score_views(splats, left, self.background, self.backend)
         ]
+        self._tell("judge")
+        return scores
 
     def refit(self, number: int, chain: _Chain, looked: _Looked, doing: str) -> None:
         """Fit the photos and the views from the start, as the photos alone were.
@@ -397,7 +432,7 @@ class _Loop:
             self._view(f"{name}-{k}.png", one)
             for k, one in enumerate((*looked.chosen, *looked.again))
         ]
-        chain.splats = self._fit(name, doing, [*chain.photos, *views])
+        chain.splats = self._fit(name, doing, [*chain.photos, *views], chain.share)
         chain.added += [one.view for one in looked.chosen]
 
     def _view(self, name: str, one: Candidate) -> View:
@@ -405,25 +440,28 @@ class _Loop:
         camera, picture = one.view.camera, one.picture
         return View(name, camera, "train", picture, None, one.trust, self.behind)
 
-    def _fit(self, name: str, doing: str, views: list[View]) -> Splats:
-        photos = [view for view in views if view.weights is None]
-        share = _share(photos, self.capture.train_views)
+    def _fit(self, name: str, doing: str, views: list[View], share: float) -> Splats:
+        goes_on = True
 
         def progress(now: Progress) -> bool:
-            self._tell(doing, share * now.step / now.steps)
-            return True
+            nonlocal goes_on
+            self.further = True
+            goes_on = self._goes_on(doing, share * now.step / now.steps)
+            return goes_on
 
-        path = None if self.out is None else self.out / "checkpoints" / f"{name}.npz"
+        path = None if self.out is None else _checkpoints(self.out) / f"{name}.npz"
         splats = fit(
             Capture(self.capture.path, views, self.capture.points),
-            self.steps,
-            progress,
-            self.backend,
-            self.seed,
+            progress=progress,
+            backend=self.backend,
+            seed=self.seed,
             max_splats=max(1, round(share * self.max_splats)),
             checkpoint=path,
             resume=self.resume and path is not None and path.is_file(),
+            **self.settings,
         )
+        if not goes_on:  # asked after the fit has saved what it has
+            raise IgsrError(STOPPED)
         self.done += share
         return splats
 
@@ -432,36 +470,45 @@ class _Loop:
         if splats is None or not self.capture.test_views:
             return None
         scores = evaluate(splats, self.capture, "test", self.background, self.backend)
-        self._tell("test", 0.0)
+        self._tell("test")
         return {metric: scores[metric] for metric in METRICS}
 
     def write(self, refined: Refined) -> None:
-        """Put what there is so far into ``out``."""
-        if self.out is not None:
+        """Put what there is so far into ``out``, once it is more than lay there."""
+        if self.out is not None and (self.further or refined.stopped):
             write_refinement(self.out, refined, self.backend, self.seed)
 
-    def _tell(self, doing: str, doing_done: float) -> None:
+    def _tell(self, doing: str) -> None:
+        if not self._goes_on(doing, 0.0):
+            raise IgsrError(STOPPED)
+
+    def _goes_on(self, doing: str, doing_done: float) -> bool:
         now = time.monotonic()
         self.seconds[doing] = self.seconds.get(doing, 0.0) + now - self.noted
         self.noted = now
         if self.progress is None:
-            return
+            return True
         done = min(1.0, (self.done + doing_done) / self.all)
         seconds = now - self.started
-        if self.progress(RefineProgress(self.round, doing, done, seconds)) is False:
-            raise IgsrError("the refinement was stopped; go on with resume.")
+        return self.progress(RefineProgress(self.round, doing, done, seconds)) is not False
 
 
-def _folded(photos: Sequence[View]) -> list[View]:
-    """Photos as folds fit them."""
-    sides = [min(photo.camera.width, photo.camera.height) for photo in photos]
-    return [halved(photo) for photo in photos] if min(sides) >= 2 * FOLD_SIDE else list(photos)
+def _folded(photos: Sequence[View]) -> tuple[list[View], float]:
+    """Photos as folds fit them, and the part of the pixels that these have."""
+    if min(min(photo.camera.width, photo.camera.height) for photo in photos) < 2 * FOLD_SIDE:
+        return list(photos), 1.0
+    small = [halved(photo) for photo in photos]
+    pixels = (sum(v.camera.width * v.camera.height for v in some) for some in (small, photos))
+    return small, next(pixels) / next(pixels)
 
 
-def _share(views: Sequence[View], of: Sequence[View]) -> float:
-    """Pixels of a view beside one of others: a step takes about this part of the time."""
+def _checkpoints(out: Path) -> Path:
+    return out / "checkpoints"
 
-    def pixels(some: Sequence[View]) -> float:
-        return sum(v.camera.width * v.camera.height for v in some) / len(some)
 
-    return pixels(views) / pixels(of)
+def _remove_checkpoints(out: Path) -> None:
+    """Remove an earlier run's fits: resuming this one must not find them."""
+    for pattern in ("whole", "fold[0-9]"):
+        for kind in (f"{pattern}.npz", f"{pattern}-round[0-9]*.npz"):
+            for path in _checkpoints(out).glob(kind):
+                path.unlink(missing_ok=True)

@@ -92,7 +92,7 @@ def write_page(path: Path, refined: Refined, report: dict[str, Any]) -> None:
         _summary(refined),
         _scores(report["rounds"]),
         _cameras(refined),
-        _photos(refined),
+        _photos(refined, report["not_placed"]),
         *(_round(number, one) for number, one in enumerate(refined.rounds, 1)),
         _timings(report),
     ]
@@ -141,8 +141,12 @@ def _scores(rows: list[dict[str, Any]]) -> str:
             cells = "".join(f"<td>{_number(scores, name)}</td>" for name in SCORES)
             out.append(f"<tr><td>{label}</td>{cells}<td>{row['splats'] or ''}</td></tr>")
     out.append("</table>")
+    judged = [row["left_out"] for row in rows[1:] if row["left_out"]["with"]]
+    if judged:
+        left_out = [judged[0]["before"], *(scores["with"] for scores in judged)]
+        out.append(_curve([scores["psnr"] for scores in left_out], "photos left out"))
     if known:
-        out.append(_curve([row["test"]["psnr"] for row in rows if row["test"]]))
+        out.append(_curve([row["test"]["psnr"] for row in rows if row["test"]], "test views"))
     return "".join(out)
 
 
@@ -153,8 +157,8 @@ def _number(scores: dict[str, float] | None, name: str) -> str:
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
 
 
-def _curve(values: list[float]) -> str:
-    """PSNR of the test views over the rounds, as SVG."""
+def _curve(values: list[float], of: str) -> str:
+    """PSNR of some views over the rounds, as SVG."""
     if len(values) < 2:
         return ""
     low, high = min(values), max(values)
@@ -171,10 +175,10 @@ def _curve(values: list[float]) -> str:
         for (x, y), value in zip(at, values, strict=True)
     )
     return (
-        '<svg width="400" height="150" role="img" aria-label="PSNR of test views">'
+        f'<svg width="400" height="150" role="img" aria-label="PSNR of {of}">'
         f'<polyline points="{line}" fill="none" stroke="currentColor"/>{dots}'
         '<text x="40" y="145" font-size="12" fill="currentColor">'
-        "PSNR of the test views, dB, by round</text></svg>"
+        f"PSNR of {of}, dB, by round</text></svg>"
     )
 
 
@@ -207,13 +211,17 @@ def _frustum(camera: Camera, depth: float) -> npt.NDArray[np.float64]:
     return np.concatenate([camera.centre[None], world])
 
 
-def _photos(refined: Refined) -> str:
+def _photos(refined: Refined, not_placed: list[str]) -> str:
     background = default_background(refined.capture)
     figures = [
         _figure(over_background(view.image, background), html.escape(view.name), THUMBNAIL)
         for view in refined.capture.train_views
     ]
-    return f'<h2>Photos</h2><div class="row">{"".join(figures)}</div>'
+    missing = ""
+    if not_placed:
+        names = html.escape(", ".join(not_placed))
+        missing = f"<p>No camera was found for these, which were left out: {names}.</p>"
+    return f'<h2>Photos</h2>{missing}<div class="row">{"".join(figures)}</div>'
 
 
 def _round(number: int, one: Round) -> str:

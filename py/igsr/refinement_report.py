@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from PIL import Image
 from . import _core
 from .atomic_write import atomic_write
 from .evaluation import default_background, score_views
+from .pose import not_placed
 from .refinement_page import write_page
 from .report import rounds_sheet, save_sheet, sheet_names, write_cameras, write_report
 from .splats import Splats
@@ -20,6 +22,9 @@ from .splats import Splats
 if TYPE_CHECKING:
     from .refinement import Refined, Round
     from .selection import Candidate
+
+#: Parts of a refinement, as ``RefineProgress.doing`` has them.
+PARTS = ("fit", "look", "judge", "refit", "test")
 
 
 def write_refinement(out: Path, refined: Refined, backend: str, seed: int) -> None:
@@ -52,6 +57,7 @@ def write_refinement(out: Path, refined: Refined, backend: str, seed: int) -> No
         "seconds": {part: round(seconds, 2) for part, seconds in refined.seconds.items()},
         "peak_memory_bytes": _peak_memory(),
         "photos": [view.name for view in refined.capture.train_views],
+        "not_placed": not_placed(refined.capture),
         "splats": len(refined.splats),
         "seed": seed,
         "version": _core.__version__,
@@ -60,6 +66,15 @@ def write_refinement(out: Path, refined: Refined, backend: str, seed: int) -> No
     write_report(out / "report.json", report)
     _write_views(out / "views.png", refined, backend)
     write_page(out / "report.html", refined, report)
+
+
+def seconds_so_far(out: Path) -> dict[str, float]:
+    """What each part took by the report that lies in ``out``; none where there is no such."""
+    try:
+        found = json.loads((out / "report.json").read_text(encoding="utf-8"))["seconds"]
+        return {part: float(found[part]) for part in PARTS if part in found}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 def _write_views(path: Path, refined: Refined, backend: str) -> None:
@@ -98,7 +113,6 @@ def _row(one: Round) -> dict[str, Any]:
 
 
 def _save(splats: Splats, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
     splats.save(path)
     return path
 
@@ -110,7 +124,6 @@ def _write_view(folder: Path, k: int, one: Candidate) -> list[Path]:
         "after": one.picture,
         "trust": trust,
     }
-    folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"view-{k}.{name}.png" for name in pictures]
     for path, picture in zip(paths, pictures.values(), strict=True):
         with atomic_write(path) as temporary:

@@ -58,6 +58,9 @@ def candidate(
 ) -> Candidate:
     """Clean a render and say how far it can be trusted.
 
+    Where photos have masks, what no photo shows is not of the scene that is asked for: a pixel
+    counts by how much of it photos show.
+
     Args:
         view: where it was rendered from.
         buffers: of ``render_buffers``.
@@ -69,6 +72,8 @@ def candidate(
     """
     cleaned, confidence = denoise(buffers, photos, denoiser)
     trust = trust_of(confidence)
+    if buffers.support is not None and not all(photo.usable.all() for photo in photos):
+        trust *= np.clip(buffers.support, 0.0, 1.0)
     seen = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
     change = np.abs(cleaned - seen).mean(axis=-1)
     worth = float((trust * change).mean())
@@ -110,9 +115,12 @@ class Rightness:
 
     @property
     def share(self) -> float:
-        """The part of each change that would leave the least squared error, in [0, 1]."""
+        """The part of each change that would leave the least squared error, in [0, 1].
+
+        Where nothing was changed, or nothing is known, nothing speaks against it: 1.
+        """
         if self.squared <= 0.0:
-            return 0.0
+            return 1.0
         return min(1.0, max(0.0, self.towards / self.squared))
 
 

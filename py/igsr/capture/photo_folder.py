@@ -123,6 +123,16 @@ def has_photos(path: Path) -> bool:
         return False
 
 
+def photo_sizes(path: Path) -> dict[str, int]:
+    """Bytes of each photo and video of a path that ``load_photos`` takes, by its name, sorted.
+
+    Raises:
+        IgsrError: there are none.
+    """
+    root, files, _ = _files([path]) if is_file(path) else _folder(path)
+    return {file.relative_to(root).as_posix(): file.stat().st_size for file in files}
+
+
 def _is_photo(path: Path) -> bool:
     return (
         path.suffix.lower() in SUFFIXES + VIDEO_SUFFIXES

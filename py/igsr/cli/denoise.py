@@ -149,9 +149,12 @@ def train_command(
         BackboneChoice | None,
         typer.Option("--lpips", help="True LPIPS with this backbone, which is downloaded."),
     ] = None,
+    # Not --start: torchrun would take it for the beginning of one of its own options.
     start: Annotated[
         Path | None,
-        typer.Option("--start", metavar="FILE", help="Weights to go on from, such as igsr's own."),
+        typer.Option(
+            "--weights", metavar="FILE", help="Weights to go on from, such as igsr's own."
+        ),
     ] = None,
     steps: Annotated[int, typer.Option("--steps", help="Batches.")] = 20_000,
     batch: Annotated[int, typer.Option("--batch", help="Crops per step.")] = 8,
@@ -283,7 +286,7 @@ def apply_command(
         on = resolved(backend)
         views = views_of_split(capture, split.value if split else default_split(capture))
         photos = capture.train_views
-        support = photo_support(splats, [photo.camera for photo in photos], on)
+        support = photo_support(splats, photos, on)
         sources = photo_sources(splats, photos, background, on)
         files = []
         for view in views:

@@ -20,7 +20,15 @@ from ..capture.folder import holds_cameras
 from ..capture.photo_folder import FRAMES, has_photos
 from ..capture.write_colmap import write_colmap
 from ..errors import IgsrError
-from ..pose import AUTO, capture_of, estimate, kept_cameras, photos_of
+from ..pose import (
+    AUTO,
+    capture_of,
+    estimate,
+    found_before,
+    kept_cameras,
+    note_photos,
+    photos_of,
+)
 from ..pose.registry import ESTIMATORS
 from .shared import (
     JsonOption,
@@ -102,10 +110,11 @@ def capture_to_fit(
             )
         return load(path, holdout), False
     kept = kept_cameras(path, out)
-    if resume and holds_cameras(kept):
+    if resume and found_before(path, kept):
         complain(f"The cameras found before are used, from {kept}")
     else:
         report = _posed(path, kept, finder, plot=False, shown=shown, replace=True)
+        note_photos(path, kept)
         complain(
             f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
             f"{report['estimator']} and are kept in {kept}"

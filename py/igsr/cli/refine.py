@@ -59,14 +59,15 @@ def refine_command(
         typer.Option("--out", help="Folder for scene.ply, report.html, report.json, rounds/."),
     ],
     rounds: Annotated[
-        str, typer.Option("--rounds", help="At most so many, or auto: until one does not help.")
+        str,
+        typer.Option("--rounds", help="At most so many, or auto: until one does not help, or 4."),
     ] = AUTO,
     holdout: HoldoutOption = None,
     photo_count: Annotated[
         int | None,
         typer.Option("--photos", help="Use so many of the train photos, evenly spaced."),
     ] = None,
-    steps: Annotated[int | None, typer.Option("--steps", help="Of the first fit.")] = None,
+    steps: Annotated[int | None, typer.Option("--steps", help="Of each fit.")] = None,
     backend: BackendOption = BackendChoice.auto,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
     weights: Annotated[
@@ -84,13 +85,14 @@ def refine_command(
 ) -> None:
     """Fit photos, render views that nobody took, clean them, keep what helps, and fit again."""
     from ..denoiser import NetworkDenoiser, load_network
-    from ..refinement import refine
+    from ..refinement import check_arguments, refine
 
     with one_sentence(
         lambda: f"Interrupted; what is done is in {out}, the same command with --resume goes on."
     ):
         name = resolved(backend)
         most = _rounds(rounds)
+        check_arguments(most, steps, name, out, resume)
         denoiser = NetworkDenoiser(load_network(weights))
         with warnings_as_sentences():
             capture, _ = capture_to_fit(

@@ -133,7 +133,7 @@ def study_command(
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option("--steps", help="Studies of the loop: of the first fit.")
+        int | None, typer.Option("--steps", help="Studies of the loop: of each fit.")
     ] = None,
     features: Annotated[
         Path | None,

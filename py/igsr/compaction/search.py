@@ -17,6 +17,7 @@ import numpy.typing as npt
 from .. import _core
 from ..capture import Capture
 from ..errors import IgsrError
+from ..fitting import check_fits
 from ..splats import MAX_SH_DEGREE, Splats
 from .contribution import contribution
 from .refinement import State, chosen, fresh_state, refined, splats_of, with_sh_degree
@@ -110,14 +111,9 @@ def compact(
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     _check_arguments(max_loss, capture, psnr, sh_degree, steps, seed, background)
-    if backend == "reference":
-        raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
+    info = check_fits(backend)
     if splats.antialiased:
         raise IgsrError("Antialiased splats cannot be made fewer: fits draw without that.")
-    try:
-        info = _core.backend_info(_core.resolve_backend(backend))
-    except ValueError as error:
-        raise IgsrError(f"{error}.") from error
     name = info["backend"]
     finite = chosen(fresh_state(splats), np.flatnonzero(splats.finite))
     whole = splats_of(finite, splats.origin)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 
 from .. import _core
-from ..capture import Camera
+from ..capture import Camera, View
 from ..errors import IgsrError
 from ..normals import facing_normals
 from ..rendering import project, viewmat_about
@@ -44,7 +44,7 @@ class Buffers:
             none, as behind photos without alpha.
 
     Raises:
-        IgsrError: an array has another shape than the colour's picture.
+        IgsrError: an array has another shape than the colour's picture, or is not of floats.
     """
 
     color: Float32
@@ -61,6 +61,8 @@ class Buffers:
         """Check that all are of one picture."""
         if self.color.ndim != 3 or self.color.shape[2] != 3 or 0 in self.color.shape:
             raise IgsrError(f"color must be [H, W, 3], not {list(self.color.shape)}")
+        if not np.issubdtype(self.color.dtype, np.floating):
+            raise IgsrError(f"color must be of floats in [0, 1], not {self.color.dtype}")
         size = self.color.shape[:2]
         for name in ("alpha", "depth", "depth_deviation", "normal", "footprint", "support"):
             array = getattr(self, name)
@@ -118,7 +120,7 @@ def render_buffers(
 
     viewmat = viewmat_about(splats.origin, camera.viewmat)
     # What is not drawn may lie anywhere, at a depth of zero too.
-    seen = np.asarray(projected["radii"]).reshape(len(splats), -1).min(axis=1) > 0
+    seen = (np.asarray(projected["radii"]).reshape(len(splats), 2) > 0).all(axis=1)
     z = np.where(seen, projected["depths"], 1.0).astype(np.float32)
     sizes = np.exp(splats.scales.mean(axis=1)) * np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / z
     middle = float(np.median(depth[alpha > EMPTY])) if (alpha > EMPTY).any() else 1.0
@@ -152,12 +154,12 @@ def render_buffers(
     )
 
 
-def photo_support(splats: Splats, cameras: Sequence[Camera], backend: str = "auto") -> Float32:
+def photo_support(splats: Splats, photos: Sequence[View], backend: str = "auto") -> Float32:
     """Number of photos [N] that see each splat: that it adds more to than ``SEEN_WEIGHT`` pixels.
 
     Args:
         splats: the scene.
-        cameras: the photos' cameras.
+        photos: their cameras say what they see; pixels that their masks leave out see nothing.
         backend: "auto", "cpu", "gpu" or "reference".
 
     Raises:
@@ -166,17 +168,21 @@ def photo_support(splats: Splats, cameras: Sequence[Camera], backend: str = "aut
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)
     count = np.zeros(len(splats), np.float32)
-    for camera in cameras:
+    for photo in photos:
+        camera = photo.camera
         projected = project(splats, camera, backend)
         black = np.zeros(3, dtype)
         image = _core.rasterize(
             projected, width=camera.width, height=camera.height, background=black, backend=backend
         )
+        counted = np.ones_like(image["color"])
+        if photo.mask is not None:
+            counted *= photo.mask[..., None]
         # The derivative of a colour by a splat's colour is the splat's weight in it.
         gradients = _core.rasterize_backward(
             projected,
             image,
-            v_color=np.ones_like(image["color"]),
+            v_color=counted,
             v_alpha=np.zeros_like(image["alpha"]),
             v_depth=np.zeros_like(image["alpha"]),
             background=black,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from .buffers import EMPTY, Buffers
+from .buffers import Buffers
 from .warping import Warped
 
 Float32 = npt.NDArray[np.float32]
@@ -59,7 +59,7 @@ def network_inputs(buffers: Buffers, warped: Warped) -> Float32:
 
 
 def _relative_depth(depth: Float32) -> Float32:
-    drawn = depth > EMPTY * max(float(depth.max()), 0.0)
+    drawn = depth > 0.0
     if not drawn.any():
         return np.zeros_like(depth)
     ratio = depth / np.float32(np.median(depth[drawn])) - np.float32(1.0)

@@ -35,7 +35,7 @@ def rendered_pairs(
         raise IgsrError(
             f"views to render are of sizes {sorted(sizes)}; pairs need one, resize the photos."
         )
-    support = photo_support(splats, [view.camera for view in photos], backend)
+    support = photo_support(splats, photos, backend)
     behind = BLACK if background is None else background
     sources = photo_sources(splats, photos, behind, backend)
     inputs, truth, masks = [], [], []

@@ -27,6 +27,8 @@ CONSIDERED = 8
 UNSEEN = -2.0
 #: Below this alpha a render has no surface to look up.
 SURFACE_ALPHA = 0.5
+#: So many pixels are looked up at a time, in whole rows: each takes some 300 bytes meanwhile.
+BAND = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,18 +102,34 @@ def warp_photos(
     surface = alpha > SURFACE_ALPHA
     points = _surface_points(camera, depth, surface)
     near = _nearest(sources, camera, points)
-    if points.shape[1] and near:
-        cosines, at = zip(*(_looked_up(source, camera, points) for source in near), strict=True)
-        best = torch.stack(cosines).topk(min(keep, len(near)), dim=0)
-        for k, (cosine, photo) in enumerate(zip(best.values, best.indices, strict=True)):
-            found = torch.zeros(points.shape[1], 3)
-            for index, source in enumerate(near):
-                chosen = torch.nonzero((photo == index) & (cosine > UNSEEN))[:, 0]
-                found[chosen] = _colors(source, at[index][:, chosen])
-            color[k, surface] = found.numpy()
-            seen = torch.where(cosine > UNSEEN, cosine.clamp(-1.0, 1.0).acos(), torch.pi)
-            angle[k, surface] = seen.numpy()
+    done = 0
+    for top in range(0, height if near else 0, max(1, BAND // width)):
+        rows = slice(top, top + max(1, BAND // width))
+        shown = surface[rows]
+        count = int(shown.sum())
+        if count:
+            band = _best(near, camera, points[:, done : done + count], keep)
+            for k, (colors, angles) in enumerate(band):
+                color[k, rows][shown], angle[k, rows][shown] = colors, angles
+        done += count
     return Warped(color, angle < np.float32(np.pi), angle)
+
+
+def _best(
+    near: Sequence[Source], camera: Camera, points: Tensor, keep: int
+) -> list[tuple[Float32, Float32]]:
+    """Colours [N, 3] and angles [N] of ``points`` in the photos, the nearest direction first."""
+    cosines, at = zip(*(_looked_up(source, camera, points) for source in near), strict=True)
+    best = torch.stack(cosines).topk(min(keep, len(near)), dim=0)
+    out = []
+    for cosine, photo in zip(best.values, best.indices, strict=True):
+        found = torch.zeros(points.shape[1], 3)
+        for index, source in enumerate(near):
+            chosen = torch.nonzero((photo == index) & (cosine > UNSEEN))[:, 0]
+            found[chosen] = _colors(source, at[index][:, chosen])
+        seen = torch.where(cosine > UNSEEN, cosine.clamp(-1.0, 1.0).acos(), torch.pi)
+        out.append((found.numpy(), seen.numpy()))
+    return out
 
 
 def _nearest(sources: Sequence[Source], camera: Camera, points: Tensor) -> list[Source]:

@@ -20,6 +20,7 @@ from igsr.capture.undistort import Undistorter
 from igsr.errors import IgsrError
 
 from .estimate import Estimate, Estimator, Progress
+from .kept import found_before, kept_cameras, not_placed, note_photos
 from .registry import ESTIMATORS
 
 __all__ = [
@@ -29,7 +30,10 @@ __all__ = [
     "capture_of",
     "estimate",
     "estimate_poses",
+    "found_before",
     "kept_cameras",
+    "not_placed",
+    "note_photos",
 ]
 
 
@@ -73,18 +77,6 @@ def estimate_poses(
         warnings.warn(sentence, stacklevel=2)
     path = Path(photos) if isinstance(photos, (str, os.PathLike)) else Path("photos")
     return capture_of(path, loaded, found)
-
-
-def kept_cameras(photos: Path, out: Path) -> Path:
-    """Where the cameras of photos are kept that are found for what goes to ``out``.
-
-    Raises:
-        IgsrError: the photos lie there themselves, and would be replaced.
-    """
-    kept = out / "capture"
-    if kept.resolve() in (photos.resolve(), *photos.resolve().parents):
-        raise IgsrError(f"{photos} lies where the fit would write {kept}; name another --out")
-    return kept
 
 
 def photos_of(

@@ -60,7 +60,7 @@ def table2(
         methods: of ``igsr.study.refinements.METHODS``; the paper's add their best 2.
         weights: the denoiser's file; None is igsr's own.
         features: SqueezeNet's arrays (.npz), for the perceptual distance.
-        steps: of the first fit; None is the default preset's.
+        steps: of each fit; None is the default preset's.
         seeds: how many seeds, from 0.
         backend: what fits and renders.
         jobs: runs at a time, each in a process of its own with its share of the cores.

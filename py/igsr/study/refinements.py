@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +30,7 @@ from ..denoiser.perceptual import SqueezeNetDistance, picture_distance
 from ..denoiser.weights import SHIPPED, load_network
 from ..errors import IgsrError
 from ..evaluation import default_background, over_background, score_views
+from ..fitting import fingerprint
 from ..presets import preset_settings
 from ..refinement import Choose, Look, Refined, refine
 from ..selection import Candidate, select
@@ -111,7 +113,7 @@ class Given:
         methods: what goes on from each fit.
         weights: the denoiser's file; None is igsr's own.
         features: SqueezeNet's arrays, for "perceptual" and the paper's choices; None is without.
-        steps: of the first fit; None is the default preset's.
+        steps: of each fit; None is the default preset's.
     """
 
     out: str
@@ -181,6 +183,7 @@ def run_refinement(given: Given, data: str, one: Refinement) -> dict[str, Any]:
         return means
 
     folder = Path(given.out) / "rounds" / one.name
+    _cleared_if_other(folder, given, photos)
     first: dict[str, Any] = {}
     methods: dict[str, Any] = {}
     for how in given.methods:
@@ -208,6 +211,26 @@ def run_refinement(given: Given, data: str, one: Refinement) -> dict[str, Any]:
         truth = over_background(middle.image, background)
         Image.fromarray(truth).save(temporary, format="PNG")
     return {**vars(one), "held_out": len(held), "methods": methods}
+
+
+def _cleared_if_other(folder: Path, given: Given, photos: Capture) -> None:
+    """Remove what a run of other settings or another version left, which none can go on from."""
+    made_with = {
+        "igsr": _core.__version__,
+        "steps": given.steps,
+        "weights": file_hash(SHIPPED if given.weights is None else Path(given.weights)),
+        "features": None if given.features is None else file_hash(Path(given.features)),
+        "capture": fingerprint(photos.views),
+    }
+    note = folder / "made_with.json"
+    try:
+        same = json.loads(note.read_text(encoding="utf-8")) == made_with
+    except (OSError, ValueError):
+        same = False
+    if not same:
+        shutil.rmtree(folder, ignore_errors=True)
+        with atomic_write(note) as temporary:
+            temporary.write_text(json.dumps(made_with, indent=1), encoding="utf-8")
 
 
 def _share_fits(source: Path, out: Path) -> None:
@@ -307,11 +330,12 @@ def _by_truth(
 
     def rank(one: Candidate) -> float:
         truth = next(view for view in candidates if view.camera is one.view.camera)
-        photo = over_background(truth.image, background)
-        before = picture_distance(distance, one.render, photo)
+        shown = True if truth.mask is None else truth.mask[..., None]
+        photo = over_background(truth.image, background) * shown
+        before = picture_distance(distance, one.render * shown, photo)
         if how.method == "absolute-before":
             return before
-        after = picture_distance(distance, one.picture, photo)
+        after = picture_distance(distance, one.picture * shown, photo)
         return after if how.method == "absolute" else after - before
 
     return sorted(found, key=rank)[: how.views]
@@ -444,8 +468,9 @@ def _write_run_sheet(out: Path, one: Refinement, methods: Sequence[Rounds]) -> N
     """A held-out view after each round, and the two views that the first round valued most."""
     folder = out / "rounds" / one.name
     truth, first = _picture(folder / "truth.png"), _picture(folder / "first.png")
-    assert truth is not None
-    assert first is not None
+    if truth is None or first is None:
+        warnings.warn(f"{folder} has no pictures: no sheet of {one.name} is drawn.", stacklevel=3)
+        return
     sheet = {}
     for how in methods:
         row = {"truth": truth, "round 0": first}

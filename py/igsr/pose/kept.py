@@ -1,0 +1,79 @@
+"""Cameras that were found before, kept beside what was made with them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path, PurePosixPath
+
+from igsr.atomic_write import atomic_write
+from igsr.capture import Capture
+from igsr.capture.folder import holds_cameras
+from igsr.capture.photo_folder import VIDEO_SUFFIXES, photo_sizes
+from igsr.errors import IgsrError
+
+#: In the folder of the cameras: names and bytes of the photos that were given.
+GIVEN = "photos.json"
+
+
+def kept_cameras(photos: Path, out: Path) -> Path:
+    """Where the cameras of photos are kept that are found for what goes to ``out``.
+
+    Raises:
+        IgsrError: the photos lie there themselves, and would be replaced.
+    """
+    kept = out / "capture"
+    if kept.resolve() in (photos.resolve(), *photos.resolve().parents):
+        raise IgsrError(f"{photos} lies where the fit would write {kept}; name another --out")
+    return kept
+
+
+def note_photos(photos: Path, kept: Path) -> None:
+    """Write down which photos the cameras in ``kept`` were looked for in.
+
+    Raises:
+        IgsrError: it cannot be written.
+    """
+    with atomic_write(kept / GIVEN) as temporary:
+        temporary.write_text(json.dumps(photo_sizes(photos), indent=1), encoding="utf-8")
+
+
+def found_before(photos: Path, kept: Path) -> bool:
+    """Whether ``kept`` has cameras to go on with.
+
+    Raises:
+        IgsrError: they are of other photos.
+    """
+    if not holds_cameras(kept):
+        return False
+    given = _given(kept)
+    if given is not None and given != photo_sizes(photos):
+        raise IgsrError(
+            f"{kept} has the cameras of other photos than {photos} holds now; resume with the same "
+            "ones or leave --resume out."
+        )
+    return True
+
+
+def not_placed(capture: Capture) -> list[str]:
+    """Names of photos that no camera was found for, if cameras had to be found."""
+    given = _given(capture.path) or {}
+    placed = {_without_suffix(view.name) for view in capture.views}
+    return [
+        name
+        for name in given
+        if PurePosixPath(name).suffix.lower() not in VIDEO_SUFFIXES
+        and _without_suffix(name) not in placed
+    ]
+
+
+def _without_suffix(name: str) -> str:
+    return PurePosixPath(name.removeprefix("images/")).with_suffix("").as_posix()
+
+
+def _given(kept: Path) -> dict[str, int] | None:
+    """What ``note_photos`` wrote; None where nothing of that kind is."""
+    try:
+        found = json.loads((kept / GIVEN).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
