@@ -22,12 +22,14 @@ def trained(tmp_path_factory):
     """A capture, its splats, and a folder with a denoiser trained for a few steps."""
     folder = tmp_path_factory.mktemp("denoise")
     scene = scenes.splats()
-    scenes.write_capture(folder / "ball", scenes.capture(views=5, size=40, scene=scene))
+    for name in ("ball", "other"):
+        scenes.write_capture(folder / name, scenes.capture(views=5, size=40, scene=scene))
     scene.save(folder / "ball.ply")
     options = ("--steps", 3, "--views", 1, "--backend", "cpu", "--json")
-    made = run("denoise", "pairs", folder / "ball", "--out", folder / "pairs", *options)
+    captures = (folder / "ball", folder / "other")
+    made = run("denoise", "pairs", *captures, "--out", folder / "pairs", "--all-views", *options)
     assert made.exit_code == 0, made.output
-    assert len(json.loads(made.stdout)["fits"]) == 3
+    assert len(json.loads(made.stdout)["fits"]) == 6
     options = ("--steps", 4, "--batch", 2, "--crop", 16, "--width", 4, "--json")
     taught = run("denoise", "train", "--pairs", folder / "pairs", "--out", folder / "out", *options)
     assert taught.exit_code == 0, taught.output
@@ -60,6 +62,7 @@ def test_views_are_cleaned_with_the_weights_given(trained):
         (["train", "--pairs", "pairs", "--features", "a", "--lpips", "alex"], "give one"),
         (["train", "--pairs", "pairs", "--loss", "lpips"], "needs a perceptual distance"),
         (["train", "--pairs", "pairs", "--photos", "all"], "photos must be one of"),
+        (["train", "--pairs", "pairs", "--width", "5"], "width must be even, from 2 to 256, not 5"),
         (["pairs", "ball", "--fits", "0"], "fits must be at least 1"),
     ],
 )

@@ -1,6 +1,9 @@
 """The denoiser's network, losses, training, files and use."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +20,7 @@ from igsr.denoiser import (
     load_network,
     save_network,
 )
-from igsr.denoiser.cleaning import UNSEEN_CHANGE
+from igsr.denoiser.cleaning import DOUBT, UNSEEN_CHANGE
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
 from igsr.denoiser.losses import (
     LOSSES,
@@ -27,9 +30,11 @@ from igsr.denoiser.losses import (
     perceptual_ratio,
     regret,
     squared_ratio,
+    structure_ratio,
 )
 from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetwork
 from igsr.denoiser.pair_files import Pairs, read_pairs, write_pairs
+from igsr.denoiser.pairs import capture_of_pairs
 from igsr.denoiser.perceptual import SqueezeNetDistance, lpips_distance
 from igsr.denoiser.training import (
     CHECKPOINT,
@@ -38,6 +43,7 @@ from igsr.denoiser.training import (
     WEIGHTS,
     Training,
     _batch,
+    _kept_for_validation,
     _Processes,
     train,
 )
@@ -131,11 +137,26 @@ def test_any_size_comes_out_as_it_went_in(size):
 def test_a_change_that_nobody_sees_is_not_made():
     color = np.random.default_rng(0).uniform(0.1, 0.9, size=(20, 20, 3)).astype(np.float32)
     for brighter, same in ((0.9 * UNSEEN_CHANGE, True), (1.1 * UNSEEN_CHANGE, False)):
-        made = DenoiserNetwork(SMALL).eval()
-        with torch.no_grad():
-            made.tail.bias[:12] = brighter
-        picture, _ = denoise(color, denoiser=NetworkDenoiser(made))
+        picture, _ = denoise(color, denoiser=NetworkDenoiser(brightening(brighter, 1e-3)))
         assert np.array_equal(picture, color) is same
+
+
+def brightening(by, error):
+    """A network that makes everything brighter, and expects that it is then as wrong as said."""
+    made = DenoiserNetwork(SMALL).eval()
+    with torch.no_grad():
+        made.tail.bias[:12] = by
+        made.tail.bias[12:16] = float(np.log(error)) + 3.0
+    return made
+
+
+def test_a_change_counts_by_its_size_beside_the_error_that_is_expected():
+    color = np.full((20, 20, 3), 0.4, np.float32)
+    for error, part in ((1e-3, 1.0), (0.1 / DOUBT, 0.5), (0.3 / DOUBT, 0.1)):
+        cleaner = NetworkDenoiser(brightening(0.1, error))
+        picture, confidence = denoise(color, denoiser=cleaner)
+        assert picture == pytest.approx(0.4 + 0.1 * part, abs=1e-4)
+        assert confidence == pytest.approx(0.05 / (0.05 + error), rel=1e-4)
 
 
 def test_pixels_that_are_not_numbers_are_filled_in_without_confidence():
@@ -195,18 +216,21 @@ def test_damaged_files_of_weights_are_refused_in_a_sentence(tmp_path):
         refused("is no whole .safetensors file")
     save_file(weights, path)
     refused("does not say which network it is of")
-    for wrong in (
-        '{"width": 100000, "blocks": [1, 1, 1]}',
-        "[]",
-        '{"width": 4}',
-        "{",
-        '{"width": 4, "blocks": [1, 1]}',
-        '{"width": 4.5, "blocks": [1, 1, 1]}',
-        '{"width": 4, "blocks": [1, 1, 1], "photos": "all"}',
-        '{"width": 4, "blocks": [1, 1, 1], "code": "import os"}',
+    unsaid = "does not say which network it is of"
+    for wrong, why in (
+        ("[]", unsaid),
+        ('{"width": 4}', unsaid),
+        ("{", unsaid),
+        ('{"width": 4, "blocks": [1, 1, 1], "code": "import os"}', unsaid),
+        ('{"width": 100000, "blocks": [1, 1, 1]}', "width must be even, from 2 to 256"),
+        ('{"width": 4.5, "blocks": [1, 1, 1]}', "width must be even"),
+        ('{"width": 4, "blocks": [1, 1]}', "blocks must be three from 0 to 32"),
+        ('{"width": 4, "blocks": [1, 1, 99]}', "blocks must be three from 0 to 32"),
+        ('{"width": 4, "blocks": [1, 1, 1], "photos": "all"}', "photos must be one of"),
+        ('{"width": 4, "blocks": [1, 1, 1], "residual": 1}', "residual must be True or False"),
     ):
         save_file(weights, path, metadata={"architecture": wrong})
-        refused("does not say which network it is of")
+        refused(why)
     save_file({k: v for k, v in weights.items() if k != "head.bias"}, path, metadata=about)
     refused("lacks the weight head.bias")
     save_file(weights | {"head.bias": torch.zeros(3)}, path, metadata=about)
@@ -253,6 +277,23 @@ def test_a_decibel_counts_the_same_in_good_and_bad_pictures():
     assert 0.0 < invisible.item() < 0.02
 
 
+def test_structure_counts_beside_the_squared_error():
+    random = torch.Generator().manual_seed(0)
+    truth = torch.rand(2, 3, 24, 24, generator=random)
+    render = (truth + 0.2 * torch.randn(truth.shape, generator=random)).clamp(0.0, 1.0)
+    blurred = torch.nn.functional.avg_pool2d(render, 3, 1, 1)
+    nearer = 0.5 * (render + truth)
+    same, better, smooth = (
+        structure_ratio(prediction(image, truth, render)).item()
+        for image in (render, nearer, blurred)
+    )
+    assert same == 0.0
+    assert better < -0.5
+    assert smooth > 0.1, "what is smoothed is like nothing that was there"
+    small = truth[..., :8, :8]
+    assert structure_ratio(prediction(small, small, small)).item() == 0.0
+
+
 def test_the_perceptual_ratio_looks_at_some_pictures_of_a_batch():
     truth = torch.full((4, 3, 8, 8), 0.5)
     image = truth.clone()
@@ -292,7 +333,7 @@ def test_every_loss_has_its_parts_and_moves_the_network(name):
     image, log_error = made(inputs)
     total, parts = loss(Prediction(inputs[:, :COLOR], image, log_error, truth))
     expected = {
-        "default": {"squared", "perceptual", "likelihood"},
+        "default": {"squared", "structure", "perceptual", "likelihood"},
         "charbonnier": {"charbonnier", "perceptual", "likelihood"},
         "gan": {"gan", "likelihood"},
         "gan+lpips": {"gan", "perceptual", "likelihood"},
@@ -386,8 +427,23 @@ def test_a_training_that_was_stopped_ends_with_the_same_weights(tmp_path, loss):
     for one, other in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(one, other)
 
-    with pytest.raises(igsr.IgsrError, match="is of a training with other pairs or settings"):
+    # The rows that were written after the checkpoint, and one torn by a kill, are not there twice.
+    assert [row["step"] for row in log_of(tmp_path / "b")] == [4, 8, 12]
+    with (tmp_path / "b" / LOG).open("a") as file:
+        file.write('{"step": 13}\n{"ste')
+    train(pairs, tmp_path / "b", training, SMALL, log_every=4, checkpoint_every=4, resume=True)
+    assert [row["step"] for row in log_of(tmp_path / "b")] == [4, 8, 12]
+
+    other = "is of a training with other pairs or settings"
+    with pytest.raises(igsr.IgsrError, match=other):
         train(pairs, tmp_path / "b", replace(training, rate=1e-4), SMALL, resume=True)
+    with pytest.raises(igsr.IgsrError, match=other):
+        train(pairs, tmp_path / "b", training, SMALL, resume=True, distance=mean_distance)
+    once = read_pairs(pairs[0])
+    write_pairs(pairs[0], replace(once, truth=once.truth // 2))
+    with pytest.raises(igsr.IgsrError, match=other):
+        train(pairs, tmp_path / "b", training, SMALL, resume=True)
+    write_pairs(pairs[0], once)
     data = (tmp_path / "b" / CHECKPOINT).read_bytes()
     (tmp_path / "b" / CHECKPOINT).write_bytes(data[:999])
     with pytest.raises(igsr.IgsrError, match="is no whole checkpoint"):
@@ -401,6 +457,7 @@ def test_a_training_that_was_stopped_ends_with_the_same_weights(tmp_path, loss):
         ({"crop": 30}, "crop must be a multiple of 8"),
         ({"rate": float("nan")}, "rate must be positive"),
         ({"dropout": 1.0}, "dropout must be from 0 to 1"),
+        ({"seed": -1}, "seed must not be negative"),
     ],
 )
 def test_bad_settings_of_a_training(options, message):
@@ -457,6 +514,60 @@ def test_crops_that_are_right_already_are_drawn_again(tmp_path):
     crops, truth = _batch(pairs, training, 0, _Processes("cpu"))
     drawn = (crops[:, :COLOR] - truth[:, :COLOR]).square().mean(dim=(1, 2, 3)) > RIGHT
     assert 0.85 < drawn.float().mean() < 1.0, "half to the power of four stays right"
+
+
+def test_no_scene_of_validation_is_trained_on():
+    def kept(*names):
+        return _kept_for_validation([f"{name}-seed0-cpu.npz" for name in names])
+
+    assert kept("a-noise-0", "a-sparse-0", "b-noise-0", "b-sparse-0") == 2
+    assert kept(*(f"{c}-sparse-0" for c in "abcdefghijklmnopqrst")) == 2
+    assert kept("a-b-sparse-0", "a-sparse-0", "a-sparse-1", "a-sparse-2") == 3
+    with pytest.warns(UserWarning, match="validation is of the scene that is trained on"):
+        assert kept("a-leave-one-out-0", "a-leave-one-out-1", "a-leave-one-out-2") == 1
+    assert capture_of_pairs("k.1-leave-one-out-3-seed0-cpu.npz") == "k.1"
+    assert capture_of_pairs("mine.npz") == "mine.npz"
+
+
+def test_processes_learn_one_network_and_one_discriminator(tmp_path):
+    pair_files(tmp_path / "pairs")
+    code = (
+        "import sys, torch\n"
+        "from igsr.denoiser import training\n"
+        "from igsr.denoiser.network import Architecture\n"
+        "folder, rank = sys.argv[1], training._Processes.__init__\n"
+        "seen = []\n"
+        "real = training._Learner.learn\n"
+        "def learn(self, *batch):\n"
+        "    out = real(self, *batch)\n"
+        "    seen[:] = [p.detach().double().sum().item() for part in (self.network, self.judge)\n"
+        "               for p in part.parameters()]\n"
+        "    return out\n"
+        "training._Learner.learn = learn\n"
+        "from pathlib import Path\n"
+        "import os\n"
+        "given = training.Training(steps=3, batch=4, crop=32, loss='gan')\n"
+        "training.train(sorted(Path(folder, 'pairs').glob('*.npz')), Path(folder, 'out'), given,\n"
+        "               Architecture(4, (1, 1, 1)))\n"
+        "Path(folder, os.environ['RANK']).write_text(repr(seen))\n"
+    )
+    (tmp_path / "learn.py").write_text(code)
+    started = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node"]
+    done = subprocess.run(
+        [*started, "2", str(tmp_path / "learn.py"), str(tmp_path)],
+        capture_output=True, text=True, timeout=300, env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    first, second = ((tmp_path / rank).read_text() for rank in "01")
+    assert len(first) > 100
+    assert first == second
+    assert [row["step"] for row in log_of(tmp_path / "out")] == [3]
+
+
+def test_a_batch_is_shared_evenly(tmp_path, monkeypatch):
+    monkeypatch.setattr(_Processes, "__init__", lambda self, device: vars(self).update(count=3))
+    with pytest.raises(igsr.IgsrError, match="batch must be a multiple of the number of proc"):
+        train(pair_files(tmp_path / "pairs"), tmp_path / "out", TINY, SMALL)
 
 
 def test_training_needs_two_files_of_pairs(tmp_path):

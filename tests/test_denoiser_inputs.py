@@ -14,6 +14,7 @@ from igsr.denoiser import (
     Buffers,
     Source,
     Warped,
+    pairs,
     photo_sources,
     photo_support,
     render_buffers,
@@ -282,11 +283,60 @@ def test_pairs_of_every_recipe_are_the_same_again_and_not_made_twice(tmp_path, r
     assert (tmp_path / "a" / rows[0]["pairs"]).stat().st_mtime_ns == written
 
 
+def test_what_is_held_out_is_not_trained_on(tmp_path, monkeypatch):
+    split = scenes.capture(views=9, size=24)
+    monkeypatch.setattr(pairs, "load_capture", lambda _: split)
+    folder = tmp_path / "ball"
+    assert split.test_views
+    held = {view.image.tobytes() for view in split.test_views}
+    options = {"steps": 4, "views": 9, "backend": "cpu"}
+    for recipes in (["sparse", "paper"], ["leave-one-out"]):
+        rows = make_pairs([folder], tmp_path / "a", recipes=recipes, **options)
+        for row in rows:
+            truth = read_pairs(tmp_path / "a" / row["pairs"]).truth
+            shown = {np.moveaxis(one, 0, -1).tobytes() for one in truth}
+            assert not shown & held
+            if row["recipe"] == "paper":
+                assert row["photos"] == len(split.train_views)
+                assert row["renders"] == row["photos"] + FITTED_RENDERED
+    assert len(rows) == len(split.train_views)
+
+
+def test_another_capture_of_the_same_name_is_not_taken_for_done(tmp_path):
+    options = {"recipes": ["sparse"], "steps": 4, "views": 1, "backend": "cpu"}
+    rows = []
+    for name, seed in (("a", 0), ("b", 1)):
+        made = scenes.capture(views=5, size=24, scene=scenes.splats(seed=seed))
+        scenes.write_capture(tmp_path / name / "ball", made)
+        rows += make_pairs([tmp_path / name / "ball"], tmp_path / "out", **options)
+    assert rows[0]["psnr"] != rows[1]["psnr"]
+    file = tmp_path / "out" / rows[1]["pairs"]
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-100])
+    with pytest.raises(igsr.IgsrError, match="delete it and make it again"):
+        read_pairs(file)
+    file.unlink()
+    make_pairs([tmp_path / "b" / "ball"], tmp_path / "out", **options)
+    assert np.array_equal(read_pairs(file).inputs.shape, (2, CHANNELS, 24, 24))
+
+
+def test_photos_of_several_sizes_are_refused_before_the_first_fit(tmp_path, monkeypatch):
+    made = scenes.capture(views=8, size=24)
+    tall = [
+        replace(view, camera=replace(view.camera, height=16), image=view.image[:16])
+        for view in made.views[:4]
+    ]
+    scenes.write_capture(tmp_path / "mixed", igsr.Capture(made.path, tall + made.views[4:]))
+    monkeypatch.setattr(pairs, "fit_with_cameras", lambda *_, **__: pytest.fail("it is fitted"))
+    with pytest.raises(igsr.IgsrError, match="views to render are of sizes"):
+        make_pairs([tmp_path / "mixed"], tmp_path / "out", recipes=["noise"], backend="cpu")
+
+
 @pytest.mark.parametrize("recipe", ["noise", "sparse"])
 def test_after_noise_all_views_are_rendered_from_where_they_are(tmp_path, recipe):
     made = scenes.capture(views=6, size=24)
     scenes.write_capture(tmp_path / "ball", made)
-    options = {"recipes": [recipe], "steps": 4, "views": 9, "backend": "cpu"}
+    options = {"recipes": [recipe], "steps": 4, "views": 9, "backend": "cpu", "all_views": True}
     (row,) = make_pairs([tmp_path / "ball"], tmp_path / "out", **options)
     unseen = 6 if recipe == "noise" else 6 - row["photos"]
     assert row["renders"] == unseen + FITTED_RENDERED
@@ -305,8 +355,11 @@ def test_after_noise_all_views_are_rendered_from_where_they_are(tmp_path, recipe
 def test_bad_arguments_of_pairs(tmp_path, options, message):
     with pytest.raises(igsr.IgsrError, match=message):
         make_pairs([tmp_path / "a"], tmp_path / "out", **options)
+    folders = [tmp_path / "a", tmp_path / "b" / "a"]
+    for folder in folders:
+        scenes.write_capture(folder, scenes.capture(views=5, size=24))
     with pytest.raises(igsr.IgsrError, match="two captures are called a"):
-        make_pairs([tmp_path / "a", tmp_path / "b" / "a"], tmp_path / "out")
+        make_pairs(folders, tmp_path / "out")
 
 
 def test_pairs_can_be_imported_first():

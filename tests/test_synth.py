@@ -71,6 +71,8 @@ def test_captures_load_with_the_cameras_written(made: Path) -> None:
         families.add(recipe["family"])
         assert recipe["recipe"]["seed"] == 0
         assert recipe["recipe"]["index"] == index
+        assert recipe["mitsuba"]
+        assert recipe["pyoidn"]
         capture = load_capture(folder)
         assert len(capture.train_views) == 3
         assert len(capture.test_views) == 1

@@ -85,6 +85,9 @@ def pairs_command(
     steps: Annotated[
         int | None, typer.Option("--steps", help="Of each fit. Default: as igsr fit.")
     ] = None,
+    all_views: Annotated[
+        bool, typer.Option("--all-views", help="Use the views that are held out, too.")
+    ] = False,
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same pairs.")] = 0,
     jobs: JobsOption = 1,
     ray: RayOption = False,
@@ -116,6 +119,7 @@ def pairs_command(
             fits=fits,
             views=views,
             steps=steps,
+            all_views=all_views,
             seed=seed,
             backend=resolved(backend),
             jobs=jobs,
@@ -180,7 +184,14 @@ def train_command(
     from ..denoiser.network import Architecture
     from ..denoiser.perceptual import Distance, SqueezeNetDistance, lpips_distance
     from ..denoiser.plot import plot_training
-    from ..denoiser.training import LOG, WEIGHTS, Training, TrainingProgress, train
+    from ..denoiser.training import (
+        LOG,
+        WEIGHTS,
+        Training,
+        TrainingProgress,
+        is_first_process,
+        train,
+    )
 
     with one_sentence(
         lambda: f"Interrupted; go on from the last checkpoint in {out} with --resume."
@@ -189,7 +200,7 @@ def train_command(
             raise IgsrError("--features and --lpips are two distances; give one.")
         distance: Distance | None = None
         if features is not None:
-            distance = SqueezeNetDistance(features).to(device)
+            distance = SqueezeNetDistance(features)
         elif lpips is not None:
             distance = lpips_distance(lpips.value)
         files = sorted(pairs.glob("*.npz"))
@@ -213,6 +224,8 @@ def train_command(
                 resume=resume,
                 progress=progress,
             )
+        if not is_first_process():
+            return
         rows = plot_training(out / LOG, out / "loss.png")
     last = {name: value for row in rows for name, value in row.items()}
     if as_json:

@@ -23,6 +23,9 @@ Float32 = npt.NDArray[np.float32]
 
 #: Expected error, in units of the colours' range, at which the confidence is a half.
 HALF_CONFIDENCE_ERROR = 0.05
+#: A change as large as this part of the error that is expected to remain is made by half: it is as
+#: likely noise. On scenes unlike those trained on, what is not sure of itself goes wrong.
+DOUBT = 0.7
 #: Colours that would change by less than this, of 1, are left alone: a background that is right
 #: stays exactly so.
 UNSEEN_CHANGE = 1.5 / 255.0
@@ -64,10 +67,14 @@ class NetworkDenoiser:
         """Clean what ``network_inputs`` gave, [``CHANNELS``, H, W]; returns as ``denoise``."""
         image, log_error = self._in_tiles(torch.from_numpy(inputs)[None])
         render = torch.from_numpy(inputs[:COLOR])
-        change = (image[0] - render).abs().amax(dim=0)
-        cleaned = torch.where(change < UNSEEN_CHANGE, render, image[0])
+        expected = log_error[0, 0].exp()
+        change = image[0] - render
+        squared = change.abs().amax(dim=0).square()
+        change *= squared / (squared + (DOUBT * expected).square())
+        seen = change.abs().amax(dim=0) >= UNSEEN_CHANGE
+        cleaned = torch.where(seen, render + change, render)
         picture = cleaned.clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
-        error: Float32 = log_error[0, 0].exp().numpy()
+        error: Float32 = expected.numpy()
         confidence: Float32 = HALF_CONFIDENCE_ERROR / (HALF_CONFIDENCE_ERROR + error)
         return picture, confidence
 

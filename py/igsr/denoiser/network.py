@@ -29,6 +29,8 @@ FIRST_SCALE = 0.3
 NORM_FLOOR = 1e-6
 #: At the start a warped photo counts this much beside the render (as a logit).
 FIRST_LOGIT = -2.0
+#: No wider or deeper network is built.
+MOST_WIDTH, MOST_BLOCKS = 256, 32
 #: Ways to look at the photos.
 PHOTO_WAYS = ("concatenated", "attention", "none")
 
@@ -57,6 +59,14 @@ class Architecture:
         """Check what could be mistyped."""
         if self.photos not in PHOTO_WAYS:
             raise IgsrError(f"photos must be one of {', '.join(PHOTO_WAYS)}, not {self.photos!r}.")
+        if type(self.width) is not int or self.width % 2 or not 2 <= self.width <= MOST_WIDTH:
+            raise IgsrError(f"width must be even, from 2 to {MOST_WIDTH}, not {self.width!r}.")
+        counts = [type(count) is int and 0 <= count <= MOST_BLOCKS for count in self.blocks]
+        if len(counts) != 3 or not all(counts):
+            raise IgsrError(f"blocks must be three from 0 to {MOST_BLOCKS}, not {self.blocks!r}.")
+        for name in ("residual", "buffers"):
+            if type(getattr(self, name)) is not bool:
+                raise IgsrError(f"{name} must be True or False, not {getattr(self, name)!r}.")
 
 
 def _gate(x: Tensor) -> Tensor:

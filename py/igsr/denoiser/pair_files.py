@@ -77,7 +77,7 @@ def read_pairs(path: str | os.PathLike[str]) -> Pairs:
         zipfile.BadZipFile,
         zipfile.LargeZipFile,
     ) as error:
-        raise IgsrError(f"{path} is no whole file of pairs; make it again") from error
+        raise IgsrError(f"{path} is no whole file of pairs; delete it and make it again") from error
     inputs, truth, masks = pairs.inputs, pairs.truth, pairs.masks
     if (
         inputs.ndim != 4

@@ -16,6 +16,19 @@ from .pair_files import Pairs, packed
 from .warping import photo_sources, warp_photos
 
 
+def check_one_size(views: Sequence[View]) -> None:
+    """Find before a fit what pairs of it could not hold.
+
+    Raises:
+        IgsrError: the views are not all of one size.
+    """
+    sizes = {(view.camera.width, view.camera.height) for view in views}
+    if len(sizes) > 1:
+        raise IgsrError(
+            f"views to render are of sizes {sorted(sizes)}; pairs need one, resize the photos."
+        )
+
+
 def rendered_pairs(
     splats: Splats,
     photos: Sequence[View],
@@ -30,11 +43,7 @@ def rendered_pairs(
     Raises:
         IgsrError: the views are not all of one size.
     """
-    sizes = {(view.camera.width, view.camera.height) for view in views}
-    if len(sizes) > 1:
-        raise IgsrError(
-            f"views to render are of sizes {sorted(sizes)}; pairs need one, resize the photos."
-        )
+    check_one_size(views)
     support = photo_support(splats, photos, backend)
     behind = BLACK if background is None else background
     sources = photo_sources(splats, photos, behind, backend)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,14 +15,14 @@ import numpy as np
 from ..capture import Capture, View, load_capture
 from ..errors import IgsrError
 from ..evaluation import WHITE
-from ..fitting import fit_with_cameras
+from ..fitting import fingerprint, fit_with_cameras
 from ..metrics import psnr
 from ..presets import preset_settings
 from ..study.noisy_poses import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
 from ..study.runs import Run, finished_runs
 from .inputs import COLOR
 from .pair_files import write_pairs
-from .pair_renders import rendered_pairs
+from .pair_renders import check_one_size, rendered_pairs
 
 #: Kinds of fits. "sparse" has 3 to 16 photos; "underfit" stops early; "noise" has wrong cameras;
 #: "paper" is the paper's recipe, "scattered" its other one; "leave-one-out" leaves one photo of the
@@ -51,6 +52,24 @@ class PairFit:
     steps: int | None
     seed: int
     backend: str
+    all_views: bool
+
+    @property
+    def scene(self) -> str:
+        """What its capture is called."""
+        path = Path(self.capture)
+        return path.stem if path.suffix == ".json" else path.name
+
+    @property
+    def name(self) -> str:
+        """Of its files; ``capture_of_pairs`` reads it."""
+        return f"{self.scene}-{self.recipe}-{self.number}-seed{self.seed}-{self.backend}"
+
+
+def capture_of_pairs(file: str) -> str:
+    """The name of the capture that a file of pairs is of; the file's own where it does not say."""
+    found = re.fullmatch(rf"(.+)-(?:{'|'.join(RECIPES)})-\d+-seed\d+.*\.npz", file)
+    return file if found is None else found[1]
 
 
 def make_pairs(
@@ -61,6 +80,7 @@ def make_pairs(
     fits: int = 1,
     views: int = 8,
     steps: int | None = None,
+    all_views: bool = False,
     seed: int = 0,
     backend: str = "cpu",
     jobs: int = 1,
@@ -76,8 +96,10 @@ def make_pairs(
         recipes: names of ``RECIPES``.
         fits: fits per capture and recipe ("leave-one-out" has one per photo instead).
         views: unseen views rendered per fit, after noise also fitted ones from their true cameras;
-            as many as there are, if fewer.
+            as many as there are, if fewer. "paper" renders all.
         steps: of each fit, where the recipe does not say; None is the default preset's.
+        all_views: use the views too that a capture holds out to be scored, as of captures that
+            nothing is ever scored on; without, what is trained never sees them.
         seed: of everything that is drawn.
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own.
@@ -96,42 +118,55 @@ def make_pairs(
     unknown = [recipe for recipe in recipes if recipe not in RECIPES]
     if unknown:
         raise IgsrError(f"recipe must be one of {', '.join(RECIPES)}, not {unknown[0]!r}.")
-    paths = [Path(path).resolve() for path in captures]
-    names = [path.stem if path.suffix == ".json" else path.name for path in paths]
-    twice = {name for name in names if names.count(name) > 1}
+    out, runs = Path(out), []
+    for path in captures:
+        # Read before the first fit: what is wrong with the last must not come up hours later.
+        capture = load_capture(path)
+        settings = preset_settings("default", FEW[0]) | {
+            "views": views,
+            "steps": steps,
+            "all_views": all_views,
+            "capture": fingerprint(capture.views),
+        }
+        for recipe in recipes:
+            own = len(_used(capture, all_views)) if recipe == "leave-one-out" else fits
+            for number in range(own):
+                one = PairFit(
+                    str(Path(path).resolve()),
+                    recipe,
+                    number,
+                    views,
+                    steps,
+                    seed,
+                    backend,
+                    all_views,
+                )
+                check_one_size(_chosen(capture, one, _random(one))[1])
+                runs.append(Run(one.name, one, settings, out / f"{one.name}.npz"))
+    names = [run.name for run in runs]
+    twice = {run.what.scene for run in runs if names.count(run.name) > 1}
     if twice:
         raise IgsrError(f"two captures are called {min(twice)}; rename one, pairs go by the name.")
-    runs = []
-    for path, name in zip(paths, names, strict=True):
-        for recipe in recipes:
-            count = len(load_capture(path).views) if recipe == "leave-one-out" else fits
-            for number in range(count):
-                one = PairFit(str(path), recipe, number, views, steps, seed, backend)
-                settings = preset_settings("default", FEW[0]) | {"views": views, "steps": steps}
-                runs.append(Run(f"{name}-{recipe}-{number}-seed{seed}-{backend}", one, settings))
-    out = Path(out)
     return finished_runs(out / "runs", runs, partial(_work, out), "", jobs, on_run, ray)
 
 
 def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
     """Make the pairs of one fit; for a process of its own. Paths are whole: ``data`` is unused."""
     capture = load_capture(one.capture)
-    name = Path(one.capture).stem
-    random = np.random.default_rng(
-        [one.seed, one.number, 0xDE40, *name.encode(), *one.recipe.encode()]
-    )
+    random = _random(one)
     train, unseen, steps, about = _chosen(capture, one, random)
     given = Capture(capture.path, train, None if about.get("noise") else capture.points)
     splats, _ = fit_with_cameras(
-        given, backend=one.backend, seed=one.seed + one.number, steps=steps, hull=_hull(one, train)
+        given, backend=one.backend, seed=one.seed + one.number, steps=steps, hull=_hull(one)
     )
     has_alpha = train[0].image.shape[2] == 4
     background: tuple[float, ...] | None = None
     if has_alpha:
         background = WHITE if random.uniform() < 0.7 else tuple(random.uniform(size=3))
-    fitted = [train[i] for i in random.permutation(len(train))[:FITTED_RENDERED]]
+    shown = [train[i] for i in random.permutation(len(train))]
+    fitted = [view for view in shown if _size(view) == _size(unseen[0])][:FITTED_RENDERED]
     pairs = rendered_pairs(splats, train, unseen + fitted, background, one.backend)
-    file = f"{name}-{one.recipe}-{one.number}-seed{one.seed}.npz"
+    file = f"{one.name}.npz"
     write_pairs(out / file, pairs)
     seen, true, masks = pairs.inputs[:, :COLOR], pairs.truth, pairs.masks
     before = [
@@ -152,7 +187,22 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
     }
 
 
-def _hull(one: PairFit, train: list[View]) -> bool | None:
+def _random(one: PairFit) -> np.random.Generator:
+    """What a fit's choices are drawn from."""
+    return np.random.default_rng(
+        [one.seed, one.number, 0xDE40, *one.scene.encode(), *one.recipe.encode()]
+    )
+
+
+def _size(view: View) -> tuple[int, int]:
+    return view.camera.width, view.camera.height
+
+
+def _used(capture: Capture, all_views: bool) -> list[View]:
+    return capture.views if all_views else capture.train_views
+
+
+def _hull(one: PairFit) -> bool | None:
     """Silhouettes of wrong cameras, or as the paper had them, take nothing away."""
     return False if one.recipe in ("noise", "paper", "scattered") else None
 
@@ -161,7 +211,7 @@ def _chosen(
     capture: Capture, one: PairFit, random: np.random.Generator
 ) -> tuple[list[View], list[View], int | None, dict[str, Any]]:
     """Photos to fit (their cameras as the recipe has them), views to render, steps, and a note."""
-    views = capture.views
+    views = _used(capture, one.all_views)
     if one.recipe == "leave-one-out":
         train = [replace(v, split="train") for i, v in enumerate(views) if i != one.number]
         if len(train) < 2:
@@ -172,7 +222,9 @@ def _chosen(
         "noise": NOISY_PHOTOS,
         "scattered": SCATTERED_PHOTOS,
     }.get(one.recipe) or int(random.choice(FEW))
-    count = min(count, len(views) - max(1, min(one.views, len(views) // 4)))
+    # The paper fits 20 of the views and renders all: they are not where they were fitted.
+    held = 0 if one.recipe == "paper" else max(1, min(one.views, len(views) // 4))
+    count = min(count, len(views) - held)
     if count < 2:
         raise IgsrError(
             f"{capture.path} has {len(views)} views; {one.recipe} needs more to render."
@@ -198,6 +250,8 @@ def _chosen(
         noise, steps = Noise(kind, float(size)), one.steps
     unit = noise_unit(train)
     # No photo was fitted from where it is: as in the paper, all views may be rendered.
-    unseen = [views[i] for i in (*order[count:], *order[:count])][: one.views]
+    unseen = [views[i] for i in (*order[count:], *order[:count])]
+    if one.recipe != "paper":
+        unseen = unseen[: one.views]
     noisy = [noisy_view(view, noise, random, unit) for view in train]
     return noisy, unseen, steps, {"noise": str(noise)}

@@ -9,6 +9,7 @@ LPIPS.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import zipfile
 from collections.abc import Callable
@@ -163,14 +164,32 @@ def lpips_distance(backbone: Backbone) -> Distance:
             f"the weights of LPIPS' backbone {backbone} cannot be downloaded ({error}); put them "
             "into torch's cache, or use --features FILE instead"
         ) from error
-    network = metric.net.eval().requires_grad_(False)
+    return _Lpips(metric.net, backbone)
 
-    def distance(first: Tensor, second: Tensor) -> Tensor:
-        # LPIPS is of pictures in [-1, 1].
-        values: Tensor = network(2.0 * first - 1.0, 2.0 * second - 1.0)
+
+class _Lpips(nn.Module):
+    """LPIPS of pictures [B, 3, H, W] in [0, 1], which it takes in [-1, 1]."""
+
+    def __init__(self, network: nn.Module, backbone: str) -> None:
+        super().__init__()
+        self.name = f"LPIPS v0.1 {backbone}"
+        self.network = network.eval().requires_grad_(False)
+
+    def forward(self, first: Tensor, second: Tensor) -> Tensor:
+        values: Tensor = self.network(2.0 * first - 1.0, 2.0 * second - 1.0)
         return values.reshape(len(first))
 
-    return distance
+
+def distance_name(distance: Distance | None) -> str | None:
+    """What a distance is, and a hash of its weights: what a result depends on."""
+    if distance is None:
+        return None
+    name = getattr(distance, "name", getattr(distance, "__name__", type(distance).__name__))
+    digest = hashlib.sha256()
+    if isinstance(distance, nn.Module):
+        for tensor in distance.state_dict().values():
+            digest.update(tensor.cpu().contiguous().numpy().data)
+    return f"{name} {digest.hexdigest()[:16]}"
 
 
 def picture_distance(

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +24,8 @@ from .inputs import BUFFERS, CHOICES, COLOR, PHOTO
 from .losses import Loss, Prediction, charbonnier, regret
 from .network import MULTIPLE, Architecture, DenoiserNetwork
 from .pair_files import OFFSET, SCALE, Pairs, read_pairs
-from .perceptual import Distance
+from .pairs import capture_of_pairs
+from .perceptual import Distance, distance_name
 from .weights import load_network, save_network
 
 CHECKPOINT = "checkpoint.pt"
@@ -79,6 +81,8 @@ class Training:
             raise IgsrError(f"crop must be a multiple of {MULTIPLE}, not {self.crop}.")
         if not (math.isfinite(self.rate) and self.rate > 0.0):
             raise IgsrError(f"rate must be positive, not {self.rate:g}.")
+        if self.seed < 0:
+            raise IgsrError(f"seed must not be negative, not {self.seed}.")
         for name in ("weight_decay", "dropout"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise IgsrError(f"{name} must be from 0 to 1, not {getattr(self, name):g}.")
@@ -113,7 +117,9 @@ def train(
     Under torchrun each process takes its share of every batch.
 
     Args:
-        pairs: files of ``make_pairs``; the last tenth by name is kept for validation.
+        pairs: files of ``make_pairs``; those of the last captures by name, a tenth of all files,
+            are kept for validation. Of a single capture the last files are, with a warning: what
+            they score is then of a scene that was trained on.
         out: folder for ``denoiser.safetensors``, ``log.jsonl``, ``checkpoint.pt`` and, where
             tensorboard is installed, ``tensorboard/``.
         training: how.
@@ -137,11 +143,18 @@ def train(
     names = sorted(str(path) for path in pairs)
     if len(names) < 2:
         raise IgsrError("training needs at least two files of pairs, one of them to validate on.")
-    kept = max(1, round(VALIDATION * len(names)))
+    kept = _kept_for_validation(names)
     train_set = [read_pairs(name) for name in names[:-kept]]
     validation = _validation_crops([read_pairs(name) for name in names[-kept:]], training)
 
     processes = _Processes(device)
+    if training.batch % processes.count:
+        raise IgsrError(
+            f"batch must be a multiple of the number of processes, {processes.count}, not "
+            f"{training.batch}."
+        )
+    if isinstance(distance, nn.Module):
+        distance = distance.to(processes.device)
     torch.manual_seed(training.seed)
     network = DenoiserNetwork(architecture, training.dropout)
     if start is not None:
@@ -151,14 +164,20 @@ def train(
         network.load_state_dict(begun.state_dict())
     loss = Loss(training.loss, distance, training.a)
     learner = _Learner(network, loss, training, processes)
-    state = {"pairs": [Path(name).name for name in names], "training": asdict(training)}
+    state = {
+        "pairs": [Path(name).name for name in names],
+        "pairs_sha256": _hash_of_all(names),
+        "training": asdict(training),
+        "distance": distance_name(distance),
+        "processes": processes.count,
+    }
     if start is not None:
         state["start"] = hashlib.sha256(Path(start).read_bytes()).hexdigest()
     state["architecture"] = json.loads(json.dumps(asdict(architecture)))
     if resume and (out / CHECKPOINT).is_file():
         learner.restore(out / CHECKPOINT, state)
-    elif processes.first:
-        (out / LOG).unlink(missing_ok=True)
+    if processes.first:
+        _cut_log(out / LOG, learner.step)
     board = _board(out) if processes.first else None
     started = time.monotonic() - learner.seconds
 
@@ -169,8 +188,8 @@ def train(
         last = learner.step == training.steps
         if not all(math.isfinite(part) for part in parts.values()):
             raise IgsrError(
-                f"the loss is not finite at step {learner.step}; lower the rate and go on with "
-                "--resume from the last checkpoint."
+                f"the loss is not finite at step {learner.step}; train with a lower rate, in "
+                "another --out."
             )
         row: dict[str, Any] = {}
         if learner.step % log_every == 0 or last:
@@ -190,13 +209,18 @@ def train(
     return learner.averaged.to("cpu").eval()
 
 
+def is_first_process() -> bool:
+    """Whether this is the process that writes, of those that torchrun started."""
+    return int(os.environ.get("RANK", "0")) == 0
+
+
 class _Processes:
     """This process among those that torchrun started; alone if it did not."""
 
     def __init__(self, device: str) -> None:
         self.count = int(os.environ.get("WORLD_SIZE", "1"))
         self.rank = int(os.environ.get("RANK", "0"))
-        self.first = self.rank == 0
+        self.first = is_first_process()
         index = os.environ.get("LOCAL_RANK")
         self.device = torch.device(f"cuda:{index}" if device == "cuda" and index else device)
         if self.count > 1:
@@ -208,9 +232,42 @@ class _Processes:
             return network
         return nn.parallel.DistributedDataParallel(network)
 
+    def average_gradients(self, network: nn.Module) -> None:
+        """Make each gradient the mean over the processes, of what ``shared`` does not wrap."""
+        if self.count == 1:
+            return
+        for parameter in network.parameters():
+            if parameter.grad is not None:
+                torch.distributed.all_reduce(parameter.grad)
+                parameter.grad /= self.count
+
     def end(self) -> None:
         if self.count > 1:
             torch.distributed.destroy_process_group()
+
+
+def _kept_for_validation(names: Sequence[str]) -> int:
+    """How many files at the end to keep: whole captures, so that none of them is trained on."""
+    captures = [capture_of_pairs(Path(name).name) for name in names]
+    kept = max(1, round(VALIDATION * len(names)))
+    if len(set(captures)) == 1:
+        warnings.warn(
+            "All pairs are of one capture: validation is of the scene that is trained on.",
+            stacklevel=3,
+        )
+        return kept
+    while kept < len(names) and captures[-kept - 1] == captures[-kept]:
+        kept += 1
+    if kept < len(names):
+        return kept
+    return captures.count(captures[-1])
+
+
+def _hash_of_all(names: Sequence[str]) -> str:
+    digest = hashlib.sha256()
+    for name in names:
+        digest.update(hashlib.sha256(Path(name).read_bytes()).digest())
+    return digest.hexdigest()
 
 
 class _Learner:
@@ -223,7 +280,7 @@ class _Learner:
         self.shared = processes.shared(self.network)
         self.averaged = _placed(DenoiserNetwork(network.architecture), processes.device).eval()
         self.averaged.load_state_dict(network.state_dict())
-        self.loss, self.training = loss, training
+        self.loss, self.training, self.processes = loss, training, processes
         self.device = processes.device
         self.adam = _adam(self.network, training)
         self.judge = loss.discriminator.to(self.device) if loss.discriminator else None
@@ -244,10 +301,11 @@ class _Learner:
         log_error = torch.where(known, log_error.float(), log_error.detach().float())
         made = Prediction(inputs[:, :COLOR], image, log_error, truth)
         total, parts = self.loss(made)
-        _stepped(self.adam, total, rate)
+        _stepped(self.adam, total, rate)  # ``shared`` has averaged its gradients
         if self.judge is not None and self.judge_adam is not None:
             judged = self.judge.loss(made)
-            _stepped(self.judge_adam, judged, rate)
+            judge = self.judge
+            _stepped(self.judge_adam, judged, rate, lambda: self.processes.average_gradients(judge))
             parts["discriminator"] = float(judged.detach())
         self.step += 1
         share = 1.0 / min(1.0 + self.step / 10.0, AVERAGED_STEPS)
@@ -296,11 +354,18 @@ def _adam(network: nn.Module, training: Training) -> torch.optim.AdamW:
     return torch.optim.AdamW(network.parameters(), weight_decay=training.weight_decay)
 
 
-def _stepped(adam: torch.optim.AdamW, loss: Tensor, rate: float) -> None:
+def _stepped(
+    adam: torch.optim.AdamW,
+    loss: Tensor,
+    rate: float,
+    before: Callable[[], None] | None = None,
+) -> None:
     for group in adam.param_groups:
         group["lr"] = rate
     adam.zero_grad()
     loss.backward()
+    if before is not None:
+        before()
     nn.utils.clip_grad_norm_([p for g in adam.param_groups for p in g["params"]], 1.0)
     adam.step()
 
@@ -429,6 +494,24 @@ def _board(out: Path) -> Any:
     except ImportError:
         return None
     return SummaryWriter(out / "tensorboard")
+
+
+def _cut_log(path: Path, step: int) -> None:
+    """Leave the log's whole lines up to ``step``: later ones are written again."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return
+    kept = []
+    for line in lines if step else []:
+        try:
+            row = json.loads(line)
+        except ValueError:  # torn when a training was killed
+            continue
+        if row["step"] <= step:
+            kept.append(f"{line}\n")
+    with atomic_write(path) as temporary:
+        temporary.write_text("".join(kept), encoding="utf-8")
 
 
 def _write_log(path: Path, board: Any, step: int, seconds: float, row: dict[str, float]) -> None:

@@ -18,8 +18,6 @@ from .network import Architecture, DenoiserNetwork
 
 #: The denoiser that comes with igsr.
 SHIPPED = Path(__file__).with_name("denoiser.safetensors")
-#: No larger network is built for a file that asks for one.
-MOST_WIDTH, MOST_BLOCKS = 256, 32
 
 
 def save_network(
@@ -87,21 +85,12 @@ def load_network(path: str | os.PathLike[str] | None = None) -> DenoiserNetwork:
 
 
 def _architecture(text: str | None, path: Path) -> Architecture:
-    refused = IgsrError(f"{path} does not say which network it is of; it is no denoiser of igsr's")
     try:
         given = json.loads(text or "")
-        blocks = tuple(given["blocks"])
-        architecture = Architecture(**{**given, "blocks": blocks})
+        return Architecture(**{**given, "blocks": tuple(given["blocks"])})
+    except IgsrError as error:
+        raise IgsrError(f"{path} is of a network that igsr does not build: {error}") from error
     except (ValueError, TypeError, KeyError) as error:
-        raise refused from error
-    sizes = (architecture.width, *architecture.blocks)
-    if (
-        len(blocks) != 3
-        or not all(type(size) is int for size in sizes)
-        or not 2 <= architecture.width <= MOST_WIDTH
-        or architecture.width % 2
-        or not all(0 <= size <= MOST_BLOCKS for size in blocks)
-        or not all(type(flag) is bool for flag in (architecture.residual, architecture.buffers))
-    ):
-        raise refused
-    return architecture
+        raise IgsrError(
+            f"{path} does not say which network it is of; it is no denoiser of igsr's"
+        ) from error

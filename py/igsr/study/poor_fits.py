@@ -23,7 +23,7 @@ from ..capture import Capture, load_capture
 from ..capture.folder import holds_cameras
 from ..denoiser.cleaning import NetworkDenoiser
 from ..denoiser.pair_files import OFFSET, SCALE, Pairs, read_pairs, write_pairs
-from ..denoiser.pair_renders import rendered_pairs
+from ..denoiser.pair_renders import check_one_size, rendered_pairs
 from ..denoiser.perceptual import SMALLEST_SIDE, SqueezeNetDistance, picture_distance
 from ..denoiser.weights import SHIPPED, load_network
 from ..errors import IgsrError
@@ -313,9 +313,11 @@ def denoiser_table(
         # Read before the first fit: what is wrong with the last scene must not come up hours later.
         capture = load_capture(data / scene)
         for one in (one for one in fits if one.scene == scene):
-            photos = len(poor_capture(capture, one).train_views)
+            poor = poor_capture(capture, one)
+            check_one_size(poor.test_views)
+            photos = len(poor.train_views)
             settings = preset_settings("default", photos) | {"scored": SCORED_VIEWS}
-            tasks.append(Run(one.name, one, settings))
+            tasks.append(Run(one.name, one, settings, out / "renders" / f"{one.name}.npz"))
     rows = finished_runs(out / "runs", tasks, partial(run_fit, out), str(data), jobs, on_run, ray)
     perceptual = None if features is None else file_hash(Path(features))
     columns: dict[str, Path | None] = {BEFORE: None, **weights}

@@ -19,11 +19,19 @@ from ..worker_processes import THREADS, worker_processes
 
 @dataclass(frozen=True)
 class Run:
-    """One fit: its file's name without ending, what describes it, and the settings that it uses."""
+    """One fit.
+
+    Attributes:
+        name: of its file, without ending.
+        what: describes it.
+        settings: that it uses.
+        leaves: a file that it leaves beside its row, if any; without that it is not done.
+    """
 
     name: str
     what: Any
     settings: dict[str, Any]
+    leaves: Path | None = None
 
 
 def file_hash(path: Path) -> str:
@@ -42,7 +50,9 @@ def finished_runs(
 ) -> list[dict[str, Any]]:
     """The row of every run, in order: read where its file is there, else done and written.
 
-    A file of another version or with other settings (presets change) is done again.
+    A file of another version or with other settings (presets change) is done again, and one whose
+    run left a file that is not there any more. When one run fails those that are under way are
+    still finished and kept.
 
     Args:
         folder: of the runs' files.
@@ -62,7 +72,8 @@ def finished_runs(
     for run in runs:
         row = _read(folder / f"{run.name}.json")
         current = {"igsr": _core.__version__, "settings": run.settings}
-        if row is not None and {key: row.get(key) for key in current} == current:
+        whole = run.leaves is None or run.leaves.is_file()
+        if row is not None and whole and {key: row.get(key) for key in current} == current:
             rows[run.name] = row
         else:
             missing.append(run)
@@ -90,6 +101,10 @@ def finished_runs(
                     keep(pending[done], done.result())
             except BaseException:
                 pool.shutdown(cancel_futures=True)
+                for other, run in pending.items():
+                    finished = other.done() and not other.cancelled()
+                    if finished and run.name not in rows and other.exception() is None:
+                        keep(run, other.result())
                 raise
     return [rows[run.name] for run in runs]
 

@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +213,7 @@ def make_scene(folder: Path, seed: int, index: int, settings: CaptureSettings) -
         with one_threaded_mitsuba() as mitsuba:
             document = _photograph(unfinished, seed, index, settings)
             document["mitsuba"] = mitsuba.__version__
+        document["pyoidn"] = version("pyoidn")
         _write_json(unfinished / "scene.json", document)
         unfinished.rename(final)
     except OSError as error:
