@@ -157,6 +157,8 @@ def test_a_change_counts_by_its_size_beside_the_error_that_is_expected():
         picture, confidence = denoise(color, denoiser=cleaner)
         assert picture == pytest.approx(0.4 + 0.1 * part, abs=1e-4)
         assert confidence == pytest.approx(0.05 / (0.05 + error), rel=1e-4)
+        picture, _ = denoise(color, denoiser=NetworkDenoiser(cleaner.network, doubt=0.0))
+        assert picture == pytest.approx(0.5, abs=1e-6), "every change is made"
 
 
 def test_pixels_that_are_not_numbers_are_filled_in_without_confidence():

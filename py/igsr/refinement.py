@@ -18,7 +18,14 @@ import numpy as np
 from .capture import Camera, Capture, View, load_capture
 from .capture.folder import holds_cameras
 from .capture.write_colmap import write_colmap
-from .denoiser import Denoiser, photo_sources, photo_support, render_buffers
+from .denoiser import (
+    Denoiser,
+    NetworkDenoiser,
+    load_network,
+    photo_sources,
+    photo_support,
+    render_buffers,
+)
 from .errors import IgsrError
 from .evaluation import (
     METRICS,
@@ -190,7 +197,7 @@ def refine(
         steps: of each fit; None is the default preset's.
         backend: "auto", "cpu" or "gpu".
         seed: of everything random; same seed, same bits.
-        denoiser: what cleans; None is the one that comes with igsr.
+        denoiser: what cleans; None is ``round_denoiser()``.
         out: folder for ``scene.ply``, ``rounds/``, ``report.json`` and ``report.html``
             (``igsr.refinement_report``), written after every round, ``checkpoints/``, and
             ``capture/`` with cameras that had to be found; None writes nothing.
@@ -248,6 +255,17 @@ def refine(
         )
         if not accepted:
             return so_far(f"round {number} did not make photos that were left out better")
+
+
+def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDenoiser:
+    """A denoiser as rounds use it; None is the one that comes with igsr.
+
+    It makes every change, sure or not: what is added to a fit is weighed by its confidence there.
+
+    Raises:
+        IgsrError: as ``igsr.denoiser.load_network``.
+    """
+    return NetworkDenoiser(load_network(weights), doubt=0.0)
 
 
 def check_arguments(
@@ -317,7 +335,8 @@ class _Loop:
         self.rounds = MOST_ROUNDS if isinstance(rounds, str) else rounds
         if not capture.train_views:
             raise IgsrError(f"{capture.path} has no train views to fit.")
-        self.capture, self.backend, self.seed, self.denoiser = capture, backend, seed, denoiser
+        self.capture, self.backend, self.seed = capture, backend, seed
+        self.denoiser = denoiser or round_denoiser()
         self.background = default_background(capture)
         self.behind = known_background(capture.views)
         views = capture.train_views

@@ -24,8 +24,8 @@ Float32 = npt.NDArray[np.float32]
 PHOTO_ERROR = 0.06
 #: A view whose pixels count less than this on average is not one to learn from.
 LEAST_TRUST = 0.15
-#: Nor is one that is worth less than this: an eighth of a level of 8 bits, trusted everywhere.
-LEAST_WORTH = 0.0005
+#: Nor is one that is worth less than this: a fortieth of a level of 8 bits, trusted everywhere.
+LEAST_WORTH = 0.0001
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,8 +84,7 @@ def refine_command(
     as_json: JsonOption = False,
 ) -> None:
     """Fit photos, render views that nobody took, clean them, keep what helps, and fit again."""
-    from ..denoiser import NetworkDenoiser, load_network
-    from ..refinement import check_arguments, refine
+    from ..refinement import check_arguments, refine, round_denoiser
 
     with one_sentence(
         lambda: f"Interrupted; what is done is in {out}, the same command with --resume goes on."
@@ -93,7 +92,7 @@ def refine_command(
         name = resolved(backend)
         most = _rounds(rounds)
         check_arguments(most, steps, name, out, resume)
-        denoiser = NetworkDenoiser(load_network(weights))
+        denoiser = round_denoiser(weights)
         with warnings_as_sentences():
             capture, _ = capture_to_fit(
                 photos,

@@ -23,9 +23,10 @@ Float32 = npt.NDArray[np.float32]
 
 #: Expected error, in units of the colours' range, at which the confidence is a half.
 HALF_CONFIDENCE_ERROR = 0.05
-#: A change as large as this part of the error that is expected to remain is made by half: it is as
-#: likely noise. On scenes unlike those trained on, what is not sure of itself goes wrong.
-DOUBT = 0.7
+#: A change this many times as large as the error that is expected to remain is made by half: it is
+#: as likely wrong. On scenes unlike those trained on, what is not sure of itself goes wrong.
+DOUBT = 1.0
+TINY = 1e-12
 #: Colours that would change by less than this, of 1, are left alone: a background that is right
 #: stays exactly so.
 UNSEEN_CHANGE = 1.5 / 255.0
@@ -50,11 +51,13 @@ class NetworkDenoiser:
 
     Args:
         network: its network, ready for use (``load_network``).
+        doubt: a change this many times as large as the error that is expected to remain is made by
+            half; 0 makes every change, for one who weighs the picture by its confidence.
     """
 
-    def __init__(self, network: DenoiserNetwork) -> None:
+    def __init__(self, network: DenoiserNetwork, doubt: float = DOUBT) -> None:
         """Keep the network."""
-        self.network = network
+        self.network, self.doubt = network, doubt
 
     def __call__(self, render: Buffers, photos: Sequence[Source]) -> tuple[Float32, Float32]:
         """Clean one render; see ``denoise``."""
@@ -70,7 +73,7 @@ class NetworkDenoiser:
         expected = log_error[0, 0].exp()
         change = image[0] - render
         squared = change.abs().amax(dim=0).square()
-        change *= squared / (squared + (DOUBT * expected).square())
+        change *= squared / (squared + (self.doubt * expected).square()).clamp_min(TINY)
         seen = change.abs().amax(dim=0) >= UNSEEN_CHANGE
         cleaned = torch.where(seen, render + change, render)
         picture = cleaned.clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()

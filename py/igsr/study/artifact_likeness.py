@@ -117,6 +117,8 @@ def plot_likeness(
         shares = list(found[name].values())[: len(OCTAVES)]
         if shares:
             axes["spectra"].loglog(OCTAVES, shares, "o-", label=name)
+    axes["spectra"].set_xticks(OCTAVES, [f"{edge:.3g}" for edge in OCTAVES])
+    axes["spectra"].set_xticks([], minor=True)
     axes["spectra"].set_xlabel("upper edge of the octave, cycles per pixel")
     axes["spectra"].set_ylabel("share of the error's power")
     axes["spectra"].grid(alpha=0.3, which="both")

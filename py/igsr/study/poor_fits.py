@@ -264,7 +264,8 @@ def denoiser_table(
         denoisers: further ones, weights by name: the paper's losses trained on the same pairs.
         features: SqueezeNet's arrays (.npz), to score by ``SqueezeNetDistance`` as well.
         pairs: folder of the training pairs, to compare their errors with those of the renders from
-            few photos here (``artifact_likeness``); also writes ``artifacts.png``.
+            few photographs here (of scenes without alpha, if there are any; see
+            ``artifact_likeness``); also writes ``artifacts.png``.
         seeds: how many seeds, from 0.
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own with its share of the cores.
@@ -309,9 +310,12 @@ def denoiser_table(
         for kind in kinds
     ]
     tasks = []
+    made_up = set()
     for scene in scenes:
         # Read before the first fit: what is wrong with the last scene must not come up hours later.
         capture = load_capture(data / scene)
+        if known_background(capture.views) is not None:
+            made_up.add(scene)
         for one in (one for one in fits if one.scene == scene):
             poor = poor_capture(capture, one)
             check_one_size(poor.test_views)
@@ -340,7 +344,13 @@ def denoiser_table(
             row[name] = scores
     report = _report(rows, short, kinds, tuple(weights), seeds, features is not None)
     if training:
-        few = [read_pairs(out / "renders" / f"{one.name}.npz") for one in fits if one.kind != NOISE]
+        # Photographs have no alpha; without any of those the others must do.
+        photographed = [scene for scene in scenes if scene not in made_up] or scenes
+        few = [
+            read_pairs(out / "renders" / f"{one.name}.npz")
+            for one in fits
+            if one.kind != NOISE and one.scene in photographed
+        ]
         synthetic = [read_pairs(path) for path in training]
         report["artifacts"] = likeness(few, synthetic)
         plot_likeness(out / "artifacts.png", report["artifacts"], few, synthetic)

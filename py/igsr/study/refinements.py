@@ -25,14 +25,13 @@ from .. import _core
 from ..atomic_write import atomic_write
 from ..capture import Camera, Capture, View, load_capture
 from ..denoiser import Buffers, Denoiser, Source
-from ..denoiser.cleaning import NetworkDenoiser
 from ..denoiser.perceptual import SqueezeNetDistance, picture_distance
 from ..denoiser.weights import SHIPPED, load_network
 from ..errors import IgsrError
 from ..evaluation import default_background, over_background, score_views
 from ..fitting import fingerprint
 from ..presets import preset_settings
-from ..refinement import Choose, Look, Refined, refine
+from ..refinement import Choose, Look, Refined, refine, round_denoiser
 from ..selection import Candidate, select
 from ..splats import Splats
 from ..views import UnseenView, unseen_views
@@ -252,7 +251,7 @@ def _refined(
     distance: SqueezeNetDistance | None,
     out: Path,
 ) -> Refined:
-    base: Denoiser = NetworkDenoiser(load_network(given.weights))
+    base: Denoiser = round_denoiser(given.weights)
     look: Look = unseen_views
     choose: Choose = lambda found, _: select(found, how.views)  # noqa: E731
     if how.method == "no-denoiser":
