@@ -142,7 +142,8 @@ $(VENV)/.venv-ready: requirements-dev.txt
 	@touch $@
 
 $(VENV)/.build-ready: $(VENV)/.venv-ready pyproject.toml $(RUST_SOURCES)
-	$(BIN)/maturin develop $(PROFILE) --locked
+	@# Another environment that is active is not the one to install into.
+	env -u CONDA_PREFIX VIRTUAL_ENV="$(CURDIR)/$(VENV)" $(BIN)/maturin develop $(PROFILE) --locked
 	@touch $@
 
 $(VENV)/.dev-ready: $(VENV)/.venv-ready requirements-dev.txt
