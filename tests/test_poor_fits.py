@@ -68,7 +68,8 @@ def test_a_denoiser_that_does_nothing_changes_no_score(tmp_path):
 
 def test_what_was_right_counts_as_the_best_quarter(tmp_path):
     file = pairs(tmp_path / "pairs.npz")
-    brighter = weights(tmp_path / "brighter.safetensors", brighter=10.2 / 255)
+    # Sure of itself, so that all of the change is made.
+    brighter = weights(tmp_path / "brighter.safetensors", brighter=10.2 / 255, log_error=-7.0)
     after = run_cleaning("", Cleaning(file, brighter, None))
     # Right pixels become 10 too bright, wrong ones stay 10 too dark.
     assert after["psnr"] == pytest.approx(-20 * np.log10(10 / 255), abs=0.05)
