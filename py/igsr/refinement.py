@@ -65,6 +65,7 @@ MOST_ROUNDS = 4
 Look = Callable[[Splats, Sequence[Camera], int, str], Sequence[UnseenView]]
 #: Which of the cleaned views to add, and how many at most.
 Choose = Callable[[Sequence[Candidate], int], list[Candidate]]
+#: What one that was cancelled ends with.
 STOPPED = "the refinement was stopped; go on with resume."
 #: Scores of photos left out that decide about a round.
 DECIDING = ("psnr", "ssim", "flip")

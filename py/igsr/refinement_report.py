@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,7 +73,8 @@ def seconds_so_far(out: Path) -> dict[str, float]:
     """What each part took by the report that lies in ``out``; none where there is no such."""
     try:
         found = json.loads((out / "report.json").read_text(encoding="utf-8"))["seconds"]
-        return {part: float(found[part]) for part in PARTS if part in found}
+        seconds = {part: float(found[part]) for part in PARTS if part in found}
+        return {part: value for part, value in seconds.items() if math.isfinite(value)}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 

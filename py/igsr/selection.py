@@ -24,8 +24,8 @@ Float32 = npt.NDArray[np.float32]
 PHOTO_ERROR = 0.06
 #: A view whose pixels count less than this on average is not one to learn from.
 LEAST_TRUST = 0.15
-#: Nor is one that is worth less than this: a fortieth of a level of 8 bits, trusted everywhere.
-LEAST_WORTH = 0.0001
+#: Nor is one that is worth less than this: an eighth of a level of 8 bits, trusted everywhere.
+LEAST_WORTH = 0.0005
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,12 +115,9 @@ class Rightness:
 
     @property
     def share(self) -> float:
-        """The part of each change that would leave the least squared error, in [0, 1].
-
-        Where nothing was changed, or nothing is known, nothing speaks against it: 1.
-        """
+        """The part of each change that would leave the least squared error, in [0, 1]."""
         if self.squared <= 0.0:
-            return 1.0
+            return 0.0
         return min(1.0, max(0.0, self.towards / self.squared))
 
 

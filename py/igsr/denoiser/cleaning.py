@@ -26,7 +26,6 @@ HALF_CONFIDENCE_ERROR = 0.05
 #: A change this many times as large as the error that is expected to remain is made by half: it is
 #: as likely wrong. On scenes unlike those trained on, what is not sure of itself goes wrong.
 DOUBT = 1.0
-TINY = 1e-12
 #: Colours that would change by less than this, of 1, are left alone: a background that is right
 #: stays exactly so.
 UNSEEN_CHANGE = 1.5 / 255.0
@@ -73,7 +72,8 @@ class NetworkDenoiser:
         expected = log_error[0, 0].exp()
         change = image[0] - render
         squared = change.abs().amax(dim=0).square()
-        change *= squared / (squared + (self.doubt * expected).square()).clamp_min(TINY)
+        both = squared + (self.doubt * expected).square()
+        change *= squared / both.clamp_min(torch.finfo(both.dtype).tiny)
         seen = change.abs().amax(dim=0) >= UNSEEN_CHANGE
         cleaned = torch.where(seen, render + change, render)
         picture = cleaned.clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()

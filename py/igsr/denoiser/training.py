@@ -260,6 +260,7 @@ def _kept_for_validation(names: Sequence[str]) -> int:
         kept += 1
     if kept < len(names):
         return kept
+    # The tenth reached into the first capture: the last alone is kept.
     return captures.count(captures[-1])
 
 
