@@ -351,6 +351,17 @@ def test_every_loss_has_its_parts_and_moves_the_network(name):
         Loss(name, mean_distance, a=1.5)
 
 
+def test_the_discriminator_is_shown_colours_that_a_picture_can_have():
+    torch.manual_seed(0)
+    loss, render = Loss("gan", None), torch.full((1, 3, 32, 32), 0.5)
+    bright = [
+        Prediction(render, torch.full_like(render, value), torch.zeros(1, 1, 32, 32), render)
+        for value in (1.0, 3.0)
+    ]
+    values = [(loss(one)[1]["gan"], loss.discriminator.loss(one).item()) for one in bright]
+    assert values[0] == values[1]
+
+
 def test_losses_that_cannot_be_had_are_refused():
     with pytest.raises(igsr.IgsrError, match="loss must be one of default, charbonnier, gan"):
         Loss("mse", None)

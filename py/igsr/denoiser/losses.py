@@ -149,9 +149,9 @@ class Discriminator(nn.Module):
         return logits
 
     def loss(self, prediction: Prediction) -> Tensor:
-        """-E log D(truth) - E log(1 - D(image)); does not reach the denoiser."""
+        """-E log D(truth) - E log(1 - D(image)), clamped; does not reach the denoiser."""
         true = F.softplus(-self(prediction.truth)).mean()
-        made = F.softplus(self(prediction.image.detach())).mean()
+        made = F.softplus(self(_clamped(prediction.image.detach()))).mean()
         return true + made
 
 
@@ -197,7 +197,8 @@ class Loss:
                 parts["perceptual"] = CHARBONNIER_PERCEPTUAL, distance
         if self.discriminator is not None:
             weight = 1.0 if self.name == "gan" else 1.0 - self.a
-            parts["gan"] = weight, F.softplus(-self.discriminator(prediction.image)).mean()
+            judged = self.discriminator(_clamped(prediction.image))
+            parts["gan"] = weight, F.softplus(-judged).mean()
         if self.name.endswith("lpips") and self.distance is not None:
             weight = 1.0 if self.name == "lpips" else self.a
             parts["perceptual"] = weight, perceptual(prediction, self.distance)
