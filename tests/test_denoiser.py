@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetw
 from igsr.denoiser.pair_files import Pairs, read_pairs, write_pairs
 from igsr.denoiser.pairs import capture_of_pairs
 from igsr.denoiser.perceptual import SqueezeNetDistance, lpips_distance
+from igsr.denoiser.plot import plot_training
 from igsr.denoiser.training import (
     CHECKPOINT,
     LOG,
@@ -613,3 +615,20 @@ def test_the_feature_distance_grows_with_blur_and_carries_gradients(tmp_path):
     ):
         with pytest.raises(igsr.IgsrError, match=message):
             SqueezeNetDistance(tmp_path / f"{name}.npz")
+
+
+def test_a_single_validation_shows_in_the_plot(tmp_path, monkeypatch):
+    lines = {}
+
+    def kept(figure, file, **_):
+        for line in (line for axis in figure.axes for line in axis.lines):
+            lines[line.get_label()] = line
+        file.write(b"png") if hasattr(file, "write") else Path(file).write_bytes(b"png")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", kept)
+    rows = [{"step": 100, "squared": -0.1}, {"step": 200, "squared": -0.2, "validation_psnr": 20.0}]
+    (tmp_path / "log.jsonl").write_text("\n".join(json.dumps(row) for row in rows))
+    assert plot_training(tmp_path / "log.jsonl", tmp_path / "loss.png") == rows
+    assert lines["validation psnr"].get_marker() == "o"
+    assert lines["squared"].get_marker() in ("", "None", None)
+    assert lines["squared"].get_linestyle() == "-"

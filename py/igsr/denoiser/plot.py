@@ -35,7 +35,9 @@ def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
         for key, style in ((name, "-"), (f"{name}_before", "--")):
             known = [(row["step"], row[key]) for row in rows if key in row]
             if known:
-                axis.plot(*zip(*known, strict=True), style, label=key.replace("_", " "))
+                # A line of one point would not show.
+                marker = "o" if len(known) == 1 else ""
+                axis.plot(*zip(*known, strict=True), style + marker, label=key.replace("_", " "))
         axis.set_xlabel("step")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
