@@ -15,6 +15,7 @@ import igsr
 from igsr import presets, refinement
 from igsr.pose import registry
 from igsr.pose.estimate import Estimate
+from igsr.refinement_report import seconds_so_far
 from igsr.rendering import render
 
 BALL = scenes.splats(60)
@@ -563,3 +564,10 @@ def test_photos_come_up_more_often_than_views_that_are_none(capture):
     assert _turns([photos[0], *views, photos[1]]) == [PHOTO_STEPS, 1, 1, PHOTO_STEPS]
     assert _turns([*photos, views[0]]) == [-(-PHOTO_STEPS // 2)] * 2 + [1]
     assert _turns(photos) == _turns(views) == [1, 1]
+
+
+def test_seconds_that_a_report_cannot_have_are_not_gone_on_from(tmp_path):
+    (tmp_path / "report.json").write_text('{"seconds": {"fit": NaN, "look": 2.5, "judge": 1e999}}')
+    assert seconds_so_far(tmp_path) == {"look": 2.5}
+    (tmp_path / "report.json").write_text('{"seconds": {"fit": "long"}}')
+    assert seconds_so_far(tmp_path) == {}
