@@ -13,6 +13,7 @@ import torch
 from feature_files import squeezenet_file
 
 import igsr
+from igsr.capture import Camera
 from igsr.denoiser import (
     Buffers,
     NetworkDenoiser,
@@ -36,7 +37,7 @@ from igsr.denoiser.losses import (
 from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetwork
 from igsr.denoiser.pair_files import Pairs, read_pairs, write_pairs
 from igsr.denoiser.pairs import capture_of_pairs
-from igsr.denoiser.perceptual import SqueezeNetDistance, lpips_distance
+from igsr.denoiser.perceptual import SqueezeNetDistance, _Lpips, lpips_distance
 from igsr.denoiser.plot import plot_training
 from igsr.denoiser.training import (
     CHECKPOINT,
@@ -49,6 +50,7 @@ from igsr.denoiser.training import (
     _Processes,
     train,
 )
+from igsr.denoiser.warping import Source
 from igsr.rendering import Render
 
 SMALL = Architecture(width=4, blocks=(1, 1, 1))
@@ -185,6 +187,12 @@ def test_renders_of_all_kinds_are_taken():
     assert denoise(drawn, denoiser=cleaner)[0].shape == (8, 9, 3)
     with pytest.raises(igsr.IgsrError, match=r"color must be \[H, W, 3\], not \[8, 9\]"):
         denoise(floats[..., 0], denoiser=cleaner)
+    camera = Camera(np.eye(4), np.eye(3), 9, 8)
+    photo = Source(camera, floats, ones > 0.0, ones)
+    with pytest.raises(igsr.IgsrError, match=r"must be of igsr\.denoiser\.photo_sources"):
+        denoise(Buffers(floats), ["photo.png"], denoiser=cleaner)
+    with pytest.raises(igsr.IgsrError, match="only where render has a camera"):
+        denoise(drawn, [photo], denoiser=cleaner)
     with pytest.raises(igsr.IgsrError, match="render must be uint8 or float"):
         denoise(np.zeros((2, 2, 3), np.int64), denoiser=cleaner)
 
@@ -232,6 +240,7 @@ def test_damaged_files_of_weights_are_refused_in_a_sentence(tmp_path):
         ('{"width": 4, "blocks": [1, 1, 99]}', "blocks must be three from 0 to 32"),
         ('{"width": 4, "blocks": [1, 1, 1], "photos": "all"}', "photos must be one of"),
         ('{"width": 4, "blocks": [1, 1, 1], "residual": 1}', "residual must be True or False"),
+        ("[" * 100_000, unsaid),
     ):
         save_file(weights, path, metadata={"architecture": wrong})
         refused(why)
@@ -337,13 +346,14 @@ def test_every_loss_has_its_parts_and_moves_the_network(name):
     image, log_error = made(inputs)
     total, parts = loss(Prediction(inputs[:, :COLOR], image, log_error, truth))
     expected = {
-        "default": {"squared", "structure", "perceptual", "likelihood"},
+        "default": {"squared_ratio", "structure_ratio", "perceptual_ratio", "likelihood"},
         "charbonnier": {"charbonnier", "perceptual", "likelihood"},
         "gan": {"gan", "likelihood"},
         "gan+lpips": {"gan", "perceptual", "likelihood"},
         "lpips": {"perceptual", "likelihood"},
     }[name]
-    assert set(parts) == expected
+    assert set(parts) == expected | {"total"}
+    assert parts["total"] == pytest.approx(total.item())
     if name == "gan+lpips":
         weighed = 0.75 * parts["gan"] + 0.25 * parts["perceptual"] + 0.1 * parts["likelihood"]
         assert total.item() == pytest.approx(weighed, rel=1e-5)
@@ -576,7 +586,7 @@ def test_processes_learn_one_network_and_one_discriminator(tmp_path):
     first, second = ((tmp_path / rank).read_text() for rank in "01")
     assert len(first) > 100
     assert first == second
-    assert [row["step"] for row in log_of(tmp_path / "out")] == [3]
+    assert [row["step"] for row in log_of(tmp_path / "out")] == [1, 2, 3]
 
 
 def test_a_batch_is_shared_evenly(tmp_path, monkeypatch):
@@ -588,6 +598,41 @@ def test_a_batch_is_shared_evenly(tmp_path, monkeypatch):
 def test_training_needs_two_files_of_pairs(tmp_path):
     with pytest.raises(igsr.IgsrError, match="at least two files of pairs"):
         train(pair_files(tmp_path, count=1), tmp_path / "out", TINY, SMALL)
+
+
+def test_a_training_has_checkpoints_on_its_way(tmp_path):
+    train(pair_files(tmp_path / "pairs"), tmp_path, replace(TINY, steps=20), SMALL)
+    validated = [row["step"] for row in log_of(tmp_path) if "validation_psnr" in row]
+    assert validated == list(range(2, 21, 2))
+
+
+def test_captures_are_kept_together_where_one_name_begins_with_another(tmp_path):
+    pairs = pair_files(tmp_path / "all", count=5)
+    named = []
+    for path, name in zip(
+        pairs,
+        ("a-noise-0", "a-p2-noise-0", "a-p2-sparse-0", "a-sparse-0", "a-sparse-1"),
+        strict=True,
+    ):
+        named.append(path.rename(tmp_path / f"{name}-seed0-cpu.npz"))
+    train(named, tmp_path / "out", replace(TINY, steps=1), SMALL)
+    about = torch.load(tmp_path / "out" / CHECKPOINT, weights_only=True)["about"]
+    ends = [name.split("-seed")[0] for name in about["pairs"]]
+    assert ends == ["a-noise-0", "a-sparse-0", "a-sparse-1", "a-p2-noise-0", "a-p2-sparse-0"]
+
+
+def test_lpips_is_given_pictures_from_minus_one_to_one():
+    class Network(torch.nn.Module):
+        def forward(self, first, second):
+            assert first.min() == second.max() == -1.0
+            assert first.max() == 1.0
+            return (first - second).abs().mean(dim=(1, 2, 3), keepdim=True)
+
+    distance = _Lpips(Network(), "alex")
+    first = torch.stack([torch.linspace(0.0, 1.0, 75).reshape(3, 5, 5), torch.zeros(3, 5, 5)])
+    found = distance(first, torch.zeros(2, 3, 5, 5))
+    assert found.tolist() == pytest.approx([1.0, 0.0])
+    assert distance.name == "LPIPS v0.1 alex"
 
 
 def test_the_feature_distance_grows_with_blur_and_carries_gradients(tmp_path):
@@ -608,7 +653,10 @@ def test_the_feature_distance_grows_with_blur_and_carries_gradients(tmp_path):
     del arrays["fire4/conv1x1_1.bias"]
     np.savez(tmp_path / "lacking.npz", **arrays)
     (tmp_path / "torn.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:5000])
+    np.save(tmp_path / "array", np.zeros(3))
+    (tmp_path / "array.npy").rename(tmp_path / "array.npz")
     for name, message in (
+        ("array", "is no whole .npz file"),
         ("lacking", "lacks .*fire4/conv1x1_1.bias"),
         ("torn", "is no whole .npz file"),
         ("none", "does not exist"),
@@ -632,3 +680,20 @@ def test_a_single_validation_shows_in_the_plot(tmp_path, monkeypatch):
     assert lines["validation psnr"].get_marker() == "o"
     assert lines["squared"].get_marker() in ("", "None", None)
     assert lines["squared"].get_linestyle() == "-"
+
+
+def test_training_and_validation_have_one_axis(tmp_path, monkeypatch):
+    seen = []
+
+    def kept(figure, file, **_):
+        seen.extend({line.get_label() for line in axis.lines} for axis in figure.axes)
+        Path(file).write_bytes(b"png")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", kept)
+    row = {"step": 1, "perceptual": 0.3, "validation_perceptual": 0.4}
+    (tmp_path / "log.jsonl").write_text(json.dumps(row | {"validation_perceptual_before": 0.5}))
+    plot_training(tmp_path / "log.jsonl", tmp_path / "loss.png")
+    assert seen == [{"perceptual", "validation perceptual", "validation perceptual before"}]
+    (tmp_path / "log.jsonl").write_text("")
+    with pytest.raises(igsr.IgsrError, match="holds nothing to plot"):
+        plot_training(tmp_path / "log.jsonl", tmp_path / "loss.png")

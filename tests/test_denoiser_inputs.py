@@ -232,6 +232,16 @@ def test_eight_bits_keep_what_counts(tmp_path):
     (tmp_path / "torn.npz").write_bytes(data[: len(data) // 2])
     with pytest.raises(igsr.IgsrError, match=r"torn\.npz is no whole file of pairs"):
         read_pairs(tmp_path / "torn.npz")
+    with open(tmp_path / "array.npz", "wb") as file:
+        np.save(file, truth)
+    with pytest.raises(igsr.IgsrError, match=r"array\.npz is no whole file of pairs"):
+        read_pairs(tmp_path / "array.npz")
+    for at in range(100, len(data) - 100, 7):
+        (tmp_path / "flipped.npz").write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
+        try:
+            read_pairs(tmp_path / "flipped.npz")
+        except igsr.IgsrError as error:
+            assert "flipped.npz" in str(error)
     with pytest.raises(igsr.IgsrError, match=r"missing\.npz does not exist"):
         read_pairs(tmp_path / "missing.npz")
     old = {"inputs": np.zeros((1, 4, 5, 6), np.uint8), "truth": truth[None], "masks": mask[None]}
@@ -298,7 +308,7 @@ def test_what_is_held_out_is_not_trained_on(tmp_path, monkeypatch):
             assert not shown & held
             if row["recipe"] == "paper":
                 assert row["photos"] == len(split.train_views)
-                assert row["renders"] == row["photos"] + FITTED_RENDERED
+                assert row["renders"] == row["photos"]
     assert len(rows) == len(split.train_views)
 
 
@@ -332,14 +342,15 @@ def test_photos_of_several_sizes_are_refused_before_the_first_fit(tmp_path, monk
         make_pairs([tmp_path / "mixed"], tmp_path / "out", recipes=["noise"], backend="cpu")
 
 
-@pytest.mark.parametrize("recipe", ["noise", "sparse"])
-def test_after_noise_all_views_are_rendered_from_where_they_are(tmp_path, recipe):
+@pytest.mark.parametrize("recipe", ["noise", "sparse", "paper"])
+def test_after_noise_all_views_are_rendered_from_where_they_are(tmp_path, recipe, monkeypatch):
+    monkeypatch.setattr(pairs, "PAPER_STEPS", 4)
     made = scenes.capture(views=6, size=24)
     scenes.write_capture(tmp_path / "ball", made)
     options = {"recipes": [recipe], "steps": 4, "views": 9, "backend": "cpu", "all_views": True}
     (row,) = make_pairs([tmp_path / "ball"], tmp_path / "out", **options)
-    unseen = 6 if recipe == "noise" else 6 - row["photos"]
-    assert row["renders"] == unseen + FITTED_RENDERED
+    unseen = 6 - row["photos"] if recipe == "sparse" else 6
+    assert row["renders"] == unseen + (0 if recipe == "paper" else FITTED_RENDERED)
     shown = read_pairs(tmp_path / "out" / row["pairs"]).truth[:unseen]
     assert len(np.unique(shown, axis=0)) == unseen
 
@@ -350,6 +361,8 @@ def test_after_noise_all_views_are_rendered_from_where_they_are(tmp_path, recipe
         ({"recipes": ["best"]}, "recipe must be one of sparse, underfit"),
         ({"fits": 0}, "fits must be at least 1, not 0"),
         ({"views": 0}, "views must be at least 1, not 0"),
+        ({"steps": 0}, "steps must be at least 1, not 0"),
+        ({"seed": -1}, "seed must not be negative, not -1"),
     ],
 )
 def test_bad_arguments_of_pairs(tmp_path, options, message):

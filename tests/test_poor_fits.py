@@ -102,6 +102,9 @@ def test_views_of_poor_fits():
         assert np.array_equal(view.camera.viewmat, by_name[view.name].camera.viewmat)
     again = poor_capture(made, PoorFit("ball", "noise", 0, "cpu"))
     other = poor_capture(made, PoorFit("ball", "noise", 1, "cpu"))
+    paper = poor_capture(made, PoorFit("ball", "paper", 0, "cpu"))
+    K = paper.train_views[0].camera.K
+    assert abs(K[0, 0] / K[1, 1] - 1.0) > 1e-3, "stretched as it comes"
     first = noisy.train_views[0].camera.viewmat
     assert np.array_equal(first, again.train_views[0].camera.viewmat)
     assert not np.array_equal(first, other.train_views[0].camera.viewmat)
@@ -164,6 +167,7 @@ def test_the_study(data, tmp_path, monkeypatch, igsr_here):
     monkeypatch.setattr(poor_fits, "run_fit", again)
     weights(tmp_path / "same.safetensors", brighter=0.1)
     pairs(tmp_path / "pairs/a-sparse-0.npz")
+    (tmp_path / "pairs/.b-sparse-0.npz.unfinished.npz").write_bytes(b"killed")
     changed = denoiser_table(data, tmp_path / "out", kinds=("3", "noise"), pairs=tmp_path / "pairs")
     assert changed["artifacts"]["renders"] == {"real": 2, "synthetic": 2}
     assert "octaves from the training pairs'" in (tmp_path / "out/study.md").read_text()
@@ -171,10 +175,34 @@ def test_the_study(data, tmp_path, monkeypatch, igsr_here):
     assert changed["scenes"]["ball"]["after"] != ball["after"], "other weights are scored again"
 
 
+def test_a_fit_of_other_photos_is_not_taken_for_done(tmp_path, monkeypatch):
+    monkeypatch.setattr(presets, "_FEW", replace(presets._FEW, steps=5, max_splats=50))
+    monkeypatch.setattr(poor_fits, "PAPER_STEPS", 5)
+    made = scenes.capture(views=6, size=24)
+    scenes.write_capture(tmp_path / "data/ball", made)
+    options = {"kinds": ("3", "paper"), "backend": "cpu"}
+    first = denoiser_table(tmp_path / "data", tmp_path / "out", **options)
+    assert set(first["mean"]) == {"sparse", "paper"}
+    assert first["protocol"]["kinds"]["paper"] == "at most 20 photos, raw-affine 0.01, 5 steps"
+    darker = [replace(view, image=view.image // 2) for view in made.views]
+    scenes.write_capture(tmp_path / "data/ball", replace(made, views=darker))
+    second = denoiser_table(tmp_path / "data", tmp_path / "out", **options)
+    other = denoiser_table(tmp_path / "data", tmp_path / "other", **options)
+    ball = [report["scenes"]["ball"] for report in (first, second, other)]
+    assert ball[1] == ball[2] != ball[0]
+
+
+def test_scenes_whose_files_would_have_one_name_are_refused(tmp_path):
+    for scene in ("more/ball", "more-ball"):
+        scenes.write_capture(tmp_path / scene, scenes.capture(views=6, size=24))
+    with pytest.raises(igsr.IgsrError, match=r"files of .* and .* would have one name; rename one"):
+        denoiser_table(tmp_path, tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"kinds": ("4",)}, "kinds must be of 3, 6, 9, noise, not '4'"),
+        ({"kinds": ("4",)}, "kinds must be of 3, 6, 9, noise, paper, not '4'"),
         ({"kinds": ()}, "kinds must be of"),
         ({"seeds": 0}, "at least 1"),
         ({"scenes": ("ball", "more/ball")}, "two scenes are called ball"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from igsr.study import blender, blender8, few_photos, fits
 from igsr.study.blender import VIEW_IDS
 from igsr.study.fits import Fit, run_fit
 from igsr.study.real_captures import load_views
+from igsr.study.runs import folder_hash
 from igsr.study.summary import summarized
 from igsr.study.views import dtu_views, llff_views, with_train_views
 
@@ -74,7 +76,8 @@ def test_a_study_is_written_and_goes_on_where_it_stopped(data, tmp_path, monkeyp
     assert len(list((tmp_path / "out/runs").iterdir())) == 2
     report = blender8(data, tmp_path / "out", **options)
     assert len(done) == 5, "two were not done again"
-    assert report["runs"][0]["settings"] == preset_settings("default", 8)
+    settings = preset_settings("default", 8) | {"data": folder_hash(data / "ball")}
+    assert report["runs"][0]["settings"] == settings
     assert report == json.loads((tmp_path / "out/study.json").read_text())
     assert report["mean"]["default"]["psnr"] == 21.5
     assert report["mean"]["default"]["psnr_spread"] == pytest.approx(np.sqrt(0.5))
@@ -90,6 +93,14 @@ def test_a_study_is_written_and_goes_on_where_it_stopped(data, tmp_path, monkeyp
     file.write_text(json.dumps(row))
     assert blender8(data, tmp_path / "out", **options) == report
     assert len(done) == 6
+
+    # And so are photos that have.
+    changed = tmp_path / "data"
+    shutil.copytree(data, changed)
+    photo = next((changed / "ball").rglob("*.png"))
+    photo.write_bytes(photo.read_bytes() + b"\0")
+    blender8(changed, tmp_path / "out", **options)
+    assert len(done) == 6 + 4
 
 
 def test_a_real_fit_of_the_study(data, monkeypatch):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import tokenize
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -19,25 +18,12 @@ import numpy.typing as npt
 
 from .atomic_write import atomic_write
 from .errors import IgsrError
+from .npz_damage import DAMAGE
 
 #: Raised whenever the arrays' meaning changes; older checkpoints are then refused by number.
 FORMAT = 1
 #: Member that holds the settings, as UTF-8 JSON.
 SETTINGS = "settings"
-
-#: What zipfile, numpy and json raise on damaged files. RuntimeError: members that are encrypted, of
-#: an unknown zip version or nested too deep; the syntax errors: array headers that do not parse.
-DAMAGE = (
-    OSError,
-    EOFError,
-    ValueError,
-    KeyError,
-    OverflowError,
-    RuntimeError,
-    SyntaxError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-)
 
 State = dict[str, npt.NDArray[Any]]
 

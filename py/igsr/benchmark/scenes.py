@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .. import _core
-from ..checkpoint import DAMAGE
 from ..errors import IgsrError
+from ..npz_damage import DAMAGE
 
 #: Arrays by name, as ``_core`` takes and returns them.
 Arrays = dict[str, Any]
@@ -144,7 +144,7 @@ def garden(path: Path, seed: int) -> Scene:
             raise ValueError("its first camera sees none of its points")
     except FileNotFoundError as error:
         raise IgsrError(f"There is no file {path}; give --garden test_garden.npz.") from error
-    except (*DAMAGE, TypeError, IndexError, AttributeError) as error:
+    except (*DAMAGE, IndexError, AttributeError) as error:
         raise IgsrError(
             f"{path} is not the garden fixture of gsplat ({error}); give --garden test_garden.npz."
         ) from error

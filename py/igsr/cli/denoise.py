@@ -203,7 +203,8 @@ def train_command(
             distance = SqueezeNetDistance(features)
         elif lpips is not None:
             distance = lpips_distance(lpips.value)
-        files = sorted(pairs.glob("*.npz"))
+        # A fit that was killed leaves a file whose name begins with a dot.
+        files = sorted(pairs.glob("[!.]*.npz"))
         if not files:
             raise IgsrError(f"{pairs} holds no .npz of pairs; make some with igsr denoise pairs.")
         with _bar(steps) as show:

@@ -106,7 +106,8 @@ def study_command(
         list[str] | None,
         typer.Option(
             "--kind",
-            help="denoiser-table: 3, 6, 9 (photos) or noise; repeat it for several. Default: all.",
+            help="denoiser-table: 3, 6, 9 (photos), noise, paper (its noise and steps); repeat "
+            "it for several. Default: the first four.",
         ),
     ] = None,
     denoisers: Annotated[

@@ -109,7 +109,8 @@ def denoise(
     Args:
         render: of any size: ``igsr.denoiser.render_buffers`` (best), ``igsr.render``, or only a
             picture [H, W, 3], uint8 or float in [0, 1]. The less is known, the less is mended.
-        photos: of ``igsr.denoiser.photo_sources``; used where ``render`` has a camera and depth.
+        photos: of ``igsr.denoiser.photo_sources``, with a render of ``render_buffers``: others have
+            no camera.
         denoiser: what cleans; None is the one that comes with igsr.
 
     Returns:
@@ -118,8 +119,17 @@ def denoise(
         to be a twentieth of their range off. NaN pixels are filled in and have confidence 0.
 
     Raises:
-        IgsrError: an array has another shape or dtype, or the shipped weights cannot be read.
+        IgsrError: an array has another shape or dtype, photos are of another kind or could not be
+            used, or the shipped weights cannot be read.
     """
+    others = [type(photo).__name__ for photo in photos if not isinstance(photo, Source)]
+    if others:
+        raise IgsrError(f"photos must be of igsr.denoiser.photo_sources, not {others[0]}")
+    if photos and not isinstance(render, Buffers):
+        raise IgsrError(
+            "photos can be looked up only where render has a camera: give one of "
+            "igsr.denoiser.render_buffers, or no photos"
+        )
     return (denoiser or _shipped())(_buffers(render), photos)
 
 

@@ -53,7 +53,7 @@ def network_inputs(buffers: Buffers, warped: Warped) -> Float32:
         out[at + 4] = np.where(valid, 1.0 - warped.angle[k] / np.pi, 0.0)
     if buffers.background is not None:
         at = COLOR + BUFFERS + PHOTOS * PHOTO
-        out[at : at + 3] = np.clip(buffers.background, 0.0, 1.0)[:, None, None]
+        out[at : at + 3] = np.clip(np.nan_to_num(buffers.background), 0.0, 1.0)[:, None, None]
         out[at + 3] = 1.0
     return out
 

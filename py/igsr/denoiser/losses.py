@@ -186,10 +186,10 @@ class Loss:
         """The total and its parts."""
         parts: dict[str, tuple[float, Tensor]] = {}
         if self.name == "default":
-            parts["squared"] = 1.0, squared_ratio(prediction)
-            parts["structure"] = STRUCTURE, structure_ratio(prediction)
+            parts["squared_ratio"] = 1.0, squared_ratio(prediction)
+            parts["structure_ratio"] = STRUCTURE, structure_ratio(prediction)
             if self.distance is not None:
-                parts["perceptual"] = PERCEPTUAL, perceptual_ratio(prediction, self.distance)
+                parts["perceptual_ratio"] = PERCEPTUAL, perceptual_ratio(prediction, self.distance)
         elif self.name == "charbonnier":
             parts["charbonnier"] = 1.0, charbonnier(prediction)
             if self.distance is not None:
@@ -204,4 +204,5 @@ class Loss:
             parts["perceptual"] = weight, perceptual(prediction, self.distance)
         parts["likelihood"] = LIKELIHOOD, error_likelihood(prediction)
         total = torch.stack([weight * part for weight, part in parts.values()]).sum()
-        return total, {name: float(part.detach()) for name, (_, part) in parts.items()}
+        shown = {"total": total} | {name: part for name, (_, part) in parts.items()}
+        return total, {name: float(part.detach()) for name, part in shown.items()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from ..atomic_write import atomic_write
 from ..errors import IgsrError
+from ..npz_damage import DAMAGE
 from .inputs import BUFFERS, CHANNELS, COLOR
 
 Bytes = npt.NDArray[np.uint8]
@@ -69,14 +69,7 @@ def read_pairs(path: str | os.PathLike[str]) -> Pairs:
             pairs = Pairs(file["inputs"], file["truth"], file["masks"])
     except FileNotFoundError as error:
         raise IgsrError(f"{path} does not exist; make pairs with igsr denoise pairs") from error
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        EOFError,
-        zipfile.BadZipFile,
-        zipfile.LargeZipFile,
-    ) as error:
+    except DAMAGE as error:
         raise IgsrError(f"{path} is no whole file of pairs; delete it and make it again") from error
     inputs, truth, masks = pairs.inputs, pairs.truth, pairs.masks
     if (

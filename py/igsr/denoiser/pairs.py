@@ -18,9 +18,17 @@ from ..evaluation import WHITE
 from ..fitting import fingerprint, fit_with_cameras
 from ..metrics import psnr
 from ..presets import preset_settings
-from ..study.noisy_poses import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
+from ..study.noisy_poses import (
+    AFFINE,
+    MATRIX,
+    PAPER_STEPS,
+    TURN,
+    Noise,
+    noise_unit,
+    noisy_view,
+)
 from ..study.runs import Run, finished_runs
-from .inputs import COLOR
+from .inputs import CHANNELS, COLOR
 from .pair_files import write_pairs
 from .pair_renders import check_one_size, rendered_pairs
 
@@ -33,8 +41,8 @@ RECIPES = (*DEFAULT_RECIPES, "paper", "scattered", "leave-one-out")
 FEW = (3, 4, 5, 6, 8, 9, 12, 16)
 #: Photos of a fit with noise (the paper has 20), and of the paper's "many scattered views".
 NOISY_PHOTOS, SCATTERED_PHOTOS = 20, 60
-#: Steps of "paper", and of "scattered": few for so many photos.
-PAPER_STEPS, SCATTERED_STEPS = 5000, 1000
+#: Steps of "scattered": few for so many photos.
+SCATTERED_STEPS = 1000
 #: Standard deviations of camera-to-world's numbers, and degrees of turns.
 MATRIX_NOISE, TURN_NOISE = (0.003, 0.02), (0.2, 2.0)
 #: Of the photos fitted, so many are rendered too: what is good already must be seen in training.
@@ -115,6 +123,10 @@ def make_pairs(
     for name, number in (("fits", fits), ("views", views), ("jobs", jobs)):
         if number < 1:
             raise IgsrError(f"{name} must be at least 1, not {number}.")
+    if steps is not None and steps < 1:
+        raise IgsrError(f"steps must be at least 1, not {steps}.")
+    if seed < 0:
+        raise IgsrError(f"seed must not be negative, not {seed}.")
     unknown = [recipe for recipe in recipes if recipe not in RECIPES]
     if unknown:
         raise IgsrError(f"recipe must be one of {', '.join(RECIPES)}, not {unknown[0]!r}.")
@@ -127,6 +139,9 @@ def make_pairs(
             "steps": steps,
             "all_views": all_views,
             "capture": fingerprint(capture.views),
+            "channels": CHANNELS,
+            "few": list(FEW),
+            "noise": [*MATRIX_NOISE, *TURN_NOISE],
         }
         for recipe in recipes:
             own = len(_used(capture, all_views)) if recipe == "leave-one-out" else fits
@@ -165,6 +180,8 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
         background = WHITE if random.uniform() < 0.7 else tuple(random.uniform(size=3))
     shown = [train[i] for i in random.permutation(len(train))]
     fitted = [view for view in shown if _size(view) == _size(unseen[0])][:FITTED_RENDERED]
+    if one.recipe == "paper":  # which renders all views from their true cameras
+        fitted = []
     pairs = rendered_pairs(splats, train, unseen + fitted, background, one.backend)
     file = f"{one.name}.npz"
     write_pairs(out / file, pairs)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
@@ -23,6 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import IgsrError
+from ..npz_damage import DAMAGE
 
 #: Two pictures [B, 3, H, W] in [0, 1] to their distance [B].
 Distance = Callable[[Tensor, Tensor], Tensor]
@@ -134,7 +134,7 @@ def _arrays(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]
         raise IgsrError(f"{path} does not exist; name a SqueezeNet 1.0 .npz file") from error
     except KeyError as error:
         raise IgsrError(f"{path} lacks {error.args[0]}; it is no SqueezeNet 1.0") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         if isinstance(error, IgsrError):
             raise
         raise IgsrError(f"{path} is no whole .npz file; copy it again") from error

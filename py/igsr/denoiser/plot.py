@@ -23,16 +23,29 @@ def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError) as error:
         raise IgsrError(f"{log} cannot be read ({error}); train again.") from error
     names = list(dict.fromkeys(key for row in rows for key in row))
-    # A score before has no axis of its own: it lies beside the one after.
+    # A score before has no axis of its own: it lies beside the one after, and what is validated
+    # beside what is trained.
     drawn = [
-        name for name in names if name not in ("step", "seconds") and not name.endswith("_before")
+        name
+        for name in names
+        if name not in ("step", "seconds")
+        and not name.endswith("_before")
+        and name.removeprefix("validation_") not in set(names) - {name}
     ]
+    if not drawn:
+        raise IgsrError(f"{log} holds nothing to plot; train again.")
     figure = Figure(figsize=(10.0, 2.4 * -(-len(drawn) // 2)), layout="constrained")
     axes = figure.subplots(-(-len(drawn) // 2), 2, squeeze=False).ravel()
     for axis in axes[len(drawn) :]:
         axis.remove()
     for axis, name in zip(axes, drawn, strict=False):
-        for key, style in ((name, "-"), (f"{name}_before", "--")):
+        also = f"validation_{name}"
+        for key, style in (
+            (name, "-"),
+            (f"{name}_before", "--"),
+            (also, "-"),
+            (f"{also}_before", "--"),
+        ):
             known = [(row["step"], row[key]) for row in rows if key in row]
             if known:
                 # A line of one point would not show.

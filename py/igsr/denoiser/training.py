@@ -40,6 +40,8 @@ LACKING = 0.05
 #: A crop whose render is less wrong than this, in squared error, teaches nothing; others are drawn
 #: in its place, at most so many.
 RIGHT, DRAWN_AGAIN = 1e-5, 3
+#: Steps between checkpoints, at most.
+MOST_BETWEEN = 500
 #: The weights kept are a running mean over about the last tenth of the steps, at most over these.
 AVERAGED_STEPS = 500
 
@@ -110,7 +112,7 @@ def train(
     resume: bool = False,
     progress: Callable[[TrainingProgress], None] | None = None,
     log_every: int = 100,
-    checkpoint_every: int = 500,
+    checkpoint_every: int | None = None,
 ) -> DenoiserNetwork:
     """Train a denoiser; the same arguments give the same weights on one machine.
 
@@ -121,7 +123,7 @@ def train(
             are kept for validation. Of a single capture the last files are, with a warning: what
             they score is then of a scene that was trained on.
         out: folder for ``denoiser.safetensors``, ``log.jsonl``, ``checkpoint.pt`` and, where
-            tensorboard is installed, ``tensorboard/``.
+            tensorboard is installed (``pip install 'igsr[tensorboard]'``), ``tensorboard/``.
         training: how.
         architecture: which network.
         distance: perceptual, for the losses that have it.
@@ -131,16 +133,20 @@ def train(
         resume: go on from ``out``'s checkpoint, if there is one, to the same end.
         progress: called now and then.
         log_every: steps between lines of the log.
-        checkpoint_every: steps between checkpoints, and validations.
+        checkpoint_every: steps between checkpoints, and validations; None is a tenth of all, at
+            most 500.
 
     Raises:
         IgsrError: a file cannot be used, ``start`` is of another architecture, the checkpoint is
             of another training, or the loss is not finite.
     """
     training, architecture = training or Training(), architecture or Architecture()
+    if checkpoint_every is None:
+        checkpoint_every = min(MOST_BETWEEN, max(1, training.steps // 10))
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    names = sorted(str(path) for path in pairs)
+    # By captures: one's name may begin with another's.
+    names = sorted((str(path) for path in pairs), key=lambda name: (_capture(name), name))
     if len(names) < 2:
         raise IgsrError("training needs at least two files of pairs, one of them to validate on.")
     kept = _kept_for_validation(names)
@@ -194,14 +200,16 @@ def train(
         row: dict[str, Any] = {}
         if learner.step % log_every == 0 or last:
             row |= parts
-        if learner.step % checkpoint_every == 0 or last:
+        checkpoint = learner.step % checkpoint_every == 0 or last
+        if checkpoint:
             row |= _validated(learner.averaged, validation, distance, processes.device)
-            if processes.first:
-                learner.save(out / CHECKPOINT, state)
         if row and processes.first:
             _write_log(out / LOG, board, learner.step, learner.seconds, row)
             if progress is not None:
                 progress(TrainingProgress(learner.step, training.steps, row, learner.seconds))
+        # After its line of the log: what comes later is cut from there, what lacks stays lacking.
+        if checkpoint and processes.first:
+            learner.save(out / CHECKPOINT, state)
     if processes.first:
         recipe = {"igsr": _core.__version__, **state, "seconds": round(learner.seconds)}
         save_network(learner.averaged, out / WEIGHTS, recipe)
@@ -246,9 +254,13 @@ class _Processes:
             torch.distributed.destroy_process_group()
 
 
+def _capture(name: str) -> str:
+    return capture_of_pairs(Path(name).name)
+
+
 def _kept_for_validation(names: Sequence[str]) -> int:
     """How many files at the end to keep: whole captures, so that none of them is trained on."""
-    captures = [capture_of_pairs(Path(name).name) for name in names]
+    captures = [_capture(name) for name in names]
     kept = max(1, round(VALIDATION * len(names)))
     if len(set(captures)) == 1:
         warnings.warn(

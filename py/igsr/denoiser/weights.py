@@ -90,7 +90,7 @@ def _architecture(text: str | None, path: Path) -> Architecture:
         return Architecture(**{**given, "blocks": tuple(given["blocks"])})
     except IgsrError as error:
         raise IgsrError(f"{path} is of a network that igsr does not build: {error}") from error
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise IgsrError(
             f"{path} does not say which network it is of; it is no denoiser of igsr's"
         ) from error

@@ -18,7 +18,7 @@ from ..capture.photo_folder import Photo, load_photos
 from ..errors import IgsrError
 from ..pose.accuracy import pose_accuracy
 from ..pose.registry import ESTIMATORS
-from .runs import Run, finished_runs
+from .runs import Run, finished_runs, folder_hash
 
 SCENES = (
     "strecha_fountain",
@@ -126,7 +126,9 @@ def poses(
             raise IgsrError(f"{Path(data) / scene} does not exist; name --scene.")
     tasks = [
         Run(
-            f"{scene.replace('/', '-')}-{estimator}-seed{seed}", PoseRun(scene, estimator, seed), {}
+            f"{scene.replace('/', '-')}-{estimator}-seed{seed}",
+            PoseRun(scene, estimator, seed),
+            {"data": folder_hash(Path(data) / scene)},
         )
         for seed in range(seeds)
         for scene in scenes

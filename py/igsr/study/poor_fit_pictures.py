@@ -31,7 +31,9 @@ def plot_gains(path: Path, report: dict[str, Any]) -> None:
         gains = []
         for _, columns in lines:
             scores = columns["after"] if name == "igsr" else columns["others"][name]
-            gains.append(scores["psnr"] - columns["before"]["psnr"])
+            after, before = scores["psnr"], columns["before"]["psnr"]
+            # Masks may hide all that would be scored.
+            gains.append(np.nan if after is None or before is None else after - before)
         at = np.arange(len(lines)) + (k - 0.5 * (len(names) - 1)) * 0.8 / len(names)
         axis.bar(at, gains, 0.8 / len(names), label=name)
     axis.axhline(0.0, color="black", linewidth=0.8)

@@ -21,7 +21,7 @@ from .. import _core
 from ..atomic_write import atomic_write
 from ..capture import Capture, load_capture
 from ..capture.folder import holds_cameras
-from ..denoiser.cleaning import NetworkDenoiser
+from ..denoiser.cleaning import DOUBT, UNSEEN_CHANGE, NetworkDenoiser
 from ..denoiser.pair_files import OFFSET, SCALE, Pairs, read_pairs, write_pairs
 from ..denoiser.pair_renders import check_one_size, rendered_pairs
 from ..denoiser.perceptual import SMALLEST_SIDE, SqueezeNetDistance, picture_distance
@@ -32,18 +32,20 @@ from ..fitting import fit_with_cameras
 from ..metrics import PSNR_CAP, score
 from ..presets import preset_settings
 from .artifact_likeness import likeness, plot_likeness
-from .noisy_poses import MATRIX, Noise, noise_unit, noisy_view
+from .noisy_poses import AFFINE, MATRIX, PAPER_STEPS, Noise, noise_unit, noisy_view
 from .poor_fit_pictures import plot_confidence, plot_gains, write_sheet
 from .real_captures import is_dtu
-from .runs import Run, file_hash, finished_runs
+from .runs import Run, file_hash, finished_runs, folder_hash
 from .views import dtu_views, llff_views
 
 Float64 = npt.NDArray[np.float64]
 
-#: Kinds of poor fits: numbers of photos, and the paper's noise on the cameras of 20.
+#: Kinds of poor fits: numbers of photos; noise on the cameras of 20, made rotations again; and the
+#: same as the paper has it, matrices as they come and 5 000 steps.
 FEW = ("3", "6", "9")
-NOISE = "noise"
-KINDS = (*FEW, NOISE)
+NOISE, PAPER = "noise", "paper"
+USUAL = (*FEW, NOISE)
+KINDS = (*USUAL, PAPER)
 NOISY_PHOTOS, CAMERA_NOISE = 20, 0.01
 #: Held-out views scored per fit, at most; evenly spaced ones where there are more.
 SCORED_VIEWS = 8
@@ -121,7 +123,7 @@ def poor_capture(capture: Capture, one: PoorFit) -> Capture:
     Raises:
         IgsrError: the capture has too few photos.
     """
-    noisy = one.kind == NOISE
+    noisy = one.kind in (NOISE, PAPER)
     if capture.test_views:
         train = capture.train_views
         count = min(NOISY_PHOTOS, len(train)) if noisy else int(one.kind)
@@ -141,9 +143,17 @@ def poor_capture(capture: Capture, one: PoorFit) -> Capture:
     if not noisy:
         return Capture(capture.path, train + test, capture.points)
     random = np.random.default_rng([one.seed, 0x7AB1, *one.scene.encode()])
-    noise, unit = Noise(MATRIX, CAMERA_NOISE), noise_unit(train)
+    noise, unit = _noise(one.kind), noise_unit(train)
     # Points would tell a fit where the cameras were.
     return Capture(capture.path, [noisy_view(v, noise, random, unit) for v in train] + test, None)
+
+
+def _noise(kind: str) -> Noise:
+    return Noise(AFFINE if kind == PAPER else MATRIX, CAMERA_NOISE)
+
+
+def _steps(kind: str) -> int | None:
+    return PAPER_STEPS if kind == PAPER else None
 
 
 def run_fit(out: Path, data: str, one: PoorFit) -> dict[str, Any]:
@@ -155,9 +165,14 @@ def run_fit(out: Path, data: str, one: PoorFit) -> dict[str, Any]:
         nonlocal seconds
         seconds = now.seconds
 
-    hull = False if one.kind == NOISE else None
     splats, _ = fit_with_cameras(
-        capture, backend=one.backend, seed=one.seed, hull=hull, progress=progress
+        capture,
+        backend=one.backend,
+        seed=one.seed,
+        steps=_steps(one.kind),
+        # Silhouettes of wrong cameras take away what is there.
+        hull=None if one.kind in FEW else False,
+        progress=progress,
     )
     background = known_background(capture.views)
     pairs = rendered_pairs(splats, capture.train_views, capture.test_views, background, one.backend)
@@ -242,7 +257,7 @@ def denoiser_table(
     out: str | os.PathLike[str],
     *,
     scenes: tuple[str, ...] | None = None,
-    kinds: tuple[str, ...] = KINDS,
+    kinds: tuple[str, ...] = USUAL,
     denoisers: Mapping[str, str | os.PathLike[str]] | None = None,
     features: str | os.PathLike[str] | None = None,
     pairs: str | os.PathLike[str] | None = None,
@@ -300,7 +315,7 @@ def denoiser_table(
         load_network(path)
     if features is not None:
         SqueezeNetDistance(features)
-    training = [] if pairs is None else sorted(Path(pairs).glob("*-sparse-*.npz"))
+    training = [] if pairs is None else sorted(Path(pairs).glob("[!.]*-sparse-*.npz"))
     if pairs is not None and not training:
         raise IgsrError(f"{pairs} holds no pairs of recipe sparse; make some.")
     fits = [
@@ -309,18 +324,23 @@ def denoiser_table(
         for seed in range(seeds)
         for kind in kinds
     ]
+    names = [one.name for one in fits]
+    if len(set(names)) < len(names):
+        twice = [one.scene for one in fits if names.count(one.name) > 1]
+        raise IgsrError(f"files of {twice[0]} and {twice[-1]} would have one name; rename one.")
     tasks = []
     made_up = set()
     for scene in scenes:
         # Read before the first fit: what is wrong with the last scene must not come up hours later.
-        capture = load_capture(data / scene)
+        capture, photos_hash = load_capture(data / scene), folder_hash(data / scene)
         if known_background(capture.views) is not None:
             made_up.add(scene)
         for one in (one for one in fits if one.scene == scene):
             poor = poor_capture(capture, one)
             check_one_size(poor.test_views)
             photos = len(poor.train_views)
-            settings = preset_settings("default", photos) | {"scored": SCORED_VIEWS}
+            settings = preset_settings("default", photos, steps=_steps(one.kind))
+            settings |= {"scored": SCORED_VIEWS, "data": photos_hash}
             tasks.append(Run(one.name, one, settings, out / "renders" / f"{one.name}.npz"))
     rows = finished_runs(out / "runs", tasks, partial(run_fit, out), str(data), jobs, on_run, ray)
     perceptual = None if features is None else file_hash(Path(features))
@@ -335,9 +355,15 @@ def denoiser_table(
                     None if file is None else str(file),
                     None if features is None else str(features),
                 ),
-                {"weights": hashed, "perceptual": perceptual, "fit": row["settings"]},
+                {
+                    "weights": hashed,
+                    "doubt": DOUBT,
+                    "unseen_change": UNSEEN_CHANGE,
+                    "perceptual": perceptual,
+                    "renders": file_hash(out / "renders" / f"{one.name}.npz"),
+                },
             )
-            for one, row in zip(fits, rows, strict=True)
+            for one in fits
         ]
         cleaned = finished_runs(out / "runs", cleanings, run_cleaning, "", jobs, None, False)
         for row, scores in zip(rows, cleaned, strict=True):
@@ -349,7 +375,7 @@ def denoiser_table(
         few = [
             read_pairs(out / "renders" / f"{one.name}.npz")
             for one in fits
-            if one.kind != NOISE and one.scene in photographed
+            if one.kind in FEW and one.scene in photographed
         ]
         synthetic = [read_pairs(path) for path in training]
         report["artifacts"] = likeness(few, synthetic)
@@ -402,6 +428,11 @@ def _columns(rows: Sequence[dict[str, Any]], denoisers: Sequence[str]) -> dict[s
     }
 
 
+def _noisy(kind: str) -> str:
+    steps = f", {PAPER_STEPS} steps" if kind == PAPER else ""
+    return f"at most {NOISY_PHOTOS} photos, {_noise(kind)}{steps}"
+
+
 def _report(
     rows: list[dict[str, Any]],
     short: Mapping[str, str],
@@ -419,7 +450,9 @@ def _report(
                 for kind in kinds
             }
         }
-    groups = {"sparse": [k for k in kinds if k != NOISE], "noise": [k for k in kinds if k == NOISE]}
+    groups = {"sparse": [k for k in kinds if k in FEW]} | {
+        kind: [k for k in kinds if k == kind] for kind in (NOISE, PAPER)
+    }
     bins = [row[OURS]["confidence"] for row in rows]
     pixels, sure, error = (
         np.sum([one[key] for one in bins], axis=0) for key in ("pixels", "confidence", "error")
@@ -430,8 +463,7 @@ def _report(
         "igsr": _core.__version__,
         "protocol": {
             "name": "denoiser-table",
-            "kinds": {NOISE: f"{NOISY_PHOTOS} photos, {Noise(MATRIX, CAMERA_NOISE)}"}
-            | {kind: f"{kind} photos" for kind in kinds if kind != NOISE},
+            "kinds": {kind: f"{kind} photos" if kind in FEW else _noisy(kind) for kind in kinds},
             "views": f"at most {SCORED_VIEWS} held-out views of each scene",
             "seeds": seeds,
             "perceptual": SqueezeNetDistance.name if perceptual else None,

@@ -39,6 +39,15 @@ def file_hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def folder_hash(folder: Path) -> str:
+    """Of all files in a scene's folder, for a fit's settings: photos and cameras get mended."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(path.relative_to(folder).as_posix().encode())
+        digest.update(bytes.fromhex(file_hash(path)))
+    return digest.hexdigest()
+
+
 def finished_runs(
     folder: Path,
     runs: list[Run],
@@ -50,9 +59,9 @@ def finished_runs(
 ) -> list[dict[str, Any]]:
     """The row of every run, in order: read where its file is there, else done and written.
 
-    A file of another version or with other settings (presets change) is done again, and one whose
-    run left a file that is not there any more. When one run fails those that are under way are
-    still finished and kept.
+    A file of another version or with other settings (presets and photos change) is done again, and
+    one whose run left a file that is not there any more. When one run fails those that are under
+    way are still finished and kept.
 
     Args:
         folder: of the runs' files.
