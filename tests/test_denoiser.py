@@ -193,6 +193,8 @@ def test_renders_of_all_kinds_are_taken():
         denoise(Buffers(floats), ["photo.png"], denoiser=cleaner)
     with pytest.raises(igsr.IgsrError, match="only where render has a camera"):
         denoise(drawn, [photo], denoiser=cleaner)
+    with pytest.raises(igsr.IgsrError, match=r"the denoiser made a picture \[4, 9, 3\]"):
+        denoise(floats, denoiser=lambda render, _: (floats[::2], ones))
     with pytest.raises(igsr.IgsrError, match="render must be uint8 or float"):
         denoise(np.zeros((2, 2, 3), np.int64), denoiser=cleaner)
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scenes
+from made_up_tracks import tracked
 
 import igsr
+from igsr.capture import Points
+from igsr.capture.types import Tracks
 from igsr.initialization import chosen_start, initial_splats
 from igsr.presets import FEW_PHOTOS, preset_settings
 
@@ -179,3 +185,23 @@ def test_unsure_points_start_faint_and_large(capture):
     for place in places:
         own.append(confidence[np.argmin(np.abs(xyz - place).sum(axis=1))])
     assert (np.argsort(own) == np.argsort(half.opacities)).all()
+
+
+def test_a_photo_that_is_held_out_has_no_part_in_first_splats():
+    views = scenes.capture(views=6, size=24).views
+    xyz = np.random.default_rng(0).normal(scale=0.3, size=(400, 3))
+    points = tracked(views, xyz, miss=0.4)
+    points.confidence = np.arange(1.0, 401.0)
+    held, tracks = views[5].name, points.tracks
+    named = np.array(tracks.names)[tracks.view] != held
+    counts = np.bincount(tracks.point[named], minlength=400)
+    assert 0 < (counts < 2).sum() < 300, "some points are known of that photo"
+    seen = points.seen_by([view.name for view in views[:5]])
+    assert np.array_equal(seen.xyz, xyz[counts >= 2])
+    assert np.array_equal(seen.confidence, points.confidence[counts >= 2])
+    split = [replace(view, split="test" if view.name == held else "train") for view in views]
+    splats, made_from = initial_splats(igsr.Capture(Path("a"), split, points), 0, 10_000, 0)
+    assert made_from == "points"
+    assert len(splats) == (counts >= 2).sum()
+    untold = Points(xyz, points.rgb, tracks=Tracks([], *(tracks.view[:0],) * 2, tracks.xy[:0]))
+    assert untold.seen_by([]) is untold

@@ -95,6 +95,13 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Ite
             shutil.rmtree(temporary, ignore_errors=True)
 
 
+def remove_unfinished(folder: Path) -> None:
+    """Remove what writing into a folder left when it was killed; what cannot be removed stays."""
+    for path in folder.glob(".*.unfinished*"):
+        with contextlib.suppress(OSError):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
 def check_folder(path: str | os.PathLike[str], *, replace: bool = False) -> None:
     """Find out before long work whether ``atomic_folder`` will take a path.
 

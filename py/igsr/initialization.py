@@ -97,7 +97,7 @@ def initial_splats(
     The same arguments give the same splats.
 
     Args:
-        capture: its train views and points are used.
+        capture: its train views are used, and the points that two of them see.
         seed: of the random choices.
         max_splats: at most so many.
         sh_degree: 0-4; coefficients above degree 0 start at zero.
@@ -113,6 +113,9 @@ def initial_splats(
         IgsrError: there is no such start, the capture has not what it needs, or no points can be
             placed: the poses, points or focal lengths are too extreme.
     """
+    if capture.points is not None:
+        points = capture.points.seen_by(view.name for view in capture.train_views)
+        capture = Capture(capture.path, capture.views, points)
     if start == "auto" and not exact_poses and chosen_start(capture) == "sift":
         start = "rays"
     try:

@@ -7,6 +7,7 @@ photos that it has not seen say that it helped.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .atomic_write import remove_unfinished
 from .capture import Camera, Capture, View, load_capture
 from .capture.folder import holds_cameras
 from .capture.write_colmap import write_colmap
@@ -37,10 +39,10 @@ from .evaluation import (
 )
 from .fitting import Progress, check_fits, fit
 from .halved import halved
-from .pose import AUTO, estimate_poses, found_before, kept_cameras, note_photos
+from .pose import AUTO, estimate_poses, found_before, kept_cameras, photos_note
 from .presets import preset_settings
 from .refinement_report import seconds_so_far, write_refinement
-from .selection import Candidate, Rightness, candidate, rightness, select
+from .selection import Candidate, Passed, Rightness, candidate, passed, rightness, select
 from .splats import Splats
 from .views import UnseenView, unseen_views
 
@@ -77,7 +79,8 @@ class RefineProgress:
 
     Attributes:
         round: 0 is the fit to the photos alone.
-        doing: "fit", "look" (render and clean unseen views), "judge", "refit" or "test".
+        doing: "pose" (find cameras), "fit", "look" (render and clean unseen views), "judge",
+            "refit" or "test".
         done: part of all that may be to do, in [0, 1]; it ends early if a round does not help.
         seconds: so far.
     """
@@ -95,7 +98,7 @@ class Round:
     Attributes:
         chosen: the views that were added, the one worth most first. Those of earlier rounds were
             rendered and cleaned anew, and are not in it.
-        candidates: how many there were to choose from.
+        passed: those that were looked at and not chosen.
         right: the part of what cleaning changes that is right, in [0, 1], as photos left out tell.
         before: scores ("psnr", "ssim", "flip") of photos left out, by fits without the round's
             views.
@@ -108,7 +111,7 @@ class Round:
     """
 
     chosen: list[Candidate]
-    candidates: int
+    passed: list[Passed]
     right: float
     before: dict[str, float]
     left_out: dict[str, float]
@@ -128,6 +131,7 @@ class Refined:
         capture: photos and cameras.
         rounds: those that were tried, in order; only the last can be one that was not accepted.
         stopped: why there was no further round; empty while there may be one.
+        passed: views that were looked at for a round that then was not begun.
         seconds: that each part took, by the names of ``RefineProgress.doing``, with what earlier
             calls took that this one went on from.
     """
@@ -138,6 +142,7 @@ class Refined:
     capture: Capture
     rounds: list[Round]
     stopped: str
+    passed: list[Passed]
     seconds: dict[str, float]
 
 
@@ -157,11 +162,11 @@ class _Chain:
 
 @dataclass(frozen=True, eq=False)
 class _Looked:
-    """Cleaned views of a chain: the best unseen ones of ``candidates``, and those added before."""
+    """Cleaned views of a chain: unseen ones, chosen or not, and those that were added before."""
 
     chosen: list[Candidate]
+    passed: list[Passed]
     again: list[Candidate]
-    candidates: int
 
 
 @dataclass(eq=False)
@@ -213,7 +218,7 @@ def refine(
             ``igsr.estimate_poses``.
     """
     check_arguments(rounds, steps, backend, out, resume)
-    capture = photos if isinstance(photos, Capture) else _posed(photos, out, resume, seed)
+    capture = photos if isinstance(photos, Capture) else _posed(photos, out, resume, seed, progress)
     loop = _Loop(
         capture, rounds, progress, steps, backend, seed, denoiser, out, resume, look, choose, judge
     )
@@ -222,9 +227,10 @@ def refine(
     folds: list[_Fold] = []
     done: list[Round] = []
 
-    def so_far(stopped: str) -> Refined:
+    def so_far(stopped: str, passed: Sequence[Passed] = ()) -> Refined:
+        rounds, seconds = list(done), dict(loop.seconds)
         refined = Refined(
-            whole.splats, first, first_test, capture, list(done), stopped, dict(loop.seconds)
+            whole.splats, first, first_test, capture, rounds, stopped, list(passed), seconds
         )
         loop.write(refined)
         return refined
@@ -232,9 +238,18 @@ def refine(
     while True:
         so_far("")
         number = len(done) + 1
-        looked, why_none = loop.looked_for(number, whole)
-        if looked is None:
+        why_none = loop.why_no_round(number, whole)
+        if why_none:
             return so_far(why_none)
+        looked = loop.looked(number, whole)
+        if not looked.chosen:
+            some = len(looked.passed)
+            return so_far(
+                f"none of {some} unseen views can be trusted to add anything"
+                if some
+                else "no view near the photos is unseen",
+                looked.passed,
+            )
         before: dict[str, float] = {}
         left_out, accepted, right = before, True, 1.0
         if judge:
@@ -243,7 +258,8 @@ def refine(
             if right < LEAST_RIGHT:
                 return so_far(
                     f"cleaning brings views no nearer to photos that were left out ({right:.2f} of "
-                    "what it changes is right)"
+                    "what it changes is right)",
+                    [*map(passed, looked.chosen), *looked.passed],
                 )
             before, left_out = loop.judged(number, folds)
             accepted = _error(left_out) < _error(before)
@@ -252,7 +268,7 @@ def refine(
         splats = whole.splats if accepted else None
         test = loop.tested(splats)
         done.append(
-            Round(looked.chosen, looked.candidates, right, before, left_out, accepted, splats, test)
+            Round(looked.chosen, looked.passed, right, before, left_out, accepted, splats, test)
         )
         if not accepted:
             return so_far(f"round {number} did not make photos that were left out better")
@@ -294,15 +310,26 @@ def check_arguments(
 
 
 def _posed(
-    photos: str | os.PathLike[str], out: str | os.PathLike[str] | None, resume: bool, seed: int
+    photos: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None,
+    resume: bool,
+    seed: int,
+    progress: Callable[[RefineProgress], bool | None] | None,
 ) -> Capture:
     """Photos with cameras. What is fitted is what lies in ``out``, so that resuming finds it."""
+
+    def told(stage: str, done: int, total: int) -> None:
+        seconds = time.monotonic() - started
+        if progress is not None and progress(RefineProgress(0, "pose", 0.0, seconds)) is False:
+            raise IgsrError(STOPPED)
+
+    started = time.monotonic()
     if out is None or holds_cameras(photos):
-        return estimate_poses(photos, seed=seed)
+        return estimate_poses(photos, seed=seed, progress=told)
     kept = kept_cameras(Path(photos), Path(out))
     if not (resume and found_before(Path(photos), kept)):
-        write_colmap(estimate_poses(photos, seed=seed), kept, replace=True)
-        note_photos(Path(photos), kept)
+        found = estimate_poses(photos, seed=seed, progress=told)
+        write_colmap(found, kept, replace=True, notes=photos_note(Path(photos)))
     return load_capture(kept)
 
 
@@ -350,8 +377,11 @@ class _Loop:
         self.out = None if out is None else Path(out)
         self.resume = resume
         self.further = not resume
-        if self.out is not None and not resume:
-            _remove_checkpoints(self.out)
+        if self.out is not None:
+            for folder in (self.out, _checkpoints(self.out), *self.out.glob("rounds/[0-9]*")):
+                remove_unfinished(folder)
+            if not resume:
+                _remove_checkpoints(self.out)
         self.progress = progress
         self.look, self.choose, self.fewest = look, choose, FEWEST if judge else 1
         self.started = self.noted = time.monotonic()
@@ -377,29 +407,25 @@ class _Loop:
             out.append(_Fold(chain, left, self._scores(chain.splats, left)))
         return out
 
-    def looked_for(self, number: int, whole: _Chain) -> tuple[_Looked | None, str]:
-        """What a round may add, or why there is nothing."""
+    def why_no_round(self, number: int, whole: _Chain) -> str:
+        """Why there is nothing to look for; empty where there is."""
         if number > self.rounds:
-            return None, "1 round is done" if self.rounds == 1 else f"{self.rounds} rounds are done"
+            return "1 round is done" if self.rounds == 1 else f"{self.rounds} rounds are done"
         if len(whole.photos) < self.fewest:
-            return None, f"fewer than {self.fewest} photos leave none to judge a round by"
-        looked = self._looked(number, whole)
-        if looked.candidates == 0:
-            return None, "no view near the photos is unseen"
-        if not looked.chosen:
-            some = looked.candidates
-            return None, f"none of {some} unseen views can be trusted to add anything"
-        return looked, ""
+            return f"fewer than {self.fewest} photos leave none to judge a round by"
+        return ""
 
-    def _looked(self, number: int, chain: _Chain) -> _Looked:
+    def looked(self, number: int, chain: _Chain) -> _Looked:
         self.round = number
         self._tell("look")
         known = [photo.camera for photo in chain.photos] + [view.camera for view in chain.added]
         unseen = self.look(chain.splats, known, CANDIDATES, self.backend)
         cleaned = self._cleaned(chain, [*unseen, *chain.added])
-        count = len(unseen)
         self.done += LOOK_SHARE * chain.share
-        return _Looked(self.choose(cleaned[:count], CHOSEN), cleaned[count:], count)
+        candidates, again = cleaned[: len(unseen)], cleaned[len(unseen) :]
+        chosen = self.choose(candidates, CHOSEN)
+        others = [one for one in candidates if not any(one is other for other in chosen)]
+        return _Looked(chosen, [*map(passed, others)], again)
 
     def _cleaned(self, chain: _Chain, views: Sequence[UnseenView]) -> list[Candidate]:
         photos, splats = chain.photos, chain.splats
@@ -429,7 +455,7 @@ class _Loop:
         rows: list[list[dict[str, float]]] = [[], []]
         for fold in folds:
             rows[0] += fold.scores
-            self.refit(number, fold.chain, self._looked(number, fold.chain), "judge")
+            self.refit(number, fold.chain, self.looked(number, fold.chain), "judge")
             fold.scores = self._scores(fold.chain.splats, fold.left)
             rows[1] += fold.scores
         return [{s: float(np.mean([one[s] for one in some])) for s in DECIDING} for some in rows]
@@ -527,7 +553,9 @@ def _checkpoints(out: Path) -> Path:
 
 
 def _remove_checkpoints(out: Path) -> None:
-    """Remove an earlier run's fits: resuming this one must not find them."""
+    """Remove an earlier run's fits and how long they took: resuming must not find them."""
+    with contextlib.suppress(OSError):
+        (out / "report.json").unlink()
     for pattern in ("whole", "fold[0-9]"):
         for kind in (f"{pattern}.npz", f"{pattern}-round[0-9]*.npz"):
             for path in _checkpoints(out).glob(kind):

@@ -16,6 +16,8 @@ from PIL import Image
 from .atomic_write import atomic_write
 from .capture import Camera
 from .evaluation import default_background, over_background
+from .selection import LEAST_TRUST, LEAST_WORTH, Passed
+from .views import UnseenView
 
 if TYPE_CHECKING:
     from .refinement import Refined, Round
@@ -56,7 +58,7 @@ function draw() {
   };
   c.clearRect(0, 0, w, h);
   for (const [kind, points] of cameras) {
-    c.strokeStyle = kind === 0 ? "#3b7dd8" : "#e08a1e";
+    c.strokeStyle = ["#3b7dd8", "#e08a1e", "#8888"][kind];
     c.lineWidth = kind === 0 ? 1.6 : 1.1;
     const p = points.map(at);
     c.beginPath();
@@ -94,6 +96,7 @@ def write_page(path: Path, refined: Refined, report: dict[str, Any]) -> None:
         _cameras(refined),
         _photos(refined, report["not_placed"]),
         *(_round(number, one) for number, one in enumerate(refined.rounds, 1)),
+        _not_begun(refined),
         _timings(report),
     ]
     text = (
@@ -102,12 +105,13 @@ def write_page(path: Path, refined: Refined, report: dict[str, Any]) -> None:
         f"<style>{_STYLE}</style><body>{''.join(parts)}<script>{_SCRIPT}</script></body></html>\n"
     )
     with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # A file may be named by bytes that are no text.
+        temporary.write_text(text, encoding="utf-8", errors="xmlcharrefreplace")
 
 
 def _summary(refined: Refined) -> str:
     accepted = sum(one.accepted for one in refined.rounds)
-    stopped = refined.stopped or "it is still running"
+    stopped = refined.stopped or "it is still running, or was cut off and can be resumed"
     return (
         f"<h1>{html.escape(refined.capture.path.name or 'photos')}</h1><p>"
         f"{len(refined.capture.train_views)} photos, {len(refined.splats)} splats. "
@@ -190,13 +194,15 @@ def _cameras(refined: Refined) -> str:
     centres = np.stack([camera.centre for camera in (*known, *added)])
     middle = centres.mean(axis=0)
     size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-9)
+    others = [one.view.camera for one in _last_passed(refined)]
     drawn = [
         (kind, np.round((_frustum(camera, 0.18 * size) - middle) / size, 4).tolist())
-        for kind, cameras in ((0, known), (1, added))
+        for kind, cameras in ((2, others), (0, known), (1, added))
         for camera in cameras
     ]
     return (
-        "<h2>Cameras</h2><p>Photos blue, added views orange; drag to turn, wheel to zoom.</p>"
+        "<h2>Cameras</h2><p>Photos blue, added views orange, those that were looked at last and "
+        "not added grey; drag to turn, wheel to zoom.</p>"
         '<canvas id="scene" width="720" height="420"></canvas>'
         f'<script type="application/json" id="cameras">{json.dumps(drawn)}</script>'
     )
@@ -229,20 +235,52 @@ def _round(number: int, one: Round) -> str:
     judged = ""
     if one.left_out:
         judged = f"By photos that were left out, {100.0 * one.right:.0f} % of each change is right."
+    count = len(one.chosen) + len(one.passed)
     out = [
-        f"<h2>Round {number}: {verdict}</h2><p>{len(one.chosen)} of {one.candidates} unseen views "
-        f"were chosen: as rendered, cleaned, and where they are trusted. {judged}"
+        f"<h2>Round {number}: {verdict}</h2><p>{len(one.chosen)} of {count} unseen views were "
+        f"chosen: as rendered, cleaned, and where they are trusted. {judged}"
         '</p><div class="views">'
     ]
     for candidate in one.chosen:
-        place = "between photos" if candidate.view.between else "beyond the photos"
         trust = np.rint(255.0 * np.clip(candidate.trust, 0.0, 1.0)).astype(np.uint8)
         out += [
-            _figure(candidate.render, f"{candidate.view.angle:.0f}° away, {place}", PICTURE),
+            _figure(candidate.render, _place(candidate.view), PICTURE),
             _figure(candidate.picture, "cleaned", PICTURE),
             _figure(trust, f"trust {candidate.mean_trust:.2f}", PICTURE),
         ]
-    return "".join(out) + "</div>"
+    return "".join(out) + "</div>" + _table_of_passed(one.passed)
+
+
+def _last_passed(refined: Refined) -> list[Passed]:
+    return refined.passed or (refined.rounds[-1].passed if refined.rounds else [])
+
+
+def _not_begun(refined: Refined) -> str:
+    if not refined.passed:
+        return ""
+    return "<h2>No further round</h2>" + _table_of_passed(refined.passed)
+
+
+def _table_of_passed(some: list[Passed]) -> str:
+    """Views that were not added, and by which number."""
+    if not some:
+        return ""
+    rows = "".join(
+        f"<tr><td>{_place(one.view)}</td>"
+        f"<td>{one.mean_trust:.2f}</td><td>{1000.0 * one.worth:.2f}</td></tr>"
+        for one in sorted(some, key=lambda one: -one.worth)
+    )
+    return (
+        f"<p>Not added: {len(some)}. A view needs a trust of {LEAST_TRUST:g} and a worth of "
+        f"{1000.0 * LEAST_WORTH:g}; the worth is the mean of trust times what cleaning changed, in "
+        "thousandths of the colours' range. Of more, those that are worth most are added.</p>"
+        f"<table><tr><th>view</th><th>trust</th><th>worth</th></tr>{rows}</table>"
+    )
+
+
+def _place(view: UnseenView) -> str:
+    where = "between photos" if view.between else "beyond the photos"
+    return f"{view.angle:.0f}° away, {where}"
 
 
 def _timings(report: dict[str, Any]) -> str:

@@ -22,7 +22,7 @@ from .splats import Splats
 
 if TYPE_CHECKING:
     from .refinement import Refined, Round
-    from .selection import Candidate
+    from .selection import Candidate, Passed
 
 #: Parts of a refinement, as ``RefineProgress.doing`` has them.
 PARTS = ("fit", "look", "judge", "refit", "test")
@@ -55,6 +55,7 @@ def write_refinement(out: Path, refined: Refined, backend: str, seed: int) -> No
     report = {
         "rounds": rows,
         "stopped": refined.stopped,
+        "passed": [*map(_numbers, refined.passed)],
         "seconds": {part: round(seconds, 2) for part, seconds in refined.seconds.items()},
         "peak_memory_bytes": _peak_memory(),
         "photos": [view.name for view in refined.capture.train_views],
@@ -74,8 +75,8 @@ def seconds_so_far(out: Path) -> dict[str, float]:
     try:
         found = json.loads((out / "report.json").read_text(encoding="utf-8"))["seconds"]
         seconds = {part: float(found[part]) for part in PARTS if part in found}
-        return {part: value for part, value in seconds.items() if math.isfinite(value)}
-    except (OSError, ValueError, KeyError, TypeError):
+        return {part: value for part, value in seconds.items() if 0.0 <= value < math.inf}
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return {}
 
 
@@ -99,18 +100,20 @@ def _row(one: Round) -> dict[str, Any]:
         "splats": None if one.splats is None else len(one.splats),
         "test": one.test,
         "accepted": one.accepted,
-        "candidates": one.candidates,
+        "candidates": len(one.chosen) + len(one.passed),
         "right": round(one.right, 4),
         "left_out": {"before": one.before, "with": one.left_out},
-        "views": [
-            {
-                "angle": round(candidate.view.angle, 2),
-                "between": candidate.view.between,
-                "mean_trust": round(candidate.mean_trust, 4),
-                "worth": round(candidate.worth, 6),
-            }
-            for candidate in one.chosen
-        ],
+        "views": [*map(_numbers, one.chosen)],
+        "passed": [*map(_numbers, one.passed)],
+    }
+
+
+def _numbers(one: Candidate | Passed) -> dict[str, Any]:
+    return {
+        "angle": round(one.view.angle, 2),
+        "between": one.view.between,
+        "mean_trust": round(one.mean_trust, 4),
+        "worth": round(one.worth, 6),
     }
 
 

@@ -53,6 +53,20 @@ class Candidate:
         return float(self.trust.mean())
 
 
+@dataclass(frozen=True, eq=False)
+class Passed:
+    """An unseen view that was not added: where from, and what ``Candidate`` says of it."""
+
+    view: UnseenView
+    mean_trust: float
+    worth: float
+
+
+def passed(one: Candidate) -> Passed:
+    """A candidate without its pictures."""
+    return Passed(one.view, one.mean_trust, one.worth)
+
+
 def candidate(
     view: UnseenView, buffers: Buffers, photos: Sequence[Source], denoiser: Denoiser | None = None
 ) -> Candidate:

@@ -35,6 +35,7 @@ def write_colmap(
     text: bool = False,
     replace: bool = False,
     further_masks: Mapping[str, Sequence[np.ndarray | None]] | None = None,
+    notes: Mapping[str, str] | None = None,
 ) -> None:
     """Write a capture as a folder that COLMAP and all that read its models take.
 
@@ -46,6 +47,7 @@ def write_colmap(
         further_masks: by the name of a folder for them: per view bool [h, w] of any size, which is
             brought to the photo's, or None. They are for other programs; ``load_capture`` reads
             ``masks`` alone.
+        notes: further text files, by name.
 
     Raises:
         IgsrError: the folder is there and holds something, or cannot be written.
@@ -57,6 +59,8 @@ def write_colmap(
             for view, name, mask in zip(capture.views, names, masks, strict=True):
                 if mask is not None:
                     save_png(folder / kind / f"{name}.png", _at_size(mask, view.camera))
+        for note, text_of_note in (notes or {}).items():
+            (folder / note).write_text(text_of_note, encoding="utf-8")
         model = folder / "sparse" / "0"
         model.mkdir(parents=True)
         cameras = [view.camera for view in capture.views]

@@ -26,7 +26,7 @@ from ..pose import (
     estimate,
     found_before,
     kept_cameras,
-    note_photos,
+    photos_note,
     photos_of,
 )
 from ..pose.registry import ESTIMATORS
@@ -113,8 +113,7 @@ def capture_to_fit(
     if resume and found_before(path, kept):
         complain(f"The cameras found before are used, from {kept}")
     else:
-        report = _posed(path, kept, finder, plot=False, shown=shown, replace=True)
-        note_photos(path, kept)
+        report = _posed(path, kept, finder, plot=False, shown=shown, notes=photos_note(path))
         complain(
             f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
             f"{report['estimator']} and are kept in {kept}"
@@ -171,9 +170,12 @@ def _posed(
     *,
     plot: bool,
     shown: bool,
-    replace: bool = False,
+    notes: dict[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Find cameras and write the capture; what ``igsr pose`` reports."""
+    """Find cameras and write the capture; what ``igsr pose`` reports.
+
+    With ``notes``, text files that lie beside the capture, what is there is replaced.
+    """
     from ..pose.plot import plot_poses
 
     loaded = photos_of(photos, finder.frames)
@@ -189,7 +191,9 @@ def _posed(
         for mask, camera in zip(found.trusted, found.cameras, strict=True)
         if camera is not None
     ]
-    write_colmap(capture, out, replace=replace, further_masks={"trusted": trusted})
+    write_colmap(
+        capture, out, replace=notes is not None, further_masks={"trusted": trusted}, notes=notes
+    )
     if plot:
         plot_poses(out / "poses.png", capture)
     return {

@@ -120,7 +120,8 @@ def denoise(
 
     Raises:
         IgsrError: an array has another shape or dtype, photos are of another kind or could not be
-            used, or the shipped weights cannot be read.
+            used, ``denoiser`` returns arrays of another size, or the shipped weights cannot be
+            read.
     """
     others = [type(photo).__name__ for photo in photos if not isinstance(photo, Source)]
     if others:
@@ -130,7 +131,15 @@ def denoise(
             "photos can be looked up only where render has a camera: give one of "
             "igsr.denoiser.render_buffers, or no photos"
         )
-    return (denoiser or _shipped())(_buffers(render), photos)
+    given = _buffers(render)
+    picture, confidence = (denoiser or _shipped())(given, photos)
+    size = given.color.shape[:2]
+    if picture.shape != (*size, 3) or confidence.shape != size:
+        raise IgsrError(
+            f"the denoiser made a picture {list(picture.shape)} and a confidence "
+            f"{list(confidence.shape)} of a render of {list(size)} pixels"
+        )
+    return picture, confidence
 
 
 @cache

@@ -20,7 +20,7 @@ from igsr.capture.undistort import Undistorter
 from igsr.errors import IgsrError
 
 from .estimate import Estimate, Estimator, Progress
-from .kept import found_before, kept_cameras, not_placed, note_photos
+from .kept import found_before, kept_cameras, not_placed, photos_note
 from .registry import ESTIMATORS
 
 __all__ = [
@@ -33,7 +33,7 @@ __all__ = [
     "found_before",
     "kept_cameras",
     "not_placed",
-    "note_photos",
+    "photos_note",
 ]
 
 

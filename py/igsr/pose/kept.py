@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path, PurePosixPath
 
-from igsr.atomic_write import atomic_write
+from igsr.atomic_write import check_folder
 from igsr.capture import Capture
 from igsr.capture.folder import holds_cameras
 from igsr.capture.photo_folder import VIDEO_SUFFIXES, photo_sizes
@@ -19,22 +19,18 @@ def kept_cameras(photos: Path, out: Path) -> Path:
     """Where the cameras of photos are kept that are found for what goes to ``out``.
 
     Raises:
-        IgsrError: the photos lie there themselves, and would be replaced.
+        IgsrError: the photos lie there themselves, or something else that would be replaced.
     """
     kept = out / "capture"
     if kept.resolve() in (photos.resolve(), *photos.resolve().parents):
         raise IgsrError(f"{photos} lies where the fit would write {kept}; name another --out")
+    check_folder(kept, replace=_given(kept) is not None)
     return kept
 
 
-def note_photos(photos: Path, kept: Path) -> None:
-    """Write down which photos the cameras in ``kept`` were looked for in.
-
-    Raises:
-        IgsrError: it cannot be written.
-    """
-    with atomic_write(kept / GIVEN) as temporary:
-        temporary.write_text(json.dumps(photo_sizes(photos), indent=1), encoding="utf-8")
+def photos_note(photos: Path) -> dict[str, str]:
+    """What says, beside cameras that are kept, which photos they were looked for in."""
+    return {GIVEN: json.dumps(photo_sizes(photos), indent=1)}
 
 
 def found_before(photos: Path, kept: Path) -> bool:
@@ -45,8 +41,7 @@ def found_before(photos: Path, kept: Path) -> bool:
     """
     if not holds_cameras(kept):
         return False
-    given = _given(kept)
-    if given is not None and given != photo_sizes(photos):
+    if _given(kept) != photo_sizes(photos):
         raise IgsrError(
             f"{kept} has the cameras of other photos than {photos} holds now; resume with the same "
             "ones or leave --resume out."
@@ -71,9 +66,9 @@ def _without_suffix(name: str) -> str:
 
 
 def _given(kept: Path) -> dict[str, int] | None:
-    """What ``note_photos`` wrote; None where nothing of that kind is."""
+    """What ``photos_note`` was; None where nothing of that kind is."""
     try:
         found = json.loads((kept / GIVEN).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
