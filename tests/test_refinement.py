@@ -87,7 +87,6 @@ def test_rounds_that_help_are_accepted_and_make_views_better(helped):
         assert 0 < len(one.chosen) <= len(one.chosen) + len(one.passed) <= refinement.CANDIDATES
     psnr = [refined.first_test["psnr"], *(one.test["psnr"] for one in refined.rounds)]
     assert psnr[0] + 0.1 < psnr[1] < psnr[2]
-    assert all(one.right > 0.9 for one in refined.rounds)
     done = [now.done for now in seen]
     assert done == sorted(done)
     assert done[-1] <= 1.0
@@ -133,23 +132,9 @@ def test_everything_it_did_is_in_its_folder(helped):
     assert np.abs(photo - after).mean() < np.abs(photo - before).mean()
 
 
-def test_a_denoiser_that_photos_disprove_adds_nothing(capture, helped):
-    refined = refine(capture, "auto", lying)
-    assert not refined.rounds
-    assert "no nearer to photos that were left out (0.00 of what it changes" in refined.stopped
-    assert same(refined.splats, helped[0].first)
-
-
 def test_a_round_that_does_not_help_is_rolled_back(capture, helped):
-    photographed = [view.camera.viewmat for view in capture.views]
-
-    def lying_where_nobody_was(buffers, photos):
-        here = any(np.array_equal(buffers.camera.viewmat, viewmat) for viewmat in photographed)
-        return truthful(buffers, photos) if here else lying(buffers, photos)
-
-    refined = refine(capture, "auto", lying_where_nobody_was)
+    refined = refine(capture, "auto", lying)
     assert [one.accepted for one in refined.rounds] == [False]
-    assert refined.rounds[0].right > 0.9
     assert refined.stopped == "round 1 did not make photos that were left out better"
     assert refined.splats is refined.first
     assert same(refined.splats, helped[0].first)

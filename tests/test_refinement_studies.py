@@ -212,7 +212,6 @@ def test_the_sweep_and_the_ablation(data):
 def test_bad_arguments_are_refused_before_the_first_fit(data, igsr_here):
     for changes, message in (
         ({"methods": ("best",)}, f"methods must be of {', '.join(METHODS)}, not 'best'"),
-        ({"methods": ("no-denoiser",)}, "no-denoiser changes nothing that photos left out"),
         ({"features": None}, "give --features"),
         ({"weights": "none"}, "none does not exist"),
         ({"seeds": 0}, "seeds and jobs must be at least 1"),

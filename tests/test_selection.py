@@ -15,7 +15,6 @@ from igsr.selection import (
     LEAST_WORTH,
     PHOTO_ERROR,
     candidate,
-    rightness,
     select,
     trust_of,
 )
@@ -51,26 +50,6 @@ def test_a_view_is_worth_what_it_changes_where_it_can_be_trusted():
     there = candidate(VIEW, Buffers(render), [], cleaning(picture, sure))
     assert there.worth == pytest.approx(0.0, abs=1e-6), "what it changes is not to be trusted"
     assert there.mean_trust == pytest.approx(0.5)
-
-
-def test_of_a_change_that_goes_too_far_a_part_is_right():
-    render = np.full((8, 8, 3), 0.4, np.float32)
-    picture = render.copy()
-    picture[:, :4] = 0.8
-    one = candidate(VIEW, Buffers(render), [], cleaning(picture, np.ones((8, 8), np.float32)))
-    truth = one.render.copy()
-    truth[:, :4] += 51  # half of the change
-    found = rightness(one, truth)
-    assert found.share == pytest.approx(0.5, abs=1e-3)
-    assert (found + rightness(one, one.picture)).share == pytest.approx(0.75, abs=1e-3)
-    assert rightness(one, 2 * one.render - one.picture).share == 0.0, "the wrong way"
-    assert rightness(one, one.picture, np.zeros((8, 8), np.bool_)).share == 0.0, "nothing is known"
-    partly = one.picture.copy()
-    partly[:, :2] = one.render[:, :2]  # wrong where it is not trusted
-    trust = one.trust.copy()
-    trust[:, :2] = 0.0
-    assert rightness(one, partly).share == pytest.approx(0.5, abs=1e-3)
-    assert rightness(replace(one, trust=trust), partly).share == pytest.approx(1.0, abs=1e-3)
 
 
 def test_the_most_worth_first_and_none_that_cannot_be_trusted():

@@ -34,7 +34,6 @@ from .evaluation import (
     default_background,
     evaluate,
     known_background,
-    over_background,
     score_views,
 )
 from .fitting import Progress, check_fits, fit
@@ -42,7 +41,7 @@ from .halved import halved
 from .pose import AUTO, estimate_poses, found_before, kept_cameras, photos_note
 from .presets import preset_settings
 from .refinement_report import seconds_so_far, write_refinement
-from .selection import Candidate, Passed, Rightness, candidate, passed, rightness, select
+from .selection import Candidate, Passed, candidate, passed, select
 from .splats import Splats
 from .views import UnseenView, unseen_views
 
@@ -59,8 +58,6 @@ FOLDS, LEFT_OUT = 2, 8
 FOLD_SIDE = 64
 #: Looking takes about this part of a whole fit's time.
 LOOK_SHARE = 0.1
-#: Of what cleaning changes, photos left out must find this part right for a round to begin.
-LEAST_RIGHT = 0.1
 #: Most rounds of "auto".
 MOST_ROUNDS = 4
 #: Where to look from: the splats, the known cameras, how many views at most, and what renders.
@@ -99,7 +96,6 @@ class Round:
         chosen: the views that were added, the one worth most first. Those of earlier rounds were
             rendered and cleaned anew, and are not in it.
         passed: those that were looked at and not chosen.
-        right: the part of what cleaning changes that is right, in [0, 1], as photos left out tell.
         before: scores ("psnr", "ssim", "flip") of photos left out, by fits without the round's
             views.
         left_out: the same by fits with them. Both are empty where rounds are not judged.
@@ -112,7 +108,6 @@ class Round:
 
     chosen: list[Candidate]
     passed: list[Passed]
-    right: float
     before: dict[str, float]
     left_out: dict[str, float]
     accepted: bool
@@ -251,25 +246,16 @@ def refine(
                 looked.passed,
             )
         before: dict[str, float] = {}
-        left_out, accepted, right = before, True, 1.0
+        left_out, accepted = before, True
         if judge:
             folds = folds or loop.folds()
-            right = sum((loop.rightness(fold) for fold in folds), Rightness()).share
-            if right < LEAST_RIGHT:
-                return so_far(
-                    f"cleaning brings views no nearer to photos that were left out ({right:.2f} of "
-                    "what it changes is right)",
-                    [*map(passed, looked.chosen), *looked.passed],
-                )
             before, left_out = loop.judged(number, folds)
             accepted = _error(left_out) < _error(before)
         if accepted:
             loop.refit(number, whole, looked, "refit")
         splats = whole.splats if accepted else None
         test = loop.tested(splats)
-        done.append(
-            Round(looked.chosen, looked.passed, right, before, left_out, accepted, splats, test)
-        )
+        done.append(Round(looked.chosen, looked.passed, before, left_out, accepted, splats, test))
         if not accepted:
             return so_far(f"round {number} did not make photos that were left out better")
 
@@ -437,15 +423,6 @@ class _Loop:
             found.append(candidate(view, buffers, sources, self.denoiser))
             self._tell("look")
         return found
-
-    def rightness(self, fold: _Fold) -> Rightness:
-        """How much of what cleaning changes in the photos that a fold leaves out is right."""
-        views = [UnseenView(view.camera, 0.0, between=False) for view in fold.left]
-        measured = Rightness()
-        for one, view in zip(self._cleaned(fold.chain, views), fold.left, strict=True):
-            photo = over_background(view.image, self.background)
-            measured += rightness(one, photo, view.mask)
-        return measured
 
     def judged(self, number: int, folds: Sequence[_Fold]) -> list[dict[str, float]]:
         """Mean scores of the photos left out, before and after each fold's own round.

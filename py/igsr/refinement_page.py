@@ -232,14 +232,10 @@ def _photos(refined: Refined, not_placed: list[str]) -> str:
 
 def _round(number: int, one: Round) -> str:
     verdict = "accepted" if one.accepted else "rolled back"
-    judged = ""
-    if one.left_out:
-        judged = f"By photos that were left out, {100.0 * one.right:.0f} % of each change is right."
     count = len(one.chosen) + len(one.passed)
     out = [
         f"<h2>Round {number}: {verdict}</h2><p>{len(one.chosen)} of {count} unseen views were "
-        f"chosen: as rendered, cleaned, and where they are trusted. {judged}"
-        '</p><div class="views">'
+        'chosen: as rendered, cleaned, and where they are trusted.</p><div class="views">'
     ]
     for candidate in one.chosen:
         trust = np.rint(255.0 * np.clip(candidate.trust, 0.0, 1.0)).astype(np.uint8)

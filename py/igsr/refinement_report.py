@@ -101,7 +101,6 @@ def _row(one: Round) -> dict[str, Any]:
         "test": one.test,
         "accepted": one.accepted,
         "candidates": len(one.chosen) + len(one.passed),
-        "right": round(one.right, 4),
         "left_out": {"before": one.before, "with": one.left_out},
         "views": [*map(_numbers, one.chosen)],
         "passed": [*map(_numbers, one.passed)],

@@ -111,50 +111,5 @@ def select(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
     return sorted(some, key=lambda one: one.worth, reverse=True)[:count]
 
 
-@dataclass(frozen=True)
-class Rightness:
-    """How much of what cleaning changes is right, measured where the truth is known.
-
-    Attributes:
-        towards: sum over pixels of trust times the change times what would have been right.
-        squared: sum of trust times the squared change.
-    """
-
-    towards: float = 0.0
-    squared: float = 0.0
-
-    def __add__(self, other: Rightness) -> Rightness:
-        """Of all pixels of both."""
-        return Rightness(self.towards + other.towards, self.squared + other.squared)
-
-    @property
-    def share(self) -> float:
-        """The part of each change that would leave the least squared error, in [0, 1]."""
-        if self.squared <= 0.0:
-            return 0.0
-        return min(1.0, max(0.0, self.towards / self.squared))
-
-
-def rightness(
-    one: Candidate, truth: npt.NDArray[np.uint8], mask: npt.NDArray[np.bool_] | None = None
-) -> Rightness:
-    """How much of what cleaning changed in a view is right, given its photo.
-
-    Pixels count as a fit would count them: what is not trusted may be wrong.
-
-    Args:
-        one: the view, cleaned.
-        truth: uint8 [H, W, 3].
-        mask: bool [H, W], pixels that count; None is all.
-    """
-    render, change = (p.astype(np.float64) / 255.0 for p in (one.render, one.picture))
-    change -= render
-    right = truth / 255.0 - render
-    weight = one.trust if mask is None else one.trust * mask
-    towards = (change * right).sum(axis=-1, dtype=np.float64)
-    squared = np.square(change).sum(axis=-1, dtype=np.float64)
-    return Rightness(float((weight * towards).sum()), float((weight * squared).sum()))
-
-
 def _bytes(colors: Float32) -> npt.NDArray[np.uint8]:
     return np.rint(255.0 * colors).astype(np.uint8)

@@ -392,11 +392,6 @@ def studied(
     for how in methods:
         if how.method not in METHODS:
             raise IgsrError(f"methods must be of {', '.join(METHODS)}, not {how.method!r}.")
-        if how.method == "no-denoiser" and how.judge:
-            raise IgsrError(
-                "method no-denoiser changes nothing that photos left out could find right, so no "
-                "round of it is begun here; refinement-ablation, which does not judge, has it."
-            )
         if how.method in PAPER and features is None:
             raise IgsrError(
                 f"method {how.method} chooses by a perceptual distance; give --features "
