@@ -172,21 +172,6 @@ class Points:
     confidence: np.ndarray | None = None
     tracks: Tracks | None = None
 
-    def seen_by(self, names: Iterable[str]) -> Points:
-        """Those that at least two of these photos see, without tracks; all where none are known.
-
-        Photos that are held out have a part in no other.
-        """
-        if self.tracks is None or not len(self.tracks.view):
-            return self
-        wanted, tracks = set(names), self.tracks
-        named = np.array([name in wanted for name in tracks.names], np.bool_)[tracks.view]
-        both = np.stack([tracks.point[named], tracks.view[named]])
-        seen = np.bincount(np.unique(both, axis=1)[0], minlength=len(self.xyz))
-        kept = np.flatnonzero(seen >= 2)
-        confidence = None if self.confidence is None else self.confidence[kept]
-        return Points(self.xyz[kept], self.rgb[kept], confidence)
-
     def __post_init__(self) -> None:
         """Check confidence and tracks against the points."""
         seen = () if self.tracks is None else self.tracks.point
@@ -207,6 +192,22 @@ class Points:
             raise IgsrError(
                 "confidence holds a number that is not positive and finite; remove such points"
             )
+
+    def seen_by(self, names: Iterable[str]) -> Points:
+        """The points that at least two of these photos see, without tracks.
+
+        What only other photos show is not known to a fit of these. Where no tracks are known all
+        points are returned.
+        """
+        if self.tracks is None or not len(self.tracks.view):
+            return self
+        wanted, tracks = set(names), self.tracks
+        named = np.array([name in wanted for name in tracks.names], np.bool_)[tracks.view]
+        both = np.stack([tracks.point[named], tracks.view[named]])
+        seen = np.bincount(np.unique(both, axis=1)[0], minlength=len(self.xyz))
+        kept = np.flatnonzero(seen >= 2)
+        confidence = None if self.confidence is None else self.confidence[kept]
+        return Points(self.xyz[kept], self.rgb[kept], confidence)
 
 
 @dataclass(eq=False)
