@@ -18,7 +18,7 @@ from ..capture.photo_folder import Photo, load_photos
 from ..errors import IgsrError
 from ..pose.accuracy import pose_accuracy
 from ..pose.registry import ESTIMATORS
-from .runs import Run, finished_runs, folder_hash
+from .runs import Run, finished_runs
 
 SCENES = (
     "strecha_fountain",
@@ -128,7 +128,8 @@ def poses(
         Run(
             f"{scene.replace('/', '-')}-{estimator}-seed{seed}",
             PoseRun(scene, estimator, seed),
-            {"data": folder_hash(Path(data) / scene)},
+            {},
+            scene=scene,
         )
         for seed in range(seeds)
         for scene in scenes

@@ -16,7 +16,7 @@ from ..fitting import fit_with_cameras
 from ..poses import refine_cameras, similarity_between
 from ..presets import preset_settings
 from ..splats import Splats
-from .runs import Run, finished_runs, folder_hash
+from .runs import Run, finished_runs
 
 SCORES = ("psnr", "ssim", "flip")
 
@@ -123,14 +123,13 @@ def fitted(
         for scene, views in photos
         for preset in presets
     ]
-    scene_hashes = {scene: {"data": folder_hash(Path(data) / scene)} for scene, _ in photos}
     tasks = [
         Run(
             f"{one.scene}-views{one.views}-{one.preset}-seed{one.seed}-{one.backend}",
             one,
             preset_settings(one.preset, photos[one.scene, one.views])
-            | ({"refined": True} if refined else {})
-            | scene_hashes[one.scene],
+            | ({"refined": True} if refined else {}),
+            scene=one.scene,
         )
         for one in fits
     ]

@@ -26,7 +26,7 @@ from ..evaluation import WHITE, evaluate
 from ..fitting import fit_with_cameras
 from ..poses import pose_errors, refine_cameras, similarity_between
 from ..presets import preset_settings
-from .runs import Run, finished_runs, folder_hash
+from .runs import Run, finished_runs
 
 Float64 = npt.NDArray[np.float64]
 
@@ -262,12 +262,12 @@ def pose_noise(
         for scene in scenes
         for poses in (("fixed",) if kind == CLEAN else POSES)
     ]
-    scene_hashes = {scene: {"data": folder_hash(Path(data) / scene)} for scene in scenes}
     tasks = [
         Run(
             f"{one.scene}-{one.noise.kind}{one.noise.size:g}-{one.poses}-seed{one.seed}-{backend}",
             one,
-            preset_settings("default", len(VIEW_IDS), poses=one.poses) | scene_hashes[one.scene],
+            preset_settings("default", len(VIEW_IDS), poses=one.poses),
+            scene=one.scene,
         )
         for one in fits
     ]

@@ -35,7 +35,7 @@ from .artifact_likeness import likeness, plot_likeness
 from .noisy_poses import AFFINE, MATRIX, PAPER_STEPS, Noise, noise_unit, noisy_view
 from .poor_fit_pictures import plot_confidence, plot_gains, write_sheet
 from .real_captures import is_dtu
-from .runs import Run, file_hash, finished_runs, folder_hash
+from .runs import Run, file_hash, finished_runs
 from .views import dtu_views, llff_views
 
 Float64 = npt.NDArray[np.float64]
@@ -332,7 +332,7 @@ def denoiser_table(
     made_up = set()
     for scene in scenes:
         # Read before the first fit: what is wrong with the last scene must not come up hours later.
-        capture, photos_hash = load_capture(data / scene), folder_hash(data / scene)
+        capture = load_capture(data / scene)
         if known_background(capture.views) is not None:
             made_up.add(scene)
         for one in (one for one in fits if one.scene == scene):
@@ -340,8 +340,8 @@ def denoiser_table(
             check_one_size(poor.test_views)
             photos = len(poor.train_views)
             settings = preset_settings("default", photos, steps=_steps(one.kind))
-            settings |= {"scored": SCORED_VIEWS, "data": photos_hash}
-            tasks.append(Run(one.name, one, settings, out / "renders" / f"{one.name}.npz"))
+            settings |= {"scored": SCORED_VIEWS}
+            tasks.append(Run(one.name, one, settings, out / "renders" / f"{one.name}.npz", scene))
     rows = finished_runs(out / "runs", tasks, partial(run_fit, out), str(data), jobs, on_run, ray)
     perceptual = None if features is None else file_hash(Path(features))
     columns: dict[str, Path | None] = {BEFORE: None, **weights}

@@ -37,7 +37,7 @@ from ..splats import Splats
 from ..views import UnseenView, unseen_views
 from .poor_fit_pictures import write_sheet
 from .refinement_tables import plot_rounds, summarized, write_table
-from .runs import Run, file_hash, finished_runs, folder_hash
+from .runs import Run, file_hash, finished_runs
 from .views import HOLDOUT, localized, scattered, spread_out
 
 #: How photos are chosen, by the name of the layout.
@@ -421,12 +421,12 @@ def studied(
         "features": None if features is None else file_hash(Path(features)),
         "methods": [list(vars(how).values()) for how in methods],
     }
-    scene_hashes = {scene: {"data": folder_hash(Path(data) / scene)} for scene, _, _ in kinds}
     tasks = [
         Run(
             one.name,
             one,
-            preset_settings("default", one.photos, steps=steps) | hashes | scene_hashes[one.scene],
+            preset_settings("default", one.photos, steps=steps) | hashes,
+            scene=one.scene,
         )
         for one in runs
     ]

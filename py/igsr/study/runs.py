@@ -26,12 +26,15 @@ class Run:
         what: describes it.
         settings: that it uses.
         leaves: a file that it leaves beside its row, if any; without that it is not done.
+        scene: its folder in the data, all of whose files count among the settings, as "data":
+            photos and cameras get mended. None where other settings say what it is of.
     """
 
     name: str
     what: Any
     settings: dict[str, Any]
     leaves: Path | None = None
+    scene: str | None = None
 
 
 def file_hash(path: Path) -> str:
@@ -40,7 +43,7 @@ def file_hash(path: Path) -> str:
 
 
 def folder_hash(folder: Path) -> str:
-    """Of all files in a scene's folder, for a fit's settings: photos and cameras get mended."""
+    """Of all files in a folder and their names."""
     digest = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         digest.update(path.relative_to(folder).as_posix().encode())
@@ -78,9 +81,16 @@ def finished_runs(
     """
     rows: dict[str, dict[str, Any]] = {}
     missing = []
+    scenes = {run.scene for run in runs if run.scene}
+    hashes = {scene: folder_hash(Path(data) / scene) for scene in scenes}
+
+    def about(run: Run) -> dict[str, Any]:
+        of = {"data": hashes[run.scene]} if run.scene else {}
+        return {"igsr": _core.__version__, "settings": run.settings | of}
+
     for run in runs:
         row = _read(folder / f"{run.name}.json")
-        current = {"igsr": _core.__version__, "settings": run.settings}
+        current = about(run)
         whole = run.leaves is None or run.leaves.is_file()
         if row is not None and whole and {key: row.get(key) for key in current} == current:
             rows[run.name] = row
@@ -88,7 +98,7 @@ def finished_runs(
             missing.append(run)
 
     def keep(run: Run, row: dict[str, Any]) -> None:
-        row = {**row, "igsr": _core.__version__, "settings": run.settings}
+        row = {**row, **about(run)}
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder / f"{run.name}.json") as temporary:
             temporary.write_text(json.dumps(row, indent=2, allow_nan=False), encoding="utf-8")
