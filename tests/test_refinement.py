@@ -13,7 +13,7 @@ import scenes
 from PIL import Image
 
 import igsr
-from igsr import presets, refinement
+from igsr import fitter, presets, refinement
 from igsr.pose import registry
 from igsr.pose.estimate import Estimate
 from igsr.refinement_report import seconds_so_far
@@ -28,6 +28,8 @@ STEPS = 800
 def small_fits():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presets, "_FEW", replace(presets._FEW, max_splats=1000))
+        # So few steps would hardly see the views at all.
+        patch.setattr(fitter, "PHOTO_STEPS", 1)
         yield
 
 
@@ -578,15 +580,20 @@ def test_a_round_fits_photos_and_views_from_the_start(capture, helped):
     assert same(fitted, refined.rounds[0].splats)
 
 
-def test_photos_come_up_more_often_than_views_that_are_none(capture):
-    from igsr.fitter import PHOTO_STEPS, _turns
-
+def test_photos_come_up_more_often_than_views_that_are_none_and_alone_at_the_end(
+    capture, monkeypatch
+):
     photos = capture.train_views[:2]
     views = [replace(view, weights=np.ones((40, 40), np.float32)) for view in photos]
-    assert PHOTO_STEPS > 1
-    assert _turns([photos[0], *views, photos[1]]) == [PHOTO_STEPS, 1, 1, PHOTO_STEPS]
-    assert _turns([*photos, views[0]]) == [-(-PHOTO_STEPS // 2)] * 2 + [1]
-    assert _turns(photos) == _turns(views) == [1, 1]
+    monkeypatch.setattr(fitter, "PHOTO_STEPS", 5)
+    monkeypatch.setattr(fitter, "PHOTOS_LAST", 0.2)
+
+    def turns(*views):
+        return fitter._turns(views, 1000)
+
+    assert turns(photos[0], *views, photos[1]) == [(5, None), (1, 800), (1, 800), (5, None)]
+    assert turns(*photos, views[0]) == [(3, None), (3, None), (1, 800)]
+    assert turns(*photos) == turns(*views) == [(1, None), (1, None)]
 
 
 def test_seconds_that_a_report_cannot_have_are_not_gone_on_from(tmp_path):

@@ -19,6 +19,9 @@ from .rendering import intrinsics_of, viewmat_about
 #: Steps on photos, at least, for one on a view that is none, where there are both: what such views
 #: teach they teach soon, and what photos show is right.
 PHOTO_STEPS = 5
+#: The last part of the steps, that is on photos alone: such views are a little blurred, and what is
+#: fine is fitted last.
+PHOTOS_LAST = 0.2
 
 
 def fitter_of(
@@ -40,7 +43,7 @@ def fitter_of(
         [np.ascontiguousarray(view.image) for view in views],
         [_counting(view) for view in views],
         [view.background for view in views],
-        _turns(views),
+        _turns(views, int(settings["steps"])),
         *_arrays(views, origin),
         state,
         settings,
@@ -49,12 +52,15 @@ def fitter_of(
     )
 
 
-def _turns(views: Sequence[View]) -> list[int]:
-    """How many steps of a round are of each view."""
+def _turns(views: Sequence[View], steps: int) -> list[tuple[int, int | None]]:
+    """How many steps of a round are of each view, and until which step; None is the last."""
     photos = sum(view.weights is None for view in views)
     others = len(views) - photos
-    each = max(1, -(-PHOTO_STEPS * others // max(1, photos)))
-    return [each if view.weights is None else 1 for view in views]
+    if not photos:
+        return [(1, None)] * others
+    each = max(1, -(-PHOTO_STEPS * others // photos))
+    until = round((1.0 - PHOTOS_LAST) * steps)
+    return [(each, None) if view.weights is None else (1, until) for view in views]
 
 
 def _counting(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None:

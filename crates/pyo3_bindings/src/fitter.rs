@@ -260,7 +260,7 @@ fn targets_from(
     images: &Bound<'_, PyList>,
     masks: &Bound<'_, PyList>,
     backgrounds: &[Option<[f32; 3]>],
-    turns: &[u32],
+    turns: &[(u32, Option<u32>)],
 ) -> PyResult<Vec<Target>> {
     for (name, entries) in
         [("masks", masks.len()), ("backgrounds", backgrounds.len()), ("turns", turns.len())]
@@ -292,7 +292,8 @@ fn targets_from(
             pixels: pixels.to_vec(),
             weights,
             background: backgrounds[i],
-            turns: turns[i],
+            turns: turns[i].0,
+            until: turns[i].1,
         };
         target.validate(i).map_err(to_python)?;
         targets.push(target);
@@ -310,7 +311,8 @@ impl Fitter {
 
 #[pymethods]
 impl Fitter {
-    /// A fit of `state` to photos; `holds` say where cameras are known to be, and how surely.
+    /// A fit of `state` to photos, each with its turns in a round of steps and the first step that is
+    /// not of it; `holds` say where cameras are known to be, and how surely.
     #[new]
     #[pyo3(signature = (images, masks, backgrounds, turns, viewmats, intrinsics, state, config, backend, holds=None))]
     fn new<'py>(
@@ -318,7 +320,7 @@ impl Fitter {
         images: &Bound<'py, PyList>,
         masks: &Bound<'py, PyList>,
         backgrounds: Vec<Option<[f32; 3]>>,
-        turns: Vec<u32>,
+        turns: Vec<(u32, Option<u32>)>,
         viewmats: &Bound<'py, PyAny>,
         intrinsics: &Bound<'py, PyAny>,
         state: &Bound<'py, PyDict>,

@@ -37,6 +37,7 @@ fn photos() -> (Vec<Target>, Vec<Camera>) {
                 weights: None,
                 background: None,
                 turns: 1,
+                until: None,
             }
         })
         .collect();
@@ -144,6 +145,36 @@ fn a_photo_of_two_turns_is_fitted_as_often_as_two_photos() {
     assert!(twice == fitted(&[(0, 1), (0, 1), (1, 1), (2, 1)]).unwrap());
     assert!(twice != once);
     assert!(fitted(&[(0, 0), (1, 1)]).unwrap_err().to_string().contains("images[0]: has no turn"));
+}
+
+#[test]
+fn a_photo_that_leaves_is_fitted_no_more() {
+    let (targets, cameras) = photos();
+    let config = FitConfig { cameras: None, ..config(DensityControl::Mcmc) };
+    let fitter = |until: &[Option<u32>], state: &FitState, step: u32| {
+        let targets = targets.iter().zip(until);
+        let targets = targets.map(|(one, &until)| Target { until, ..one.clone() }).collect();
+        let device = Box::new(CpuFit::default());
+        Fitter::new(device, targets, cameras.clone(), state.clone(), step, config.clone())
+    };
+    let fitted =
+        |until: &[Option<u32>], steps| run(&mut fitter(until, &start(1), 0).unwrap(), steps);
+    let all = [None; 5];
+    let leaving = [None, Some(10), Some(10), Some(10), Some(10)];
+    assert!(fitted(&leaving, 10) == fitted(&all, 10));
+    let whole = fitted(&leaving, 30);
+    assert!(whole != fitted(&all, 30));
+    // From then on it is a fit to the one that stays, whatever the others show; in rounds of one.
+    let half = fitted(&all, 10);
+    let gone = [None, Some(0), Some(0), Some(0), Some(0)];
+    assert!(run(&mut fitter(&gone, &half, 10).unwrap(), 30) == whole);
+    // Also where it is resumed in the middle of either part.
+    for cut in [4, 10, 17] {
+        let mut resumed = fitter(&leaving, &fitted(&leaving, cut), cut).unwrap();
+        assert!(run(&mut resumed, 30) == whole, "resumed at step {cut} it ends otherwise");
+    }
+    let none = fitter(&[Some(10); 5], &start(1), 0).err().unwrap().to_string();
+    assert!(none.contains("images: has none that is fitted to until the end"), "{none}");
 }
 
 /// One step that changes no splat, and what it says of its camera.

@@ -72,6 +72,7 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
             weights,
             background: None,
             turns: 1,
+            until: None,
         });
         cameras.push(camera);
     }

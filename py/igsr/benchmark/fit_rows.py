@@ -250,7 +250,7 @@ def fitter(shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) 
         [shot.photo],
         [mask],
         [None],
-        [1],
+        [(1, None)],
         scene.viewmat[None],
         scene.intrinsics[None],
         _state(scene),

@@ -25,6 +25,8 @@ pub struct Target {
     pub background: Option<[f32; 3]>,
     /// How many steps of a round are of it, at least 1.
     pub turns: u32,
+    /// The first step that is not of it any more, where there is one.
+    pub until: Option<u32>,
 }
 
 /// What a photo's pixels weigh.

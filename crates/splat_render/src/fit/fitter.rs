@@ -49,9 +49,13 @@ pub struct Fitter {
     behind: Vec<Option<[f32; 3]>>,
     hull: Option<Hull>,
     extent: f32,
-    /// The photos of a round of steps, each as often as it has turns, and their order in this one.
+    /// How often each photo comes in a round of steps, and until which step.
+    turns: Vec<(u32, Option<u32>)>,
+    /// The photos of a round as many as there are now, their order in this one, and the step that
+    /// rounds of these photos begin at.
     round: Vec<usize>,
     order: Vec<usize>,
+    rounds_from: u32,
     splats: usize,
     step: u32,
 }
@@ -113,11 +117,10 @@ impl Fitter {
         }
         let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
         let behind = targets.iter().map(|t| t.background).collect();
-        let round = targets
-            .iter()
-            .enumerate()
-            .flat_map(|(k, target)| repeat_n(k, target.turns as usize))
-            .collect();
+        if targets.iter().all(|target| target.until.is_some()) {
+            return Err(Error::argument("images", "has none that is fitted to until the end"));
+        }
+        let turns = targets.iter().map(|target| (target.turns, target.until)).collect();
         let hull = config.hull.then(|| Hull::new(&targets));
         device.set_targets(targets)?;
         let splats = state.splats.len();
@@ -136,8 +139,10 @@ impl Fitter {
             has_alpha,
             behind,
             hull,
-            round,
+            turns,
+            round: Vec::new(),
             order: Vec::new(),
+            rounds_from: 0,
             splats,
             step,
         })
@@ -200,11 +205,20 @@ impl Fitter {
     }
 
     /// The photo of step `step` (from 0): every photo takes its turns in a round, in a new order each
-    /// round.
+    /// round. When some leave, a round of the others begins.
     fn view(&mut self, step: u32) -> usize {
-        let n = self.round.len() as u32;
+        let left = self.turns.iter().filter_map(|&(_, until)| until).filter(|&until| until <= step);
+        let from = left.max().unwrap_or(0);
+        if self.round.is_empty() || from != self.rounds_from {
+            self.rounds_from = from;
+            self.order.clear();
+            let stays = |until: Option<u32>| until.is_none_or(|until| until > step);
+            let staying = self.turns.iter().enumerate().filter(|(_, (_, until))| stays(*until));
+            self.round = staying.flat_map(|(k, &(turns, _))| repeat_n(k, turns as usize)).collect();
+        }
+        let (n, step) = (self.round.len() as u32, step - from);
         if self.order.is_empty() || step.is_multiple_of(n) {
-            let mut rng = self.rng(Draw::Order, u64::from(step / n));
+            let mut rng = self.rng(Draw::Order, u64::from(from) << 32 | u64::from(step / n));
             self.order.clone_from(&self.round);
             self.order.shuffle(&mut rng);
         }
@@ -259,7 +273,7 @@ impl Fitter {
         let Some(cameras) = self.moving.as_mut().filter(|cameras| cameras.moving(progress)) else {
             return Ok(());
         };
-        if self.step.is_multiple_of(self.round.len() as u32) {
+        if (self.step - self.rounds_from).is_multiple_of(self.round.len() as u32) {
             cameras.add(&self.device.camera_gradients()?);
             cameras.step(progress);
             self.cameras = cameras.now().to_vec();

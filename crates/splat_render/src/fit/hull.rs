@@ -103,6 +103,7 @@ mod tests {
             weights: None,
             background: None,
             turns: 1,
+            until: None,
         };
         let hull = Hull::new(std::slice::from_ref(&target));
         assert!(hull.contains([0.2, 0.0, 1.0], &[camera]));
