@@ -588,12 +588,26 @@ def test_photos_come_up_more_often_than_views_that_are_none_and_alone_at_the_end
     monkeypatch.setattr(fitter, "PHOTO_STEPS", 5)
     monkeypatch.setattr(fitter, "PHOTOS_LAST", 0.2)
 
-    def turns(*views):
-        return fitter._turns(views, 1000)
+    def schedule(*views, first=0):
+        return fitter._schedule(views, 1000, first)
 
-    assert turns(photos[0], *views, photos[1]) == [(5, None), (1, 800), (1, 800), (5, None)]
-    assert turns(*photos, views[0]) == [(3, None), (3, None), (1, 800)]
-    assert turns(*photos) == turns(*views) == [(1, None), (1, None)]
+    assert schedule(photos[0], *views, photos[1]) == [(5, None), (1, 800), (1, 800), (5, None)]
+    assert schedule(*photos, views[0]) == [(3, None), (3, None), (1, 800)]
+    assert schedule(*photos) == schedule(*views) == [(1, None), (1, None)]
+    # A fit that enters the schedule late has its own last fifth.
+    assert schedule(*photos, views[0], first=900)[-1] == (1, 980)
+
+
+def test_a_short_fit_that_goes_on_sees_views_that_are_no_photos(capture):
+    photos = capture.train_views[:2]
+    view = replace(capture.train_views[2], weights=np.ones((40, 40), np.float32))
+    start = igsr.fit(igsr.Capture(capture.path, photos), 20, backend="cpu")
+
+    def gone_on(view):
+        given = igsr.Capture(capture.path, [*photos, view])
+        return igsr.fit(given, 20, backend="cpu", start=start)
+
+    assert not same(gone_on(view), gone_on(replace(view, image=255 - view.image)))
 
 
 def test_seconds_that_a_report_cannot_have_are_not_gone_on_from(tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import igsr
-from igsr.study.runs import Run, finished_runs
+from igsr.study.runs import Run, finished_runs, folder_hash
 
 
 def work(data, what):
@@ -48,3 +48,26 @@ def test_a_run_without_what_it_left_is_done_again(tmp_path):
     assert len(done) == 2
     assert left.is_file()
     assert run.settings == {"steps": 3}
+
+
+def test_a_run_whose_scene_has_changed_is_done_again(tmp_path):
+    (tmp_path / "scene").mkdir()
+    photo = tmp_path / "scene" / "photo.png"
+    photo.write_bytes(b"first")
+    done = []
+
+    def rows(scene):
+        runs = [Run("quick", "quick", {"steps": 3}, scene=scene)]
+        return finished_runs(
+            tmp_path / "runs", runs, work, str(tmp_path), 1, lambda *row: done.append(row)
+        )
+
+    (row,) = rows("scene")
+    assert row["settings"] == {"steps": 3, "data": folder_hash(photo.parent)}
+    assert rows("scene") == [row]
+    assert len(done) == 1
+    photo.write_bytes(b"mended")
+    assert rows("scene") != [row]
+    assert len(done) == 2
+    assert rows(None)[0]["settings"] == {"steps": 3}
+    assert len(done) == 3

@@ -196,7 +196,7 @@ class Fitter:
         images: list[npt.NDArray[np.uint8]],
         masks: list[npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None],
         backgrounds: Sequence[tuple[float, float, float] | None],
-        turns: Sequence[tuple[int, int | None]],
+        schedule: Sequence[tuple[int, int | None]],
         viewmats: Float64,
         intrinsics: Float64,
         state: dict[str, Any],
@@ -207,7 +207,7 @@ class Fitter:
         """A fit to V photos.
 
         ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
-        ``backgrounds`` RGB that stood behind an image without alpha, or None, ``turns`` how many
+        ``backgrounds`` RGB that stood behind an image without alpha, or None, ``schedule`` how many
         steps of a round are of it, at least 1, and the first step that is not of it any more, or
         None. ``viewmats`` are [V, 4, 4] relative to the splats'
         origin, ``intrinsics`` [V, 4]. ``state`` is either the parameters to start from

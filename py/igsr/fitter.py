@@ -19,8 +19,8 @@ from .rendering import intrinsics_of, viewmat_about
 #: Steps on photos, at least, for one on a view that is none, where there are both: what such views
 #: teach they teach soon, and what photos show is right.
 PHOTO_STEPS = 5
-#: The last part of the steps, that is on photos alone: such views are a little blurred, and what is
-#: fine is fitted last.
+#: The last part of the steps, which are on photos alone: views that are none are a little blurred,
+#: and what is fine is fitted last.
 PHOTOS_LAST = 0.2
 
 
@@ -43,7 +43,7 @@ def fitter_of(
         [np.ascontiguousarray(view.image) for view in views],
         [_counting(view) for view in views],
         [view.background for view in views],
-        _turns(views, int(settings["steps"])),
+        _schedule(views, int(settings["steps"]), int(settings.get("first_step", 0))),
         *_arrays(views, origin),
         state,
         settings,
@@ -52,14 +52,17 @@ def fitter_of(
     )
 
 
-def _turns(views: Sequence[View], steps: int) -> list[tuple[int, int | None]]:
-    """How many steps of a round are of each view, and until which step; None is the last."""
+def _schedule(views: Sequence[View], steps: int, first: int) -> list[tuple[int, int | None]]:
+    """How many steps of a round are of each view, and the first step that is not of it any more.
+
+    None is for views that stay to the end. Steps are counted from 0; ``first`` is done first.
+    """
     photos = sum(view.weights is None for view in views)
     others = len(views) - photos
     if not photos:
         return [(1, None)] * others
     each = max(1, -(-PHOTO_STEPS * others // photos))
-    until = round((1.0 - PHOTOS_LAST) * steps)
+    until = first + round((1.0 - PHOTOS_LAST) * (steps - first))
     return [(each, None) if view.weights is None else (1, until) for view in views]
 
 

@@ -260,10 +260,10 @@ fn targets_from(
     images: &Bound<'_, PyList>,
     masks: &Bound<'_, PyList>,
     backgrounds: &[Option<[f32; 3]>],
-    turns: &[(u32, Option<u32>)],
+    schedule: &[(u32, Option<u32>)],
 ) -> PyResult<Vec<Target>> {
     for (name, entries) in
-        [("masks", masks.len()), ("backgrounds", backgrounds.len()), ("turns", turns.len())]
+        [("masks", masks.len()), ("backgrounds", backgrounds.len()), ("schedule", schedule.len())]
     {
         if images.len() != entries {
             return Err(PyValueError::new_err(format!(
@@ -292,8 +292,8 @@ fn targets_from(
             pixels: pixels.to_vec(),
             weights,
             background: backgrounds[i],
-            turns: turns[i].0,
-            until: turns[i].1,
+            turns: schedule[i].0,
+            until: schedule[i].1,
         };
         target.validate(i).map_err(to_python)?;
         targets.push(target);
@@ -314,13 +314,13 @@ impl Fitter {
     /// A fit of `state` to photos, each with its turns in a round of steps and the first step that is
     /// not of it; `holds` say where cameras are known to be, and how surely.
     #[new]
-    #[pyo3(signature = (images, masks, backgrounds, turns, viewmats, intrinsics, state, config, backend, holds=None))]
+    #[pyo3(signature = (images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, holds=None))]
     fn new<'py>(
         py: Python<'py>,
         images: &Bound<'py, PyList>,
         masks: &Bound<'py, PyList>,
         backgrounds: Vec<Option<[f32; 3]>>,
-        turns: Vec<(u32, Option<u32>)>,
+        schedule: Vec<(u32, Option<u32>)>,
         viewmats: &Bound<'py, PyAny>,
         intrinsics: &Bound<'py, PyAny>,
         state: &Bound<'py, PyDict>,
@@ -329,7 +329,7 @@ impl Fitter {
         holds: Option<&Bound<'py, PyDict>>,
     ) -> PyResult<Self> {
         let config = config_from(config)?;
-        let targets = targets_from(images, masks, &backgrounds, &turns)?;
+        let targets = targets_from(images, masks, &backgrounds, &schedule)?;
         let sizes: Vec<(u32, u32)> = targets.iter().map(|t| (t.width, t.height)).collect();
         let cameras = cameras(viewmats, intrinsics, &sizes)?;
         let camera_state = camera_state_from(state, cameras.len())?;

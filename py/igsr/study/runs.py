@@ -81,11 +81,11 @@ def finished_runs(
     """
     rows: dict[str, dict[str, Any]] = {}
     missing = []
-    scenes = {run.scene for run in runs if run.scene}
+    scenes = {run.scene for run in runs if run.scene is not None}
     hashes = {scene: folder_hash(Path(data) / scene) for scene in scenes}
 
     def about(run: Run) -> dict[str, Any]:
-        of = {"data": hashes[run.scene]} if run.scene else {}
+        of = {} if run.scene is None else {"data": hashes[run.scene]}
         return {"igsr": _core.__version__, "settings": run.settings | of}
 
     for run in runs:

@@ -49,10 +49,10 @@ pub struct Fitter {
     behind: Vec<Option<[f32; 3]>>,
     hull: Option<Hull>,
     extent: f32,
-    /// How often each photo comes in a round of steps, and until which step.
-    turns: Vec<(u32, Option<u32>)>,
-    /// The photos of a round as many as there are now, their order in this one, and the step that
-    /// rounds of these photos begin at.
+    /// How often each photo comes in a round of steps, and the first step that is not of it.
+    schedule: Vec<(u32, Option<u32>)>,
+    /// The photos of a round, of those that have not left, each as often as it comes; their order in
+    /// this one; and the step that rounds of these photos began at.
     round: Vec<usize>,
     order: Vec<usize>,
     rounds_from: u32,
@@ -120,7 +120,7 @@ impl Fitter {
         if targets.iter().all(|target| target.until.is_some()) {
             return Err(Error::argument("images", "has none that is fitted to until the end"));
         }
-        let turns = targets.iter().map(|target| (target.turns, target.until)).collect();
+        let schedule = targets.iter().map(|target| (target.turns, target.until)).collect();
         let hull = config.hull.then(|| Hull::new(&targets));
         device.set_targets(targets)?;
         let splats = state.splats.len();
@@ -139,7 +139,7 @@ impl Fitter {
             has_alpha,
             behind,
             hull,
-            turns,
+            schedule,
             round: Vec::new(),
             order: Vec::new(),
             rounds_from: 0,
@@ -207,13 +207,14 @@ impl Fitter {
     /// The photo of step `step` (from 0): every photo takes its turns in a round, in a new order each
     /// round. When some leave, a round of the others begins.
     fn view(&mut self, step: u32) -> usize {
-        let left = self.turns.iter().filter_map(|&(_, until)| until).filter(|&until| until <= step);
+        let left =
+            self.schedule.iter().filter_map(|&(_, until)| until).filter(|&until| until <= step);
         let from = left.max().unwrap_or(0);
         if self.round.is_empty() || from != self.rounds_from {
             self.rounds_from = from;
             self.order.clear();
             let stays = |until: Option<u32>| until.is_none_or(|until| until > step);
-            let staying = self.turns.iter().enumerate().filter(|(_, (_, until))| stays(*until));
+            let staying = self.schedule.iter().enumerate().filter(|(_, (_, until))| stays(*until));
             self.round = staying.flat_map(|(k, &(turns, _))| repeat_n(k, turns as usize)).collect();
         }
         let (n, step) = (self.round.len() as u32, step - from);
