@@ -22,6 +22,7 @@ from igsr.rendering import render
 BALL = scenes.splats(60)
 WHITE = (1.0, 1.0, 1.0)
 STEPS = 800
+SHIPPED_PHOTO_STEPS = fitter.PHOTO_STEPS
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -93,6 +94,16 @@ def test_rounds_that_help_are_accepted_and_make_views_better(helped):
     assert done == sorted(done)
     assert done[-1] <= 1.0
     assert {now.doing for now in seen} == {"fit", "look", "judge", "refit", "test"}
+
+
+def test_a_round_helps_with_as_many_steps_on_photos_as_igsr_has(capture, helped, monkeypatch):
+    monkeypatch.setattr(fitter, "PHOTO_STEPS", SHIPPED_PHOTO_STEPS)
+    refined = refine(capture, 1, truthful)
+    assert same(refined.first, helped[0].first)
+    (one,) = refined.rounds
+    assert one.accepted
+    assert not same(refined.splats, helped[0].rounds[0].splats)
+    assert one.test["psnr"] > refined.first_test["psnr"] + 0.1
 
 
 def test_everything_it_did_is_in_its_folder(helped):

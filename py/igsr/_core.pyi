@@ -209,9 +209,9 @@ class Fitter:
         ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
         ``backgrounds`` RGB that stood behind an image without alpha, or None, ``schedule`` how many
         steps of a round are of it, at least 1, and the first step that is not of it any more, or
-        None. ``viewmats`` are [V, 4, 4] relative to the splats'
-        origin, ``intrinsics`` [V, 4]. ``state`` is either the parameters to start from
-        (``SplatArrays`` without origin) or what ``state()`` returned. ``config``: steps, first_step
+        None. ``viewmats`` are [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4].
+        ``state`` is either the parameters to start from (``SplatArrays`` without origin) or what
+        ``state()`` returned. ``config``: steps, first_step
         (where in the schedule a fit begins), seed, sh_degree, max_splats, density, dropout, hull,
         background; poses ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate
         (pixels a step), camera_decay, camera_warm_up (part of the steps), frozen (splats stay as

@@ -55,7 +55,8 @@ def fitter_of(
 def _schedule(views: Sequence[View], steps: int, first: int) -> list[tuple[int, int | None]]:
     """How many steps of a round are of each view, and the first step that is not of it any more.
 
-    None is for views that stay to the end. Steps are counted from 0; ``first`` is done first.
+    None is for views that stay to the end. Steps are counted from 0; a fit that enters the schedule
+    late begins with ``first``.
     """
     photos = sum(view.weights is None for view in views)
     others = len(views) - photos
