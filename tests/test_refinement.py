@@ -145,13 +145,18 @@ def test_everything_it_did_is_in_its_folder(helped):
     assert np.abs(photo - after).mean() < np.abs(photo - before).mean()
 
 
-def test_a_round_that_does_not_help_is_rolled_back(capture, helped):
-    refined = refine(capture, "auto", lying)
+def test_a_round_that_does_not_help_is_rolled_back(capture, helped, tmp_path):
+    refined = refine(capture, "auto", lying, out=tmp_path)
     assert [one.accepted for one in refined.rounds] == [False]
     assert refined.stopped == "round 1 did not make photos that were left out better"
     assert refined.splats is refined.first
     assert same(refined.splats, helped[0].first)
     assert refined.rounds[0].splats is refined.rounds[0].test is None
+    page = (tmp_path / "report.html").read_text()
+    drawn = json.loads(page.split('id="cameras">')[1].split("</script>")[0])
+    looked_at = len(refined.rounds[0].chosen) + len(refined.rounds[0].passed)
+    kinds = [kind for kind, _ in drawn]
+    assert (kinds.count(0), kinds.count(1), kinds.count(2)) == (9, 0, looked_at)
 
 
 def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(capture, helped):
@@ -311,17 +316,39 @@ def test_what_masks_leave_out_is_not_learned(capture):
         (True, {}, "rounds must be a whole number"),
         (1, {"resume": True}, "resume needs out"),
         (1, {"backend": "reference"}, "backend reference renders but does not fit"),
-        (1, {"steps": 0}, "steps must be a whole number from 1, not 0"),
-        (1, {"steps": 2.9}, "steps must be a whole number from 1, not 2.9"),
+        (1, {"steps": 0}, "steps must be from 1 to 10000000, not 0"),
+        (1, {"steps": 20_000_000}, "steps must be from 1 to 10000000, not 20000000"),
+        (1, {"steps": 2.9}, "steps must be a whole number, not 2.9"),
         (1, {"steps": "many"}, "steps must be"),
+        (1, {"seed": -1}, "seed must be from 0 to"),
     ],
 )
-def test_bad_arguments(capture, rounds, options, message, monkeypatch):
+def test_bad_arguments(capture, rounds, options, message, monkeypatch, tmp_path):
+    earlier = tmp_path / "checkpoints/whole.npz"
+    earlier.parent.mkdir()
+    earlier.write_bytes(b"of an earlier run")
+    given = options if "resume" in options else {**options, "out": tmp_path}
     with pytest.raises(igsr.IgsrError, match=message):
-        refine(capture, rounds, truthful, **options)
+        refine(capture, rounds, truthful, **given)
+    assert earlier.is_file()
     monkeypatch.setattr(refinement, "_posed", lambda *_: pytest.fail("cameras are looked for"))
     with pytest.raises(igsr.IgsrError, match=message):
         refine("a folder", rounds, truthful, **options)
+
+
+def test_photos_that_cannot_be_fitted_or_scored_are_told_before_anything_is_done(
+    capture, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(refinement, "fit", lambda *_, **__: pytest.fail("it is fitted"))
+    earlier = tmp_path / "checkpoints/whole.npz"
+    earlier.parent.mkdir()
+    earlier.write_bytes(b"of an earlier run")
+    nothing = np.zeros((40, 40), np.bool_)
+    for split, message in (("train", "no pixel to fit"), ("test", "no pixel to score")):
+        views = [replace(v, mask=nothing) if v.split == split else v for v in capture.views]
+        with pytest.raises(igsr.IgsrError, match=message):
+            refine(igsr.Capture(capture.path, views), 1, truthful, out=tmp_path)
+    assert earlier.is_file()
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence(capture, tmp_path):
@@ -395,6 +422,9 @@ def test_photos_that_cannot_be_placed_are_left_out_with_a_warning(tmp_path, monk
     missing = sorted(path.name for path in (tmp_path / "photos").iterdir())[::2]
     assert report["not_placed"] == missing
     assert ", ".join(missing) in (tmp_path / "out/report.html").read_text()
+    some = igsr.Capture(first.capture.path, first.capture.views[:3])  # as with --photos 3
+    igsr.refine(some, 0, out=tmp_path / "some", steps=5, backend="cpu", denoiser=unsure)
+    assert json.loads((tmp_path / "some/report.json").read_text())["not_placed"] == missing
     (tmp_path / "photos" / missing[0]).unlink()
     with pytest.raises(igsr.IgsrError, match="has the cameras of other photos than"):
         igsr.refine(tmp_path / "photos", 1, **given, resume=True)

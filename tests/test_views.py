@@ -59,21 +59,36 @@ def test_a_ring_that_is_full_has_nothing_between():
     assert not any(view.between for view in unseen_views(BALL, known, 5, "cpu"))
 
 
-def test_no_view_stands_inside_or_behind_a_wall():
-    known = [scenes.ring_camera(0.0)]
-    free = unseen_views(BALL, known, 8, "cpu")
-    # A wall that begins right of the photo's picture, where views to that side would stand.
-    there = max((view.camera.centre for view in free), key=lambda centre: centre[0])
+def with_wall(at):
+    """The ball, and a piece of wall."""
     random = np.random.default_rng(0)
-    at = there * (1.0 - 0.5 * CLOSE) + random.uniform(-0.25, 0.25, (400, 3))
-    wall = igsr.Splats(
-        means=np.concatenate([BALL.means, at.astype(np.float32)]),
+    there = (at + random.uniform(-0.25, 0.25, (400, 3))).astype(np.float32)
+    return igsr.Splats(
+        means=np.concatenate([BALL.means, there]),
         quats=np.tile(np.float32([1, 0, 0, 0]), (440, 1)),
         scales=np.concatenate([BALL.scales, np.full((400, 3), -2.5, np.float32)]),
         opacities=np.full(440, 4.0, np.float32),
         sh=np.concatenate([BALL.sh, np.zeros((400, 4, 3), np.float32)]),
     )
-    left = unseen_views(wall, known, 8, "cpu")
+
+
+def test_what_is_too_near_goes_by_how_far_a_view_itself_is():
+    """Halfway between a camera at 2 and one at 10 a view is 6 away, whichever it is made from."""
+    known = [scenes.ring_camera(0.0, distance=2.0), scenes.ring_camera(0.9, distance=10.0)]
+    (free,) = (view for view in unseen_views(BALL, known, 20, "cpu") if view.between)
+    centre = free.camera.centre
+    assert np.linalg.norm(centre) == pytest.approx(6.0, rel=0.1)
+    for part, stays in ((0.8 * CLOSE, False), (1.3 * CLOSE, True)):
+        found = unseen_views(with_wall(centre * (1.0 - part)), known, 20, "cpu")
+        assert any(view.between for view in found) == stays
+
+
+def test_no_view_stands_inside_or_behind_a_wall():
+    known = [scenes.ring_camera(0.0)]
+    free = unseen_views(BALL, known, 8, "cpu")
+    # A wall that begins right of the photo's picture, where views to that side would stand.
+    there = max((view.camera.centre for view in free), key=lambda centre: centre[0])
+    left = unseen_views(with_wall(there * (1.0 - 0.5 * CLOSE)), known, 8, "cpu")
     assert any(np.allclose(view.camera.centre, there) for view in free)
     assert left
     assert not any(np.linalg.norm(view.camera.centre - there) < 0.2 for view in left)

@@ -88,15 +88,28 @@ def score_views(
     background: Sequence[float],
     backend: str = "auto",
 ) -> Iterator[ScoredView]:
-    """Render and score views one by one (so that only what the caller keeps stays in memory)."""
+    """Render and score views one by one (so that only what the caller keeps stays in memory).
+
+    Raises:
+        IgsrError: as ``check_masks``, before anything is rendered.
+    """
+    check_masks(views)
     for view in views:
         photo = over_background(view.image, background)
         picture = render(splats, view.camera, background, backend).to_uint8()
-        mask = view.mask
-        if mask is not None and not mask.any():
-            raise IgsrError(f"{view.name}: its mask leaves no pixel to score.")
-        scores = metrics.score(picture, photo, mask)
-        yield ScoredView(view.name, photo, picture, mask, scores)
+        scores = metrics.score(picture, photo, view.mask)
+        yield ScoredView(view.name, photo, picture, view.mask, scores)
+
+
+def check_masks(views: Sequence[View]) -> None:
+    """Find views that cannot be scored.
+
+    Raises:
+        IgsrError: a mask leaves no pixel to score.
+    """
+    for view in views:
+        if view.mask is not None and not view.mask.any():
+            raise IgsrError(f"{view.name}: its mask leaves no pixel to score; leave it out.")
 
 
 def evaluate(

@@ -40,6 +40,13 @@ CHECKPOINT_STEPS = 500
 CHECKPOINT_SECONDS = 20.0
 #: What reports say of a fit that went on from splats that it was given.
 GIVEN = "given"
+#: Least and most of what is a whole number.
+LIMITS = {
+    "steps": (1, 10_000_000),
+    "seed": (0, 2**63 - 1),
+    "sh_degree": (0, MAX_SH_DEGREE),
+    "max_splats": (1, 2**27),
+}
 #: Ways to control the number of splats.
 DENSITIES = ("mcmc", "original", "fixed")
 #: Whether cameras are fitted with the splats, and which of their focal lengths are.
@@ -439,6 +446,19 @@ def check_fits(backend: str) -> dict[str, str]:
         raise IgsrError(f"{error}.") from error
 
 
+def check_whole_number(name: str, value: object) -> None:
+    """Find a setting of ``LIMITS`` that no fit can have.
+
+    Raises:
+        IgsrError: it is no whole number, or out of its range.
+    """
+    low, high = LIMITS[name]
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise IgsrError(f"{name} must be a whole number, not {value!r}.")
+    if not low <= value <= high:
+        raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
+
+
 def _check_arguments(
     chosen: dict[str, Any],
     seed: object,
@@ -447,17 +467,9 @@ def _check_arguments(
     resume: bool,
     warm: Splats | None,
 ) -> None:
-    limits: list[tuple[str, object, int, int]] = [
-        ("steps", chosen["steps"], 1, 10_000_000),
-        ("seed", seed, 0, 2**63 - 1),
-        ("sh_degree", chosen["sh_degree"], 0, MAX_SH_DEGREE),
-        ("max_splats", chosen["max_splats"], 1, 2**27),
-    ]
-    for name, value, low, high in limits:
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-            raise IgsrError(f"{name} must be a whole number, not {value!r}.")
-        if not low <= value <= high:
-            raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
+    check_whole_number("seed", seed)
+    for name in ("steps", "sh_degree", "max_splats"):
+        check_whole_number(name, chosen[name])
     for name, choices in (
         ("density", DENSITIES),
         ("start", STARTS if warm is None else (GIVEN,)),

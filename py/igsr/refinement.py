@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,13 +32,15 @@ from .denoiser import (
 from .errors import IgsrError
 from .evaluation import (
     METRICS,
+    check_masks,
     default_background,
     evaluate,
     known_background,
     score_views,
 )
-from .fitting import Progress, check_fits, fit
+from .fitting import Progress, check_fits, check_whole_number, fit
 from .halved import halved
+from .photo_checks import check_photos
 from .pose import AUTO, estimate_poses, found_before, kept_cameras, photos_note
 from .presets import preset_settings
 from .refinement_report import seconds_so_far, write_refinement
@@ -47,7 +50,7 @@ from .views import UnseenView, unseen_views
 
 #: Unseen views rendered in a round, and how many of them are added at most.
 CANDIDATES, CHOSEN = 24, 16
-#: Fewer photos are not judged: each fold needs two to fit.
+#: With fewer photos there is no round to be judged: each fold needs two to fit.
 FEWEST = 3
 #: Each of two folds leaves out one photo in so many. With more left out, cleaning helps the folds'
 #: fits, which are worse, where it helps no whole one.
@@ -127,8 +130,9 @@ class Refined:
         rounds: those that were tried, in order; only the last can be one that was not accepted.
         stopped: why there was no further round; empty while there may be one.
         passed: views that were looked at for a round that then was not begun.
-        seconds: that each part took, by the names of ``RefineProgress.doing``, with what earlier
-            calls took that this one went on from.
+        seconds: that each part but finding cameras took, by the names of
+            ``RefineProgress.doing``, with what earlier calls took by the report that this one
+            went on from.
     """
 
     splats: Splats
@@ -212,11 +216,17 @@ def refine(
         IgsrError: an argument cannot be used, photos lie in ``out/capture``, or as ``igsr.fit`` and
             ``igsr.estimate_poses``.
     """
-    check_arguments(rounds, steps, backend, out, resume)
-    capture = photos if isinstance(photos, Capture) else _posed(photos, out, resume, seed, progress)
-    loop = _Loop(
-        capture, rounds, progress, steps, backend, seed, denoiser, out, resume, look, choose, judge
+    started = time.monotonic()
+    check_arguments(rounds, steps, backend, seed, out, resume)
+    capture = (
+        photos
+        if isinstance(photos, Capture)
+        else _posed(photos, out, resume, seed, progress, started)
     )
+    loop = _Loop(
+        capture, rounds, progress, steps, backend, seed, denoiser, out, resume, look, choose, judge,
+        started,
+    )  # fmt: skip
     whole = loop.fitted("whole", capture.train_views)
     first, first_test = whole.splats, loop.tested(whole.splats)
     folds: list[_Fold] = []
@@ -275,10 +285,11 @@ def check_arguments(
     rounds: int | str,
     steps: int | None,
     backend: str,
+    seed: int,
     out: str | os.PathLike[str] | None,
     resume: bool,
 ) -> None:
-    """Find what cannot be used before cameras are looked for.
+    """Find what cannot be used before cameras are looked for, or an earlier run's fits removed.
 
     Raises:
         IgsrError: an argument of ``refine`` cannot be used.
@@ -288,8 +299,9 @@ def check_arguments(
         raise IgsrError(f'rounds must be a whole number or "auto", not {rounds!r}.')
     if isinstance(rounds, int) and rounds < 0:
         raise IgsrError(f"rounds must not be negative, not {rounds}.")
-    if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool) or steps < 1):
-        raise IgsrError(f"steps must be a whole number from 1, not {steps!r}.")
+    if steps is not None:
+        check_whole_number("steps", steps)
+    check_whole_number("seed", seed)
     check_fits(backend)
     if resume and out is None:
         raise IgsrError("resume needs out, the folder to go on from.")
@@ -301,6 +313,7 @@ def _posed(
     resume: bool,
     seed: int,
     progress: Callable[[RefineProgress], bool | None] | None,
+    started: float,
 ) -> Capture:
     """Photos with cameras. What is fitted is what lies in ``out``, so that resuming finds it."""
 
@@ -309,7 +322,6 @@ def _posed(
         if progress is not None and progress(RefineProgress(0, "pose", 0.0, seconds)) is False:
             raise IgsrError(STOPPED)
 
-    started = time.monotonic()
     if out is None or holds_cameras(photos):
         return estimate_poses(photos, seed=seed, progress=told)
     kept = kept_cameras(Path(photos), Path(out))
@@ -345,15 +357,17 @@ class _Loop:
         look: Look,
         choose: Choose,
         judge: bool,
+        started: float,
     ) -> None:
         self.rounds = MOST_ROUNDS if isinstance(rounds, str) else rounds
         if not capture.train_views:
             raise IgsrError(f"{capture.path} has no train views to fit.")
-        self.capture, self.backend, self.seed = capture, backend, seed
+        self.capture, self.backend, self.seed = capture, backend, int(seed)
         self.denoiser = denoiser or round_denoiser()
         self.background = default_background(capture)
         self.behind = known_background(capture.views)
         views = capture.train_views
+        _check_views(views, capture.test_views)
         # All fits have those of the first: a fold's fewer photos are to be fitted as all of them.
         settings = preset_settings("default", len(views), steps=steps)
         self.settings = {
@@ -370,7 +384,7 @@ class _Loop:
                 _remove_checkpoints(self.out)
         self.progress = progress
         self.look, self.choose, self.fewest = look, choose, FEWEST if judge else 1
-        self.started = self.noted = time.monotonic()
+        self.started, self.noted = started, time.monotonic()
         self.seconds = seconds_so_far(self.out) if resume and self.out is not None else {}
         # In units of a whole fit.
         self.folded, self.fold_share = _folded(views)
@@ -514,6 +528,14 @@ class _Loop:
         done = min(1.0, (self.done + doing_done) / self.all)
         seconds = now - self.started
         return self.progress(RefineProgress(self.round, doing, done, seconds)) is not False
+
+
+def _check_views(photos: list[View], tests: list[View]) -> None:
+    """Find what cannot be fitted or scored before anything of an earlier run is removed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the first fit warns
+        check_photos(photos)
+    check_masks(tests)
 
 
 def _folded(photos: Sequence[View]) -> tuple[list[View], float]:

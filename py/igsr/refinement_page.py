@@ -20,7 +20,10 @@ from .selection import LEAST_TRUST, LEAST_WORTH, Passed
 from .views import UnseenView
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from .refinement import Refined, Round
+    from .selection import Candidate
 
 #: Longest side of pictures on the page, pixels.
 THUMBNAIL, PICTURE = 160, 320
@@ -194,7 +197,7 @@ def _cameras(refined: Refined) -> str:
     centres = np.stack([camera.centre for camera in (*known, *added)])
     middle = centres.mean(axis=0)
     size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-9)
-    others = [one.view.camera for one in _last_passed(refined)]
+    others = [one.view.camera for one in _last_not_added(refined)]
     drawn = [
         (kind, np.round((_frustum(camera, 0.18 * size) - middle) / size, 4).tolist())
         for kind, cameras in ((2, others), (0, known), (1, added))
@@ -247,8 +250,12 @@ def _round(number: int, one: Round) -> str:
     return "".join(out) + "</div>" + _table_of_passed(one.passed)
 
 
-def _last_passed(refined: Refined) -> list[Passed]:
-    return refined.passed or (refined.rounds[-1].passed if refined.rounds else [])
+def _last_not_added(refined: Refined) -> Sequence[Candidate | Passed]:
+    """Views that were looked at last; those of a round that was rolled back with the others."""
+    if refined.passed or not refined.rounds:
+        return refined.passed
+    last = refined.rounds[-1]
+    return last.passed if last.accepted else [*last.passed, *last.chosen]
 
 
 def _not_begun(refined: Refined) -> str:
@@ -275,8 +282,8 @@ def _table_of_passed(some: list[Passed]) -> str:
 
 
 def _place(view: UnseenView) -> str:
-    where = "between photos" if view.between else "beyond the photos"
-    return f"{view.angle:.0f}° away, {where}"
+    where = "between" if view.between else "beyond"
+    return f"{view.angle:.0f}° from the nearest known view, {where} known ones"
 
 
 def _timings(report: dict[str, Any]) -> str:

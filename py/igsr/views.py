@@ -42,7 +42,8 @@ class UnseenView:
     """A camera that no photo was taken from.
 
     Attributes:
-        camera: pinhole camera with the size and focal length of the known camera it is nearest to.
+        camera: pinhole camera with the size and focal length of the known camera that it was
+            turned away from.
         angle: degrees to the nearest known camera, about what that looks at.
         between: whether it lies between known cameras and not beyond them.
     """
@@ -78,10 +79,10 @@ def unseen_views(
     found: list[tuple[UnseenView, float]] = []
     for k, (camera, distance) in enumerate(looking):
         others = [one for i, (one, _) in enumerate(looking) if i != k]
-        for candidate, between in _neighbourhood(camera, distance, others):
+        for candidate, reach, between in _neighbourhood(camera, distance, others):
             angle = float(_angles(targets, centres, candidate.centre).min())
             if angle >= SEEN * STEP:
-                found.append((UnseenView(candidate, angle, between), distance))
+                found.append((UnseenView(candidate, angle, between), reach))
     chosen: list[UnseenView] = []
     for between in (True, False):
         group = [pair for pair in found if pair[0].between == between]
@@ -92,13 +93,13 @@ def unseen_views(
         )
         while len(chosen) < count and len(apart) and apart.max() >= SEEN * STEP:
             best = int(np.argmax(apart))
-            view, distance = group[best]
+            view, reach = group[best]
             apart[best] = 0.0
-            if not _is_outside(splats, view.camera, distance, backend):
+            if not _is_outside(splats, view.camera, reach, backend):
                 continue
             chosen.append(view)
-            for i, (other, reach) in enumerate(group):
-                target = _target(other.camera, reach)
+            for i, (other, its_reach) in enumerate(group):
+                target = _target(other.camera, its_reach)
                 away = _angles(target, other.camera.centre, view.camera.centre)
                 apart[i] = min(apart[i], float(away))
     return chosen
@@ -106,16 +107,16 @@ def unseen_views(
 
 def _neighbourhood(
     camera: Camera, distance: float, others: Sequence[Camera]
-) -> list[tuple[Camera, bool]]:
-    """Cameras around one, and whether each lies between it and another."""
+) -> list[tuple[Camera, float, bool]]:
+    """Cameras around one, how far each is from what it looks at, and whether it is between."""
     out = []
     for other in others:
         gap = _angle(camera, other, distance)
         if STEP < gap <= GAP:
-            out.append((_towards(camera, other, distance, 0.5), True))
+            out.append((*_towards(camera, other, distance, 0.5), True))
     for k in range(COMPASS):
         turn = 2.0 * np.pi * k / COMPASS
-        out.append((_leaning(camera, distance, np.cos(turn), np.sin(turn)), False))
+        out.append((_leaning(camera, distance, np.cos(turn), np.sin(turn)), distance, False))
     return out
 
 
@@ -134,8 +135,8 @@ def _leaning(camera: Camera, distance: float, right: float, down: float) -> Came
     return _looking(camera, target + distance * moved, target, rotation[1])
 
 
-def _towards(camera: Camera, other: Camera, distance: float, part: float) -> Camera:
-    """A camera on the arc from one to another, about what the first looks at."""
+def _towards(camera: Camera, other: Camera, distance: float, part: float) -> tuple[Camera, float]:
+    """A camera on the arc from one to another, about what the first looks at, and how far off."""
     target = _target(camera, distance)
     there = other.centre - target
     far = float(np.linalg.norm(there))
@@ -145,7 +146,7 @@ def _towards(camera: Camera, other: Camera, distance: float, part: float) -> Cam
     direction = (weights[0] * start + weights[1] * end) / np.sin(angle)
     reach = (1.0 - part) * distance + part * far
     down = (1.0 - part) * camera.viewmat[1, :3] + part * other.viewmat[1, :3]
-    return _looking(camera, target + reach * direction, target, down)
+    return _looking(camera, target + reach * direction, target, down), reach
 
 
 def _looking(camera: Camera, centre: Float64, target: Float64, down: Float64) -> Camera:

@@ -91,7 +91,7 @@ def refine_command(
     ):
         name = resolved(backend)
         most = _rounds(rounds)
-        check_arguments(most, steps, name, out, resume)
+        check_arguments(most, steps, name, seed, out, resume)
         denoiser = round_denoiser(weights)
         with warnings_as_sentences():
             capture, _ = capture_to_fit(

@@ -50,9 +50,17 @@ def found_before(photos: Path, kept: Path) -> bool:
 
 
 def not_placed(capture: Capture) -> list[str]:
-    """Names of photos that no camera was found for, if cameras had to be found."""
+    """Names of photos that no camera was found for, if cameras had to be found.
+
+    A capture may have fewer views than were placed: what was is kept beside its cameras.
+    """
     given = _given(capture.path) or {}
-    placed = {_without_suffix(view.name) for view in capture.views}
+    photos = capture.path / "images"
+    placed = {
+        path.relative_to(photos).with_suffix("").as_posix()
+        for path in photos.rglob("*")
+        if path.is_file()
+    }
     return [
         name
         for name in given
@@ -62,7 +70,7 @@ def not_placed(capture: Capture) -> list[str]:
 
 
 def _without_suffix(name: str) -> str:
-    return PurePosixPath(name.removeprefix("images/")).with_suffix("").as_posix()
+    return PurePosixPath(name).with_suffix("").as_posix()
 
 
 def _given(kept: Path) -> dict[str, int] | None:

@@ -187,7 +187,8 @@ def run_refinement(given: Given, data: str, one: Refinement) -> dict[str, Any]:
     methods: dict[str, Any] = {}
     for how in given.methods:
         out = folder / how.name
-        _share_fits(folder / given.methods[0].name, out)
+        for earlier in given.methods[: given.methods.index(how)]:
+            _share_fits(folder / earlier.name, out)
         refined = _refined(photos, candidates, how, given, one, distance, out)
         first = first or scored(refined.first, folder / "first.png")
         rows = [{**first, "splats": len(refined.first), "accepted": True}]
@@ -445,7 +446,6 @@ def studied(
         "title": title,
         "igsr": _core.__version__,
         "protocol": {
-            "held_out": HELD_OUT,
             "seeds": seeds,
             "backend": backend,
             "near": NEAR,
