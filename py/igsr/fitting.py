@@ -118,7 +118,7 @@ def fit(
 
     Args:
         capture: photos and cameras; masked pixels do not count. Views with weights are no photos:
-            five steps are on photos for one on such a view, and the last fifth of all.
+            at least five steps are on photos for one on such a view, and the last fifth of all.
         steps: optimiser steps, each on one photo; None, here and below, is what the preset says.
         progress: called about five times a second, with step 0 while cameras are looked for
             roughly; returning False ends the fit early, with the splats as they are then.

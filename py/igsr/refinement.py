@@ -203,9 +203,10 @@ def refine(
         backend: "auto", "cpu" or "gpu".
         seed: of everything random; same seed, same bits.
         denoiser: what cleans; None is ``round_denoiser()``.
-        out: folder for ``scene.ply``, ``rounds/``, ``report.json`` and ``report.html``
-            (``igsr.refinement_report``), written after every round, ``checkpoints/``, and
-            ``capture/`` with cameras that had to be found; None writes nothing.
+        out: folder for ``scene.ply``, ``cameras.json``, ``rounds/``, ``views.png``,
+            ``report.json`` and ``report.html`` (``igsr.refinement_report``), written after every
+            round, ``checkpoints/``, and ``capture/`` with cameras that had to be found; None
+            writes nothing.
         resume: go on from the checkpoints in ``out``, to the same end; what lies there is left as
             it is until there is more. Without, checkpoints of an earlier run are removed.
         look: where to look from; the paper's experiments have cameras that are given.

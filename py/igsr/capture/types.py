@@ -70,8 +70,8 @@ class View:
             and what undistortion could fill, joined.
         weights: float32 [H, W], how much each pixel counts in fits beside a photo's, finite and
             not negative, or None where all count 1. Only pictures that are not photos have them:
-            fits go by the photos, have five steps on those for one on such pictures, and the
-            last fifth of the steps on photos alone.
+            fits go by the photos, have at least five steps on those for one on such a picture, and
+            the last fifth of the steps on photos alone.
         background: RGB in [0, 1] that stood behind what ``image`` shows without alpha, where that
             is known: fits compare it to renders over that. None for photos.
 
