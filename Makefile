@@ -98,6 +98,7 @@ check-python: build vulkan browser $(VENV)/.dev-ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 	$(BIN)/python -m pytest
 
 # The GPU kernels are tested on whatever device answers; where none does, on Mesa's software one.

@@ -21,9 +21,9 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from pointmaps import PointmapScene, all_pairs
 
+from igsr.geometry.pose_errors import pose_errors
 from igsr.pose.alignment import align
-from igsr.pose.alignment.alignment import STEPS
-from igsr.poses import pose_errors
+from igsr.pose.alignment.global_alignment import STEPS
 
 
 def main() -> None:

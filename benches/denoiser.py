@@ -31,7 +31,7 @@ from igsr.denoiser import (
     warp_photos,
 )
 from igsr.denoiser.inputs import PHOTOS, network_inputs
-from igsr.rendering import render
+from igsr.rendering.renders import render
 
 BACKGROUND = (1.0, 1.0, 1.0)
 

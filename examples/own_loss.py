@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 import igsr
-from igsr.evaluation import default_split
-from igsr.initialization import initial_splats
+from igsr.evaluation.scores import default_split
+from igsr.fitting.initialization.initial_splats import initial_splats
 
 RATES = {"means": 2e-3, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh": 2.5e-3}
 EPSILON = 1e-3

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from igsr.denoiser.perceptual import _FIRES
+from igsr.denoiser.training.perceptual_distance import _FIRES
 
 
 def squeezenet_file(path):

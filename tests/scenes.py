@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from igsr.capture import Camera, Capture, View
-from igsr.rendering import render
+from igsr.rendering.renders import render
 from igsr.splats import Splats
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from igsr.denoiser.inputs import CHANNELS
-from igsr.denoiser.pair_files import Pairs
+from igsr.denoiser.training.pair_files import Pairs
 from igsr.study.artifact_likeness import NAMES, OCTAVES, likeness, plot_likeness, signatures
 
 

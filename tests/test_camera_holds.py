@@ -10,9 +10,9 @@ import scenes
 from made_up_tracks import projected, tracked
 
 import igsr
-from igsr.camera_holds import LEAST_ERROR, LEFT_OPEN, camera_holds
 from igsr.capture import Capture, View
-from igsr.poses import pose_errors
+from igsr.fitting.pose_priors import LEAST_ERROR, LEFT_OPEN, camera_holds
+from igsr.geometry.pose_errors import pose_errors
 
 COUNT = 4
 XYZ = np.random.default_rng(1).normal(scale=0.4, size=(30, 3))

@@ -9,7 +9,8 @@ import pycolmap
 import pytest
 from capture_files import HEIGHT, MODEL_PARAMS, WIDTH, photo, save, write_colmap
 
-from igsr.capture import colmap, load_capture
+from igsr.capture import load_capture
+from igsr.capture import read_colmap as colmap
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
 

@@ -13,7 +13,7 @@ from capture_files import photo, random_viewmats, save
 from capture_files import write_colmap as write_with_pycolmap
 from PIL import Image
 
-from igsr.atomic_write import atomic_folder
+from igsr._internal.atomic_write import atomic_folder
 from igsr.capture import Camera, Capture, Points, View, load_capture
 from igsr.capture.types import Tracks, intrinsic_matrix
 from igsr.capture.write_colmap import quaternion, write_colmap

@@ -19,7 +19,7 @@ from PIL import Image
 
 import igsr
 from igsr.cli.shared import PresetChoice
-from igsr.presets import PRESETS
+from igsr.fitting.presets import PRESETS
 
 COMMAND = [sys.executable, "-m", "igsr.cli"]
 FIT = ["--steps", "60", "--max-splats", "300", "--sh-degree", "1", "--backend", "cpu"]
@@ -395,7 +395,7 @@ def test_missing_adapter_is_a_sentence(capture_path, tmp_path):
 
 
 def test_study_few_photos(igsr_here, tmp_path, monkeypatch):
-    from igsr.study import fits
+    from igsr.study import scored_fits as fits
 
     scenes.write_capture(tmp_path / "leaf", scenes.capture(views=10, size=16))
 

@@ -12,8 +12,8 @@ from PIL import Image
 
 import igsr
 from igsr.capture.undistort import Lens
+from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose import registry
-from igsr.pose.accuracy import pose_accuracy
 from igsr.pose.estimate import Estimate
 
 MADE = scenes.capture(views=6, size=40)

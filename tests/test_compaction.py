@@ -11,9 +11,9 @@ import pytest
 import scenes
 
 import igsr
-from igsr import metrics
 from igsr.compaction import contribution, yardstick
 from igsr.compaction.yardstick import loss_of_change, own_yardstick, photo_yardstick
+from igsr.evaluation import metrics
 
 
 def wall(count=2000, seed=0):

@@ -14,17 +14,11 @@ from feature_files import squeezenet_file
 
 import igsr
 from igsr.capture import Camera
-from igsr.denoiser import (
-    Buffers,
-    NetworkDenoiser,
-    cleaning,
-    denoise,
-    load_network,
-    save_network,
-)
+from igsr.denoiser import Buffers, NetworkDenoiser, cleaning, denoise, load_network, save_network
 from igsr.denoiser.cleaning import DOUBT, UNSEEN_CHANGE
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
-from igsr.denoiser.losses import (
+from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetwork
+from igsr.denoiser.training.losses import (
     LOSSES,
     Loss,
     Prediction,
@@ -34,12 +28,11 @@ from igsr.denoiser.losses import (
     squared_ratio,
     structure_ratio,
 )
-from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetwork
-from igsr.denoiser.pair_files import Pairs, read_pairs, write_pairs
-from igsr.denoiser.pairs import capture_of_pairs
-from igsr.denoiser.perceptual import SqueezeNetDistance, _Lpips, lpips_distance
-from igsr.denoiser.plot import plot_training
-from igsr.denoiser.training import (
+from igsr.denoiser.training.pair_files import Pairs, read_pairs, write_pairs
+from igsr.denoiser.training.pairs import capture_of_pairs
+from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance, _Lpips, lpips_distance
+from igsr.denoiser.training.plot_training import plot_training
+from igsr.denoiser.training.train import (
     CHECKPOINT,
     LOG,
     RIGHT,
@@ -51,7 +44,7 @@ from igsr.denoiser.training import (
     train,
 )
 from igsr.denoiser.warping import Source
-from igsr.rendering import Render
+from igsr.rendering.renders import Render
 
 SMALL = Architecture(width=4, blocks=(1, 1, 1))
 

@@ -14,7 +14,6 @@ from igsr.denoiser import (
     Buffers,
     Source,
     Warped,
-    pairs,
     photo_sources,
     photo_support,
     render_buffers,
@@ -22,11 +21,12 @@ from igsr.denoiser import (
     warping,
 )
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
-from igsr.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
-from igsr.denoiser.pair_renders import rendered_pairs
-from igsr.denoiser.pairs import FITTED_RENDERED, make_pairs
+from igsr.denoiser.training import pairs
+from igsr.denoiser.training.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
+from igsr.denoiser.training.pair_renders import rendered_pairs
+from igsr.denoiser.training.pairs import FITTED_RENDERED, make_pairs
 from igsr.denoiser.warping import CONSIDERED
-from igsr.evaluation import BLACK
+from igsr.evaluation.scores import BLACK
 
 
 def camera(x=0.0, size=32, focal=40.0):
@@ -377,7 +377,7 @@ def test_bad_arguments_of_pairs(tmp_path, options, message):
 
 def test_pairs_can_be_imported_first():
     """Studies make pairs too; neither may need the other to be there already."""
-    subprocess.run([sys.executable, "-c", "import igsr.denoiser.pairs"], check=True)
+    subprocess.run([sys.executable, "-c", "import igsr.denoiser.training.pairs"], check=True)
 
 
 def test_a_large_picture_is_looked_up_in_bands_of_rows(monkeypatch):

@@ -15,14 +15,15 @@ from igsr.capture import Camera, load_capture
 from igsr.capture.photo_folder import Photo
 from igsr.capture.write_colmap import write_colmap
 from igsr.errors import IgsrError
+from igsr.geometry.pose_errors import pose_errors
+from igsr.geometry.similarity import similarity_between
 from igsr.pose import registry
 from igsr.pose.alignment import TRUSTED, Grid, PairPrediction
 from igsr.pose.dust3r import estimator as estimator_module
 from igsr.pose.dust3r.dense_depth import with_dense_depth
 from igsr.pose.dust3r.estimator import Dust3r
 from igsr.pose.dust3r.prediction import DenseGrid, DensePrediction, DustPredictor
-from igsr.poses import pose_errors, similarity_between
-from igsr.rendering import render
+from igsr.rendering.renders import render
 
 COUNT, SIZE, STEP = 4, 48, 2
 #: A photo's grid leaves out its border, as cropping to patches does.

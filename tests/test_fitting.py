@@ -18,8 +18,9 @@ import pytest
 import scenes
 
 import igsr
-from igsr import fitting, metrics
-from igsr.checkpoint import load_checkpoint, save_checkpoint
+from igsr.evaluation import metrics
+from igsr.fitting import run as fitting
+from igsr.fitting.checkpoint import load_checkpoint, save_checkpoint
 
 STEPS = 420  # density control runs at 300 and every 100 from then on
 

@@ -6,7 +6,7 @@ import numpy as np
 import scenes
 
 from igsr.capture import View
-from igsr.halved import halved
+from igsr.capture.downscaling import halved
 
 
 def view(image, mask=None):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from igsr import metrics
+from igsr.evaluation import metrics
 
 
 def picture(seed=0, height=40, width=52):

@@ -11,7 +11,7 @@ import scenes
 
 import igsr
 from igsr.capture import Camera, Capture
-from igsr.photo_checks import check_photos
+from igsr.capture.photo_checks import check_photos
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from igsr.capture import Camera, View
-from igsr.plane_sweep import DEPTHS, _most_alike, can_sweep, swept_points
+from igsr.fitting.initialization.plane_sweep import DEPTHS, _most_alike, can_sweep, swept_points
 
 SIZE, FOCAL, DEPTH = 64, 80.0, 4.0
 #: The wall moves by 8 pixels from photo to photo, and photos are compared at whole pixels.

@@ -12,14 +12,15 @@ import scenes
 import torch
 
 import igsr
-from igsr import presets
 from igsr.capture import Capture
 from igsr.denoiser.inputs import CHANNELS
 from igsr.denoiser.network import Architecture, DenoiserNetwork
-from igsr.denoiser.pair_files import Pairs, write_pairs
+from igsr.denoiser.training.pair_files import Pairs, write_pairs
 from igsr.denoiser.weights import save_network
-from igsr.study import denoiser_table, poor_fits
-from igsr.study.poor_fits import Cleaning, PoorFit, poor_capture, run_cleaning, scenes_in
+from igsr.fitting import presets
+from igsr.study import denoiser_comparison as poor_fits
+from igsr.study import denoiser_table
+from igsr.study.denoiser_comparison import Cleaning, PoorFit, poor_capture, run_cleaning, scenes_in
 
 SMALL = Architecture(4, (1, 0, 0))
 

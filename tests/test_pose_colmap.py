@@ -16,8 +16,8 @@ from igsr import pose
 from igsr.capture import Camera, Capture, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.write_transforms import write_transforms
+from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose import colmap, registry
-from igsr.pose.accuracy import pose_accuracy
 from igsr.pose.colmap import Colmap
 from igsr.pose.estimate import Estimate
 
@@ -50,7 +50,7 @@ def test_cameras_and_points_are_right(found: Estimate) -> None:
         assert camera.K[:2, 2].tolist() == [120.0, 90.0]
     assert not any(found.lenses)  # there is no distortion, and none is made up
     # In the true world, the points lie on the walls.
-    to_true = igsr.poses.similarity_between(found.cameras, CAMERAS)
+    to_true = igsr.geometry.similarity.similarity_between(found.cameras, CAMERAS)
     xyz = to_true.scale * found.points.xyz @ to_true.rotation.T + to_true.translation
     off = [
         np.abs(xyz @ np.array(normal) - offset) / np.linalg.norm(normal)
@@ -258,7 +258,9 @@ def test_accuracy_by_hand() -> None:
     # One pair is right for all of 30 thresholds, two for those from 11 degrees.
     assert accuracy["mAA@30"] == pytest.approx((1 + 2 * 20 / 30) / 3)
     # A world of another scale and frame changes nothing.
-    pose_of_world = igsr.poses.Similarity(3.0, turn[:3, :3], np.array([1.0, 2.0, 3.0]))
+    pose_of_world = igsr.geometry.similarity.Similarity(
+        3.0, turn[:3, :3], np.array([1.0, 2.0, 3.0])
+    )
     moved = [pose_of_world.camera(camera) for camera in true]
     exact = pose_accuracy(moved, true)
     assert exact["mAA@30"] == 1.0

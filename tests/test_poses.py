@@ -13,10 +13,13 @@ from typer.testing import CliRunner
 import igsr
 from igsr.capture import Capture
 from igsr.cli import app
-from igsr.evaluation import BLACK
-from igsr.poses import Similarity, pose_errors, refine_cameras, similarity_between
+from igsr.evaluation.scores import BLACK
+from igsr.fitting.pose_refinement import refine_cameras
+from igsr.geometry.camera_noise import Noise, noise_unit, noisy_view
+from igsr.geometry.pose_errors import pose_errors
+from igsr.geometry.similarity import Similarity, similarity_between
 from igsr.study import noisy_poses, pose_noise
-from igsr.study.noisy_poses import CLEAN, Noise, PoseFit, compared, noise_unit, noisy_view, run_fit
+from igsr.study.noisy_poses import CLEAN, PoseFit, compared, run_fit
 from igsr.study.noisy_poses import markdown as pose_table
 
 
@@ -403,7 +406,7 @@ def test_the_study_compares_what_the_protocol_says(data, tmp_path, monkeypatch):
 
 
 def test_a_real_fit_of_the_study(data, monkeypatch):
-    from igsr import presets
+    from igsr.fitting import presets
 
     short = presets.Preset(40, 300, 0, "fixed", 0.2, True, "auto")
     monkeypatch.setattr(presets, "_FEW", short)

@@ -13,8 +13,8 @@ from made_up_tracks import tracked
 import igsr
 from igsr.capture import Points
 from igsr.capture.types import Tracks
-from igsr.initialization import chosen_start, initial_splats
-from igsr.presets import FEW_PHOTOS, preset_settings
+from igsr.fitting.initialization.initial_splats import chosen_start, initial_splats
+from igsr.fitting.presets import FEW_PHOTOS, preset_settings
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_default_follows_the_number_of_photos_and_gives_way_to_the_caller():
 
 
 def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
-    from igsr.checkpoint import load_checkpoint
+    from igsr.fitting.checkpoint import load_checkpoint
 
     igsr.fit(capture, steps=3, backend="cpu", checkpoint=tmp_path / "a.npz")
     _, settings = load_checkpoint(tmp_path / "a.npz")
@@ -135,7 +135,7 @@ def test_starts(capture):
 
 def test_a_start_prefers_points_that_photos_agree_on(capture):
     """Of the hull's points those near the surface; any number of photos will do."""
-    from igsr.initialization import _disagreement
+    from igsr.fitting.initialization.initial_splats import _disagreement
 
     agreed = np.full((4, 1, 3), 0.5, np.float32)
     occluded = agreed.copy()
@@ -155,7 +155,7 @@ def test_a_start_prefers_points_that_photos_agree_on(capture):
 
 
 def test_unsure_points_start_faint_and_large(capture):
-    from igsr.initialization import SURE_OPACITY, UNSURE_OPACITY, UNSURE_SIZE
+    from igsr.fitting.initialization.initial_splats import SURE_OPACITY, UNSURE_OPACITY, UNSURE_SIZE
 
     random = np.random.default_rng(0)
     xyz, rgb = random.normal(size=(200, 3)), np.full((200, 3), 128, dtype=np.uint8)

@@ -13,11 +13,12 @@ import scenes
 from PIL import Image
 
 import igsr
-from igsr import fitter, presets, refinement
+from igsr.fitting import fitter, presets
 from igsr.pose import registry
 from igsr.pose.estimate import Estimate
-from igsr.refinement_report import seconds_so_far
-from igsr.rendering import render
+from igsr.refinement import loop as refinement
+from igsr.refinement.report import seconds_so_far
+from igsr.rendering.renders import render
 
 BALL = scenes.splats(60)
 WHITE = (1.0, 1.0, 1.0)

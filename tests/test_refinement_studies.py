@@ -13,15 +13,16 @@ import torch
 from feature_files import squeezenet_file
 
 import igsr
-from igsr import presets, study
+from igsr import study
 from igsr.capture import Capture
 from igsr.denoiser.network import Architecture, DenoiserNetwork
 from igsr.denoiser.weights import save_network
-from igsr.selection import Candidate
-from igsr.study import refinements
-from igsr.study.refinements import METHODS, Refinement, split
-from igsr.study.views import localized, scattered
-from igsr.views import UnseenView
+from igsr.fitting import presets
+from igsr.refinement.novel_views import UnseenView
+from igsr.refinement.selection import Candidate
+from igsr.study import loop_runs as refinements
+from igsr.study.loop_runs import METHODS, Refinement, split
+from igsr.study.splits import localized, scattered
 
 BALL = scenes.splats(60)
 

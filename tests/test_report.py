@@ -11,10 +11,11 @@ import scenes
 from PIL import Image
 
 import igsr
-from igsr import metrics
-from igsr.atomic_write import atomic_write
-from igsr.evaluation import ScoredView, over_background
-from igsr.report import contact_sheet, error_picture, sheet_names, write_report
+from igsr._internal.atomic_write import atomic_write
+from igsr._internal.json_file import write_json
+from igsr.evaluation import metrics
+from igsr.evaluation.contact_sheet import contact_sheet, error_picture, sheet_names
+from igsr.evaluation.scores import ScoredView, over_background
 
 
 def test_the_true_scene_scores_perfectly_and_another_does_not():
@@ -105,10 +106,10 @@ def test_sheet_names_spread_over_all_views():
 
 
 def test_report_is_strict_json(tmp_path):
-    write_report(tmp_path / "report.json", {"psnr": 1.5, "ms_ssim": None})
+    write_json(tmp_path / "report.json", {"psnr": 1.5, "ms_ssim": None})
     assert json.loads((tmp_path / "report.json").read_text()) == {"psnr": 1.5, "ms_ssim": None}
     with pytest.raises(ValueError, match="JSON"):
-        write_report(tmp_path / "report.json", {"psnr": float("nan")})
+        write_json(tmp_path / "report.json", {"psnr": float("nan")})
     assert json.loads((tmp_path / "report.json").read_text())["psnr"] == 1.5
 
 

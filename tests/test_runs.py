@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import igsr
-from igsr.study.runs import Run, finished_runs, folder_hash
+from igsr._internal.resumable_jobs import Run, finished_runs, folder_hash
 
 
 def work(data, what):

@@ -10,7 +10,8 @@ import scenes
 
 from igsr.denoiser import Buffers
 from igsr.denoiser.cleaning import HALF_CONFIDENCE_ERROR
-from igsr.selection import (
+from igsr.refinement.novel_views import UnseenView
+from igsr.refinement.selection import (
     LEAST_TRUST,
     LEAST_WORTH,
     PHOTO_ERROR,
@@ -18,7 +19,6 @@ from igsr.selection import (
     select,
     trust_of,
 )
-from igsr.views import UnseenView
 
 VIEW = UnseenView(scenes.ring_camera(0.0, size=8), 12.0, True)
 

@@ -9,11 +9,22 @@ import numpy as np
 import pytest
 import scenes
 
-import igsr.sift_points
+import igsr.fitting.initialization.sift_points
 from igsr.capture import Camera, Capture, View
 from igsr.errors import IgsrError
-from igsr.initialization import SPLATS_PER_FEATURE, chosen_start, initial_splats
-from igsr.sift_points import _features, _matches, _off_epipolar, _tracks, _triangulated, sift_points
+from igsr.fitting.initialization.initial_splats import (
+    SPLATS_PER_FEATURE,
+    chosen_start,
+    initial_splats,
+)
+from igsr.fitting.initialization.sift_points import (
+    _features,
+    _matches,
+    _off_epipolar,
+    _tracks,
+    _triangulated,
+    sift_points,
+)
 
 SIZE = 120
 NORMAL = np.array([0.4, 0.2, -1.0]) / np.linalg.norm([0.4, 0.2, -1.0])
@@ -129,7 +140,7 @@ def test_photos_that_tell_nothing_have_no_points(photos, case):
 
 @pytest.mark.parametrize("alpha", [False, True])
 def test_large_photos_are_reduced(photos, found, monkeypatch, alpha):
-    monkeypatch.setattr(igsr.sift_points, "LONGEST", SIZE)
+    monkeypatch.setattr(igsr.fitting.initialization.sift_points, "LONGEST", SIZE)
     large = []
     for view in photos:
         image = view.image.repeat(3, axis=0).repeat(3, axis=1)
@@ -141,7 +152,7 @@ def test_large_photos_are_reduced(photos, found, monkeypatch, alpha):
     xyz, colors = sift_points(large)
     np.testing.assert_allclose(xyz, found[0], atol=1e-9)
     np.testing.assert_allclose(colors, found[1], atol=1e-9)
-    monkeypatch.setattr(igsr.sift_points, "LONGEST", 1)
+    monkeypatch.setattr(igsr.fitting.initialization.sift_points, "LONGEST", 1)
     assert len(sift_points(large)[0]) == 0
 
 

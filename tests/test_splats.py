@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 import igsr
-from igsr.orbit import orbit
+from igsr.geometry.camera_paths import orbit
 
 
 @pytest.mark.parametrize("degree", range(5))

@@ -11,15 +11,16 @@ import pytest
 import scenes
 
 import igsr
+from igsr._internal.resumable_jobs import folder_hash
 from igsr.capture import Capture
-from igsr.presets import PRESETS, preset_settings
-from igsr.study import blender, blender8, few_photos, fits
+from igsr.fitting.presets import PRESETS, preset_settings
+from igsr.study import blender, blender8, few_photos
+from igsr.study import scored_fits as fits
 from igsr.study.blender import VIEW_IDS
-from igsr.study.fits import Fit, run_fit
 from igsr.study.real_captures import load_views
-from igsr.study.runs import folder_hash
+from igsr.study.scored_fits import Fit, run_fit
+from igsr.study.splits import dtu_views, llff_views, with_train_views
 from igsr.study.summary import summarized
-from igsr.study.views import dtu_views, llff_views, with_train_views
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +105,7 @@ def test_a_study_is_written_and_goes_on_where_it_stopped(data, tmp_path, monkeyp
 
 
 def test_a_real_fit_of_the_study(data, monkeypatch):
-    from igsr import presets
+    from igsr.fitting import presets
 
     short = presets.Preset(30, 300, 0, "fixed", 0.2, True, "auto")
     monkeypatch.setattr(presets, "_FEW", short)
@@ -206,7 +207,7 @@ def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypa
 
 
 def test_presets_that_move_cameras_are_scored_refined_too(real, monkeypatch):
-    from igsr import presets
+    from igsr.fitting import presets
 
     short = presets.Preset(20, 300, 0, "fixed", 0.0, False, "random", "joint", "shared")
     monkeypatch.setattr(presets, "_INSTANTSPLAT", short)
@@ -217,7 +218,7 @@ def test_presets_that_move_cameras_are_scored_refined_too(real, monkeypatch):
 
 
 def test_what_a_mask_hides_in_a_scored_photo_changes_no_score(real, monkeypatch):
-    from igsr import presets
+    from igsr.fitting import presets
 
     monkeypatch.setattr(presets, "_3DGS", presets.Preset(20, 300, 0, "fixed", 0.0, False, "random"))
     mask = np.zeros((16, 16), dtype=bool)

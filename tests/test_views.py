@@ -7,7 +7,7 @@ import pytest
 import scenes
 
 import igsr
-from igsr.views import CLOSE, SEEN, STEP, unseen_views
+from igsr.refinement.novel_views import CLOSE, SEEN, STEP, unseen_views
 
 BALL = scenes.splats()
 

@@ -8,12 +8,12 @@ import time
 
 import pytest
 
-from igsr.worker_processes import worker_processes
+from igsr._internal.worker_processes import worker_processes
 
 #: Starts a worker, says its number, and waits for it.
 PARENT = """
 import os, time
-from igsr.worker_processes import worker_processes
+from igsr._internal.worker_processes import worker_processes
 
 if __name__ == "__main__":
     with worker_processes(1) as pool:

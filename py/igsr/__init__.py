@@ -1,27 +1,34 @@
-"""igsr: from a handful of photos with known cameras to a Gaussian-splat scene.
+"""igsr: from a few photos to a Gaussian-splat scene.
 
 >>> import igsr
 >>> capture = igsr.load_capture("photos").with_holdout(8)
 >>> splats = igsr.fit(capture, steps=5000)
 >>> igsr.evaluate(splats, capture)["psnr"]
 >>> splats.save("scene.ply")
+
+Names are imported when they are first used (PEP 562): ``import igsr`` alone loads no torch.
 """
 
 from __future__ import annotations
 
-from ._core import __version__
-from .capture import Camera, Capture, Points, View, load_capture
-from .compaction import Compaction, compact
-from .denoiser import denoise
-from .errors import IgsrError
-from .evaluation import evaluate
-from .fitting import Progress, fit, fit_with_cameras
-from .pose import estimate_poses
-from .poses import refine_cameras
-from .rasterization import rasterization
-from .refinement import Refined, refine
-from .rendering import Render, render
-from .splats import Splats
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from igsr._internal import moved_modules
+
+if TYPE_CHECKING:
+    from igsr._core import __version__
+    from igsr.capture import Camera, Capture, Points, View, load_capture
+    from igsr.compaction import Compaction, compact
+    from igsr.denoiser import denoise
+    from igsr.errors import IgsrError
+    from igsr.evaluation import evaluate
+    from igsr.fitting import Progress, fit, fit_with_cameras, refine_cameras
+    from igsr.pose import estimate_poses
+    from igsr.refinement import Refined, refine
+    from igsr.rendering import Render, render
+    from igsr.rendering.rasterization import rasterization
+    from igsr.splats import Splats
 
 __all__ = [
     "Camera",
@@ -47,3 +54,35 @@ __all__ = [
     "refine_cameras",
     "render",
 ]
+
+#: Where each public name is defined.
+_HOMES = {
+    "igsr._core": ("__version__",),
+    "igsr.capture": ("Camera", "Capture", "Points", "View", "load_capture"),
+    "igsr.compaction": ("Compaction", "compact"),
+    "igsr.denoiser": ("denoise",),
+    "igsr.errors": ("IgsrError",),
+    "igsr.evaluation": ("evaluate",),
+    "igsr.fitting": ("Progress", "fit", "fit_with_cameras", "refine_cameras"),
+    "igsr.pose": ("estimate_poses",),
+    "igsr.refinement": ("Refined", "refine"),
+    "igsr.rendering": ("Render", "render"),
+    "igsr.rendering.rasterization": ("rasterization",),
+    "igsr.splats": ("Splats",),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'igsr' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+moved_modules.install()

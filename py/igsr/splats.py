@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from . import _core
-from .errors import IgsrError
+from igsr import _core
+from igsr.errors import IgsrError
 
 FloatArray = npt.NDArray[np.float32]
 

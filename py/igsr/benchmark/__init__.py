@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from .accuracy import measure_accuracy, write_accuracy
-from .plots import plot_speed_vs_error
-from .run import WORKLOADS, Settings, resolved_backends, run_benchmark
-from .table import print_report
+from igsr.benchmark.accuracy import measure_accuracy, write_accuracy
+from igsr.benchmark.plots import plot_speed_vs_error
+from igsr.benchmark.run import WORKLOADS, Settings, resolved_backends, run_benchmark
+from igsr.benchmark.table import print_report
 
 __all__ = [
     "WORKLOADS",

@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from .. import _core
-from ..atomic_write import atomic_write
-from ..splats import MAX_SH_DEGREE
-from . import oracle
-from .comparison import BOUND_3D, FLIP
-from .machine import describe_machine
-from .plots import plot_speed_vs_error
-from .scenes import Arrays, Scene, ball
-from .stage_rows import pipeline_rows
-from .table import machine_line, milliseconds
+from igsr import _core
+from igsr._internal.atomic_write import atomic_write
+from igsr.benchmark import oracle
+from igsr.benchmark.comparison import BOUND_3D, FLIP
+from igsr.benchmark.machine import describe_machine
+from igsr.benchmark.plots import plot_speed_vs_error
+from igsr.benchmark.scenes import Arrays, Scene, ball
+from igsr.benchmark.stage_rows import pipeline_rows
+from igsr.benchmark.table import machine_line, milliseconds
+from igsr.splats import MAX_SH_DEGREE
 
 #: The scene: small enough for the reference to walk all splats at every pixel, and its splats about
 #: a pixel in size, where antialiasing matters.

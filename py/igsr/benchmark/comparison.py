@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .scenes import Arrays
+from igsr.benchmark.scenes import Arrays
 
 #: Error beyond which a pixel of the band is left out (docs/numerics.md has the bounds): for 2D
 #: splats handed over as they are, and for pictures from splats.

@@ -19,17 +19,24 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from .. import _core
-from ..capture import Capture, View
-from ..errors import IgsrError
-from ..fitting import fingerprint, fit
-from ..rasterization import rasterization
-from ..rendering import intrinsics_of, viewmat_about
-from ..splats import Splats
-from . import oracle
-from .comparison import BOUND_3D, Band, Error, errors_row, gradient_error, picture_error
-from .scenes import PARAMETERS, Arrays, Scene
-from .stage_rows import MIN_REPEATS, SECONDS, timing_row
+from igsr import _core
+from igsr.benchmark import oracle
+from igsr.benchmark.comparison import (
+    BOUND_3D,
+    Band,
+    Error,
+    errors_row,
+    gradient_error,
+    picture_error,
+)
+from igsr.benchmark.scenes import PARAMETERS, Arrays, Scene
+from igsr.benchmark.stage_rows import MIN_REPEATS, SECONDS, timing_row
+from igsr.capture import Capture, View
+from igsr.errors import IgsrError
+from igsr.fitting.run import fingerprint, fit
+from igsr.rendering.rasterization import rasterization
+from igsr.rendering.renders import intrinsics_of, viewmat_about
+from igsr.splats import Splats
 
 #: Views that a step is timed on; they differ in what they show.
 VIEWS = 4

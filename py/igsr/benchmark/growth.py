@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import IgsrError
-from .comparison import errors_row
-from .fit_rows import Shot, fit_step_ms, step_rows
-from .scenes import ball, upstream
-from .stage_rows import compare, runs_on_cores, timing_row
+from igsr.benchmark.comparison import errors_row
+from igsr.benchmark.fit_rows import Shot, fit_step_ms, step_rows
+from igsr.benchmark.scenes import ball, upstream
+from igsr.benchmark.stage_rows import compare, runs_on_cores, timing_row
+from igsr.errors import IgsrError
 
 #: Splats, at GROWN_SIDE pixels a side; and sides, at GROWN_COUNT splats.
 COUNTS = (10_000, 30_000, 100_000, 300_000, 1_000_000)

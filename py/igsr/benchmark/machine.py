@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from .. import _core
-from .comparison import FLIP
+from igsr import _core
+from igsr.benchmark.comparison import FLIP
 
 #: How every figure comes about; goes into the JSON and above the tables.
 PROTOCOL = (

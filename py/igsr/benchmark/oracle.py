@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import _core
-from .scenes import Arrays, Scene
+from igsr import _core
+from igsr.benchmark.scenes import Arrays, Scene
 
 #: Side of a crop in pixels: small, since its pixels walk all of its splats.
 CROP = 16

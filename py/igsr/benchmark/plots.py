@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..atomic_write import atomic_write
-from .growth import GROWN_COUNT, GROWN_SIDE
-from .table import machine_line
+from igsr._internal.atomic_write import atomic_write
+from igsr.benchmark.growth import GROWN_COUNT, GROWN_SIDE
+from igsr.benchmark.table import machine_line
 
 #: Colours that stay apart in print and for the colour-blind (Okabe and Ito).
 COLORS = {"cpu": "#0072b2", "gpu": "#d55e00", "reference": "#444444"}

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import _core
-from ..atomic_write import check_writable
-from ..capture import Capture, load_capture
-from ..errors import IgsrError
-from .fit_rows import capture_rows, model_path
-from .growth import PAIR, POINT_SECONDS, growth_rows, pair_rows
-from .machine import describe_machine
-from .scenes import garden
-from .stage_rows import SECONDS, pipeline_rows, rasterize_rows
+from igsr import _core
+from igsr._internal.atomic_write import check_writable
+from igsr.benchmark.fit_rows import capture_rows, model_path
+from igsr.benchmark.growth import PAIR, POINT_SECONDS, growth_rows, pair_rows
+from igsr.benchmark.machine import describe_machine
+from igsr.benchmark.scenes import garden
+from igsr.benchmark.stage_rows import SECONDS, pipeline_rows, rasterize_rows
+from igsr.capture import Capture, load_capture
+from igsr.errors import IgsrError
 
 Row = dict[str, Any]
 #: A workload's name, its number of splats where it runs with several, and what gives its rows.

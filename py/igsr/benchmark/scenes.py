@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import _core
-from ..errors import IgsrError
-from ..npz_damage import DAMAGE
+from igsr import _core
+from igsr._internal.untrusted_npz import DAMAGE
+from igsr.errors import IgsrError
 
 #: Arrays by name, as ``_core`` takes and returns them.
 Arrays = dict[str, Any]

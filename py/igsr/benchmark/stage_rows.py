@@ -10,10 +10,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import _core
-from . import oracle
-from .comparison import BOUND_2D, BOUND_3D, Band, Error, errors_row, gradient_error, picture_error
-from .scenes import Arrays, Scene, splats2d, upstream
+from igsr import _core
+from igsr.benchmark import oracle
+from igsr.benchmark.comparison import (
+    BOUND_2D,
+    BOUND_3D,
+    Band,
+    Error,
+    errors_row,
+    gradient_error,
+    picture_error,
+)
+from igsr.benchmark.scenes import Arrays, Scene, splats2d, upstream
 
 #: A repeat that nothing disturbed is among this many on a shared machine.
 MIN_REPEATS = 5

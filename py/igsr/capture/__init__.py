@@ -6,7 +6,7 @@ cameras in OpenCV axes, photos with lens distortion undone, masks of the pixels 
 
 from __future__ import annotations
 
-from igsr.capture.folder import load_capture
+from igsr.capture.load import load_capture
 from igsr.capture.types import Camera, Capture, Points, View
 
 __all__ = ["Camera", "Capture", "Points", "View", "load_capture"]

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from igsr.atomic_write import atomic_folder
+from igsr._internal.atomic_write import atomic_folder
 from igsr.capture.types import Camera, Capture, Points
 from igsr.capture.write_files import png_names, save_png, write_pictures
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from igsr.atomic_write import atomic_folder
+from igsr._internal.atomic_write import atomic_folder
 from igsr.capture.point_cloud import write_point_cloud
 from igsr.capture.types import Camera, Capture
 from igsr.capture.write_files import png_names, write_pictures

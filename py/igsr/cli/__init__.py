@@ -7,21 +7,21 @@ from typing import Annotated
 
 import typer
 
-from .._core import __version__
-from .bench import bench_command
-from .compact import compact_command
-from .convert import convert_command
-from .denoise import app as denoise_app
-from .evaluate import eval_command
-from .export import export_command
-from .fit import fit_command
-from .info import info_command
-from .pose import pose_command
-from .refine import refine_command
-from .render import render_command
-from .study import study_command
-from .synth import synth_command
-from .view import PASSED_ON, view_command
+from igsr._core import __version__
+from igsr.cli.bench import bench_command
+from igsr.cli.compact import compact_command
+from igsr.cli.convert import convert_command
+from igsr.cli.denoise import app as denoise_app
+from igsr.cli.evaluate import eval_command
+from igsr.cli.export import export_command
+from igsr.cli.fit import fit_command
+from igsr.cli.info import info_command
+from igsr.cli.pose import pose_command
+from igsr.cli.refine import refine_command
+from igsr.cli.render import render_command
+from igsr.cli.study import study_command
+from igsr.cli.synth import synth_command
+from igsr.cli.view import PASSED_ON, view_command
 
 app = typer.Typer(
     help="Fit a Gaussian-splat scene from photos, with known cameras or without.",

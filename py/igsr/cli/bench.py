@@ -8,15 +8,10 @@ from typing import Annotated
 
 import typer
 
-from ..atomic_write import check_writable
-from ..errors import IgsrError
-from ..report import write_report
-from .shared import (
-    BackendChoice,
-    error_console,
-    one_sentence,
-    output_console,
-)
+from igsr._internal.atomic_write import check_writable
+from igsr._internal.json_file import write_json
+from igsr.cli.shared import BackendChoice, error_console, one_sentence, output_console
+from igsr.errors import IgsrError
 
 
 class WorkloadChoice(str, enum.Enum):
@@ -78,7 +73,7 @@ def bench_command(
     W1: rasterize only. W2: the garden, forward and backward. W3: a fit step on a capture. W4: how a
     fit step grows with splats and pixels.
     """
-    from .. import benchmark
+    from igsr import benchmark
 
     with one_sentence():
         if seed < 0:
@@ -119,5 +114,5 @@ def bench_command(
         if plot is not None:
             benchmark.plot_speed_vs_error(plot, report)
         if json_path is not None:
-            write_report(json_path, report)
+            write_json(json_path, report)
     benchmark.print_report(output_console(), report)

@@ -13,12 +13,9 @@ import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
-from ..atomic_write import check_writable
-from ..compaction import DEFAULT_STEPS, CompactProgress, compact, write_plot
-from ..errors import IgsrError
-from ..report import write_report
-from ..splats import Splats
-from .shared import (
+from igsr._internal.atomic_write import check_writable
+from igsr._internal.json_file import write_json
+from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
     BackgroundOption,
@@ -34,6 +31,9 @@ from .shared import (
     resolved,
     stopped,
 )
+from igsr.compaction import DEFAULT_STEPS, CompactProgress, compact, write_plot
+from igsr.errors import IgsrError
+from igsr.splats import Splats
 
 
 def compact_command(
@@ -118,7 +118,7 @@ def compact_command(
         report = {"scene": str(scene), "out": str(target), **compaction.report}
         report["protocol"]["holdout"] = holdout
         compaction.splats.save(target)
-        write_report(curve, report)
+        write_json(curve, report)
         write_plot(plot, report)
     if as_json:
         print_json(report)

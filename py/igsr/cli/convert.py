@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from ..atomic_write import check_writable
-from ..splats import Splats
-from .shared import (
+from igsr._internal.atomic_write import check_writable
+from igsr.cli.shared import (
     JsonOption,
     SceneArgument,
     complain,
@@ -18,6 +17,7 @@ from .shared import (
     print_json,
     warnings_as_sentences,
 )
+from igsr.splats import Splats
 
 
 def convert_command(

@@ -13,11 +13,8 @@ import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
-from ..atomic_write import atomic_write
-from ..errors import IgsrError
-from ..evaluation import default_background, default_split, known_background, views_of_split
-from ..splats import Splats
-from .shared import (
+from igsr._internal.atomic_write import atomic_write
+from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
     JobsOption,
@@ -34,6 +31,14 @@ from .shared import (
     resolved,
     stopped,
 )
+from igsr.errors import IgsrError
+from igsr.evaluation.scores import (
+    default_background,
+    default_split,
+    known_background,
+    views_of_split,
+)
+from igsr.splats import Splats
 
 app = typer.Typer(
     help="Clean what a poor splat model renders: training pairs, training, use.",
@@ -98,7 +103,7 @@ def pairs_command(
 
     What is finished is kept in --out, and the same command goes on from there.
     """
-    from ..denoiser.pairs import DEFAULT_RECIPES, make_pairs
+    from igsr.denoiser.training.pairs import DEFAULT_RECIPES, make_pairs
 
     with one_sentence(
         lambda: "Interrupted; finished fits are kept, the same command goes on from there."
@@ -181,10 +186,14 @@ def train_command(
     as_json: JsonOption = False,
 ) -> None:
     """Train a denoiser. Several GPUs: torchrun --nproc-per-node N -m igsr.cli denoise train ..."""
-    from ..denoiser.network import Architecture
-    from ..denoiser.perceptual import Distance, SqueezeNetDistance, lpips_distance
-    from ..denoiser.plot import plot_training
-    from ..denoiser.training import (
+    from igsr.denoiser.network import Architecture
+    from igsr.denoiser.training.perceptual_distance import (
+        Distance,
+        SqueezeNetDistance,
+        lpips_distance,
+    )
+    from igsr.denoiser.training.plot_training import plot_training
+    from igsr.denoiser.training.train import (
         LOG,
         WEIGHTS,
         Training,
@@ -283,7 +292,7 @@ def apply_command(
     """Render views of a scene and clean them: NAME.png, and NAME.confidence.png (white: sure)."""
     from PIL import Image
 
-    from ..denoiser import (
+    from igsr.denoiser import (
         NetworkDenoiser,
         denoise,
         load_network,

@@ -7,10 +7,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from .. import _core
-from ..evaluation import default_background, default_split
-from ..splats import Splats
-from .shared import (
+from igsr import _core
+from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
     BackgroundOption,
@@ -29,6 +27,8 @@ from .shared import (
     score_line,
     scored,
 )
+from igsr.evaluation.scores import default_background, default_split
+from igsr.splats import Splats
 
 
 def eval_command(

@@ -8,17 +8,11 @@ from typing import Annotated
 
 import typer
 
-from ..atomic_write import check_folder
-from ..capture import load_capture
-from ..capture.write_colmap import write_colmap
-from ..capture.write_transforms import write_transforms
-from .shared import (
-    CaptureArgument,
-    JsonOption,
-    one_sentence,
-    output_console,
-    print_json,
-)
+from igsr._internal.atomic_write import check_folder
+from igsr.capture import load_capture
+from igsr.capture.write_colmap import write_colmap
+from igsr.capture.write_transforms import write_transforms
+from igsr.cli.shared import CaptureArgument, JsonOption, one_sentence, output_console, print_json
 
 
 class FormatChoice(str, enum.Enum):

@@ -12,17 +12,12 @@ import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
-from .. import _core
-from ..capture import Capture
-from ..capture.photo_folder import FRAMES
-from ..evaluation import METRICS, default_background, default_split
-from ..fitting import Progress, fit_with_cameras
-from ..pose import AUTO
-from ..poses import refine_cameras
-from ..presets import preset_settings
-from ..report import contact_sheet, save_sheet, write_cameras, write_report
-from ..splats import Splats
-from .pose import (
+from igsr import _core
+from igsr._internal.json_file import write_json
+from igsr.capture import Capture
+from igsr.capture.photo_folder import FRAMES
+from igsr.capture.write_cameras import write_cameras
+from igsr.cli.pose import (
     CameraFinder,
     CheckpointOption,
     EstimatorOption,
@@ -30,7 +25,7 @@ from .pose import (
     GraphOption,
     capture_to_fit,
 )
-from .shared import (
+from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
     BackgroundOption,
@@ -50,6 +45,13 @@ from .shared import (
     stopped,
     warnings_as_sentences,
 )
+from igsr.evaluation.contact_sheet import contact_sheet, save_sheet
+from igsr.evaluation.scores import METRICS, default_background, default_split
+from igsr.fitting.pose_refinement import refine_cameras
+from igsr.fitting.presets import preset_settings
+from igsr.fitting.run import Progress, fit_with_cameras
+from igsr.pose import AUTO
+from igsr.splats import Splats
 
 
 class DensityChoice(str, enum.Enum):
@@ -235,12 +237,12 @@ def fit_command(
             "views": scores["views"],
         }
         save_sheet(out / "views.png", contact_sheet(sheet))
-        write_report(out / "report.json", report)
+        write_json(out / "report.json", report)
         if (moved or found) and split == "test":
             # Photos that were not fitted have the cameras they were given, which may be as wrong
             # as those that were found or moved; these are their best.
             report["refined"] = _refined_scores(splats, fitted, color, name, shown=not as_json)
-            write_report(out / "report.json", report)
+            write_json(out / "report.json", report)
     if as_json:
         print_json(report)
         return
@@ -291,7 +293,7 @@ def _refined_scores(
 
 def _finished_before(out: Path) -> tuple[float, tuple[str, int]]:
     """Seconds of fitting and first splats (see ``Progress``) of a fit that was already complete."""
-    from ..checkpoint import load_checkpoint
+    from igsr.fitting.checkpoint import load_checkpoint
 
     _, settings = load_checkpoint(out / "checkpoint.npz")
     return settings["seconds"], tuple(settings["started"])

@@ -9,15 +9,10 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from .. import _core
-from ..capture import load_capture
-from ..splats import SPLAT_ENDINGS, Splats
-from .shared import (
-    JsonOption,
-    one_sentence,
-    output_console,
-    print_json,
-)
+from igsr import _core
+from igsr.capture import load_capture
+from igsr.cli.shared import JsonOption, one_sentence, output_console, print_json
+from igsr.splats import SPLAT_ENDINGS, Splats
 
 
 def info_command(

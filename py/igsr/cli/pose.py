@@ -13,24 +13,13 @@ import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
-from .. import _core
-from ..atomic_write import check_folder
-from ..capture import Capture
-from ..capture.folder import holds_cameras
-from ..capture.photo_folder import FRAMES, has_photos
-from ..capture.write_colmap import write_colmap
-from ..errors import IgsrError
-from ..pose import (
-    AUTO,
-    capture_of,
-    estimate,
-    found_before,
-    kept_cameras,
-    photos_note,
-    photos_of,
-)
-from ..pose.registry import ESTIMATORS
-from .shared import (
+from igsr import _core
+from igsr._internal.atomic_write import check_folder
+from igsr.capture import Capture
+from igsr.capture.load import holds_cameras
+from igsr.capture.photo_folder import FRAMES, has_photos
+from igsr.capture.write_colmap import write_colmap
+from igsr.cli.shared import (
     JsonOption,
     complain,
     error_console,
@@ -41,6 +30,9 @@ from .shared import (
     stopped,
     warnings_as_sentences,
 )
+from igsr.errors import IgsrError
+from igsr.pose import AUTO, capture_of, estimate, found_before, kept_cameras, photos_note, photos_of
+from igsr.pose.registry import ESTIMATORS
 
 FramesOption = Annotated[
     int, typer.Option("--frames", help="How many frames are taken of each video.")
@@ -176,7 +168,7 @@ def _posed(
 
     With ``notes``, text files that lie beside the capture, what is there is replaced.
     """
-    from ..pose.plot import plot_poses
+    from igsr.pose.plot_poses import plot_poses
 
     loaded = photos_of(photos, finder.frames)
     with _pose_bar(shown) as show:

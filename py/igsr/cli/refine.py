@@ -11,10 +11,8 @@ import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
-from ..capture.photo_folder import FRAMES
-from ..errors import IgsrError
-from ..pose import AUTO
-from .pose import (
+from igsr.capture.photo_folder import FRAMES
+from igsr.cli.pose import (
     CameraFinder,
     CheckpointOption,
     EstimatorOption,
@@ -22,7 +20,7 @@ from .pose import (
     GraphOption,
     capture_to_fit,
 )
-from .shared import (
+from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
     HoldoutOption,
@@ -35,10 +33,12 @@ from .shared import (
     stopped,
     warnings_as_sentences,
 )
+from igsr.errors import IgsrError
+from igsr.pose import AUTO
 
 if TYPE_CHECKING:
-    from ..capture import Capture
-    from ..refinement import RefineProgress
+    from igsr.capture import Capture
+    from igsr.refinement.results import RefineProgress
 
 #: What each part of a round does, for the bar.
 _DOING = {
@@ -84,7 +84,7 @@ def refine_command(
     as_json: JsonOption = False,
 ) -> None:
     """Fit photos, render views that nobody took, clean them, keep what helps, and fit again."""
-    from ..refinement import check_arguments, refine, round_denoiser
+    from igsr.refinement.loop import check_arguments, refine, round_denoiser
 
     with one_sentence(
         lambda: f"Interrupted; what is done is in {out}, the same command with --resume goes on."
@@ -142,7 +142,7 @@ def refine_command(
 
 def _some_photos(capture: Capture, count: int) -> Capture:
     """The capture with ``count`` of its train views, evenly spaced, and its test views."""
-    from ..capture import Capture
+    from igsr.capture import Capture
 
     train = capture.train_views
     if not 1 <= count <= len(train):

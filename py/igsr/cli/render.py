@@ -7,15 +7,10 @@ from typing import Annotated
 
 import typer
 
-from .. import _core
-from ..atomic_write import atomic_write
-from ..capture import Camera, Capture, load_capture
-from ..errors import IgsrError
-from ..evaluation import default_background
-from ..orbit import orbit
-from ..rendering import render
-from ..splats import Splats
-from .shared import (
+from igsr import _core
+from igsr._internal.atomic_write import atomic_write
+from igsr.capture import Camera, Capture, load_capture
+from igsr.cli.shared import (
     NAMED_COLORS,
     BackendChoice,
     BackendOption,
@@ -29,6 +24,11 @@ from .shared import (
     print_json,
     resolved,
 )
+from igsr.errors import IgsrError
+from igsr.evaluation.scores import default_background
+from igsr.geometry.camera_paths import orbit
+from igsr.rendering.renders import render
+from igsr.splats import Splats
 
 
 def render_command(
@@ -91,7 +91,7 @@ def _write_orbit(
     background: tuple[float, float, float],
     backend: str,
 ) -> Path:
-    from ..video import write_video
+    from igsr.rendering.video import write_video
 
     frames = (render(splats, camera, background, backend).to_uint8() for camera in path_cameras)
     write_video(out, frames)

@@ -17,13 +17,13 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as ProgressBar
 
-from .. import _core
-from ..capture import Capture, load_capture
-from ..capture.write_files import relative_name
-from ..errors import IgsrError
-from ..evaluation import ScoredView, evaluate
-from ..report import sheet_names
-from ..splats import Splats
+from igsr import _core
+from igsr.capture import Capture, load_capture
+from igsr.capture.write_files import relative_name
+from igsr.errors import IgsrError
+from igsr.evaluation.contact_sheet import sheet_names
+from igsr.evaluation.scores import ScoredView, evaluate
+from igsr.splats import Splats
 
 #: Exit status after Ctrl-C: 128 + SIGINT, as shells report it.
 INTERRUPTED = 130

@@ -10,8 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ..errors import IgsrError
-from .shared import (
+from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
     JobsOption,
@@ -25,6 +24,7 @@ from .shared import (
     print_json,
     resolved,
 )
+from igsr.errors import IgsrError
 
 
 class StudyChoice(str, enum.Enum):
@@ -169,7 +169,7 @@ def study_command(
 
     What is finished is kept in --out, and the same command goes on from there.
     """
-    from .. import study
+    from igsr import study
 
     with one_sentence(
         lambda: "Interrupted; finished fits are kept, the same command goes on from there."

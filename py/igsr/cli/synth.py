@@ -8,13 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .shared import (
-    JsonOption,
-    error_console,
-    one_sentence,
-    output_console,
-    print_json,
-)
+from igsr.cli.shared import JsonOption, error_console, one_sentence, output_console, print_json
 
 
 def synth_command(
@@ -39,7 +33,7 @@ def synth_command(
     Needs Mitsuba 3 (pip install 'igsr[synth]'). What is finished is kept in --out, and the same
     command goes on from there.
     """
-    from .. import synth
+    from igsr import synth
 
     with one_sentence(
         lambda: "Interrupted; finished scenes are kept, the same command goes on from there."

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from ..errors import IgsrError
-from .shared import INTERRUPTED, one_sentence
+from igsr.cli.shared import INTERRUPTED, one_sentence
+from igsr.errors import IgsrError
 
 #: The viewer, a program of its own: windows are not this package's business.
 PROGRAM = "splat-view"

@@ -1,8 +1,8 @@
 """Fewer splats for the same pictures: prune by what they show, refine, and measure the loss."""
 
-from .contribution import Contribution, contribution
-from .plot import write_plot
-from .search import DEFAULT_STEPS, Compaction, CompactProgress, compact
+from igsr.compaction.contribution import Contribution, contribution
+from igsr.compaction.plot_curve import write_plot
+from igsr.compaction.search import DEFAULT_STEPS, Compaction, CompactProgress, compact
 
 __all__ = [
     "DEFAULT_STEPS",

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .. import _core
-from ..capture import Camera
-from ..rendering import project
-from ..splats import Splats
+from igsr import _core
+from igsr.capture import Camera
+from igsr.rendering.renders import project
+from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 

@@ -14,14 +14,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import _core
-from ..capture import Capture
-from ..errors import IgsrError
-from ..fitting import check_fits
-from ..splats import MAX_SH_DEGREE, Splats
-from .contribution import contribution
-from .refinement import State, chosen, fresh_state, refined, splats_of, with_sh_degree
-from .yardstick import Verdict, Yardstick, own_yardstick, photo_yardstick
+from igsr import _core
+from igsr.capture import Capture
+from igsr.compaction.contribution import contribution
+from igsr.compaction.finetuning import (
+    State,
+    chosen,
+    fresh_state,
+    refined,
+    splats_of,
+    with_sh_degree,
+)
+from igsr.compaction.yardstick import Verdict, Yardstick, own_yardstick, photo_yardstick
+from igsr.errors import IgsrError
+from igsr.fitting.run import check_fits
+from igsr.splats import MAX_SH_DEGREE, Splats
 
 #: Part of the splats that one round of pruning leaves. Many small rounds lose less than one large.
 KEEP = 0.8

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from .. import metrics
-from ..capture import Camera, Capture, View
-from ..errors import IgsrError
-from ..evaluation import default_background, over_background
-from ..orbit import cameras_around
-from ..rendering import render
-from ..splats import Splats
+from igsr.capture import Camera, Capture, View
+from igsr.errors import IgsrError
+from igsr.evaluation import metrics
+from igsr.evaluation.scores import default_background, over_background
+from igsr.geometry.camera_paths import cameras_around
+from igsr.rendering.renders import render
+from igsr.splats import Splats
 
 #: Without test views, every how many train views one judges, as in the protocol of LLFF and 3DGS.
 HOLDOUT = 8

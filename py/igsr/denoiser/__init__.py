@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from .buffers import Buffers, photo_support, render_buffers
-from .cleaning import Denoiser, NetworkDenoiser, denoise
-from .warping import Source, Warped, photo_sources, warp_photos
-from .weights import load_network, save_network
+from igsr.denoiser.buffers import Buffers, photo_support, render_buffers
+from igsr.denoiser.cleaning import Denoiser, NetworkDenoiser, denoise
+from igsr.denoiser.warping import Source, Warped, photo_sources, warp_photos
+from igsr.denoiser.weights import load_network, save_network
 
 __all__ = [
     "Buffers",

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from .. import _core
-from ..capture import Camera, View
-from ..errors import IgsrError
-from ..normals import facing_normals
-from ..rendering import project, viewmat_about
-from ..splats import Splats
+from igsr import _core
+from igsr.capture import Camera, View
+from igsr.errors import IgsrError
+from igsr.rendering.normals import facing_normals
+from igsr.rendering.renders import project, viewmat_about
+from igsr.splats import Splats
 
 Float32 = npt.NDArray[np.float32]
 

@@ -11,13 +11,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..errors import IgsrError
-from ..rendering import Render
-from .buffers import Buffers
-from .inputs import COLOR, PHOTOS, network_inputs
-from .network import MULTIPLE, REACH, DenoiserNetwork
-from .warping import Source, Warped, warp_photos
-from .weights import load_network
+from igsr.denoiser.buffers import Buffers
+from igsr.denoiser.inputs import COLOR, PHOTOS, network_inputs
+from igsr.denoiser.network import MULTIPLE, REACH, DenoiserNetwork
+from igsr.denoiser.warping import Source, Warped, warp_photos
+from igsr.denoiser.weights import load_network
+from igsr.errors import IgsrError
+from igsr.rendering.renders import Render
 
 Float32 = npt.NDArray[np.float32]
 

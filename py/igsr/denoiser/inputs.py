@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from .buffers import Buffers
-from .warping import Warped
+from igsr.denoiser.buffers import Buffers
+from igsr.denoiser.warping import Warped
 
 Float32 = npt.NDArray[np.float32]
 

@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..errors import IgsrError
-from .inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO, PHOTOS
+from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO, PHOTOS
+from igsr.errors import IgsrError
 
 #: Pictures are padded to multiples of this: one step of pixel shuffle and two of the U-Net.
 MULTIPLE = 8

@@ -11,10 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..capture import Camera, View
-from ..evaluation import over_background
-from ..rendering import render
-from ..splats import Splats
+from igsr.capture import Camera, View
+from igsr.evaluation.scores import over_background
+from igsr.rendering.renders import render
+from igsr.splats import Splats
 
 Float32 = npt.NDArray[np.float32]
 

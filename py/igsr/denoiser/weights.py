@@ -12,9 +12,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from ..atomic_write import atomic_write
-from ..errors import IgsrError
-from .network import Architecture, DenoiserNetwork
+from igsr._internal.atomic_write import atomic_write
+from igsr.denoiser.network import Architecture, DenoiserNetwork
+from igsr.errors import IgsrError
 
 #: The denoiser that comes with igsr.
 SHIPPED = Path(__file__).with_name("denoiser.safetensors")

@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from igsr.capture import Capture, View, load_capture
-from igsr.capture.folder import holds_cameras
+from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import FEWEST, FRAMES, Photo, load_photos
 from igsr.capture.undistort import Undistorter
 from igsr.errors import IgsrError
-
-from .estimate import Estimate, Estimator, Progress
-from .kept import found_before, kept_cameras, not_placed, photos_note
-from .registry import ESTIMATORS
+from igsr.pose.cache import found_before, kept_cameras, not_placed, photos_note
+from igsr.pose.estimate import Estimate, Estimator, Progress
+from igsr.pose.registry import ESTIMATORS
 
 __all__ = [
     "AUTO",

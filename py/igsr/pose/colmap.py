@@ -32,8 +32,7 @@ from igsr.capture.tracks import straightened, track_confidence
 from igsr.capture.types import Tracks, intrinsic_matrix
 from igsr.capture.undistort import Lens
 from igsr.errors import IgsrError
-
-from .estimate import Estimate, Progress
+from igsr.pose.estimate import Estimate, Progress
 
 Float64 = npt.NDArray[np.float64]
 

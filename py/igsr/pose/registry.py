@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from igsr.capture import Camera
-
-from .estimate import Estimator
+from igsr.pose.estimate import Estimator
 
 
 @dataclass(frozen=True)
@@ -30,19 +29,19 @@ def _dust3r(
     graph: str | None = None,
     cameras: Mapping[str, Camera] | None = None,
 ) -> Estimator:
-    from .dust3r.estimator import Dust3r
+    from igsr.pose.dust3r.estimator import Dust3r
 
     return Dust3r(checkpoint=checkpoint, graph=graph, cameras=cameras)
 
 
 def _dust3r_is_ready(options: Mapping[str, Any]) -> bool:
-    from .dust3r.checkpoint import find_checkpoint
+    from igsr.pose.dust3r.checkpoint import find_checkpoint
 
     return find_checkpoint(options.get("checkpoint")) is not None
 
 
 def _colmap() -> Estimator:
-    from .colmap import Colmap
+    from igsr.pose.colmap import Colmap
 
     return Colmap()
 

@@ -1,11 +1,11 @@
 """Protocols of the literature as commands: fixed views, seeds and scores, so that runs compare."""
 
-from .blender import blender8
-from .estimated_poses import poses
-from .noisy_poses import pose_noise
-from .poor_fits import denoiser_table
-from .real_captures import few_photos
-from .refinement_protocols import refinement_ablation, sweep, table2, table3
+from igsr.study.blender import blender8
+from igsr.study.denoiser_comparison import denoiser_table
+from igsr.study.estimated_poses import poses
+from igsr.study.loop_protocols import refinement_ablation, sweep, table2, table3
+from igsr.study.noisy_poses import pose_noise
+from igsr.study.real_captures import few_photos
 
 __all__ = [
     "blender8",

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..atomic_write import atomic_write
-from ..denoiser.inputs import COLOR
-from ..denoiser.pair_files import Pairs
+from igsr._internal.atomic_write import atomic_write
+from igsr.denoiser.inputs import COLOR
+from igsr.denoiser.training.pair_files import Pairs
 
 Float64 = npt.NDArray[np.float64]
 

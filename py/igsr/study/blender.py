@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..capture import Capture, load_capture
-from ..errors import IgsrError
-from ..presets import PRESETS
-from .fits import Fit, fitted
-from .summary import write_study
-from .views import with_train_views
+from igsr.capture import Capture, load_capture
+from igsr.errors import IgsrError
+from igsr.fitting.presets import PRESETS
+from igsr.study.scored_fits import Fit, fitted
+from igsr.study.splits import with_train_views
+from igsr.study.summary import write_study
 
 #: Indices into the train split, as few-view papers have them; codes that derive from 3DGS have 76
 #: where the others have 75.
@@ -50,7 +50,7 @@ def blender8(
             a fit whose file is there is not done again.
         scenes: names of folders in ``data``.
         views: keys of ``VIEW_IDS``.
-        presets: names of ``igsr.presets``.
+        presets: names of ``igsr.fitting.presets``.
         seeds: how many seeds, from 0.
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own with its share of the cores.

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import _core
-from ..atomic_write import atomic_write
-from ..capture import Camera, load_capture
-from ..capture.folder import holds_cameras
-from ..capture.photo_folder import Photo, load_photos
-from ..errors import IgsrError
-from ..pose.accuracy import pose_accuracy
-from ..pose.registry import ESTIMATORS
-from .runs import Run, finished_runs
+from igsr import _core
+from igsr._internal.atomic_write import atomic_write
+from igsr._internal.resumable_jobs import Run, finished_runs
+from igsr.capture import Camera, load_capture
+from igsr.capture.load import holds_cameras
+from igsr.capture.photo_folder import Photo, load_photos
+from igsr.errors import IgsrError
+from igsr.geometry.pose_errors import pose_accuracy
+from igsr.pose.registry import ESTIMATORS
 
 SCENES = (
     "strecha_fountain",
@@ -111,8 +111,8 @@ def poses(
         ray: estimates run over a Ray cluster instead (``pip install 'igsr[ray]'``).
 
     Returns:
-        What ``study.json`` holds: "runs", a row per scene and seed (see ``igsr.pose.accuracy``),
-        and "protocol".
+        What ``study.json`` holds: "runs", a row per scene and seed (see
+        ``igsr.geometry.pose_errors``), and "protocol".
 
     Raises:
         IgsrError: a scene cannot be read, or an argument cannot be used.

@@ -2,14 +2,14 @@
 
 Twenty train views of a NeRF-Synthetic scene get noise on their poses and are fitted with poses
 fixed and joint, beside a fit with the true ones. Held-out views are scored in the three ways of
-``igsr.poses``, never mixed.
+``igsr.fitting.pose_refinement``, never mixed.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,42 +17,25 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import _core
-from ..atomic_write import atomic_write
-from ..capture import Camera, Capture, View, load_capture
-from ..capture.types import intrinsic_matrix
-from ..errors import IgsrError
-from ..evaluation import WHITE, evaluate
-from ..fitting import fit_with_cameras
-from ..poses import pose_errors, refine_cameras, similarity_between
-from ..presets import preset_settings
-from .runs import Run, finished_runs
+from igsr import _core
+from igsr._internal.atomic_write import atomic_write
+from igsr._internal.resumable_jobs import Run, finished_runs
+from igsr.capture import Capture, load_capture
+from igsr.errors import IgsrError
+from igsr.evaluation.scores import WHITE, evaluate
+from igsr.fitting.pose_refinement import refine_cameras
+from igsr.fitting.presets import preset_settings
+from igsr.fitting.run import fit_with_cameras
+from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
+from igsr.geometry.pose_errors import pose_errors
+from igsr.geometry.similarity import similarity_between
 
 Float64 = npt.NDArray[np.float64]
 
 VIEW_IDS = tuple(range(0, 100, 5))
-#: Of NeRF Synthetic's cameras from the origin, world units.
-VIEWING_DISTANCE = 4.03
 SCORES = ("psnr", "ssim", "flip")
 WAYS = ("raw", "aligned", "refined")
 POSES = ("fixed", "joint")
-#: Kinds of noise: on all twelve numbers of camera-to-world, then made rigid again; the same with
-#: the shear kept; turns about a random axis through the camera's centre.
-MATRIX, AFFINE, TURN = "matrix", "raw-affine", "turn"
-#: Steps of the paper's fits to photos whose cameras have noise.
-PAPER_STEPS = 5000
-
-
-@dataclass(frozen=True)
-class Noise:
-    """A kind of noise and its size: standard deviation of the numbers, or degrees of the turn."""
-
-    kind: str
-    size: float
-
-    def __str__(self) -> str:
-        """As tables and file names have it."""
-        return f"{self.kind} {self.size:g}" + ("°" if self.kind == TURN else "")
 
 
 CLEAN = Noise("clean", 0.0)
@@ -67,96 +50,6 @@ class PoseFit:
     poses: str
     seed: int
     backend: str
-
-
-def noise_unit(views: Sequence[View]) -> float:
-    """World units that stand for one of NeRF Synthetic's: noise on positions is in those.
-
-    Its cameras stand ``VIEWING_DISTANCE`` from what they look at; these look at the point nearest
-    to all their axes.
-    """
-    # Each axis contributes the part of an offset from it that is across it.
-    across = []
-    for view in views:
-        axis = view.camera.viewmat[2, :3]
-        across.append(np.eye(3) - np.outer(axis, axis))
-    centres = np.stack([view.camera.centre for view in views])
-    pulled = np.einsum("nij,nj->i", np.stack(across), centres - centres[0])
-    target = centres[0] + np.linalg.lstsq(np.sum(across, axis=0), pulled, rcond=1e-6)[0]
-    distance = float(np.mean(np.linalg.norm(centres - target, axis=1)))
-    return distance / VIEWING_DISTANCE if distance > 0.0 else 1.0
-
-
-def noisy_view(view: View, noise: Noise, random: np.random.Generator, unit: float = 1.0) -> View:
-    """The view with noise on its camera; with "raw-affine" the photo is sheared as well.
-
-    ``unit`` scales the noise on the position (``noise_unit``).
-
-    A camera-to-world matrix with noise is no longer rigid. Its shear and stretch can be written as
-    another focal length, principal point and skew of a rigid camera at the same centre; the skew
-    moves each row of the photo sideways as a whole.
-    """
-    camera = view.camera
-    to_world = np.linalg.inv(camera.viewmat)
-    if noise.kind == TURN:
-        axis = random.normal(size=3)
-        axis *= np.radians(noise.size) / np.linalg.norm(axis)
-        to_world[:3, :3] = _rotation(axis) @ to_world[:3, :3]
-    elif noise.kind in (MATRIX, AFFINE):
-        to_world[:3, :4] += noise.size * random.normal(size=(3, 4)) * (1.0, 1.0, 1.0, unit)
-    if noise.kind != AFFINE:
-        u, _, vt = np.linalg.svd(to_world[:3, :3])
-        return replace(view, camera=_camera(camera, (u @ vt).T, to_world[:3, 3], camera.K))
-    upper, rotation = _upper_times_rotation(camera.K @ np.linalg.inv(to_world[:3, :3]))
-    upper /= upper[2, 2]
-    K = intrinsic_matrix(upper[0, 0], upper[1, 1], upper[0, 2], upper[1, 2])
-    slope = upper[0, 1] / upper[1, 1]
-    shifts = slope * (np.arange(camera.height) + 0.5 - upper[1, 2])
-    return replace(
-        view,
-        camera=_camera(camera, rotation, to_world[:3, 3], K),
-        image=_rows_shifted(view.image, shifts),
-    )
-
-
-def _camera(camera: Camera, rotation: Float64, centre: Float64, K: Float64) -> Camera:
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ centre
-    return replace(camera, viewmat=viewmat, K=K)
-
-
-def _rotation(axis: Float64) -> Float64:
-    """Rodrigues' formula; the axis' length is the angle."""
-    angle = float(np.linalg.norm(axis))
-    x, y, z = axis / angle if angle > 0.0 else axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation: Float64 = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    return rotation
-
-
-def _upper_times_rotation(matrix: Float64) -> tuple[Float64, Float64]:
-    """The factors of a matrix with positive determinant, the upper one's diagonal positive."""
-    q, r = np.linalg.qr(matrix[::-1].T)
-    upper, rotation = r.T[::-1, ::-1], q.T[::-1]
-    signs = np.sign(np.diag(upper))
-    return upper * signs[None, :], signs[:, None] * rotation
-
-
-def _rows_shifted(image: npt.NDArray[np.uint8], shifts: Float64) -> npt.NDArray[np.uint8]:
-    """Row y of the result at column x is the photo's row y at x + shifts[y]."""
-    pixels = image.astype(np.float64)
-    if image.shape[2] == 4:
-        # Colours of transparent pixels are of no meaning and must not mix in.
-        pixels[..., :3] *= pixels[..., 3:] / 255.0
-    at = np.arange(image.shape[1], dtype=np.float64)
-    for row, shift in zip(pixels, shifts, strict=True):
-        for c in range(image.shape[2]):
-            row[:, c] = np.interp(at + shift, at, row[:, c].copy())
-    if image.shape[2] == 4:
-        alpha = pixels[..., 3:]
-        pixels[..., :3] *= np.divide(255.0, alpha, out=np.zeros_like(alpha), where=alpha > 0.0)
-    return np.clip(pixels + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
 def run_fit(data: str, one: PoseFit) -> dict[str, Any]:

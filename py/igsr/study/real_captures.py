@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..capture import Capture, load_capture
-from ..errors import IgsrError
-from ..presets import PRESETS
-from .fits import Fit, fitted
-from .summary import write_study
-from .views import dtu_views, llff_views
+from igsr.capture import Capture, load_capture
+from igsr.errors import IgsrError
+from igsr.fitting.presets import PRESETS
+from igsr.study.scored_fits import Fit, fitted
+from igsr.study.splits import dtu_views, llff_views
+from igsr.study.summary import write_study
 
 SCENES = ("fern", "dtu_scan24", "tankard")
 #: Numbers of photos. LLFF's and DTU's protocols have three; a turntable needs more to go round.
@@ -65,7 +65,7 @@ def few_photos(
             a fit whose file is there is not done again.
         scenes: names of folders in ``data``.
         views: numbers of photos to fit, the same for all scenes; None is each scene's own.
-        presets: names of ``igsr.presets``.
+        presets: names of ``igsr.fitting.presets``.
         seeds: how many seeds, from 0.
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own with its share of the cores.

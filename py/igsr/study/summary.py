@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .. import _core
-from ..atomic_write import atomic_write
+from igsr import _core
+from igsr._internal.atomic_write import atomic_write
 
 #: Scores in the order of the table: how they are headed and written. Not every study has all.
 SCORES = {

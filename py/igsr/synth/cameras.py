@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .description import Description
+from igsr.synth.description import Description
 
 #: The plastic number's powers: the additive recurrence in two dimensions that covers a square most
 #: evenly (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences").

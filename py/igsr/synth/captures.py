@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..atomic_write import check_writable
-from ..errors import IgsrError
-from ..worker_processes import worker_processes
-from .cameras import Viewpoint, draw_rig
-from .mitsuba_scene import (
+from igsr._internal.atomic_write import check_writable
+from igsr._internal.worker_processes import worker_processes
+from igsr.errors import IgsrError
+from igsr.synth.cameras import Viewpoint, draw_rig
+from igsr.synth.mitsuba_scene import (
     LoadedScene,
     encode,
     first_hits,
@@ -39,8 +39,8 @@ from .mitsuba_scene import (
     one_threaded_mitsuba,
     take_photo,
 )
-from .photographs import choose_viewpoints, exposure
-from .surroundings import draw_description
+from igsr.synth.photographs import choose_viewpoints, exposure
+from igsr.synth.surroundings import draw_description
 
 #: Goes up when the same seed begins to mean other scenes.
 RECIPE_VERSION = 2

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .meshes import Mesh
+from igsr.synth.meshes import Mesh
 
 
 @dataclass(frozen=True, eq=False)

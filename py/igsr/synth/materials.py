@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .description import Material
-from .textures import TEXTURES, palette
+from igsr.synth.description import Material
+from igsr.synth.textures import TEXTURES, palette
 
 #: Rows and columns of a texture.
 TEXTURE_SIZE = 256

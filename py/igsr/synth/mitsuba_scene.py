@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import IgsrError
-from .cameras import Viewpoint
-from .description import Description, Light, Material, Part
-from .meshes import Mesh, vertex_normals
-from .textures import to_linear, to_srgb
+from igsr.errors import IgsrError
+from igsr.synth.cameras import Viewpoint
+from igsr.synth.description import Description, Light, Material, Part
+from igsr.synth.meshes import Mesh, vertex_normals
+from igsr.synth.textures import to_linear, to_srgb
 
 VARIANT = "scalar_rgb"
 #: Surfaces on a light path and the light at its end: each further one costs as much time again and

@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .description import Part
-from .materials import Materials
-from .meshes import (
+from igsr.synth.description import Part
+from igsr.synth.materials import Materials
+from igsr.synth.meshes import (
     Mesh,
     box,
     disc,
@@ -32,7 +32,7 @@ from .meshes import (
     transformed,
     tube,
 )
-from .textures import leaf_veins
+from igsr.synth.textures import leaf_veins
 
 
 def moved(

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from .cameras import Rig, Viewpoint, spread
-from .description import Description
-from .mitsuba_scene import LoadedScene, first_hits, take_photo
+from igsr.synth.cameras import Rig, Viewpoint, spread
+from igsr.synth.description import Description
+from igsr.synth.mitsuba_scene import LoadedScene, first_hits, take_photo
 
 #: Pixels of the longer side of the small pictures by which viewpoints and exposures are judged.
 PROBE_SIZE = 40

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .textures import hsv, noise, octaves, to_linear
+from igsr.synth.textures import hsv, noise, octaves, to_linear
 
 #: Rows of a map that shows things; it has twice as many columns.
 ROWS = 256

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from .description import Description, Light, Part
-from .materials import Materials
-from .meshes import Mesh, box, disc, joined, lathe, place, rotation, sheet, tube
-from .objects import OBJECTS, bounds, moved, random_object
-from .skies import SKIES, UNSEEN_SKIES, cloudy
-from .textures import landscape, noise, to_linear
+from igsr.synth.description import Description, Light, Part
+from igsr.synth.materials import Materials
+from igsr.synth.meshes import Mesh, box, disc, joined, lathe, place, rotation, sheet, tube
+from igsr.synth.objects import OBJECTS, bounds, moved, random_object
+from igsr.synth.skies import SKIES, UNSEEN_SKIES, cloudy
+from igsr.synth.textures import landscape, noise, to_linear
 
 #: Part of the scenes that are of the family "object".
 OBJECT_SHARE = 0.45

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import Camera
-
-from .predictions import Grid
+from igsr.pose.alignment.predictions import Grid
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

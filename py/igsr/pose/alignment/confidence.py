@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from .aligned_photo import AlignedPhoto
+from igsr.pose.alignment.aligned_photo import AlignedPhoto
 
 Bool = npt.NDArray[np.bool_]
 

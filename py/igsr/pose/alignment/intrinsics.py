@@ -7,10 +7,10 @@ from collections.abc import Hashable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from .absolute_pose import searched_focal
-from .focal import weiszfeld_focal
-from .observations import Observations
-from .predictions import PhotoToAlign
+from igsr.pose.alignment.absolute_pose import searched_focal
+from igsr.pose.alignment.focal import weiszfeld_focal
+from igsr.pose.alignment.observations import Observations
+from igsr.pose.alignment.predictions import PhotoToAlign
 
 Float64 = npt.NDArray[np.float64]
 #: Points [3, P] and their raw confidence [P].

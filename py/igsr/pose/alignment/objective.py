@@ -18,11 +18,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from igsr.poses import Similarity
-
-from .observations import Observations
-from .placement import Placement
-from .predictions import PhotoToAlign
+from igsr.geometry.similarity import Similarity
+from igsr.pose.alignment.observations import Observations
+from igsr.pose.alignment.placement import Placement
+from igsr.pose.alignment.predictions import PhotoToAlign
 
 Float64 = npt.NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .predictions import PairPrediction, PhotoToAlign, kept
-from .similarity import is_spread
+from igsr.geometry.similarity import is_spread
+from igsr.pose.alignment.predictions import PairPrediction, PhotoToAlign, kept
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -8,9 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import Camera
-from igsr.poses import Similarity
-
-from .similarity import apply
+from igsr.geometry.similarity import Similarity, apply
 
 Float64 = npt.NDArray[np.float64]
 

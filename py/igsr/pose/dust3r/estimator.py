@@ -12,14 +12,7 @@ import numpy.typing as npt
 from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
-from igsr.pose.alignment import (
-    AlignedPhoto,
-    Grid,
-    PhotoToAlign,
-    Predictor,
-    align,
-    trusted_pixels,
-)
+from igsr.pose.alignment import AlignedPhoto, Grid, PhotoToAlign, Predictor, align, trusted_pixels
 from igsr.pose.dust3r.pairs import pair_graph, usual_graph
 from igsr.pose.dust3r.preprocessing import usable
 from igsr.pose.estimate import Estimate

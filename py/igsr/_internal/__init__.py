@@ -1,0 +1,1 @@
+"""Helpers, not part of the public interface: atomic files, worker processes, untrusted files."""

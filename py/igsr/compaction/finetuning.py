@@ -1,0 +1,104 @@
+"""Let the splats that are left take over what the removed ones showed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.capture import View
+from igsr.errors import IgsrError
+from igsr.fitting.fitter import fitter_of
+from igsr.splats import Splats
+
+#: Parameters of splats with the optimiser's moments, as ``_core.Fitter`` takes and returns them.
+State = dict[str, npt.NDArray[Any]]
+
+#: Steps after which a fit from nothing takes up one more SH degree. A refinement begins where all
+#: degrees are in use, or it would first unlearn what the model knows of them.
+STEPS_PER_DEGREE = 1000
+#: Steps between two looks at Ctrl-C and calls of the progress callback.
+CHUNK_STEPS = 10
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+MOMENTS = ("first_", "second_")
+
+
+def fresh_state(splats: Splats) -> State:
+    """``splats`` before their first step."""
+    state: State = {name: np.ascontiguousarray(getattr(splats, name)) for name in PARAMETERS}
+    for moment in MOMENTS:
+        state |= {moment + name: np.zeros_like(state[name]) for name in PARAMETERS}
+    for name in ("stats_grad_sum", "stats_seen"):
+        state[name] = np.zeros(len(splats), np.float32)
+    return state
+
+
+def chosen(state: State, indices: npt.NDArray[np.intp]) -> State:
+    """Those splats alone, with their moments."""
+    return {name: array[indices] for name, array in state.items() if name != "step"}
+
+
+def with_sh_degree(state: State, degree: int) -> State:
+    """The same without the SH bands above ``degree``, and with zeros for those missing below."""
+    bands = (degree + 1) ** 2
+    changed = {f"{prefix}sh" for prefix in ("", *MOMENTS)}
+
+    def fitted(sh: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        missing = max(0, bands - sh.shape[1])
+        return np.ascontiguousarray(np.pad(sh[:, :bands], ((0, 0), (0, missing), (0, 0))))
+
+    return {name: fitted(array) if name in changed else array for name, array in state.items()}
+
+
+def splats_of(state: State, origin: npt.NDArray[np.float64]) -> Splats:
+    """The splats of a state."""
+    return Splats(**{name: state[name] for name in PARAMETERS}, origin=origin, antialiased=False)
+
+
+def refined(
+    state: State,
+    origin: npt.NDArray[np.float64],
+    views: list[View],
+    steps: int,
+    settle: bool,
+    seed: int,
+    backend: str,
+    on_steps: Callable[[int], None],
+) -> State:
+    """``state``, with as many splats as it has, after more steps of fitting to ``views``.
+
+    Args:
+        state: where to start; finite, at least one splat.
+        origin: what its means are relative to, [3].
+        views: what to fit; those with alpha over a new random colour in each step.
+        steps: optimiser steps.
+        settle: whether the centres' rate falls to where fits end; else it hardly falls, and
+            another refinement is to follow.
+        seed: of the order of views and the colours.
+        backend: "auto", "cpu" or "gpu".
+        on_steps: called with the steps done.
+
+    Raises:
+        IgsrError: the views or splats cannot be used; the message names what.
+    """
+    degree = round(state["sh"].shape[1] ** 0.5) - 1
+    # As if within a fit, from a third of it: there the rates suit a model that is nearly right.
+    first = max(STEPS_PER_DEGREE * degree, -(-steps // 2))
+    settings = {
+        "steps": first + steps if settle else 3 * (first + steps),
+        "seed": seed,
+        "sh_degree": degree,
+        "max_splats": len(state["means"]),
+        "density": "fixed",
+    }
+    start = {**state, "step": np.array([first], np.uint32)}
+    try:
+        fitter = fitter_of(views, origin, start, settings, backend)
+        while (done := fitter.steps_done - first) < steps:
+            fitter.step(min(CHUNK_STEPS, steps - done))
+            on_steps(fitter.steps_done - first)
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
+    return fitter.state()

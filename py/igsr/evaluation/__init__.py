@@ -1,0 +1,7 @@
+"""Scores of splats on the photos of a capture: metrics, held-out scores, contact sheets."""
+
+from __future__ import annotations
+
+from igsr.evaluation.scores import METRICS, ScoredView, evaluate, score_views
+
+__all__ = ["METRICS", "ScoredView", "evaluate", "score_views"]

@@ -1,0 +1,98 @@
+"""Checkpoints of a fit: everything needed to continue it and end with the same bits.
+
+A checkpoint is an uncompressed ``.npz``: the fitter's arrays and one JSON object of settings. It
+is read as an untrusted file: no pickles, nothing compressed, and no array is allocated before its
+size is known to be in the file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr._internal.atomic_write import atomic_write
+from igsr._internal.untrusted_npz import DAMAGE
+from igsr.errors import IgsrError
+
+#: Raised whenever the arrays' meaning changes; older checkpoints are then refused by number.
+FORMAT = 1
+#: Member that holds the settings, as UTF-8 JSON.
+SETTINGS = "settings"
+
+State = dict[str, npt.NDArray[Any]]
+
+
+def save_checkpoint(path: Path, state: State, settings: dict[str, Any]) -> None:
+    """Write a checkpoint, whole or not at all.
+
+    ``settings`` holds "seconds", the time spent so far, as a float, and "started", what
+    the first splats were made from and their number.
+
+    Raises:
+        IgsrError: the file cannot be written; an older checkpoint is still there.
+    """
+    text = json.dumps({"format": FORMAT, **settings}, allow_nan=False).encode()
+    members: dict[str, Any] = {**state, SETTINGS: np.frombuffer(text, dtype=np.uint8)}
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **members)
+
+
+def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
+    """The arrays and settings of a checkpoint.
+
+    Raises:
+        IgsrError: there is none, it is damaged, or another format; the message says which.
+    """
+    if not path.is_file():
+        raise IgsrError(f"There is no checkpoint {path} to resume; leave --resume out.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            state = {
+                member.filename.removesuffix(".npy"): _read_member(archive, member)
+                for member in archive.infolist()
+            }
+        settings = json.loads(state.pop(SETTINGS).tobytes())
+        if not isinstance(settings, dict) or settings.pop("format", None) != FORMAT:
+            raise ValueError(f"it is not of format {FORMAT}")
+        seconds = settings.get("seconds")
+        if not isinstance(seconds, float) or not math.isfinite(seconds):
+            raise ValueError(f"its seconds are {seconds!r} where a finite number belongs")
+        started = settings.get("started")
+        if not isinstance(started, list) or [type(value) for value in started] != [str, int]:
+            raise ValueError(f"its started is {started!r} where a name and a number belong")
+    except DAMAGE as error:
+        raise IgsrError(
+            f"The checkpoint {path} cannot be read ({error}); leave --resume out to start anew."
+        ) from error
+    return state, settings
+
+
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    if member.compress_type != zipfile.ZIP_STORED or not member.filename.endswith(".npy"):
+        raise ValueError(f"{member.filename} is not a stored array")
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"{member.filename} is of an unknown array version")
+        read_header = (
+            np.lib.format.read_array_header_1_0
+            if version == (1, 0)
+            else np.lib.format.read_array_header_2_0
+        )
+        shape, fortran, dtype = read_header(file)
+        if dtype.hasobject or fortran or dtype.kind not in "biuf":
+            raise ValueError(f"{member.filename} is not a plain array of numbers")
+        count = 1
+        for size in shape:  # Python integers: a hostile shape cannot overflow
+            count *= size
+        # One byte more than promised, so that a longer member shows as well as a shorter one.
+        data = file.read(min(member.file_size, count * dtype.itemsize) + 1)
+        if len(data) != count * dtype.itemsize:
+            raise ValueError(f"{member.filename} has another size than its header says")
+    return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)

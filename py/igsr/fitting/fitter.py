@@ -1,0 +1,161 @@
+"""The renderer's fitter, made from views and read back as cameras; cameras as plain numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr import _core
+from igsr.capture import Camera, Capture, View
+from igsr.capture.types import intrinsic_matrix
+from igsr.errors import IgsrError
+from igsr.fitting.pose_priors import CameraHolds
+from igsr.rendering.renders import intrinsics_of, viewmat_about
+
+#: Steps on photos, at least, for one on a view that is none, where there are both: what such views
+#: teach they teach soon, and what photos show is right.
+PHOTO_STEPS = 5
+#: The last part of the steps, which are on photos alone: views that are none are a little blurred,
+#: and what is fine is fitted last.
+PHOTOS_LAST = 0.2
+
+
+def fitter_of(
+    views: Sequence[View],
+    origin: npt.NDArray[np.float64],
+    state: dict[str, Any],
+    settings: dict[str, Any],
+    backend: str,
+    holds: CameraHolds | None = None,
+) -> _core.Fitter:
+    """A fit in progress of ``state``, relative to ``origin``, to the views; see ``_core.Fitter``.
+
+    Cameras that are fitted are held by ``holds``, of as many views.
+
+    Raises:
+        ValueError: a view, the state or a setting cannot be used; the message names it.
+    """
+    return _core.Fitter(
+        [np.ascontiguousarray(view.image) for view in views],
+        [_counting(view) for view in views],
+        [view.background for view in views],
+        _schedule(views, int(settings["steps"]), int(settings.get("first_step", 0))),
+        *_arrays(views, origin),
+        state,
+        settings,
+        backend,
+        None if holds is None else _hold_arrays(holds, origin),
+    )
+
+
+def _schedule(views: Sequence[View], steps: int, first: int) -> list[tuple[int, int | None]]:
+    """How many steps of a round are of each view, and the first step that is not of it any more.
+
+    None is for views that stay to the end. Steps are counted from 0; a fit that enters the schedule
+    late begins with ``first``.
+    """
+    photos = sum(view.weights is None for view in views)
+    others = len(views) - photos
+    if not photos:
+        return [(1, None)] * others
+    each = max(1, -(-PHOTO_STEPS * others // photos))
+    until = first + round((1.0 - PHOTOS_LAST) * (steps - first))
+    return [(each, None) if view.weights is None else (1, until) for view in views]
+
+
+def _counting(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None:
+    """What the fitter takes as a view's mask: weights where the view has them."""
+    if view.weights is None:
+        return None if view.mask is None else np.ascontiguousarray(view.mask)
+    return np.ascontiguousarray(view.weights if view.mask is None else view.weights * view.mask)
+
+
+def _arrays(
+    views: Sequence[View], origin: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Viewmats relative to the origin [V, 4, 4] and intrinsics [V, 4]."""
+    return (
+        np.stack([viewmat_about(origin, view.camera.viewmat) for view in views]),
+        np.stack([intrinsics_of(view.camera.K) for view in views]),
+    )
+
+
+def _hold_arrays(
+    holds: CameraHolds, origin: npt.NDArray[np.float64]
+) -> dict[str, npt.NDArray[np.float64]]:
+    viewmats, intrinsics = _arrays(holds.views, origin)
+    return {
+        "viewmats": viewmats,
+        "intrinsics": intrinsics,
+        "information": holds.information,
+        "focal_information": holds.focal_information,
+    }
+
+
+def fitted_cameras(
+    views: Sequence[View], fitter: _core.Fitter, origin: npt.NDArray[np.float64]
+) -> list[Camera]:
+    """The views' cameras with poses and focal lengths as a fitter has them.
+
+    Args:
+        views: V views.
+        fitter: of these views.
+        origin: [3] of the splats, which the fitter's poses are relative to.
+    """
+    arrays = fitter.cameras()
+    return [
+        replace(
+            view.camera,
+            viewmat=viewmat_about(-origin, viewmat),
+            K=intrinsic_matrix(*(float(value) for value in intrinsics)),
+        )
+        for view, viewmat, intrinsics in zip(
+            views, arrays["camera_viewmats"], arrays["camera_intrinsics"], strict=True
+        )
+    ]
+
+
+def with_train_cameras(capture: Capture, cameras: list[Camera]) -> Capture:
+    """The capture with other cameras for its train views, in their order."""
+    each = iter(cameras)
+    views = [
+        replace(view, camera=next(each)) if view.split == "train" else view
+        for view in capture.views
+    ]
+    return Capture(capture.path, views, capture.points)
+
+
+def camera_rows(views: Sequence[View]) -> npt.NDArray[np.float64]:
+    """Poses and focal lengths [V, 14]: the viewmat's upper block by rows, fx, fy."""
+    return np.stack(
+        [
+            np.concatenate([view.camera.viewmat[:3].reshape(-1), view.camera.K[[0, 1], [0, 1]]])
+            for view in views
+        ]
+    )
+
+
+def with_camera_rows(views: list[View], rows: npt.NDArray[np.float64] | None) -> list[View]:
+    """The views with the cameras of ``camera_rows``; as they are where there are none.
+
+    Raises:
+        ValueError: there is not a finite row for each view.
+    """
+    if rows is None:
+        return views
+    if rows.shape != (len(views), 14) or not np.isfinite(rows).all():
+        raise ValueError(f"cameras: must be 14 finite numbers for each of {len(views)} views")
+    moved = []
+    for view, row in zip(views, rows, strict=True):
+        viewmat, K = np.eye(4), view.camera.K.copy()
+        viewmat[:3] = row[:12].reshape(3, 4)
+        K[[0, 1], [0, 1]] = row[12:]
+        try:
+            moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat, K=K)))
+        except IgsrError as error:
+            raise ValueError(f"cameras: {error}") from error
+    return moved

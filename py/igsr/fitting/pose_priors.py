@@ -1,0 +1,292 @@
+"""How well tracks know cameras, by which joint fits hold them.
+
+Bundle adjustment finds cameras to hundredths of a pixel, since it averages over thousands of places
+that several photos show. The colours of a fit are no match for that: left to themselves, they move
+such cameras away from where they were. So cameras that have tracks are held by what these say: the
+inverse of the covariance that bundle adjustment would report, points and all other cameras free,
+for the errors that the tracks are seen to have (Triggs et al., "Bundle Adjustment - A Modern
+Synthesis", 2000, sections 6.1 and 9).
+
+Cameras that are not where their tracks have them (noise was added, or something else moved them
+since) are known less well than that: by how far the next step of bundle adjustment would move them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.capture import Points, View
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+#: A camera that sees fewer points is held by none.
+FEWEST = 3
+#: Pixels; no place in a photo is known better, however well made-up tracks agree.
+LEAST_ERROR = 0.05
+#: Part of a standard deviation that is left to the colours. They pull all the time, and mostly one
+#: way: with a whole one, cameras that COLMAP had found were measurably worse after a fit.
+LEFT_OPEN = 0.25
+#: Observations further off than so many times the median, and by more than so many pixels, are of
+#: something else: squares would make one of them outweigh all others.
+OUTLIER, OUTLIER_PIXELS = 10.0, 4.0
+#: Depths beyond this many times the median, or below its inverse, are no places that cameras see.
+DEEPEST = 1e5
+#: What is known of a camera is limited to this many times what is known least of it (in units of
+#: its own deviations): of only two cameras, one direction is known by definition.
+MOST_KNOWN = 1e7
+#: Points that are eliminated at a time; bounds memory.
+AT_ONCE = 512
+#: Added to the information, as a part of it: along what no track shows, cameras are free.
+RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class CameraHolds:
+    """Where V cameras were found, and how well they are known.
+
+    Attributes:
+        views: with these cameras.
+        information: float64 [V, 6, 6], inverse of the covariance of turn (radians) about and move
+            (world units) along x, y, z of the camera, with ``LEFT_OPEN`` of the standard deviations
+            that the tracks leave; zero where nothing is known.
+        focal_information: float64 [V], inverse of the variance of the focal length's logarithm.
+    """
+
+    views: Sequence[View]
+    information: Float64
+    focal_information: Float64
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Linearised reprojection errors of M observations, two rows each.
+
+    The C columns are those of ``normal`` that an observation has to do with; the last one is that
+    of the errors themselves.
+    """
+
+    point: Int64  # [M], from 0 without gaps
+    column: Int64  # [M, C]
+    value: Float64  # [M, 2, C], pixels by unit of the parameter
+    of_point: Float64  # [M, 2, 3], pixels by world unit
+    width: int
+
+
+def camera_holds(
+    views: Sequence[View], points: Points | None, *, poses: bool, focal: str
+) -> CameraHolds | None:
+    """What the tracks of a capture say about the cameras that are to be fitted.
+
+    Args:
+        views: with the cameras that were found with the tracks; what other photos saw is left out.
+        points: without tracks, nothing is known.
+        poses: whether poses are fitted; what is not fitted is taken to be exact.
+        focal: which focal lengths are: "fixed", "shared" or "per-camera".
+
+    Returns:
+        None where no camera has tracks enough.
+    """
+    count = len(views)
+    seen = None if points is None else _seen_by(views, points)
+    if points is None or seen is None:
+        return None
+    view, point, xy = seen
+    enough = np.bincount(view, minlength=count) > 0
+    try:
+        with np.errstate(all="ignore"):
+            return _held(views, points.xyz, view, point, xy, enough, poses, focal)
+    except np.linalg.LinAlgError:
+        return None  # places and points that no camera can have seen hold nothing
+
+
+def _held(
+    views: Sequence[View],
+    xyz: Float64,
+    view: Int64,
+    point: Int64,
+    xy: Float64,
+    enough: npt.NDArray[np.bool_],
+    poses: bool,
+    focal: str,
+) -> CameraHolds | None:
+    count = len(views)
+    equations = _linearised(views, xyz, view, point, xy, poses, focal)
+    normal = _without_points(equations)
+    size = equations.width - 1
+    slope, error = normal[:size, size], normal[size, size]
+    known = np.diagonal(normal)[:size]
+    scale = np.sqrt(np.where(known > 0.0, known, 1.0))
+    scaled = normal[:size, :size] / np.outer(scale, scale) + RIDGE * np.eye(size)
+    unseen = np.zeros((size, 0))
+    if poses:
+        # Turning, moving and scaling all together is seen by no photo, and is not what is asked.
+        unseen = np.zeros((size, 7))
+        # Cameras without tracks have no part in it: they would loosen all others.
+        unseen[: 6 * count] = _gauge(views) * np.repeat(enough, 6)[:, None]
+        unseen = np.linalg.qr(unseen * scale[:, None])[0]
+    covariance = np.linalg.inv(scaled + unseen @ unseen.T) - unseen @ unseen.T
+    step = -covariance @ (slope / scale) / scale
+    freedom = 2 * len(point) - 3 * (equations.point.max() + 1) - size
+    variance = max(LEAST_ERROR**2, (error + slope @ step) / max(freedom, 1))
+    covariance *= LEFT_OPEN**2 * variance / np.outer(scale, scale)
+    covariance += np.outer(step, step)
+
+    information, of_focal = np.zeros((count, 6, 6)), np.zeros(count)
+    for k in np.flatnonzero(enough):
+        if poses:
+            rows = slice(6 * k, 6 * k + 6)
+            information[k] = _inverse(covariance[rows, rows])
+    if focal == "shared":
+        of_focal[:] = 1.0 / covariance[-1, -1]
+    elif focal == "per-camera":
+        of_focal[enough] = 1.0 / np.diagonal(covariance)[-count:][enough]
+    if not (
+        np.isfinite(information).all() and np.isfinite(of_focal).all() and of_focal.min() >= 0.0
+    ):
+        return None
+    return CameraHolds(views, information, of_focal)
+
+
+def _seen_by(
+    views: Sequence[View], points: Points
+) -> tuple[Int64, Int64, npt.NDArray[np.float64]] | None:
+    """View, point and place of observations of points that at least two of the views see.
+
+    Left out are what stands behind a camera, what is far off, and views with too few of the rest.
+    """
+    tracks = points.tracks
+    if tracks is None:
+        return None
+    index = {view.name: k for k, view in enumerate(views)}
+    view_of = np.array([index.get(name, -1) for name in tracks.names], dtype=np.int64)
+    view = view_of[tracks.view]
+    depth, off = np.full(len(view), -1.0), np.full(len(view), np.inf)
+    with np.errstate(all="ignore"):
+        for k, one in enumerate(views):
+            mine = np.flatnonzero(view == k)
+            camera = one.camera
+            local = points.xyz[tracks.point[mine]] @ camera.viewmat[:3, :3].T
+            local += camera.viewmat[:3, 3]
+            place = local[:, :2] / local[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+            depth[mine] = local[:, 2]
+            off[mine] = np.linalg.norm(place - tracks.xy[mine], axis=1)
+    usable = (view >= 0) & (depth > 0.0) & np.isfinite(depth) & np.isfinite(off)
+    if not usable.any():
+        return None
+    middle = float(np.median(depth[usable]))
+    usable &= (depth < DEEPEST * middle) & (depth > middle / DEEPEST)
+    usable &= off <= max(OUTLIER_PIXELS, OUTLIER * float(np.median(off[usable])))
+    # A point that one photo sees says nothing about it; one that a photo sees twice is no point.
+    pairs = np.unique(
+        np.stack([tracks.point[usable], view[usable]], axis=1), axis=0, return_index=True
+    )[1]
+    chosen = np.sort(np.flatnonzero(usable)[pairs])
+    before = -1
+    while len(chosen) != before:
+        before = len(chosen)
+        seen_by = np.bincount(tracks.point[chosen], minlength=len(points.xyz))
+        sees = np.bincount(view[chosen], minlength=len(views))
+        keep = (seen_by[tracks.point[chosen]] >= 2) & (sees[view[chosen]] >= FEWEST)
+        chosen = chosen[keep]
+    if not len(chosen):
+        return None
+    return view[chosen], tracks.point[chosen], tracks.xy[chosen]
+
+
+def _linearised(
+    views: Sequence[View],
+    xyz: Float64,
+    view: Int64,
+    point: Int64,
+    xy: Float64,
+    poses: bool,
+    focal: str,
+) -> _Equations:
+    """The equations of bundle adjustment at where cameras and points are."""
+    count, total = len(views), len(view)
+    cameras = [one.camera for one in views]
+    viewmat = np.stack([camera.viewmat for camera in cameras])[view]
+    K = np.stack([camera.K for camera in cameras])[view]
+    focal_pixels = K[:, [0, 1], [0, 1]]
+    local = np.einsum("mij,mj->mi", viewmat[:, :3, :3], xyz[point]) + viewmat[:, :3, 3]
+    ray = local[:, :2] / local[:, 2:]
+    # How the place in the photo follows the point in the camera's frame: [M, 2, 3].
+    of_local = np.zeros((total, 2, 3))
+    of_local[:, [0, 1], [0, 1]] = 1.0
+    of_local[:, :, 2] = -ray
+    of_local *= (focal_pixels / local[:, 2:])[:, :, None]
+    columns, values = [], []
+    if poses:
+        # A turn w moves the point by w x local.
+        turns = np.cross(of_local, local[:, None, :], axisa=2, axisb=2)
+        values.append(np.concatenate([-turns, of_local], axis=2))
+        columns.append(6 * view[:, None] + np.arange(6))
+    before = 6 * count * poses
+    focals = {"fixed": 0, "shared": 1, "per-camera": count}[focal]
+    if focals:
+        values.append((ray * focal_pixels)[:, :, None])
+        columns.append((before + (view if focals > 1 else 0 * view))[:, None])
+    width = before + focals + 1
+    values.append((ray * focal_pixels + K[:, :2, 2] - xy)[:, :, None])
+    columns.append(np.full((total, 1), width - 1))
+    return _Equations(
+        np.unique(point, return_inverse=True)[1],
+        np.concatenate(columns, axis=1),
+        np.concatenate(values, axis=2),
+        of_local @ viewmat[:, :3, :3],
+        width,
+    )
+
+
+def _without_points(equations: _Equations) -> Float64:
+    """The normal equations [width, width] once each point has gone where it fits best."""
+    normal = np.zeros((equations.width, equations.width))
+    order = np.argsort(equations.point, kind="stable")
+    point = equations.point[order]
+    for first in range(0, int(point[-1]) + 1, AT_ONCE):
+        chunk = order[slice(*np.searchsorted(point, (first, first + AT_ONCE)))]
+        number = equations.point[chunk] - first
+        column, value = equations.column[chunk], equations.value[chunk]
+        of_point = equations.of_point[chunk]
+        np.add.at(
+            normal,
+            (column[:, :, None], column[:, None, :]),
+            np.einsum("mri,mrj->mij", value, value),
+        )
+        count = int(number.max()) + 1
+        own = np.zeros((count, 3, 3))
+        np.add.at(own, number, np.einsum("mri,mrj->mij", of_point, of_point))
+        own += RIDGE * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        mixed = np.zeros((count, equations.width, 3))
+        np.add.at(mixed, (number[:, None], column), np.einsum("mri,mrj->mij", value, of_point))
+        half = np.linalg.solve(np.linalg.cholesky(own), mixed.swapaxes(1, 2))
+        half = half.reshape(3 * count, -1)
+        normal -= half.T @ half
+    return normal
+
+
+def _gauge(views: Sequence[View]) -> Float64:
+    """How turning about, moving along x, y, z and scaling the world moves V cameras [6 V, 7]."""
+    rows = []
+    for view in views:
+        rotation, shift = view.camera.viewmat[:3, :3], view.camera.viewmat[:3, 3]
+        own = np.zeros((6, 7))
+        own[:3, :3] = -rotation
+        own[3:, :3] = np.cross(rotation, shift, axisa=0, axisb=0, axisc=0)
+        own[3:, 3:6] = -rotation
+        own[3:, 6] = shift
+        rows.append(own)
+    return np.concatenate(rows)
+
+
+def _inverse(covariance: Float64) -> Float64:
+    """The symmetric inverse of a covariance whose entries have units of their own."""
+    unit = np.sqrt(np.diagonal(covariance))
+    variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
+    variances = np.maximum(variances, variances[-1] / MOST_KNOWN)
+    return np.asarray((axes / variances) @ axes.T / np.outer(unit, unit))

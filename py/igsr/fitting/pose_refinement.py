@@ -1,0 +1,85 @@
+"""Cameras that are not exact: how far two sets of them are apart, and finding a photo's camera.
+
+Splats and cameras that were fitted together may be turned, moved and scaled as a whole without any
+photo showing it. Scores of held-out views say which of three things was done about that:
+
+* raw: the held-out cameras as they were given;
+* aligned: moved by the similarity that maps the true train cameras onto the fitted ones;
+* refined: each held-out camera fitted to its own photo while the splats stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr import _core
+from igsr.capture import View
+from igsr.errors import IgsrError
+from igsr.fitting.fitter import fitted_cameras, fitter_of
+from igsr.splats import Splats
+
+Float64 = npt.NDArray[np.float64]
+
+#: Steps that refining spends on each camera.
+REFINE_STEPS = 30
+
+
+def refine_cameras(
+    splats: Splats,
+    views: Sequence[View],
+    background: Sequence[float],
+    *,
+    steps: int = REFINE_STEPS,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> list[View]:
+    """The views with poses fitted to their photos; splats and focal lengths stay as they are.
+
+    Photo, mask and given camera of each view are used, one view at a time, and nothing is learnt
+    about the scene: this is how few-view papers score scenes whose cameras were fitted too.
+
+    Args:
+        splats: the scene.
+        views: what to find the cameras of; their own are where the search starts.
+        background: RGB in [0, 1] behind splats and photos with alpha.
+        steps: steps per view; each moves the picture by at most about a third of a pixel, at the
+            end by a hundredth.
+        backend: "auto", "cpu" or "gpu".
+        progress: called with (steps done, of all) now and then.
+
+    Raises:
+        IgsrError: ``steps`` is not positive, or a view cannot be used.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    if steps < 1:
+        raise IgsrError(f"steps must be at least 1, not {steps}.")
+    if splats.antialiased:
+        raise IgsrError("Cameras cannot be refined to antialiased splats: fits draw without that.")
+    if not views:
+        return []
+    total = steps * len(views)
+    apart = ("origin", "antialiased")
+    state = {name: value for name, value in vars(splats).items() if name not in apart}
+    settings = {
+        "steps": total,
+        "sh_degree": splats.sh_degree,
+        "density": "fixed",
+        "background": [float(channel) for channel in background],
+        "poses": "joint",
+        "frozen": True,
+        "camera_warm_up": 0.0,
+    }
+    try:
+        fitter = fitter_of(views, splats.origin, state, settings, _core.resolve_backend(backend))
+        for done in range(len(views), total + 1, len(views)):
+            fitter.step(len(views))
+            if progress is not None:
+                progress(done, total)
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
+    cameras = fitted_cameras(views, fitter, splats.origin)
+    return [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]

@@ -1,0 +1,200 @@
+"""Unseen views: cameras near the photos', looking at what they look at.
+
+A camera's neighbourhood is where it can turn to about the point that it looks at: eight ways to
+lean out, by ``STEP`` degrees each, and the middle between it and each of the others near it. What
+is not near a known camera already is unseen. Views between photos come first, then those beyond;
+where views from beyond are added to the known ones, the next round starts from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.capture import Camera
+from igsr.rendering.renders import render
+from igsr.splats import Splats
+
+Float64 = npt.NDArray[np.float64]
+
+#: Degrees from a known camera to an unseen one, about what they look at.
+STEP = 12.0
+#: Nearer than this part of a step to a known camera a view is not unseen.
+SEEN = 0.6
+#: Two cameras further apart than this, degrees, have nothing between them that is known.
+GAP = 60.0
+#: Ways to lean out.
+COMPASS = 8
+#: A view of which more than this share is nearer than ``CLOSE`` of the distance to what it looks at
+#: stands inside the scene, or behind something.
+CLOSE_SHARE, CLOSE = 0.1, 0.35
+#: Where a render covers less than this there is nothing to look at.
+SURFACE_ALPHA = 0.5
+#: Views are looked at in this size, pixels of the longer side, to find that out.
+GLANCE = 96
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenView:
+    """A camera that no photo was taken from.
+
+    Attributes:
+        camera: pinhole camera with the size and focal length of the known camera that it was
+            turned away from.
+        angle: degrees to the nearest known camera, about what that looks at.
+        between: whether it lies between known cameras and not beyond them.
+    """
+
+    camera: Camera
+    angle: float
+    between: bool
+
+
+def unseen_views(
+    splats: Splats, known: Sequence[Camera], count: int, backend: str = "auto"
+) -> list[UnseenView]:
+    """Cameras worth rendering: near known ones but not at them, spread out, never inside the scene.
+
+    Args:
+        splats: the scene as it is known.
+        known: cameras of the photos, and of views accepted before.
+        count: how many to return at most.
+        backend: "auto", "cpu", "gpu" or "reference".
+
+    Returns:
+        Those between known cameras first, each group with the ones farthest from all others first.
+        Fewer than ``count``, or none, where there is nothing unseen nearby.
+    """
+    distances = [_viewing_distance(splats, camera, backend) for camera in known]
+    looking = [
+        (camera, distance)
+        for camera, distance in zip(known, distances, strict=True)
+        if distance is not None
+    ]
+    centres = np.array([camera.centre for camera, _ in looking]).reshape(-1, 3)
+    targets = np.array([_target(*one) for one in looking]).reshape(-1, 3)
+    found: list[tuple[UnseenView, float]] = []
+    for k, (camera, distance) in enumerate(looking):
+        others = [one for i, (one, _) in enumerate(looking) if i != k]
+        for candidate, reach, between in _neighbourhood(camera, distance, others):
+            angle = float(_angles(targets, centres, candidate.centre).min())
+            if angle >= SEEN * STEP:
+                found.append((UnseenView(candidate, angle, between), reach))
+    chosen: list[UnseenView] = []
+    for between in (True, False):
+        group = [pair for pair in found if pair[0].between == between]
+        new = np.array([view.camera.centre for view in chosen]).reshape(-1, 3)
+        around = np.concatenate([centres, new])
+        apart = np.array(
+            [_angles(_target(v.camera, d), v.camera.centre, around).min() for v, d in group]
+        )
+        while len(chosen) < count and len(apart) and apart.max() >= SEEN * STEP:
+            best = int(np.argmax(apart))
+            view, reach = group[best]
+            apart[best] = 0.0
+            if not _is_outside(splats, view.camera, reach, backend):
+                continue
+            chosen.append(view)
+            for i, (other, its_reach) in enumerate(group):
+                target = _target(other.camera, its_reach)
+                away = _angles(target, other.camera.centre, view.camera.centre)
+                apart[i] = min(apart[i], float(away))
+    return chosen
+
+
+def _neighbourhood(
+    camera: Camera, distance: float, others: Sequence[Camera]
+) -> list[tuple[Camera, float, bool]]:
+    """Cameras around one, how far each is from what it looks at, and whether it is between."""
+    out = []
+    for other in others:
+        gap = _angle(camera, other, distance)
+        if STEP < gap <= GAP:
+            out.append((*_towards(camera, other, distance, 0.5), True))
+    for k in range(COMPASS):
+        turn = 2.0 * np.pi * k / COMPASS
+        out.append((_leaning(camera, distance, np.cos(turn), np.sin(turn)), distance, False))
+    return out
+
+
+def _target(camera: Camera, distance: float) -> Float64:
+    return np.asarray(camera.centre + distance * camera.viewmat[2, :3])
+
+
+def _leaning(camera: Camera, distance: float, right: float, down: float) -> Camera:
+    """The camera turned by a step about what it looks at, towards a side of its own picture."""
+    target = _target(camera, distance)
+    rotation = camera.viewmat[:3, :3]
+    away = -rotation[2]
+    side = right * rotation[0] + down * rotation[1]
+    angle = np.radians(STEP)
+    moved = np.cos(angle) * away + np.sin(angle) * side
+    return _looking(camera, target + distance * moved, target, rotation[1])
+
+
+def _towards(camera: Camera, other: Camera, distance: float, part: float) -> tuple[Camera, float]:
+    """A camera on the arc from one to another, about what the first looks at, and how far off."""
+    target = _target(camera, distance)
+    there = other.centre - target
+    far = float(np.linalg.norm(there))
+    start, end = -camera.viewmat[2, :3], there / far
+    angle = np.arccos(np.clip(start @ end, -1.0, 1.0))
+    weights = np.sin((1.0 - part) * angle), np.sin(part * angle)
+    direction = (weights[0] * start + weights[1] * end) / np.sin(angle)
+    reach = (1.0 - part) * distance + part * far
+    down = (1.0 - part) * camera.viewmat[1, :3] + part * other.viewmat[1, :3]
+    return _looking(camera, target + reach * direction, target, down), reach
+
+
+def _looking(camera: Camera, centre: Float64, target: Float64, down: Float64) -> Camera:
+    """A camera like another, at a place, looking at a target, its y axis nearest to a given one."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(down, forward)
+    if np.linalg.norm(right) < 1e-6:
+        right = camera.viewmat[0, :3] - (camera.viewmat[0, :3] @ forward) * forward
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    return replace(camera, viewmat=viewmat)
+
+
+def _angle(camera: Camera, other: Camera, distance: float) -> float:
+    """Degrees between where two cameras stand, seen from what the first looks at."""
+    return float(_angles(_target(camera, distance), camera.centre, other.centre))
+
+
+def _angles(target: Float64, centre: Float64, others: Float64) -> Float64:
+    """Degrees between ``centre`` and ``others``, seen from ``target``; [..., 3] broadcast."""
+    here, there = centre - target, others - target
+    lengths = np.linalg.norm(here, axis=-1) * np.linalg.norm(there, axis=-1)
+    cosine = np.sum(here * there, axis=-1) / np.where(lengths > 0.0, lengths, 1.0)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return np.where(lengths > 0.0, angle, 180.0)
+
+
+def _glance(camera: Camera) -> Camera:
+    """The same camera with a small picture."""
+    scale = min(1.0, GLANCE / max(camera.width, camera.height))
+    width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
+    K = camera.K.copy()
+    K[0] *= width / camera.width
+    K[1] *= height / camera.height
+    return replace(camera, K=K, width=width, height=height)
+
+
+def _viewing_distance(splats: Splats, camera: Camera, backend: str) -> float | None:
+    """Median depth of what a camera sees; None where it sees nothing."""
+    seen = render(splats, _glance(camera), backend=backend)
+    depths = seen.expected_depth[seen.alpha > SURFACE_ALPHA]
+    return float(np.median(depths)) if len(depths) else None
+
+
+def _is_outside(splats: Splats, camera: Camera, distance: float, backend: str) -> bool:
+    """Whether a camera sees the scene from in front: little too near, and something at all."""
+    seen = render(splats, _glance(camera), backend=backend)
+    near = (seen.alpha > SURFACE_ALPHA) & (seen.expected_depth < CLOSE * distance)
+    return bool(near.mean() <= CLOSE_SHARE and (seen.alpha > SURFACE_ALPHA).any())

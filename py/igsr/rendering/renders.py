@@ -1,0 +1,134 @@
+"""Render splats from one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr import _core
+from igsr.capture import Camera
+from igsr.errors import IgsrError
+from igsr.splats import FloatArray, Splats
+
+
+@dataclass(frozen=True)
+class Render:
+    """What one camera sees. All float32.
+
+    Attributes:
+        color: [H, W, 3], not clamped: SH may exceed 1.
+        alpha: [H, W], accumulated opacity in [0, 1].
+        depth: [H, W], accumulated camera-space z, sum of weight * z.
+        expected_depth: [H, W], depth / alpha, 0 where alpha is 0.
+        transmittance: [H, W], the share of background that shows, stored rather than 1 - alpha.
+    """
+
+    color: FloatArray
+    alpha: FloatArray
+    depth: FloatArray
+    expected_depth: FloatArray
+    transmittance: FloatArray
+
+    def to_uint8(self) -> npt.NDArray[np.uint8]:
+        """The picture a user sees, uint8 [H, W, 3]: clamped to [0, 1] and rounded."""
+        finite = np.nan_to_num(self.color, nan=0.0, posinf=1.0, neginf=0.0)
+        return (np.clip(finite, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def render(
+    splats: Splats,
+    camera: Camera,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    backend: str = "auto",
+) -> Render:
+    """Render ``splats`` as ``camera`` sees them.
+
+    Args:
+        splats: the scene.
+        camera: pinhole camera, OpenCV axes, pixel centres at +0.5, world frame of the capture.
+        background: RGB in [0, 1] behind the splats.
+        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu" or "reference".
+
+    Raises:
+        IgsrError: an argument is unusable; the message names it.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    try:
+        background_color = np.asarray(background, dtype=np.float64)
+    except (TypeError, ValueError):
+        background_color = np.zeros(0)
+    if background_color.shape != (3,) or not np.isfinite(background_color).all():
+        raise IgsrError("background must be three finite numbers")
+    try:
+        image = _render_arrays(splats, camera, background_color, backend)
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
+    color, alpha, depth, transmittance = (
+        image[name].astype(np.float32, copy=False)
+        for name in ("color", "alpha", "depth", "transmittance")
+    )
+    expected = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
+    return Render(color, alpha, depth, expected, transmittance)
+
+
+def project(splats: Splats, camera: Camera, backend: str) -> dict[str, npt.NDArray[Any]]:
+    """The splats as 2D Gaussians in one camera's picture: what ``_core.rasterize`` draws.
+
+    Args:
+        splats: the scene.
+        camera: pinhole camera, OpenCV axes, world frame of the capture.
+        backend: "cpu", "gpu" or "reference".
+
+    Raises:
+        ValueError: the parameters cannot be drawn; the message names the argument.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    dtype = _core.working_dtype(backend)
+    parameters = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    projected: dict[str, npt.NDArray[Any]] = _core.project(
+        *(parameter.astype(dtype, order="C", copy=False) for parameter in parameters),
+        sh_degree=splats.sh_degree,
+        raw_parameters=True,
+        viewmat=viewmat_about(splats.origin, camera.viewmat),
+        intrinsics=intrinsics_of(camera.K),
+        width=camera.width,
+        height=camera.height,
+        near=_core.NEAR_PLANE,
+        far=_core.FAR_PLANE,
+        eps2d=_core.EPS2D,
+        antialiased=splats.antialiased,
+        backend=backend,
+    )
+    return projected
+
+
+def _render_arrays(
+    splats: Splats, camera: Camera, background: npt.NDArray[np.float64], backend: str
+) -> dict[str, npt.NDArray[Any]]:
+    backend = _core.resolve_backend(backend)
+    image: dict[str, npt.NDArray[Any]] = _core.rasterize(
+        project(splats, camera, backend),
+        width=camera.width,
+        height=camera.height,
+        background=background.astype(_core.working_dtype(backend)),
+        backend=backend,
+    )
+    return image
+
+
+def viewmat_about(
+    origin: npt.NDArray[np.float64], viewmat: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """World-to-camera [4, 4] for points given relative to ``origin``, composed in float64."""
+    composed = np.array(viewmat, dtype=np.float64)
+    composed[:3, 3] += composed[:3, :3] @ origin
+    return composed
+
+
+def intrinsics_of(K: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """fx, fy, cx, cy [4] float64 of a pinhole matrix [3, 3]."""
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64)
