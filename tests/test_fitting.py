@@ -19,8 +19,10 @@ import scenes
 
 import igsr
 from igsr.evaluation import metrics
-from igsr.fitting import run as fitting
+from igsr.fitting import checkpoint as checkpoints
+from igsr.fitting import optimization as fitting
 from igsr.fitting.checkpoint import load_checkpoint, save_checkpoint
+from igsr.fitting.fingerprint import fingerprint
 
 STEPS = 420  # density control runs at 300 and every 100 from then on
 
@@ -138,7 +140,7 @@ def test_pictures_are_compared_over_what_stood_behind_them(capture):
     assert same(small_fit(before(green), steps=20), expected)
     assert same(small_fit(before(green), steps=20, background=(0.0, 0.0, 1.0)), expected)
     assert not same(small_fit(capture, steps=20), expected)
-    prints = {fitting.fingerprint(before(color).train_views) for color in (None, green)}
+    prints = {fingerprint(before(color).train_views) for color in (None, green)}
     assert len(prints) == 2
 
 
@@ -188,8 +190,8 @@ FIT_FOREVER = """
 import sys
 sys.path[:0] = {path!r}
 import igsr, scenes
-from igsr import fitting
-fitting.CHECKPOINT_STEPS = 20
+from igsr.fitting import optimization
+optimization.CHECKPOINT_STEPS = 20
 capture = scenes.capture(views=4, size=40)
 igsr.fit(capture, steps=1_000_000, backend="cpu", max_splats=400, sh_degree=1,
          checkpoint=sys.argv[1], progress=lambda now: print(now.step, flush=True))
@@ -279,7 +281,7 @@ def test_last_checkpoint_that_fails_does_not_cost_the_splats(capture, tmp_path, 
     def full_disk(*arguments):
         raise igsr.IgsrError("Cannot write checkpoint.npz: No space left on device.")
 
-    monkeypatch.setattr(fitting, "save_checkpoint", full_disk)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", full_disk)
     with pytest.warns(UserWarning, match="No space left"):
         splats = small_fit(capture, steps=20, checkpoint=tmp_path / "checkpoint.npz")
     assert same(splats, small_fit(capture, steps=20))
@@ -294,7 +296,7 @@ def test_interrupt_during_the_last_save_saves_again(capture, tmp_path, monkeypat
             raise KeyboardInterrupt
         save_checkpoint(*arguments)
 
-    monkeypatch.setattr(fitting, "save_checkpoint", interrupted_once)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", interrupted_once)
     with pytest.raises(KeyboardInterrupt):
         small_fit(capture, steps=20, checkpoint=tmp_path / "checkpoint.npz")
     assert load_checkpoint(tmp_path / "checkpoint.npz")[0]["step"] == [20]
