@@ -417,6 +417,8 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
         dropout=0.2,
         hull=True,
         start="auto",
+        poses="fixed",
+        focal="fixed",
     )
     monkeypatch.setattr(presets, "_FEW", short)
     row = run_fit(str(data), PoseFit("ball", Noise("turn", 1.0), "joint", 0, "cpu"))

@@ -32,6 +32,8 @@ SHORT = FitSettings(
     dropout=0.0,
     hull=False,
     start="random",
+    poses="fixed",
+    focal="fixed",
 )
 
 

@@ -35,10 +35,17 @@ class BarState(NamedTuple):
 
 
 @contextlib.contextmanager
-def progress_bar(label: str, *, shown: bool = True) -> Iterator[Callable[[BarState], None]]:
+def progress_bar(
+    label: str, *, shown: bool = True, transient: bool = False
+) -> Iterator[Callable[[BarState], None]]:
     """A bar on stderr with label, counts, text and time left; what it yields moves it.
 
     It appears with the first state, so that an error before that is a message alone.
+
+    Args:
+        label: before the bar.
+        shown: whether there is a bar at all.
+        transient: whether it goes when it is done.
     """
     # Half of a short command's time would go into this import.
     from rich.console import Console
@@ -51,13 +58,14 @@ def progress_bar(label: str, *, shown: bool = True) -> Iterator[Callable[[BarSta
         TimeRemainingColumn(compact=True),
         console=Console(file=sys.stderr, highlight=False),
         disable=not shown,
+        transient=transient,
     )
     task = bar.add_task(label, total=None, counts="", text="")
 
     def show(state: BarState) -> None:
         bar.start()
         # Fractions are a unit of their own, which no count explains.
-        counts = f"{state.done:g}/{state.total:g}" if state.total > 1 else ""
+        counts = f"{state.done:.0f}/{state.total:.0f}" if state.total > 1 else ""
         bar.update(task, completed=state.done, total=state.total, counts=counts, text=state.text)
 
     try:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
+from igsr._internal.progress_bar import BarState
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import CheckpointFile
 from igsr.fitting.settings import FitSettings
@@ -46,6 +47,15 @@ class Progress:
     seconds: float
     steps_per_second: float
     backend: dict[str, str]
+
+
+def bar_state(now: Progress) -> BarState:
+    """What a progress bar shows of a fit."""
+    return BarState(
+        now.step,
+        now.steps,
+        f"loss {now.loss:.4f}  {now.splats} splats  {now.steps_per_second:.0f} steps/s",
+    )
 
 
 #: What is called with the progress of a fit; False ends the fit early.

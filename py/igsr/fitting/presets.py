@@ -27,6 +27,8 @@ _MANY = FitSettings(
     dropout=0.0,
     hull=False,
     start="auto",
+    poses="fixed",
+    focal="fixed",
 )
 _FEW = replace(_MANY, steps=4000, sh_degree=1, density="mcmc", dropout=0.3)
 #: As Kerbl et al. 2023 fit synthetic scenes, at their shorter number of steps, but for our number
@@ -81,5 +83,10 @@ def preset_settings(name: str, photos: int, **given: Any) -> dict[str, Any]:
     Raises:
         IgsrError: as ``settings_for``.
     """
-    values = settings_for(name, photos, **given).plain()
+    return preset_keywords(settings_for(name, photos, **given))
+
+
+def preset_keywords(settings: FitSettings) -> dict[str, Any]:
+    """Those settings that presets have, as keywords of ``igsr.fit``."""
+    values = settings.plain()
     return {name: value for name, value in values.items() if name not in _NOT_OF_PRESETS}

@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from igsr._internal.progress_bar import BarState, progress_or_bar
+from igsr._internal.progress_bar import progress_or_bar
 from igsr.capture import Capture
 from igsr.capture.photo_checks import check_photos
 from igsr.errors import IgsrError
@@ -29,7 +29,7 @@ from igsr.fitting.fitter import (
     with_camera_rows,
     with_train_cameras,
 )
-from igsr.fitting.optimization import FitRun, Progress, Report
+from igsr.fitting.optimization import FitRun, Progress, Report, bar_state
 from igsr.fitting.pose_priors import camera_holds
 from igsr.fitting.presets import Preset, settings_for
 from igsr.fitting.rough_cameras import with_rough_cameras
@@ -202,7 +202,7 @@ def _fitted(
         recorded = recorded_settings(settings, device, fingerprint(views, tracks), splats_hash)
         file = CheckpointFile(Path(checkpoint), recorded)
 
-    with progress_or_bar(progress, "fit", _bar_state) as report:
+    with progress_or_bar(progress, "fit", bar_state) as report:
         # Go on from the checkpoint, or initialize the splats; joint fits find the cameras first.
         seconds, rough, stopped = 0.0, False, False
         if resume and file is not None:
@@ -270,11 +270,3 @@ def _settings_from_splats(
         raise IgsrError("start has antialiased splats, which igsr does not fit; give others.")
     whole = max(settings.steps, settings_for(preset, photos).steps)
     return replace(settings, steps=whole, first_step=whole - settings.steps)
-
-
-def _bar_state(now: Progress) -> BarState:
-    return BarState(
-        now.step,
-        now.steps,
-        f"loss {now.loss:.4f}  {now.splats} splats  {now.steps_per_second:.0f} steps/s",
-    )

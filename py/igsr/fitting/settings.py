@@ -38,7 +38,8 @@ def _color(name: str, value: Any) -> tuple[float, ...]:
 class FitSettings:
     """Everything that decides the result of a fit, but for the photos and the backend.
 
-    Each field says in its metadata what it means (``igsr._internal.settings``).
+    Each field says in its metadata what it means (``igsr._internal.settings``). Presets have values
+    for all that have no default here.
 
     Raises:
         IgsrError: a setting cannot be used; the message names it.
@@ -50,7 +51,7 @@ class FitSettings:
     seed: int = field(
         default=0,
         metadata=about(
-            "Of everything random. A fit is deterministic for a given seed.",
+            "Random seed. Results are deterministic for a given seed.",
             limits=(0, 2**63 - 1),
         ),
     )
@@ -85,11 +86,8 @@ class FitSettings:
             aliases=("init",),
         )
     )
-    poses: Poses = field(
-        default="fixed", metadata=about("joint: optimize the cameras' poses with the splats.")
-    )
+    poses: Poses = field(metadata=about("joint: optimize the cameras' poses with the splats."))
     focal: Focal = field(
-        default="fixed",
         metadata=about(
             "Focal lengths that are optimized: none (fixed), one factor for all (shared), or "
             "each (per-camera)."
