@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from igsr._internal.choices import FitBackend
 from igsr._internal.progress_bar import progress_or_bar
 from igsr.capture import Capture
 from igsr.capture.photo_checks import check_photos
@@ -34,7 +35,6 @@ from igsr.fitting.pose_priors import camera_holds
 from igsr.fitting.presets import Preset, settings_for
 from igsr.fitting.rough_cameras import with_rough_cameras
 from igsr.fitting.settings import (
-    Backend,
     Density,
     FitSettings,
     Focal,
@@ -64,7 +64,7 @@ def fit(
     capture: Capture,
     steps: int | None = None,
     progress: Callable[[Progress], bool | None] | None = None,
-    backend: Backend = "auto",
+    backend: FitBackend = "auto",
     seed: int = 0,
     *,
     preset: Preset = "default",

@@ -17,7 +17,6 @@ Density: TypeAlias = Literal["mcmc", "original", "fixed"]
 Initialization: TypeAlias = Literal["auto", "points", "hull", "sift", "rays", "random"]
 Poses: TypeAlias = Literal["fixed", "joint"]
 Focal: TypeAlias = Literal["fixed", "shared", "per-camera"]
-Backend: TypeAlias = Literal["auto", "cpu", "gpu"]
 
 #: Highest degree of spherical harmonics, as ``igsr.splats.MAX_SH_DEGREE``.
 _MAX_SH_DEGREE = 4
