@@ -135,7 +135,7 @@ def test_starts(capture):
 
 def test_a_start_prefers_points_that_photos_agree_on(capture):
     """Of the hull's points those near the surface; any number of photos will do."""
-    from igsr.fitting.initialization.initial_splats import _disagreement
+    from igsr.fitting.initialization.visual_hull import color_disagreement
 
     agreed = np.full((4, 1, 3), 0.5, np.float32)
     occluded = agreed.copy()
@@ -143,7 +143,7 @@ def test_a_start_prefers_points_that_photos_agree_on(capture):
     inside = np.arange(12, dtype=np.float32).reshape(4, 1, 3) / 12.0
     unseen = agreed.copy()
     unseen[1:] = np.nan
-    values = _disagreement(np.concatenate([agreed, occluded, inside, unseen], axis=1))
+    values = color_disagreement(np.concatenate([agreed, occluded, inside, unseen], axis=1))
     assert values[0] == values[1] == 0.0
     assert values[2] > 0.05
     assert np.isinf(values[3])

@@ -15,16 +15,16 @@ from igsr.capture.types import intrinsic_matrix
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import GIVEN
 from igsr.fitting.initialization.initial_splats import initial_splats
-from igsr.fitting.pose_priors import CameraHolds
+from igsr.fitting.pose_priors import PosePriors
 from igsr.fitting.settings import FitSettings
 from igsr.rendering.renders import intrinsics_of, viewmat_about
 from igsr.splats import Splats
 
-#: Steps on photos, at least, for one on a view that is none, where there are both: what such views
-#: teach they teach soon, and what photos show is right.
+#: Steps on photos, at least, for one on a pseudo-view, where there are both: pseudo-views teach what
+#: they can soon, and what photos show is right.
 PHOTO_STEPS = 5
-#: The last part of the steps, which are on photos alone: views that are none are a little blurred,
-#: and what is fine is fitted last.
+#: The last fraction of the steps, which are on photos alone: pseudo-views are a little blurred, and
+#: fine detail is fitted last.
 PHOTOS_LAST = 0.2
 
 
@@ -34,11 +34,19 @@ def fitter_of(
     state: dict[str, Any],
     settings: dict[str, Any],
     backend: str,
-    holds: CameraHolds | None = None,
+    priors: PosePriors | None = None,
 ) -> _core.Fitter:
-    """A fit in progress of ``state``, relative to ``origin``, to the views; see ``_core.Fitter``.
+    """The renderer's fitter of splats to views; see ``_core.Fitter``.
 
-    Cameras that are fitted are held by ``holds``, of as many views.
+    Args:
+        views: V photos or pseudo-views with their cameras, in the world frame.
+        origin: float64 [3], world position that the splats are relative to.
+        state: float32 arrays of N splats ("means" [N, 3] ...), and where a fit goes on, those of
+            the optimizer, as ``Fitter.state`` returns them.
+        settings: fields of ``FitSettings``, and what else the fitter knows: "frozen" (splats stay
+            as they are) and "camera_warm_up" (fraction of the steps before cameras move).
+        backend: "cpu" or "gpu".
+        priors: of the V cameras, where these are optimized and something is known of them.
 
     Raises:
         ValueError: a view, the state or a setting cannot be used; the message names it.
@@ -52,7 +60,7 @@ def fitter_of(
         state,
         settings,
         backend,
-        None if holds is None else _hold_arrays(holds, origin),
+        None if priors is None else _prior_arrays(priors, origin),
     )
 
 
@@ -110,10 +118,10 @@ def photos_among(views: list[View]) -> list[View]:
 
 
 def _schedule(views: Sequence[View], steps: int, first: int) -> list[tuple[int, int | None]]:
-    """How many steps of a round are of each view, and the first step that is not of it any more.
+    """For each view, its steps in a round and the first step that no longer takes it.
 
-    None is for views that stay to the end. Steps are counted from 0; a fit that enters the schedule
-    late begins with ``first``.
+    The latter is None for views that stay to the end. Steps are counted from 0; a fit that enters
+    the schedule late begins with ``first``.
     """
     photos = sum(view.weights is None for view in views)
     others = len(views) - photos
@@ -125,7 +133,7 @@ def _schedule(views: Sequence[View], steps: int, first: int) -> list[tuple[int, 
 
 
 def _counting(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None:
-    """What the fitter takes as a view's mask: weights where the view has them."""
+    """What the fitter takes as a view's mask [H, W]: confidence weights where the view has them."""
     if view.weights is None:
         return None if view.mask is None else np.ascontiguousarray(view.mask)
     return np.ascontiguousarray(view.weights if view.mask is None else view.weights * view.mask)
@@ -141,27 +149,27 @@ def _arrays(
     )
 
 
-def _hold_arrays(
-    holds: CameraHolds, origin: npt.NDArray[np.float64]
+def _prior_arrays(
+    priors: PosePriors, origin: npt.NDArray[np.float64]
 ) -> dict[str, npt.NDArray[np.float64]]:
-    viewmats, intrinsics = _arrays(holds.views, origin)
+    viewmats, intrinsics = _arrays(priors.views, origin)
     return {
         "viewmats": viewmats,
         "intrinsics": intrinsics,
-        "information": holds.information,
-        "focal_information": holds.focal_information,
+        "information": priors.information,
+        "focal_information": priors.focal_information,
     }
 
 
 def fitted_cameras(
     views: Sequence[View], fitter: _core.Fitter, origin: npt.NDArray[np.float64]
 ) -> list[Camera]:
-    """The views' cameras with poses and focal lengths as a fitter has them.
+    """The views' cameras with poses and focal lengths as a fitter has them, in the world frame.
 
     Args:
         views: V views.
         fitter: of these views.
-        origin: [3] of the splats, which the fitter's poses are relative to.
+        origin: float64 [3] of the splats, which the fitter's poses are relative to.
     """
     arrays = fitter.cameras()
     return [
@@ -177,7 +185,7 @@ def fitted_cameras(
 
 
 def with_train_cameras(capture: Capture, cameras: list[Camera]) -> Capture:
-    """The capture with other cameras for its train views, in their order."""
+    """The capture with other cameras for its train views, given in their order."""
     each = iter(cameras)
     views = [
         replace(view, camera=next(each)) if view.split == "train" else view
@@ -187,7 +195,7 @@ def with_train_cameras(capture: Capture, cameras: list[Camera]) -> Capture:
 
 
 def camera_rows(views: Sequence[View]) -> npt.NDArray[np.float64]:
-    """Poses and focal lengths [V, 14]: the viewmat's upper block by rows, fx, fy."""
+    """Poses and focal lengths, float64 [V, 14]: the viewmat's first three rows, fx, fy."""
     return np.stack(
         [
             np.concatenate([view.camera.viewmat[:3].reshape(-1), view.camera.K[[0, 1], [0, 1]]])

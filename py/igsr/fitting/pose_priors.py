@@ -1,10 +1,10 @@
-"""How well tracks know cameras, by which joint fits hold them.
+"""Pose priors: how well tracks know the cameras, which joint fits then keep near them.
 
 Bundle adjustment finds cameras to hundredths of a pixel, since it averages over thousands of places
-that several photos show. The colours of a fit are no match for that: left to themselves, they move
-such cameras away from where they were. So cameras that have tracks are held by what these say: the
-inverse of the covariance that bundle adjustment would report, points and all other cameras free,
-for the errors that the tracks are seen to have (Triggs et al., "Bundle Adjustment - A Modern
+that several photos show. The colors of a fit are no match for that: left to themselves, they move
+such cameras away. So cameras that have tracks get a Gaussian prior from these. Its information is
+the inverse of the covariance that bundle adjustment would report, points and all other cameras
+free, for the errors that the tracks are seen to have (Triggs et al., "Bundle Adjustment - A Modern
 Synthesis", 2000, sections 6.1 and 9).
 
 Cameras that are not where their tracks have them (noise was added, or something else moved them
@@ -24,15 +24,15 @@ from igsr.capture import Points, View
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-#: A camera that sees fewer points is held by none.
+#: A camera that sees fewer points has no prior.
 FEWEST = 3
-#: Pixels; no place in a photo is known better, however well made-up tracks agree.
+#: Pixels; no place in a photo is known better, however well synthetic tracks agree.
 LEAST_ERROR = 0.05
-#: Part of a standard deviation that is left to the colours. They pull all the time, and mostly one
-#: way: with a whole one, cameras that COLMAP had found were measurably worse after a fit.
+#: Fraction of a standard deviation that is left to the colors. They pull all the time, and mostly
+#: one way: with a whole one, cameras that COLMAP had found were measurably worse after a fit.
 LEFT_OPEN = 0.25
-#: Observations further off than so many times the median, and by more than so many pixels, are of
-#: something else: squares would make one of them outweigh all others.
+#: Observations further off than so many times the median, and by more than so many pixels, are
+#: outliers: squared, one of them would outweigh all others.
 OUTLIER, OUTLIER_PIXELS = 10.0, 4.0
 #: Depths beyond this many times the median, or below its inverse, are no places that cameras see.
 DEEPEST = 1e5
@@ -46,14 +46,14 @@ RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
-class CameraHolds:
-    """Where V cameras were found, and how well they are known.
+class PosePriors:
+    """Gaussian priors of V cameras: where they were found, and how well they are known.
 
     Attributes:
         views: with these cameras.
-        information: float64 [V, 6, 6], inverse of the covariance of turn (radians) about and move
-            (world units) along x, y, z of the camera, with ``LEFT_OPEN`` of the standard deviations
-            that the tracks leave; zero where nothing is known.
+        information: float64 [V, 6, 6], inverse of the covariance of rotation (radians) about and
+            translation (world units) along x, y, z of the camera, with ``LEFT_OPEN`` of the
+            standard deviations that the tracks leave; zero where nothing is known.
         focal_information: float64 [V], inverse of the variance of the focal length's logarithm.
     """
 
@@ -77,19 +77,19 @@ class _Equations:
     width: int
 
 
-def camera_holds(
+def pose_priors(
     views: Sequence[View], points: Points | None, *, poses: bool, focal: str
-) -> CameraHolds | None:
-    """What the tracks of a capture say about the cameras that are to be fitted.
+) -> PosePriors | None:
+    """What the tracks of a capture say about the cameras that are to be optimized.
 
     Args:
         views: with the cameras that were found with the tracks; what other photos saw is left out.
-        points: without tracks, nothing is known.
-        poses: whether poses are fitted; what is not fitted is taken to be exact.
-        focal: which focal lengths are: "fixed", "shared" or "per-camera".
+        points: of the capture; without tracks, nothing is known.
+        poses: whether poses are optimized; what is not is taken to be exact.
+        focal: which focal lengths are optimized: "fixed", "shared" or "per-camera".
 
     Returns:
-        None where no camera has tracks enough.
+        None where no camera has enough tracks.
     """
     count = len(views)
     seen = None if points is None else _seen_by(views, points)
@@ -99,12 +99,12 @@ def camera_holds(
     enough = np.bincount(view, minlength=count) > 0
     try:
         with np.errstate(all="ignore"):
-            return _held(views, points.xyz, view, point, xy, enough, poses, focal)
+            return _priors(views, points.xyz, view, point, xy, enough, poses, focal)
     except np.linalg.LinAlgError:
-        return None  # places and points that no camera can have seen hold nothing
+        return None  # places and points that no camera can have seen say nothing
 
 
-def _held(
+def _priors(
     views: Sequence[View],
     xyz: Float64,
     view: Int64,
@@ -113,7 +113,7 @@ def _held(
     enough: npt.NDArray[np.bool_],
     poses: bool,
     focal: str,
-) -> CameraHolds | None:
+) -> PosePriors | None:
     count = len(views)
     equations = _linearised(views, xyz, view, point, xy, poses, focal)
     normal = _without_points(equations)
@@ -149,7 +149,7 @@ def _held(
         np.isfinite(information).all() and np.isfinite(of_focal).all() and of_focal.min() >= 0.0
     ):
         return None
-    return CameraHolds(views, information, of_focal)
+    return PosePriors(views, information, of_focal)
 
 
 def _seen_by(

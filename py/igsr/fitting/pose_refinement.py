@@ -1,11 +1,11 @@
-"""Cameras that are not exact: how far two sets of them are apart, and finding a photo's camera.
+"""Test-time pose refinement: cameras are fitted to their photos while the splats stay as they are.
 
-Splats and cameras that were fitted together may be turned, moved and scaled as a whole without any
-photo showing it. Scores of held-out views say which of three things was done about that:
+Splats and cameras that were optimized together may be rotated, moved and scaled as a whole without
+any photo showing it. Scores of held-out photos therefore say which cameras they are of:
 
-* raw: the held-out cameras as they were given;
-* aligned: moved by the similarity that maps the true train cameras onto the fitted ones;
-* refined: each held-out camera fitted to its own photo while the splats stay as they are.
+* raw: as they were given;
+* aligned: moved by the similarity that maps the true train cameras onto the optimized ones;
+* refined: each fitted to its own photo.
 """
 
 from __future__ import annotations
@@ -39,20 +39,23 @@ def refine_cameras(
 ) -> list[View]:
     """The views with poses fitted to their photos; splats and focal lengths stay as they are.
 
-    Photo, mask and given camera of each view are used, one view at a time, and nothing is learnt
-    about the scene: this is how few-view papers score scenes whose cameras were fitted too.
+    Each view is used alone, with its photo, mask and given camera, and nothing is learned about the
+    scene: this is how few-view papers score scenes whose cameras were optimized too.
 
     Args:
         splats: the scene.
-        views: what to find the cameras of; their own are where the search starts.
+        views: whose cameras to refine, from where they are.
         background: RGB in [0, 1] behind splats and photos with alpha.
         steps: steps per view; each moves the picture by at most about a third of a pixel, at the
             end by a hundredth.
-        backend: "auto", "cpu" or "gpu".
-        progress: called with (steps done, of all) now and then.
+        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
+        progress: called with steps done and steps in all, now and then.
+
+    Returns:
+        The views in their order, with other cameras.
 
     Raises:
-        IgsrError: ``steps`` is not positive, or a view cannot be used.
+        IgsrError: ``steps`` is not positive, the splats are antialiased, or a view cannot be used.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     if steps < 1:

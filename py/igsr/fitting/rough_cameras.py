@@ -13,7 +13,7 @@ from igsr.capture.downscaling import halved
 from igsr.errors import IgsrError
 from igsr.fitting.fitter import fitted_cameras, fitter_of, initial_state, with_train_cameras
 from igsr.fitting.optimization import FitRun, Progress, Report
-from igsr.fitting.pose_priors import CameraHolds
+from igsr.fitting.pose_priors import PosePriors
 from igsr.fitting.settings import FitSettings
 
 #: Fractions of the fit's steps and splats that the rough fit has.
@@ -26,7 +26,7 @@ def with_rough_cameras(
     capture: Capture,
     settings: FitSettings,
     backend: dict[str, str],
-    holds: CameraHolds | None,
+    priors: PosePriors | None,
     report: Report | None,
 ) -> tuple[Capture, bool]:
     """The capture with train cameras as the rough fit has them, and whether ``report`` ended it.
@@ -37,7 +37,7 @@ def with_rough_cameras(
         capture: its train views are fitted.
         settings: of the fit that follows.
         backend: "backend" is the resolved one.
-        holds: pose priors of the train views, if there are any.
+        priors: pose priors of the train views, if there are any.
         report: called with step 0 of the fit that follows.
     """
     if len(capture.train_views) == 1 and settings.focal == "fixed":
@@ -63,10 +63,10 @@ def with_rough_cameras(
     try:
         state, started = initial_state(small, rough)
         origin = state.pop("origin")
-        if holds is not None:
-            # What is known of rotations, moves and logarithms holds for pictures of any size.
-            holds = replace(holds, views=views)
-        fitter = fitter_of(views, origin, state, rough.plain(), backend["backend"], holds)
+        if priors is not None:
+            # What is known of rotations, moves and focal lengths' logarithms holds for any size.
+            priors = replace(priors, views=views)
+        fitter = fitter_of(views, origin, state, rough.plain(), backend["backend"], priors)
     except (IgsrError, ValueError):
         return capture, False  # what cannot be started from at half size may be at full size
     FitRun(fitter, rough, started, backend, report_rough).optimize()

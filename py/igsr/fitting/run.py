@@ -31,7 +31,7 @@ from igsr.fitting.fitter import (
     with_train_cameras,
 )
 from igsr.fitting.optimization import FitRun, Progress, Report, bar_state
-from igsr.fitting.pose_priors import camera_holds
+from igsr.fitting.pose_priors import pose_priors
 from igsr.fitting.presets import Preset, settings_for
 from igsr.fitting.rough_cameras import with_rough_cameras
 from igsr.fitting.settings import (
@@ -191,11 +191,11 @@ def _fitted(
     tracks = None
     if settings.moves_cameras and capture.points is not None:
         tracks = capture.points.tracks
-    holds = None
+    priors = None
     if tracks is not None:
         # By the cameras as they were given, also where the fit goes on from others.
         poses = settings.poses != "fixed"
-        holds = camera_holds(views, capture.points, poses=poses, focal=settings.focal)
+        priors = pose_priors(views, capture.points, poses=poses, focal=settings.focal)
     file = None
     if checkpoint is not None:
         splats_hash = None if initial is None else hash_of(splat_arrays(initial).values())
@@ -212,7 +212,7 @@ def _fitted(
         if not resume:
             if settings.moves_cameras and initial is None:
                 rough, began = True, time.perf_counter()
-                capture, stopped = with_rough_cameras(capture, settings, device, holds, report)
+                capture, stopped = with_rough_cameras(capture, settings, device, priors, report)
                 seconds = time.perf_counter() - began
             state, started = initial_state(capture, settings, initial)
 
@@ -223,7 +223,7 @@ def _fitted(
             if origin.shape != (3,) or not np.isfinite(origin).all():
                 raise ValueError("origin: must be three finite numbers")
             values = {**settings.plain(), "first_step": settings.first_step}
-            fitter = fitter_of(views, origin, state, values, device["backend"], holds)
+            fitter = fitter_of(views, origin, state, values, device["backend"], priors)
         except ValueError as error:
             if resume:
                 raise IgsrError(f"The checkpoint {checkpoint} cannot be used: {error}.") from error

@@ -1,4 +1,4 @@
-"""The splats that a fit starts from: SfM points, the visual hull, plane sweep, SIFT, random."""
+"""Initialization of splats: SfM points, visual hull, plane sweep, SIFT features or random."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """Points on the rays of photo pixels, at the depth where the other photos look most alike.
 
-A plane sweep with small patches, for photos that look from similar directions. What makes a start
-good is less where most points are than that few are wrong: twice as many rays are tried as points
-are asked for, and those are taken whose depth stands out most from all others of its ray.
+A plane sweep (Collins 1996) with small patches, for photos that look from similar directions. What
+makes an initialization good is less where most points are than that few are wrong: twice as many
+rays are tried as points are asked for, and those are taken whose depth stands out most from all
+others of its ray.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ DEPTHS = 96
 NEAREST, FARTHEST = 0.25, 8.0
 #: Photos compared with per ray, the nearest: more cost time and look from further apart.
 COMPARED = 4
-#: A patch is 3 x 3 averages over squares; so many of these squares make the longer side of a photo.
+#: A patch is 3 x 3 averages over squares; so many of these squares fit in a photo's longer side.
 SQUARES = 85
 #: Rays tried per point taken.
 TRIES = 2
@@ -49,15 +50,16 @@ def can_sweep(views: list[View], target: Float64, angle: float = MAX_ANGLE) -> b
 def swept_points(
     views: list[View], target: Float64, count: int, random: np.random.Generator
 ) -> tuple[Float64, Float64]:
-    """Points [count, 3] in the world frame and their photos' colours [count, 3] in 0..1.
-
-    Rays that no other photo sees have a random depth and are taken last.
+    """Points where photos look alike. Rays that no other photo sees are taken last, at any depth.
 
     Args:
         views: the photos; masked pixels have no rays and are not compared.
         target: [3], the point that the cameras look at.
         count: number of points.
         random: what draws the rays.
+
+    Returns:
+        Points [count, 3] in the world frame and their photos' colors [count, 3] in 0..1.
     """
     photos = [_averaged(view) for view in views]
     centres = np.stack([view.camera.centre for view in views])
@@ -152,7 +154,7 @@ def _most_alike(differences: Float64, random: np.random.Generator) -> tuple[Int6
     # The lower median over those that see it: the rest may be hidden behind something.
     middle = np.maximum(seen - 1, 0) // 2
     cost = np.take_along_axis(np.sort(differences, axis=0), middle[None], axis=0)[0]
-    # Ties (flat colour, nothing seen) must not all fall to the nearest depth.
+    # Ties (flat color, nothing seen) must not all fall to the nearest depth.
     tie = random.uniform(size=cost.shape)
     best = np.where(seen > 0, cost + 1e-4 * tie, 1e9 + tie).argmin(axis=1)
     least = np.take_along_axis(cost, best[:, None], axis=1)[:, 0]
@@ -173,9 +175,9 @@ def _side(view: View) -> int:
 
 
 def _averaged(view: View) -> Float32:
-    """Colours in 0..1 and a weight, [H, W, 4], averaged over the square around each pixel.
+    """Colors in 0..1 and a weight, [H, W, 4], averaged over the square around each pixel.
 
-    Masked pixels have no part in the colours; the weight is the part of the square that is not
+    Masked pixels have no part in the colors; the weight is the part of the square that is not
     masked.
     """
     height, width = view.image.shape[:2]

@@ -1,7 +1,8 @@
-"""Points that the photos themselves tell: SIFT features matched and triangulated at given poses.
+"""Points from the photos themselves: SIFT features, matched and triangulated at given poses.
 
-Such points are few but right, also where photos look from far apart. Features are matched between
-the nearest photos by their descriptors alone, and the poses then say which matches can be true.
+Such points are few but right, also where photos look from far apart. Features (Lowe 2004) are
+matched between the nearest photos by their descriptors alone; the poses then say which matches can
+be true, by epipolar distance and by reprojection error.
 """
 
 from __future__ import annotations
@@ -28,17 +29,20 @@ FEATURES = 4096
 RATIO = 0.85
 #: Pixels, of the reduced photo, that a feature may be from its point.
 MAX_ERROR = 2.0
-#: Degrees that the rays to a point must part by, or its depth is a guess.
+#: Degrees between the rays to a point, at least; with less its depth is a guess.
 MIN_ANGLE = 2.0
+#: Points are put between a triangulated one and one of so many nearest neighbours.
+NEIGHBOURS = 5
 
 
 def sift_points(views: list[View]) -> tuple[Float64, Float64]:
-    """Points [P, 3] in the world frame and their mean colours [P, 3] in 0..1; P may be 0.
-
-    The same photos give the same points; nothing is random.
+    """Triangulated features of photos; nothing is random.
 
     Args:
         views: the photos; masked and wholly transparent pixels have no features.
+
+    Returns:
+        Points [P, 3] in the world frame and their mean colors [P, 3] in 0..1; P may be 0.
     """
     views = [_reduced(view) for view in views]
     features = [_features(view) for view in views]
@@ -112,7 +116,7 @@ def _features(view: View) -> tuple[Float64, Float32]:
 
 def _sift(grey: npt.NDArray[np.uint8]) -> tuple[Float32, Float32]:
     """Keypoints [N, 4] (column and row in pixels, size, turn) and descriptors [N, 128]."""
-    # It takes longer to load than all of igsr, and only this start needs it.
+    # It takes longer to import than all of igsr, and only this initialization needs it.
     import pycolmap
 
     level = pycolmap.logging.minloglevel
@@ -185,7 +189,7 @@ def _tracks(pairs: Int64, count: int) -> Int64:
 def _triangulated(
     views: list[View], view_of: Int64, pixels: Float64, track: Int64
 ) -> tuple[Float64, Float64]:
-    """Points nearest to their features' rays, and their colours, where the rays agree.
+    """Points nearest to their features' rays, and their colors, where the rays agree.
 
     Args:
         views: V photos.
@@ -222,3 +226,37 @@ def _triangulated(
         np.add.at(colors, point[view_of == v], view.image[row, column, :3] / 255.0)
     colors /= np.bincount(point)[:, None]
     return xyz[sure], colors[sure]
+
+
+def with_points_between(
+    xyz: Float64, colors: Float64, count: int, random: np.random.Generator
+) -> tuple[Float64, Float64]:
+    """The points, and more between them and their nearest neighbours, ``count`` in all.
+
+    Args:
+        xyz: [P, 3] in any frame.
+        colors: [P, 3].
+        count: number of points asked for; no point is taken away.
+        random: what draws pairs and places between them.
+
+    Returns:
+        Points [max(P, count), 3] and their colors, the given ones first.
+    """
+    more = max(0, count - len(xyz))
+    points = random.integers(len(xyz), size=more)
+    # From the middle, where products of coordinates are small enough to tell points apart.
+    local = xyz - np.median(xyz, axis=0)
+    squares = (local**2).sum(axis=1)
+    others = np.empty(more, dtype=np.int64)
+    # In parts, which bounds memory.
+    for part in np.array_split(np.arange(more), 1 + more // 1024):
+        own = points[part]
+        apart = squares - 2.0 * local[own] @ local.T
+        apart[np.arange(len(own)), own] = np.inf
+        near = np.argpartition(apart, NEIGHBOURS, axis=1)[:, :NEIGHBOURS]
+        others[part] = near[np.arange(len(own)), random.integers(near.shape[1], size=len(own))]
+    way = random.uniform(size=(more, 1))
+    return (
+        np.concatenate([xyz, xyz[points] + way * (xyz[others] - xyz[points])]),
+        np.concatenate([colors, colors[points] + way * (colors[others] - colors[points])]),
+    )

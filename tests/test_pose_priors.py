@@ -1,4 +1,4 @@
-"""What tracks say about cameras, and joint fits that are held by it."""
+"""What tracks say about cameras, and joint fits that it is a prior for."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from made_up_tracks import projected, tracked
 
 import igsr
 from igsr.capture import Capture, View
-from igsr.fitting.pose_priors import LEAST_ERROR, LEFT_OPEN, camera_holds
+from igsr.fitting.pose_priors import LEAST_ERROR, LEFT_OPEN, pose_priors
 from igsr.geometry.pose_errors import pose_errors
 
 COUNT = 4
@@ -102,7 +102,7 @@ def by_hand(views, points, poses, focal):
 def test_it_is_what_bundle_adjustment_reports(poses, focal):
     points = tracked(VIEWS, XYZ, noise=0.7, miss=0.3)
     given = [moved(view, 1e-3 * np.ones(3), 1e-3 * np.ones(3)) for view in VIEWS[:1]] + VIEWS[1:]
-    found = camera_holds(given, points, poses=poses, focal=focal)
+    found = pose_priors(given, points, poses=poses, focal=focal)
     expected = by_hand(given, points, poses, focal)
     for k in range(COUNT):
         if poses:
@@ -126,7 +126,7 @@ def test_cameras_that_their_tracks_have_elsewhere_are_free_to_go_there():
     given = [*VIEWS[:2], moved(VIEWS[2], turn, move), VIEWS[3]]
     way = np.concatenate([-turn, -move])
     surely, there = (
-        np.sqrt(way @ camera_holds(views, points, poses=True, focal="fixed").information[2] @ way)
+        np.sqrt(way @ pose_priors(views, points, poses=True, focal="fixed").information[2] @ way)
         for views in (VIEWS, given)
     )
     # In standard deviations. It is still some, as a part of the way counts as that of all cameras.
@@ -136,16 +136,16 @@ def test_cameras_that_their_tracks_have_elsewhere_are_free_to_go_there():
 
 def test_only_what_the_views_see_counts():
     points = tracked(VIEWS, XYZ, noise=0.5)
-    assert camera_holds(VIEWS, None, poses=True, focal="fixed") is None
+    assert pose_priors(VIEWS, None, poses=True, focal="fixed") is None
     bare = igsr.Points(points.xyz, points.rgb)
-    assert camera_holds(VIEWS, bare, poses=True, focal="fixed") is None
+    assert pose_priors(VIEWS, bare, poses=True, focal="fixed") is None
     strangers = [replace(view, name=f"other/{view.name}") for view in VIEWS]
-    assert camera_holds(strangers, points, poses=True, focal="fixed") is None
-    assert camera_holds(VIEWS[:1], points, poses=True, focal="fixed") is None
+    assert pose_priors(strangers, points, poses=True, focal="fixed") is None
+    assert pose_priors(VIEWS[:1], points, poses=True, focal="fixed") is None
     # Held-out photos' tracks say nothing: here they are wrong.
     wrong = tracked(VIEWS, XYZ, noise=0.5)
     wrong.tracks.xy[wrong.tracks.view == 3] += 50.0
-    one, two = (camera_holds(VIEWS[:3], p, poses=True, focal="fixed") for p in (points, wrong))
+    one, two = (pose_priors(VIEWS[:3], p, poses=True, focal="fixed") for p in (points, wrong))
     np.testing.assert_array_equal(one.information, two.information)
     # A camera that sees two points, and one that sees none, are not held; the others are.
     few = (points.tracks.view < 2) | ((points.tracks.view == 2) & (points.tracks.point < 2))
@@ -153,7 +153,7 @@ def test_only_what_the_views_see_counts():
     points.tracks = replace(
         tracks, view=tracks.view[few], point=tracks.point[few], xy=tracks.xy[few]
     )
-    held = camera_holds(VIEWS, points, poses=True, focal="fixed")
+    held = pose_priors(VIEWS, points, poses=True, focal="fixed")
     assert held.information.any(axis=(1, 2)).tolist() == [True, True, False, False]
     assert np.isfinite(held.information).all()
 
@@ -207,7 +207,7 @@ def least_ratio(found, expected, rows):
 
 @pytest.mark.parametrize("focal", ["fixed", "shared", "per-camera"])
 def test_two_cameras_are_held(focal):
-    found = camera_holds(VIEWS[:2], tracked(VIEWS[:2], XYZ, noise=0.5), poses=True, focal=focal)
+    found = pose_priors(VIEWS[:2], tracked(VIEWS[:2], XYZ, noise=0.5), poses=True, focal=focal)
     for information in found.information:
         assert np.linalg.eigvalsh(information).min() > 0.0
 
@@ -215,7 +215,7 @@ def test_two_cameras_are_held(focal):
 @pytest.mark.parametrize("seen", [0, 1, 2])
 def test_a_camera_without_tracks_loosens_no_other(seen):
     points = tracked(VIEWS, XYZ, noise=0.5)
-    expected = camera_holds(VIEWS, points, poses=True, focal="fixed")
+    expected = pose_priors(VIEWS, points, poses=True, focal="fixed")
     more = [*VIEWS, replace(VIEWS[0], name="more.png", camera=scenes.ring_camera(-0.4, 64))]
     tracks = points.tracks
     place = projected(more[-1].camera, XYZ[:seen])
@@ -229,22 +229,22 @@ def test_a_camera_without_tracks_loosens_no_other(seen):
             xy=np.concatenate([tracks.xy, place]),
         ),
     )
-    found = camera_holds(more, points, poses=True, focal="fixed")
+    found = pose_priors(more, points, poses=True, focal="fixed")
     assert not found.information[COUNT].any()
     assert least_ratio(found, expected, range(COUNT)) > 0.9
 
 
 def test_what_no_camera_can_have_seen_changes_little():
     points = tracked(VIEWS, XYZ, noise=0.5)
-    expected = camera_holds(VIEWS, points, poses=True, focal="fixed")
+    expected = pose_priors(VIEWS, points, poses=True, focal="fixed")
     for wrong in (1e200, 1e6):
         xyz = XYZ.copy()
         xyz[3] = wrong
-        found = camera_holds(VIEWS, replace(points, xyz=xyz), poses=True, focal="fixed")
+        found = pose_priors(VIEWS, replace(points, xyz=xyz), poses=True, focal="fixed")
         assert least_ratio(found, expected, range(COUNT)) > 0.5
     for wrong in (1e300, 100.0):
         xy = points.tracks.xy.copy()
         xy[5] += wrong
         off = replace(points, tracks=replace(points.tracks, xy=xy))
-        found = camera_holds(VIEWS, off, poses=True, focal="fixed")
+        found = pose_priors(VIEWS, off, poses=True, focal="fixed")
         assert least_ratio(found, expected, range(COUNT)) > 0.5
