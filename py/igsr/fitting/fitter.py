@@ -20,8 +20,8 @@ from igsr.fitting.settings import FitSettings
 from igsr.rendering.renders import intrinsics_of, viewmat_about
 from igsr.splats import Splats
 
-#: Steps on photos, at least, for one on a pseudo-view, where there are both: pseudo-views teach what
-#: they can soon, and what photos show is right.
+#: Steps on photos, at least, for one on a pseudo-view, where there are both: these teach what they
+#: can soon, and what photos show is right.
 PHOTO_STEPS = 5
 #: The last fraction of the steps, which are on photos alone: pseudo-views are a little blurred, and
 #: fine detail is fitted last.
