@@ -46,8 +46,8 @@ def compact_command(
         typer.Option(
             "--capture",
             metavar="CAPTURE",
-            help="The photos of the scene: refine to them and measure the loss on held-out ones. "
-            "Without it, both by pictures of SCENE from around it.",
+            help="The photos of the scene: fine-tune to them, measure the loss on held-out ones. "
+            "Without it, on renders of SCENE from cameras around it.",
         ),
     ] = None,
     holdout: HoldoutOption = None,
@@ -55,7 +55,7 @@ def compact_command(
         float | None,
         typer.Option(
             "--psnr",
-            help="Without --capture: how good SCENE is, dB, for a change of it to be worth dB. "
+            help="Without --capture: PSNR assumed of SCENE, dB, by which changes are weighed. "
             "Default: what the report.json beside SCENE says, else 30.",
         ),
     ] = None,
@@ -77,9 +77,11 @@ def compact_command(
         ),
     ] = None,
     steps: Annotated[
-        int, typer.Option("--steps", help="Refinement steps of a model that may be the result.")
+        int, typer.Option("--steps", help="Fine-tuning steps of a model that may be the result.")
     ] = DEFAULT_STEPS,
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Random seed; deterministic for a given seed.")
+    ] = 0,
     background: BackgroundOption = None,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
@@ -131,7 +133,7 @@ def compact_command(
     )
     console.print(f"loses {result['loss']:.3f} dB of at most {limit:g}")
     console.print(
-        f"{report['protocol']['judge_views']} views that were not refined to, against "
+        f"{report['protocol']['validation_views']} held-out views, against "
         f"{report['protocol']['against']}",
         style="dim",
     )
