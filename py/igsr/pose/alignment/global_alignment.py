@@ -47,11 +47,11 @@ class Alignment:
     """What the alignment found.
 
     Attributes:
-        photos: None where one could not be placed.
+        photos: None where one is not registered.
         pairs: the directed pairs that were aligned.
         start_loss: the objective after the start; its unit is the median depth.
         loss: the objective at the end.
-        warnings: sentences that name the photos without a place.
+        warnings: messages that name the photos that are not registered.
     """
 
     photos: list[AlignedPhoto | None]
@@ -78,7 +78,7 @@ def align(
     Pairs that have nothing in common are left out. Of photos that then fall into groups, the group
     with most fixed poses is placed, and of those with equally many the largest.
 
-    The same predictions and seed give the same bits on the same number of threads.
+    Deterministic for given predictions, seed and number of threads.
 
     Args:
         predictions: of directed pairs.
