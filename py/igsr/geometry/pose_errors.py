@@ -3,9 +3,9 @@
 RRA@t and RTA@t are the fractions of all pairs of photos whose relative rotation, and whose
 direction of relative translation, are off by less than t degrees; mAA@30 is the area under the
 curve of the smaller of the two for t from 1 to 30 degrees (Wang et al., PoseDiffusion, ICCV 2023).
-Pairs with a photo that is not registered count as wrong. ATE is the root mean square distance of the cameras'
-centres (Sturm et al., IROS 2012) after the similarity of ``igsr.geometry.similarity``,
-which two cameras suffice for.
+Pairs with a photo that is not registered count as wrong. ATE is the root mean square distance
+of the cameras' centres (Sturm et al., IROS 2012) after alignment by the similarity of
+``igsr.geometry.similarity``, for which two cameras suffice.
 """
 
 from __future__ import annotations

@@ -286,13 +286,13 @@ def _largest_features(count: int, database: Path) -> list[npt.NDArray[np.float32
     """Descriptors of length 1 of each photo's largest features."""
     import pycolmap
 
-    descriptors = []
+    largest_of = []
     with pycolmap.Database.open(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         for index in range(count):
             image_id = ids.get(_file(index))
             if image_id is None:
-                descriptors.append(np.zeros((0, 128), dtype=np.float32))
+                largest_of.append(np.zeros((0, 128), dtype=np.float32))
                 continue
             keypoints = opened.read_keypoints(image_id)
             descriptors = opened.read_descriptors(image_id).data.astype(np.float32)
@@ -300,8 +300,8 @@ def _largest_features(count: int, database: Path) -> list[npt.NDArray[np.float32
             size = np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2)))
             largest = descriptors[np.argsort(-size, kind="stable")[:PRESELECTION_FEATURES]]
             lengths = np.linalg.norm(largest, axis=1, keepdims=True)
-            descriptors.append(largest / np.maximum(lengths, 1e-9))
-    return descriptors
+            largest_of.append(largest / np.maximum(lengths, 1e-9))
+    return largest_of
 
 
 def _similarity(descriptors: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
