@@ -138,7 +138,7 @@ def test_what_shows_something_else_is_named_and_the_rest_kept(photos: list[Photo
         capture = igsr.estimate_poses([*photos[1:3], stranger, *photos[3:5]], "colmap")
     assert [view.name for view in capture.views] == ["1.png", "2.png", "3.png", "4.png"]
     assert capture.train_views == capture.views
-    with pytest.raises(igsr.IgsrError, match=r"No camera could be found: the 2 photos \(1\.png"):
+    with pytest.raises(igsr.IgsrError, match=r"No cameras found: the 2 photos \(1\.png"):
         igsr.estimate_poses([photos[1], stranger], "colmap")
     away = [CAMERAS[2], rooms.camera(np.pi)]  # back to back: no common view
     with pytest.raises(igsr.IgsrError, match="too few matches"):
