@@ -119,7 +119,7 @@ def test_nothing_placed_is_a_sentence(photos, tmp_path, igsr_here, monkeypatch):
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
     refused(
         igsr_here("pose", photos, "--out", tmp_path / "out", "--estimator", "colmap"),
-        "No camera could be found", "6 photos",
+        "No cameras found", "6 photos",
     )  # fmt: skip
     assert not (tmp_path / "out").exists()
 

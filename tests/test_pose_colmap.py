@@ -159,9 +159,9 @@ def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -
     places /= np.linalg.norm(places, axis=2, keepdims=True)
     glances = [places[i % 180 : i % 180 + 4].reshape(-1, 128) for i in range(200)]
     glances[77] = np.zeros((0, 128), dtype=np.float32)  # a photo without features
-    monkeypatch.setattr(colmap, "_glances", lambda count, database: glances)
+    monkeypatch.setattr(colmap, "_largest_features", lambda count, database: glances)
     pairs = colmap._pairs(200, Path("database"))
-    assert len(pairs) < 200 * (colmap.FOLLOWING + colmap.ALIKE) < 200 * 199 // 2
+    assert len(pairs) < 200 * (colmap.FOLLOWING + colmap.MOST_SIMILAR) < 200 * 199 // 2
     assert {(i, i + 180) for i in range(20)} <= set(pairs)
     assert {(i, i + 1) for i in range(199)} <= set(pairs)
     assert len(colmap._pairs(colmap.EXHAUSTIVE, Path("database"))) == 60 * 59 // 2
@@ -185,10 +185,10 @@ def test_photos_that_look_alike_are_found_in_the_database(photos: list[Photo], t
     database = tmp_path / "database.db"
     colmap._list_photos(both, database)
     colmap._find_features(both, tmp_path, database, lambda *arguments: None)
-    counts = colmap._alike(colmap._glances(4, database))
+    counts = colmap._similarity(colmap._largest_features(4, database))
     assert (counts == counts.T).all()
-    assert min(counts[0, 1], counts[1, 2]) >= 2 * colmap.LEAST_ALIKE
-    assert counts[:3, 3].max() < colmap.LEAST_ALIKE
+    assert min(counts[0, 1], counts[1, 2]) >= 2 * colmap.LEAST_SIMILAR
+    assert counts[:3, 3].max() < colmap.LEAST_SIMILAR
 
 
 def make_estimator(calls: list[dict[str, object]], name: str) -> object:
