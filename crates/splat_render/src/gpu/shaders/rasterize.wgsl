@@ -107,64 +107,23 @@ fn rasterize(
     let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     let center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
     let center_y = f32(y) + 0.5;
-    // ROWS is a constant, so that unused rows cost nothing; a loop over an array of rows is not
-    // unrolled by every driver, and then lives in memory.
-    var q0 = start(x, y + 0u);
-    var q1 = start(x, y + 1u);
-    var q2 = start(x, y + 2u);
-    var q3 = start(x, y + 3u);
-    var q4 = start(x, y + 4u);
-    var q5 = start(x, y + 5u);
-    var q6 = start(x, y + 6u);
-    var q7 = start(x, y + 7u);
+    // A line with {row} stands once for each of the thread's rows: shaders.rs repeats it. A loop over
+    // an array of rows is not unrolled by every driver, and then lives in memory.
+    var quad{row} = start(x, y + {row}u);
     var walking = true;
     for (var batch = list + chunk.list_begin; walking && batch < end; batch += AHEAD) {
         let ahead = read_ahead(batch, end, thread);
         for (var k = 0u; k < AHEAD && batch + k < end; k++) {
             let splat = splat_of(ahead, k);
             let p_dx = splat.pq.x * (center_x - splat.mean.x);
-            q0 = blend(q0, splat, p_dx, center_y);
-            if ROWS > 1u {
-                q1 = blend(q1, splat, p_dx, center_y + 1.0);
-            }
-            if ROWS > 2u {
-                q2 = blend(q2, splat, p_dx, center_y + 2.0);
-                q3 = blend(q3, splat, p_dx, center_y + 3.0);
-            }
-            if ROWS > 4u {
-                q4 = blend(q4, splat, p_dx, center_y + 4.0);
-                q5 = blend(q5, splat, p_dx, center_y + 5.0);
-                q6 = blend(q6, splat, p_dx, center_y + 6.0);
-                q7 = blend(q7, splat, p_dx, center_y + 7.0);
-            }
-            var live = q0.live;
-            if ROWS > 1u {
-                live = live | q1.live;
-            }
-            if ROWS > 2u {
-                live = live | q2.live | q3.live;
-            }
-            if ROWS > 4u {
-                live = live | q4.live | q5.live | q6.live | q7.live;
-            }
+            var live = vec4(false);
+            quad{row} = blend(quad{row}, splat, p_dx, center_y + {row}.0);
+            live = live | quad{row}.live;
             walking = walks_on(any(live));
             if !walking {
                 break;
             }
         }
     }
-    finish(q0, x, y, goes_on);
-    if ROWS > 1u {
-        finish(q1, x, y + 1u, goes_on);
-    }
-    if ROWS > 2u {
-        finish(q2, x, y + 2u, goes_on);
-        finish(q3, x, y + 3u, goes_on);
-    }
-    if ROWS > 4u {
-        finish(q4, x, y + 4u, goes_on);
-        finish(q5, x, y + 5u, goes_on);
-        finish(q6, x, y + 6u, goes_on);
-        finish(q7, x, y + 7u, goes_on);
-    }
+    finish(quad{row}, x, y + {row}u, goes_on);
 }

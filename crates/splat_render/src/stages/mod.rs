@@ -3,9 +3,17 @@
 //! All arrays are on the host; an implementation may keep its own copies where its kernels run.
 //! `T` is f64 in the reference and f32 elsewhere.
 
+pub(crate) mod check;
+
+use num_traits::Float;
+
 use crate::camera::{Camera, check_size};
-use crate::constants::{BLUR, FAR, NEAR, SH_COEFFS_MAX, SH_DEGREE_MAX};
+use crate::constants::{ADAM, BLUR, FAR, NEAR};
 use crate::error::{Error, Result};
+use crate::splats::SplatArrays;
+use crate::target::Target;
+
+pub use crate::splats::{Colors, SplatParams};
 
 /// Checks that every named length is `expected`; `unit` goes between the two numbers of the error.
 fn check_lengths(lengths: &[(&str, usize)], expected: usize, unit: &str) -> Result<()> {
@@ -15,91 +23,6 @@ fn check_lengths(lengths: &[(&str, usize)], expected: usize, unit: &str) -> Resu
         }
     }
     Ok(())
-}
-
-/// Colour of each splat.
-#[derive(Debug, Clone, Copy)]
-pub enum Colors<'a, T> {
-    /// Spherical harmonics; colour = max(0, 0.5 + SH(direction from the camera to the mean)).
-    Sh {
-        /// Degree that is evaluated, 0..=4; may be lower than what is stored.
-        degree: u32,
-        /// Stored coefficients per splat, at least `(degree + 1)^2`.
-        stride: usize,
-        /// `[N * stride]` RGB coefficients, splat-major.
-        coeffs: &'a [[T; 3]],
-    },
-    /// `[N]` colours that do not depend on the view, used as they are.
-    Direct(&'a [[T; 3]]),
-}
-
-/// Parameters of N splats, borrowed.
-#[derive(Debug, Clone, Copy)]
-pub struct SplatParams<'a, T> {
-    /// `[N]` centres in the world frame (less the scene's origin).
-    pub means: &'a [[T; 3]],
-    /// `[N]` rotations as wxyz quaternions, normalised inside.
-    pub quats: &'a [[T; 4]],
-    /// `[N]` standard deviations along the splat's axes: logs if `raw`, else themselves.
-    pub scales: &'a [[T; 3]],
-    /// `[N]` opacities: logits if `raw`, else themselves.
-    pub opacities: &'a [T],
-    /// Colours.
-    pub colors: Colors<'a, T>,
-    /// Whether `scales` are logarithms and `opacities` logits (as fitted and stored).
-    pub raw: bool,
-}
-
-impl<T> SplatParams<'_, T> {
-    /// Number of splats.
-    pub fn len(&self) -> usize {
-        self.means.len()
-    }
-
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.means.is_empty()
-    }
-
-    /// Checks that all arrays are of one length and the SH degree is supported.
-    pub fn validate(&self) -> Result<()> {
-        let n = self.len();
-        let lengths = [
-            ("quats", self.quats.len()),
-            ("scales", self.scales.len()),
-            ("opacities", self.opacities.len()),
-        ];
-        for (name, length) in lengths {
-            if length != n {
-                return Err(Error::argument(
-                    name,
-                    format!("has {length} rows where means has {n}"),
-                ));
-            }
-        }
-        let rows = match self.colors {
-            Colors::Direct(colors) => colors.len(),
-            Colors::Sh { degree, stride, coeffs } => {
-                let needed = (degree as usize + 1).pow(2);
-                if degree > SH_DEGREE_MAX || stride > SH_COEFFS_MAX || stride < needed {
-                    return Err(Error::argument(
-                        "sh_degree",
-                        format!(
-                            "degree {degree} needs {needed} coefficients of at most {SH_COEFFS_MAX}, got {stride}"
-                        ),
-                    ));
-                }
-                if coeffs.len() % stride != 0 {
-                    return Err(Error::argument("sh", "is not a whole number of splats"));
-                }
-                coeffs.len() / stride
-            }
-        };
-        if rows != n {
-            return Err(Error::argument("colors", format!("has {rows} rows where means has {n}")));
-        }
-        Ok(())
-    }
 }
 
 /// Settings of the project stage.
@@ -120,6 +43,41 @@ pub struct ProjectOptions {
 impl Default for ProjectOptions {
     fn default() -> Self {
         Self { near: NEAR, far: FAR, blur: BLUR, antialiased: false }
+    }
+}
+
+impl ProjectOptions {
+    /// Checks every setting: `near` finite and not negative, `far` beyond it, `blur` finite and not
+    /// negative.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] that names the setting.
+    pub fn validate(&self) -> Result<()> {
+        if !(self.near.is_finite() && self.near >= 0.0) {
+            return Err(Error::argument(
+                "near",
+                format!("must be finite and not negative, got {}", self.near),
+            ));
+        }
+        if self.far.is_nan() || self.far <= self.near {
+            return Err(Error::argument(
+                "far",
+                format!("must exceed near, {}, got {}", self.near, self.far),
+            ));
+        }
+        if !(self.blur.is_finite() && self.blur >= 0.0) {
+            return Err(Error::argument(
+                "blur",
+                format!("must be finite and not negative, got {}", self.blur),
+            ));
+        }
+        Ok(())
+    }
+
+    /// The least depth that is drawn. It is above 0 even where `near` is 0: a splat at the camera's
+    /// plane or behind it has no picture.
+    pub fn nearest(&self) -> f32 {
+        self.near.max(f32::MIN_POSITIVE)
     }
 }
 
@@ -186,6 +144,19 @@ impl<T: Copy + Default> Projected<T> {
     }
 }
 
+impl<T: Float> Projected<T> {
+    /// Whether splat `i` is drawn: it is not culled and, since callers may put anything here, its
+    /// shape and opacity are finite and its depth is above 0.
+    pub fn is_drawn(&self, i: usize) -> bool {
+        let [mean, radii] = [self.means2d[i], self.radii[i]];
+        let shape = mean.iter().chain(&radii).chain(&self.factors[i]);
+        radii != [T::zero(); 2]
+            && shape.copied().all(T::is_finite)
+            && self.depths[i] > T::zero()
+            && self.opacities[i].is_finite()
+    }
+}
+
 /// A rendered picture, row-major, H x W.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Image<T> {
@@ -215,11 +186,25 @@ pub struct ImageGradients<T> {
 }
 
 impl<T> ImageGradients<T> {
-    /// Checks that these and `image` have as many pixels as the picture of `projected`.
+    /// Checks that these and `image` have the size of the picture of `projected`.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] that names the array.
     pub fn validate(&self, projected: &Projected<T>, image: &Image<T>) -> Result<()> {
+        let size = (projected.width, projected.height);
+        if (image.width, image.height) != size {
+            return Err(Error::argument(
+                "image",
+                format!(
+                    "is {} x {} where the picture is {} x {}",
+                    image.width, image.height, size.0, size.1
+                ),
+            ));
+        }
         let lengths = [
             ("image", image.color.len()),
             ("image", image.depth.len()),
+            ("image", image.alpha.len()),
             ("image", image.transmittance.len()),
             ("v_color", self.v_color.len()),
             ("v_alpha", self.v_alpha.len()),
@@ -300,6 +285,139 @@ pub struct SplatGradients<T> {
     pub v_intrinsics: [f64; 4],
 }
 
+/// Loss of a picture against a photo.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Loss<T> {
+    /// The loss; 0 where the photo is masked out everywhere.
+    pub value: T,
+    /// `[H * W]` its gradient with respect to the picture's colours.
+    pub v_color: Vec<[T; 3]>,
+}
+
+/// Adam's step sizes per kind of parameter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rates {
+    /// Centres, world units.
+    pub means: f32,
+    /// Quaternions.
+    pub quats: f32,
+    /// Log-scales.
+    pub scales: f32,
+    /// Opacity logits.
+    pub opacities: f32,
+    /// SH coefficient 0.
+    pub sh0: f32,
+    /// The other SH coefficients.
+    pub sh_rest: f32,
+}
+
+impl Rates {
+    /// No parameter moves.
+    pub const ZERO: Self =
+        Self { means: 0.0, quats: 0.0, scales: 0.0, opacities: 0.0, sh0: 0.0, sh_rest: 0.0 };
+}
+
+/// What one step of the optimiser is to do.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamStep {
+    /// Number of the step, from 1, for the bias correction.
+    pub number: u32,
+    /// Step sizes.
+    pub rates: Rates,
+    /// SH degree in use. Coefficients of higher degrees and their moments stay as they are.
+    pub sh_degree: u32,
+    /// Added to the loss: this times the mean opacity.
+    pub opacity_regularizer: f32,
+    /// Added to the loss: this times the mean scale (over splats and axes, world units).
+    pub scale_regularizer: f32,
+    /// Size of the exploration noise on the centres (3DGS-MCMC, eq. 8), 0 for none. After Adam's
+    /// update: mean += C (z * noise / (1 + exp(-100 (0.005 - opacity)))) with C the splat's 3D
+    /// covariance, z from [`crate::fit::noise_normal`] and the parameters as updated.
+    pub noise: f32,
+    /// Seed of the noise; differs from step to step.
+    pub noise_seed: u32,
+}
+
+impl AdamStep {
+    /// Whether nothing moves: all rates are 0. The moments then stay as they are, too, and there is
+    /// no noise.
+    pub fn is_frozen(&self) -> bool {
+        self.rates == Rates::ZERO
+    }
+
+    /// What Adam's moments of this step are multiplied by, since they began at 0 (Kingma and Ba,
+    /// 2015, algorithm 1): 1 / (1 - beta^number), for the first and the second.
+    pub fn bias(&self) -> [f64; 2] {
+        let number = self.number.min(i32::MAX as u32) as i32;
+        [ADAM.0, ADAM.1].map(|beta| 1.0 / (1.0 - f64::from(beta).powi(number)))
+    }
+
+    /// Checks every setting.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] that names the setting.
+    pub fn validate(&self) -> Result<()> {
+        if self.number == 0 {
+            return Err(Error::argument("step", "must be at least 1: the bias correction divides"));
+        }
+        let Rates { means, quats, scales, opacities, sh0, sh_rest } = self.rates;
+        let rates = [means, quats, scales, opacities, sh0, sh_rest];
+        let settings = [
+            ("rates", rates.as_slice()),
+            ("opacity_regularizer", &[self.opacity_regularizer]),
+            ("scale_regularizer", &[self.scale_regularizer]),
+            ("noise", &[self.noise]),
+        ];
+        for (name, values) in settings {
+            if !values.iter().all(|v| v.is_finite() && *v >= 0.0) {
+                return Err(Error::argument(name, "must be finite and not negative"));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Splats under optimisation: parameters and Adam's two moments, which have the same layout.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct AdamState<T> {
+    /// Parameters.
+    pub splats: SplatArrays<T>,
+    /// First moments.
+    pub first: SplatArrays<T>,
+    /// Second moments.
+    pub second: SplatArrays<T>,
+}
+
+impl<T> AdamState<T> {
+    /// Checks that parameters, moments and `gradients` belong to the same splats.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] that names the array.
+    pub fn validate(&self, gradients: &SplatGradients<T>) -> Result<()> {
+        let (n, degree) = (self.splats.len(), self.splats.sh_degree);
+        for (name, arrays) in
+            [("splats", &self.splats), ("first", &self.first), ("second", &self.second)]
+        {
+            arrays.validate()?;
+            if arrays.len() != n || arrays.sh_degree != degree {
+                return Err(Error::argument(name, "does not belong to the same splats"));
+            }
+        }
+        let lengths = [
+            ("v_means", gradients.v_means.len()),
+            ("v_quats", gradients.v_quats.len()),
+            ("v_scales", gradients.v_scales.len()),
+            ("v_opacities", gradients.v_opacities.len()),
+        ];
+        check_lengths(&lengths, n, "rows where means has")?;
+        check_lengths(
+            &[("v_colors", gradients.v_colors.len())],
+            self.splats.sh.len(),
+            "rows where sh has",
+        )
+    }
+}
+
 /// The stages, as every implementation offers them. `bin` runs inside the two rasterize stages.
 pub trait Stages<T> {
     /// Splats and camera to 2D splats.
@@ -334,4 +452,26 @@ pub trait Stages<T> {
         projected: &Projected<T>,
         v_projected: &ProjectedGradients<T>,
     ) -> Result<SplatGradients<T>>;
+
+    /// Loss of a picture against a photo over `background`, with its gradient:
+    /// `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / count` over pixels p of weight w
+    /// and channels c, with s the `ssim_weight` in 0..=1, `count` the pixels whose weight is not 0,
+    /// and zeros around the picture in SSIM's window (Wang et al. 2004; 3DGS, eq. 7).
+    fn loss(
+        &self,
+        image: &Image<T>,
+        target: &Target,
+        background: [T; 3],
+        ssim_weight: f32,
+    ) -> Result<Loss<T>>;
+
+    /// One optimiser step of all parameters (Kingma and Ba, 2015, algorithm 1), with the pull of the
+    /// regularisers and, after it, the exploration noise. `gradients` are those of
+    /// [`Stages::project_backward`]; its camera's are not read.
+    fn adam(
+        &self,
+        state: &mut AdamState<T>,
+        gradients: &SplatGradients<T>,
+        step: &AdamStep,
+    ) -> Result<()>;
 }

@@ -24,7 +24,7 @@ struct View {
     // 1 where opacities are lowered by what the blur adds to a splat's area.
     antialiased: u32,
     // Splats with a hash below the first are left out (0 for none), opacities of the others times
-    // the last. As is_dropped in fit/device.rs.
+    // the last. As is_dropped in fit_device/random.rs.
     dropout_threshold: u32,
     dropout_seed: u32,
     compensation: f32,
@@ -91,6 +91,8 @@ struct Step {
     l1: f32,
     ssim: f32,
     has_weights: u32,
+    // 1 where no parameter and no moment moves.
+    frozen: u32,
 }
 
 struct Splat2d {

@@ -29,7 +29,7 @@ fn unit(h: u32) -> f32 {
     return (f32(h >> 8u) + 1.0) * (1.0 / 16777216.0);
 }
 
-// As noise_normal in fit/device.rs.
+// As noise_normal in fit_device/random.rs.
 fn noise_normal(index: u32) -> vec3<f32> {
     let base = hash(index ^ hash(step.noise_seed));
     let r0 = sqrt(-2.0 * log(unit(hash(base))));
@@ -89,6 +89,9 @@ fn adam_geometry(
         stats[i * STATS] += length(0.5 * size * v_mean);
         stats[i * STATS + 1u] += 1.0;
     }
+    if step.frozen == 1u {
+        return;
+    }
     let at = i * GEOMETRY;
     // opacity (1 - opacity) without the cancellation that is 0 for logits over 17.
     let odds = exp_accurate(-abs(values[at + 10u]));
@@ -120,7 +123,8 @@ fn adam_colors(
     let floats = 3u * view.sh_stride;
     let used = 3u * (view.sh_degree + 1u) * (view.sh_degree + 1u);
     let within = at % floats;
-    if at >= window.count * floats || within >= used || status.overflow != 0u {
+    let idle = status.overflow != 0u || step.frozen == 1u;
+    if at >= window.count * floats || within >= used || idle {
         return;
     }
     update(at, gradient[at], select(step.sh_rest, step.sh0, within < 3u));

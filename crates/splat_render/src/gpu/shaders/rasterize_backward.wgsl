@@ -160,28 +160,8 @@ fn rasterize_backward(
     let end = list + min(chunk.list_end, length);
     let x = (tile % view.tiles_x) * TILE + 4u * (thread % 4u);
     let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
-    // As in rasterize: ROWS is a constant and unused rows cost nothing.
-    var q0 = load_quad(x, y);
-    var q1: Quad;
-    var q2: Quad;
-    var q3: Quad;
-    var q4: Quad;
-    var q5: Quad;
-    var q6: Quad;
-    var q7: Quad;
-    if ROWS > 1u {
-        q1 = load_quad(x, y + 1u);
-    }
-    if ROWS > 2u {
-        q2 = load_quad(x, y + 2u);
-        q3 = load_quad(x, y + 3u);
-    }
-    if ROWS > 4u {
-        q4 = load_quad(x, y + 4u);
-        q5 = load_quad(x, y + 5u);
-        q6 = load_quad(x, y + 6u);
-        q7 = load_quad(x, y + 7u);
-    }
+    // A line with {row} stands once for each of the thread's rows, as in rasterize.
+    var quad{row} = load_quad(x, y + {row}u);
     for (var batch = begin; batch < end; batch += BATCH) {
         let count = min(BATCH, end - batch);
         var ahead = read_ahead(batch, end, thread);
@@ -191,20 +171,7 @@ fn rasterize_backward(
             }
             let splat = splat_of(ahead, b);
             var sums = Sums();
-            accumulate(&q0, splat, &sums);
-            if ROWS > 1u {
-                accumulate(&q1, splat, &sums);
-            }
-            if ROWS > 2u {
-                accumulate(&q2, splat, &sums);
-                accumulate(&q3, splat, &sums);
-            }
-            if ROWS > 4u {
-                accumulate(&q4, splat, &sums);
-                accumulate(&q5, splat, &sums);
-                accumulate(&q6, splat, &sums);
-                accumulate(&q7, splat, &sums);
-            }
+            accumulate(&quad{row}, splat, &sums);
             keep_sum(b, 0u, total(sums.u), thread);
             keep_sum(b, 1u, total(sums.v), thread);
             keep_sum(b, 2u, total(sums.uu), thread);
@@ -220,34 +187,13 @@ fn rasterize_backward(
                 keep_sum(b, 11u, total(sums.absolute_y), thread);
             }
         }
-        var live = q0.live;
-        if ROWS > 1u {
-            live = live | q1.live;
-        }
-        if ROWS > 2u {
-            live = live | q2.live | q3.live;
-        }
-        if ROWS > 4u {
-            live = live | q4.live | q5.live | q6.live | q7.live;
-        }
+        var live = vec4(false);
+        live = live | quad{row}.live;
         if !write_sums(batch, count, any(live), thread) {
             break;
         }
     }
     if length > chunk.list_end {
-        keep(q0, x, y);
-        if ROWS > 1u {
-            keep(q1, x, y + 1u);
-        }
-        if ROWS > 2u {
-            keep(q2, x, y + 2u);
-            keep(q3, x, y + 3u);
-        }
-        if ROWS > 4u {
-            keep(q4, x, y + 4u);
-            keep(q5, x, y + 5u);
-            keep(q6, x, y + 6u);
-            keep(q7, x, y + 7u);
-        }
+        keep(quad{row}, x, y + {row}u);
     }
 }

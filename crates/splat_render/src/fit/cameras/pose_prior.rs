@@ -5,27 +5,28 @@
 //! as ever along what is not, and is drawn back towards where it was told to stand: so far that a
 //! steady push ends one standard deviation away.
 
-use glam::{DMat4, DQuat};
+use glam::DMat4;
 
-use super::cameras::{POSE, inverse_cholesky, move_by};
+use super::cholesky::inverse_cholesky;
+use super::motion::{POSE, PoseMatrix, between, move_by};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 
 /// Where a camera is told to stand, and the information about it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hold {
+pub struct PosePrior {
     /// World to camera.
     pub viewmat: DMat4,
     /// Focal lengths, pixels.
     pub focal: [f64; 2],
     /// Inverse of the covariance of turn (radians) about and move (world units) along x, y, z of the
     /// camera, as [`move_by`] takes them; symmetric, zero where nothing is known.
-    pub pose: [[f64; POSE]; POSE],
+    pub pose: PoseMatrix,
     /// Inverse of the variance of the focal length's logarithm; zero where nothing is known.
     pub log_focal: f64,
 }
 
-impl Hold {
+impl PosePrior {
     /// Checks that every entry can be used; `k` is the camera's number.
     pub fn validate(&self, k: usize) -> Result<()> {
         let information = self.pose.as_flattened().iter().chain([&self.log_focal]);
@@ -47,7 +48,7 @@ impl Hold {
     ///
     /// `scale` takes steps of length 1 to poses; they are made with this hold's information, so that
     /// none goes further than a standard deviation.
-    pub fn pull_pose(&self, camera: &mut Camera, scale: &[[f64; POSE]; POSE], rate: f64) {
+    pub fn pull_pose(&self, camera: &mut Camera, scale: &PoseMatrix, rate: f64) {
         if self.pose == [[0.0; POSE]; POSE] {
             return;
         }
@@ -55,8 +56,8 @@ impl Hold {
         let off = between(&told, camera);
         // With T the scale and I the information, off - rate T (1 + rate T'IT)^-1 T'I off solves
         // ((TT')^-1 + rate I) x = (TT')^-1 off, which weighs the way back against a step's length.
-        let weighed: [[f64; POSE]; POSE] = product(&self.pose, scale);
-        let within: [[f64; POSE]; POSE] = std::array::from_fn(|i| {
+        let weighed: PoseMatrix = product(&self.pose, scale);
+        let within: PoseMatrix = std::array::from_fn(|i| {
             std::array::from_fn(|j| {
                 let along: f64 = (0..POSE).map(|k| scale[k][i] * weighed[k][j]).sum();
                 rate * along + if i == j { 1.0 } else { 0.0 }
@@ -85,15 +86,6 @@ impl Hold {
     }
 }
 
-/// The turn and move that take one camera to another.
-fn between(from: &Camera, to: &Camera) -> [f64; POSE] {
-    let turn = DQuat::from_mat3(&to.rotation()) * DQuat::from_mat3(&from.rotation()).inverse();
-    let turn = if turn.w < 0.0 { -turn } else { turn };
-    let moved = to.translation() - turn * from.translation();
-    let turned = turn.to_scaled_axis();
-    [turned.x, turned.y, turned.z, moved.x, moved.y, moved.z]
-}
-
-fn product(a: &[[f64; POSE]; POSE], b: &[[f64; POSE]; POSE]) -> [[f64; POSE]; POSE] {
+fn product(a: &PoseMatrix, b: &PoseMatrix) -> PoseMatrix {
     std::array::from_fn(|i| std::array::from_fn(|j| (0..POSE).map(|k| a[i][k] * b[k][j]).sum()))
 }
