@@ -124,6 +124,7 @@ fn list_limit(software: bool, subgroups: bool) -> u32 {
 
 /// wgpu as this crate opens it.
 fn instance() -> wgpu::Instance {
+    super::desktop::silence_device_select();
     wgpu::Instance::new(wgpu::InstanceDescriptor {
         // Debug layers are asked for by wgpu's environment variables alone.
         flags: wgpu::InstanceFlags::empty().with_env(),

@@ -6,6 +6,7 @@
 //! binding is done in parts: splats in windows, tiles in chunks. Neither changes a bit of the result.
 
 mod bin;
+mod desktop;
 mod device;
 mod fit;
 mod layout;
