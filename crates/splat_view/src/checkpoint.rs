@@ -1,8 +1,8 @@
 //! The splats of a fit in progress, from the checkpoint that `igsr fit` writes: an uncompressed
 //! `.npz` of numpy arrays.
 //!
-//! Untrusted: nothing compressed is read, and no memory is taken before its size is known to be in
-//! the file.
+//! The file is untrusted: nothing compressed is read, and no memory is allocated that the file's own
+//! size does not justify.
 
 use std::fs::File;
 use std::io::{Read, Seek};

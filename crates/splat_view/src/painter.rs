@@ -16,9 +16,9 @@ use crate::stage_times::{
     Stamps, Written,
 };
 
-/// Of pictures that are read back.
+/// Format of pictures that are read back.
 const PICTURE: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
-/// Bytes that rows of a copied texture are a multiple of.
+/// Alignment of the rows of a copied texture, bytes.
 const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
 
 /// Longest side of a texture, and so of a frame.
@@ -44,17 +44,17 @@ pub fn check_size(gpu: &Gpu, [width, height]: [u32; 2]) -> Result<()> {
 /// What a frame shows.
 #[derive(Debug, Clone, Copy)]
 pub struct Shot<'a> {
-    /// From where, with the size of the picture.
+    /// The camera, with the size of the picture.
     pub camera: Camera,
-    /// How.
+    /// How splats are drawn.
     pub settings: &'a Settings,
-    /// The model, on the left where there are two.
+    /// The model; the left one if there are two.
     pub left: Option<&'a Drawable>,
     /// The other, on the right.
     pub right: Option<&'a Drawable>,
-    /// Where the right one begins, in parts of the width.
+    /// Where the right one begins, as a fraction of the width.
     pub divider: f32,
-    /// Depths at the ends of the colours that show them, world units.
+    /// Depths at the ends of the colour map, world units.
     pub depths: [f32; 2],
 }
 
@@ -74,7 +74,7 @@ pub struct Painter {
 }
 
 impl Painter {
-    /// For targets of a format.
+    /// A painter for targets of a format.
     pub fn new(gpu: Arc<Gpu>, format: wgpu::TextureFormat) -> Result<Self> {
         let painter = Self {
             blending: Blending::new(&gpu),
@@ -88,11 +88,6 @@ impl Painter {
         };
         painter.gpu.check()?;
         Ok(painter)
-    }
-
-    /// The device.
-    pub fn gpu(&self) -> &Arc<Gpu> {
-        &self.gpu
     }
 
     /// Copies a model to the device.
@@ -167,7 +162,7 @@ impl Painter {
         let data = self.gpu.read(&[(&readable, 8)])?;
         let texel: [u16; 4] = bytemuck::pod_read_unaligned(&data[0]);
         let [depth, .., alpha] = texel.map(|bits| f16::from_bits(bits).to_f64());
-        // Fainter than half, nobody sees what is there.
+        // Where less than half is opaque, nothing can be made out.
         Ok((alpha > 0.5).then(|| depth / alpha * f64::from(unit(&shot))))
     }
 

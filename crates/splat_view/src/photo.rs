@@ -89,21 +89,6 @@ fn jpeg(bytes: &[u8]) -> JpegDecoder<Cursor<&[u8]>> {
     JpegDecoder::new_with_options(Cursor::new(bytes), options)
 }
 
-/// Width and height in pixels, from the file's head.
-pub fn photo_size(path: &Path) -> Result<[usize; 2]> {
-    let bytes = bytes(path)?;
-    if is_png(&bytes) {
-        let reader =
-            png::Decoder::new(Cursor::new(&bytes)).read_info().map_err(|e| bad(path, e))?;
-        let info = reader.info();
-        return Ok([info.width as usize, info.height as usize]);
-    }
-    let mut decoder = jpeg(&bytes);
-    decoder.decode_headers().map_err(|e| bad(path, e))?;
-    let (width, height) = decoder.dimensions().ok_or_else(|| bad(path, "it has no size"))?;
-    Ok([width, height])
-}
-
 /// Reads a photo.
 pub fn read_photo(path: &Path) -> Result<Photo> {
     let bytes = bytes(path)?;
@@ -178,7 +163,6 @@ mod tests {
         ];
         for (color, depth, data, expected) in kinds {
             let path = file("kind.png", &png(color, depth, data));
-            assert_eq!(photo_size(&path).expect("size"), [2, 1], "{color:?}");
             let photo = read_photo(&path).expect("photo");
             assert_eq!((photo.size, &photo.rgba[..]), ([2, 1], &expected[..]), "{color:?}");
             std::fs::remove_file(path).expect("clean");
@@ -205,7 +189,6 @@ mod tests {
         // 16x8: the left half (200, 40, 30), the right one (20, 60, 180).
         let bytes = include_bytes!("../tests/photo.jpg");
         let path = file("a.jpg", bytes);
-        assert_eq!(photo_size(&path).expect("size"), [16, 8]);
         let photo = read_photo(&path).expect("photo");
         assert_eq!((photo.size, photo.rgba.len()), ([16, 8], 16 * 8 * 4));
         for (x, expected) in [(3, [200, 40, 30, 255]), (12, [20, 60, 180, 255])] {
@@ -220,7 +203,6 @@ mod tests {
             let path = file(name, bytes);
             let error = read_photo(&path).expect_err(name).to_string();
             assert!(error.contains(name) && error.contains("no PNG or JPEG"), "{error}");
-            photo_size(&path).expect_err(name);
             std::fs::remove_file(path).expect("clean");
         }
     }
