@@ -49,8 +49,8 @@ fn main() -> ExitCode {
     match run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            let sentence = error.to_string();
-            eprintln!("{}.", sentence.trim_end_matches('.'));
+            let message = error.to_string();
+            eprintln!("{}.", message.trim_end_matches('.'));
             ExitCode::FAILURE
         }
     }

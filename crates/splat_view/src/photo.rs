@@ -1,4 +1,4 @@
-//! Photos of a capture: PNG and JPEG, untrusted.
+//! Reads photos of a capture, PNG and JPEG. The files are untrusted.
 
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
@@ -9,9 +9,9 @@ use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-/// Largest file that is read.
+/// Largest file that is read, bytes.
 const FILE_MAX: u64 = 256 << 20;
-/// Longest side that is read.
+/// Longest side that is read, pixels.
 const SIDE_MAX: usize = 16_384;
 
 /// An 8-bit picture.
@@ -24,7 +24,7 @@ pub struct Photo {
 }
 
 impl Photo {
-    /// The photo with no side longer than `most`: what is longer is averaged.
+    /// Shrinks the photo by averaging until no side is longer than `most` pixels.
     #[must_use]
     pub fn within(self, most: usize) -> Self {
         let [width, height] = self.size;
@@ -33,7 +33,7 @@ impl Photo {
             return self;
         }
         let size = self.size.map(|side| (side * most / longest).max(1));
-        // The pixels of a side that a smaller one's pixel stands for.
+        // The range of source pixels that one target pixel averages.
         let part = |i: usize, was: usize, is: usize| {
             let begin = i * was / is;
             begin..((i + 1) * was / is).max(begin + 1)
@@ -49,7 +49,7 @@ impl Photo {
                     for pixel in self.rgba[from..from + 4 * columns.len()].chunks_exact(4) {
                         let alpha = u64::from(pixel[3]);
                         alphas += alpha;
-                        // What cannot be seen has no colour to give.
+                        // Weighted by alpha: invisible pixels have no meaningful colour.
                         for (sum, &value) in sum.iter_mut().zip(pixel) {
                             *sum += alpha * u64::from(value);
                         }

@@ -163,7 +163,7 @@ fn splats_that_are_not_finite_are_left_out_and_counted() {
 }
 
 #[test]
-fn files_that_hold_no_splats_are_refused_in_one_sentence() {
+fn files_that_hold_no_splats_are_refused_in_one_message() {
     let folder = Folder::new();
     let header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n\
                   property float x\nproperty float y\nproperty float z\nend_header\n";
@@ -192,7 +192,7 @@ fn files_that_hold_no_splats_are_refused_in_one_sentence() {
 }
 
 #[test]
-fn arguments_that_make_no_sense_are_refused_in_one_sentence() {
+fn arguments_that_make_no_sense_are_refused_in_one_message() {
     let folder = Folder::new();
     let scene = folder.join("scene.ply");
     write(&scene, &ball(10, 7, [0.5; 3]));
@@ -245,7 +245,7 @@ fn without_an_adapter_the_cpu_draws_and_gpu_is_refused() {
 }
 
 #[test]
-fn without_a_display_one_sentence_says_what_to_do() {
+fn without_a_display_an_error_message_says_what_to_do() {
     if cfg!(target_os = "linux") {
         let folder = Folder::new();
         let scene = folder.join("scene.ply");

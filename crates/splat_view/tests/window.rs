@@ -481,7 +481,7 @@ fn windows_larger_than_any_texture_are_refused_when_asked_for_and_else_go_on() {
 }
 
 #[test]
-fn without_an_adapter_one_sentence_says_so() {
+fn without_an_adapter_an_error_message_says_so() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     scenes(&folder);
     let mut command = program();

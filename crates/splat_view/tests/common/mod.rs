@@ -132,11 +132,11 @@ pub fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).trim_end().to_owned()
 }
 
-/// Asserts that the program ended with one sentence that holds the words.
+/// Asserts that the program ended with one error message that contains the words.
 pub fn refused(output: &Output, words: &[&str]) {
     let text = said(output);
     assert_eq!(output.status.code(), Some(1), "{text}");
-    assert_eq!(text.lines().count(), 1, "not one sentence: {text}");
+    assert_eq!(text.lines().count(), 1, "not one message: {text}");
     assert!(text.ends_with('.') && !text.contains("panicked"), "{text}");
     for word in words {
         assert!(text.contains(word), "{word} is not in: {text}");
