@@ -1,4 +1,4 @@
-//! Pictures to files: PNG as seen, EXR with alpha and depth.
+//! Writes pictures: PNG as shown, EXR with alpha and depth.
 
 use std::path::Path;
 
@@ -17,12 +17,12 @@ pub fn write_png(path: &Path, [width, height]: [u32; 2], rgb: &[u8]) -> Result<(
     })
 }
 
-/// RGB bytes of RGBA ones.
+/// Drops alpha: RGBA bytes to RGB bytes.
 pub fn without_alpha(rgba: &[u8]) -> Vec<u8> {
     rgba.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect()
 }
 
-/// RGB bytes of a rendered picture, rounded.
+/// A rendered picture as RGB bytes, rounded.
 pub fn to_bytes(image: &Image<f32>) -> Vec<u8> {
     let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
     image.color.iter().flatten().map(byte).collect()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Annotated
 
 import typer
@@ -65,7 +64,4 @@ app.command("bench")(bench_command)
 
 def main() -> None:
     """Run the ``igsr`` command."""
-    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        # Mesa's layer that asks the desktop for its GPU prints an error where there is no desktop.
-        os.environ.setdefault("NODEVICE_SELECT", "1")
     app()

@@ -7,6 +7,7 @@
 
 mod adam;
 mod bin;
+mod desktop;
 mod device;
 mod fit;
 mod layout;

@@ -36,6 +36,7 @@ fn rank(kind: wgpu::DeviceType) -> u32 {
 
 /// wgpu as this crate opens it.
 fn instance() -> wgpu::Instance {
+    crate::gpu::desktop::silence_device_select();
     wgpu::Instance::new(wgpu::InstanceDescriptor {
         // Debug layers are asked for by wgpu's environment variables alone.
         flags: wgpu::InstanceFlags::empty().with_env(),
