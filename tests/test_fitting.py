@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import io
 import json
 import os
@@ -18,9 +19,13 @@ import pytest
 import scenes
 
 import igsr
+from igsr import _core
 from igsr.evaluation import metrics
-from igsr.fitting import run as fitting
+from igsr.fitting import checkpoint as checkpoints
+from igsr.fitting import optimization as fitting
 from igsr.fitting.checkpoint import load_checkpoint, save_checkpoint
+from igsr.fitting.fingerprint import fingerprint
+from igsr.fitting.settings import FitSettings
 
 STEPS = 420  # density control runs at 300 and every 100 from then on
 
@@ -138,7 +143,7 @@ def test_pictures_are_compared_over_what_stood_behind_them(capture):
     assert same(small_fit(before(green), steps=20), expected)
     assert same(small_fit(before(green), steps=20, background=(0.0, 0.0, 1.0)), expected)
     assert not same(small_fit(capture, steps=20), expected)
-    prints = {fitting.fingerprint(before(color).train_views) for color in (None, green)}
+    prints = {fingerprint(before(color).train_views) for color in (None, green)}
     assert len(prints) == 2
 
 
@@ -188,8 +193,8 @@ FIT_FOREVER = """
 import sys
 sys.path[:0] = {path!r}
 import igsr, scenes
-from igsr import fitting
-fitting.CHECKPOINT_STEPS = 20
+from igsr.fitting import optimization
+optimization.CHECKPOINT_STEPS = 20
 capture = scenes.capture(views=4, size=40)
 igsr.fit(capture, steps=1_000_000, backend="cpu", max_splats=400, sh_degree=1,
          checkpoint=sys.argv[1], progress=lambda now: print(now.step, flush=True))
@@ -279,7 +284,7 @@ def test_last_checkpoint_that_fails_does_not_cost_the_splats(capture, tmp_path, 
     def full_disk(*arguments):
         raise igsr.IgsrError("Cannot write checkpoint.npz: No space left on device.")
 
-    monkeypatch.setattr(fitting, "save_checkpoint", full_disk)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", full_disk)
     with pytest.warns(UserWarning, match="No space left"):
         splats = small_fit(capture, steps=20, checkpoint=tmp_path / "checkpoint.npz")
     assert same(splats, small_fit(capture, steps=20))
@@ -294,7 +299,7 @@ def test_interrupt_during_the_last_save_saves_again(capture, tmp_path, monkeypat
             raise KeyboardInterrupt
         save_checkpoint(*arguments)
 
-    monkeypatch.setattr(fitting, "save_checkpoint", interrupted_once)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", interrupted_once)
     with pytest.raises(KeyboardInterrupt):
         small_fit(capture, steps=20, checkpoint=tmp_path / "checkpoint.npz")
     assert load_checkpoint(tmp_path / "checkpoint.npz")[0]["step"] == [20]
@@ -410,3 +415,67 @@ def test_fit_needs_train_views(capture):
     only_test = [dataclasses.replace(view, split="test") for view in capture.views]
     with pytest.raises(igsr.IgsrError, match="no train views"):
         small_fit(igsr.Capture(capture.path, only_test))
+
+
+def test_a_checkpoint_of_format_1_goes_on(capture, tmp_path):
+    """As files were written from the first release on, array by array."""
+    path, count = tmp_path / "old.npz", 30
+    options = {"steps": 20, "max_splats": count, "sh_degree": 0, "density": "fixed", "seed": 5}
+    random = np.random.default_rng(0)
+    shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3)}
+    shapes |= {"opacities": (count,), "sh": (count, 1, 3)}
+    arrays = {name: random.normal(size=shape) for name, shape in shapes.items()}
+    arrays |= {f"first_{name}": 1e-3 * random.normal(size=s) for name, s in shapes.items()}
+    arrays |= {f"second_{name}": 1e-6 * random.uniform(size=s) for name, s in shapes.items()}
+    arrays |= {"stats_grad_sum": np.zeros(count), "stats_seen": np.zeros(count)}
+    state = {name: array.astype(np.float32) for name, array in arrays.items()}
+    state |= {"step": np.array([12], dtype=np.uint32), "origin": np.zeros(3)}
+    info = _core.backend_info("cpu")
+    settings = {
+        "format": 1,
+        **options,
+        "dropout": 0.3,
+        "hull": False,
+        "start": "auto",
+        "poses": "fixed",
+        "focal": "fixed",
+        "background": [0.0, 0.0, 0.0],
+        "backend": "cpu",
+        "instruction_set": info["instruction_set"],
+        "igsr": igsr.__version__,
+        "capture": fingerprint(capture.train_views),
+        "started": ["sift", count],
+        "seconds": 2.5,
+    }
+
+    def resumed(**changed):
+        text = json.dumps(settings | changed).encode()
+        np.savez(path, **state, settings=np.frombuffer(text, dtype=np.uint8))
+        last = []
+        keywords = options | {"background": (0.0, 0.0, 0.0), "checkpoint": path, "resume": True}
+        splats = small_fit(capture, progress=last.append, **keywords)
+        return splats, last[-1]
+
+    splats, last = resumed()
+    assert (len(splats), last.step, last.started) == (count, 20, ("sift", count))
+    assert last.seconds > 2.5
+    assert np.array_equal(splats.origin, np.zeros(3))
+    # Eight steps away from what the file holds, and no other fit.
+    assert 0 < np.abs(splats.means - state["means"]).max() < 0.2
+    assert load_checkpoint(path)[1].keys() == settings.keys() - {"format"}
+    with pytest.raises(igsr.IgsrError, match="it is not of format 1"):
+        resumed(format=2)
+    with pytest.raises(igsr.IgsrError, match=r"was made with igsr '0\.0\.9', not"):
+        resumed(igsr="0.0.9")
+
+
+def test_both_fits_have_the_same_arguments(capture):
+    ours, theirs = (inspect.signature(one) for one in (igsr.fit, igsr.fit_with_cameras))
+    assert ours.parameters == theirs.parameters
+    named = set(ours.parameters) - {"capture", "progress", "backend", "preset", "checkpoint"}
+    fields = {one.name for one in dataclasses.fields(FitSettings)}
+    assert named - {"resume"} == fields - {"first_step"}
+    with pytest.raises(TypeError, match="steps_"):
+        igsr.fit_with_cameras(capture, steps_=3)
+    alike = (capture, 5, None, "cpu", 4)
+    assert same(igsr.fit(*alike), igsr.fit_with_cameras(*alike)[0])

@@ -15,6 +15,7 @@ from igsr.capture import Capture
 from igsr.cli import app
 from igsr.evaluation.scores import BLACK
 from igsr.fitting.pose_refinement import refine_cameras
+from igsr.fitting.settings import FitSettings
 from igsr.geometry.camera_noise import Noise, noise_unit, noisy_view
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
@@ -340,7 +341,7 @@ def test_affine_noise_is_the_same_picture_with_a_shear(made):
 
 
 def test_the_photo_is_sheared_by_what_the_camera_is_not():
-    from igsr.study.noisy_poses import _rows_shifted
+    from igsr.geometry.camera_noise import _rows_shifted
 
     image = np.zeros((3, 6, 4), np.uint8)
     image[:, 2] = (200, 100, 50, 255)
@@ -408,7 +409,17 @@ def test_the_study_compares_what_the_protocol_says(data, tmp_path, monkeypatch):
 def test_a_real_fit_of_the_study(data, monkeypatch):
     from igsr.fitting import presets
 
-    short = presets.Preset(40, 300, 0, "fixed", 0.2, True, "auto")
+    short = FitSettings(
+        steps=40,
+        max_splats=300,
+        sh_degree=0,
+        density="fixed",
+        dropout=0.2,
+        hull=True,
+        start="auto",
+        poses="fixed",
+        focal="fixed",
+    )
     monkeypatch.setattr(presets, "_FEW", short)
     row = run_fit(str(data), PoseFit("ball", Noise("turn", 1.0), "joint", 0, "cpu"))
     assert row["before"]["rotation"] == pytest.approx(1.0, abs=0.2)

@@ -14,6 +14,7 @@ import igsr
 from igsr._internal.resumable_jobs import folder_hash
 from igsr.capture import Capture
 from igsr.fitting.presets import PRESETS, preset_settings
+from igsr.fitting.settings import FitSettings
 from igsr.study import blender, blender8, few_photos
 from igsr.study import scored_fits as fits
 from igsr.study.blender import VIEW_IDS
@@ -21,6 +22,19 @@ from igsr.study.real_captures import load_views
 from igsr.study.scored_fits import Fit, run_fit
 from igsr.study.splits import dtu_views, llff_views, with_train_views
 from igsr.study.summary import summarized
+
+#: A preset that is over at once.
+SHORT = FitSettings(
+    steps=20,
+    max_splats=300,
+    sh_degree=0,
+    density="fixed",
+    dropout=0.0,
+    hull=False,
+    start="random",
+    poses="fixed",
+    focal="fixed",
+)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +121,7 @@ def test_a_study_is_written_and_goes_on_where_it_stopped(data, tmp_path, monkeyp
 def test_a_real_fit_of_the_study(data, monkeypatch):
     from igsr.fitting import presets
 
-    short = presets.Preset(30, 300, 0, "fixed", 0.2, True, "auto")
+    short = replace(SHORT, steps=30, dropout=0.2, hull=True, start="auto")
     monkeypatch.setattr(presets, "_FEW", short)
     row = run_fit(blender.load_views, str(data), Fit("ball", "76", "default", 1, "cpu"))
     assert row["psnr"] > 10.0
@@ -209,7 +223,7 @@ def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypa
 def test_presets_that_move_cameras_are_scored_refined_too(real, monkeypatch):
     from igsr.fitting import presets
 
-    short = presets.Preset(20, 300, 0, "fixed", 0.0, False, "random", "joint", "shared")
+    short = replace(SHORT, poses="joint", focal="shared")
     monkeypatch.setattr(presets, "_INSTANTSPLAT", short)
     one = Fit("leaf", "3", "instantsplat", 0, "cpu")
     row = run_fit(load_views, str(real), one, refined=True)
@@ -220,7 +234,7 @@ def test_presets_that_move_cameras_are_scored_refined_too(real, monkeypatch):
 def test_what_a_mask_hides_in_a_scored_photo_changes_no_score(real, monkeypatch):
     from igsr.fitting import presets
 
-    monkeypatch.setattr(presets, "_3DGS", presets.Preset(20, 300, 0, "fixed", 0.0, False, "random"))
+    monkeypatch.setattr(presets, "_3DGS", SHORT)
     mask = np.zeros((16, 16), dtype=bool)
     mask[3:13, 4:14] = True
 

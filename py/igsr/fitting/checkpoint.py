@@ -10,22 +10,107 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from igsr._internal.atomic_write import atomic_write
+from igsr import _core
+from igsr._internal.atomic_write import atomic_write, check_writable
 from igsr._internal.untrusted_npz import DAMAGE
 from igsr.errors import IgsrError
+from igsr.fitting.settings import FitSettings
 
 #: Raised whenever the arrays' meaning changes; older checkpoints are then refused by number.
 FORMAT = 1
 #: Member that holds the settings, as UTF-8 JSON.
 SETTINGS = "settings"
+#: What is recorded as the initialization of a fit that went on from splats that it was given.
+GIVEN = "given"
 
-State = dict[str, npt.NDArray[Any]]
+State: TypeAlias = dict[str, npt.NDArray[Any]]
+
+
+def recorded_settings(
+    settings: FitSettings, backend: dict[str, str], capture: str, splats: str | None = None
+) -> dict[str, Any]:
+    """What a checkpoint records of a fit: all that a resumed fit must have in common with it.
+
+    Args:
+        settings: of the fit.
+        backend: "backend" and "instruction_set": on another one the bits differ.
+        capture: fingerprint of photos, cameras and tracks.
+        splats: hash of the splats that the fit goes on from, if it does.
+    """
+    recorded = {
+        **settings.plain(),
+        "backend": backend["backend"],
+        "instruction_set": backend["instruction_set"],
+        "igsr": _core.__version__,
+    }
+    if splats is not None:
+        recorded |= {"start": GIVEN, "first_step": settings.first_step, "splats": splats}
+    return {**recorded, "capture": capture}
+
+
+@dataclass(frozen=True)
+class CheckpointFile:
+    """The checkpoint of one fit.
+
+    Attributes:
+        path: of the ``.npz`` file.
+        settings: ``recorded_settings`` of the fit.
+    """
+
+    path: Path
+    settings: dict[str, Any]
+
+    def check_writable(self) -> None:
+        """Find out now whether the file can be written.
+
+        Raises:
+            IgsrError: it cannot.
+        """
+        check_writable(self.path)
+
+    def save(self, state: State, started: tuple[str, int], seconds: float) -> None:
+        """Write the file, whole or not at all.
+
+        Args:
+            state: arrays of the fitter, and what else is kept.
+            started: what the splats were initialized from, and their number.
+            seconds: time spent so far.
+
+        Raises:
+            IgsrError: it cannot be written; an older checkpoint is still there.
+        """
+        save_checkpoint(
+            self.path, state, {**self.settings, "started": list(started), "seconds": seconds}
+        )
+
+    def load(self) -> tuple[State, tuple[str, int], float]:
+        """What ``save`` was given.
+
+        Raises:
+            IgsrError: there is no checkpoint, it is damaged, or of another format, fit or capture;
+                the message says which.
+        """
+        state, saved = load_checkpoint(self.path)
+        for name, value in self.settings.items():
+            if saved.get(name) == value:
+                continue
+            if name == "capture":
+                raise IgsrError(
+                    f"{self.path} was made from other photos, masks, cameras, tracks or another "
+                    "split; resume with the same or leave --resume out."
+                )
+            raise IgsrError(
+                f"{self.path} was made with {name} {saved.get(name)!r}, not {value!r}; "
+                "resume with the same or leave --resume out."
+            )
+        return state, (saved["started"][0], saved["started"][1]), saved["seconds"]
 
 
 def save_checkpoint(path: Path, state: State, settings: dict[str, Any]) -> None:

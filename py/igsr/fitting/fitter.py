@@ -1,4 +1,4 @@
-"""The renderer's fitter, made from views and read back as cameras; cameras as plain numbers."""
+"""The renderer's fitter, made from views and splats, and read back as cameras."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ from igsr import _core
 from igsr.capture import Camera, Capture, View
 from igsr.capture.types import intrinsic_matrix
 from igsr.errors import IgsrError
+from igsr.fitting.checkpoint import GIVEN
+from igsr.fitting.initialization.initial_splats import initial_splats
 from igsr.fitting.pose_priors import CameraHolds
+from igsr.fitting.settings import FitSettings
 from igsr.rendering.renders import intrinsics_of, viewmat_about
+from igsr.splats import Splats
 
 #: Steps on photos, at least, for one on a view that is none, where there are both: what such views
 #: teach they teach soon, and what photos show is right.
@@ -50,6 +54,59 @@ def fitter_of(
         backend,
         None if holds is None else _hold_arrays(holds, origin),
     )
+
+
+def check_fits(backend: str) -> dict[str, str]:
+    """What a backend is ("backend", "device", "instruction_set"), which must be one that fits.
+
+    Raises:
+        IgsrError: there is none of that name, or it does not fit.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    if backend == "reference":
+        raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
+    try:
+        return _core.backend_info(_core.resolve_backend(backend))
+    except ValueError as error:
+        raise IgsrError(f"{error}.") from error
+
+
+def initial_state(
+    capture: Capture, settings: FitSettings, given: Splats | None = None
+) -> tuple[dict[str, npt.NDArray[Any]], tuple[str, int]]:
+    """The splats that a fit starts from, by name of parameter, with their origin.
+
+    And what they were made from, with their number.
+
+    Raises:
+        IgsrError: as ``initial_splats``.
+    """
+    if given is not None:
+        return splat_arrays(given), (GIVEN, len(given))
+    splats, made_from = initial_splats(
+        replace(capture, views=photos_among(capture.train_views)),
+        settings.seed,
+        settings.max_splats,
+        settings.sh_degree,
+        settings.start,
+        dense=settings.density == "fixed",
+        exact_poses=settings.poses == "fixed",
+    )
+    return splat_arrays(splats), (made_from, len(splats))
+
+
+def splat_arrays(splats: Splats) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of splats by name, with their origin."""
+    names = ("means", "quats", "scales", "opacities", "sh", "origin")
+    return {name: getattr(splats, name) for name in names}
+
+
+def photos_among(views: list[View]) -> list[View]:
+    """The views that are photos, by which presets and initialization go; all where none is.
+
+    Views with weights are pseudo-views: they show what a fit to the photos made up.
+    """
+    return [view for view in views if view.weights is None] or views
 
 
 def _schedule(views: Sequence[View], steps: int, first: int) -> list[tuple[int, int | None]]:

@@ -1,0 +1,35 @@
+"""Hashes of what a fit was made from, by which a checkpoint is told from others."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.capture import View
+from igsr.capture.types import Tracks
+
+
+def fingerprint(views: list[View], tracks: Tracks | None = None) -> str:
+    """SHA-256 of photos, masks, weights, backgrounds, cameras and tracks, in hexadecimal."""
+    arrays: list[npt.NDArray[Any] | None] = []
+    for view in views:
+        camera = view.camera
+        arrays += [camera.viewmat, camera.K, view.image, view.mask, view.weights]
+        arrays.append(None if view.background is None else np.asarray(view.background))
+    if tracks is not None:
+        arrays += [tracks.view, tracks.point, tracks.xy]
+    return hash_of(arrays)
+
+
+def hash_of(arrays: Iterable[npt.NDArray[Any] | None]) -> str:
+    """SHA-256 of arrays with their types and shapes, in hexadecimal; None counts for nothing."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        if array is not None:
+            digest.update(str((array.dtype.str, array.shape)).encode())
+            digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -1,0 +1,155 @@
+"""A fit in progress: steps in chunks, with progress, time and checkpoints."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr import _core
+from igsr._internal.progress_bar import BarState
+from igsr.errors import IgsrError
+from igsr.fitting.checkpoint import CheckpointFile
+from igsr.fitting.settings import FitSettings
+
+#: A killed run loses at most this much work.
+CHECKPOINT_STEPS = 500
+CHECKPOINT_SECONDS = 20.0
+#: How long the Rust side runs before Python may look at Ctrl-C and the progress callback.
+CHUNK_SECONDS = 0.2
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit stands.
+
+    Attributes:
+        step: steps done, of ``steps``.
+        steps: steps in all.
+        loss: 0.8 L1 + 0.2 D-SSIM of the last step's photo, before that step.
+        splats: number of splats now.
+        started: what the splats were initialized from ("points", "hull" ...) and their number.
+        seconds: time spent fitting, earlier runs that were resumed included.
+        steps_per_second: of the last chunk of steps.
+        backend: what runs: "backend", "device" and "instruction_set".
+    """
+
+    step: int
+    steps: int
+    loss: float
+    splats: int
+    started: tuple[str, int]
+    seconds: float
+    steps_per_second: float
+    backend: dict[str, str]
+
+
+def bar_state(now: Progress) -> BarState:
+    """What a progress bar shows of a fit."""
+    return BarState(
+        now.step,
+        now.steps,
+        f"loss {now.loss:.4f}  {now.splats} splats  {now.steps_per_second:.0f} steps/s",
+    )
+
+
+#: What is called with the progress of a fit; False ends the fit early.
+Report: TypeAlias = Callable[[Progress], bool | None]
+
+
+@dataclass
+class FitRun:
+    """One fit in progress; it keeps progress, time and the checkpoint file.
+
+    Attributes:
+        fitter: the renderer's fitter.
+        settings: the fit's.
+        started: what the splats were initialized from, and their number.
+        backend: what runs; see ``Progress``.
+        report: what is called after each chunk of steps.
+        checkpoint: the file to save to.
+        kept: arrays that checkpoints hold beside the fitter's.
+        seconds_before: time spent before this run.
+    """
+
+    fitter: _core.Fitter
+    settings: FitSettings
+    started: tuple[str, int]
+    backend: dict[str, str]
+    report: Report | None = None
+    checkpoint: CheckpointFile | None = None
+    kept: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
+    seconds_before: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Start the clock."""
+        self._began = self._saved_at = time.perf_counter()
+        self._step = self._saved_step = int(self.fitter.steps_done)
+
+    def save(self) -> None:
+        """Save a checkpoint, if there is a file for it.
+
+        Raises:
+            IgsrError: it cannot be written.
+        """
+        if self.checkpoint is not None:
+            seconds = self.seconds_before + time.perf_counter() - self._began
+            self.checkpoint.save({**self.fitter.state(), **self.kept}, self.started, seconds)
+        self._saved_step, self._saved_at = self._step, time.perf_counter()
+
+    def optimize(self) -> None:
+        """Step until done or told to stop. Save on the way, at the end and on Ctrl-C.
+
+        Raises:
+            IgsrError: a step fails, or a checkpoint cannot be written.
+            UserWarning: the last checkpoint cannot be written.
+            KeyboardInterrupt: on Ctrl-C, after a checkpoint.
+        """
+        chunk = 1
+        try:
+            while self._step < self.settings.steps:
+                now = self._stepped(chunk)
+                # A step's time follows the number of splats: follow it, a factor two at a time.
+                chunk = max(1, min(2 * chunk, int(now.steps_per_second * CHUNK_SECONDS)))
+                if self.report is not None and self.report(now) is False:
+                    break
+                if self._is_save_due():
+                    self.save()
+            if self._step > self._saved_step:
+                try:
+                    self.save()
+                except IgsrError as error:
+                    # The splats are finished: losing them to a full disk would be the greater harm.
+                    warnings.warn(str(error), stacklevel=4)
+        except KeyboardInterrupt:
+            self.save()
+            raise
+
+    def _stepped(self, count: int) -> Progress:
+        """Take ``count`` steps, or as many as are left, and say where the fit stands."""
+        began = time.perf_counter()
+        try:
+            done: dict[str, Any] = self.fitter.step(min(count, self.settings.steps - self._step))
+        except ValueError as error:
+            raise IgsrError(f"{error}.") from error
+        now = time.perf_counter()
+        advanced, self._step = done["step"] - self._step, done["step"]
+        return Progress(
+            step=self._step,
+            steps=self.settings.steps,
+            loss=done["loss"],
+            splats=done["splats"],
+            started=self.started,
+            seconds=self.seconds_before + now - self._began,
+            steps_per_second=advanced / max(now - began, 1e-9),
+            backend=self.backend,
+        )
+
+    def _is_save_due(self) -> bool:
+        steps, seconds = self._step - self._saved_step, time.perf_counter() - self._saved_at
+        return steps >= CHECKPOINT_STEPS or seconds >= CHECKPOINT_SECONDS
