@@ -10,7 +10,12 @@ import typer
 
 from igsr._internal.atomic_write import check_writable
 from igsr._internal.json_file import write_json
-from igsr.cli.shared import BackendChoice, error_console, one_sentence, output_console
+from igsr.cli.error_messages import error_messages
+from igsr.cli.shared import (
+    BackendChoice,
+    error_console,
+    output_console,
+)
 from igsr.errors import IgsrError
 
 
@@ -75,7 +80,7 @@ def bench_command(
     """
     from igsr import benchmark
 
-    with one_sentence():
+    with error_messages():
         if seed < 0:
             raise IgsrError(f"--seed must be at least 0, not {seed}.")
         if not 0.0 <= seconds <= 3600.0:

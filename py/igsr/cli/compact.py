@@ -15,6 +15,7 @@ from rich.progress import Progress as ProgressBar
 
 from igsr._internal.atomic_write import check_writable
 from igsr._internal.json_file import write_json
+from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
@@ -25,7 +26,6 @@ from igsr.cli.shared import (
     background_color,
     error_console,
     load,
-    one_sentence,
     output_console,
     print_json,
     resolved,
@@ -85,7 +85,7 @@ def compact_command(
     as_json: JsonOption = False,
 ) -> None:
     """Make SCENE smaller: the fewest splats that lose no more than --max-loss."""
-    with one_sentence(lambda: "Interrupted; nothing is written."):
+    with error_messages(lambda: "Interrupted; nothing is written."):
         name = resolved(backend)
         limit = _decibels("--max-loss", max_loss)
         target = scene.with_suffix(".compact.ply") if out is None else out

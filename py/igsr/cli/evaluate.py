@@ -8,6 +8,7 @@ import typer
 from rich.table import Table
 
 from igsr import _core
+from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
@@ -19,7 +20,6 @@ from igsr.cli.shared import (
     SplitChoice,
     background_color,
     load,
-    one_sentence,
     output_console,
     print_json,
     protocol_line,
@@ -43,7 +43,7 @@ def eval_command(
     as_json: JsonOption = False,
 ) -> None:
     """Score SCENE against the photos of CAPTURE."""
-    with one_sentence():
+    with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)
         capture = load(capture_path, holdout)

@@ -12,7 +12,8 @@ from igsr._internal.atomic_write import check_folder
 from igsr.capture import load_capture
 from igsr.capture.write_colmap import write_colmap
 from igsr.capture.write_transforms import write_transforms
-from igsr.cli.shared import CaptureArgument, JsonOption, one_sentence, output_console, print_json
+from igsr.cli.error_messages import error_messages
+from igsr.cli.shared import CaptureArgument, JsonOption, output_console, print_json
 
 
 class FormatChoice(str, enum.Enum):
@@ -33,7 +34,7 @@ def export_command(
     as_json: JsonOption = False,
 ) -> None:
     """Write CAPTURE in another format: photos undistorted, at full resolution, masks as masks."""
-    with one_sentence(lambda: "Interrupted; nothing is written."):
+    with error_messages(lambda: "Interrupted; nothing is written."):
         check_folder(out)
         capture = load_capture(capture_path)
         if form is FormatChoice.transforms:

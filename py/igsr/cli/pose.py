@@ -19,16 +19,14 @@ from igsr.capture import Capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import FRAMES, has_photos
 from igsr.capture.write_colmap import write_colmap
+from igsr.cli.error_messages import error_messages, print_message, warning_messages
 from igsr.cli.shared import (
     JsonOption,
-    complain,
     error_console,
     load,
-    one_sentence,
     output_console,
     print_json,
     stopped,
-    warnings_as_sentences,
 )
 from igsr.errors import IgsrError
 from igsr.pose import AUTO, capture_of, estimate, found_before, kept_cameras, photos_note, photos_of
@@ -103,10 +101,10 @@ def capture_to_fit(
         return load(path, holdout), False
     kept = kept_cameras(path, out)
     if resume and found_before(path, kept):
-        complain(f"The cameras found before are used, from {kept}")
+        print_message(f"The cameras found before are used, from {kept}")
     else:
         report = _posed(path, kept, finder, plot=False, shown=shown, notes=photos_note(path))
-        complain(
+        print_message(
             f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
             f"{report['estimator']} and are kept in {kept}"
         )
@@ -132,7 +130,7 @@ def pose_command(
     as_json: JsonOption = False,
 ) -> None:
     """Find the cameras of PHOTOS and write both as a COLMAP capture."""
-    with one_sentence(lambda: "Interrupted; nothing is written."), warnings_as_sentences():
+    with error_messages(lambda: "Interrupted; nothing is written."), warning_messages():
         check_folder(out)
         started = time.monotonic()
         given = photos[0] if len(photos) == 1 else photos
@@ -176,7 +174,7 @@ def _posed(
             loaded, finder.estimator, seed=finder.seed, progress=show, **finder.options
         )
     for sentence in found.warnings:
-        complain(sentence)
+        print_message(sentence)
     capture = capture_of(photos if isinstance(photos, Path) else Path("photos"), loaded, found)
     trusted = [
         mask

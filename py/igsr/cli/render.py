@@ -10,6 +10,7 @@ import typer
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr.capture import Camera, Capture, load_capture
+from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
     NAMED_COLORS,
     BackendChoice,
@@ -18,7 +19,6 @@ from igsr.cli.shared import (
     JsonOption,
     SceneArgument,
     background_color,
-    one_sentence,
     output_console,
     picture_name,
     print_json,
@@ -59,7 +59,7 @@ def render_command(
     as_json: JsonOption = False,
 ) -> None:
     """Render SCENE to PNG or EXR pictures, or to a video around it."""
-    with one_sentence():
+    with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)
         capture = None if cameras is None else load_capture(cameras)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,8 @@ from igsr.errors import IgsrError
 from igsr.evaluation import metrics
 from igsr.rendering.renders import render
 from igsr.splats import Splats
+
+logger = logging.getLogger(__name__)
 
 METRICS = ("psnr", "ssim", "ms_ssim", "flip")
 
