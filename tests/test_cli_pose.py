@@ -223,5 +223,7 @@ def test_study_of_poses(tmp_path, igsr_here, calls, monkeypatch):
     assert "| plain | 0 | 3 | 3 | - |" in done.stdout
     report = json.loads((tmp_path / "out/study.json").read_text())
     assert report["protocol"] == {"name": "poses", "estimator": "colmap", "seeds": 1}
-    refused(igsr_here(*study, "--views", "3"), "--views says nothing to poses")
+    foreign = igsr_here(*study, "--views", "3")
+    assert foreign.returncode == 2
+    assert "No such option: --views" in foreign.stderr
     refused(igsr_here(*study, "--estimator", "magic"), "estimator must be")

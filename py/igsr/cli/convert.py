@@ -24,13 +24,13 @@ def convert_command(
         Path,
         typer.Argument(
             metavar="TARGET",
-            help="File to write; its ending is the format: .ply, .compressed.ply, .splat, .spz, "
+            help="File to write. Its ending sets the format: .ply, .compressed.ply, .splat, .spz, "
             ".sog, .glb or .gltf.",
         ),
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Write SCENE as TARGET, and say what TARGET's format cannot hold."""
+    """Write SCENE in the format of TARGET; name what that format cannot hold."""
     with error_messages(lambda: "Interrupted; nothing is written."), warning_messages():
         check_writable(target)
         splats = Splats.load(scene)

@@ -1,4 +1,4 @@
-"""``igsr eval``: score splats."""
+"""``igsr eval``: score a scene against photos."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def eval_command(
     capture_path: CaptureArgument,
     holdout: HoldoutOption = None,
     split: Annotated[
-        SplitChoice | None, typer.Option("--split", help="Default: test views if there are any.")
+        SplitChoice | None,
+        typer.Option("--split", help="Views to score. Default: test if there are any, else train."),
     ] = None,
     background: BackgroundOption = None,
     backend: BackendOption = BackendChoice.auto,

@@ -1,4 +1,4 @@
-"""``igsr export``: write a capture in another form."""
+"""``igsr export``: write a capture in another format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from igsr.cli.shared import CaptureArgument, JsonOption, output_console, print_j
 
 
 class FormatChoice(str, enum.Enum):
-    """Files that describe cameras."""
+    """Formats of captures that can be written."""
 
     colmap = "colmap"
     colmap_text = "colmap-text"
@@ -26,14 +26,14 @@ class FormatChoice(str, enum.Enum):
 
 def export_command(
     capture_path: CaptureArgument,
-    out: Annotated[Path, typer.Option("--out", help="Folder; it must be new or empty.")],
+    out: Annotated[Path, typer.Option("--out", help="New or empty folder.")],
     form: Annotated[
         FormatChoice,
-        typer.Option("--format", help="colmap (binary), colmap-text, or nerfstudio's transforms."),
+        typer.Option("--format", help="colmap (binary), colmap-text, or transforms (nerfstudio)."),
     ] = FormatChoice.colmap,
     as_json: JsonOption = False,
 ) -> None:
-    """Write CAPTURE in another format: photos undistorted, at full resolution, masks as masks."""
+    """Write CAPTURE in another format: undistorted photos at full resolution, masks, cameras."""
     with error_messages(lambda: "Interrupted; nothing is written."):
         check_folder(out)
         capture = load_capture(capture_path)

@@ -34,7 +34,7 @@ from igsr.splats import Splats
 def render_command(
     scene: SceneArgument,
     out: Annotated[
-        Path, typer.Option("--out", help="Folder for pictures, or .mp4 file with --orbit.")
+        Path, typer.Option("--out", help="Folder for the pictures; with --orbit, an .mp4 file.")
     ],
     cameras: Annotated[
         Path | None,
@@ -45,13 +45,14 @@ def render_command(
         typer.Option(
             "--orbit",
             metavar="FRAMES",
-            help="Write a video once around the scene; with --cameras, at their distance.",
+            help="Write a video of an orbit around the scene; with --cameras, at their distance.",
         ),
     ] = None,
     exr: Annotated[
         bool,
         typer.Option(
-            "--exr", help="EXR in 32-bit float: R, G, B, A and Z (expected depth) instead of PNG."
+            "--exr",
+            help="Write EXR, not PNG: 32-bit floats R, G, B, A and Z (expected depth).",
         ),
     ] = False,
     background: BackgroundOption = None,
@@ -68,14 +69,14 @@ def render_command(
         )
         if orbit_frames is not None:
             if exr:
-                raise IgsrError("--exr writes pictures and --orbit a video; leave one out.")
+                raise IgsrError("--exr writes pictures and --orbit writes a video; leave one out.")
             if out.suffix.lower() not in (".mp4", ".mkv", ".mov"):
                 raise IgsrError(f"--out {out} must be a video file such as orbit.mp4 with --orbit.")
             files = [_write_orbit(splats, orbit(splats, capture, orbit_frames), out, color, name)]
         elif capture is not None:
             files = _write_pictures(splats, capture, out, color, name, exr)
         else:
-            raise IgsrError("Say where from: --cameras CAPTURE, --orbit FRAMES, or both.")
+            raise IgsrError("Name the cameras: --cameras CAPTURE, --orbit FRAMES, or both.")
     if as_json:
         print_json({"files": [str(file) for file in files], **_core.backend_info(name)})
     else:

@@ -101,6 +101,9 @@ HoldoutOption = Annotated[
         help="Hold out every Nth photo for testing, such as 8.",
     ),
 ]
+SeedOption = Annotated[
+    int, typer.Option("--seed", help="Random seed. Results are deterministic for a given seed.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 JobsOption = Annotated[
     int, typer.Option("--jobs", help="How many fits run at the same time; they share the cores.")

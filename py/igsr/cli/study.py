@@ -170,9 +170,7 @@ def poses_command(
     scenes: ScenesOption = None,
     estimator: Annotated[
         str | None,
-        typer.Option(
-            "--estimator", metavar="NAME", help="What finds the cameras. Default: colmap."
-        ),
+        typer.Option("--estimator", metavar="NAME", help="What finds cameras. Default: colmap."),
     ] = None,
     seeds: OneSeedOption = None,
     jobs: JobsOption = 1,
