@@ -5,7 +5,7 @@ Arrays are C-contiguous. ``Real`` is float32, or float64 for the backend "refere
 """
 
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,7 @@ class SplatArrays(TypedDict):
     sh: Float32  # [N, K, 3]
     origin: Float64  # [3]
 
-def resolve_backend(name: str) -> str:
+def resolve_backend(name: str) -> Literal["cpu", "gpu", "reference"]:
     """The backend that "auto", "cpu", "gpu" or "reference" stands for.
 
     Raises ValueError for another name, RuntimeError where "gpu" has no adapter.

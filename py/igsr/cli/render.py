@@ -9,6 +9,7 @@ import typer
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.choices import Backend
 from igsr.capture import Camera, Capture, load_capture
 from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
@@ -90,7 +91,7 @@ def _write_orbit(
     path_cameras: list[Camera],
     out: Path,
     background: tuple[float, float, float],
-    backend: str,
+    backend: Backend,
 ) -> Path:
     from igsr.rendering.video import write_video
 
@@ -104,7 +105,7 @@ def _write_pictures(
     capture: Capture,
     out: Path,
     background: tuple[float, float, float],
-    backend: str,
+    backend: Backend,
     exr: bool,
 ) -> list[Path]:
     from PIL import Image

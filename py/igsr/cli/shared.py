@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from igsr._internal.choices import Backend, ResolvedBackend, Split
 from igsr.cli.error_messages import (
     INTERRUPTED,
     error_messages,
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as ProgressBar
 
     from igsr.capture import Capture
-    from igsr.evaluation import ScoredView
+    from igsr.evaluation import ScoredView, Scores
     from igsr.splats import Splats
 
 # The names that these had before.
@@ -120,7 +121,7 @@ SceneArgument = Annotated[
 ]
 
 
-def resolved(backend: BackendChoice | FitBackendChoice) -> str:
+def resolved(backend: BackendChoice | FitBackendChoice) -> ResolvedBackend:
     """The name of the backend that runs: "cpu", "gpu" or "reference".
 
     Raises:
@@ -243,11 +244,11 @@ def stopped(bar: ProgressBar) -> Iterator[None]:
 def scored(
     splats: Splats,
     capture: Capture,
-    split: str,
+    split: Split,
     background: tuple[float, float, float],
-    backend: str,
+    backend: Backend,
     shown: bool,
-) -> tuple[dict[str, Any], list[ScoredView]]:
+) -> tuple[Scores, list[ScoredView]]:
     """Scores of a split, and the views for a contact sheet; with a progress bar if ``shown``.
 
     Raises:

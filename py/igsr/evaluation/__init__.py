@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from igsr.evaluation.scores import METRICS, ScoredView, evaluate, score_views
+from igsr.evaluation.scores import METRICS, ScoredView, Scores, evaluate, score_views
 
-__all__ = ["METRICS", "ScoredView", "evaluate", "score_views"]
+__all__ = ["METRICS", "ScoredView", "Scores", "evaluate", "score_views"]
