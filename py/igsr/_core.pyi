@@ -10,7 +10,7 @@ unknown one raises TypeError; a GPU that is missing or fails raises RuntimeError
 """
 
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,7 @@ class SplatArrays(TypedDict):
     sh: Float32  # [N, K, 3]
     origin: Float64  # [3]
 
-def resolve_backend(name: str) -> str:
+def resolve_backend(name: str) -> Literal["cpu", "gpu", "reference"]:
     """The backend that "auto", "cpu", "gpu" or "reference" stands for.
 
     Raises ValueError for another name, RuntimeError where "gpu" has no adapter.
