@@ -15,9 +15,12 @@ from feature_files import squeezenet_file
 import igsr
 from igsr.capture import Camera
 from igsr.denoiser import Buffers, NetworkDenoiser, cleaning, denoise, load_network, save_network
+from igsr.denoiser.architecture import Architecture
 from igsr.denoiser.cleaning import DOUBT, UNSEEN_CHANGE
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
-from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetwork
+from igsr.denoiser.network import FIRST_LOGIT, REACH, DenoiserNetwork
+from igsr.denoiser.training.crops import RIGHT, draw_batch
+from igsr.denoiser.training.distributed import Processes
 from igsr.denoiser.training.losses import (
     LOSSES,
     Loss,
@@ -29,20 +32,13 @@ from igsr.denoiser.training.losses import (
     structure_ratio,
 )
 from igsr.denoiser.training.pair_files import Pairs, read_pairs, write_pairs
+from igsr.denoiser.training.pair_sets import kept_for_validation
 from igsr.denoiser.training.pairs import capture_of_pairs
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance, _Lpips, lpips_distance
 from igsr.denoiser.training.plot_training import plot_training
-from igsr.denoiser.training.train import (
-    CHECKPOINT,
-    LOG,
-    RIGHT,
-    WEIGHTS,
-    Training,
-    _batch,
-    _kept_for_validation,
-    _Processes,
-    train,
-)
+from igsr.denoiser.training.train_network import train
+from igsr.denoiser.training.training_run import CHECKPOINT, LOG, WEIGHTS
+from igsr.denoiser.training.training_settings import Training
 from igsr.denoiser.warping import Source
 from igsr.rendering.renders import Render
 
@@ -531,14 +527,14 @@ def test_crops_that_are_right_already_are_drawn_again(tmp_path):
     inputs[0, :COLOR] = made.truth[0]  # one of the two views is right everywhere
     training = replace(TINY, batch=64, augment=False)
     pairs = [Pairs(inputs, made.truth, made.masks)]
-    crops, truth = _batch(pairs, training, 0, _Processes("cpu"))
-    drawn = (crops[:, :COLOR] - truth[:, :COLOR]).square().mean(dim=(1, 2, 3)) > RIGHT
+    batch = draw_batch(pairs, training, 0, range(64), torch.device("cpu"))
+    drawn = (batch.inputs[:, :COLOR] - batch.truth).square().mean(dim=(1, 2, 3)) > RIGHT
     assert 0.85 < drawn.float().mean() < 1.0, "half to the power of four stays right"
 
 
 def test_no_scene_of_validation_is_trained_on():
     def kept(*names):
-        return _kept_for_validation([f"{name}-seed0-cpu.npz" for name in names])
+        return kept_for_validation([f"{name}-seed0-cpu.npz" for name in names])
 
     assert kept("a-noise-0", "a-sparse-0", "b-noise-0", "b-sparse-0") == 2
     assert kept(*(f"{c}-sparse-0" for c in "abcdefghijklmnopqrst")) == 2
@@ -552,23 +548,21 @@ def test_no_scene_of_validation_is_trained_on():
 def test_processes_learn_one_network_and_one_discriminator(tmp_path):
     pair_files(tmp_path / "pairs")
     code = (
-        "import sys, torch\n"
-        "from igsr.denoiser import training\n"
-        "from igsr.denoiser.network import Architecture\n"
-        "folder, rank = sys.argv[1], training._Processes.__init__\n"
-        "seen = []\n"
-        "real = training._Learner.learn\n"
-        "def learn(self, *batch):\n"
-        "    out = real(self, *batch)\n"
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from igsr.denoiser.architecture import Architecture\n"
+        "from igsr.denoiser.training import Training, train\n"
+        "from igsr.denoiser.training.learner import Learner\n"
+        "folder, seen = sys.argv[1], []\n"
+        "real = Learner.learn\n"
+        "def learn(self, batch):\n"
+        "    out = real(self, batch)\n"
         "    seen[:] = [p.detach().double().sum().item() for part in (self.network, self.judge)\n"
         "               for p in part.parameters()]\n"
         "    return out\n"
-        "training._Learner.learn = learn\n"
-        "from pathlib import Path\n"
-        "import os\n"
-        "given = training.Training(steps=3, batch=4, crop=32, loss='gan')\n"
-        "training.train(sorted(Path(folder, 'pairs').glob('*.npz')), Path(folder, 'out'), given,\n"
-        "               Architecture(4, (1, 1, 1)))\n"
+        "Learner.learn = learn\n"
+        "train(sorted(Path(folder, 'pairs').glob('*.npz')), Path(folder, 'out'),\n"
+        "      Training(steps=3, batch=4, crop=32, loss='gan'), Architecture(4, (1, 1, 1)))\n"
         "Path(folder, os.environ['RANK']).write_text(repr(seen))\n"
     )
     (tmp_path / "learn.py").write_text(code)
@@ -585,7 +579,7 @@ def test_processes_learn_one_network_and_one_discriminator(tmp_path):
 
 
 def test_a_batch_is_shared_evenly(tmp_path, monkeypatch):
-    monkeypatch.setattr(_Processes, "__init__", lambda self, device: vars(self).update(count=3))
+    monkeypatch.setattr(Processes, "__init__", lambda self, device: vars(self).update(count=3))
     with pytest.raises(igsr.IgsrError, match="batch must be a multiple of the number of proc"):
         train(pair_files(tmp_path / "pairs"), tmp_path / "out", TINY, SMALL)
 

@@ -11,9 +11,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from igsr.denoiser.architecture import MULTIPLE
 from igsr.denoiser.buffers import Buffers
 from igsr.denoiser.inputs import COLOR, PHOTOS, network_inputs
-from igsr.denoiser.network import MULTIPLE, REACH, DenoiserNetwork
+from igsr.denoiser.network import REACH, DenoiserNetwork
 from igsr.denoiser.warping import Source, Warped, warp_photos
 from igsr.denoiser.weights import load_network
 from igsr.errors import IgsrError
