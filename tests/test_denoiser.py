@@ -16,7 +16,7 @@ import igsr
 from igsr.capture import Camera
 from igsr.denoiser import Buffers, NetworkDenoiser, cleaning, denoise, load_network, save_network
 from igsr.denoiser.architecture import Architecture
-from igsr.denoiser.cleaning import DOUBT, UNSEEN_CHANGE
+from igsr.denoiser.cleaning import DOUBT, SMALLEST_CHANGE
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
 from igsr.denoiser.network import FIRST_LOGIT, REACH, DenoiserNetwork
 from igsr.denoiser.training.crops import RIGHT, draw_batch
@@ -129,7 +129,7 @@ def test_any_size_comes_out_as_it_went_in(size):
 
 def test_a_change_that_nobody_sees_is_not_made():
     color = np.random.default_rng(0).uniform(0.1, 0.9, size=(20, 20, 3)).astype(np.float32)
-    for brighter, same in ((0.9 * UNSEEN_CHANGE, True), (1.1 * UNSEEN_CHANGE, False)):
+    for brighter, same in ((0.9 * SMALLEST_CHANGE, True), (1.1 * SMALLEST_CHANGE, False)):
         picture, _ = denoise(color, denoiser=NetworkDenoiser(brightening(brighter, 1e-3)))
         assert np.array_equal(picture, color) is same
 

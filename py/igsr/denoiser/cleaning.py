@@ -29,7 +29,7 @@ HALF_CONFIDENCE_ERROR = 0.05
 DOUBT = 1.0
 #: Colours that would change by less than this, of 1, are left alone: a background that is right
 #: stays exactly so.
-UNSEEN_CHANGE = 1.5 / 255.0
+SMALLEST_CHANGE = 1.5 / 255.0
 #: Pictures of more pixels go through the network in tiles of this side, without what is around.
 TILE = 768
 assert TILE % MULTIPLE == 0
@@ -75,7 +75,7 @@ class NetworkDenoiser:
         squared = change.abs().amax(dim=0).square()
         both = squared + (self.doubt * expected).square()
         change *= squared / both.clamp_min(torch.finfo(both.dtype).tiny)
-        seen = change.abs().amax(dim=0) >= UNSEEN_CHANGE
+        seen = change.abs().amax(dim=0) >= SMALLEST_CHANGE
         cleaned = torch.where(seen, render + change, render)
         picture = cleaned.clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
         error: Float32 = expected.numpy()

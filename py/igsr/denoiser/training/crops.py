@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from igsr.denoiser.inputs import BUFFERS, CHOICES, COLOR, PHOTO
-from igsr.denoiser.training.pair_files import OFFSET, SCALE, Pairs
+from igsr.denoiser.training.pair_files import Pairs, unpacked
 from igsr.denoiser.training.training_settings import Training
 
 #: Each crop lacks all the buffers, or the photos, this often: renders may come without.
@@ -107,7 +107,7 @@ def _crop(pairs: Pairs, side: int, random: np.random.Generator) -> Crop:
     top = random.integers(max(1, height - side + 1))
     left = random.integers(max(1, width - side + 1))
     at = (view, slice(None), slice(top, top + side), slice(left, left + side))
-    inputs = pairs.inputs[at] * SCALE[:, None, None] + OFFSET[:, None, None]
+    inputs = unpacked(pairs.inputs[at])
     truth = pairs.truth[at].astype(np.float32) / np.float32(255.0)
     known = pairs.masks[view, at[2], at[3]]
     truth = np.concatenate([np.where(known, truth, inputs[:COLOR]), known[None].astype(np.float32)])

@@ -1,18 +1,13 @@
-"""Pictures of the denoiser study: gains, confidence against error, sheets of views."""
+"""Plots of the denoiser study: gains, and confidence against error."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from igsr._internal.atomic_write import atomic_write
-
-#: Width of a view on a sheet, inches, at so many pixels per inch.
-VIEW_WIDTH, DPI = 2.6, 120
 
 
 def plot_gains(path: Path, report: dict[str, Any]) -> None:
@@ -69,26 +64,6 @@ def plot_confidence(path: Path, confidence: dict[str, Any]) -> None:
     _save(figure, path)
 
 
-def write_sheet(path: Path, rows: Mapping[str, Mapping[str, npt.NDArray[np.uint8]]]) -> None:
-    """A sheet of pictures: rows and columns by the names that ``rows`` has."""
-    from matplotlib.figure import Figure
-
-    first = next(iter(rows.values()))
-    height, width = next(iter(first.values())).shape[:2]
-    size = (VIEW_WIDTH * len(first), (VIEW_WIDTH * height / width + 0.05) * len(rows) + 0.2)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(len(rows), len(first), squeeze=False)
-    for line, (row, pictures) in zip(axes, rows.items(), strict=True):
-        line[0].set_ylabel(row, fontsize=8)
-        for axis, picture in zip(line, pictures.values(), strict=True):
-            axis.imshow(picture)
-            axis.set_xticks([])
-            axis.set_yticks([])
-    for axis, column in zip(axes[0], first, strict=True):
-        axis.set_title(column, fontsize=8)
-    _save(figure, path)
-
-
 def _save(figure: Any, path: Path) -> None:
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=DPI)
+        figure.savefig(temporary, format="png", dpi=120)
