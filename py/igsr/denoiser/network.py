@@ -62,7 +62,7 @@ class _Block(nn.Module):
 
 
 class _PhotoAttention(nn.Module):
-    """One photo's worth of features per pixel: a mean over photos, weighted by how they fit."""
+    """One photo's features per pixel: a mean over the photos, weighted by how well they fit."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Cameras made wrong on purpose: what fixed and joint poses make of them.
+"""Noise on camera poses: fits with poses fixed and with joint poses, scored side by side.
 
 Twenty train views of a NeRF-Synthetic scene get noise on their poses and are fitted with poses
 fixed and joint, beside a fit with the true ones. Held-out views are scored in the three ways of
@@ -188,7 +188,7 @@ def pose_noise(
 
 
 def compared(rows: list[dict[str, Any]], noise: str, scene: str) -> dict[str, Any]:
-    """One line of the table: means over seeds (and scenes, for "mean") and what they come to.
+    """One line of the table: means over seeds (and scenes, for "mean").
 
     "recovered" is the part of the dB lost to noise, both scored aligned, that joint poses bring
     back; "short_of_clean" the dB between clean and joint, both scored refined.

@@ -1,4 +1,4 @@
-"""What a study's fits come to: ``study.json``, a Markdown table and a plot."""
+"""Means and spreads of a study's fits: ``study.json``, a Markdown table and a plot."""
 
 from __future__ import annotations
 

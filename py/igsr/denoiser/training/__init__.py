@@ -1,6 +1,6 @@
 """How the denoiser is trained: pairs of renders and true pictures, losses, the training itself.
 
-``make_pairs`` fits captures poorly on purpose and renders views beside their true pictures.
+``make_pairs`` degrades fits on purpose and keeps renders of views beside their true pictures.
 ``train`` learns a network from such pairs; ``Training`` holds its settings. Names are imported when
 they are first used (PEP 562), so that command lines load no torch.
 """

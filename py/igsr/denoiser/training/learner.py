@@ -47,8 +47,10 @@ class Learner:
         self.averaged = _placed(DenoiserNetwork(network.architecture), self.device).eval()
         self.averaged.load_state_dict(network.state_dict())
         self._adam = _adam(self.network, training)
-        self.judge = loss.discriminator.to(self.device) if loss.discriminator else None
-        self._judge_adam = _adam(self.judge, training) if self.judge else None
+        self.discriminator = loss.discriminator.to(self.device) if loss.discriminator else None
+        self._discriminator_adam = (
+            _adam(self.discriminator, training) if self.discriminator else None
+        )
         self.step = 0
 
     def learn(self, batch: Batch) -> dict[str, float]:
@@ -57,10 +59,16 @@ class Learner:
         made = self._predicted(batch)
         total, parts = self._loss(made)
         _step(self._adam, total, rate)  # ``_shared`` has averaged its gradients
-        if self.judge is not None and self._judge_adam is not None:
-            judged, judge = self.judge.loss(made), self.judge
-            _step(self._judge_adam, judged, rate, lambda: self._processes.average_gradients(judge))
-            parts["discriminator"] = float(judged.detach())
+        if self.discriminator is not None and self._discriminator_adam is not None:
+            discriminator, processes = self.discriminator, self._processes
+            wrong = discriminator.loss(made)
+            _step(
+                self._discriminator_adam,
+                wrong,
+                rate,
+                lambda: processes.average_gradients(discriminator),
+            )
+            parts["discriminator"] = float(wrong.detach())
         self.step += 1
         self._average()
         return parts
@@ -98,8 +106,8 @@ class Learner:
 
     def _parts(self) -> dict[str, Any]:
         parts = {"network": self.network, "averaged": self.averaged, "adam": self._adam}
-        if self.judge is not None:
-            parts |= {"judge": self.judge, "judge_adam": self._judge_adam}
+        if self.discriminator is not None:
+            parts |= {"judge": self.discriminator, "judge_adam": self._discriminator_adam}
         return parts
 
 
