@@ -469,11 +469,17 @@ def test_a_training_that_was_stopped_ends_with_the_same_weights(tmp_path, loss):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 0}, "steps must be at least 1"),
+        ({"steps": 0}, "steps must be from 1 to 1000000000, not 0"),
+        ({"batch": 2.5}, "batch must be a whole number, not 2.5"),
         ({"crop": 30}, "crop must be a multiple of 8"),
-        ({"rate": float("nan")}, "rate must be positive"),
-        ({"dropout": 1.0}, "dropout must be from 0 to 1"),
-        ({"seed": -1}, "seed must not be negative"),
+        ({"rate": float("nan")}, "rate must be a number from 1e-12 to 1000, not nan"),
+        ({"rate": 0.0}, "rate must be a number from 1e-12 to 1000, not 0.0"),
+        ({"loss": "mse"}, "loss must be one of default, charbonnier, gan"),
+        ({"a": 1.5}, "a must be a number from 0 to 1, not 1.5"),
+        ({"dropout": 1.0}, "dropout must be a number from 0 to 0.9999, not 1.0"),
+        ({"weight_decay": -0.1}, "weight_decay must be a number from 0 to"),
+        ({"seed": -1}, "seed must be from 0 to"),
+        ({"seed": 2**60}, "seed must be from 0 to"),
     ],
 )
 def test_bad_settings_of_a_training(options, message):
@@ -686,3 +692,19 @@ def test_training_and_validation_have_one_axis(tmp_path, monkeypatch):
     (tmp_path / "log.jsonl").write_text("")
     with pytest.raises(igsr.IgsrError, match="holds nothing to plot"):
         plot_training(tmp_path / "log.jsonl", tmp_path / "loss.png")
+
+
+def test_old_names_of_training_still_import():
+    from igsr.denoiser import training
+
+    assert training.train is train
+    assert training.Training is Training
+    assert {"Training", "TrainingProgress", "make_pairs", "train"} <= {*dir(training)}
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        training.nothing  # noqa: B018
+
+
+def test_a_training_that_never_logs_is_refused(tmp_path):
+    for name in ("log_every", "checkpoint_every"):
+        with pytest.raises(igsr.IgsrError, match="must be at least 1"):
+            train(pair_files(tmp_path / "pairs"), tmp_path / "out", TINY, SMALL, **{name: 0})

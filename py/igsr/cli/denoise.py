@@ -12,6 +12,7 @@ import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
+from igsr.cli.settings_options import settings_options
 from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
@@ -48,16 +49,6 @@ class RecipeChoice(str, enum.Enum):
     paper = "paper"
     scattered = "scattered"
     leave_one_out = "leave-one-out"
-
-
-class LossChoice(str, enum.Enum):
-    """Loss of a training."""
-
-    default = "default"
-    charbonnier = "charbonnier"
-    gan = "gan"
-    gan_lpips = "gan+lpips"
-    lpips = "lpips"
 
 
 class BackboneChoice(str, enum.Enum):
@@ -134,6 +125,7 @@ def pairs_command(
 
 
 @app.command("train")
+@settings_options(Training)
 def train_command(
     pairs: Annotated[
         Path, typer.Option("--pairs", metavar="PAIRS", help="Folder that igsr denoise pairs made.")
@@ -141,12 +133,7 @@ def train_command(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for weights, log and checkpoint.")
     ],
-    loss: Annotated[
-        LossChoice, typer.Option("--loss", help="gan, gan+lpips and lpips are the paper's.")
-    ] = (LossChoice.default),
-    a: Annotated[
-        float, typer.Option("--a", help="gan+lpips: weight of LPIPS, 0 to 1.")
-    ] = Training.a,
+    given: dict[str, Any],
     features: Annotated[
         Path | None,
         typer.Option(
@@ -166,24 +153,6 @@ def train_command(
             "--weights", metavar="FILE", help="Weights to go on from, such as igsr's own."
         ),
     ] = None,
-    steps: Annotated[int, typer.Option("--steps", help="Training steps.")] = Training.steps,
-    batch: Annotated[int, typer.Option("--batch", help="Crops per step.")] = Training.batch,
-    crop: Annotated[
-        int, typer.Option("--crop", help="Side of a crop, pixels; a multiple of 8.")
-    ] = Training.crop,
-    rate: Annotated[
-        float, typer.Option("--rate", help="Adam's highest learning rate.")
-    ] = Training.rate,
-    weight_decay: Annotated[
-        float, typer.Option("--weight-decay", help="Decoupled, as in AdamW.")
-    ] = Training.weight_decay,
-    dropout: Annotated[
-        float, typer.Option("--dropout", help="Part of the deepest features left out.")
-    ] = Training.dropout,
-    augment: Annotated[
-        bool,
-        typer.Option("--augment/--no-augment", help="Mirror crops, swap colours, change exposure."),
-    ] = Training.augment,
     width: Annotated[
         int, typer.Option("--width", help="Channels at half resolution.")
     ] = Architecture.width,
@@ -199,9 +168,6 @@ def train_command(
     device: Annotated[
         str, typer.Option("--device", help="Where to train, as torch names it: cpu, cuda ...")
     ] = "cpu",
-    seed: Annotated[
-        int, typer.Option("--seed", help="Training is deterministic for a given seed.")
-    ] = Training.seed,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")
     ] = False,
@@ -232,7 +198,8 @@ def train_command(
         files = sorted(pairs.glob("[!.]*.npz"))
         if not files:
             raise IgsrError(f"{pairs} holds no .npz of pairs; make some with igsr denoise pairs.")
-        with _bar(steps) as show:
+        training = Training(**given)
+        with _bar(training.steps) as show:
 
             def progress(now: TrainingProgress) -> None:
                 show(now.step, now.parts)
@@ -240,18 +207,7 @@ def train_command(
             train(
                 files,
                 out,
-                Training(
-                    steps=steps,
-                    batch=batch,
-                    crop=crop,
-                    rate=rate,
-                    weight_decay=weight_decay,
-                    dropout=dropout,
-                    augment=augment,
-                    loss=loss.value,
-                    a=a,
-                    seed=seed,
-                ),
+                training,
                 Architecture(width=width, residual=residual, buffers=buffers, photos=photos),
                 distance=distance,
                 start=start,

@@ -51,7 +51,7 @@ def plot_confidence(path: Path, confidence: dict[str, Any]) -> None:
     axis = figure.subplots()
     claimed = HALF_CONFIDENCE_ERROR * (1.0 / np.maximum(predicted, 1e-3) - 1.0)
     axis.plot(predicted, claimed, "--", color="grey", label="as claimed")
-    axis.plot(predicted, confidence["error"], "o-", label="meapredictedd")
+    axis.plot(predicted, confidence["error"], "o-", label="measured")
     axis.set_yscale("log")
     axis.set_xlabel("predicted confidence")
     axis.set_ylabel("mean absolute error")

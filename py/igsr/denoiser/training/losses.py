@@ -13,10 +13,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from igsr.denoiser.training.perceptual_distance import Distance
+from igsr.denoiser.training.training_settings import LOSSES
 from igsr.errors import IgsrError
 
-#: Names of ``--loss``. The last three are the paper's.
-LOSSES = ("default", "charbonnier", "gan", "gan+lpips", "lpips")
 #: Parts of the default, beside the squared error's ratio, which counts 1.
 STRUCTURE, PERCEPTUAL, LIKELIHOOD = 1.0, 0.1, 0.1
 #: Part of "charbonnier" that the perceptual distance has.
