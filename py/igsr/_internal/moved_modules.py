@@ -87,6 +87,8 @@ MOVED: dict[str, tuple[str, ...]] = {
 RENAMED = {
     ("igsr.initialization", "looked_at"): "focus_point",
     ("igsr.report", "write_report"): "write_json",
+    ("igsr.study.poor_fits", "PoorFit"): "DegradedFit",
+    ("igsr.study.poor_fits", "poor_capture"): "degraded_capture",
 }
 
 

@@ -11,7 +11,7 @@ from igsr._internal.atomic_write import atomic_write
 
 
 def plot_gains(path: Path, report: dict[str, Any]) -> None:
-    """PSNR after less before, by scene and kind of fit, a bar per denoiser."""
+    """PSNR gain by scene and kind of fit, a bar per denoiser."""
     from matplotlib.figure import Figure
 
     lines = [
@@ -33,7 +33,7 @@ def plot_gains(path: Path, report: dict[str, Any]) -> None:
         axis.bar(at, gains, 0.8 / len(names), label=name)
     axis.axhline(0.0, color="black", linewidth=0.8)
     axis.set_xticks(range(len(lines)), [label for label, _ in lines], rotation=60, ha="right")
-    axis.set_ylabel("PSNR after less before, dB")
+    axis.set_ylabel("PSNR gain by denoising, dB")
     axis.set_title(report["title"], fontsize=10)
     axis.grid(alpha=0.3, axis="y")
     axis.legend(fontsize=8)
