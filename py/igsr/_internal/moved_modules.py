@@ -67,8 +67,13 @@ MOVED: dict[str, tuple[str, ...]] = {
     "igsr.selection": ("igsr.refinement.selection",),
     "igsr.sift_points": ("igsr.fitting.initialization.sift_points",),
     "igsr.study.fits": ("igsr.study.scored_fits",),
-    "igsr.study.poor_fit_pictures": ("igsr.study.pictures",),
-    "igsr.study.poor_fits": ("igsr.study.denoiser_comparison",),
+    "igsr.study.poor_fit_pictures": ("igsr.study.denoiser_plots", "igsr.study.picture_sheet"),
+    "igsr.study.poor_fits": (
+        "igsr.study.denoiser_comparison",
+        "igsr.study.degraded_fits",
+        "igsr.study.cleaned_renders",
+        "igsr.study.denoiser_report",
+    ),
     "igsr.study.refinement_protocols": ("igsr.study.loop_protocols",),
     "igsr.study.refinement_tables": ("igsr.study.loop_tables",),
     "igsr.study.refinements": ("igsr.study.loop_runs",),
@@ -82,6 +87,8 @@ MOVED: dict[str, tuple[str, ...]] = {
 RENAMED = {
     ("igsr.initialization", "looked_at"): "focus_point",
     ("igsr.report", "write_report"): "write_json",
+    ("igsr.study.poor_fits", "PoorFit"): "DegradedFit",
+    ("igsr.study.poor_fits", "poor_capture"): "degraded_capture",
 }
 
 

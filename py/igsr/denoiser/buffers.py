@@ -1,4 +1,4 @@
-"""What the rasterizer knows of a picture besides its colours."""
+"""What the rasterizer knows of a render beside its colours: depth, normals, support by photos."""
 
 from __future__ import annotations
 

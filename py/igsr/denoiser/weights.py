@@ -13,7 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from igsr._internal.atomic_write import atomic_write
-from igsr.denoiser.network import Architecture, DenoiserNetwork
+from igsr.denoiser.architecture import Architecture
+from igsr.denoiser.network import DenoiserNetwork
 from igsr.errors import IgsrError
 
 #: The denoiser that comes with igsr.

@@ -38,7 +38,7 @@ from igsr.refinement.results import Refined
 from igsr.refinement.selection import Candidate, select
 from igsr.splats import Splats
 from igsr.study.loop_tables import plot_rounds, summarized, write_table
-from igsr.study.pictures import write_sheet
+from igsr.study.picture_sheet import write_sheet
 from igsr.study.splits import HOLDOUT, localized, scattered, spread_out
 
 #: How photos are chosen, by the name of the layout.

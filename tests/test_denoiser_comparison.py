@@ -13,14 +13,15 @@ import torch
 
 import igsr
 from igsr.capture import Capture
+from igsr.denoiser.architecture import Architecture
 from igsr.denoiser.inputs import CHANNELS
-from igsr.denoiser.network import Architecture, DenoiserNetwork
+from igsr.denoiser.network import DenoiserNetwork
 from igsr.denoiser.training.pair_files import Pairs, write_pairs
 from igsr.denoiser.weights import save_network
 from igsr.fitting import presets
-from igsr.study import denoiser_comparison as poor_fits
-from igsr.study import denoiser_table
-from igsr.study.denoiser_comparison import Cleaning, PoorFit, poor_capture, run_cleaning, scenes_in
+from igsr.study import degraded_fits, denoiser_comparison, denoiser_table
+from igsr.study.cleaned_renders import SCORES, Cleaning, run_cleaning
+from igsr.study.degraded_fits import DegradedFit, degraded_capture, scenes_in
 
 SMALL = Architecture(4, (1, 0, 0))
 
@@ -58,7 +59,7 @@ def test_a_denoiser_that_does_nothing_changes_no_score(tmp_path):
     assert before["psnr"] == pytest.approx(-10 * np.log10(half))
     assert before["best_quarter"] == 100.0
     assert before["perceptual"] is None
-    for name in poor_fits.SCORES:
+    for name in SCORES:
         assert same[name] == before[name]
     found = same["confidence"]
     assert found["mean_error"] == pytest.approx(10 / 255, rel=1e-5)
@@ -86,14 +87,14 @@ def test_hidden_pixels_count_nowhere(tmp_path):
     assert sum(same["confidence"]["pixels"]) == 2 * 40 * 24
 
 
-def test_views_of_poor_fits():
+def test_views_of_degraded_fits():
     made = scenes.capture(views=40, size=16)
-    few = poor_capture(made, PoorFit("ball", "3", 0, "cpu"))
+    few = degraded_capture(made, DegradedFit("ball", "3", 0, "cpu"))
     assert [view.name for view in few.train_views] == [
         made.train_views[i].name for i in (0, 14, 29)
     ]
     assert len(few.test_views) == 8, "of ten"
-    noisy = poor_capture(made, PoorFit("ball", "noise", 0, "cpu"))
+    noisy = degraded_capture(made, DegradedFit("ball", "noise", 0, "cpu"))
     assert len(noisy.train_views) == 20
     assert noisy.points is None
     by_name = {view.name: view for view in made.views}
@@ -101,9 +102,9 @@ def test_views_of_poor_fits():
         assert not np.allclose(view.camera.viewmat, by_name[view.name].camera.viewmat, atol=1e-4)
     for view in noisy.test_views:
         assert np.array_equal(view.camera.viewmat, by_name[view.name].camera.viewmat)
-    again = poor_capture(made, PoorFit("ball", "noise", 0, "cpu"))
-    other = poor_capture(made, PoorFit("ball", "noise", 1, "cpu"))
-    paper = poor_capture(made, PoorFit("ball", "paper", 0, "cpu"))
+    again = degraded_capture(made, DegradedFit("ball", "noise", 0, "cpu"))
+    other = degraded_capture(made, DegradedFit("ball", "noise", 1, "cpu"))
+    paper = degraded_capture(made, DegradedFit("ball", "paper", 0, "cpu"))
     K = paper.train_views[0].camera.K
     assert abs(K[0, 0] / K[1, 1] - 1.0) > 1e-3, "stretched as it comes"
     first = noisy.train_views[0].camera.viewmat
@@ -111,10 +112,10 @@ def test_views_of_poor_fits():
     assert not np.array_equal(first, other.train_views[0].camera.viewmat)
 
     whole = Capture(made.path, [replace(view, split="train") for view in made.views])
-    assert len(poor_capture(whole, PoorFit("leaf", "6", 0, "cpu")).train_views) == 6
-    assert len(poor_capture(whole, PoorFit("leaf", "noise", 0, "cpu")).train_views) == 20
+    assert len(degraded_capture(whole, DegradedFit("leaf", "6", 0, "cpu")).train_views) == 6
+    assert len(degraded_capture(whole, DegradedFit("leaf", "noise", 0, "cpu")).train_views) == 20
     with pytest.raises(igsr.IgsrError, match="has 3 photos to fit, not 6"):
-        poor_capture(scenes.capture(views=4, size=16), PoorFit("ball", "6", 0, "cpu"))
+        degraded_capture(scenes.capture(views=4, size=16), DegradedFit("ball", "6", 0, "cpu"))
 
 
 @pytest.fixture
@@ -135,7 +136,7 @@ def test_photos_in_a_folder_of_their_own_are_no_further_scene(tmp_path):
 def test_the_study(data, tmp_path, monkeypatch, igsr_here):
     assert scenes_in(data) == ("ball", "more/cube")
     monkeypatch.setattr(presets, "_FEW", replace(presets._FEW, steps=20, max_splats=200))
-    monkeypatch.setattr(poor_fits, "SHIPPED", tmp_path / "same.safetensors")
+    monkeypatch.setattr(denoiser_comparison, "SHIPPED", tmp_path / "same.safetensors")
     weights(tmp_path / "same.safetensors")
     dark = weights(tmp_path / "dark.safetensors", brighter=-0.2)
     study = ["study", "denoiser-table", data, "--out", tmp_path / "out", "--kind", "3"]
@@ -165,7 +166,7 @@ def test_the_study(data, tmp_path, monkeypatch, igsr_here):
     def again(*arguments):
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr(poor_fits, "run_fit", again)
+    monkeypatch.setattr(denoiser_comparison, "run_fit", again)
     weights(tmp_path / "same.safetensors", brighter=0.1)
     pairs(tmp_path / "pairs/a-sparse-0.npz")
     (tmp_path / "pairs/.b-sparse-0.npz.unfinished.npz").write_bytes(b"killed")
@@ -178,7 +179,7 @@ def test_the_study(data, tmp_path, monkeypatch, igsr_here):
 
 def test_a_fit_of_other_photos_is_not_taken_for_done(tmp_path, monkeypatch):
     monkeypatch.setattr(presets, "_FEW", replace(presets._FEW, steps=5, max_splats=50))
-    monkeypatch.setattr(poor_fits, "PAPER_STEPS", 5)
+    monkeypatch.setattr(degraded_fits, "PAPER_STEPS", 5)
     made = scenes.capture(views=6, size=24)
     scenes.write_capture(tmp_path / "data/ball", made)
     options = {"kinds": ("3", "paper"), "backend": "cpu"}
@@ -217,7 +218,7 @@ def test_scenes_whose_files_would_have_one_name_are_refused(tmp_path):
 )
 def test_bad_arguments(data, tmp_path, monkeypatch, options, message):
     weights(tmp_path / "same.safetensors")
-    monkeypatch.setattr(poor_fits, "SHIPPED", tmp_path / "same.safetensors")
+    monkeypatch.setattr(denoiser_comparison, "SHIPPED", tmp_path / "same.safetensors")
     with pytest.raises(igsr.IgsrError, match=message):
         denoiser_table(data, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()

@@ -1,22 +1,17 @@
-"""Pictures of the denoiser study: gains, confidence against error, sheets of views."""
+"""Plots of the denoiser study: gains, and confidence against error."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from igsr._internal.atomic_write import atomic_write
 
-#: Width of a view on a sheet, inches, at so many pixels per inch.
-VIEW_WIDTH, DPI = 2.6, 120
-
 
 def plot_gains(path: Path, report: dict[str, Any]) -> None:
-    """PSNR after less before, by scene and kind of fit, a bar per denoiser."""
+    """PSNR gain by scene and kind of fit, a bar per denoiser."""
     from matplotlib.figure import Figure
 
     lines = [
@@ -38,7 +33,7 @@ def plot_gains(path: Path, report: dict[str, Any]) -> None:
         axis.bar(at, gains, 0.8 / len(names), label=name)
     axis.axhline(0.0, color="black", linewidth=0.8)
     axis.set_xticks(range(len(lines)), [label for label, _ in lines], rotation=60, ha="right")
-    axis.set_ylabel("PSNR after less before, dB")
+    axis.set_ylabel("PSNR gain by denoising, dB")
     axis.set_title(report["title"], fontsize=10)
     axis.grid(alpha=0.3, axis="y")
     axis.legend(fontsize=8)
@@ -51,44 +46,24 @@ def plot_confidence(path: Path, confidence: dict[str, Any]) -> None:
 
     from igsr.denoiser.cleaning import HALF_CONFIDENCE_ERROR
 
-    sure = np.asarray(confidence["confidence"])
+    predicted = np.asarray(confidence["confidence"])
     figure = Figure(figsize=(6.0, 4.2), layout="constrained")
     axis = figure.subplots()
-    claimed = HALF_CONFIDENCE_ERROR * (1.0 / np.maximum(sure, 1e-3) - 1.0)
-    axis.plot(sure, claimed, "--", color="grey", label="as claimed")
-    axis.plot(sure, confidence["error"], "o-", label="measured")
+    claimed = HALF_CONFIDENCE_ERROR * (1.0 / np.maximum(predicted, 1e-3) - 1.0)
+    axis.plot(predicted, claimed, "--", color="grey", label="as claimed")
+    axis.plot(predicted, confidence["error"], "o-", label="measured")
     axis.set_yscale("log")
     axis.set_xlabel("predicted confidence")
     axis.set_ylabel("mean absolute error")
     axis.grid(alpha=0.3, which="both")
     share = figure.axes[0].twinx()
     pixels = np.asarray(confidence["pixels"])
-    share.bar(sure, pixels / pixels.sum(), 0.03, alpha=0.2, color="C2")
+    share.bar(predicted, pixels / pixels.sum(), 0.03, alpha=0.2, color="C2")
     share.set_ylabel("share of the pixels (bars)")
     axis.legend(fontsize=8)
     _save(figure, path)
 
 
-def write_sheet(path: Path, rows: Mapping[str, Mapping[str, npt.NDArray[np.uint8]]]) -> None:
-    """A sheet of pictures: rows and columns by the names that ``rows`` has."""
-    from matplotlib.figure import Figure
-
-    first = next(iter(rows.values()))
-    height, width = next(iter(first.values())).shape[:2]
-    size = (VIEW_WIDTH * len(first), (VIEW_WIDTH * height / width + 0.05) * len(rows) + 0.2)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(len(rows), len(first), squeeze=False)
-    for line, (row, pictures) in zip(axes, rows.items(), strict=True):
-        line[0].set_ylabel(row, fontsize=8)
-        for axis, picture in zip(line, pictures.values(), strict=True):
-            axis.imshow(picture)
-            axis.set_xticks([])
-            axis.set_yticks([])
-    for axis, column in zip(axes[0], first, strict=True):
-        axis.set_title(column, fontsize=8)
-    _save(figure, path)
-
-
 def _save(figure: Any, path: Path) -> None:
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=DPI)
+        figure.savefig(temporary, format="png", dpi=120)
