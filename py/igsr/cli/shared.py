@@ -1,44 +1,60 @@
-"""What the commands have in common: options, sentences, scores."""
+"""What the commands share: options, loading, progress bars, output, scores."""
 
 from __future__ import annotations
 
 import contextlib
 import enum
-import json
 import sys
 import time
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, TextColumn
-from rich.progress import Progress as ProgressBar
 
-from igsr import _core
-from igsr.capture import Capture, load_capture
-from igsr.capture.write_files import relative_name
+from igsr.cli.error_messages import (
+    INTERRUPTED,
+    error_messages,
+    print_message,
+    warning_messages,
+)
 from igsr.errors import IgsrError
-from igsr.evaluation.contact_sheet import sheet_names
-from igsr.evaluation.scores import ScoredView, evaluate
-from igsr.splats import Splats
 
-#: Exit status after Ctrl-C: 128 + SIGINT, as shells report it.
-INTERRUPTED = 130
+# ``igsr info`` and ``igsr convert`` import this module: what takes long to import and only some
+# commands need is imported by the function that needs it.
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as ProgressBar
 
+    from igsr.capture import Capture
+    from igsr.evaluation import ScoredView
+    from igsr.splats import Splats
+
+# The names that these had before.
+one_sentence = error_messages
+warnings_as_sentences = warning_messages
+complain = print_message
+
+__all__ = ["INTERRUPTED", "complain", "one_sentence", "warnings_as_sentences"]
 
 NAMED_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
 
 
 class BackendChoice(str, enum.Enum):
-    """What computes."""
+    """Backends that render."""
 
     auto = "auto"
     cpu = "cpu"
     gpu = "gpu"
     reference = "reference"
+
+
+class FitBackendChoice(str, enum.Enum):
+    """Backends that fit: the reference renders, but has no optimizer."""
+
+    auto = "auto"
+    cpu = "cpu"
+    gpu = "gpu"
 
 
 class PresetChoice(str, enum.Enum):
@@ -50,7 +66,7 @@ class PresetChoice(str, enum.Enum):
 
 
 class SplitChoice(str, enum.Enum):
-    """Which views of a capture."""
+    """Train or test views of a capture."""
 
     train = "train"
     test = "test"
@@ -58,86 +74,66 @@ class SplitChoice(str, enum.Enum):
 
 BackendOption = Annotated[
     BackendChoice,
-    typer.Option("--backend", help="auto: a real GPU if one answers, else the CPU."),
+    typer.Option(
+        "--backend",
+        help="auto: the GPU if there is a real one, else the CPU. reference: 64-bit floats, slow.",
+    ),
 ]
-
-
+FitBackendOption = Annotated[
+    FitBackendChoice,
+    typer.Option("--backend", help="auto: the GPU if there is a real one, else the CPU."),
+]
 BackgroundOption = Annotated[
     str | None,
     typer.Option(
         "--background",
         metavar="COLOR",
-        help="white, black, grey or R,G,B in 0..1, behind renders and photos with alpha. "
-        "Default: white where photos have alpha, else black.",
+        help="Color behind renders and behind photos with alpha: white, black, grey, or R,G,B "
+        "from 0 to 1. Default: white if photos have alpha, else black.",
     ),
 ]
-
-
 HoldoutOption = Annotated[
     int | None,
-    typer.Option("--holdout", help="Every how many views one is held out and scored, such as 8."),
+    typer.Option(
+        "--holdout",
+        "--test-every",
+        metavar="N",
+        help="Hold out every Nth photo for testing, such as 8.",
+    ),
 ]
-
-
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, for machines.")]
-
-
-JobsOption = Annotated[int, typer.Option("--jobs", help="Fits at a time; they share the cores.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+JobsOption = Annotated[
+    int, typer.Option("--jobs", help="How many fits run at the same time; they share the cores.")
+]
 RayOption = Annotated[
-    bool, typer.Option("--ray", help="Fits go over a Ray cluster (pip install 'igsr[ray]').")
+    bool, typer.Option("--ray", help="Run fits on a Ray cluster (pip install 'igsr[ray]').")
 ]
 CaptureArgument = Annotated[
-    Path, typer.Argument(metavar="CAPTURE", help="Folder or file that holds photos and cameras.")
+    Path, typer.Argument(metavar="CAPTURE", help="Folder or file with photos and cameras.")
 ]
-
-
 SceneArgument = Annotated[
     Path,
-    typer.Argument(metavar="SCENE", help="A splat file: .ply, .splat, .ksplat, .spz, .sog, .glb."),
+    typer.Argument(metavar="SCENE", help="Splat file: .ply, .splat, .ksplat, .spz, .sog or .glb."),
 ]
 
 
-@contextlib.contextmanager
-def one_sentence(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Iterator[None]:
-    """Turn what a user can mend into one sentence on stderr and a non-zero exit."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        complain(interrupted())
-        raise typer.Exit(INTERRUPTED) from None
-    except (IgsrError, RuntimeError) as error:  # the renderer's RuntimeErrors are the GPU's
-        complain(str(error))
-        raise typer.Exit(1) from None
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        complain(f"{where}{error.strerror or error}")
-        raise typer.Exit(1) from None
-    except MemoryError:
-        complain("There is not enough memory for this; use fewer or smaller photos or splats")
-        raise typer.Exit(1) from None
+def resolved(backend: BackendChoice | FitBackendChoice) -> str:
+    """The name of the backend that runs: "cpu", "gpu" or "reference".
 
+    Raises:
+        RuntimeError: backend gpu was asked for and no adapter answers.
+    """
+    from igsr import _core
 
-@contextlib.contextmanager
-def warnings_as_sentences() -> Iterator[None]:
-    """Print the warnings of igsr itself as the command prints its errors, as they come."""
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *rest: complain(str(message))
-        yield
-
-
-def complain(sentence: str) -> None:
-    """Print one sentence on stderr."""
-    sentence = " ".join(sentence.split())
-    print(sentence if sentence.endswith((".", "!", "?")) else sentence + ".", file=sys.stderr)
-
-
-def resolved(backend: BackendChoice) -> str:
-    """The backend that runs; a missing adapter is found before any work."""
     return _core.resolve_backend(backend.value)
 
 
 def background_color(text: str | None) -> tuple[float, float, float] | None:
-    """RGB in [0, 1] of what --background says; None for the default."""
+    """RGB in [0, 1] of ``--background``; None for the default.
+
+    Raises:
+        IgsrError: the text is neither a name nor three numbers.
+    """
     if text is None:
         return None
     if text in NAMED_COLORS:
@@ -155,20 +151,29 @@ def background_color(text: str | None) -> tuple[float, float, float] | None:
 
 
 def load(path: Path, holdout: int | None) -> Capture:
-    """A capture, with every ``holdout``-th view held out if that is given."""
+    """Load a capture; hold out every ``holdout``-th view if that is given.
+
+    Raises:
+        IgsrError: as ``load_capture`` and ``Capture.with_holdout``.
+    """
+    from igsr.capture import load_capture
+
     capture = load_capture(path)
     return capture if holdout is None else capture.with_holdout(holdout)
 
 
 class TimeLeft:
-    """Time left of runs of which some were there already, guessed from those done since."""
+    """An estimate of the time left, from the runs done by this process.
+
+    Runs that were finished before it started do not count.
+    """
 
     def __init__(self) -> None:
         self._started = time.monotonic()
         self._before: int | None = None
 
     def __call__(self, done: int, total: int) -> str:
-        """In words, when ``done`` of ``total`` are there."""
+        """The time left in words, once ``done`` of ``total`` runs are finished."""
         if self._before is None:
             self._before = done - 1
         each = (time.monotonic() - self._started) / (done - self._before)
@@ -176,23 +181,29 @@ class TimeLeft:
 
 
 def error_console() -> Console:
-    """Where progress goes."""
+    """The console for progress: stderr."""
+    from rich.console import Console
+
     return Console(file=sys.stderr, highlight=False)
 
 
 def output_console() -> Console:
-    """Where results go."""
-    # Paths stay whole: a terminal breaks long lines by itself.
+    """The console for results: stdout."""
+    from rich.console import Console
+
+    # Without soft wrapping, long paths would be broken into lines.
     return Console(file=sys.stdout, highlight=False, soft_wrap=True)
 
 
 def print_json(value: dict[str, Any]) -> None:
     """Print one JSON object on stdout."""
+    import json
+
     print(json.dumps(value, indent=2, allow_nan=False))
 
 
 def score_line(scores: dict[str, Any]) -> str:
-    """The scores of some views in one line."""
+    """Mean scores in one line."""
     parts = [
         f"PSNR {scores['psnr']:.2f} dB",
         f"SSIM {scores['ssim']:.4f}",
@@ -203,7 +214,7 @@ def score_line(scores: dict[str, Any]) -> str:
 
 
 def protocol_line(protocol: dict[str, Any]) -> str:
-    """How views were scored, in one line."""
+    """How views were scored, in one line; ``protocol`` as ``Scores.protocol``."""
     background = tuple(protocol["background"])
     names = {color: name for name, color in NAMED_COLORS.items()}
     behind = names.get(background) or ",".join(f"{channel:g}" for channel in background)
@@ -215,7 +226,10 @@ def protocol_line(protocol: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def stopped(bar: ProgressBar) -> Iterator[None]:
-    """Stop a bar at the end. It starts with the first progress: a mistake before is one line."""
+    """Stop a progress bar at the end, if it was started.
+
+    The caller starts it with the first progress, so that an error before that is a single line.
+    """
     try:
         yield
     finally:
@@ -231,7 +245,17 @@ def scored(
     backend: str,
     shown: bool,
 ) -> tuple[dict[str, Any], list[ScoredView]]:
-    """The scores, and the views that go on a contact sheet."""
+    """Scores of a split, and the views for a contact sheet; with a progress bar if ``shown``.
+
+    Raises:
+        IgsrError: as ``evaluate``.
+    """
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as ProgressBar
+
+    from igsr.evaluation.contact_sheet import sheet_names
+    from igsr.evaluation.scores import evaluate
+
     views = capture.test_views if split == "test" else capture.train_views
     wanted = sheet_names([view.name for view in views])
     sheet: list[ScoredView] = []
@@ -256,5 +280,10 @@ def scored(
 
 
 def picture_name(view_name: str, suffix: str) -> Path:
-    """A view's name as a relative path that cannot leave the folder it is joined to."""
+    """A view's name with another suffix, as a relative path without ``..``.
+
+    Joined to a folder it stays inside.
+    """
+    from igsr.capture.write_files import relative_name
+
     return Path(relative_name(view_name)).with_suffix(suffix)

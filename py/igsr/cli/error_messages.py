@@ -1,0 +1,76 @@
+"""Error messages of the commands: one line on stderr, with a traceback only where asked for."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+
+import typer
+
+from igsr.errors import IgsrError
+
+#: Exit status after Ctrl-C: 128 + SIGINT, as shells report it.
+INTERRUPTED = 130
+
+#: Environment variable that asks for the traceback behind an error message. ``igsr --debug`` sets
+#: it, so that worker processes see it too.
+DEBUG_VARIABLE = "IGSR_DEBUG"
+
+
+def debugging() -> bool:
+    """Whether ``igsr --debug`` or ``IGSR_DEBUG=1`` asks for tracebacks; ``IGSR_DEBUG=0`` is no."""
+    return os.environ.get(DEBUG_VARIABLE, "") not in ("", "0")
+
+
+@contextlib.contextmanager
+def error_messages(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Iterator[None]:
+    """Turn errors that a user can mend into one message on stderr and a non-zero exit status.
+
+    Other exceptions are bugs and pass through with their traceback.
+
+    Args:
+        interrupted: the message after Ctrl-C, made when it is needed.
+
+    Raises:
+        typer.Exit: with status 1, or ``INTERRUPTED`` after Ctrl-C.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        _report(interrupted())
+        raise typer.Exit(INTERRUPTED) from None
+    except (IgsrError, RuntimeError) as error:  # the renderer's RuntimeErrors are the GPU's
+        _report(str(error))
+        raise typer.Exit(1) from None
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _report(f"{where}{error.strerror or error}")
+        raise typer.Exit(1) from None
+    except MemoryError:
+        _report("There is not enough memory for this; use fewer or smaller photos or splats")
+        raise typer.Exit(1) from None
+
+
+@contextlib.contextmanager
+def warning_messages() -> Iterator[None]:
+    """Print igsr's warnings as they come, each as one line on stderr."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *rest: print_message(str(message))
+        yield
+
+
+def print_message(message: str) -> None:
+    """Print an error, a warning or a note as one line on stderr, with a full stop at its end."""
+    message = " ".join(message.split())
+    print(message if message.endswith((".", "!", "?")) else message + ".", file=sys.stderr)
+
+
+def _report(message: str) -> None:
+    """Print the message of the exception that is being handled, and its traceback if asked for."""
+    if debugging():
+        traceback.print_exc()
+    print_message(message)
