@@ -18,10 +18,11 @@ from igsr.capture import Capture
 from igsr.denoiser.network import Architecture, DenoiserNetwork
 from igsr.denoiser.weights import save_network
 from igsr.fitting import presets
-from igsr.refinement.novel_views import UnseenView
+from igsr.refinement.novel_views import NovelView
 from igsr.refinement.selection import Candidate
-from igsr.study import loop_runs as refinements
-from igsr.study.loop_runs import METHODS, Refinement, split
+from igsr.study import loop_methods
+from igsr.study.loop_methods import METHODS, OURS, Method
+from igsr.study.loop_runs import RunSpec, split
 from igsr.study.splits import localized, scattered
 
 BALL = scenes.splats(60)
@@ -46,22 +47,22 @@ def test_localized_photos_are_neighbours_and_scattered_ones_go_round():
 
 def test_views_of_a_run():
     made = ball(100)
-    photos, held, given = split(made, Refinement("ball", "localized", 10, 0, "cpu"))
+    photos, held, given = split(made, RunSpec("ball", "localized", 10, 0, "cpu"))
     assert len(photos.train_views) == 10
     assert not photos.test_views
     assert [len(held), len(given)] == [15, 10]
     assert {view.name for view in (*held, *given)} == {view.name for view in made.test_views}
 
     alone = Capture(made.path, [replace(view, split="train") for view in made.views[:35]])
-    photos, held, given = split(alone, Refinement("tankard", "localized", 4, 0, "cpu"))
+    photos, held, given = split(alone, RunSpec("tankard", "localized", 4, 0, "cpu"))
     names = [{view.name for view in some} for some in (photos.views, held, given)]
     assert [len(some) for some in names] == [4, 7, 6]
     assert len(names[0] | names[1] | names[2]) == 17
-    photos, held, given = split(alone, Refinement("fern", "even", 3, 0, "cpu"))
+    photos, held, given = split(alone, RunSpec("fern", "even", 3, 0, "cpu"))
     by_name = sorted(view.name for view in alone.views)
     assert [view.name for view in held] == by_name[::8], "as in LLFF's protocol"
     with pytest.raises(igsr.IgsrError, match="has 28 photos to fit, not 29"):
-        split(alone, Refinement("fern", "scattered", 29, 0, "cpu"))
+        split(alone, RunSpec("fern", "scattered", 29, 0, "cpu"))
 
 
 @pytest.fixture
@@ -141,7 +142,7 @@ def test_the_papers_choice_is_blind_where_masks_are():
         # One is right where the mask is, the other where it is not.
         picture = view.image.copy()
         picture[:, 20 * wrong : 20 * wrong + 20] = 255 - picture[:, 20 * wrong : 20 * wrong + 20]
-        unseen = UnseenView(view.camera, 0.0, between=False)
+        unseen = NovelView(view.camera, 0.0, between=False)
         return Candidate(unseen, black, picture, np.ones((40, 40), np.float32), 1.0)
 
     given = [found(views[0], 1), found(views[1], 0)]
@@ -150,25 +151,25 @@ def test_the_papers_choice_is_blind_where_masks_are():
         return float(np.abs(one.astype(float) - other).mean())
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refinements, "picture_distance", distance)
-        how = refinements.Rounds("one", "absolute", 1, 1, judge=False)
-        (best,) = refinements._by_truth(views, made, how, None, given, 1)
+        patch.setattr(loop_methods, "picture_distance", distance)
+        method = Method("one", "absolute", 1, 1, cross_validate=False)
+        (best,) = loop_methods._by_true_picture(views, made, method, None, given, 1)
     assert best is given[1]
 
 
 def test_the_papers_choice_is_by_the_true_picture(data, monkeypatch):
     chosen = []
-    real = refinements._by_truth
+    real = loop_methods._by_true_picture
 
-    def watched(candidates, photos, how, distance, found, count):
-        out = real(candidates, photos, how, distance, found, count)
-        chosen.append((how.method, candidates, found, out))
+    def watched(candidates, photos, method, distance, found, count):
+        out = real(candidates, photos, method, distance, found, count)
+        chosen.append((method.method, candidates, found, out))
         return out
 
-    monkeypatch.setattr(refinements, "_by_truth", watched)
+    monkeypatch.setattr(loop_methods, "_by_true_picture", watched)
     # Distances are of mean brightness, so that the right choice is known.
     monkeypatch.setattr(
-        refinements,
+        loop_methods,
         "picture_distance",
         lambda _, one, other: abs(float(one.mean()) - float(other.mean())),
     )
@@ -185,7 +186,7 @@ def test_the_papers_choice_is_by_the_true_picture(data, monkeypatch):
             view = next(v for v in candidates if v.camera is one.view.camera)
             rgba = view.image.astype(np.float64) / 255.0
             truth = 255.0 * (rgba[..., :3] * rgba[..., 3:] + 1.0 - rgba[..., 3:]).mean()
-            before, after = (abs(p.mean() - truth) for p in (one.render, one.picture))
+            before, after = (abs(p.mean() - truth) for p in (one.render, one.denoised))
             return {"absolute": after, "improvement": after - before}.get(method, before)
 
         assert len(out) == 1
@@ -205,7 +206,7 @@ def test_the_sweep_and_the_ablation(data):
 
     ablated = study.refinement_ablation(data / "data", data / "ablation", **given(data))
     methods = ablated["even"]
-    assert set(methods) == {*refinements.OURS, "improvement"}
+    assert set(methods) == {*OURS, "improvement"}
     after = {name: method["rounds"][-1]["psnr"] for name, method in methods.items()}
     assert len(set(after.values())) >= 4, "what is taken out shows"
 

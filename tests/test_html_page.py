@@ -26,7 +26,7 @@ def report(tmp_path_factory):
         picture = np.clip(buffers.color + 0.05, 0.0, 1.0)
         return picture, np.full(picture.shape[:2], 0.95, np.float32)
 
-    igsr.refine(capture, 1, steps=30, backend="cpu", denoiser=sure, out=out, judge=False)
+    igsr.refine(capture, 1, steps=30, backend="cpu", denoiser=sure, out=out, cross_validate=False)
     return out / "report.html"
 
 
