@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import enum
 import re
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 from typer.main import get_command
 
@@ -61,19 +63,36 @@ def _place(argument: Any) -> str:
 
 def _value(option: Any) -> str:
     """What stands behind an option: a name for the value, or the values there are."""
-    if option.is_flag:
+    kind = _type(option)
+    if option.is_flag or kind is bool:
         return ""
+    if option.metavar:
+        return f"`{option.metavar}`"
+    if isinstance(kind, type) and issubclass(kind, enum.Enum):
+        return "`" + " | ".join(str(choice.value) for choice in kind) + "`"
+    return f"`{_NAMES.get(kind, 'TEXT')}`"
+
+
+#: Values by their type.
+_NAMES = {int: "INTEGER", float: "NUMBER", Path: "PATH"}
+
+
+def _type(option: Any) -> Any:
+    """The Python type of one value; typer before 0.27 has click's types instead."""
+    described = getattr(option, "type_descriptor", None)
+    if described is not None:
+        return (get_args(described.annotation) or (described.annotation,))[0]
     choices = getattr(option.type, "choices", None)
     if choices:
-        return "`" + " | ".join(str(getattr(choice, "value", choice)) for choice in choices) + "`"
-    return "`" + str(option.metavar or option.type.name).upper() + "`"
+        return enum.Enum("Choices", {str(choice): str(choice) for choice in choices})
+    types = {"integer": int, "float": float, "path": Path, "boolean": bool}
+    return types.get(option.type.name, str)
 
 
 def _default(option: Any) -> str:
-    default = option.default
-    if option.is_flag or default is None or callable(default) or str(default).startswith("Sentinel"):
-        return ""
-    return f"`{getattr(default, 'value', default)}`"
+    default = getattr(option.default, "value", option.default)
+    # False and True are flags'; what is no plain value is a marker for "none given".
+    return f"`{default}`" if type(default) in (int, float, str) else ""
 
 
 def _row(*cells: str | None) -> str:

@@ -64,7 +64,7 @@ def bench_command(
             "--accuracy",
             metavar="FILE",
             help="Instead of workloads, measure every setting and write a page like "
-            "docs/accuracy.md, its plot beside it.",
+            "docs/how-it-works/accuracy.md, its plot beside it.",
         ),
     ] = None,
 ) -> None:

@@ -71,7 +71,7 @@ def study_command(
         typer.Option(
             "--scene",
             help="A folder in DATA; repeat it for several. Default: chair and lego; fern, "
-            "dtu_scan24 and tankard; for poses the sets of docs/pose_colmap.md; for "
+            "dtu_scan24 and tankard; for poses the sets of docs/research/finding-cameras.md; for "
             "denoiser-table all that have cameras; chair, or tankard for table3, and fern too for "
             "refinement-ablation.",
         ),

@@ -268,6 +268,8 @@ def rasterization(
                     to the device  40 P per splat (8 more with ``absgrad``; per drawn splat if
                                    ``packed``), and then 44 + 12 K per splat
 
+    Arguments that are not listed are gsplat's and accepted at their defaults only.
+
     Args:
         means: [N, 3] centres, world frame.
         quats: [N, 4] rotations w x y z, normalised inside.
@@ -280,9 +282,10 @@ def rasterization(
             the cost of a whole pass over the 2D splats.
         viewmats: [C, 4, 4] rigid world-to-camera matrices, OpenCV axes.
         Ks: [C, 3, 3] pinhole matrices in pixels without skew; pixel centres at +0.5.
-        width, height: picture size in pixels.
-        near_plane, far_plane: splats whose centre's camera-space z is outside are not drawn;
-            far_plane may be inf.
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+        near_plane: splats whose centre's camera-space z is less are not drawn.
+        far_plane: nor are those where it is more; may be inf.
         radius_clip: splats whose ``radii`` are both at most this many pixels are not drawn.
         eps2d: variance in square pixels added to every projected Gaussian.
         sh_degree: degree to evaluate, 0-4, or None for direct colours.
@@ -307,8 +310,6 @@ def rasterization(
             depth and normal are 0, and it passes no gradient to the splats and the camera. What
             gsplat's ``rasterize_to_pixels`` means by tile masks, per pixel; it saves no time.
         render_normals: True adds ``meta["render_normals"]``.
-
-        All other arguments are gsplat's and accepted at their defaults only.
 
     Returns:
         ``render_colors`` [C, height, width, X] with X = D, 1 or D + 1 by ``render_mode``,
