@@ -21,7 +21,8 @@ OLD_NAMES = {
     "igsr.checkpoint": "load_checkpoint save_checkpoint",
     "igsr.compaction.plot": "write_plot",
     "igsr.compaction.refinement": "chosen fresh_state refined splats_of with_sh_degree",
-    "igsr.denoiser.losses": "Discriminator Loss Prediction charbonnier error_likelihood perceptual perceptual_ratio "
+    "igsr.denoiser.losses": "Discriminator Loss Prediction charbonnier error_likelihood "
+    "perceptual perceptual_ratio "
     "regret squared_ratio structure_ratio",
     "igsr.denoiser.pair_files": "Pairs packed read_pairs write_pairs",
     "igsr.denoiser.pair_renders": "check_one_size rendered_pairs",
@@ -55,7 +56,8 @@ OLD_NAMES = {
     "igsr.sift_points": "sift_points",
     "igsr.study.fits": "Fit fitted run_fit",
     "igsr.study.poor_fit_pictures": "plot_confidence plot_gains write_sheet",
-    "igsr.study.poor_fits": "Cleaning PoorFit denoiser_table markdown poor_capture run_cleaning run_fit scenes_in",
+    "igsr.study.poor_fits": "Cleaning PoorFit denoiser_table markdown poor_capture "
+    "run_cleaning run_fit scenes_in",
     "igsr.study.refinement_protocols": "refinement_ablation sweep table2 table3",
     "igsr.study.refinement_tables": "plot_rounds summarized write_table",
     "igsr.study.refinements": "Given Refinement Rounds run_refinement split studied",

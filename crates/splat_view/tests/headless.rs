@@ -470,7 +470,7 @@ fn every_format_opens_and_shows_the_scene() {
 }
 
 /// Bounds on what the ways to draw in the window are off the rasterizer's picture, in 255ths;
-/// docs/viewer.md has them.
+/// docs/guides/viewing.md has them.
 const OFF: [(&str, f64, f64); 2] = [("rasterize", 1.0, 0.1), ("blend", 3.0, 0.5)];
 
 #[test]

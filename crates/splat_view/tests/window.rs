@@ -22,7 +22,7 @@ const INSTALL: &str = "run `make display`, or install xvfb, xdotool, libxcursor1
 /// The window's first size; small, since a software adapter draws.
 const SIZE: [usize; 2] = [320, 240];
 /// Bounds on what a window's picture is off the rasterizer's, in 255ths, whatever draws it:
-/// docs/viewer.md has them.
+/// docs/guides/viewing.md has them.
 const MOST: u8 = 3;
 const MEAN: f64 = 0.5;
 /// The same where the rasterizer draws in the window, too.

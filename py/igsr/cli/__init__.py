@@ -6,7 +6,6 @@ whatever else it needs, is imported when that subcommand runs.
 
 from __future__ import annotations
 
-import os
 from typing import Annotated, ClassVar
 
 import typer

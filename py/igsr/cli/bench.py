@@ -69,8 +69,8 @@ def bench_command(
         typer.Option(
             "--accuracy",
             metavar="FILE",
-            help="Measure every setting instead of the workloads, and write a page like "
-            "docs/accuracy.md with its plot.",
+            help="Instead of workloads, measure every setting and write a page like "
+            "docs/how-it-works/accuracy.md, its plot beside it.",
         ),
     ] = None,
 ) -> None:

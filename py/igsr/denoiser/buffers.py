@@ -163,7 +163,7 @@ def photo_support(splats: Splats, photos: Sequence[View], backend: str = "auto")
         backend: "auto", "cpu", "gpu" or "reference".
 
     Raises:
-        As ``render_buffers``.
+        IgsrError, RuntimeError: as ``render_buffers``.
     """
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)

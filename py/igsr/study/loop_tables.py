@@ -14,7 +14,7 @@ from PIL import Image
 from igsr._internal.atomic_write import atomic_write
 from igsr.study.loop_methods import Method
 from igsr.study.loop_runs import RunSpec
-from igsr.study.pictures import write_sheet
+from igsr.study.picture_sheet import write_sheet
 
 #: Scores of the table: their headings and formats.
 COLUMNS = {

@@ -1,4 +1,4 @@
-//! Splat files: read whatever people have, write whatever they need; `docs/formats.md` says what
+//! Splat files: read whatever people have, write whatever they need; `docs/guides/formats.md` says what
 //! each format holds.
 //!
 //! Files are untrusted. Every size that a file claims is held against the bytes that are there

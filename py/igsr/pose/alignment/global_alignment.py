@@ -1,6 +1,7 @@
 """Global alignment: from pointmaps of pairs of photos to cameras and depths of all of them.
 
-DUSt3R's (Wang et al. 2024, section 3.4). ``docs/alignment.md`` says where ours differs and why.
+DUSt3R's (Wang et al. 2024, section 3.4). ``docs/how-it-works/alignment.md`` says where
+ours differs and why.
 """
 
 from __future__ import annotations
