@@ -2,6 +2,7 @@
 # make test   sets everything up and runs every check
 # make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
 # make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
+# make docs   builds the documentation site into out/docs
 #
 # Needs a Python (3.10 or newer), a Rust toolchain, a C linker and a package manager. Everything
 # Python goes into .venv; what a rerun need not repeat is remembered in .venv/.*-ready.
@@ -25,7 +26,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test fuzz bench accuracy profile build wheel check-rust check-python vulkan display browser \
+.PHONY: demo test fuzz bench accuracy docs profile build wheel check-rust check-python vulkan display browser \
 	example-capture clean
 .DELETE_ON_ERROR:
 
@@ -46,9 +47,14 @@ BENCH := $(BIN)/igsr bench $(if $(GARDEN),--garden '$(GARDEN)') $(if $(CAPTURE),
 bench: build
 	$(BENCH) $(BACKENDS:%=--backend %) --plot out/bench/speed_vs_error.png --json out/bench/rows.json
 
-# Writes docs/accuracy.md and its plot; on the software driver where there is no GPU.
+# Writes the page of accuracy and its plot; on the software driver where there is no GPU.
 accuracy: build vulkan
-	$(BIN)/igsr bench --backend cpu --backend gpu --accuracy docs/accuracy.md
+	$(BIN)/igsr bench --backend cpu --backend gpu --accuracy docs/how-it-works/accuracy.md
+
+# Stops at any warning: a link without a target, a page that no menu leads to.
+docs: build $(VENV)/.dev-ready
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "The documentation is in out/docs: open out/docs/index.html"
 
 # The hottest functions of W1 or, with CAPTURE=DIR, of W3's fit steps (once its models are fitted).
 profile: build

@@ -43,19 +43,19 @@ def test_power_in_few_pixels_shows():
 def test_like_errors_are_near_and_others_far():
     alike = likeness([renders(8, seed=1)], [renders(8, seed=2), renders(8, seed=3)])
     unlike = likeness([renders(8, seed=1)], [renders(2, seed=2), renders(2, seed=3)])
-    assert alike["distance"] < 0.5 < unlike["distance"]
-    assert alike["within"] < 0.5
-    assert alike["noise"] > 1.0
-    assert set(alike["real"]) == set(NAMES)
-    assert alike["renders"] == {"real": 4, "synthetic": 8}
+    assert alike.distance < 0.5 < unlike.distance
+    assert alike.within < 0.5
+    assert alike.noise > 1.0
+    assert set(alike.real) == set(NAMES)
+    assert alike.renders == {"real": 4, "synthetic": 8}
 
 
 def test_sets_without_a_render_have_no_distance(tmp_path):
     hidden = renders(4)
     hidden.masks[:, 0] = False
     found = likeness([hidden], [renders(4)])
-    assert found["distance"] is None
-    assert found["within"] is None
-    assert found["renders"]["real"] == 0
+    assert found.distance is None
+    assert found.within is None
+    assert found.renders["real"] == 0
     plot_likeness(tmp_path / "a.png", found, [hidden], [renders(4)])
     assert (tmp_path / "a.png").stat().st_size > 1000

@@ -121,6 +121,19 @@ BAD = {
     "ftheta_coeffs": {"ftheta_coeffs": object()},
     "rolling_shutter": {"rolling_shutter": 1},
     "viewmats_rs": {"viewmats_rs": torch.eye(4).repeat(2, 1, 1)},
+    "macro_tile": {"macro_tile": True},
+    "return_normals": {"return_normals": True},
+    "global_z_order": {"global_z_order": False},
+    "rays": {"rays": torch.zeros(2, 20, 24, 6)},
+    "lidar_coeffs": {"lidar_coeffs": object()},
+    "external_distortion_coeffs": {"external_distortion_coeffs": object()},
+    "ut_params": {"ut_params": object()},
+    "extra_signals": {"extra_signals": torch.zeros(5, 2)},
+    "extra_signals_sh_degree": {"extra_signals_sh_degree": 3},
+    "renderer_config": {"renderer_config": object()},
+    "nht_params": {"nht_params": object()},
+    "render_mode hit distance": {"render_mode": "RGB-d"},
+    "tile_size array": {"tile_size": torch.ones(2)},
 }
 
 
@@ -161,6 +174,46 @@ def test_gsplats_own_defaults_are_accepted():
             assert ours[name].default == default, name
     color, _, _ = call({**defaults, "sh_degree": 2})
     assert torch.equal(color, call({"backgrounds": None})[0])
+
+
+#: Arguments of gsplat's development branch that 1.5 has not, with their defaults there.
+NEWER = {
+    "tile_size": None,
+    "macro_tile": False,
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "ut_params": None,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
+    "nht_params": None,
+}
+
+
+def test_defaults_of_newer_gsplat_are_accepted():
+    color, _, meta = call(NEWER)
+    assert torch.equal(color, call({})[0])
+    assert meta["tile_size"] == 16
+
+
+def test_only_the_head_is_positional():
+    scene = scenes.torch_scene()
+    head = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+    given = [scene[name] for name in head]
+    color, _, _ = rasterization(*given, 24, 20, sh_degree=2, backend="cpu")
+    assert torch.equal(color, call({**scene, "backgrounds": None})[0])
+    with pytest.raises(TypeError, match="positional"):
+        rasterization(*given, 24, 20, 0.01)
+
+
+def test_what_is_not_supported_says_what_to_do_instead():
+    with pytest.raises(ValueError, match=r"return_normals: .*render_normals=True"):
+        call({"return_normals": True})
+    with pytest.raises(ValueError, match=r"camera_model: only 'pinhole' .*undistort"):
+        call({"camera_model": "fisheye"})
 
 
 @pytest.mark.parametrize("slot", ["means", "quats", "scales", "opacities", "colors"])

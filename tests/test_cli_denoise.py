@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -10,7 +12,11 @@ import scenes
 from PIL import Image
 from typer.testing import CliRunner
 
+from igsr._internal.settings import settings_of
 from igsr.cli import app
+from igsr.cli.denoise import RecipeChoice
+from igsr.denoiser.training import Training
+from igsr.denoiser.training.pairs import RECIPES
 
 
 def run(*arguments):
@@ -72,3 +78,19 @@ def test_mistakes_are_one_sentence(trained, monkeypatch, arguments, message):
     assert done.exit_code == 1
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_help_loads_no_torch():
+    code = "import sys, igsr.cli.denoise; print(sorted({'torch', 'matplotlib'} & {*sys.modules}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_recipes_of_the_command_are_all_there_are():
+    assert tuple(choice.value for choice in RecipeChoice) == RECIPES
+
+
+def test_options_of_a_training_are_its_settings():
+    told = run("denoise", "train", "--help").stdout
+    for name in settings_of(Training):
+        assert f"--{name.replace('_', '-')}" in told

@@ -83,7 +83,7 @@ def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, igsr_h
         colors = {color for _, color in plot.convert("RGB").getcolors(1 << 20)}
     assert len(colors) > 50  # five cameras, each of its own colour
     again = igsr_here("pose", photos, "--out", tmp_path / "plain")
-    assert "5 of 6 photos placed by colmap" in again.stdout
+    assert "5 of 6 photos registered by colmap" in again.stdout
     refused(igsr_here("pose", photos, "--out", out), out, "holds something already")
     assert len(calls) == 2
 
@@ -119,7 +119,7 @@ def test_nothing_placed_is_a_sentence(photos, tmp_path, igsr_here, monkeypatch):
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
     refused(
         igsr_here("pose", photos, "--out", tmp_path / "out", "--estimator", "colmap"),
-        "No camera could be found", "6 photos",
+        "No cameras found", "6 photos",
     )  # fmt: skip
     assert not (tmp_path / "out").exists()
 
@@ -217,11 +217,13 @@ def test_study_of_poses(tmp_path, igsr_here, calls, monkeypatch):
     study = ["study", "poses", tmp_path, "--out", tmp_path / "out", "--scene", "ring"]
     done = igsr_here(*study, "--scene", "plain")
     assert done.returncode == 0, done.stderr
-    assert "1 of 2: ring seed 0: 6 of 6 placed" in done.stderr
+    assert "1 of 2: ring seed 0: 6 of 6 registered" in done.stderr
     # Five of fifteen pairs have the camera that stands on its head.
     assert "| ring | 0 | 6 | 6 | 0.667 |" in done.stdout
     assert "| plain | 0 | 3 | 3 | - |" in done.stdout
     report = json.loads((tmp_path / "out/study.json").read_text())
     assert report["protocol"] == {"name": "poses", "estimator": "colmap", "seeds": 1}
-    refused(igsr_here(*study, "--views", "3"), "--views says nothing to poses")
+    foreign = igsr_here(*study, "--views", "3")
+    assert foreign.returncode == 2
+    assert "No such option: --views" in foreign.stderr
     refused(igsr_here(*study, "--estimator", "magic"), "estimator must be")

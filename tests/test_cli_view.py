@@ -1,49 +1,168 @@
-"""``igsr view``: starts splat-view, or says how to get it."""
+"""``igsr view``: starts splat-view with cameras that it can read, or says how to get it."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+import scenes
+from PIL import Image
+from typer.testing import CliRunner
 
-VIEW = [sys.executable, "-m", "igsr.cli", "view"]
+import igsr
+from igsr.capture import Capture, View
+from igsr.capture.write_colmap import write_colmap
+from igsr.cli import app
+from igsr.cli.view import write_for_viewer
+from igsr.report import write_cameras
 
-#: Stands in for splat-view: writes what it was given, one a line, and ends with 3.
+#: Stands in for splat-view: keeps its arguments and what --cameras names, which is gone afterwards,
+#: beside itself, and ends with 3.
 STAND_IN = f"""#!{sys.executable}
-import sys
-print(*sys.argv[1:], sep="\\n")
+import json, pathlib, shutil, sys
+own = pathlib.Path(__file__).parent
+(own / "words").write_text(json.dumps(sys.argv[1:]))
+shutil.rmtree(own / "kept", ignore_errors=True)
+if "--cameras" in sys.argv:
+    cameras = pathlib.Path(sys.argv[sys.argv.index("--cameras") + 1])
+    shutil.copytree(cameras.parent, own / "kept", ignore=shutil.ignore_patterns("capture"))
 sys.exit(3)
 """
 
+#: The same camera and name as in the viewer's tests, which read the file.
+VIEWERS_FILE = Path(__file__).parents[1] / "crates" / "splat_view" / "tests" / "cameras.json"
 
-def view(path, *arguments):
-    return subprocess.run(
-        [*VIEW, *map(str, arguments)],
-        env={**os.environ, "PATH": str(path)},
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    if os.name == "nt":
+        pytest.skip("the stand-in is a script with a #! line")
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    program = folder / "splat-view"
+    program.write_text(STAND_IN)
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+    return folder
+
+
+def view(*arguments):
+    return CliRunner().invoke(app, ["view", *map(str, arguments)])
+
+
+def words(stand_in):
+    return json.loads((stand_in / "words").read_text())
+
+
+def kept_cameras(stand_in):
+    return json.loads((stand_in / "kept" / "cameras.json").read_text())
+
+
+def test_without_splat_view_an_error_message_says_how_to_get_it(tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-m", "igsr.cli", "view", "scene.ply"],
+        env={**os.environ, "PATH": str(tmp_path)},
         capture_output=True,
         text=True,
         timeout=60,
     )
-
-
-def test_without_splat_view_one_sentence_says_how_to_get_it(tmp_path):
-    result = view(tmp_path, "scene.ply")
     assert result.returncode == 1
     assert result.stdout == ""
     assert "cargo install --locked --path crates/splat_view" in result.stderr
-    lines = [line for line in result.stderr.splitlines() if "XDG_RUNTIME_DIR" not in line]
-    assert len(lines) == 1, result.stderr
-    assert lines[0].endswith("."), result.stderr
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    assert result.stderr.endswith(".\n"), result.stderr
 
 
-@pytest.mark.skipif(os.name == "nt", reason="the stand-in is a script with a #! line")
-def test_splat_view_gets_scenes_and_options_as_given_and_its_exit_status_counts(tmp_path):
-    program = tmp_path / "splat-view"
-    program.write_text(STAND_IN)
-    program.chmod(0o755)
+def test_scenes_and_options_are_passed_on_and_the_exit_status_comes_back(stand_in):
     given = ["a dir", "--camera", "3", "b.ply", "--near", "0.5"]
-    result = view(tmp_path, *given)
-    assert result.stdout.splitlines() == given, result.stderr
-    assert result.returncode == 3
+    result = view(*given)
+    assert words(stand_in) == given
+    assert result.output == ""
+    assert result.exit_code == 3
+
+
+@pytest.mark.parametrize("layout", ["transforms", "colmap"])
+def test_cameras_and_photos_of_any_capture_are_handed_over(tmp_path, stand_in, layout):
+    path = scenes.write_capture(tmp_path / "transforms", scenes.capture(views=3, size=40))
+    if layout == "colmap":
+        write_colmap(igsr.load_capture(path), tmp_path / "colmap")
+        path = tmp_path / "colmap"
+    result = view("scene.ply", "--cameras", path, "--fov", "40")
+    assert result.exit_code == 3, result.output
+    assert str(path) in result.stderr
+    *given, option, file = words(stand_in)
+    assert given == ["scene.ply", "--fov", "40"]
+    assert option == "--cameras"
+    assert not Path(file).exists()
+    cameras = kept_cameras(stand_in)
+    loaded = igsr.load_capture(path)
+    assert cameras["camera_model"] == "PINHOLE"
+    assert len(cameras["frames"]) == len(loaded.views) == 3
+    for frame, one in zip(cameras["frames"], loaded.views, strict=True):
+        assert (frame["w"], frame["h"]) == (one.camera.width, one.camera.height)
+        pose = np.linalg.inv(np.array(frame["transform_matrix"]) * [1, -1, -1, 1])
+        np.testing.assert_allclose(pose, one.camera.viewmat, atol=1e-9)
+        photo = np.asarray(Image.open(stand_in / "kept" / frame["file_path"]))
+        np.testing.assert_array_equal(photo, one.image)
+
+
+def test_large_photos_are_handed_over_smaller(tmp_path):
+    camera = scenes.ring_camera(0.0)
+    large = igsr.Camera(camera.viewmat, camera.K, 1700, 850)
+    one = View("../a.jpg", large, "train", np.zeros((850, 1700, 3), np.uint8))
+    write_for_viewer(Capture(tmp_path, [one]), tmp_path / "out")
+    (frame,) = json.loads((tmp_path / "out" / "cameras.json").read_text())["frames"]
+    assert (frame["w"], frame["h"]) == (1700, 850)
+    assert Image.open(tmp_path / "out" / frame["file_path"]).size == (1600, 800)
+    # A name leads nowhere else.
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "out"]
+
+
+def test_the_capture_kept_beside_a_scene_is_found_unless_the_fit_wrote_cameras(tmp_path, stand_in):
+    out = tmp_path / "out"
+    scenes.write_capture(out / "capture", scenes.capture(views=2, size=16))
+    for scene in (out, out / "scene.ply"):
+        view(scene)
+        assert words(stand_in)[:2] == [str(scene), "--cameras"]
+        assert len(kept_cameras(stand_in)["frames"]) == 2
+    (out / "cameras.json").write_text("{}")
+    view(out)
+    assert words(stand_in) == [str(out)]
+    # One that the viewer reads is named, not read.
+    for named in (out, out / "cameras.json"):
+        view("other.ply", "--cameras", named)
+        assert words(stand_in) == ["other.ply", "--cameras", str(out / "cameras.json")]
+
+
+def test_a_capture_that_cannot_be_read_is_an_error_only_if_it_was_named(tmp_path, stand_in):
+    broken = tmp_path / "out"
+    broken.mkdir()
+    (broken / "transforms.json").write_text("{")
+    beside = view(broken)
+    assert words(stand_in) == [str(broken)]
+    assert "transforms.json is not valid JSON" in beside.stderr
+    assert "no cameras are shown" in beside.stderr
+    (stand_in / "words").unlink()
+    for named, reason in ((broken, "transforms.json is not valid JSON"), ("nowhere", "nowhere")):
+        result = view("scene.ply", "--cameras", named)
+        assert result.exit_code == 1
+        assert reason in result.stderr.splitlines()[-1]
+    assert not (stand_in / "words").exists()
+
+
+def test_igsr_writes_the_cameras_that_the_viewer_s_tests_read(tmp_path):
+    (frame,) = json.loads(VIEWERS_FILE.read_text())["frames"]
+    viewmat = np.linalg.inv(np.array(frame["transform_matrix"]) * [1, -1, -1, 1])
+    K = np.array([[110.0, 0.0, 60.0], [0.0, 100.0, 35.0], [0.0, 0.0, 1.0]])
+    camera = igsr.Camera(viewmat, K, 120, 80)
+    photo = np.zeros((80, 120, 3), np.uint8)
+    write_cameras(tmp_path / "cameras.json", [View("images/a.png", camera, "train", photo)])
+    written = json.loads((tmp_path / "cameras.json").read_text())
+    matrix = written["frames"][0].pop("transform_matrix")
+    np.testing.assert_allclose(matrix, frame.pop("transform_matrix"), atol=1e-12)
+    assert written == {"camera_model": "PINHOLE", "frames": [frame]}

@@ -11,8 +11,8 @@ import pytest
 import scenes
 
 import igsr
-from igsr.compaction import contribution, yardstick
-from igsr.compaction.yardstick import loss_of_change, own_yardstick, photo_yardstick
+from igsr.compaction import contribution, validation
+from igsr.compaction.validation import loss_of_change, photo_validation, self_validation
 from igsr.evaluation import metrics
 
 
@@ -49,8 +49,8 @@ def beads(colors, opacities, depths):
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch):
     """Without a capture: fewer and smaller pictures than users get, for the time it takes."""
-    monkeypatch.setattr(yardstick, "AROUND", 15)
-    monkeypatch.setattr(yardstick, "AROUND_SIDE", 56)
+    monkeypatch.setattr(validation, "AROUND", 15)
+    monkeypatch.setattr(validation, "AROUND_SIDE", 56)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_what_is_hidden_or_before_its_own_colour_is_not_important():
     assert hidden[3] < 0.05 * hidden[0]
 
 
-# ---- what is judged by -------------------------------------------------------------------------
+# ---- validation views --------------------------------------------------------------------------
 
 
 def test_loss_of_a_change():
@@ -128,26 +128,26 @@ def test_loss_of_a_change():
     assert loss_of_change(100.0, 30.0) < 1e-5
 
 
-def test_no_view_is_refined_to_and_judges(photos):
+def test_no_view_is_both_trained_on_and_validated_on(photos):
     capture, model = photos
     without_tests = igsr.Capture(
         capture.path, [replace(view, split="train") for view in capture.views]
     )
     for measure, judges in (
-        (photo_yardstick(model, capture, None, "cpu"), 2),
-        (photo_yardstick(model, without_tests, None, "cpu"), 1),
-        (own_yardstick(model, None, None, "cpu"), 3),
+        (photo_validation(model, capture, None, "cpu"), 2),
+        (photo_validation(model, without_tests, None, "cpu"), 1),
+        (self_validation(model, None, None, "cpu"), 3),
     ):
-        refine = {view.camera.viewmat.tobytes() for view in measure.refine_views}
-        judge = {view.camera.viewmat.tobytes() for view in measure.judge_views}
-        assert len(judge) == judges == measure.protocol["judge_views"]
-        assert len(refine) == measure.protocol["refine_views"]
+        refine = {view.camera.viewmat.tobytes() for view in measure.train_views}
+        judge = {view.camera.viewmat.tobytes() for view in measure.validation_views}
+        assert len(judge) == judges == measure.protocol["validation_views"]
+        assert len(refine) == measure.protocol["train_views"]
         assert not refine & judge
 
 
 def test_cameras_around_see_the_scene_from_all_sides():
     splats = scenes.splats(count=60, origin=(100.0, -20.0, 5.0))
-    cameras = [view.camera for view in own_yardstick(splats, None, None, "cpu").refine_views]
+    cameras = [view.camera for view in self_validation(splats, None, None, "cpu").train_views]
     directions = np.array([camera.centre for camera in cameras]) - [100.0, -20.0, 5.0]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     assert np.linalg.norm(directions.mean(axis=0)) < 0.25
@@ -278,7 +278,7 @@ def test_scenes_and_captures_that_cannot_be_used(photos):
     with pytest.raises(igsr.IgsrError, match="no finite splats"):
         igsr.compact(empty, backend="cpu")
     lone = igsr.Capture(capture.path, capture.views[:1])
-    with pytest.raises(igsr.IgsrError, match="others to judge by"):
+    with pytest.raises(igsr.IgsrError, match="one held-out view"):
         igsr.compact(model, 0.1, lone, backend="cpu")
     with pytest.raises(igsr.IgsrError, match="leave psnr or capture out"):
         igsr.compact(model, 0.1, capture, psnr=30.0, backend="cpu")

@@ -15,9 +15,12 @@ from feature_files import squeezenet_file
 import igsr
 from igsr.capture import Camera
 from igsr.denoiser import Buffers, NetworkDenoiser, cleaning, denoise, load_network, save_network
-from igsr.denoiser.cleaning import DOUBT, UNSEEN_CHANGE
+from igsr.denoiser.architecture import Architecture
+from igsr.denoiser.cleaning import DOUBT, SMALLEST_CHANGE
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
-from igsr.denoiser.network import FIRST_LOGIT, REACH, Architecture, DenoiserNetwork
+from igsr.denoiser.network import FIRST_LOGIT, REACH, DenoiserNetwork
+from igsr.denoiser.training.crops import RIGHT, draw_batch
+from igsr.denoiser.training.distributed import Processes
 from igsr.denoiser.training.losses import (
     LOSSES,
     Loss,
@@ -29,20 +32,13 @@ from igsr.denoiser.training.losses import (
     structure_ratio,
 )
 from igsr.denoiser.training.pair_files import Pairs, read_pairs, write_pairs
+from igsr.denoiser.training.pair_sets import kept_for_validation
 from igsr.denoiser.training.pairs import capture_of_pairs
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance, _Lpips, lpips_distance
 from igsr.denoiser.training.plot_training import plot_training
-from igsr.denoiser.training.train import (
-    CHECKPOINT,
-    LOG,
-    RIGHT,
-    WEIGHTS,
-    Training,
-    _batch,
-    _kept_for_validation,
-    _Processes,
-    train,
-)
+from igsr.denoiser.training.train_network import train
+from igsr.denoiser.training.training_run import CHECKPOINT, LOG, WEIGHTS
+from igsr.denoiser.training.training_settings import Training
 from igsr.denoiser.warping import Source
 from igsr.rendering.renders import Render
 
@@ -133,7 +129,7 @@ def test_any_size_comes_out_as_it_went_in(size):
 
 def test_a_change_that_nobody_sees_is_not_made():
     color = np.random.default_rng(0).uniform(0.1, 0.9, size=(20, 20, 3)).astype(np.float32)
-    for brighter, same in ((0.9 * UNSEEN_CHANGE, True), (1.1 * UNSEEN_CHANGE, False)):
+    for brighter, same in ((0.9 * SMALLEST_CHANGE, True), (1.1 * SMALLEST_CHANGE, False)):
         picture, _ = denoise(color, denoiser=NetworkDenoiser(brightening(brighter, 1e-3)))
         assert np.array_equal(picture, color) is same
 
@@ -473,11 +469,17 @@ def test_a_training_that_was_stopped_ends_with_the_same_weights(tmp_path, loss):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 0}, "steps must be at least 1"),
+        ({"steps": 0}, "steps must be from 1 to 1000000000, not 0"),
+        ({"batch": 2.5}, "batch must be a whole number, not 2.5"),
         ({"crop": 30}, "crop must be a multiple of 8"),
-        ({"rate": float("nan")}, "rate must be positive"),
-        ({"dropout": 1.0}, "dropout must be from 0 to 1"),
-        ({"seed": -1}, "seed must not be negative"),
+        ({"rate": float("nan")}, "rate must be a number from 1e-12 to 1000, not nan"),
+        ({"rate": 0.0}, "rate must be a number from 1e-12 to 1000, not 0.0"),
+        ({"loss": "mse"}, "loss must be one of default, charbonnier, gan"),
+        ({"a": 1.5}, "a must be a number from 0 to 1, not 1.5"),
+        ({"dropout": 1.0}, "dropout must be a number from 0 to 0.9999, not 1.0"),
+        ({"weight_decay": -0.1}, "weight_decay must be a number from 0 to"),
+        ({"seed": -1}, "seed must be from 0 to"),
+        ({"seed": 2**60}, "seed must be from 0 to"),
     ],
 )
 def test_bad_settings_of_a_training(options, message):
@@ -531,14 +533,14 @@ def test_crops_that_are_right_already_are_drawn_again(tmp_path):
     inputs[0, :COLOR] = made.truth[0]  # one of the two views is right everywhere
     training = replace(TINY, batch=64, augment=False)
     pairs = [Pairs(inputs, made.truth, made.masks)]
-    crops, truth = _batch(pairs, training, 0, _Processes("cpu"))
-    drawn = (crops[:, :COLOR] - truth[:, :COLOR]).square().mean(dim=(1, 2, 3)) > RIGHT
+    batch = draw_batch(pairs, training, 0, range(64), torch.device("cpu"))
+    drawn = (batch.inputs[:, :COLOR] - batch.truth).square().mean(dim=(1, 2, 3)) > RIGHT
     assert 0.85 < drawn.float().mean() < 1.0, "half to the power of four stays right"
 
 
 def test_no_scene_of_validation_is_trained_on():
     def kept(*names):
-        return _kept_for_validation([f"{name}-seed0-cpu.npz" for name in names])
+        return kept_for_validation([f"{name}-seed0-cpu.npz" for name in names])
 
     assert kept("a-noise-0", "a-sparse-0", "b-noise-0", "b-sparse-0") == 2
     assert kept(*(f"{c}-sparse-0" for c in "abcdefghijklmnopqrst")) == 2
@@ -552,23 +554,21 @@ def test_no_scene_of_validation_is_trained_on():
 def test_processes_learn_one_network_and_one_discriminator(tmp_path):
     pair_files(tmp_path / "pairs")
     code = (
-        "import sys, torch\n"
-        "from igsr.denoiser import training\n"
-        "from igsr.denoiser.network import Architecture\n"
-        "folder, rank = sys.argv[1], training._Processes.__init__\n"
-        "seen = []\n"
-        "real = training._Learner.learn\n"
-        "def learn(self, *batch):\n"
-        "    out = real(self, *batch)\n"
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from igsr.denoiser.architecture import Architecture\n"
+        "from igsr.denoiser.training import Training, train\n"
+        "from igsr.denoiser.training.learner import Learner\n"
+        "folder, seen = sys.argv[1], []\n"
+        "real = Learner.learn\n"
+        "def learn(self, batch):\n"
+        "    out = real(self, batch)\n"
         "    seen[:] = [p.detach().double().sum().item() for part in (self.network, self.judge)\n"
         "               for p in part.parameters()]\n"
         "    return out\n"
-        "training._Learner.learn = learn\n"
-        "from pathlib import Path\n"
-        "import os\n"
-        "given = training.Training(steps=3, batch=4, crop=32, loss='gan')\n"
-        "training.train(sorted(Path(folder, 'pairs').glob('*.npz')), Path(folder, 'out'), given,\n"
-        "               Architecture(4, (1, 1, 1)))\n"
+        "Learner.learn = learn\n"
+        "train(sorted(Path(folder, 'pairs').glob('*.npz')), Path(folder, 'out'),\n"
+        "      Training(steps=3, batch=4, crop=32, loss='gan'), Architecture(4, (1, 1, 1)))\n"
         "Path(folder, os.environ['RANK']).write_text(repr(seen))\n"
     )
     (tmp_path / "learn.py").write_text(code)
@@ -585,7 +585,7 @@ def test_processes_learn_one_network_and_one_discriminator(tmp_path):
 
 
 def test_a_batch_is_shared_evenly(tmp_path, monkeypatch):
-    monkeypatch.setattr(_Processes, "__init__", lambda self, device: vars(self).update(count=3))
+    monkeypatch.setattr(Processes, "__init__", lambda self, device: vars(self).update(count=3))
     with pytest.raises(igsr.IgsrError, match="batch must be a multiple of the number of proc"):
         train(pair_files(tmp_path / "pairs"), tmp_path / "out", TINY, SMALL)
 
@@ -692,3 +692,19 @@ def test_training_and_validation_have_one_axis(tmp_path, monkeypatch):
     (tmp_path / "log.jsonl").write_text("")
     with pytest.raises(igsr.IgsrError, match="holds nothing to plot"):
         plot_training(tmp_path / "log.jsonl", tmp_path / "loss.png")
+
+
+def test_old_names_of_training_still_import():
+    from igsr.denoiser import training
+
+    assert training.train is train
+    assert training.Training is Training
+    assert {"Training", "TrainingProgress", "make_pairs", "train"} <= {*dir(training)}
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        training.nothing  # noqa: B018
+
+
+def test_a_training_that_never_logs_is_refused(tmp_path):
+    for name in ("log_every", "checkpoint_every"):
+        with pytest.raises(igsr.IgsrError, match="must be at least 1"):
+            train(pair_files(tmp_path / "pairs"), tmp_path / "out", TINY, SMALL, **{name: 0})

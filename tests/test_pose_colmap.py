@@ -138,13 +138,13 @@ def test_what_shows_something_else_is_named_and_the_rest_kept(photos: list[Photo
         capture = igsr.estimate_poses([*photos[1:3], stranger, *photos[3:5]], "colmap")
     assert [view.name for view in capture.views] == ["1.png", "2.png", "3.png", "4.png"]
     assert capture.train_views == capture.views
-    with pytest.raises(igsr.IgsrError, match=r"No camera could be found: the 2 photos \(1\.png"):
+    with pytest.raises(igsr.IgsrError, match=r"No cameras found: the 2 photos \(1\.png"):
         igsr.estimate_poses([photos[1], stranger], "colmap")
     away = [CAMERAS[2], rooms.camera(np.pi)]  # back to back: no common view
-    with pytest.raises(igsr.IgsrError, match="show too little in common"):
+    with pytest.raises(igsr.IgsrError, match="too few matches"):
         igsr.estimate_poses(rooms.photos(away), "colmap")
     blank = [Photo(f"{i}.png", np.full((60, 80, 3), 200, dtype=np.uint8)) for i in range(3)]
-    with pytest.raises(igsr.IgsrError, match="show too little in common"):
+    with pytest.raises(igsr.IgsrError, match="too few matches"):
         igsr.estimate_poses(blank, "colmap")
     with pytest.raises(
         igsr.IgsrError, match=r"two photos at least|from 2 photos at least; .*1\.png"
@@ -159,9 +159,9 @@ def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -
     places /= np.linalg.norm(places, axis=2, keepdims=True)
     glances = [places[i % 180 : i % 180 + 4].reshape(-1, 128) for i in range(200)]
     glances[77] = np.zeros((0, 128), dtype=np.float32)  # a photo without features
-    monkeypatch.setattr(colmap, "_glances", lambda count, database: glances)
+    monkeypatch.setattr(colmap, "_largest_features", lambda count, database: glances)
     pairs = colmap._pairs(200, Path("database"))
-    assert len(pairs) < 200 * (colmap.FOLLOWING + colmap.ALIKE) < 200 * 199 // 2
+    assert len(pairs) < 200 * (colmap.FOLLOWING + colmap.MOST_SIMILAR) < 200 * 199 // 2
     assert {(i, i + 180) for i in range(20)} <= set(pairs)
     assert {(i, i + 1) for i in range(199)} <= set(pairs)
     assert len(colmap._pairs(colmap.EXHAUSTIVE, Path("database"))) == 60 * 59 // 2
@@ -185,10 +185,10 @@ def test_photos_that_look_alike_are_found_in_the_database(photos: list[Photo], t
     database = tmp_path / "database.db"
     colmap._list_photos(both, database)
     colmap._find_features(both, tmp_path, database, lambda *arguments: None)
-    counts = colmap._alike(colmap._glances(4, database))
+    counts = colmap._similarity(colmap._largest_features(4, database))
     assert (counts == counts.T).all()
-    assert min(counts[0, 1], counts[1, 2]) >= 2 * colmap.LEAST_ALIKE
-    assert counts[:3, 3].max() < colmap.LEAST_ALIKE
+    assert min(counts[0, 1], counts[1, 2]) >= 2 * colmap.LEAST_SIMILAR
+    assert counts[:3, 3].max() < colmap.LEAST_SIMILAR
 
 
 def make_estimator(calls: list[dict[str, object]], name: str) -> object:
@@ -219,7 +219,7 @@ def test_auto_takes_given_cameras_then_a_checkpoint_then_colmap(
     name, _ = pose.estimate(photos[:3], checkpoint="weights.pth")
     assert name == "dust3r"
     assert calls[1] == {"name": "dust3r", "checkpoint": "weights.pth", "seed": 0}
-    with pytest.raises(igsr.IgsrError, match="checkpoint says nothing to colmap"):
+    with pytest.raises(igsr.IgsrError, match="checkpoint is no option of colmap"):
         pose.estimate(photos[:3], "colmap", checkpoint="weights.pth")
     with pytest.raises(igsr.IgsrError, match="estimator must be auto, dust3r or colmap"):
         pose.estimate(photos[:3], "magic")

@@ -451,5 +451,5 @@ def test_options_of_other_protocols_are_refused(data, tmp_path):
         result = CliRunner().invoke(
             app, ["study", protocol, str(data), "--out", str(tmp_path), *option]
         )
-        assert result.exit_code == 1
-        assert f"{option[0]} says nothing to {protocol}" in result.stderr
+        assert result.exit_code == 2
+        assert f"No such option: {option[0]}" in result.stderr

@@ -189,7 +189,7 @@ def test_what_crosses_the_bus_is_what_the_docs_say(monkeypatch, channels, passes
     scene = leaves(scene)
 
     # Both directions have one function each; on the CPU they share memory instead of copying.
-    module = importlib.import_module("igsr.rasterization")
+    module = importlib.import_module("igsr.rendering.rasterization")
     crossed = {"to the host": 0, "to the device": 0}
 
     def counting(direction, transfer):

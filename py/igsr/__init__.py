@@ -1,12 +1,12 @@
-"""igsr: from a few photos to a Gaussian-splat scene.
+"""igsr: fit a Gaussian-splat scene to a few photos.
 
 >>> import igsr
 >>> capture = igsr.load_capture("photos").with_holdout(8)
 >>> splats = igsr.fit(capture, steps=5000)
->>> igsr.evaluate(splats, capture)["psnr"]
+>>> igsr.evaluate(splats, capture).psnr
 >>> splats.save("scene.ply")
 
-Names are imported when they are first used (PEP 562): ``import igsr`` alone loads no torch.
+Names are imported when they are first used (PEP 562): ``import igsr`` alone imports no torch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from igsr.compaction import Compaction, compact
     from igsr.denoiser import denoise
     from igsr.errors import IgsrError
-    from igsr.evaluation import evaluate
+    from igsr.evaluation import Scores, evaluate
     from igsr.fitting import Progress, fit, fit_with_cameras, refine_cameras
     from igsr.pose import estimate_poses
     from igsr.refinement import Refined, refine
@@ -39,6 +39,7 @@ __all__ = [
     "Progress",
     "Refined",
     "Render",
+    "Scores",
     "Splats",
     "View",
     "__version__",
@@ -62,7 +63,7 @@ _HOMES = {
     "igsr.compaction": ("Compaction", "compact"),
     "igsr.denoiser": ("denoise",),
     "igsr.errors": ("IgsrError",),
-    "igsr.evaluation": ("evaluate",),
+    "igsr.evaluation": ("Scores", "evaluate"),
     "igsr.fitting": ("Progress", "fit", "fit_with_cameras", "refine_cameras"),
     "igsr.pose": ("estimate_poses",),
     "igsr.refinement": ("Refined", "refine"),

@@ -1,11 +1,16 @@
 """Types of the Rust module: numpy arrays in, numpy arrays out.
 
 Arrays are C-contiguous. ``Real`` is float32, or float64 for the backend "reference" (see
-``working_dtype``). N is the number of splats, K of SH coefficients per splat, H x W the picture.
+``working_dtype``). N is the number of splats, K of SH coefficients per splat, H x W the picture's
+size in pixels, V the number of photos. Lengths and depths are in world units. Every ``backend`` is
+a resolved one: "cpu", "gpu" or "reference".
+
+A wrong argument raises ValueError, whose message begins with the argument's name; a missing or
+unknown one raises TypeError; a GPU that is missing or fails raises RuntimeError.
 """
 
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +31,7 @@ class SplatArrays(TypedDict):
     sh: Float32  # [N, K, 3]
     origin: Float64  # [3]
 
-def resolve_backend(name: str) -> str:
+def resolve_backend(name: str) -> Literal["cpu", "gpu", "reference"]:
     """The backend that "auto", "cpu", "gpu" or "reference" stands for.
 
     Raises ValueError for another name, RuntimeError where "gpu" has no adapter.
@@ -57,14 +62,17 @@ def project(
     antialiased: bool,
     backend: str,
 ) -> dict[str, Real]:
-    """Splats and one camera to 2D splats.
+    """Project splats to 2D splats, as one camera sees them.
 
-    ``colors`` is [N, 3], or [N, K, 3] SH coefficients with ``sh_degree``; ``raw_parameters`` says
-    that scales are logs and opacities logits. ``viewmat`` [4, 4] is world-to-camera,
-    ``intrinsics`` [4] fx, fy, cx, cy.
+    ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``scales`` [N, 3], ``opacities`` [N]. ``colors`` is
+    [N, 3], or [N, K, 3] SH coefficients with ``sh_degree``. ``raw_parameters`` says that scales are
+    logarithms and opacities logits. ``viewmat`` [4, 4] is world-to-camera in OpenCV axes,
+    ``intrinsics`` [4] is fx, fy, cx, cy in pixels. Splats nearer than ``near`` or farther than
+    ``far`` are culled. ``eps2d`` is added to the variances of the 2D covariance, square pixels;
+    with ``antialiased`` opacities are lowered to make up for it.
 
-    Returns means2d [N, 2], factors [N, 3], covars2d [N, 3], depths [N], colors [N, 3],
-    opacities [N], radii [N, 2]; a culled splat has zeros.
+    Returns means2d [N, 2] in pixels, factors [N, 3], depths [N], colors [N, 3], opacities [N],
+    radii [N, 2]; a culled splat has zeros.
     """
 
 def rasterize(
@@ -75,7 +83,11 @@ def rasterize(
     background: Real,
     backend: str,
 ) -> dict[str, Real]:
-    """2D splats to color [H, W, 3], alpha, depth and transmittance [H, W]."""
+    """Draw 2D splats over a background [3].
+
+    ``projected`` is what ``project`` returns. Returns color [H, W, 3] and alpha, depth and
+    transmittance [H, W]; depth is accumulated: divide it by alpha for the expected depth.
+    """
 
 def rasterize_backward(
     projected: dict[str, Real],
@@ -88,9 +100,11 @@ def rasterize_backward(
     absolute: bool,
     backend: str,
 ) -> dict[str, Real]:
-    """Gradients v_means2d, v_covars2d, v_depths, v_colors, v_opacities and v_background [3].
+    """Turn gradients of a picture into gradients of its 2D splats and background.
 
-    ``image`` is what ``rasterize`` returned for the same arguments.
+    ``image`` is what ``rasterize`` returned for the same arguments. Returns v_means2d [N, 2],
+    v_factors [N, 3], v_depths [N], v_colors [N, 3], v_opacities [N] and v_background [3]; with
+    ``absolute`` also v_means2d_absolute [N, 2], the sums of the pixels' absolute gradients.
     """
 
 def project_backward(
@@ -114,21 +128,22 @@ def project_backward(
     antialiased: bool,
     backend: str,
 ) -> dict[str, Real]:
-    """Gradients v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmat, v_intrinsics.
+    """Turn gradients of 2D splats into gradients of the splats and the camera.
 
-    The last two are float64 for every backend.
+    Returns v_means, v_quats, v_scales, v_opacities and v_colors, shaped as the parameters, and
+    v_viewmat [4, 4] and v_intrinsics [4], which are float64 for every backend.
     """
 
 def peak_multiply_add(seconds: float) -> float:
-    """GFLOP/s of multiply-adds in registers on all threads, for about ``seconds``."""
+    """Measure GFLOP/s of multiply-adds in registers on all threads, for about ``seconds``."""
 
 def band_pixels(
     projected: dict[str, Real], *, width: int, height: int, alpha_band: float
 ) -> npt.NDArray[np.uint8]:
-    """1 where an f32 implementation may rightly differ from the reference, [H, W].
+    """Pixels where rounding to float32 may change which splats count: 1 there, [H, W].
 
-    ``projected`` is float64. There a pair's alpha lies within ``alpha_band`` (relative) of the
-    threshold, or the transmittance within 1e-4 of its own, or two depths within 1e-6.
+    In these, a pair's alpha lies within ``alpha_band`` (relative) of its threshold, or the
+    transmittance within 1e-4 of its own, or two depths within 1e-6. ``projected`` is float64.
     """
 
 def time_rasterize(
@@ -143,7 +158,7 @@ def time_rasterize(
     repeats: int,
     backend: str,
 ) -> dict[str, Float64]:
-    """Milliseconds [repeats] of "rasterize" and "rasterize_backward", arrays converted once."""
+    """Milliseconds [repeats] of "rasterize" and "rasterize_backward"; arrays are converted once."""
 
 def time_pipeline(
     means: Real,
@@ -169,10 +184,10 @@ def time_pipeline(
     repeats: int,
     backend: str,
 ) -> dict[str, Float64]:
-    """Milliseconds [repeats] of each of the four stages, arrays converted once."""
+    """Milliseconds [repeats] of each of the four stages; arrays are converted once."""
 
-NEAR_PLANE: float  # what lies nearer than this, in world units, is not drawn
-FAR_PLANE: float  # what lies farther than this, in world units, is not drawn
+NEAR_PLANE: float  # splats nearer than this are culled, world units
+FAR_PLANE: float  # splats farther than this are culled, world units
 EPS2D: float  # variance in square pixels added to every projected Gaussian
 ALPHA_MIN: float  # a pair fainter than this contributes nothing
 ALPHA_MAX: float  # no pair is more opaque than this
@@ -182,14 +197,14 @@ TILE_SIZE: int  # side of a tile in pixels
 SIDE_MAX: int  # largest side of a picture in pixels
 
 def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict[str, Float32]:
-    """One round splat per point [P, 3] with colours [P, 3] in 0..1.
+    """One isotropic splat per point [P, 3] with colours [P, 3] in 0..1.
 
-    Returns means, quats, scales (logs of the mean distance to the three nearest neighbours),
+    Returns means, quats, scales (logarithms of the mean distance to the three nearest neighbours),
     opacities (logits of 0.1) and sh, as ``SplatArrays`` has them.
     """
 
 class Fitter:
-    """A fit in progress; parameters and optimiser state stay where the kernels run."""
+    """A fit in progress; parameters and optimiser state stay on the device that computes."""
 
     def __init__(
         self,
@@ -206,28 +221,34 @@ class Fitter:
     ) -> None:
         """A fit to V photos.
 
-        ``images`` are [H, W, 3] or [H, W, 4] with straight alpha, ``masks`` [H, W] or None,
-        ``backgrounds`` RGB that stood behind an image without alpha, or None, ``schedule`` how many
-        steps of a round are of it, at least 1, and the first step that is not of it any more, or
-        None. ``viewmats`` are [V, 4, 4] relative to the splats' origin, ``intrinsics`` [V, 4].
-        ``state`` is either the parameters to start from (``SplatArrays`` without origin) or what
-        ``state()`` returned. ``config``: steps, first_step
-        (where in the schedule a fit begins), seed, sh_degree, max_splats, density, dropout, hull,
-        background; poses ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate
-        (pixels a step), camera_decay, camera_warm_up (part of the steps), frozen (splats stay as
-        they are); an absent or None entry takes the default. ``holds`` say where the cameras that
-        are fitted are known to be, and how surely: viewmats [V, 4, 4] and intrinsics [V, 4] as
-        above, information [V, 6, 6] (the inverse of the covariance of a turn, in radians, about and
-        a move along the camera's axes) and focal_information [V] (of the focal length's logarithm),
-        zero where nothing is known.
+        Args:
+            images: [H, W, 3], or [H, W, 4] with straight alpha.
+            masks: [H, W] each, or None: bool, or float32 weights.
+            backgrounds: RGB in 0..1 behind an image without alpha, or None if not known.
+            schedule: for each photo, its steps per round (at least 1), and the first step from
+                which it is left out, or None.
+            viewmats: [V, 4, 4], world-to-camera, relative to the splats' origin.
+            intrinsics: [V, 4], fx, fy, cx, cy in pixels.
+            state: the initialization (``SplatArrays`` without origin), or what ``state()``
+                returned.
+            config: steps, first_step (where in the schedule the fit begins), seed, sh_degree,
+                max_splats, density ("mcmc", "original", "fixed"), dropout, hull, background; poses
+                ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate (pixels per
+                step), camera_decay, camera_warm_up (fraction of the steps), frozen (splats are not
+                changed). An absent or None entry takes the default.
+            backend: "cpu" or "gpu".
+            holds: pose priors of the cameras that are fitted: viewmats and intrinsics as above,
+                information [V, 6, 6] (the inverse covariance of a rotation in radians about, and a
+                translation along, the camera's axes) and focal_information [V] (of the logarithm of
+                the focal length); zero where nothing is known.
         """
 
     def step(self, count: int) -> dict[str, Any]:
-        """Do ``count`` steps; ``step`` and ``splats`` afterwards and ``loss`` of the last one."""
+        """Do ``count`` steps. Returns ``step``, ``splats`` (their number) and the last ``loss``."""
 
     @property
     def steps_done(self) -> int:
-        """Steps done, those of resumed runs included."""
+        """Number of steps done, with those before the fit was resumed."""
 
     def splats(self) -> dict[str, Float32]:
         """The parameters as they are now, without origin."""
@@ -236,20 +257,24 @@ class Fitter:
         """The cameras as they are now: camera_viewmats [V, 4, 4] and camera_intrinsics [V, 4]."""
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Everything needed to go on bit for bit."""
+        """Everything needed to resume the fit with the same bits: the constructor's ``state``."""
 
 def read_splats(path: str) -> dict[str, Any]:
-    """Read a splat file of any format, told by its content.
+    """Read a splat file; its content tells the format.
 
-    ``SplatArrays``, antialiased (bool), format (its ending without a dot) and notes (list of
-    sentences on what was passed over); OSError says what is wrong with the file.
+    Returns ``SplatArrays``, antialiased (bool), format (its ending without a dot) and notes
+    (messages on what was ignored). Raises OSError where the file cannot be read.
     """
 
 def write_splats(path: str, splats: dict[str, Any]) -> list[str]:
     """Write ``SplatArrays`` and antialiased in the format of the ending, whole or not at all.
 
-    Returns a sentence for each thing that the format cannot hold; OSError where that fails.
+    Returns a message for each thing that the format cannot hold. Raises OSError where the file
+    cannot be written.
     """
 
 def write_exr(path: str, color: Float32, alpha: Float32, depth: Float32) -> None:
-    """Write channels R, G, B, A, Z in 32-bit float; OSError where that fails."""
+    """Write channels R, G, B, A, Z of [H, W] in 32-bit float.
+
+    Raises OSError where the file cannot be written.
+    """

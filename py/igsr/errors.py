@@ -1,17 +1,17 @@
-"""The one exception that igsr raises for a user's mistake."""
+"""The exception that igsr raises for input that it cannot use."""
 
 from __future__ import annotations
 
 
 class IgsrError(ValueError):
-    """Something the user gave cannot be used.
+    """An argument, option or file that cannot be used.
 
-    The message is one sentence that names the file, field or argument and says how to mend it; the
-    command line prints exactly that sentence and exits with a non-zero status. It is one printable
-    line whatever the names quoted in it hold: line breaks, terminal codes and the like are escaped.
+    The message names the argument, field or file and says how to mend it. The command line prints
+    it and exits with a non-zero status. It is one printable line: line breaks, terminal codes and
+    the like in quoted names are escaped.
 
     Args:
-        message: the sentence.
+        message: the error message.
     """
 
     def __init__(self, message: str) -> None:

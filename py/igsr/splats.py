@@ -6,12 +6,18 @@ import os
 import warnings
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
+from igsr._internal.array_equality import ArrayEquality
+from igsr._internal.notebook import NotebookPicture, numbers
 from igsr.errors import IgsrError
+
+if TYPE_CHECKING:
+    import torch
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -22,9 +28,11 @@ MAX_SH_DEGREE = 4
 SPLAT_ENDINGS = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb", ".gltf")
 
 
-@dataclass
-class Splats:
-    """N Gaussians with unbounded parameters, as the optimiser sees them.
+@dataclass(eq=False, repr=False)
+class Splats(ArrayEquality, NotebookPicture):
+    """N Gaussians with unbounded parameters, as the optimizer sees them.
+
+    Two are equal (``==``) if all their parameters are. A notebook shows them as a small render.
 
     Attributes:
         means: [N, 3] float32, centres relative to ``origin``, in the capture's world units.
@@ -35,12 +43,14 @@ class Splats:
             colour = max(0, 0.5 + SH(direction from camera to mean)).
         origin: [3] float64, world position that ``means`` are relative to. It keeps scenes far
             from zero (map coordinates) precise in float32.
-        antialiased: whether they were trained with antialiased opacities (Mip-Splatting's 2D
-            filter), and so are to be drawn.
+        antialiased: whether they were fitted, and must be drawn, with antialiased opacities
+            (Mip-Splatting's 2D filter).
 
     Raises:
         IgsrError: an array has the wrong shape or dtype; the message names it.
     """
+
+    pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:splats_pictures"
 
     means: FloatArray
     quats: FloatArray
@@ -74,6 +84,13 @@ class Splats:
     def __len__(self) -> int:
         return len(self.means)
 
+    def __repr__(self) -> str:
+        antialiased = ", antialiased" if self.antialiased else ""
+        return (
+            f"Splats({len(self)} splats, SH degree {self.sh_degree}, "
+            f"origin {numbers(self.origin)}{antialiased})"
+        )
+
     @property
     def sh_degree(self) -> int:
         """Degree of the stored spherical harmonics, 0-4."""
@@ -81,7 +98,7 @@ class Splats:
 
     @property
     def finite(self) -> npt.NDArray[np.bool_]:
-        """bool [N]: which splats have only finite parameters; no other is drawn."""
+        """bool [N]: which splats have only finite parameters. The others are not drawn."""
         finite: npt.NDArray[np.bool_] = np.isfinite(self.opacities)
         for rows in (self.means, self.quats, self.scales):
             finite &= np.isfinite(rows).all(axis=1)
@@ -89,21 +106,82 @@ class Splats:
         return finite
 
     def bounds(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
-        """Lowest and highest corner [3] of the finite splats' centres, world frame, or None."""
+        """The box around the centres of the finite splats, in the world frame.
+
+        Returns:
+            Its lowest and highest corner, float64 [3] each; None if no splat is finite.
+        """
         world = self.means[self.finite].astype(np.float64) + self.origin
         if len(world) == 0:
             return None
         return world.min(axis=0), world.max(axis=0)
 
-    def save(self, path: str | os.PathLike[str]) -> list[str]:
-        """Write a file in the format that the ending of ``path`` names.
+    def to_torch(
+        self,
+        device: torch.device | str | None = None,
+        requires_grad: bool = False,
+        *,
+        origin: npt.ArrayLike = (0.0, 0.0, 0.0),
+    ) -> dict[str, Any]:
+        """The arguments of ``igsr.rasterization`` that describe these splats.
 
-        ``.ply`` (INRIA's, which holds everything), ``.compressed.ply``, ``.splat``, ``.spz``,
-        ``.sog``, ``.glb`` or ``.gltf``. The file appears whole or not at all: an older one of that
-        name survives a failure.
+        ``rasterization(**splats.to_torch(), viewmats=..., Ks=..., width=..., height=...)`` draws
+        what ``igsr.render`` draws. gsplat's ``rasterization`` takes the same arguments.
+
+        ``rasterization`` takes activated parameters: scales are positive lengths and opacities lie
+        in [0, 1], where ``Splats`` holds logarithms and logits. A gradient of the returned tensors
+        is one of the activated parameters.
+
+        Args:
+            device: where the tensors lie; None is the CPU.
+            requires_grad: whether the tensors are leaves that collect gradients.
+            origin: [3], world position that the returned means are relative to. Zero puts them
+                into the world frame, which in float32 is coarse for a scene far from zero (map
+                coordinates). Give ``splats.origin`` there, and move the cameras along:
+                ``viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin``, in float64.
 
         Returns:
-            A sentence for each thing that the format cannot hold.
+            "means" [N, 3], "quats" [N, 4] (w x y z), "scales" [N, 3], "opacities" [N] and "colors"
+            [N, K, 3] (spherical harmonics), all float32; "sh_degree", int; and "rasterize_mode",
+            "antialiased" or "classic". The tensors share no memory with the splats.
+
+        Raises:
+            IgsrError: ``origin`` is not three finite numbers.
+        """
+        import torch
+
+        try:
+            shift = self.origin - np.asarray(origin, dtype=np.float64)
+        except (TypeError, ValueError):
+            shift = np.zeros(0)
+        if shift.shape != (3,) or not np.isfinite(shift).all():
+            raise IgsrError("origin must be three finite numbers")
+        means = self.means if not shift.any() else self.means.astype(np.float64) + shift
+        tensors = {
+            "means": torch.tensor(means, dtype=torch.float32),
+            "quats": torch.tensor(self.quats),
+            "scales": torch.exp(torch.tensor(self.scales)),
+            "opacities": torch.sigmoid(torch.tensor(self.opacities)),
+            "colors": torch.tensor(self.sh),
+        }
+        return {
+            **{n: t.to(device).requires_grad_(requires_grad) for n, t in tensors.items()},
+            "sh_degree": self.sh_degree,
+            "rasterize_mode": "antialiased" if self.antialiased else "classic",
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> list[str]:
+        """Write a file; the ending of ``path`` sets its format.
+
+        ``.ply`` (INRIA's, which holds everything), ``.compressed.ply``, ``.splat``, ``.spz``,
+        ``.sog``, ``.glb`` or ``.gltf``. The file is written whole or not at all: after a failure,
+        an older file of that name is still there.
+
+        Args:
+            path: the file; its folder is made if it is missing.
+
+        Returns:
+            A message for each thing that the format cannot hold.
 
         Raises:
             IgsrError: the file cannot be written, or its ending is none of these.
@@ -118,12 +196,19 @@ class Splats:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Splats:
-        """Read a splat file: what :meth:`save` writes, or ``.ksplat``, told by its content.
+        """Read a splat file: what :meth:`save` writes, or ``.ksplat``.
 
-        Warns of what in the file is passed over.
+        The content decides which format it is, not the ending. A ``UserWarning`` names each part
+        of the file that is ignored.
+
+        Args:
+            path: the file.
+
+        Returns:
+            The splats.
 
         Raises:
-            IgsrError: there is no such file, or it is no splat file; the message says why.
+            IgsrError: there is no such file, or it is not a splat file; the message says why.
         """
         if not Path(path).is_file():
             raise IgsrError(f"There is no splat file {path}.")

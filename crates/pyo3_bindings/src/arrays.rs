@@ -1,4 +1,4 @@
-//! numpy arrays as slices of fixed-size rows, and back.
+//! numpy arrays as slices of fixed-size rows, and back. Errors begin with the argument's name.
 
 use numpy::{
     Element, IntoPyArray, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
@@ -8,7 +8,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// Borrows an argument as an array of `T`; the error names it.
+/// Borrows an argument as an array of `T`. ValueError if it is another object or not C-contiguous.
 pub fn array<'py, T: Element>(
     name: &str,
     object: &Bound<'py, PyAny>,
@@ -30,7 +30,7 @@ pub fn array<'py, T: Element>(
     typed.try_readonly().map_err(|error| PyValueError::new_err(format!("{name}: {error}")))
 }
 
-/// The entry `name` of a dict, as [`array`].
+/// Borrows the entry `name` of a dict, as [`array`] does.
 pub fn entry<'py, T: Element>(
     dict: &Bound<'py, PyDict>,
     name: &str,
@@ -41,7 +41,7 @@ pub fn entry<'py, T: Element>(
     }
 }
 
-/// All elements of an array of shape `shape`; -1 in `shape` stands for any size.
+/// All elements of an array of shape `shape`, where -1 matches any size.
 pub fn elements<'a, T: Element>(
     name: &str,
     array: &'a PyReadonlyArrayDyn<'_, T>,
@@ -61,7 +61,7 @@ pub fn elements<'a, T: Element>(
     array.as_slice().map_err(|error| PyValueError::new_err(format!("{name}: {error}")))
 }
 
-/// The rows of an array whose last dimension is `N`; -1 in `leading` stands for any size.
+/// The rows of an array of shape `leading` + `[N]`, where -1 matches any size.
 pub fn rows<'a, T: Element, const N: usize>(
     name: &str,
     array: &'a PyReadonlyArrayDyn<'_, T>,
@@ -72,7 +72,7 @@ pub fn rows<'a, T: Element, const N: usize>(
     Ok(elements(name, array, &shape)?.as_chunks::<N>().0)
 }
 
-/// The one row of an array of shape `[N]`.
+/// The values of an array of shape `[N]`.
 pub fn row<T: Element + Copy, const N: usize>(
     name: &str,
     object: &Bound<'_, PyAny>,
@@ -81,7 +81,7 @@ pub fn row<T: Element + Copy, const N: usize>(
     Ok(rows::<T, N>(name, &array, &[])?[0])
 }
 
-/// A vector as an array of the given shape, without a copy.
+/// Turns a vector into an array of the given shape, without a copy.
 pub fn shaped<'py, T: Element>(
     py: Python<'py>,
     values: Vec<T>,
@@ -90,7 +90,7 @@ pub fn shaped<'py, T: Element>(
     values.into_pyarray(py).reshape(shape)
 }
 
-/// Rows as an array of shape `leading` + `[N]`, without a copy.
+/// Turns rows into an array of shape `leading` + `[N]`, without a copy.
 pub fn shaped_rows<'py, T: Element, const N: usize>(
     py: Python<'py>,
     values: Vec<[T; N]>,

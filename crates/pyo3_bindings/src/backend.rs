@@ -1,4 +1,4 @@
-//! Which implementation of the stages runs.
+//! Backends: which implementation of the stages runs, and on what.
 
 use std::sync::{Arc, OnceLock};
 
@@ -22,7 +22,7 @@ pub enum Backend {
 }
 
 impl Backend {
-    /// From a name that `resolve_backend` returns.
+    /// The backend of a name that `resolve_backend` returns.
     pub fn named(name: &str) -> PyResult<Self> {
         match name {
             "cpu" => Ok(Self::Cpu),
@@ -35,12 +35,12 @@ impl Backend {
     }
 }
 
-/// The best adapter, opened once per process; the error is kept as its sentence.
+/// The best adapter, opened once per process; an error is kept as its message.
 pub fn gpu() -> PyResult<&'static Arc<Gpu>> {
     static GPU: OnceLock<Result<Arc<Gpu>, String>> = OnceLock::new();
     GPU.get_or_init(|| Gpu::new(true).map(Arc::new).map_err(|error| error.to_string()))
         .as_ref()
-        .map_err(|sentence| PyRuntimeError::new_err(sentence.clone()))
+        .map_err(|message| PyRuntimeError::new_err(message.clone()))
 }
 
 /// A device for a fit on a resolved backend.
@@ -54,9 +54,9 @@ pub fn fit_device(name: &str) -> PyResult<Box<dyn FitDevice>> {
     }
 }
 
-/// The name that `name` stands for: "auto" is a real GPU if one answers, else the CPU.
+/// Resolves a backend's name: "auto" is a real GPU if one answers, else the CPU.
 ///
-/// A software adapter runs only when "gpu" is asked for by name: the CPU backend is faster.
+/// A software adapter runs only if "gpu" is named: the CPU backend is faster.
 #[pyfunction]
 pub fn resolve_backend<'a>(py: Python<'_>, name: &'a str) -> PyResult<&'a str> {
     if name == "auto" {
@@ -69,7 +69,7 @@ pub fn resolve_backend<'a>(py: Python<'_>, name: &'a str) -> PyResult<&'a str> {
     Ok(name)
 }
 
-/// What a resolved backend runs on.
+/// Device and instruction set of a resolved backend.
 #[pyfunction]
 pub fn backend_info<'py>(py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyDict>> {
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

@@ -1,24 +1,26 @@
-//! What only the benchmark asks of the renderer: stages timed without the conversion of arrays, the
-//! machine's peak, and the pixels at which implementations may rightly differ.
+//! What only the benchmark needs: stages timed without the conversion of arrays, the machine's peak
+//! speed, and the pixels at which implementations may differ by rounding.
 
 use std::time::{Duration, Instant};
 
 use numpy::PyArrayDyn;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyTuple};
 use splat_render::cpu::{self, Cpu};
 use splat_render::reference::{self, Reference};
-use splat_render::{ImageGradients, ProjectOptions, Projected, Result, Stages};
+use splat_render::{Projected, Result, Stages};
 
-use crate::arrays::{array, elements, row, rows, shaped};
+use crate::arguments::Call;
+use crate::arrays::{row, shaped};
 use crate::backend::{Backend, gpu};
-use crate::camera::camera;
 use crate::error::to_python;
-use crate::stages::{ProjectArguments, Real, SplatArrays, projected_from, with_stages};
+use crate::stages::{
+    PARAMETERS, Parameters, PictureGradients, Real, SplatArrays, View, projected_from, with_stages,
+};
 
-/// 10^9 floating-point operations per second that the CPU's threads reach in a loop of multiply-adds
-/// of about `seconds`, with the instruction set that the backend "cpu" runs with.
+/// Speed of multiply-adds on all CPU threads, in 10^9 floating-point operations per second, measured
+/// for about `seconds` with the instruction set that the backend "cpu" uses.
 #[pyfunction]
 pub fn peak_multiply_add(py: Python<'_>, seconds: f64) -> PyResult<f64> {
     let duration = Duration::try_from_secs_f64(seconds)
@@ -26,7 +28,7 @@ pub fn peak_multiply_add(py: Python<'_>, seconds: f64) -> PyResult<f64> {
     Ok(py.detach(|| cpu::peak_multiply_add(duration)))
 }
 
-/// Pixels at which an f32 implementation may rightly differ from the reference: [H, W] of 0 and 1.
+/// Pixels at which rounding to f32 may change which splats count, [H, W] of 0 and 1.
 #[pyfunction]
 #[pyo3(signature = (projected, *, width, height, alpha_band))]
 pub fn band_pixels<'py>(
@@ -50,40 +52,41 @@ fn timed<R>(call: impl FnOnce() -> Result<R>) -> Result<(f64, R)> {
     Ok((started.elapsed().as_secs_f64() * 1e3, value))
 }
 
-/// The gradients of a picture, owned.
-fn gradients_from<T: Real>(
-    [v_color, v_alpha, v_depth]: [&Bound<'_, PyAny>; 3],
-    width: u32,
-    height: u32,
-) -> PyResult<ImageGradients<T>> {
-    let size = [height as isize, width as isize];
-    Ok(ImageGradients {
-        v_color: rows("v_color", &array("v_color", v_color)?, &size)?.to_vec(),
-        v_alpha: elements("v_alpha", &array("v_alpha", v_alpha)?, &size)?.to_vec(),
-        v_depth: elements("v_depth", &array("v_depth", v_depth)?, &size)?.to_vec(),
-    })
+/// What the timed backward stages start from, and how often stages run.
+struct Timing<'py> {
+    background: Bound<'py, PyAny>,
+    v_image: PictureGradients<'py>,
+    repeats: usize,
 }
 
-/// The two rasterize stages (bin included) on 2D splats that are converted once.
+impl<'py> Timing<'py> {
+    fn take(call: &Call<'py>) -> PyResult<Self> {
+        Ok(Self {
+            background: call.object("background")?,
+            v_image: PictureGradients::take(call)?,
+            repeats: call.take("repeats")?,
+        })
+    }
+}
+
+/// Times the two rasterize stages, bin included, on 2D splats that are converted once.
 #[pyfunction]
-#[pyo3(signature = (projected, *, width, height, background, v_color, v_alpha, v_depth, repeats,
-    backend))]
-#[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
+#[pyo3(
+    signature = (*positional, **named),
+    text_signature = "(projected, *, width, height, background, v_color, v_alpha, v_depth, repeats, backend)"
+)]
 pub fn time_rasterize<'py>(
     py: Python<'py>,
-    projected: &Bound<'py, PyDict>,
-    width: u32,
-    height: u32,
-    background: &Bound<'py, PyAny>,
-    v_color: &Bound<'py, PyAny>,
-    v_alpha: &Bound<'py, PyAny>,
-    v_depth: &Bound<'py, PyAny>,
-    repeats: usize,
-    backend: &str,
+    positional: &Bound<'py, PyTuple>,
+    named: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let v_image = [v_color, v_alpha, v_depth];
-    let size = (width, height);
-    with_stages!(backend, time_rasterize_with(py, projected, size, background, v_image, repeats))
+    let call = Call::bind("time_rasterize", &["projected"], positional, named)?;
+    let projected = call.dict("projected")?;
+    let size = (call.take("width")?, call.take("height")?);
+    let timing = Timing::take(&call)?;
+    let backend: String = call.take("backend")?;
+    call.finish()?;
+    with_stages!(&backend, time_rasterize_with(py, &projected, size, &timing))
 }
 
 fn time_rasterize_with<'py, T: Real>(
@@ -91,13 +94,12 @@ fn time_rasterize_with<'py, T: Real>(
     py: Python<'py>,
     projected: &Bound<'py, PyDict>,
     (width, height): (u32, u32),
-    background: &Bound<'py, PyAny>,
-    v_image: [&Bound<'py, PyAny>; 3],
-    repeats: usize,
+    timing: &Timing<'py>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let projected: Projected<T> = projected_from(projected, width, height)?;
-    let background = row::<T, 3>("background", background)?;
-    let v_image = gradients_from(v_image, width, height)?;
+    let background = row::<T, 3>("background", &timing.background)?;
+    let v_image = timing.v_image.read(width, height)?;
+    let repeats = timing.repeats;
     let times = py.detach(|| {
         let mut times = [const { Vec::new() }; 2];
         for _ in 0..repeats {
@@ -112,64 +114,38 @@ fn time_rasterize_with<'py, T: Real>(
     dict_of_times(py, ["rasterize", "rasterize_backward"], times.map_err(to_python)?)
 }
 
-/// All four stages, one after another, on splats that are converted once.
+/// Times all four stages, one after another, on splats that are converted once.
 #[pyfunction]
-#[pyo3(signature = (means, quats, scales, opacities, colors, *, sh_degree, raw_parameters, viewmat,
-    intrinsics, width, height, near, far, eps2d, antialiased, background, v_color, v_alpha, v_depth, repeats,
-    backend))]
-#[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
+#[pyo3(
+    signature = (*positional, **named),
+    text_signature = "(means, quats, scales, opacities, colors, *, sh_degree, raw_parameters, viewmat, intrinsics, width, height, near, far, eps2d, antialiased, background, v_color, v_alpha, v_depth, repeats, backend)"
+)]
 pub fn time_pipeline<'py>(
     py: Python<'py>,
-    means: &Bound<'py, PyAny>,
-    quats: &Bound<'py, PyAny>,
-    scales: &Bound<'py, PyAny>,
-    opacities: &Bound<'py, PyAny>,
-    colors: &Bound<'py, PyAny>,
-    sh_degree: Option<u32>,
-    raw_parameters: bool,
-    viewmat: &Bound<'py, PyAny>,
-    intrinsics: &Bound<'py, PyAny>,
-    width: u32,
-    height: u32,
-    near: f32,
-    far: f32,
-    eps2d: f32,
-    antialiased: bool,
-    background: &Bound<'py, PyAny>,
-    v_color: &Bound<'py, PyAny>,
-    v_alpha: &Bound<'py, PyAny>,
-    v_depth: &Bound<'py, PyAny>,
-    repeats: usize,
-    backend: &str,
+    positional: &Bound<'py, PyTuple>,
+    named: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let arguments = ProjectArguments {
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        sh_degree,
-        raw_parameters,
-        camera: camera(viewmat, intrinsics, width, height)?,
-        options: ProjectOptions { near, far, blur: eps2d, antialiased },
-    };
-    let v_image = [v_color, v_alpha, v_depth];
-    with_stages!(backend, time_pipeline_with(py, &arguments, background, v_image, repeats))
+    let call = Call::bind("time_pipeline", &PARAMETERS, positional, named)?;
+    let (parameters, view) = (Parameters::take(&call)?, View::take(&call)?);
+    let timing = Timing::take(&call)?;
+    let backend: String = call.take("backend")?;
+    call.finish()?;
+    with_stages!(&backend, time_pipeline_with(py, &parameters, &view, &timing))
 }
 
 fn time_pipeline_with<'py, T: Real>(
     stages: &(impl Stages<T> + Sync),
     py: Python<'py>,
-    arguments: &ProjectArguments<'_, 'py>,
-    background: &Bound<'py, PyAny>,
-    v_image: [&Bound<'py, PyAny>; 3],
-    repeats: usize,
+    parameters: &Parameters<'py>,
+    view: &View,
+    timing: &Timing<'py>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let arrays = SplatArrays::<T>::borrow(arguments)?;
-    let params = arrays.params(arguments.sh_degree, arguments.raw_parameters)?;
-    let (camera, options) = (&arguments.camera, &arguments.options);
-    let background = row::<T, 3>("background", background)?;
-    let v_image = gradients_from(v_image, camera.width, camera.height)?;
+    let arrays = SplatArrays::<T>::borrow(parameters)?;
+    let params = arrays.params(view)?;
+    let (camera, options) = (&view.camera, &view.options);
+    let background = row::<T, 3>("background", &timing.background)?;
+    let v_image = timing.v_image.read(camera.width, camera.height)?;
+    let repeats = timing.repeats;
     let times = py.detach(|| {
         let mut times = [const { Vec::new() }; 4];
         for _ in 0..repeats {

@@ -6,10 +6,10 @@ use splat_render::Error;
 
 /// ValueError for an argument, RuntimeError for a device, OSError for a file.
 pub fn to_python(error: Error) -> PyErr {
-    let sentence = error.to_string();
+    let message = error.to_string();
     match error {
-        Error::Argument { .. } => PyValueError::new_err(sentence),
-        Error::Device(_) => PyRuntimeError::new_err(sentence),
-        Error::File { .. } => PyOSError::new_err(sentence),
+        Error::Argument { .. } => PyValueError::new_err(message),
+        Error::Device(_) => PyRuntimeError::new_err(message),
+        Error::File { .. } => PyOSError::new_err(message),
     }
 }

@@ -1,13 +1,13 @@
 //! Renders as OpenEXR files in 32-bit float.
 
-use exr::prelude::{
-    AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, SmallVec,
-    WritableImage,
-};
-use pyo3::exceptions::{PyOSError, PyValueError};
+use std::path::Path;
+
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use splat_render::io::{self, ExrPicture};
 
 use crate::arrays::{array, elements, rows};
+use crate::error::to_python;
 
 /// Writes color [H, W, 3], alpha [H, W] and depth [H, W] as channels R, G, B, A, Z.
 #[pyfunction]
@@ -31,23 +31,6 @@ pub fn write_exr(
     let depth = array::<f32>("depth", depth)?;
     let depth = elements("depth", &depth, &size)?;
     let alpha = elements("alpha", &alpha, &size)?;
-    let channel = |name: &str, samples: Vec<f32>| AnyChannel::new(name, FlatSamples::F32(samples));
-    let plane = |i: usize| color.iter().map(|rgb| rgb[i]).collect::<Vec<f32>>();
-    let channels: SmallVec<[_; 4]> = [
-        channel("R", plane(0)),
-        channel("G", plane(1)),
-        channel("B", plane(2)),
-        channel("A", alpha.to_vec()),
-        channel("Z", depth.to_vec()),
-    ]
-    .into_iter()
-    .collect();
-    let layer = Layer::new(
-        (width, height),
-        LayerAttributes::default(),
-        Encoding::SMALL_LOSSLESS,
-        AnyChannels::sort(channels),
-    );
-    py.detach(|| Image::from_layer(layer).write().to_file(path))
-        .map_err(|error| PyOSError::new_err(error.to_string()))
+    let picture = ExrPicture { width, height, color, alpha, depth };
+    py.detach(|| io::write_exr(Path::new(path), &picture)).map_err(to_python)
 }

@@ -1,15 +1,21 @@
-//! The Python module `igsr._core`: numpy arrays in, numpy arrays out, nothing else.
+//! The Python module `igsr._core`: numpy arrays in, numpy arrays out.
 //!
-//! Arrays are C-contiguous and float32, for the backend "reference" float64; what is wrong with an
-//! argument is a ValueError that begins with its name. `_core.pyi` describes every function.
+//! Arrays are C-contiguous. They are float32, and float64 for the backend "reference". A wrong argument
+//! raises a ValueError whose message begins with the argument's name; a missing or unknown one raises a
+//! TypeError. `_core.pyi` describes every function.
 
+mod arguments;
 mod arrays;
 mod backend;
 mod benchmark;
 mod camera;
 mod error;
 mod exr_files;
+mod fit_settings;
+mod fit_state;
 mod fitter;
+mod photos;
+mod splat_arrays;
 mod splat_files;
 mod stages;
 

@@ -9,9 +9,9 @@ use splat_render::io::SplatFile;
 
 use crate::arrays::{row, shaped};
 use crate::error::to_python;
-use crate::fitter::{set_splat_arrays, splat_arrays_from};
+use crate::splat_arrays::{set_splat_arrays, splat_arrays_from};
 
-/// Reads a splat file of any format. `notes` say what was passed over.
+/// Reads a splat file of any format. `notes` say what was ignored.
 #[pyfunction]
 pub fn read_splats<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, PyDict>> {
     let loaded = py.detach(|| splat_render::io::read_splats(&path)).map_err(to_python)?;
@@ -24,7 +24,7 @@ pub fn read_splats<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, P
     Ok(dict)
 }
 
-/// Writes a splat file in the format of its ending, whole or not at all. Returns a sentence for
+/// Writes a splat file in the format of its ending, whole or not at all. Returns a message for
 /// each thing that the format cannot hold.
 #[pyfunction]
 pub fn write_splats(

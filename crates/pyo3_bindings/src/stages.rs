@@ -1,9 +1,9 @@
-//! The four differentiable stages over numpy arrays.
+//! The four differentiable stages, project to project_backward, over numpy arrays.
 
 use numpy::{Element, PyReadonlyArrayDyn};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyTuple};
 use splat_render::cpu::Cpu;
 use splat_render::reference::Reference;
 use splat_render::{
@@ -11,17 +11,18 @@ use splat_render::{
     SplatParams, Stages,
 };
 
+use crate::arguments::Call;
 use crate::arrays::{array, elements, entry, row, rows, shaped, shaped_rows};
 use crate::backend::{Backend, gpu};
 use crate::camera::camera;
 use crate::error::to_python;
 
-/// What numpy and the stages ask of a number.
+/// A number type that numpy and the stages share: f32 or f64.
 pub trait Real: Element + Copy + Default + Send + Sync {}
 impl Real for f32 {}
 impl Real for f64 {}
 
-/// Calls a function generic over the number type with the stages of a backend.
+/// Calls a function that is generic over the number type, with the stages of a backend.
 macro_rules! with_stages {
     ($backend:expr, $function:ident($($argument:expr),* $(,)?)) => {
         match Backend::named($backend)? {
@@ -33,17 +34,48 @@ macro_rules! with_stages {
 }
 pub(crate) use with_stages;
 
-/// Arguments that `project` and `project_backward` share.
-pub struct ProjectArguments<'a, 'py> {
-    pub means: &'a Bound<'py, PyAny>,
-    pub quats: &'a Bound<'py, PyAny>,
-    pub scales: &'a Bound<'py, PyAny>,
-    pub opacities: &'a Bound<'py, PyAny>,
-    pub colors: &'a Bound<'py, PyAny>,
+/// Names of the parameters, which may be given by position.
+pub const PARAMETERS: [&str; 5] = ["means", "quats", "scales", "opacities", "colors"];
+
+/// Arguments of `project` and `project_backward` besides the parameters.
+pub struct View {
+    /// None: colours are given, not coefficients.
     pub sh_degree: Option<u32>,
+    /// Whether scales are logarithms and opacities logits.
     pub raw_parameters: bool,
     pub camera: splat_render::Camera,
     pub options: ProjectOptions,
+}
+
+impl View {
+    pub fn take(call: &Call<'_>) -> PyResult<Self> {
+        Ok(Self {
+            sh_degree: call.take("sh_degree")?,
+            raw_parameters: call.take("raw_parameters")?,
+            camera: camera(
+                &call.object("viewmat")?,
+                &call.object("intrinsics")?,
+                call.take("width")?,
+                call.take("height")?,
+            )?,
+            options: ProjectOptions {
+                near: call.take("near")?,
+                far: call.take("far")?,
+                blur: call.take("eps2d")?,
+                antialiased: call.take("antialiased")?,
+            },
+        })
+    }
+}
+
+/// Splat parameters as Python gives them. The backend decides the arrays' type.
+pub struct Parameters<'py>([Bound<'py, PyAny>; 5]);
+
+impl<'py> Parameters<'py> {
+    pub fn take(call: &Call<'py>) -> PyResult<Self> {
+        let [means, quats, scales, opacities, colors] = PARAMETERS.map(|name| call.object(name));
+        Ok(Self([means?, quats?, scales?, opacities?, colors?]))
+    }
 }
 
 /// Splat parameters, borrowed from numpy.
@@ -56,20 +88,21 @@ pub struct SplatArrays<'py, T: Element> {
 }
 
 impl<'py, T: Real> SplatArrays<'py, T> {
-    pub fn borrow(arguments: &ProjectArguments<'_, 'py>) -> PyResult<Self> {
+    pub fn borrow(Parameters(objects): &Parameters<'py>) -> PyResult<Self> {
+        let [means, quats, scales, opacities, colors] = objects;
         Ok(Self {
-            means: array("means", arguments.means)?,
-            quats: array("quats", arguments.quats)?,
-            scales: array("scales", arguments.scales)?,
-            opacities: array("opacities", arguments.opacities)?,
-            colors: array("colors", arguments.colors)?,
+            means: array("means", means)?,
+            quats: array("quats", quats)?,
+            scales: array("scales", scales)?,
+            opacities: array("opacities", opacities)?,
+            colors: array("colors", colors)?,
         })
     }
 
-    pub fn params(&self, sh_degree: Option<u32>, raw: bool) -> PyResult<SplatParams<'_, T>> {
+    pub fn params(&self, view: &View) -> PyResult<SplatParams<'_, T>> {
         let means = rows("means", &self.means, &[-1])?;
         let n = means.len() as isize;
-        let colors = match sh_degree {
+        let colors = match view.sh_degree {
             None => Colors::Direct(rows("colors", &self.colors, &[n])?),
             Some(degree) => {
                 let coeffs = rows("colors", &self.colors, &[n, -1])?;
@@ -83,12 +116,12 @@ impl<'py, T: Real> SplatArrays<'py, T> {
             scales: rows("scales", &self.scales, &[n])?,
             opacities: elements("opacities", &self.opacities, &[n])?,
             colors,
-            raw,
+            raw: view.raw_parameters,
         })
     }
 }
 
-/// 2D splats, copied from the dict that `project` returns.
+/// Copies 2D splats from the dict that `project` returns.
 pub fn projected_from<T: Real>(
     dict: &Bound<'_, PyDict>,
     width: u32,
@@ -117,55 +150,34 @@ pub fn projected_from<T: Real>(
     })
 }
 
-/// Splats and one camera to 2D splats.
+/// Projects splats to 2D splats, as one camera sees them.
 #[pyfunction]
-#[pyo3(signature = (means, quats, scales, opacities, colors, *, sh_degree, raw_parameters, viewmat,
-    intrinsics, width, height, near, far, eps2d, antialiased, backend))]
-#[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
+#[pyo3(
+    signature = (*positional, **named),
+    text_signature = "(means, quats, scales, opacities, colors, *, sh_degree, raw_parameters, viewmat, intrinsics, width, height, near, far, eps2d, antialiased, backend)"
+)]
 pub fn project<'py>(
     py: Python<'py>,
-    means: &Bound<'py, PyAny>,
-    quats: &Bound<'py, PyAny>,
-    scales: &Bound<'py, PyAny>,
-    opacities: &Bound<'py, PyAny>,
-    colors: &Bound<'py, PyAny>,
-    sh_degree: Option<u32>,
-    raw_parameters: bool,
-    viewmat: &Bound<'py, PyAny>,
-    intrinsics: &Bound<'py, PyAny>,
-    width: u32,
-    height: u32,
-    near: f32,
-    far: f32,
-    eps2d: f32,
-    antialiased: bool,
-    backend: &str,
+    positional: &Bound<'py, PyTuple>,
+    named: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let camera = camera(viewmat, intrinsics, width, height)?;
-    let options = ProjectOptions { near, far, blur: eps2d, antialiased };
-    let arguments = ProjectArguments {
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        sh_degree,
-        raw_parameters,
-        camera,
-        options,
-    };
-    with_stages!(backend, project_with(py, &arguments))
+    let call = Call::bind("project", &PARAMETERS, positional, named)?;
+    let (parameters, view) = (Parameters::take(&call)?, View::take(&call)?);
+    let backend: String = call.take("backend")?;
+    call.finish()?;
+    with_stages!(&backend, project_with(py, &parameters, &view))
 }
 
 fn project_with<'py, T: Real>(
     stages: &(impl Stages<T> + Sync),
     py: Python<'py>,
-    arguments: &ProjectArguments<'_, 'py>,
+    parameters: &Parameters<'py>,
+    view: &View,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let arrays = SplatArrays::<T>::borrow(arguments)?;
-    let params = arrays.params(arguments.sh_degree, arguments.raw_parameters)?;
-    let (camera, options) = (&arguments.camera, &arguments.options);
-    let projected = py.detach(|| stages.project(&params, camera, options)).map_err(to_python)?;
+    let arrays = SplatArrays::<T>::borrow(parameters)?;
+    let params = arrays.params(view)?;
+    let projected =
+        py.detach(|| stages.project(&params, &view.camera, &view.options)).map_err(to_python)?;
     let n = [projected.len()];
     let dict = PyDict::new(py);
     dict.set_item("means2d", shaped_rows(py, projected.means2d, &n)?)?;
@@ -177,7 +189,7 @@ fn project_with<'py, T: Real>(
     Ok(dict)
 }
 
-/// 2D splats to a picture over a background.
+/// Draws 2D splats over a background.
 #[pyfunction]
 #[pyo3(signature = (projected, *, width, height, background, backend))]
 pub fn rasterize<'py>(
@@ -211,63 +223,94 @@ fn rasterize_with<'py, T: Real>(
     Ok(dict)
 }
 
-/// Gradients of a picture to gradients of its 2D splats and background.
-#[pyfunction]
-#[pyo3(signature = (projected, image, *, v_color, v_alpha, v_depth, background, absolute,
-    backend))]
-#[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
-pub fn rasterize_backward<'py>(
-    py: Python<'py>,
-    projected: &Bound<'py, PyDict>,
-    image: &Bound<'py, PyDict>,
-    v_color: &Bound<'py, PyAny>,
-    v_alpha: &Bound<'py, PyAny>,
-    v_depth: &Bound<'py, PyAny>,
-    background: &Bound<'py, PyAny>,
-    absolute: bool,
-    backend: &str,
-) -> PyResult<Bound<'py, PyDict>> {
-    let v_image = [v_color, v_alpha, v_depth];
-    with_stages!(
-        backend,
-        rasterize_backward_with(py, projected, image, v_image, background, absolute)
-    )
+/// Gradients of a picture as Python gives them: `v_color`, `v_alpha`, `v_depth`.
+pub struct PictureGradients<'py>([Bound<'py, PyAny>; 3]);
+
+impl<'py> PictureGradients<'py> {
+    pub fn take(call: &Call<'py>) -> PyResult<Self> {
+        Ok(Self([call.object("v_color")?, call.object("v_alpha")?, call.object("v_depth")?]))
+    }
+
+    /// Copies them; they must be of a picture of this size.
+    pub fn read<T: Real>(&self, width: u32, height: u32) -> PyResult<ImageGradients<T>> {
+        let [v_color, v_alpha, v_depth] = &self.0;
+        let size = [height as isize, width as isize];
+        Ok(ImageGradients {
+            v_color: rows("v_color", &array("v_color", v_color)?, &size)?.to_vec(),
+            v_alpha: elements("v_alpha", &array("v_alpha", v_alpha)?, &size)?.to_vec(),
+            v_depth: elements("v_depth", &array("v_depth", v_depth)?, &size)?.to_vec(),
+        })
+    }
 }
 
-fn rasterize_backward_with<'py, T: Real>(
-    stages: &(impl Stages<T> + Sync),
-    py: Python<'py>,
-    projected: &Bound<'py, PyDict>,
-    image: &Bound<'py, PyDict>,
-    [v_color, v_alpha, v_depth]: [&Bound<'py, PyAny>; 3],
-    background: &Bound<'py, PyAny>,
-    absolute: bool,
-) -> PyResult<Bound<'py, PyDict>> {
+/// Copies a rendered picture from the dict that `rasterize` returns.
+fn image_from<T: Real>(image: &Bound<'_, PyDict>) -> PyResult<Image<T>> {
     let alpha = entry::<T>(image, "alpha")?;
-    elements("alpha", &alpha, &[-1, -1])?;
     let &[height, width] = numpy::PyUntypedArrayMethods::shape(&*alpha) else {
         return Err(PyValueError::new_err("alpha: must have shape [H, W]"));
+    };
+    let side = |side: usize| {
+        u32::try_from(side).map_err(|_| PyValueError::new_err("alpha: a side is too long"))
     };
     let size = [height as isize, width as isize];
     let plane = |name: &str| -> PyResult<Vec<T>> {
         Ok(elements(name, &entry(image, name)?, &size)?.to_vec())
     };
-    let (width, height) = (width as u32, height as u32);
-    let projected = projected_from::<T>(projected, width, height)?;
-    let background = row::<T, 3>("background", background)?;
-    let image = Image {
-        width,
-        height,
+    Ok(Image {
+        width: side(width)?,
+        height: side(height)?,
         color: rows("color", &entry(image, "color")?, &size)?.to_vec(),
         alpha: plane("alpha")?,
         depth: plane("depth")?,
         transmittance: plane("transmittance")?,
+    })
+}
+
+/// Arguments of `rasterize_backward`.
+struct RasterizeBackward<'py> {
+    projected: Bound<'py, PyDict>,
+    image: Bound<'py, PyDict>,
+    v_image: PictureGradients<'py>,
+    background: Bound<'py, PyAny>,
+    /// Whether to add up absolute gradients of the means, too.
+    absolute: bool,
+}
+
+/// Turns gradients of a picture into gradients of its 2D splats and background.
+#[pyfunction]
+#[pyo3(
+    signature = (*positional, **named),
+    text_signature = "(projected, image, *, v_color, v_alpha, v_depth, background, absolute, backend)"
+)]
+pub fn rasterize_backward<'py>(
+    py: Python<'py>,
+    positional: &Bound<'py, PyTuple>,
+    named: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let call = Call::bind("rasterize_backward", &["projected", "image"], positional, named)?;
+    let arguments = RasterizeBackward {
+        projected: call.dict("projected")?,
+        image: call.dict("image")?,
+        v_image: PictureGradients::take(&call)?,
+        background: call.object("background")?,
+        absolute: call.take("absolute")?,
     };
-    let v_image = ImageGradients {
-        v_color: rows("v_color", &array("v_color", v_color)?, &size)?.to_vec(),
-        v_alpha: elements("v_alpha", &array("v_alpha", v_alpha)?, &size)?.to_vec(),
-        v_depth: elements("v_depth", &array("v_depth", v_depth)?, &size)?.to_vec(),
-    };
+    let backend: String = call.take("backend")?;
+    call.finish()?;
+    with_stages!(&backend, rasterize_backward_with(py, &arguments))
+}
+
+fn rasterize_backward_with<'py, T: Real>(
+    stages: &(impl Stages<T> + Sync),
+    py: Python<'py>,
+    arguments: &RasterizeBackward<'py>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let image = image_from::<T>(&arguments.image)?;
+    let (width, height) = (image.width, image.height);
+    let projected = projected_from::<T>(&arguments.projected, width, height)?;
+    let background = row::<T, 3>("background", &arguments.background)?;
+    let v_image = arguments.v_image.read(width, height)?;
+    let absolute = arguments.absolute;
     let v: ProjectedGradients<T> = py
         .detach(|| stages.rasterize_backward(&projected, background, &image, &v_image, absolute))
         .map_err(to_python)?;
@@ -285,58 +328,37 @@ fn rasterize_backward_with<'py, T: Real>(
     Ok(dict)
 }
 
-/// Gradients of 2D splats to gradients of the splats and the camera.
+/// Turns gradients of 2D splats into gradients of the splats and the camera.
 #[pyfunction]
-#[pyo3(signature = (means, quats, scales, opacities, colors, projected, v_projected, *, sh_degree,
-    raw_parameters, viewmat, intrinsics, width, height, near, far, eps2d, antialiased, backend))]
-#[expect(clippy::too_many_arguments, reason = "one per array: the Python call names them")]
+#[pyo3(
+    signature = (*positional, **named),
+    text_signature = "(means, quats, scales, opacities, colors, projected, v_projected, *, sh_degree, raw_parameters, viewmat, intrinsics, width, height, near, far, eps2d, antialiased, backend)"
+)]
 pub fn project_backward<'py>(
     py: Python<'py>,
-    means: &Bound<'py, PyAny>,
-    quats: &Bound<'py, PyAny>,
-    scales: &Bound<'py, PyAny>,
-    opacities: &Bound<'py, PyAny>,
-    colors: &Bound<'py, PyAny>,
-    projected: &Bound<'py, PyDict>,
-    v_projected: &Bound<'py, PyDict>,
-    sh_degree: Option<u32>,
-    raw_parameters: bool,
-    viewmat: &Bound<'py, PyAny>,
-    intrinsics: &Bound<'py, PyAny>,
-    width: u32,
-    height: u32,
-    near: f32,
-    far: f32,
-    eps2d: f32,
-    antialiased: bool,
-    backend: &str,
+    positional: &Bound<'py, PyTuple>,
+    named: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let camera = camera(viewmat, intrinsics, width, height)?;
-    let options = ProjectOptions { near, far, blur: eps2d, antialiased };
-    let arguments = ProjectArguments {
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        sh_degree,
-        raw_parameters,
-        camera,
-        options,
-    };
-    with_stages!(backend, project_backward_with(py, &arguments, projected, v_projected))
+    let names = [&PARAMETERS[..], &["projected", "v_projected"]].concat();
+    let call = Call::bind("project_backward", &names, positional, named)?;
+    let (parameters, view) = (Parameters::take(&call)?, View::take(&call)?);
+    let (projected, v_projected) = (call.dict("projected")?, call.dict("v_projected")?);
+    let backend: String = call.take("backend")?;
+    call.finish()?;
+    with_stages!(&backend, project_backward_with(py, &parameters, &view, &projected, &v_projected))
 }
 
 fn project_backward_with<'py, T: Real>(
     stages: &(impl Stages<T> + Sync),
     py: Python<'py>,
-    arguments: &ProjectArguments<'_, 'py>,
+    parameters: &Parameters<'py>,
+    view: &View,
     projected: &Bound<'py, PyDict>,
     v_projected: &Bound<'py, PyDict>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let arrays = SplatArrays::<T>::borrow(arguments)?;
-    let params = arrays.params(arguments.sh_degree, arguments.raw_parameters)?;
-    let (camera, options) = (&arguments.camera, &arguments.options);
+    let arrays = SplatArrays::<T>::borrow(parameters)?;
+    let params = arrays.params(view)?;
+    let (camera, options) = (&view.camera, &view.options);
     let projected = projected_from::<T>(projected, camera.width, camera.height)?;
     let n = params.len() as isize;
     let v = v_projected;

@@ -41,3 +41,24 @@ pub const SH_DEGREE_MAX: u32 = 4;
 
 /// Coefficients per channel at [`SH_DEGREE_MAX`].
 pub const SH_COEFFS_MAX: usize = 25;
+
+/// Adam's decay of the first and second moments and its epsilon, for the splats' parameters (3DGS).
+pub const ADAM: (f32, f32, f32) = (0.9, 0.999, 1e-15);
+
+/// Weights of the SSIM window: 11 taps of a Gaussian of sigma 1.5, summing to 1, as in 3DGS.
+pub const SSIM_WINDOW: [f32; 11] = [
+    0.001_028_380_1,
+    0.007_598_758,
+    0.036_000_773,
+    0.109_360_69,
+    0.213_005_53,
+    0.266_011_72,
+    0.213_005_53,
+    0.109_360_69,
+    0.036_000_773,
+    0.007_598_758,
+    0.001_028_380_1,
+];
+
+/// SSIM's constants (C1, C2) for pictures in 0..1.
+pub const SSIM_C: (f32, f32) = (0.01 * 0.01, 0.03 * 0.03);

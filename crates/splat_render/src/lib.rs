@@ -10,11 +10,14 @@ pub mod constants;
 pub mod cpu;
 pub mod error;
 pub mod fit;
+pub mod fit_device;
 pub mod gpu;
 pub mod io;
 pub mod reference;
 pub mod sh;
+pub mod splats;
 pub mod stages;
+pub mod target;
 
 pub use camera::Camera;
 pub use error::{Error, Result};

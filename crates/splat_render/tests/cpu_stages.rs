@@ -144,3 +144,33 @@ fn culled_splats_change_nothing() {
 fn a_far_away_scene_renders_as_one_at_the_origin() {
     common::hard_cases::a_far_away_scene_renders_as_one_at_the_origin(&Cpu);
 }
+
+#[test]
+fn loss_matches_the_reference() {
+    common::optimisation::loss_matches_the_reference(&Cpu);
+}
+
+#[test]
+fn adam_matches_the_reference() {
+    common::optimisation::adam_matches_the_reference(&Cpu);
+}
+
+#[test]
+fn frozen_splats_keep_their_moments() {
+    common::optimisation::frozen_splats_keep_their_moments(&Cpu);
+}
+
+#[test]
+fn depths_that_are_not_positive_are_not_drawn() {
+    common::agreement::depths_that_are_not_positive_are_not_drawn(&Cpu);
+}
+
+#[test]
+fn a_near_plane_of_zero_draws_what_is_before_the_camera() {
+    common::agreement::a_near_plane_of_zero_draws_what_is_before_the_camera(&Cpu);
+}
+
+#[test]
+fn senseless_options_are_refused() {
+    common::agreement::senseless_options_are_refused(&Cpu);
+}

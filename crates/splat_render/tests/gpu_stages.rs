@@ -308,3 +308,33 @@ fn the_order_of_splats_does_not_matter() {
 fn drawn_pictures_match_the_reference() {
     common::properties::drawn_pictures_match_the_reference(gpu(), BOUNDS, 60);
 }
+
+#[test]
+fn loss_matches_the_reference() {
+    common::optimisation::loss_matches_the_reference(gpu());
+}
+
+#[test]
+fn adam_matches_the_reference() {
+    common::optimisation::adam_matches_the_reference(gpu());
+}
+
+#[test]
+fn frozen_splats_keep_their_moments() {
+    common::optimisation::frozen_splats_keep_their_moments(gpu());
+}
+
+#[test]
+fn depths_that_are_not_positive_are_not_drawn() {
+    common::agreement::depths_that_are_not_positive_are_not_drawn(gpu());
+}
+
+#[test]
+fn a_near_plane_of_zero_draws_what_is_before_the_camera() {
+    common::agreement::a_near_plane_of_zero_draws_what_is_before_the_camera(gpu());
+}
+
+#[test]
+fn senseless_options_are_refused() {
+    common::agreement::senseless_options_are_refused(gpu());
+}

@@ -1,12 +1,15 @@
-//! The reference's gradients against central differences, for every kind of parameter and the
-//! camera, on random small scenes. Samples within a step of a kink are redrawn and counted.
+//! The reference's gradients against central differences, for every kind of parameter, the camera
+//! and the loss, on random small scenes. Samples within a step of a kink are redrawn and counted.
 
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
+use splat_render::fit::{Rates, Target};
 use splat_render::reference::{Reference, decisions};
+use splat_render::splats::SplatArrays;
+use splat_render::stages::{AdamState, AdamStep};
 use splat_render::{
-    Camera, Colors, ImageGradients, ProjectOptions, SplatGradients, SplatParams, Stages,
+    Camera, Colors, Image, ImageGradients, ProjectOptions, SplatGradients, SplatParams, Stages,
 };
 
 const SCENES: u64 = 240;
@@ -241,4 +244,128 @@ fn gradients_match_central_differences() {
         println!("{kind:>14}: worst {error:.1e} of the largest of its kind");
     }
     assert!(samples > SCENES as usize * KINDS.len() * 2, "too few samples away from kinks");
+}
+
+/// A photo with alpha and weights, a picture near it, and the loss of that picture.
+fn photo_and_picture(seed: u64) -> (Target, Image<f64>) {
+    let mut rng = Pcg64Mcg::seed_from_u64(seed);
+    let (width, height) = (rng.random_range(1..18u32), rng.random_range(1..18u32));
+    let pixels = (width * height) as usize;
+    let channels = if seed.is_multiple_of(2) { 4 } else { 3 };
+    let target = Target {
+        width,
+        height,
+        channels,
+        pixels: (0..pixels * channels as usize).map(|_| rng.random()).collect(),
+        weights: (seed % 3 == 0).then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect()),
+        background: None,
+        turns: 1,
+        until: None,
+    };
+    let image = Image {
+        width,
+        height,
+        color: (0..pixels).map(|_| std::array::from_fn(|_| rng.random())).collect(),
+        alpha: vec![1.0; pixels],
+        depth: vec![0.0; pixels],
+        transmittance: vec![0.0; pixels],
+    };
+    (target, image)
+}
+
+#[test]
+fn the_loss_s_gradient_matches_central_differences() {
+    let background = [0.2, 0.7, 0.4];
+    let (mut worst, mut samples) = (0.0f64, 0);
+    for seed in 0..60 {
+        let (target, mut image) = photo_and_picture(seed);
+        let ssim_weight = [0.2, 0.0, 1.0][(seed % 3) as usize];
+        let loss =
+            |image: &Image<f64>| Reference.loss(image, &target, background, ssim_weight).unwrap();
+        let analytic = loss(&image).v_color;
+        let largest = analytic.as_flattened().iter().fold(0.0f64, |a, v| a.max(v.abs()));
+        let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0x5eed);
+        for _ in 0..12 {
+            let (pixel, c) = (rng.random_range(0..image.color.len()), rng.random_range(0..3));
+            let value = image.color[pixel][c];
+            let mut at = |value: f64| {
+                image.color[pixel][c] = value;
+                loss(&image).value
+            };
+            let (high, low, _) = (at(value + 1e-6), at(value - 1e-6), at(value));
+            let error = ((high - low) / 2e-6 - analytic[pixel][c]).abs() / largest;
+            // Within a step of the photo's colour the distance has its kink; bytes are that far
+            // from random numbers.
+            assert!(error <= 1e-6, "seed {seed}, pixel {pixel}, channel {c}: {error:.1e}");
+            worst = worst.max(error);
+            samples += 1;
+        }
+    }
+    println!("{samples} samples: worst {worst:.1e} of the largest");
+}
+
+/// With first moments that keep nothing but the gradient, a step goes along it: what adam takes for
+/// the regularisers' gradients is read off and held against differences of the regularisers.
+#[test]
+fn the_regularisers_pull_along_their_gradients() {
+    let mut rng = Pcg64Mcg::seed_from_u64(5);
+    let n = 9;
+    let mut splats = SplatArrays {
+        means: vec![[0.0; 3]; n],
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        scales: (0..n).map(|_| std::array::from_fn(|_| rng.random_range(-3.0..1.0))).collect(),
+        opacities: (0..n).map(|_| rng.random_range(-4.0..4.0)).collect(),
+        sh: vec![[0.0; 3]; n],
+        sh_degree: 0,
+    };
+    let zeros = SplatArrays {
+        means: vec![[0.0; 3]; n],
+        quats: vec![[0.0; 4]; n],
+        scales: vec![[0.0; 3]; n],
+        opacities: vec![0.0; n],
+        sh: vec![[0.0; 3]; n],
+        sh_degree: 0,
+    };
+    let mut state =
+        AdamState { splats: splats.clone(), first: zeros.clone(), second: zeros.clone() };
+    let gradients = SplatGradients {
+        v_means: zeros.means,
+        v_quats: zeros.quats,
+        v_scales: zeros.scales,
+        v_opacities: zeros.opacities,
+        v_colors: zeros.sh,
+        ..SplatGradients::default()
+    };
+    let step = AdamStep {
+        number: 1,
+        rates: Rates { means: 1e-3, ..Rates::ZERO },
+        sh_degree: 0,
+        opacity_regularizer: 0.25,
+        scale_regularizer: 0.5,
+        noise: 0.0,
+        noise_seed: 0,
+    };
+    Reference.adam(&mut state, &gradients, &step).unwrap();
+    // 0.25 times the mean opacity and 0.5 times the mean scale.
+    let regularisers = |splats: &SplatArrays<f64>| {
+        let opacities: f64 = splats.opacities.iter().map(|o| 1.0 / (1.0 + (-o).exp())).sum();
+        let scales: f64 = splats.scales.as_flattened().iter().map(|s| s.exp()).sum();
+        0.25 * opacities / n as f64 + 0.5 * scales / (3 * n) as f64
+    };
+    let part = 1.0 - f64::from(splat_render::constants::ADAM.0);
+    for i in 0..n {
+        for k in 0..4 {
+            let at = |splats: &mut SplatArrays<f64>, by: f64| {
+                let value = if k < 3 { &mut splats.scales[i][k] } else { &mut splats.opacities[i] };
+                *value += by;
+                let sum = regularisers(splats);
+                let value = if k < 3 { &mut splats.scales[i][k] } else { &mut splats.opacities[i] };
+                *value -= by;
+                sum
+            };
+            let numeric = (at(&mut splats, 1e-5) - at(&mut splats, -1e-5)) / 2e-5;
+            let taken = if k < 3 { state.first.scales[i][k] } else { state.first.opacities[i] };
+            assert!((taken / part - numeric).abs() < 1e-9, "{} for {numeric}", taken / part);
+        }
+    }
 }

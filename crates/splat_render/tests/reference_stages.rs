@@ -3,7 +3,7 @@
 mod common;
 
 use common::narrowed::Narrowed;
-use common::{hard_cases, properties};
+use common::{agreement, hard_cases, optimisation, properties};
 
 #[test]
 fn no_splats_give_the_background() {
@@ -43,4 +43,24 @@ fn culled_splats_change_nothing() {
 #[test]
 fn a_far_away_scene_renders_as_one_at_the_origin() {
     hard_cases::a_far_away_scene_renders_as_one_at_the_origin(&Narrowed);
+}
+
+#[test]
+fn frozen_splats_keep_their_moments() {
+    optimisation::frozen_splats_keep_their_moments(&Narrowed);
+}
+
+#[test]
+fn depths_that_are_not_positive_are_not_drawn() {
+    agreement::depths_that_are_not_positive_are_not_drawn(&Narrowed);
+}
+
+#[test]
+fn a_near_plane_of_zero_draws_what_is_before_the_camera() {
+    agreement::a_near_plane_of_zero_draws_what_is_before_the_camera(&Narrowed);
+}
+
+#[test]
+fn senseless_options_are_refused() {
+    agreement::senseless_options_are_refused(&Narrowed);
 }

@@ -10,38 +10,38 @@ use crate::display::Drawing;
 
 /// What `--help` prints.
 pub const HELP: &str = "\
-Look at Gaussian splats.
+Show Gaussian splats in a window, or draw pictures of them.
 
 splat-view [OPTIONS] SCENE [SCENE...]
 
 SCENE is a splat file (.ply, .compressed.ply, .splat, .ksplat, .spz, .sog, .glb, .gltf) or the folder
-of an igsr fit or igsr refine; a folder is watched, and what changes in it is shown. Two scenes are
-compared.
+of an igsr fit or igsr refine. A folder is watched: new and changed models appear. Two scenes are
+compared side by side.
 
-Without a window:
-  --screenshot FILE    draw one picture: .png, or .exr with depth
-  --frames DIR         draw --orbit N pictures of a full turn to DIR/0000.png and on
+Pictures without a window:
+  --screenshot FILE    draw one picture: .png, or .exr with alpha and depth
+  --frames DIR         draw --orbit N pictures of a full turn: DIR/0000.png, ...
   --time N             draw N frames as the window does, and print the time of each stage
-  --size WxH           of these pictures and the window; default 1280x720, or the camera's own
-  --backend NAME       auto: a real GPU if one answers, else cpu; gpu: also a software one; cpu
+  --size WxH           size of the pictures or the window; default 1280x720, or the camera's size
+  --backend NAME       auto: a real GPU if there is one, else cpu; gpu: also a software GPU; cpu
 
 In the window and for --time:
-  --draw NAME          rasterize: as --screenshot does; blend: by the GPU's blending unit; auto,
-                       the default: rasterize on software adapters, else blend
+  --draw NAME          rasterize: as --screenshot does; blend: by the GPU's blending unit;
+                       auto (default): rasterize on software GPUs, else blend
 
-From where:
-  --cameras PATH       transforms.json, cameras.json, a COLMAP model or a folder that holds one;
-                       default: what lies in or beside SCENE
-  --camera N           the capture's camera N, from 0
-  --orbit DEG          turned so far about the middle; with --frames, the number of pictures
-  --up AXIS            x, y, z, -x, -y or -z; default: the cameras' own, else -y
-  --fov DEG            height of the view, 5 to 150; default 50
-  --near DISTANCE      nothing nearer is drawn; default 0.01, or a 20th of a smaller scene's radius
+View:
+  --cameras PATH       cameras.json of igsr, or a folder with one; default: the one in SCENE's
+                       folder. For COLMAP and transforms.json use: igsr view SCENE --cameras PATH
+  --camera N           start at camera N of the capture, from 0
+  --orbit DEG          turn about the scene's centre; with --frames: the number of pictures
+  --up AXIS            up axis: x, y, z, -x, -y or -z; default: from the cameras, else -y
+  --fov DEG            vertical field of view, 5 to 150; default 50
+  --near DISTANCE      near plane; default 0.01, or a 20th of a smaller scene's radius
   --background COLOR   white, black, grey or R,G,B in 0..1; default black
 
   --help, --version";
 
-/// What computes the pictures that are drawn without a window.
+/// What computes the pictures without a window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Backend {
     /// A real GPU if one answers, else the CPU.
@@ -52,7 +52,7 @@ pub enum Backend {
     Cpu,
 }
 
-/// What the command line says.
+/// The command line.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arguments {
     /// Files and folders to show.
@@ -69,13 +69,13 @@ pub struct Arguments {
     pub backend: Backend,
     /// What draws in the window.
     pub drawing: Drawing,
-    /// Where the capture's cameras are.
+    /// File or folder of the capture's cameras.
     pub cameras: Option<PathBuf>,
-    /// Which of them to look from.
+    /// Number of the camera to start at.
     pub camera: Option<usize>,
-    /// Degrees about the middle, or a number of pictures.
+    /// Degrees about the scene's centre, or a number of pictures.
     pub orbit: Option<f64>,
-    /// What is up, a unit vector.
+    /// The up axis, a unit vector.
     pub up: Option<[f64; 3]>,
     /// Vertical field of view in degrees.
     pub fov: Option<f64>,
@@ -85,7 +85,7 @@ pub struct Arguments {
     pub background: [f32; 3],
 }
 
-/// What to do.
+/// What the command line asks for.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Asked {
     /// Print [`HELP`].
@@ -164,7 +164,7 @@ impl Arguments {
         Ok(Asked::Run(Box::new(out)))
     }
 
-    /// Whether no window is wanted.
+    /// Whether no window is to open.
     pub fn is_headless(&self) -> bool {
         self.screenshot.is_some() || self.frames.is_some() || self.time.is_some()
     }
@@ -174,7 +174,7 @@ impl Arguments {
         if kinds.iter().filter(|&&given| given).count() > 1 {
             return Err(Error::argument(
                 "--screenshot, --frames, --time",
-                "only one can be done at a time; give one of them",
+                "exclude each other; give one of them",
             ));
         }
         if self.is_headless() && self.scenes.is_empty() {
@@ -184,7 +184,7 @@ impl Arguments {
             return Err(Error::argument(
                 "SCENE",
                 format!(
-                    "must be one where no window is wanted, not {}; leave {} out",
+                    "must be one without a window, not {}; leave {} out",
                     self.scenes.len(),
                     self.scenes[1].display()
                 ),
@@ -193,7 +193,7 @@ impl Arguments {
         if self.drawing != Drawing::Auto && self.is_headless() && self.time.is_none() {
             return Err(Error::argument(
                 "--draw",
-                "is for the window and --time; pictures without a window are always rasterized",
+                "applies to the window and to --time; pictures without a window are always rasterized",
             ));
         }
         let ending = |path: &PathBuf| path.extension().map(|e| e.to_ascii_lowercase());
@@ -202,7 +202,7 @@ impl Arguments {
         {
             return Err(Error::argument(
                 "--screenshot",
-                format!("must end in .png or .exr, not as {} does", path.display()),
+                format!("must end in .png or .exr, not {}", path.display()),
             ));
         }
         if self.frames.is_some() {
@@ -210,7 +210,7 @@ impl Arguments {
             if count.fract() != 0.0 || !(1.0..=FRAMES_MAX).contains(&count) {
                 return Err(Error::argument(
                     "--orbit",
-                    "must be the number of pictures when --frames is given, such as 60",
+                    "must be the number of pictures with --frames, such as 60",
                 ));
             }
         }

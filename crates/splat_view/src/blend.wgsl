@@ -1,5 +1,5 @@
-// Splats as quads that the blending unit lays over each other, back to front. Follows splat_render's
-// shared.wgsl, whose Splat2d the project stage writes.
+// Draws each splat as a quad that is blended over the others, back to front. Comes after splat_render's
+// shared.wgsl, which has the Splat2d that the project stage writes.
 
 struct Style {
     // Rows of the world-to-camera matrix.
@@ -11,7 +11,7 @@ struct Style {
     display: u32,
     // Depths are divided by it, so that half floats hold them.
     depth_unit: f32,
-    // Of points, in pixels.
+    // Radius of points, in pixels.
     radius: f32,
 }
 
@@ -31,7 +31,7 @@ const ELLIPSE = 1.5;
 
 struct Corner {
     @builtin(position) position: vec4<f32>,
-    // From the centre, in standard deviations; of points in their radius.
+    // Place relative to the centre, in standard deviations; for points in radii.
     @location(0) whitened: vec2<f32>,
     @location(1) @interpolate(flat) color: vec3<f32>,
     @location(2) @interpolate(flat) opacity: f32,
@@ -74,7 +74,7 @@ fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance:
     var offset = side * style.radius;
     out.whitened = side;
     if style.display != POINTS {
-        // Beyond it alpha is under ALPHA_MIN.
+        // Beyond it alpha is below ALPHA_MIN.
         var reach = sqrt(2.0 * log(splat.opacity / ALPHA_MIN) * 1.0001 + 1e-3);
         if style.display == ELLIPSES {
             reach = ELLIPSE;
@@ -110,7 +110,7 @@ fn shade(in: Corner) -> @location(0) vec4<f32> {
         if square > ELLIPSE * ELLIPSE {
             discard;
         }
-        // Darker to the rim, so that neighbours stand apart.
+        // Darker towards the rim, so that neighbours can be told apart.
         return vec4(in.color * (1.0 - 0.7 * square / (ELLIPSE * ELLIPSE)), 1.0);
     }
     let alpha = min(in.opacity * exp(-0.5 * square), ALPHA_MAX);

@@ -1,5 +1,5 @@
-//! Splats to a canvas by the blending unit: projected and sorted by splat_render, drawn as quads that
-//! are laid over each other.
+//! Draws splats onto a canvas with the blending unit: splat_render projects and sorts them, and each is a
+//! quad, back to front.
 
 use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::{Gpu, ResidentSplats, shared_wgsl};
@@ -11,7 +11,7 @@ use crate::pipelines::{Pipeline, storage_layout, uniform, uniform_layout};
 use crate::stage_times::{BLEND, PROJECT, SORT, Stamps};
 use crate::viewpoint::relative_to;
 
-/// Half floats: all that is blended has few bits to lose, and the blending unit has them everywhere.
+/// Half floats: precise enough for blending, and every adapter can blend them.
 pub const CANVAS: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;
 
 #[repr(C)]
@@ -97,8 +97,8 @@ impl Blending {
         })
     }
 
-    /// Records a model's picture onto a canvas, columns `begin..end` of it, with what of depth counts
-    /// as one. One picture per model and submission.
+    /// Records a model's picture onto columns `begin..end` of a canvas; depths are divided by `unit`. One
+    /// picture per model and submission.
     pub fn record(
         &self,
         gpu: &Gpu,

@@ -1,4 +1,4 @@
-//! A path that the camera takes through places that were marked.
+//! A camera path through marked places.
 
 use std::path::PathBuf;
 
@@ -6,7 +6,7 @@ use glam::DVec3;
 
 use crate::viewpoint::Viewpoint;
 
-/// Places in the order in which they are passed.
+/// Marked places, in their order.
 #[derive(Debug, Clone, Default)]
 pub struct CameraPath {
     /// The places.
@@ -23,7 +23,8 @@ fn cubic(a: DVec3, b: DVec3, c: DVec3, d: DVec3, t: f64) -> DVec3 {
 }
 
 impl CameraPath {
-    /// Pictures of the whole path with so many from each place to the next, both ends included.
+    /// Number of pictures of the whole path, with `between` from each place to the next, both ends
+    /// included.
     pub fn pictures(&self, between: u32) -> u32 {
         match self.keys.len() {
             0 => 0,
@@ -31,7 +32,7 @@ impl CameraPath {
         }
     }
 
-    /// Where the camera is `t` places after the first; None where there is no place.
+    /// The view `t` places after the first; None if there are no places.
     pub fn at(&self, t: f64) -> Option<Viewpoint> {
         let last = self.keys.len().checked_sub(1)?;
         let segment = (t.max(0.0) as usize).min(last.saturating_sub(1));
@@ -48,18 +49,18 @@ impl CameraPath {
 /// A path whose pictures are being drawn to files.
 #[derive(Debug, Clone)]
 pub struct Recording {
-    /// A copy: places are marked and forgotten meanwhile.
+    /// A copy: places may be marked and cleared meanwhile.
     path: CameraPath,
-    /// Pictures from each place to the next, as they were when it began.
+    /// Pictures from each place to the next, as set at the start.
     between: u32,
-    /// Where the pictures go.
+    /// Folder of the pictures.
     pub folder: PathBuf,
     /// Number of the next picture.
     pub next: u32,
 }
 
 impl Recording {
-    /// Of a path as it is now, `between` pictures from each place to the next.
+    /// Records a path as it is now, with `between` pictures from each place to the next.
     pub fn new(path: &CameraPath, between: u32, folder: PathBuf) -> Self {
         Self { path: path.clone(), between: between.max(1), folder, next: 0 }
     }
@@ -69,7 +70,7 @@ impl Recording {
         self.path.pictures(self.between)
     }
 
-    /// From where the next picture is taken; None after the last.
+    /// The view of the next picture; None after the last.
     pub fn place(&self) -> Option<Viewpoint> {
         let is_left = self.next < self.total();
         self.path.at(f64::from(self.next) / f64::from(self.between)).filter(|_| is_left)

@@ -1,9 +1,9 @@
-// The rasterizer's picture to the columns of a canvas that it was made for.
+// Copies the rasterizer's picture onto its columns of a canvas.
 
 struct Place {
     // First column.
     begin: u32,
-    // Columns.
+    // Number of columns.
     width: u32,
 }
 

@@ -1,14 +1,40 @@
-//! The cameras of a capture: where they are found, and what is known of each.
+//! The cameras of a capture, from the one file this program reads: `cameras.json` as igsr writes it.
 //!
-//! They are looked from, so lens distortion is left out.
+//! The layout is that of nerfstudio's `transforms.json` with every field given for every photo:
+//!
+//! ```json
+//! {
+//!   "camera_model": "PINHOLE",
+//!   "frames": [
+//!     {
+//!       "file_path": "images/0001.jpg",
+//!       "w": 800, "h": 600,
+//!       "fl_x": 700.0, "fl_y": 700.0, "cx": 400.0, "cy": 300.0,
+//!       "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+//!     }
+//!   ]
+//! }
+//! ```
+//!
+//! `file_path` is the photo's name, and its path from the file's folder where the photo is there. Sizes,
+//! focal lengths and principal points are in pixels. `transform_matrix` is camera-to-world, row by row,
+//! in OpenGL axes (x right, y up, z backward). Other fields are ignored.
 
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat4, DVec3};
+use serde::Deserialize;
 use splat_render::{Camera, Error, Result};
 
-use crate::colmap::read_colmap;
-use crate::transforms::read_json;
+/// The file's name in a folder.
+const NAME: &str = "cameras.json";
+/// Largest file that is read, in bytes.
+const FILE_MAX: u64 = 256 << 20;
+/// What to do about cameras in another format.
+const OTHERS: &str = "igsr view shows other captures too (COLMAP, transforms.json), and igsr export \
+                      --format transforms rewrites them for splat-view";
 
 /// A photo's camera.
 #[derive(Debug, Clone)]
@@ -17,65 +43,83 @@ pub struct CaptureCamera {
     pub name: String,
     /// The photo, where it is there.
     pub photo: Option<PathBuf>,
-    /// As a pinhole, in the world.
+    /// The pinhole camera, in world coordinates.
     pub camera: Camera,
 }
 
-/// Reads the cameras at a file or in a folder: of JSON in the file's order, of COLMAP by name. Whatever
-/// is read can be drawn with.
+#[derive(Deserialize)]
+struct Cameras {
+    #[serde(rename = "camera_model")]
+    _model: Model,
+    frames: Vec<Frame>,
+}
+
+/// The only camera model: lenses that distort would be drawn without their distortion.
+#[derive(Deserialize)]
+enum Model {
+    #[serde(rename = "PINHOLE")]
+    Pinhole,
+}
+
+#[derive(Deserialize)]
+struct Frame {
+    file_path: String,
+    w: u32,
+    h: u32,
+    fl_x: f64,
+    fl_y: f64,
+    cx: f64,
+    cy: f64,
+    transform_matrix: [[f64; 4]; 4],
+}
+
+impl Frame {
+    fn camera(&self) -> Camera {
+        let opengl = DMat4::from_cols_array_2d(&self.transform_matrix).transpose();
+        // To OpenCV axes: y down, z forward.
+        let to_world = opengl * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
+        Camera {
+            viewmat: to_world.inverse(),
+            fx: self.fl_x,
+            fy: self.fl_y,
+            cx: self.cx,
+            cy: self.cy,
+            width: self.w,
+            height: self.h,
+        }
+    }
+}
+
+/// Reads the cameras in a file, or in a folder's `cameras.json`, in the file's order. Every camera that
+/// is returned is valid.
 pub fn read_cameras(path: &Path) -> Result<Vec<CaptureCamera>> {
-    let Some(source) = find_cameras(path) else {
-        return Err(Error::file(
-            path,
-            "holds no cameras; give a transforms.json, a cameras.json, a COLMAP model or a folder \
-             with one",
-        ));
+    let Some(file) = find_cameras(path) else {
+        let reason = if path.is_dir() { "holds no cameras.json" } else { "is no file or folder" };
+        return Err(Error::file(path, format!("{reason}; {OTHERS}")));
     };
-    let cameras = if source.is_dir() { read_colmap(&source)? } else { read_json(&source)? };
-    for camera in &cameras {
+    let unreadable = |e: std::io::Error| Error::file(&file, format!("cannot be read ({e})"));
+    let mut bytes = Vec::new();
+    let opened = File::open(&file).map_err(unreadable)?;
+    opened.take(FILE_MAX).read_to_end(&mut bytes).map_err(unreadable)?;
+    let cameras: Cameras = serde_json::from_slice(&bytes).map_err(|e| {
+        Error::file(&file, format!("is not a cameras.json of igsr ({e}); {OTHERS}"))
+    })?;
+    if cameras.frames.is_empty() {
+        return Err(Error::file(&file, "has no cameras; give a file with at least one"));
+    }
+    let folder = file.parent().unwrap_or(Path::new(""));
+    let read = |frame: Frame| {
+        let camera = frame.camera();
         camera
-            .camera
             .validate()
-            .map_err(|e| Error::file(&source, format!("{}: {e}", camera.name)))?;
-    }
-    Ok(cameras)
+            .map_err(|e| Error::file(&file, format!("camera of {}: {e}", frame.file_path)))?;
+        let photo = Some(folder.join(&frame.file_path)).filter(|photo| photo.is_file());
+        Ok(CaptureCamera { name: frame.file_path, photo, camera })
+    };
+    cameras.frames.into_iter().map(read).collect()
 }
 
-/// The JSON file or the COLMAP model's folder at a path, or in a folder.
+/// The file of cameras that a path names: itself, or the `cameras.json` in a folder.
 pub fn find_cameras(path: &Path) -> Option<PathBuf> {
-    if path.is_file() {
-        return Some(path.to_owned());
-    }
-    let models = [path.to_owned(), path.join("sparse/0"), path.join("sparse")];
-    let is_model =
-        |folder: &PathBuf| ["images.bin", "images.txt"].iter().any(|n| folder.join(n).is_file());
-    let files = ["cameras.json", "transforms.json", "transforms_train.json"];
-    files
-        .iter()
-        .map(|name| path.join(name))
-        .find(|file| file.is_file())
-        .or_else(|| models.into_iter().find(is_model))
-        // Where igsr keeps the cameras that it found itself.
-        .or_else(|| path.join("capture").is_dir().then(|| find_cameras(&path.join("capture")))?)
-}
-
-/// A rigid viewmat of a camera-to-world rotation that may be scaled or a little off, and a centre.
-pub fn viewmat(to_world: DMat3, center: DVec3) -> DMat4 {
-    let x = to_world.x_axis.normalize_or_zero();
-    let y = (to_world.y_axis - x * x.dot(to_world.y_axis)).normalize_or_zero();
-    let rotation = DMat3::from_cols(x, y, x.cross(y)).transpose();
-    DMat4::from_cols(
-        rotation.x_axis.extend(0.0),
-        rotation.y_axis.extend(0.0),
-        rotation.z_axis.extend(0.0),
-        (-(rotation * center)).extend(1.0),
-    )
-}
-
-/// The file that a photo's name means.
-pub fn photo_at(folder: &Path, name: &str) -> Option<PathBuf> {
-    let path = folder.join(name);
-    // NeRF-Synthetic leaves the ending out.
-    let png = folder.join(format!("{name}.png"));
-    [path, png].into_iter().find(|path| path.is_file())
+    [path.to_owned(), path.join(NAME)].into_iter().find(|file| file.is_file())
 }

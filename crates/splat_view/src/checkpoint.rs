@@ -1,8 +1,8 @@
-//! The splats of a fit in progress, from the checkpoint that `igsr fit` writes: an uncompressed
-//! `.npz` of numpy arrays.
+//! Reads the splats of a fit in progress from a checkpoint of `igsr fit`, an uncompressed `.npz` of numpy
+//! arrays.
 //!
-//! Untrusted: nothing compressed is read, and no memory is taken before its size is known to be in
-//! the file.
+//! The file is untrusted: nothing compressed is read, and no memory is allocated that the file's own
+//! size does not justify.
 
 use std::fs::File;
 use std::io::{Read, Seek};
@@ -14,7 +14,7 @@ use splat_render::io::SplatFile;
 use splat_render::{Error, Result, sh};
 use zip::{CompressionMethod, ZipArchive};
 
-/// Longest header of an array that is read.
+/// Longest array header that is read, bytes.
 const HEADER_MAX: usize = 4096;
 
 /// Reads the splats of a checkpoint.
@@ -34,7 +34,7 @@ pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     let stride = sh_shape.get(1).copied().unwrap_or(0);
     let degree = (0..=SH_DEGREE_MAX).find(|&d| sh::coeffs(d) == stride);
     let sh_degree = degree.ok_or_else(|| bad(format!("{stride} SH coefficients")))?;
-    // Captures at the world's origin have none.
+    // Captures at the world's origin store none.
     let origin = match read_doubles(&mut archive, "origin").map_err(&bad)?[..] {
         [] => [0.0; 3],
         [x, y, z] if [x, y, z].iter().all(|v| v.is_finite()) => [x, y, z],

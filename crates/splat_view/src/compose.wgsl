@@ -1,4 +1,4 @@
-// One or two canvases over the background; what is left of the divider is from the first.
+// Composes one or two canvases over the background; the first is left of the divider.
 
 struct Look {
     background: vec3<f32>,

@@ -1,4 +1,4 @@
-//! Canvases over the background, to a window or to a picture.
+//! Composes canvases over the background, into a window or a picture.
 
 use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::Gpu;
@@ -6,30 +6,30 @@ use splat_render::gpu::Gpu;
 use crate::blending::CANVAS;
 use crate::pipelines::{Pipeline, uniform, uniform_layout};
 
-/// How canvases are put together.
+/// Settings of the composition, as the shader has them.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub struct Look {
-    /// Behind the splats.
+    /// Background, RGB in 0..1.
     pub background: [f32; 3],
     /// First pixel column of the second canvas.
     pub divider: f32,
     /// 1 where the canvases hold depths.
     pub is_depth: u32,
-    /// Depths at the ends of the colours, in the canvases' unit.
+    /// Depths at the ends of the colour map, in the canvases' unit.
     pub depth_range: [f32; 2],
-    /// To the size that WGSL gives it.
+    /// Fills the struct up to its size in WGSL.
     pub padding: f32,
 }
 
-/// What splats are drawn to, for one model or two side by side.
+/// Textures that splats are drawn to, for one model or two side by side.
 #[derive(Debug)]
 pub struct Canvases {
     /// Width and height in pixels.
     pub size: [u32; 2],
-    /// The second is the first where there is one model.
+    /// Both are the same if there is one model.
     pub textures: [wgpu::Texture; 2],
-    /// Of `textures`.
+    /// Views of `textures`.
     pub views: [wgpu::TextureView; 2],
     look: wgpu::Buffer,
     bindings: wgpu::BindGroup,
@@ -89,7 +89,7 @@ impl Composing {
         Canvases { size, textures, views, look, bindings }
     }
 
-    /// Records the picture.
+    /// Records the composition.
     pub fn record(
         &self,
         gpu: &Gpu,

@@ -1,4 +1,4 @@
-//! What of the splats is shown.
+//! How splats are displayed.
 
 /// Kinds of pictures, in the order of the constants in `blend.wgsl`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -13,12 +13,12 @@ pub enum Display {
     Ellipses,
     /// Expected depth in false colour.
     Depth,
-    /// The shortest axes, in camera axes.
+    /// Each splat's shortest axis, in camera axes.
     Normals,
 }
 
 impl Display {
-    /// All of them, with what people read.
+    /// All of them, with their labels.
     pub const ALL: [(Self, &str); 5] = [
         (Self::Splats, "Splats"),
         (Self::Points, "Points"),
@@ -41,7 +41,7 @@ pub enum Drawing {
 }
 
 impl Drawing {
-    /// All of them, with what people read.
+    /// All of them, with their labels.
     pub const ALL: [(Self, &str); 3] =
         [(Self::Auto, "auto"), (Self::Rasterizer, "rasterize"), (Self::Blending, "blend")];
 }
@@ -57,7 +57,7 @@ pub struct Settings {
     pub sh_degree: u32,
     /// Vertical field of view, radians.
     pub fov: f64,
-    /// Nothing nearer is drawn, world units.
+    /// Near plane, world units.
     pub near: f32,
     /// Behind the splats, RGB in 0..1.
     pub background: [f32; 3],

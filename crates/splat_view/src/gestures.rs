@@ -1,24 +1,24 @@
-//! Drags, wheel, touches and keys to movements of the camera.
+//! Drags, wheel, touches and keys move the camera.
 
 use egui::{Event, Key, PointerButton, Response, Ui};
 
 use crate::display::Display;
 use crate::viewer::{Action, Moving, Viewer};
 
-/// Radians for a point of a drag.
+/// Radians per point of a drag.
 const TURN: f64 = 0.005;
-/// Radians in a second for arrow keys.
+/// Radians per second for arrow keys.
 const TURN_KEYS: f64 = 1.2;
-/// Zoom, as a logarithm, for a point of the wheel; a notch has about 40.
+/// Logarithm of the zoom factor per point of the wheel; a notch has about 40.
 const WHEEL: f64 = 0.002;
-/// Distances to the pivot that keys move in a second.
+/// Speed of keys, in distances to the pivot per second.
 const SPEED: f64 = 0.8;
-/// What Shift makes of it.
+/// Factor of the speed with Shift.
 const FAST: f64 = 4.0;
-/// Longest time that a key's movement counts for: after a pause nothing jumps.
+/// Longest time in seconds that one movement by key covers: nothing jumps after a pause.
 const LONGEST: f32 = 0.1;
 
-/// Moves the camera as the pointer says. `size` is the picture's, `scale` pixels per point.
+/// Moves the camera by the pointer. `size` is the picture's, in pixels.
 pub fn pointer(
     viewer: &mut Viewer,
     ui: &Ui,
@@ -30,9 +30,9 @@ pub fn pointer(
     let before = viewer.viewpoint;
     let mut moved = before;
     let camera = viewer.camera(size);
-    // World units at the pivot for a point of a drag.
+    // World units at the pivot per point of a drag.
     let reach = f64::from(scale) * moved.distance / camera.fy;
-    // Fingers that came down on the panel are the panel's.
+    // Touches that began on the panel belong to the panel.
     let touch = ui.input(|i| i.multi_touch()).filter(|_| response.is_pointer_button_down_on());
     let delta = ui.input(|i| i.pointer.delta());
     let (dx, dy) = (f64::from(delta.x), f64::from(delta.y));
@@ -80,7 +80,7 @@ pub fn pointer(
     }
 }
 
-/// Moves the camera and changes settings as keys say.
+/// Moves the camera and changes settings by keys.
 pub fn keys(viewer: &mut Viewer, ui: &Ui, size: [u32; 2], actions: &mut Vec<Action>) {
     if ui.ctx().egui_wants_keyboard_input() {
         return;
@@ -116,7 +116,7 @@ pub fn keys(viewer: &mut Viewer, ui: &Ui, size: [u32; 2], actions: &mut Vec<Acti
             Moving::Orbit => moved.orbit(-yaw, -pitch, viewer.up),
             Moving::Fly | Moving::FirstPerson => moved.turn(yaw, pitch, viewer.up),
         }
-        // Held keys go on.
+        // Held keys move on in the next frame.
         ui.ctx().request_repaint();
     }
     if moved != before {
@@ -216,7 +216,7 @@ mod tests {
                 ..RawInput::default()
             };
             let viewer = &mut self.viewer;
-            let _ = self.context.run_ui(input, |ui| {
+            let mut output = self.context.run_ui(input, |ui| {
                 Panel::right("panel").exact_size(100.0).show(ui, |ui| {
                     ui.interact(ui.max_rect(), Id::unique("list"), Sense::click_and_drag());
                 });
@@ -227,6 +227,8 @@ mod tests {
                     keys(viewer, ui, SIZE, &mut actions);
                 });
             });
+            // Nothing is painted here: egui asks that its textures are then dropped by name.
+            output.textures_delta.clear();
             actions
         }
 

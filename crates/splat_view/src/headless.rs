@@ -1,4 +1,4 @@
-//! Pictures without a window, by splat_render's own rasterizer: the same as `igsr render` draws.
+//! Pictures without a window, by the renderer's own rasterizer: the same as `igsr render` draws.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -13,12 +13,12 @@ use crate::display::Settings;
 use crate::model::Model;
 use crate::painter::{Painter, Shot, check_size};
 use crate::picture_files::{to_bytes, write_exr, write_png};
-use crate::scene_view::{cameras_of, first_view, near, up};
+use crate::scene_view::{cameras_of, first_view, near, numbered, up};
 use crate::sources::find_sources;
 use crate::stage_times::STAGES;
 use crate::viewpoint::{Viewpoint, fitted, relative_to};
 
-/// Of pictures where nothing says otherwise.
+/// Default size of pictures.
 const SIZE: [u32; 2] = [1280, 720];
 
 /// What the pictures are of.
@@ -58,7 +58,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-/// What draws; says so where it is not what one would expect.
+/// The backend that draws; prints a message if `auto` finds no GPU.
 fn stages(backend: Backend) -> Result<Box<dyn Stages<f32>>> {
     match backend {
         Backend::Cpu => Ok(Box::new(Cpu)),
@@ -91,15 +91,7 @@ impl Scene {
         let mut viewpoint = first_view(&model, &cameras, up, settings.fov);
         let mut camera = viewpoint.camera(arguments.size.unwrap_or(SIZE), settings.fov);
         if let Some(number) = arguments.camera {
-            let Some(found) = cameras.get(number) else {
-                return Err(Error::argument(
-                    "--camera",
-                    match cameras.len() {
-                        0 => "no cameras were found; name them with --cameras".to_owned(),
-                        count => format!("must be less than {count}, the number of cameras"),
-                    },
-                ));
-            };
+            let found = numbered(&cameras, number)?;
             let own = [found.camera.width, found.camera.height];
             camera = fitted(&found.camera, arguments.size.unwrap_or(own));
             viewpoint = Viewpoint::of_camera(&found.camera, model.center, model.radius);
@@ -107,7 +99,7 @@ impl Scene {
         Ok(Self { model, camera, viewpoint, settings, up })
     }
 
-    /// The camera, so many degrees about the middle.
+    /// The camera, turned by degrees about the scene's centre.
     fn turned(&self, degrees: f64) -> Camera {
         let mut viewpoint = self.viewpoint;
         viewpoint.orbit(degrees.to_radians(), 0.0, self.up);
@@ -138,8 +130,8 @@ fn write(path: &Path, image: &Image<f32>) -> Result<()> {
     write_png(path, [image.width, image.height], &to_bytes(image))
 }
 
-/// Draws frames as the window does and prints what each stage takes, and how far the picture is from
-/// the rasterizer's.
+/// Draws frames as the window does. Prints the time of each stage, and the picture's error against the
+/// rasterizer's.
 fn time(scene: &Scene, frames: u32) -> Result<()> {
     let gpu = Arc::new(Gpu::new(true)?);
     check_size(&gpu, [scene.camera.width, scene.camera.height])?;
@@ -190,7 +182,7 @@ fn time(scene: &Scene, frames: u32) -> Result<()> {
             println!("{name:>12} {:9.2}", median(took));
         }
     }
-    // Submitting, and what the driver's timestamps leave out.
+    // Submission, and what the timestamps leave out.
     let rest = whole.iter().zip(&stages).map(|(whole, times)| whole - times.iter().sum::<f32>());
     println!("{:>12} {:9.2}", "rest", median(rest.collect()));
     println!("{:>12} {:9.2}", "whole", median(whole));

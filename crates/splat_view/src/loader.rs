@@ -1,4 +1,4 @@
-//! Reads models beside the window, which goes on drawing.
+//! Reads models in threads, while the window goes on drawing.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -8,7 +8,7 @@ use splat_render::Result;
 use crate::model::Model;
 use crate::sources::{Stamp, stamp};
 
-/// A model that was read, or why not.
+/// A model that was read, or the error.
 #[derive(Debug)]
 pub struct Loaded {
     /// The side it is for, 0 or 1.
@@ -21,7 +21,7 @@ pub struct Loaded {
     pub model: Result<Model>,
 }
 
-/// What is being read, one model at a time for each side.
+/// Models being read, one at a time for each side.
 #[derive(Debug)]
 pub struct Loader {
     sender: Sender<Loaded>,
@@ -31,7 +31,7 @@ pub struct Loader {
 }
 
 impl Loader {
-    /// With nothing to read yet.
+    /// Nothing to read yet.
     pub fn new() -> Self {
         let (sender, receiver) = channel();
         Self { sender, receiver, waits: [None, None] }
@@ -55,7 +55,7 @@ impl Loader {
         });
     }
 
-    /// A side waits for nothing any more; what is being read for it is not shown.
+    /// Drops what is being read for a side: it will not be shown.
     pub fn forget(&mut self, side: usize) {
         self.waits[side] = None;
     }

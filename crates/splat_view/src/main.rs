@@ -1,11 +1,10 @@
-//! `splat-view`: splats in a window or as pictures.
+//! `splat-view` shows Gaussian splats in a window, or draws pictures of them without one.
 
 mod arguments;
 mod blending;
 mod camera_path;
 mod capture;
 mod checkpoint;
-mod colmap;
 mod composing;
 mod display;
 mod gestures;
@@ -19,10 +18,14 @@ mod photo;
 mod picture_files;
 mod pipelines;
 mod rasterizing;
+mod saving;
+mod scene_changes;
 mod scene_view;
+mod screen;
+mod session;
 mod sources;
 mod stage_times;
-mod transforms;
+mod start;
 mod viewer;
 mod viewpoint;
 mod window;
@@ -32,24 +35,11 @@ use std::process::ExitCode;
 use arguments::{Arguments, Asked, HELP};
 use splat_render::Result;
 
-/// Keeps Mesa's layer that asks the desktop which GPU to take from printing an error where there is no
-/// desktop to ask, unless something is set for it.
-fn quiet_layers() {
-    let set = ["NODEVICE_SELECT", "MESA_VK_DEVICE_SELECT"];
-    if set.iter().all(|name| std::env::var_os(name).is_none()) {
-        // SAFETY: the program has one thread so far.
-        unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
-    }
-}
-
 fn run() -> Result<()> {
     match Arguments::parse(std::env::args_os().skip(1))? {
         Asked::Help => println!("{HELP}"),
         Asked::Version => println!("splat-view {}", env!("CARGO_PKG_VERSION")),
-        Asked::Run(arguments) if arguments.is_headless() => {
-            quiet_layers();
-            headless::run(&arguments)?;
-        }
+        Asked::Run(arguments) if arguments.is_headless() => headless::run(&arguments)?,
         Asked::Run(arguments) => window::run(*arguments)?,
     }
     Ok(())
@@ -59,8 +49,8 @@ fn main() -> ExitCode {
     match run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            let sentence = error.to_string();
-            eprintln!("{}.", sentence.trim_end_matches('.'));
+            let message = error.to_string();
+            eprintln!("{}.", message.trim_end_matches('.'));
             ExitCode::FAILURE
         }
     }

@@ -1,4 +1,4 @@
-//! A scene in memory, and where its splats are.
+//! A scene in memory, and its extent.
 
 use std::path::Path;
 
@@ -8,9 +8,9 @@ use splat_render::{Error, Result};
 
 use crate::checkpoint::read_checkpoint;
 
-/// Splats fainter than this say little of where a scene is.
+/// Splats of a lower opacity logit do not count for the extent.
 const FAINT_LOGIT: f32 = -2.2;
-/// Splats looked at to find the middle.
+/// Number of splats that the extent is computed from.
 const SAMPLES: usize = 100_000;
 
 /// A scene in memory.
@@ -18,12 +18,11 @@ const SAMPLES: usize = 100_000;
 pub struct Model {
     /// Its splats and their origin.
     pub file: SplatFile,
-    /// The middle of what can be seen, in the world.
+    /// Centre of the visible splats, in world coordinates.
     pub center: DVec3,
-    /// Half of what can be seen lies within twice this of the middle, nine tenths about within it
-    /// for things that stand alone.
+    /// Radius about the centre: of 90% of the visible splats, at most four times that of 50%.
     pub radius: f64,
-    /// What was passed over in reading, a sentence each.
+    /// What was ignored in reading, one message each.
     pub notes: Vec<String>,
 }
 
@@ -61,7 +60,7 @@ fn is_finite(file: &SplatFile, i: usize) -> bool {
         && s.sh[i * stride..(i + 1) * stride].iter().flatten().all(|v| v.is_finite())
 }
 
-/// The value at a part of the way from the least to the greatest.
+/// The value at a fraction of the way from the least to the greatest.
 fn quantile(values: &mut [f64], part: f64) -> f64 {
     if values.is_empty() {
         return 0.0;
@@ -70,7 +69,7 @@ fn quantile(values: &mut [f64], part: f64) -> f64 {
     *values.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
-/// Middle and radius. Medians: captures have a few splats very far out.
+/// Centre and radius. Medians, because captures have a few splats very far out.
 fn extent(file: &SplatFile) -> (DVec3, f64) {
     let step = file.splats.len().div_ceil(SAMPLES).max(1);
     let finite = (0..file.splats.len()).step_by(step).filter(|&i| is_finite(file, i));

@@ -6,11 +6,11 @@ use splat_render::Camera;
 
 use crate::viewer::{Action, Viewer};
 
-/// Half the width of what one can take the divider by, in points.
+/// Half the width of the divider's grip, in points.
 const GRIP: f32 = 6.0;
-/// How near to a camera's place a click counts for it, in points.
+/// Farthest click from a camera's place that selects it, in points.
 const NEAR: f32 = 10.0;
-/// Length of a frustum in parts of the scene's radius.
+/// Length of a frustum as a fraction of the scene's radius.
 const FRUSTUM: f64 = 0.12;
 
 /// A point of the world in points of the window; None behind the camera.
@@ -24,7 +24,7 @@ fn project(camera: &Camera, scale: f32, point: DVec3) -> Option<Pos2> {
     Some(Pos2::new(x as f32 / scale, y as f32 / scale))
 }
 
-/// Paints the capture's cameras; a click at one, where `clicked`, looks from it.
+/// Paints the capture's cameras; a click on one, at `clicked`, moves the view to it.
 pub fn cameras(
     viewer: &Viewer,
     ui: &Ui,
@@ -51,7 +51,7 @@ pub fn cameras(
         };
         let Some(place) = project(&camera, scale, other.center()) else { continue };
         let corners = [corner(0.0, 0.0), corner(w, 0.0), corner(w, h), corner(0.0, h)];
-        // The upper edge is marked, so that one sees what is up.
+        // The upper edge is marked: it shows how the camera is rolled.
         let upper = Stroke::new(2.0, Color32::from_rgb(255, 170, 60));
         let line = Stroke::new(1.0, Color32::from_rgb(120, 190, 255));
         for (i, corner) in corners.iter().enumerate() {
@@ -89,10 +89,10 @@ pub fn photo(viewer: &Viewer, ui: &Ui, size: [u32; 2], texture: &TextureHandle) 
     ui.painter().image(texture.id(), rect, whole, tint);
 }
 
-/// Moves the divider between two models with the pointer that holds it; whether one does.
+/// Moves the divider between two models while the pointer holds it; returns whether it does.
 ///
-/// By where the button went down. egui itself goes by where the pointer is at the end of the frame,
-/// which on a slow device is past the divider already.
+/// The place where the button went down decides. egui itself takes the pointer's place at the end of
+/// the frame, which on a slow device is past the divider already.
 pub fn hold_divider(viewer: &mut Viewer, ui: &Ui) -> bool {
     if !viewer.compares() {
         viewer.holds_divider = false;
@@ -114,12 +114,12 @@ pub fn hold_divider(viewer: &mut Viewer, ui: &Ui) -> bool {
     if holds || at.is_some_and(is_at) {
         ui.ctx().set_cursor_icon(egui::CursorIcon::ResizeHorizontal);
     }
-    // The frame in which it is let go has its last movement.
+    // The frame of the release has the last movement.
     viewer.holds_divider &= down;
     holds
 }
 
-/// Paints the divider between two models, and whose side is whose.
+/// Paints the divider between two models, and their names.
 pub fn divider(viewer: &Viewer, ui: &Ui) {
     let [Some(left), Some(right)] = &viewer.shown else { return };
     let names = [viewer.name_of(&left.path), viewer.name_of(&right.path)];
@@ -131,7 +131,7 @@ pub fn divider(viewer: &Viewer, ui: &Ui) {
     for ((align, offset), name) in sides.into_iter().zip(names) {
         let at = Pos2::new(x + offset, screen.top() + 8.0);
         let font = FontId::proportional(14.0);
-        // Twice, so that it can be read on any picture.
+        // Twice, so that it is legible on any picture.
         let shadow = at + egui::vec2(1.0, 1.0);
         ui.painter().text(shadow, align, &name, font.clone(), Color32::BLACK);
         ui.painter().text(at, align, &name, font, Color32::WHITE);

@@ -1,4 +1,4 @@
-//! A frame from models to a window or a picture.
+//! Draws a frame of one model or two, into a window or a picture.
 
 use std::sync::Arc;
 
@@ -10,15 +10,15 @@ use splat_render::{Camera, Error, Result};
 use crate::blending::{Blending, Drawable};
 use crate::composing::{Canvases, Composing, Look};
 use crate::display::{Display, Drawing, Settings};
-use crate::rasterizing::{Rasterizing, Room};
+use crate::rasterizing::{Rasterizing, PictureBuffers};
 use crate::stage_times::{
     BIN, BLEND, CANVAS, COMPOSE, PANEL, PROJECT, RASTERIZE, SECOND, SORT, STAGES, StageTimes,
     Stamps, Written,
 };
 
-/// Of pictures that are read back.
+/// Format of pictures that are read back.
 const PICTURE: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
-/// Bytes that rows of a copied texture are a multiple of.
+/// Alignment of the rows of a copied texture, bytes.
 const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
 
 /// Longest side of a texture, and so of a frame.
@@ -26,7 +26,7 @@ pub fn side_max(gpu: &Gpu) -> u32 {
     gpu.device().limits().max_texture_dimension_2d
 }
 
-/// Refuses frames that a device has no texture for.
+/// Refuses frames that are larger than the device's textures.
 pub fn check_size(gpu: &Gpu, [width, height]: [u32; 2]) -> Result<()> {
     let most = side_max(gpu);
     if width.max(height) <= most {
@@ -44,17 +44,17 @@ pub fn check_size(gpu: &Gpu, [width, height]: [u32; 2]) -> Result<()> {
 /// What a frame shows.
 #[derive(Debug, Clone, Copy)]
 pub struct Shot<'a> {
-    /// From where, with the size of the picture.
+    /// The camera, with the size of the picture.
     pub camera: Camera,
-    /// How.
+    /// How splats are drawn.
     pub settings: &'a Settings,
-    /// The model, on the left where there are two.
+    /// The model; the left one if there are two.
     pub left: Option<&'a Drawable>,
     /// The other, on the right.
     pub right: Option<&'a Drawable>,
-    /// Where the right one begins, in parts of the width.
+    /// Where the right one begins, as a fraction of the width.
     pub divider: f32,
-    /// Depths at the ends of the colours that show them, world units.
+    /// Depths at the ends of the colour map, world units.
     pub depths: [f32; 2],
 }
 
@@ -67,14 +67,14 @@ pub struct Painter {
     composing: Composing,
     to_picture: Composing,
     canvases: Option<Canvases>,
-    /// What the rasterizer needs for a canvas; both sides' pictures are made in it, one by one.
-    room: Option<Room>,
-    /// Of the frames shown.
+    /// The rasterizer's buffers for a canvas; both sides use them in turn.
+    buffers: Option<PictureBuffers>,
+    /// Times of the frames shown.
     pub times: StageTimes,
 }
 
 impl Painter {
-    /// For targets of a format.
+    /// A painter for targets of a format.
     pub fn new(gpu: Arc<Gpu>, format: wgpu::TextureFormat) -> Result<Self> {
         let painter = Self {
             blending: Blending::new(&gpu),
@@ -82,7 +82,7 @@ impl Painter {
             composing: Composing::new(&gpu, format),
             to_picture: Composing::new(&gpu, PICTURE),
             canvases: None,
-            room: None,
+            buffers: None,
             times: StageTimes::new(&gpu),
             gpu,
         };
@@ -90,17 +90,12 @@ impl Painter {
         Ok(painter)
     }
 
-    /// The device.
-    pub fn gpu(&self) -> &Arc<Gpu> {
-        &self.gpu
-    }
-
     /// Copies a model to the device.
     pub fn upload(&self, file: &SplatFile) -> Result<Drawable> {
         self.blending.upload(&self.gpu, file)
     }
 
-    /// Records a frame, and which stages it has. Part of the work may be submitted at once.
+    /// Records a frame; returns which stages have timestamps. Part of the work may be submitted at once.
     pub fn record(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
@@ -122,7 +117,7 @@ impl Painter {
         self.times.stamps(PANEL).render(0)
     }
 
-    /// The frame as RGBA bytes.
+    /// Draws a frame and returns its RGBA bytes.
     pub fn picture(&mut self, shot: &Shot<'_>) -> Result<Vec<u8>> {
         self.fit(shot)?;
         let [width, height] = [shot.camera.width, shot.camera.height];
@@ -151,7 +146,7 @@ impl Painter {
         Ok(rows.flat_map(|row| row[..4 * width as usize].iter().copied()).collect())
     }
 
-    /// The expected depth at a pixel; None where nothing is.
+    /// Expected depth at a pixel in world units; None where nothing is.
     pub fn depth_at(&mut self, shot: &Shot<'_>, pixel: [u32; 2]) -> Result<Option<f64>> {
         let settings = Settings { display: Display::Depth, ..*shot.settings };
         let shot = Shot { settings: &settings, ..*shot };
@@ -167,11 +162,11 @@ impl Painter {
         let data = self.gpu.read(&[(&readable, 8)])?;
         let texel: [u16; 4] = bytemuck::pod_read_unaligned(&data[0]);
         let [depth, .., alpha] = texel.map(|bits| f16::from_bits(bits).to_f64());
-        // Fainter than half, nobody sees what is there.
+        // Where less than half is opaque, nothing can be made out.
         Ok((alpha > 0.5).then(|| depth / alpha * f64::from(unit(&shot))))
     }
 
-    /// Makes canvases and the rasterizer's room those that the frame needs.
+    /// Allocates the canvases and rasterizer buffers that the frame needs.
     fn fit(&mut self, shot: &Shot<'_>) -> Result<()> {
         let size = [shot.camera.width, shot.camera.height];
         let two = shot.right.is_some();
@@ -179,19 +174,19 @@ impl Painter {
             canvases.size == size && (!two || canvases.textures[0] != canvases.textures[1])
         });
         if !fits {
-            // The old ones' memory first; those that the device had no room for are not kept.
+            // Free the old ones' memory first; canvases that could not be allocated are not kept.
             self.canvases = None;
             let canvases = self.composing.canvases(&self.gpu, size, two);
             self.gpu.check()?;
             self.canvases = Some(canvases);
         }
-        if self.rasterizes(shot.settings) && self.room.as_ref().is_none_or(|r| r.size != size) {
-            // The old one's memory first.
-            self.room = None;
-            match self.rasterizing.room(&self.gpu, size) {
-                Ok(room) => self.room = Some(room),
+        if self.rasterizes(shot.settings) && self.buffers.as_ref().is_none_or(|r| r.size != size) {
+            // Free the old one's memory first.
+            self.buffers = None;
+            match self.rasterizing.buffers(&self.gpu, size) {
+                Ok(buffers) => self.buffers = Some(buffers),
                 Err(error) if shot.settings.drawing == Drawing::Rasterizer => return Err(error),
-                // Then the blending unit draws, which needs no such room.
+                // Then the blending unit draws, which needs no such buffers.
                 Err(_) => {}
             }
         }
@@ -208,7 +203,7 @@ impl Painter {
             }
     }
 
-    /// Records the models' pictures onto their canvases, and says which stages have timestamps.
+    /// Records the models' pictures onto their canvases; returns which stages have timestamps.
     fn draw(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
@@ -231,16 +226,16 @@ impl Painter {
             let first = side * SECOND;
             let stamps = if is_timed { self.times.stamps(first) } else { Stamps::none() };
             let mut stages = &[PROJECT, SORT, BIN, RASTERIZE, CANVAS][..];
-            let rasterized = match self.room.as_mut().filter(|_| rasterizes) {
+            let rasterized = match self.buffers.as_mut().filter(|_| rasterizes) {
                 None => false,
-                Some(room) => {
+                Some(buffers) => {
                     let (camera, settings) = (&shot.camera, shot.settings);
                     let drawn = self
                         .rasterizing
-                        .draw(&self.gpu, model, room, camera, settings, canvas, columns, &stamps);
+                        .draw(&self.gpu, model, buffers, camera, settings, canvas, columns, &stamps);
                     match drawn {
                         Err(error) if settings.drawing == Drawing::Rasterizer => return Err(error),
-                        // Too many splats in one place: the blending unit draws them all the same.
+                        // Too many splats in a tile: the blending unit draws them.
                         drawn => drawn.is_ok(),
                     }
                 }
@@ -267,12 +262,12 @@ impl Painter {
     }
 }
 
-/// First column of pixels of the right model.
+/// First pixel column of the right model.
 fn column(shot: &Shot<'_>) -> u32 {
     (shot.divider.clamp(0.0, 1.0) * shot.camera.width as f32).round() as u32
 }
 
-/// What of depth a canvas counts as one.
+/// Depth in world units that a canvas stores as 1.
 fn unit(shot: &Shot<'_>) -> f32 {
     shot.depths[1].max(f32::MIN_POSITIVE)
 }

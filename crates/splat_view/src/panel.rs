@@ -1,4 +1,4 @@
-//! The panel: what can be chosen, and what there is to know.
+//! The panel beside the scene: settings, cameras, files, statistics.
 
 use egui::{ComboBox, ScrollArea, Slider, SliderClamping, Ui};
 use glam::DVec3;
@@ -8,7 +8,7 @@ use crate::sources::label;
 use crate::stage_times::{SECOND, STAGES};
 use crate::viewer::{Action, Moving, Viewer};
 
-/// What can be up.
+/// Up axes to choose from.
 const AXES: [(DVec3, &str); 6] = [
     (DVec3::NEG_Y, "-y"),
     (DVec3::Y, "y"),
@@ -19,15 +19,15 @@ const AXES: [(DVec3, &str); 6] = [
 ];
 /// Keys and gestures, as the panel lists them.
 const KEYS: &str = "\
-drag: turn; right drag or shift: pan; wheel: zoom
-double click: look there
-W A S D Q E, arrows: move, turn; shift: faster
-1-5 display   V orbit, fly, first person   F all
-C cameras   [ ] camera by camera   H panel
-P screenshot   shift P with depth (EXR)
-K mark a place   R record   Esc stop";
+drag: orbit; right drag or Shift: pan; wheel: zoom
+double click: orbit about this point
+W A S D Q E, arrows: move, turn; Shift: faster
+1-5: display   V: orbit, fly, first person   F: fit scene
+C: cameras   [ ]: previous, next camera   H: panel
+P: screenshot   Shift P: EXR with depth
+K: mark a place   R: record   Esc: stop";
 
-/// Shows it.
+/// Shows the panel; `times` are milliseconds of the stages.
 pub fn panel(
     viewer: &mut Viewer,
     ui: &mut Ui,
@@ -83,7 +83,7 @@ fn models(viewer: &Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
     });
     if viewer.sources.len() > 1 {
         ui.horizontal(|ui| {
-            ui.label("Beside it");
+            ui.label("Compare with");
             choice(viewer, ui, 1, actions);
         });
     }
@@ -97,18 +97,18 @@ fn display(viewer: &mut Viewer, ui: &mut Ui) {
     });
     if viewer.settings.display == Display::Splats {
         ui.horizontal(|ui| {
-            ui.label("drawn by");
+            ui.label("Draw");
             for (drawing, name) in Drawing::ALL {
                 ui.selectable_value(&mut viewer.settings.drawing, drawing, name);
             }
         });
     }
     if viewer.settings.display == Display::Points {
-        ui.add(Slider::new(&mut viewer.settings.radius, 0.5..=8.0).text("radius, px"));
+        ui.add(Slider::new(&mut viewer.settings.radius, 0.5..=8.0).text("point size, px"));
     }
     let stored = viewer.shown.iter().flatten().map(|s| s.model.file.splats.sh_degree).max();
     if let Some(stored) = stored.filter(|&degree| degree > 0) {
-        // What was asked for stays for models that have more.
+        // The setting stays as it is for models of a higher degree.
         let mut degree = viewer.settings.sh_degree.min(stored);
         if ui.add(Slider::new(&mut degree, 0..=stored).text("SH degree")).changed() {
             viewer.settings.sh_degree = degree;
@@ -116,7 +116,7 @@ fn display(viewer: &mut Viewer, ui: &mut Ui) {
     }
     ui.horizontal(|ui| {
         ui.color_edit_button_rgb(&mut viewer.settings.background);
-        ui.label("background");
+        ui.label("Background");
     });
 }
 
@@ -133,13 +133,13 @@ fn camera(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
     }
     let far = (4.0 * viewer.extent().1) as f32;
     let range = 1e-4 * far..=far;
-    // One that --near gave may lie outside, and stays until it is moved.
+    // A near plane given by --near may lie outside the range, and stays until it is moved.
     let near = Slider::new(&mut viewer.settings.near, range).logarithmic(true);
-    ui.add(near.clamping(SliderClamping::Edits).text("near"));
+    ui.add(near.clamping(SliderClamping::Edits).text("near plane"));
     ui.horizontal(|ui| {
         let found = AXES.iter().find(|(axis, _)| axis.dot(viewer.up) > 0.999);
-        let text = found.map_or("the cameras'", |(_, name)| name);
-        ComboBox::from_label("is up").width(60.0).selected_text(text).show_ui(ui, |ui| {
+        let text = found.map_or("cameras", |(_, name)| name);
+        ComboBox::from_label("up axis").width(60.0).selected_text(text).show_ui(ui, |ui| {
             for (axis, name) in AXES {
                 if ui.selectable_label(viewer.up == axis, name).clicked() {
                     viewer.up = axis;
@@ -147,7 +147,7 @@ fn camera(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
                 }
             }
         });
-        if ui.button("All (F)").clicked() {
+        if ui.button("Fit scene (F)").clicked() {
             actions.push(Action::Frame);
         }
     });
@@ -165,7 +165,7 @@ fn capture(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
         }
     });
     if at.and_then(|i| viewer.cameras[i].photo.as_ref()).is_some() {
-        ui.add(Slider::new(&mut viewer.photo_strength, 0.0..=1.0).text("photo"));
+        ui.add(Slider::new(&mut viewer.photo_strength, 0.0..=1.0).text("photo opacity"));
     }
 }
 
@@ -182,15 +182,15 @@ fn files(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
         if ui.button(format!("Mark place {} (K)", viewer.path.keys.len() + 1)).clicked() {
             viewer.path.keys.push(viewer.viewpoint);
         }
-        if !viewer.path.keys.is_empty() && ui.button("Forget all").clicked() {
+        if !viewer.path.keys.is_empty() && ui.button("Clear places").clicked() {
             viewer.path.keys.clear();
         }
     });
     if let Some(recording) = &viewer.recording {
-        ui.label(format!("picture {} of {} (Esc stops)", recording.next, recording.total()));
+        ui.label(format!("Picture {} of {} (Esc stops)", recording.next, recording.total()));
     } else if viewer.path.keys.len() > 1 {
         let between = &mut viewer.pictures_between;
-        ui.add(Slider::new(between, 1..=600).logarithmic(true).text("pictures each"));
+        ui.add(Slider::new(between, 1..=600).logarithmic(true).text("pictures per segment"));
         let total = viewer.path.pictures(viewer.pictures_between);
         if ui.button(format!("Record {total} pictures (R)")).clicked() {
             actions.push(Action::Record);
@@ -203,9 +203,9 @@ fn statistics(viewer: &Viewer, ui: &mut Ui, times: Option<[f32; STAGES.len()]>) 
         let splats = shown.model.file.splats.len();
         ui.label(format!("{splats} splats: {}", viewer.name_of(&shown.path)));
     }
-    ui.label(format!("frame {:.1} ms", viewer.frame_ms));
+    ui.label(format!("Frame: {:.1} ms", viewer.frame_ms));
     let Some(times) = times else {
-        ui.label("this device tells no times of stages");
+        ui.label("This device has no timestamps.");
         return;
     };
     egui::Grid::new("times").show(ui, |ui| {
@@ -236,14 +236,16 @@ mod tests {
     use crate::painter::Painter;
     use crate::viewer::Shown;
 
-    /// What is set after two frames that nobody touches the panel in.
+    /// The settings after two frames in which nobody touches the panel.
     fn untouched(mut viewer: Viewer) -> Settings {
         let context = Context::default();
         for _ in 0..2 {
-            let _ = context.run_ui(RawInput::default(), |ui| {
+            let mut output = context.run_ui(RawInput::default(), |ui| {
                 CentralPanel::default()
                     .show(ui, |ui| panel(&mut viewer, ui, None, &mut Vec::new()));
             });
+            // Nothing is painted here: egui asks that its textures are then dropped by name.
+            output.textures_delta.clear();
         }
         viewer.settings
     }

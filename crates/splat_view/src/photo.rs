@@ -1,4 +1,4 @@
-//! Photos of a capture: PNG and JPEG, untrusted.
+//! Reads photos of a capture, PNG and JPEG. The files are untrusted.
 
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
@@ -9,9 +9,9 @@ use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-/// Largest file that is read.
+/// Largest file that is read, bytes.
 const FILE_MAX: u64 = 256 << 20;
-/// Longest side that is read.
+/// Longest side that is read, pixels.
 const SIDE_MAX: usize = 16_384;
 
 /// An 8-bit picture.
@@ -24,7 +24,7 @@ pub struct Photo {
 }
 
 impl Photo {
-    /// The photo with no side longer than `most`: what is longer is averaged.
+    /// Shrinks the photo by averaging until no side is longer than `most` pixels.
     #[must_use]
     pub fn within(self, most: usize) -> Self {
         let [width, height] = self.size;
@@ -33,7 +33,7 @@ impl Photo {
             return self;
         }
         let size = self.size.map(|side| (side * most / longest).max(1));
-        // The pixels of a side that a smaller one's pixel stands for.
+        // The range of source pixels that one target pixel averages.
         let part = |i: usize, was: usize, is: usize| {
             let begin = i * was / is;
             begin..((i + 1) * was / is).max(begin + 1)
@@ -49,7 +49,7 @@ impl Photo {
                     for pixel in self.rgba[from..from + 4 * columns.len()].chunks_exact(4) {
                         let alpha = u64::from(pixel[3]);
                         alphas += alpha;
-                        // What cannot be seen has no colour to give.
+                        // Weighted by alpha: invisible pixels have no meaningful colour.
                         for (sum, &value) in sum.iter_mut().zip(pixel) {
                             *sum += alpha * u64::from(value);
                         }
@@ -87,21 +87,6 @@ fn jpeg(bytes: &[u8]) -> JpegDecoder<Cursor<&[u8]>> {
         .set_max_height(SIDE_MAX)
         .jpeg_set_out_colorspace(ColorSpace::RGBA);
     JpegDecoder::new_with_options(Cursor::new(bytes), options)
-}
-
-/// Width and height in pixels, from the file's head.
-pub fn photo_size(path: &Path) -> Result<[usize; 2]> {
-    let bytes = bytes(path)?;
-    if is_png(&bytes) {
-        let reader =
-            png::Decoder::new(Cursor::new(&bytes)).read_info().map_err(|e| bad(path, e))?;
-        let info = reader.info();
-        return Ok([info.width as usize, info.height as usize]);
-    }
-    let mut decoder = jpeg(&bytes);
-    decoder.decode_headers().map_err(|e| bad(path, e))?;
-    let (width, height) = decoder.dimensions().ok_or_else(|| bad(path, "it has no size"))?;
-    Ok([width, height])
 }
 
 /// Reads a photo.
@@ -178,7 +163,6 @@ mod tests {
         ];
         for (color, depth, data, expected) in kinds {
             let path = file("kind.png", &png(color, depth, data));
-            assert_eq!(photo_size(&path).expect("size"), [2, 1], "{color:?}");
             let photo = read_photo(&path).expect("photo");
             assert_eq!((photo.size, &photo.rgba[..]), ([2, 1], &expected[..]), "{color:?}");
             std::fs::remove_file(path).expect("clean");
@@ -205,7 +189,6 @@ mod tests {
         // 16x8: the left half (200, 40, 30), the right one (20, 60, 180).
         let bytes = include_bytes!("../tests/photo.jpg");
         let path = file("a.jpg", bytes);
-        assert_eq!(photo_size(&path).expect("size"), [16, 8]);
         let photo = read_photo(&path).expect("photo");
         assert_eq!((photo.size, photo.rgba.len()), ([16, 8], 16 * 8 * 4));
         for (x, expected) in [(3, [200, 40, 30, 255]), (12, [20, 60, 180, 255])] {
@@ -220,7 +203,6 @@ mod tests {
             let path = file(name, bytes);
             let error = read_photo(&path).expect_err(name).to_string();
             assert!(error.contains(name) && error.contains("no PNG or JPEG"), "{error}");
-            photo_size(&path).expect_err(name);
             std::fs::remove_file(path).expect("clean");
         }
     }

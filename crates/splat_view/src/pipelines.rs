@@ -1,4 +1,4 @@
-//! How the passes that draw are made: bindings, and a pipeline of one WGSL module.
+//! Render pipelines of one WGSL module, and their bindings.
 
 use splat_render::gpu::Gpu;
 
@@ -57,7 +57,7 @@ impl Pipeline {
         Self { layout, pipeline }
     }
 
-    /// Draws `vertices` of each of `instances` with a group of bindings of its own.
+    /// Draws `vertices` of each of `instances` with a group of bindings.
     pub fn draw(
         &self,
         pass: &mut wgpu::RenderPass<'_>,

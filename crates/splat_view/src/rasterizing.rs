@@ -1,4 +1,4 @@
-//! Splats to a canvas by splat_render's rasterizer: the picture is made on the device and stays there.
+//! Draws splats onto a canvas with the renderer's rasterizer. The picture stays on the device.
 
 use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::{Gpu, ResidentPicture};
@@ -9,7 +9,7 @@ use crate::display::Settings;
 use crate::pipelines::{Pipeline, storage_layout, uniform, uniform_layout};
 use crate::stage_times::{BIN, CANVAS as CANVAS_STAGE, PROJECT, RASTERIZE, SORT, Stamps};
 
-/// Columns of a canvas.
+/// A range of a canvas's columns.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct Place {
@@ -17,9 +17,9 @@ struct Place {
     width: u32,
 }
 
-/// What pictures for a canvas are made in.
+/// Buffers for the rasterizer's picture of a canvas.
 #[derive(Debug)]
-pub struct Room {
+pub struct PictureBuffers {
     /// Width and height in pixels of the largest picture.
     pub size: [u32; 2],
     picture: ResidentPicture,
@@ -46,22 +46,22 @@ impl Rasterizing {
         ))
     }
 
-    /// Room for pictures up to a size.
-    pub fn room(&self, gpu: &Gpu, size: [u32; 2]) -> Result<Room> {
+    /// Allocates buffers for pictures up to a size.
+    pub fn buffers(&self, gpu: &Gpu, size: [u32; 2]) -> Result<PictureBuffers> {
         let picture = ResidentPicture::new(gpu, size[0], size[1])?;
         let place = uniform::<Place>(gpu);
         let buffers = [&place, picture.picture()];
         let bindings = self.0.bind(gpu, buffers.map(wgpu::Buffer::as_entire_binding));
-        Ok(Room { size, picture, place, bindings })
+        Ok(PictureBuffers { size, picture, place, bindings })
     }
 
-    /// Draws a model's picture onto a canvas, columns `begin..end` of it, which are not none. It is
-    /// submitted, so that the room is free for the next one.
+    /// Draws a model's picture onto columns `begin..end` of a canvas, at least one. The work is
+    /// submitted, so that the buffers are free for the next model.
     pub fn draw(
         &self,
         gpu: &Gpu,
         model: &Drawable,
-        room: &mut Room,
+        buffers: &mut PictureBuffers,
         camera: &Camera,
         settings: &Settings,
         canvas: &wgpu::TextureView,
@@ -70,7 +70,7 @@ impl Rasterizing {
     ) -> Result<()> {
         let (camera, options) = model.seen_from(camera, settings);
         let mut encoder = gpu.device().create_command_encoder(&Default::default());
-        room.picture.record(
+        buffers.picture.record(
             gpu,
             &mut encoder,
             model.splats(),
@@ -81,7 +81,7 @@ impl Rasterizing {
             [PROJECT, SORT, BIN, RASTERIZE].map(|stage| stamps.compute(stage)),
         )?;
         let columns = Place { begin, width: end - begin };
-        gpu.queue().write_buffer(&room.place, 0, bytemuck::bytes_of(&columns));
+        gpu.queue().write_buffer(&buffers.place, 0, bytemuck::bytes_of(&columns));
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("canvas"),
             color_attachments: &[Some(wgpu::RenderPassColorAttachment {
@@ -97,7 +97,7 @@ impl Rasterizing {
             ..Default::default()
         });
         pass.set_scissor_rect(begin, 0, end - begin, camera.height);
-        self.0.draw(&mut pass, &room.bindings, 3, 1);
+        self.0.draw(&mut pass, &buffers.bindings, 3, 1);
         drop(pass);
         gpu.queue().submit([encoder.finish()]);
         gpu.check()

@@ -1,23 +1,23 @@
-//! From where a scene is looked at when nobody has said.
+//! The view of a scene that the command line asks for, and what holds where it says nothing.
 
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
-use splat_render::Result;
 use splat_render::constants::NEAR;
+use splat_render::{Error, Result};
 
 use crate::arguments::Arguments;
 use crate::capture::{CaptureCamera, find_cameras, read_cameras};
 use crate::model::Model;
 use crate::viewpoint::{Viewpoint, up_of};
 
-/// What is up where no camera says: COLMAP's and so most captures' y is down.
+/// Up axis without cameras: in COLMAP's scenes, and so in most captures, y points down.
 const UP: DVec3 = DVec3::NEG_Y;
-/// The near plane of small scenes, in parts of their radius.
+/// Near plane of small scenes, as a fraction of their radius.
 const NEAR_PART: f64 = 0.05;
 
-/// A capture's cameras, those that were named or those that lie in or beside a scene. Cameras that
-/// nobody named and that cannot be read are left out, with a sentence.
+/// A capture's cameras: those that were named, else those in a scene's folder. Cameras that nobody
+/// named and that cannot be read are left out, and the note says so.
 pub fn cameras_of(
     named: Option<&Path>,
     scene: Option<&Path>,
@@ -34,7 +34,7 @@ pub fn cameras_of(
     }
 }
 
-/// The cameras in a scene's folder, or in the folder that a round's folder is in.
+/// The cameras in a scene's folder.
 fn beside(scene: &Path) -> Option<PathBuf> {
     if scene.is_dir() {
         return find_cameras(scene);
@@ -44,20 +44,33 @@ fn beside(scene: &Path) -> Option<PathBuf> {
     find_cameras(folder)
 }
 
-/// What is up: as said, as the cameras have it, or as most captures do.
+/// The camera that `--camera` names.
+pub fn numbered(cameras: &[CaptureCamera], number: usize) -> Result<&CaptureCamera> {
+    cameras.get(number).ok_or_else(|| {
+        Error::argument(
+            "--camera",
+            match cameras.len() {
+                0 => "no cameras were found; name them with --cameras".to_owned(),
+                count => format!("must be less than {count}, the number of cameras"),
+            },
+        )
+    })
+}
+
+/// The up axis: of the command line, else the cameras', else that of most captures.
 pub fn up(arguments: &Arguments, cameras: &[CaptureCamera]) -> DVec3 {
     let said = arguments.up.map(DVec3::from);
     said.or_else(|| up_of(cameras.iter().map(|c| &c.camera))).unwrap_or(UP)
 }
 
-/// The near plane of a scene: the renderer's, but nearer for scenes so small that it would lie beyond
-/// them. All of a scene is seen from about three times its radius.
+/// Near plane of a scene: the renderer's, or less for scenes so small that it would cut them off. A whole
+/// scene is seen from about three times its radius.
 pub fn near(model: &Model) -> f32 {
     let own = (NEAR_PART * model.radius) as f32;
     own.clamp(f32::MIN_POSITIVE, NEAR)
 }
 
-/// The first view of a scene: the capture's first camera, else all of the scene.
+/// First view of a scene: the capture's first camera, else the whole scene.
 pub fn first_view(model: &Model, cameras: &[CaptureCamera], up: DVec3, fov: f64) -> Viewpoint {
     match cameras.first() {
         Some(first) => Viewpoint::of_camera(&first.camera, model.center, model.radius),

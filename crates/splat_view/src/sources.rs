@@ -1,4 +1,4 @@
-//! The models that a path means, and when they were written.
+//! The models at a path, and when they were written.
 
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -8,7 +8,7 @@ use splat_render::{Error, Result};
 /// A model that can be shown.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Source {
-    /// What people read.
+    /// Label in the panel.
     pub name: String,
     /// The file.
     pub path: PathBuf,
@@ -16,7 +16,7 @@ pub struct Source {
     pub folder: PathBuf,
 }
 
-/// What people read of a source: its folder, too, where another one has its name.
+/// Label of a source; with its folder if another source has the same name.
 pub fn label(source: &Source, among: &[Source]) -> String {
     let alike = |other: &&Source| other.name == source.name && other.path != source.path;
     let mut twins = among.iter().filter(alike).peekable();
@@ -84,11 +84,11 @@ pub fn find_sources(path: &Path) -> Result<Vec<Source>> {
     if sources.is_empty() {
         return Err(Error::file(
             path,
-            "holds no scene.ply, no rounds and no checkpoint; give a splat file or the folder of an \
-             igsr fit or igsr refine",
+            "holds no scene.ply, rounds or checkpoint; give a splat file or the folder of an igsr fit \
+             or igsr refine",
         ));
     }
-    // A scene is written when its fit ends: what is newer than it is under way.
+    // A scene is written when its fit ends: a newer checkpoint belongs to a fit in progress.
     let stamps: Vec<_> = sources.iter().map(|source| stamp(&source.path)).collect();
     let newest = (0..sources.len()).max_by_key(|&i| stamps[i]).unwrap_or(0);
     let is_under_way = sources[newest].path.extension().is_some_and(|ending| ending == "npz");
@@ -100,7 +100,7 @@ pub fn find_sources(path: &Path) -> Result<Vec<Source>> {
     Ok(sources)
 }
 
-/// A fit writes its last checkpoint about when it writes its scene: seconds apart say nothing.
+/// More than two seconds newer: a fit writes its last checkpoint and its scene at about the same time.
 fn is_clearly_newer(one: Option<Stamp>, other: Option<Stamp>) -> bool {
     one.zip(other).is_some_and(|((one, _), (other, _))| {
         one.duration_since(other).is_ok_and(|gap| gap.as_secs() > 2)
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_folder_is_one_sentence() {
+    fn an_empty_folder_is_an_error_message() {
         let folder = folder("empty", &["notes.txt"]);
         let error = find_sources(&folder).expect_err("nothing there").to_string();
         assert!(error.contains("holds no scene.ply"), "{error}");

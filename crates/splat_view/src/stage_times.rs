@@ -1,4 +1,4 @@
-//! How long each stage of a frame takes, by timestamps that the device writes.
+//! Time of each stage of a frame, by the device's timestamps.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -23,38 +23,38 @@ pub const STAGES: [&str; 14] = [
     "compose",
     "panel",
 ];
-/// Splats to 2D splats.
+/// Splats are projected to 2D splats.
 pub const PROJECT: usize = 0;
-/// By depth.
+/// 2D splats are sorted by depth.
 pub const SORT: usize = 1;
-/// 2D splats to a canvas, by the blending unit.
+/// The blending unit draws 2D splats onto a canvas.
 pub const BLEND: usize = 2;
-/// Lists of splats for each tile.
+/// Each tile gets its list of splats.
 pub const BIN: usize = 3;
-/// 2D splats to the rasterizer's picture.
+/// The rasterizer draws its picture.
 pub const RASTERIZE: usize = 4;
-/// That picture to a canvas.
+/// That picture is copied onto a canvas.
 pub const CANVAS: usize = 5;
-/// Where the second model's begin.
+/// First stage of the second model.
 pub const SECOND: usize = 6;
-/// The two canvases to one picture.
+/// The canvases are composed into one picture.
 pub const COMPOSE: usize = 12;
-/// What egui paints.
+/// egui paints panel and overlays.
 pub const PANEL: usize = 13;
 
-/// Which stages a frame has.
+/// Which stages of a frame wrote a timestamp.
 pub type Written = [bool; STAGES.len()];
 
-/// The query for where a frame begins.
+/// The query for the beginning of a frame.
 const BEGIN: usize = STAGES.len();
 const COUNT: usize = STAGES.len() + 1;
-/// What a query's place in a buffer is a multiple of, for resolving it there.
+/// Alignment of a query's place in the buffer that it is resolved to.
 const ALIGNMENT: u64 = wgpu::QUERY_RESOLVE_BUFFER_ALIGNMENT;
 
-/// Timestamps of a frame. A device without them has no times.
+/// Timestamps of a frame. Devices without timestamps give no times.
 ///
-/// Each stage writes one when it ends, and has taken what has passed since the last one before. Those
-/// at the beginning of passes say less: on llvmpipe they are written after the pass's first dispatch.
+/// Each stage writes one when it ends; its time is the difference to the stage before. Timestamps at the
+/// beginning of passes are less exact: llvmpipe writes them after the pass's first dispatch.
 #[derive(Debug)]
 pub struct StageTimes {
     queries: Option<Queries>,
@@ -68,7 +68,7 @@ struct Queries {
     readable: wgpu::Buffer,
     /// Milliseconds of one tick.
     tick: f64,
-    /// Stages of the frame whose times are under way.
+    /// Stages of the frame whose times are being read back.
     written: Written,
     is_pending: bool,
     is_mapped: Arc<AtomicBool>,
@@ -82,7 +82,7 @@ pub struct Stamps<'a> {
 }
 
 impl<'a> Stamps<'a> {
-    /// None at all.
+    /// No timestamps.
     pub fn none() -> Self {
         Self { set: None, first: 0 }
     }
@@ -116,7 +116,7 @@ impl<'a> Stamps<'a> {
 }
 
 impl StageTimes {
-    /// Of frames on this device.
+    /// Times of frames on this device.
     pub fn new(gpu: &Gpu) -> Self {
         let device = gpu.device();
         let queries =
@@ -142,13 +142,13 @@ impl StageTimes {
     }
 
     /// Where the passes of a frame write, beginning with stage `first`; nowhere while an earlier
-    /// frame's times are under way.
+    /// frame's times are being read back.
     pub fn stamps(&self, first: usize) -> Stamps<'_> {
         let set = self.queries.as_ref().filter(|q| !q.is_pending).map(|q| &q.set);
         Stamps { set, first }
     }
 
-    /// Submits where a frame begins, ahead of all its work.
+    /// Submits the timestamp of a frame's beginning, ahead of its work.
     pub fn begin(&self, gpu: &Gpu) {
         let Some(timestamp_writes) = self.stamps(BEGIN).compute(0) else { return };
         let mut encoder = gpu.device().create_command_encoder(&Default::default());
@@ -159,7 +159,7 @@ impl StageTimes {
         gpu.queue().submit([encoder.finish()]);
     }
 
-    /// Records the read-back of the stages that the frame had.
+    /// Records the read-back of the stages that were written.
     pub fn resolve(&mut self, encoder: &mut wgpu::CommandEncoder, written: Written) {
         let Some(q) = self.queries.as_mut().filter(|q| !q.is_pending) else { return };
         q.written = written;
@@ -171,7 +171,7 @@ impl StageTimes {
         encoder.copy_buffer_to_buffer(&q.resolved, 0, &q.readable, 0, COUNT as u64 * ALIGNMENT);
     }
 
-    /// Asks for the times of the frame just submitted.
+    /// Starts the read-back of the frame just submitted.
     pub fn submitted(&mut self) {
         let Some(q) = self.queries.as_mut().filter(|q| !q.is_pending) else { return };
         q.is_pending = true;
@@ -181,13 +181,13 @@ impl StageTimes {
         });
     }
 
-    /// Whether a frame's times are under way.
+    /// Whether a frame's times are being read back.
     pub fn are_pending(&self) -> bool {
         self.queries.as_ref().is_some_and(|q| q.is_pending)
     }
 
-    /// Milliseconds of each stage of the latest frame whose times have come, 0 for stages that it did
-    /// not have; None before there is one.
+    /// Milliseconds of each stage of the latest frame whose times have arrived, 0 for stages that it did
+    /// not have; None before the first.
     pub fn latest(&mut self) -> Option<[f32; STAGES.len()]> {
         if let Some(q) = &mut self.queries
             && q.is_mapped.swap(false, Ordering::Acquire)

@@ -1,4 +1,4 @@
-//! What the window knows: models, the view, the capture, and what of it may change.
+//! The state of the window: models, view, capture, settings.
 
 use std::path::{Path, PathBuf};
 
@@ -17,17 +17,17 @@ use crate::viewpoint::{Viewpoint, fitted};
 /// How keys and drags move the camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Moving {
-    /// Drags turn about a point.
+    /// Drags orbit about a point.
     #[default]
     Orbit,
-    /// Drags turn on the spot, keys move along the gaze.
+    /// Drags look around, keys move along the viewing direction.
     Fly,
-    /// Drags turn on the spot, keys move on the level.
+    /// Drags look around, keys move horizontally.
     FirstPerson,
 }
 
 impl Moving {
-    /// All of them, with what people read.
+    /// All modes, with their labels.
     pub const ALL: [(Self, &str); 3] =
         [(Self::Orbit, "Orbit"), (Self::Fly, "Fly"), (Self::FirstPerson, "First person")];
 }
@@ -39,24 +39,24 @@ pub struct Shown {
     pub path: PathBuf,
     /// The file's stamp when it was read.
     pub stamp: Option<Stamp>,
-    /// In memory, for files with depth and to be looked at.
+    /// The model in memory: for its extent, and for files with depth.
     pub model: Model,
     /// On the device.
     pub drawable: Drawable,
 }
 
-/// What panel, keys and gestures ask the window to do.
+/// What the panel, keys and gestures ask the session to do.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
-    /// Show a source on a side; none takes the right side away.
+    /// Show a source on a side; None removes the right side.
     Choose(usize, Option<usize>),
-    /// Show all of the scene.
+    /// Fit the whole scene in the picture.
     Frame,
-    /// Look from the capture's camera.
+    /// Move the view to a camera of the capture.
     Jump(usize),
-    /// Move the middle of orbits to what is at a pixel.
+    /// Move the pivot of orbits to what is at a pixel.
     Focus([u32; 2]),
-    /// Save what is seen.
+    /// Save the picture.
     Screenshot,
     /// Save the render with alpha and depth.
     SaveExr,
@@ -77,27 +77,27 @@ pub struct Viewer {
     pub chosen: [Option<PathBuf>; 2],
     /// What is drawn there.
     pub shown: [Option<Shown>; 2],
-    /// Where the right side begins, in parts of the width.
+    /// Where the right side begins, as a fraction of the width.
     pub divider: f32,
     /// Whether the pointer holds the divider.
     pub holds_divider: bool,
-    /// How it is drawn.
+    /// How splats are drawn.
     pub settings: Settings,
-    /// From where.
+    /// The view.
     pub viewpoint: Viewpoint,
     /// Whether a model or a camera has set `viewpoint`.
     pub is_placed: bool,
-    /// What is up.
+    /// The up axis, a unit vector.
     pub up: DVec3,
-    /// How it is moved.
+    /// How the view is moved.
     pub moving: Moving,
     /// The capture's cameras.
     pub cameras: Vec<CaptureCamera>,
-    /// The one that is looked from.
+    /// The camera that the view is at.
     pub at_camera: Option<usize>,
     /// Whether they are drawn.
     pub shows_cameras: bool,
-    /// How much of the photo is laid over the picture from its camera.
+    /// Opacity of the photo over the picture from its camera, 0 to 1.
     pub photo_strength: f32,
     /// Places marked for a recording.
     pub path: CameraPath,
@@ -105,18 +105,18 @@ pub struct Viewer {
     pub pictures_between: u32,
     /// The recording under way.
     pub recording: Option<Recording>,
-    /// The last thing that happened, or went wrong.
+    /// The last result or error.
     pub message: String,
-    /// Whether the panel is there.
+    /// Whether the panel is shown.
     pub shows_panel: bool,
     /// Name of the device.
     pub device: String,
-    /// Milliseconds from the start of a frame to its submission and show.
+    /// Milliseconds from the start of a frame until it is shown.
     pub frame_ms: f32,
 }
 
 impl Viewer {
-    /// With nothing to show.
+    /// A window that shows nothing.
     pub fn new(settings: Settings, device: String) -> Self {
         Self {
             sources: Vec::new(),
@@ -144,13 +144,13 @@ impl Viewer {
         }
     }
 
-    /// Middle and radius of what is shown.
+    /// Centre and radius of what is shown.
     pub fn extent(&self) -> (DVec3, f64) {
         let shown = self.shown.iter().flatten().next();
         shown.map_or((DVec3::ZERO, 1.0), |shown| (shown.model.center, shown.model.radius))
     }
 
-    /// The camera of a picture of a size: the capture's own where one looks from it.
+    /// The camera of a picture of a size: the capture's own if the view is at one.
     pub fn camera(&self, size: [u32; 2]) -> Camera {
         match self.at_camera.and_then(|i| self.cameras.get(i)) {
             Some(at) => fitted(&at.camera, size),
@@ -158,7 +158,7 @@ impl Viewer {
         }
     }
 
-    /// Looks from the capture's camera.
+    /// Moves the view to a camera of the capture.
     pub fn jump(&mut self, number: usize) {
         let Some(at) = self.cameras.get(number) else { return };
         let (center, radius) = self.extent();
@@ -167,7 +167,7 @@ impl Viewer {
         self.message = format!("Camera {number}: {}", at.name);
     }
 
-    /// Leaves the capture's camera, whose lens goes on.
+    /// Leaves the capture's camera and keeps its field of view.
     pub fn leave_camera(&mut self, size: [u32; 2]) {
         if self.at_camera.is_some() {
             let camera = self.camera(size);
@@ -176,7 +176,7 @@ impl Viewer {
         }
     }
 
-    /// Shows all of the scene.
+    /// Fits the whole scene in the picture.
     pub fn frame(&mut self) {
         let (center, radius) = self.extent();
         self.viewpoint = Viewpoint::framing(center, radius, self.up, self.settings.fov);
@@ -199,7 +199,8 @@ impl Viewer {
         }
     }
 
-    /// What is under a pixel becomes the middle of orbits and of the picture.
+    /// Makes what is under a pixel the pivot of orbits and the centre of the picture. False if there is
+    /// nothing.
     pub fn focus(
         &mut self,
         painter: &mut Painter,

@@ -1,24 +1,24 @@
-//! Where one looks from, and how it is moved.
+//! A view of the scene, and how it is moved.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use splat_render::Camera;
 
-/// Nearest that the gaze may come to up or down, radians.
+/// Smallest angle between the viewing direction and the up axis, radians.
 const POLE: f64 = 0.02;
 
-/// A place, a gaze and what is being looked at.
+/// A camera's pose, with the pivot that orbits go about.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Viewpoint {
     /// The camera's centre in the world.
     pub position: DVec3,
     /// From camera axes (x right, y down, z forward) to the world.
     pub rotation: DQuat,
-    /// How far ahead the point lies that orbits go about.
+    /// Distance of the pivot, straight ahead.
     pub distance: f64,
 }
 
 impl Viewpoint {
-    /// From a place to a point ahead.
+    /// At `position`, looking at `target`.
     pub fn looking(position: DVec3, target: DVec3, up: DVec3) -> Self {
         let forward = (target - position).normalize_or(DVec3::Z);
         let right = forward.cross(up);
@@ -31,9 +31,9 @@ impl Viewpoint {
         }
     }
 
-    /// A ball as it fills the picture, from a little above.
+    /// A view in which a ball fills the picture, from a little above.
     pub fn framing(center: DVec3, radius: f64, up: DVec3, fov: f64) -> Self {
-        // What is forward in the captures of each convention: y down, or z up.
+        // The usual forward direction of each convention: y down, or z up.
         let usual = if up.z.abs() > 0.9 { DVec3::Y } else { DVec3::Z };
         let level = (usual - up * up.dot(usual)).normalize_or(up.any_orthonormal_vector());
         let (sin, cos) = 15f64.to_radians().sin_cos();
@@ -41,7 +41,7 @@ impl Viewpoint {
         Self::looking(center - (level * cos - up * sin) * distance, center, up)
     }
 
-    /// A capture's camera, with the point ahead that is nearest to `center` at the middle of orbits.
+    /// A capture's camera; the pivot is the point straight ahead that is nearest to `center`.
     pub fn of_camera(camera: &Camera, center: DVec3, radius: f64) -> Self {
         let rotation = DQuat::from_mat3(&camera.rotation().transpose());
         let position = camera.center();
@@ -49,17 +49,17 @@ impl Viewpoint {
         Self { position, rotation, distance: ahead.max(0.1 * radius) }
     }
 
-    /// To the right.
+    /// Right axis in the world.
     pub fn right(&self) -> DVec3 {
         self.rotation * DVec3::X
     }
 
-    /// Downward in the picture.
+    /// Down axis in the world.
     pub fn down(&self) -> DVec3 {
         self.rotation * DVec3::Y
     }
 
-    /// Ahead.
+    /// Viewing direction in the world.
     pub fn forward(&self) -> DVec3 {
         self.rotation * DVec3::Z
     }
@@ -69,36 +69,36 @@ impl Viewpoint {
         self.position + self.forward() * self.distance
     }
 
-    /// Turns on the spot: radians to the right about `up`, and upward.
+    /// Looks around: radians to the right about `up`, and upward.
     pub fn turn(&mut self, yaw: f64, pitch: f64, up: DVec3) {
         let from_up = self.forward().angle_between(up);
         let pitch = pitch.clamp(from_up - (std::f64::consts::PI - POLE), from_up - POLE);
         let lean = DQuat::from_axis_angle(self.right(), pitch);
-        // About up, the right hand's turn is to the left.
+        // A right-handed rotation about the up axis turns to the left.
         let rotation = DQuat::from_axis_angle(up, -yaw) * lean * self.rotation;
         self.rotation = rotation.normalize();
     }
 
-    /// Turns about the pivot.
+    /// Orbits about the pivot.
     pub fn orbit(&mut self, yaw: f64, pitch: f64, up: DVec3) {
         let pivot = self.pivot();
         self.turn(yaw, pitch, up);
         self.position = pivot - self.forward() * self.distance;
     }
 
-    /// Shifts so that what lies at the pivot follows the pointer: world units to the right and down.
+    /// Moves so that what lies at the pivot follows the pointer: world units to the right and down.
     pub fn pan(&mut self, right: f64, down: f64) {
         self.position -= self.right() * right + self.down() * down;
     }
 
-    /// Comes nearer to the pivot by a factor.
+    /// Divides the distance to the pivot by a factor.
     pub fn zoom(&mut self, factor: f64) {
         let pivot = self.pivot();
         self.distance = (self.distance / factor).clamp(1e-6, 1e9);
         self.position = pivot - self.forward() * self.distance;
     }
 
-    /// Looks at a point from as far as before.
+    /// Moves the pivot to a point, at the same distance and direction.
     pub fn focus(&mut self, target: DVec3) {
         self.position = target - self.forward() * self.distance;
     }
@@ -108,7 +108,7 @@ impl Viewpoint {
         DMat4::from_quat(self.rotation.inverse()) * DMat4::from_translation(-self.position)
     }
 
-    /// A pinhole with the middle of the picture ahead; `fov` is vertical, in radians.
+    /// A pinhole camera with the principal point at the centre; `fov` is vertical, in radians.
     pub fn camera(&self, [width, height]: [u32; 2], fov: f64) -> Camera {
         let focal = 0.5 * f64::from(height) / (0.5 * fov).tan();
         Camera {
@@ -137,7 +137,7 @@ pub fn relative_to(mut camera: Camera, origin: [f64; 3]) -> Camera {
     camera
 }
 
-/// The camera for a picture of another size that shows all that the camera shows.
+/// The camera for a picture of another size that still shows all of its own picture.
 pub fn fitted(camera: &Camera, [width, height]: [u32; 2]) -> Camera {
     let (w, h) = (f64::from(width), f64::from(height));
     let (was_w, was_h) = (f64::from(camera.width), f64::from(camera.height));
@@ -153,7 +153,7 @@ pub fn fitted(camera: &Camera, [width, height]: [u32; 2]) -> Camera {
     }
 }
 
-/// What is up for the cameras of a capture, if they agree on it.
+/// Mean up axis of a capture's cameras, None if it vanishes.
 pub fn up_of<'a>(cameras: impl Iterator<Item = &'a Camera>) -> Option<DVec3> {
     let sum: DVec3 = cameras.map(|camera| -(camera.rotation().transpose() * DVec3::Y)).sum();
     sum.try_normalize()

@@ -4,7 +4,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{Folder, ball, program, read_png, refused, run, said, write};
+use common::{Folder, ball, program, read_png, refused, run, said, write, write_cameras};
 use glam::{DMat4, DVec3};
 use splat_render::cpu::Cpu;
 use splat_render::io::SplatFile;
@@ -25,18 +25,6 @@ fn camera() -> Camera {
     }
 }
 
-/// The camera as a transforms.json has it: camera-to-world, y up and z back.
-fn write_transforms(path: &Path, camera: &Camera) {
-    let to_world = camera.viewmat.inverse() * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
-    let rows: Vec<[f64; 4]> = (0..4).map(|i| to_world.row(i).to_array()).collect();
-    let text = format!(
-        "{{\"fl_x\": {}, \"fl_y\": {}, \"cx\": {}, \"cy\": {}, \"w\": {}, \"h\": {}, \
-         \"frames\": [{{\"file_path\": \"a.png\", \"transform_matrix\": {rows:?}}}]}}",
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
-    );
-    std::fs::write(path, text).expect("transforms.json");
-}
-
 fn drawn(file: &SplatFile, camera: &Camera) -> Image<f32> {
     let params = file.splats.params(4);
     let projected = Cpu.project(&params, camera, &ProjectOptions::default()).expect("project");
@@ -53,7 +41,7 @@ fn a_capture_s_camera_draws_what_the_rasterizer_draws_on_cpu_and_gpu() {
     let (scene, out) = (folder.join("scene.ply"), folder.join("out.png"));
     let file = ball(300, 1, [0.6, 0.4, 0.3]);
     write(&scene, &file);
-    write_transforms(&folder.join("transforms.json"), &camera());
+    write_cameras(&folder.join("cameras.json"), &[camera()]);
     let expected = bytes(&drawn(&file, &camera()));
     for backend in ["cpu", "gpu"] {
         let output =
@@ -74,7 +62,7 @@ fn exr_holds_colour_alpha_and_expected_depth() {
     let (scene, out) = (folder.join("scene.ply"), folder.join("out.exr"));
     let file = ball(200, 2, [0.5; 3]);
     write(&scene, &file);
-    write_transforms(&folder.join("cameras.json"), &camera());
+    write_cameras(&folder.join("cameras.json"), &[camera()]);
     run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &"cpu"]);
     let image = exr::prelude::read_first_flat_layer_from_file(&out).expect("an EXR");
     let names: Vec<String> =
@@ -163,7 +151,7 @@ fn splats_that_are_not_finite_are_left_out_and_counted() {
     broken.splats.sh[2 * 4] = [f32::NAN; 3];
     with.splats.append(&broken.splats);
     write(&dirty, &with);
-    write_transforms(&folder.join("transforms.json"), &camera());
+    write_cameras(&folder.join("cameras.json"), &[camera()]);
     let draw = |scene: &Path| {
         let out = scene.with_extension("png");
         let output = run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &"cpu"]);
@@ -175,7 +163,7 @@ fn splats_that_are_not_finite_are_left_out_and_counted() {
 }
 
 #[test]
-fn files_that_hold_no_splats_are_refused_in_one_sentence() {
+fn files_that_hold_no_splats_are_refused_in_one_message() {
     let folder = Folder::new();
     let header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n\
                   property float x\nproperty float y\nproperty float z\nend_header\n";
@@ -204,7 +192,7 @@ fn files_that_hold_no_splats_are_refused_in_one_sentence() {
 }
 
 #[test]
-fn arguments_that_make_no_sense_are_refused_in_one_sentence() {
+fn arguments_that_make_no_sense_are_refused_in_one_message() {
     let folder = Folder::new();
     let scene = folder.join("scene.ply");
     write(&scene, &ball(10, 7, [0.5; 3]));
@@ -257,7 +245,7 @@ fn without_an_adapter_the_cpu_draws_and_gpu_is_refused() {
 }
 
 #[test]
-fn without_a_display_one_sentence_says_what_to_do() {
+fn without_a_display_an_error_message_says_what_to_do() {
     if cfg!(target_os = "linux") {
         let folder = Folder::new();
         let scene = folder.join("scene.ply");
@@ -337,28 +325,6 @@ fn a_checkpoint_whose_origin_is_not_finite_is_refused() {
 }
 
 #[test]
-fn json_without_cameras_or_with_other_than_numbers_is_refused_by_name_and_frame() {
-    let folder = Folder::new();
-    let (scene, cameras) = (folder.join("scene.ply"), folder.join("cameras.json"));
-    write(&scene, &ball(10, 15, [0.5; 3]));
-    let inria = |rotation: &str| {
-        format!(
-            "[{{\"width\": 9, \"height\": 9, \"fx\": 9, \"fy\": 9, \"position\": [0, 0, 3], \
-             \"rotation\": {rotation}}}]"
-        )
-    };
-    let bad = inria("[[1, null, 0, 0], [0, 1, 0], [0, 0, 1]]");
-    for (text, word) in [("[]", "names no cameras"), (&bad, "frame 0 lacks a matrix of numbers")] {
-        std::fs::write(&cameras, text).expect("cameras");
-        let mut command = program();
-        command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(&cameras);
-        refused(&command.output().expect("start"), &["cameras.json", word]);
-    }
-    std::fs::write(&cameras, inria("[[1, 0, 0], [0, 1, 0], [0, 0, 1]]")).expect("cameras");
-    assert_eq!(from_camera(&scene, &cameras, "0").size, [9, 9]);
-}
-
-#[test]
 fn a_small_scene_is_seen_as_a_large_one_is() {
     let folder = Folder::new();
     let (scene, small) = (folder.join("scene.ply"), folder.join("small.ply"));
@@ -410,106 +376,68 @@ fn from_camera(scene: &Path, cameras: &Path, number: &str) -> common::Picture {
     read_png(&out)
 }
 
-/// World-to-camera rotation wxyz and translation, as COLMAP has them.
-fn colmap_pose(camera: &Camera) -> [f64; 7] {
-    let q = glam::DQuat::from_mat4(&camera.viewmat);
-    let t = camera.viewmat.w_axis;
-    [q.w, q.x, q.y, q.z, t.x, t.y, t.z]
-}
-
 #[test]
-fn cameras_of_every_kind_draw_the_same_picture() {
+fn the_file_that_igsr_writes_gives_its_camera() {
     let folder = Folder::new();
     let scene = folder.join("scene.ply");
     write(&scene, &ball(300, 12, [0.6, 0.4, 0.3]));
-    let make = |name: &str| {
-        let path = folder.join(name);
-        std::fs::create_dir_all(&path).expect("folder");
-        path
-    };
-    // What igsr writes, with the middle off the picture's: COLMAP's models have that too.
-    let camera = camera();
-    let igsr = folder.join("igsr.json");
-    write_transforms(&igsr, &camera);
-    let expected = from_camera(&scene, &igsr, "0");
+    // igsr's tests hold its writer to the same file.
+    let written = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/cameras.json");
+    let own = folder.join("own.json");
+    write_cameras(&own, &[camera()]);
+    let (seen, expected) = (from_camera(&scene, &written, "0"), from_camera(&scene, &own, "0"));
     assert!(expected.rgb.iter().any(|&v| v > 60), "the scene is dark");
-    let [w, x, y, z, a, b, c] = colmap_pose(&camera);
-    // Cameras come by name: b.png is the second, whatever its number.
-    let text = make("text");
-    let lenses = "# Camera list\n7 PINHOLE 120 80 110 100 60 35\n2 SIMPLE_PINHOLE 50 50 40 25 25\n";
-    std::fs::write(text.join("cameras.txt"), lenses).expect("cameras.txt");
-    let poses = format!(
-        "# Image list\n4 {w} {x} {y} {z} {a} {b} {c} 7 b.png\n1.5 2.5 -1 3 4 17\n\
-         9 1 0 0 0 0 0 9 2 a.png\n\n"
-    );
-    std::fs::write(text.join("images.txt"), poses).expect("images.txt");
-    assert!(from_camera(&scene, &text, "1").apart(&expected).0 <= 1, "COLMAP as text");
+    assert!(seen.apart(&expected).0 <= 1, "off by {:?}", seen.apart(&expected));
+}
 
-    // The binary model in sparse/0, its lens one with distortion, which is left out.
-    let binary = make("binary");
-    let model = make("binary/sparse/0");
-    let mut bytes = 2u64.to_le_bytes().to_vec();
-    let mut lens = |id: u32, kind: u32, size: [u64; 2], params: &[f64]| {
-        bytes.extend(id.to_le_bytes());
-        bytes.extend(kind.to_le_bytes());
-        bytes.extend(size.iter().flat_map(|v| v.to_le_bytes()));
-        bytes.extend(params.iter().flat_map(|v| v.to_le_bytes()));
+#[test]
+fn other_cameras_are_refused_and_say_what_reads_them() {
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, &ball(10, 15, [0.5; 3]));
+    let refuse = |cameras: &Path, words: &[&str]| {
+        let mut command = program();
+        command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(cameras);
+        refused(&command.output().expect("start"), words);
     };
-    lens(2, 0, [50, 50], &[40.0, 25.0, 25.0]);
-    lens(7, 4, [120, 80], &[110.0, 100.0, 60.0, 35.0, 0.01, 0.0, 0.0, 0.0]);
-    std::fs::write(model.join("cameras.bin"), &bytes).expect("cameras.bin");
-    let mut bytes = 2u64.to_le_bytes().to_vec();
-    let mut pose = |id: u32, pose: [f64; 7], lens: u32, name: &str, points: u64| {
-        bytes.extend(id.to_le_bytes());
-        bytes.extend(pose.iter().flat_map(|v| v.to_le_bytes()));
-        bytes.extend(lens.to_le_bytes());
-        bytes.extend(name.bytes().chain([0]));
-        bytes.extend(points.to_le_bytes());
-        bytes.extend(vec![1; 24 * points as usize]);
-    };
-    pose(4, colmap_pose(&camera), 7, "b.png", 3);
-    pose(9, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.0], 2, "a.png", 0);
-    std::fs::write(model.join("images.bin"), &bytes).expect("images.bin");
-    assert!(from_camera(&scene, &binary, "1").apart(&expected).0 <= 1, "COLMAP as binary");
-    std::fs::write(model.join("images.bin"), &bytes[..100]).expect("images.bin");
-    let mut command = program();
-    command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(&binary);
-    refused(&command.output().expect("start"), &["images.bin", "damaged"]);
-
-    // INRIA's and NeRF-Synthetic's know no middle but the picture's, the latter one focal length.
-    let middle = Camera { fy: 110.0, cy: 40.0, ..camera };
-    write_transforms(&igsr, &middle);
-    let expected = from_camera(&scene, &igsr, "0");
-    let to_world = middle.viewmat.inverse();
-    let rows: Vec<Vec<f64>> = (0..3).map(|i| to_world.row(i).to_array()[..3].to_vec()).collect();
-    let position = middle.center().to_array();
-    let inria = make("inria").join("cameras.json");
-    let text = format!(
-        "[{{\"id\": 0, \"img_name\": \"b\", \"width\": 120, \"height\": 80, \
-         \"position\": {position:?}, \"rotation\": {rows:?}, \"fy\": 110.0, \"fx\": 110.0}}]"
+    let model = folder.join("colmap/sparse/0");
+    std::fs::create_dir_all(&model).expect("folder");
+    std::fs::write(model.join("cameras.bin"), [1; 64]).expect("cameras.bin");
+    let others = ["igsr view", "igsr export"];
+    refuse(&folder.join("colmap"), &[&["colmap", "holds no cameras.json"], &others[..]].concat());
+    refuse(
+        &model.join("cameras.bin"),
+        &[&["cameras.bin", "not a cameras.json"], &others[..]].concat(),
     );
-    std::fs::write(&inria, text).expect("cameras.json");
-    let drawn = from_camera(&scene, &folder.join("inria"), "0");
-    assert!(drawn.apart(&expected).0 <= 1, "INRIA's");
+    refuse(&folder.join("nothing"), &["nothing", "is no file or folder"]);
 
-    let nerf = make("nerf");
-    let opengl = to_world * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
-    let rows: Vec<[f64; 4]> = (0..4).map(|i| opengl.row(i).to_array()).collect();
-    let angle = 2.0 * (60.0f64 / 110.0).atan();
-    let text = format!(
-        "{{\"camera_angle_x\": {angle}, \"frames\": [{{\"file_path\": \"./train/r_0\", \
-         \"transform_matrix\": {rows:?}}}]}}"
-    );
-    std::fs::write(nerf.join("transforms_train.json"), text).expect("transforms_train.json");
-    // The size is the photo's.
-    let photo = make("nerf/train").join("r_0.png");
-    let mut encoder = png::Encoder::new(std::fs::File::create(photo).expect("photo"), 120, 80);
-    encoder.set_color(png::ColorType::Grayscale);
-    let mut writer = encoder.write_header().expect("header");
-    writer.write_image_data(&[9; 120 * 80]).expect("pixels");
-    writer.finish().expect("end");
-    let drawn = from_camera(&scene, &nerf, "0");
-    assert!(drawn.apart(&expected).0 <= 1, "NeRF-Synthetic's");
+    let file = folder.join("cameras.json");
+    let good = common::cameras_json(&[camera()]);
+    let bad = [
+        // nerfstudio's, whose lens distorts.
+        (good.replace("PINHOLE", "OPENCV"), &["OPENCV", "igsr view", "igsr export"][..]),
+        // instant-ngp's.
+        (good.replace("\"camera_model\": \"PINHOLE\", ", ""), &["camera_model", "igsr view"]),
+        // INRIA's.
+        ("[{\"id\": 0, \"fx\": 9.0}]".to_owned(), &["cameras.json", "igsr view"]),
+        (good.replace("\"fl_x\"", "\"focal\""), &["fl_x"]),
+        (good.replace("[[", "[[null, "), &["transform_matrix", "invalid"][1..]),
+        (good.replace("\"w\": 120", "\"w\": 0"), &["0.png", "width"]),
+        (good.replace("110", "-1"), &["0.png", "focal"]),
+        (good[..good.len() / 2].to_owned(), &["cameras.json", "EOF"]),
+        (common::cameras_json(&[]), &["has no cameras"]),
+    ];
+    for (text, words) in bad {
+        std::fs::write(&file, text).expect("cameras");
+        refuse(&file, words);
+    }
+    // Nobody named them: the scene is shown without.
+    let output = run(&[&scene, &"--screenshot", &folder.join("x.png"), &"--backend", &"cpu"]);
+    assert!(said(&output).contains("no cameras are shown"), "{}", said(&output));
+    let mut tilted = camera();
+    tilted.viewmat = DMat4::from_scale(DVec3::splat(2.0)) * tilted.viewmat;
+    write_cameras(&file, &[tilted]);
+    refuse(&file, &["0.png", "rigid"]);
 }
 
 #[test]
@@ -542,7 +470,7 @@ fn every_format_opens_and_shows_the_scene() {
 }
 
 /// Bounds on what the ways to draw in the window are off the rasterizer's picture, in 255ths;
-/// docs/viewer.md has them.
+/// docs/guides/viewing.md has them.
 const OFF: [(&str, f64, f64); 2] = [("rasterize", 1.0, 0.1), ("blend", 3.0, 0.5)];
 
 #[test]

@@ -10,15 +10,19 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use common::dragging::drop_file;
-use common::{Folder, Picture, ball, program, read_png, refused, run, write};
+use common::{Folder, Picture, ball, program, read_png, refused, run, write, write_cameras};
 use glam::{DMat4, DVec3};
+use splat_render::Camera;
 
 /// Longest that anything may take on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(120);
+/// What a test says where a tool or a library for it is missing.
+const INSTALL: &str = "run `make display`, or install xvfb, xdotool, libxcursor1, libxi6, libxrandr2, \
+                       libx11-xcb1 and libxkbcommon-x11-0";
 /// The window's first size; small, since a software adapter draws.
 const SIZE: [usize; 2] = [320, 240];
 /// Bounds on what a window's picture is off the rasterizer's, in 255ths, whatever draws it:
-/// docs/viewer.md has them.
+/// docs/guides/viewing.md has them.
 const MOST: u8 = 3;
 const MEAN: f64 = 0.5;
 /// The same where the rasterizer draws in the window, too.
@@ -50,22 +54,43 @@ impl Xvfb {
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
-            .expect("these tests need Xvfb: install the package xvfb");
+            .unwrap_or_else(|e| panic!("these tests need Xvfb ({e}): {INSTALL}"));
         let mut name = String::new();
         let mut out = BufReader::new(server.stdout.take().expect("its output"));
         out.read_line(&mut name).expect("Xvfb says which display it is");
+        assert!(!name.is_empty(), "Xvfb ends at once: {INSTALL}");
         Self { server, name: format!(":{}", name.trim()), folder }
     }
 
     fn xdotool(&self, arguments: &[&str]) -> String {
+        self.answer(arguments).unwrap_or_else(|text| panic!("xdotool {arguments:?}: {text}"))
+    }
+
+    /// What xdotool prints, as an error where it fails.
+    fn answer(&self, arguments: &[&str]) -> Result<String, String> {
         let output = Command::new("xdotool")
             .env("DISPLAY", &self.name)
             .args(arguments)
             .output()
-            .expect("these tests need xdotool: install the package xdotool");
+            .unwrap_or_else(|e| panic!("these tests need xdotool ({e}): {INSTALL}"));
         let text = String::from_utf8_lossy(&output.stdout).trim().to_owned();
-        assert!(output.status.success(), "xdotool {arguments:?}: {text}");
-        text
+        if output.status.success() { Ok(text) } else { Err(text) }
+    }
+
+    /// The viewer's window once it is there; the test fails if the viewer ends before.
+    fn window_of(&self, program: &mut Child) -> String {
+        let started = Instant::now();
+        loop {
+            let found = self.answer(&["search", "--onlyvisible", "--name", "splat-view"]);
+            if let Ok(window) = found {
+                return window;
+            }
+            if let Ok(Some(status)) = program.try_wait() {
+                panic!("splat-view ended ({status}) before its window opened: {INSTALL}");
+            }
+            assert!(started.elapsed() < PATIENCE, "splat-view opens no window");
+            std::thread::sleep(Duration::from_millis(30));
+        }
     }
 
     /// What the display shows in its upper left corner, from the file that Xvfb keeps it in.
@@ -104,7 +129,7 @@ struct Viewer<'a> {
 
 impl<'a> Viewer<'a> {
     fn start(xvfb: &'a Xvfb, folder: &'a Path, arguments: &[&str]) -> Self {
-        let program = program()
+        let mut program = program()
             .env("DISPLAY", &xvfb.name)
             .current_dir(folder)
             .args(arguments)
@@ -112,7 +137,7 @@ impl<'a> Viewer<'a> {
             .stdout(Stdio::null())
             .spawn()
             .expect("splat-view starts");
-        let window = xvfb.xdotool(&["search", "--sync", "--onlyvisible", "--name", "splat-view"]);
+        let window = xvfb.window_of(&mut program);
         let mut viewer = Self { xvfb, program, window, folder, shots: 0 };
         // No window manager gives it the keyboard.
         viewer.xvfb.xdotool(&["windowfocus", "--sync", &viewer.window]);
@@ -368,33 +393,26 @@ fn a_refinement_s_folder_opens_and_a_new_scene_in_it_appears() {
     agree("round 1", &changed, &blue);
 }
 
-/// World to camera of three cameras: two near, and one behind that sees them.
-fn cameras() -> [DMat4; 3] {
-    [(0.35, 4.0), (-0.6, 5.0), (0.0, 9.0)].map(|(angle, distance)| {
-        DMat4::from_translation(DVec3::new(0.0, 0.0, distance)) * DMat4::from_rotation_y(angle)
+/// Three cameras of the window's size: two near, and one behind that sees them.
+fn cameras() -> [Camera; 3] {
+    let [width, height] = SIZE.map(|side| side as u32);
+    [(0.35, 4.0), (-0.6, 5.0), (0.0, 9.0)].map(|(angle, distance)| Camera {
+        viewmat: DMat4::from_translation(DVec3::new(0.0, 0.0, distance))
+            * DMat4::from_rotation_y(angle),
+        fx: 260.0,
+        fy: 260.0,
+        cx: 0.5 * f64::from(width),
+        cy: 0.5 * f64::from(height),
+        width,
+        height,
     })
-}
-
-/// Of all of them: focal length, and the window's width and height.
-const LENS: [f64; 3] = [260.0, SIZE[0] as f64, SIZE[1] as f64];
-
-fn write_cameras(path: &Path) {
-    let frame = |viewmat: &DMat4| {
-        let to_world = viewmat.inverse() * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
-        let rows: Vec<[f64; 4]> = (0..4).map(|i| to_world.row(i).to_array()).collect();
-        format!("{{\"file_path\": \"a.png\", \"transform_matrix\": {rows:?}}}")
-    };
-    let frames = cameras().each_ref().map(frame).join(", ");
-    let [focal, w, h] = LENS;
-    let text = format!("{{\"fl_x\": {focal}, \"w\": {w}, \"h\": {h}, \"frames\": [{frames}]}}");
-    std::fs::write(path, text).expect("cameras");
 }
 
 #[test]
 fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
-    write_cameras(&folder.join("cameras.json"));
+    write_cameras(&folder.join("cameras.json"), &cameras());
     let expected = ["0", "1", "2"].map(|n| rasterized_with(&scene, SIZE, &["--camera", n]));
     let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply"]);
     for (key, camera) in [("bracketright", 0), ("bracketright", 1), ("bracketleft", 0)] {
@@ -406,9 +424,8 @@ fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
     // A click at the first camera's frustum, where the last one sees it.
     viewer.key("c");
     let [first, _, last] = cameras();
-    let at = last.transform_point3(first.inverse().w_axis.truncate());
-    let [focal, w, h] = LENS;
-    let place = [focal * at.x / at.z + 0.5 * w, focal * at.y / at.z + 0.5 * h];
+    let at = last.viewmat.transform_point3(first.center());
+    let place = [last.fx * at.x / at.z + last.cx, last.fy * at.y / at.z + last.cy];
     let [x, y] = place.map(|v| (v.round() as i32).to_string());
     xvfb.xdotool(&["mousemove", &x, &y, "click", "1"]);
     let jumped = viewer.shot_when("the first camera's view", |shot| {
@@ -451,7 +468,7 @@ fn windows_larger_than_any_texture_are_refused_when_asked_for_and_else_go_on() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
     let mut command = program();
-    command.env("DISPLAY", &xvfb.name).env("XDG_RUNTIME_DIR", &folder.0);
+    command.env("DISPLAY", &xvfb.name);
     command.args(["--size", "9000x40"]).arg(&scene);
     refused(&command.output().expect("start"), &["--size", "up to 8192", "9000x40"]);
     let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply"]);
@@ -464,11 +481,11 @@ fn windows_larger_than_any_texture_are_refused_when_asked_for_and_else_go_on() {
 }
 
 #[test]
-fn without_an_adapter_one_sentence_says_so() {
+fn without_an_adapter_an_error_message_says_so() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     scenes(&folder);
     let mut command = program();
-    command.env("DISPLAY", &xvfb.name).env("XDG_RUNTIME_DIR", &folder.0);
+    command.env("DISPLAY", &xvfb.name);
     command.env("VK_DRIVER_FILES", "/nothing").env("VK_ICD_FILENAMES", "/nothing");
     let output = command.arg(folder.join("scene0.ply")).output().expect("start");
     refused(&output, &["no Vulkan, Metal or DX12 adapter", "mesa-vulkan-drivers"]);

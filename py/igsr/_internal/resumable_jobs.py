@@ -1,4 +1,4 @@
-"""Independent fits, each kept in a file of its own, so that a study goes on where it stopped."""
+"""Independent runs, each kept in a file of its own, so that a study resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from igsr.errors import IgsrError
 
 @dataclass(frozen=True)
 class Run:
-    """One fit.
+    """One run of a study, such as a fit.
 
     Attributes:
         name: of its file, without ending.
-        what: describes it.
-        settings: that it uses.
+        what: describes it; what ``work`` is called with.
+        settings: all that its result depends on. A run with other settings is done again.
         leaves: a file that it leaves beside its row, if any; without that it is not done.
-        scene: its folder in the data, all of whose files count among the settings, as "data":
-            photos and cameras get mended. None where other settings say what it is of.
+        scene: its folder in the data; the hash of all its files joins the settings, as "data",
+            since photos and cameras may be corrected. None where the settings say all.
     """
 
     name: str
@@ -38,12 +38,12 @@ class Run:
 
 
 def file_hash(path: Path) -> str:
-    """Of a file that a run's result depends on, for its settings."""
+    """SHA-256 of a file that a run's result depends on, for its settings."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def folder_hash(folder: Path) -> str:
-    """Of all files in a folder and their names."""
+    """SHA-256 of all files in a folder and of their names."""
     digest = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         digest.update(path.relative_to(folder).as_posix().encode())
@@ -62,14 +62,14 @@ def finished_runs(
 ) -> list[dict[str, Any]]:
     """The row of every run, in order: read where its file is there, else done and written.
 
-    A file of another version or with other settings (presets and photos change) is done again, and
-    one whose run left a file that is not there any more. When one run fails those that are under
-    way are still finished and kept.
+    A run is done again if its file is of another version, has other settings (presets and photos
+    change), or if a file that it left is gone. When one run fails, those under way are still
+    finished and kept.
 
     Args:
         folder: of the runs' files.
         runs: what there is to do.
-        work: does one run, given ``data`` and ``Run.what``.
+        work: does one run, given ``data`` and ``Run.what``; returns its row, which JSON can hold.
         data: folder that holds the scenes.
         jobs: runs at a time on this machine, each in a process of its own with its share of cores.
         on_run: called with (done, all, the run's row) after each run.

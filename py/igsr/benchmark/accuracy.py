@@ -1,4 +1,4 @@
-"""``docs/accuracy.md``: every implementation at every setting that trades error for time.
+"""The page of accuracy: every implementation at every setting that trades error for time.
 
 One small scene, so that even the reference's own time can be measured. Two errors are told apart:
 that of the arithmetic, an implementation against the f64 reference at the same setting; and that of
@@ -186,7 +186,8 @@ def accuracy_page(report: dict[str, Any]) -> str:
         [
             "# Accuracy",
             "",
-            "Written by `igsr bench --accuracy docs/accuracy.md` (`make accuracy`); do not edit.",
+            "Written by `igsr bench --accuracy docs/how-it-works/accuracy.md` (`make accuracy`); "
+            "do not edit.",
             "",
             f"Measured with {machine_line(machine)}. The scene: {first['splats']} splats of about "
             f"a pixel on {first['width']}×{first['height']}; {compared} of its "

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from igsr.benchmark.scenes import Arrays
 
-#: Error beyond which a pixel of the band is left out (docs/numerics.md has the bounds): for 2D
-#: splats handed over as they are, and for pictures from splats.
+#: Error beyond which a pixel of the band is left out (bounds: docs/how-it-works/numerics.md):
+#: for 2D splats handed over as they are, and for pictures from splats.
 BOUND_2D = {"reference": 0.0, "cpu": 2e-6, "gpu": 2e-5}
 BOUND_3D = {"reference": 0.0, "cpu": 1e-4, "gpu": 1e-4}
 #: A pair that is blended in one picture and not in the other changes the transmittance by 1/255 of

@@ -51,7 +51,7 @@ COUNT_TOLERANCE = 0.05
 #: Relocation lets a model grow by 5 % every 100 steps, from 20 000 to 100 000 splats in 3 300.
 FIT_STEPS = 5000
 
-#: The fit's loss: part of D-SSIM, SSIM's window and constants (docs/numerics.md).
+#: The fit's loss: part of D-SSIM, SSIM's window and constants (docs/how-it-works/numerics.md).
 SSIM_WEIGHT = 0.2
 SSIM_SIGMA, SSIM_SIDE = 1.5, 11
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2

@@ -26,7 +26,7 @@ CROP = 16
 Float64 = npt.NDArray[np.float64]
 
 #: What a pair of alphas may differ by, relative to the threshold, where implementations are given
-#: the same 2D splats, and where they project for themselves (docs/numerics.md).
+#: the same 2D splats, and where they project for themselves (docs/how-it-works/numerics.md).
 ALPHA_BAND_2D = 1e-4
 ALPHA_BAND_3D = 2e-2
 

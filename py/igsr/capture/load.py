@@ -1,8 +1,10 @@
-"""The front door: finds out which kind of capture a path is."""
+"""``load_capture``: finds out which format a capture has and reads it."""
 
 from __future__ import annotations
 
+import logging
 import os
+import time
 from pathlib import Path
 
 from igsr.capture.photos import SUFFIXES, is_file
@@ -10,6 +12,8 @@ from igsr.capture.read_colmap import find_model, load_colmap
 from igsr.capture.read_transforms import load_split_transforms, load_transforms
 from igsr.capture.types import Capture
 from igsr.errors import IgsrError
+
+logger = logging.getLogger(__name__)
 
 
 def load_capture(path: str | os.PathLike[str]) -> Capture:
@@ -30,15 +34,30 @@ def load_capture(path: str | os.PathLike[str]) -> Capture:
     views are for training; ``Capture.with_holdout`` splits anew.
 
     Args:
-        path: folder or file.
+        path: the folder, or its ``transforms.json``.
 
     Returns:
-        The capture, photos decoded.
+        The capture, with its photos decoded.
 
     Raises:
-        IgsrError: one sentence naming what is wrong with which file.
+        IgsrError: nothing can be loaded; the message names the file and what is wrong with it.
     """
-    path = Path(path)
+    started = time.monotonic()
+    capture = _load(Path(path))
+    points = "no" if capture.points is None else len(capture.points.xyz)
+    logger.info(
+        "%s: %d views (%d train, %d test), %s points, loaded in %.2f s",
+        path,
+        len(capture.views),
+        len(capture.train_views),
+        len(capture.test_views),
+        points,
+        time.monotonic() - started,
+    )
+    return capture
+
+
+def _load(path: Path) -> Capture:
     if is_file(path):
         if path.suffix.lower() != ".json":
             raise IgsrError(f"{path} is no capture; give a folder or a transforms.json")
@@ -71,7 +90,11 @@ def load_capture(path: str | os.PathLike[str]) -> Capture:
 
 
 def holds_cameras(path: str | os.PathLike[str]) -> bool:
-    """Whether a path is a capture, photos with cameras, as ``load_capture`` finds it."""
+    """Whether a path holds photos with cameras, as ``load_capture`` looks for them.
+
+    Args:
+        path: a folder or file; it need not exist.
+    """
     path = Path(path)
     if is_file(path):
         return path.suffix.lower() == ".json"
@@ -93,4 +116,7 @@ def _load_folder(path: Path) -> Capture | None:
     if is_file(path / "transforms_train.json"):
         return load_split_transforms(path)
     model = find_model(path)
-    return load_colmap(path, model) if model is not None else None
+    if model is None:
+        return None
+    logger.debug("%s: COLMAP model in %s", path, model)
+    return load_colmap(path, model)

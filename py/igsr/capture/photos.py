@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from igsr._internal.choices import Split
 from igsr.capture.types import Camera, View
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
@@ -47,7 +48,7 @@ class Shot:
     path: Path
     camera: Camera
     lens: Lens
-    split: str
+    split: Split
     mask_path: Path | None
     source: Path
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from igsr._internal.choices import SPLITS, Split
 from igsr.capture.photos import Shot, image_size, is_file, load_views
 from igsr.capture.point_cloud import read_point_cloud
 from igsr.capture.types import Camera, Capture, intrinsic_matrix, nearest_rigid
@@ -45,7 +46,7 @@ def load_transforms(path: Path) -> Capture:
     shots = []
     for index, frame in enumerate(frames):
         name = _frame_name(frame, path, index)
-        split = "train" if split_from_name is None else split_from_name.get(name)
+        split: Split | None = "train" if split_from_name is None else split_from_name.get(name)
         if split is not None:
             shots.append(_shot(document, frame, path, index, split))
     points = None
@@ -62,7 +63,7 @@ def load_split_transforms(folder: Path) -> Capture:
         IgsrError: as ``load_transforms``.
     """
     shots = []
-    for split in ("train", "test"):
+    for split in SPLITS:
         path = folder / f"transforms_{split}.json"
         if split == "train" or is_file(path):
             document = _read_json(path)
@@ -141,7 +142,7 @@ def _frame_name(frame: dict[str, Any], path: Path, index: int) -> str:
 
 
 def _shot(
-    document: dict[str, Any], frame: dict[str, Any], path: Path, index: int, split: str
+    document: dict[str, Any], frame: dict[str, Any], path: Path, index: int, split: Split
 ) -> Shot:
     name = _frame_name(frame, path, index)
     where = f"{path}, frame {index} ({name})"
@@ -267,17 +268,17 @@ def _viewmat(matrix: Any, where: str) -> np.ndarray:
 
 def _named_splits(
     document: dict[str, Any], path: Path, frames: list[dict[str, Any]]
-) -> dict[str, str] | None:
+) -> dict[str, Split] | None:
     """nerfstudio's lists as {frame name: split}, or None where the file has no such lists.
 
     Frames that ``val_filenames`` alone names are left out, as a ``transforms_val.json`` is. Frames
     that no list names are for training if there is no ``train_filenames``, and left out otherwise.
     """
-    split_from_name: dict[str, str] = {}
+    split_from_name: dict[str, Split] = {}
     if "train_filenames" not in document and "test_filenames" not in document:
         return None
     known = {_frame_name(frame, path, index) for index, frame in enumerate(frames)}
-    for split in ("train", "test"):
+    for split in SPLITS:
         listed = document.get(f"{split}_filenames", [])
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise IgsrError(f"{path}: {split}_filenames must be a list of paths; correct it")

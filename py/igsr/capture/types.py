@@ -1,32 +1,37 @@
-"""What a capture is: cameras, views and points, as every other part of igsr sees them."""
+"""Cameras, views, points and captures: the types that readers return and fits take."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
+from igsr._internal.array_equality import ArrayEquality
+from igsr._internal.choices import Split
+from igsr._internal.notebook import NotebookPicture, numbers
 from igsr.errors import IgsrError
 
-# Files written with four or five decimals are this far from a rotation; anything further is not a
-# rounding but a scale, a shear or a wrong field.
+# Files written with four or five decimals are this far from a rotation. What is further away has a
+# scale or a shear, or is another field.
 RIGID_TOLERANCE = 1e-3
 # A rotation computed in float64 is this near to an exact one.
 ROUNDING = 1e-13
 
 
-@dataclass(frozen=True, eq=False)  # arrays have no single truth to compare by
-class Camera:
+@dataclass(frozen=True, eq=False, repr=False)
+class Camera(ArrayEquality):
     """A pinhole camera in OpenCV axes: x right, y down, z forward.
 
-    The point (x, y, z) of the camera frame falls on the pixel coordinates
+    The point (x, y, z) of the camera frame has the pixel coordinates
     (fx x / z + cx, fy y / z + cy); pixel (column i, row j) has its centre at (i + 0.5, j + 0.5).
+    Cameras with the same fields are equal (``==``) and have the same hash.
 
     Attributes:
-        viewmat: float64 [4, 4], world to camera, in world units. Rigid within 1e-3; stored with its
-            rotation replaced by the nearest exact one.
+        viewmat: float64 [4, 4], world to camera, in world units. It must be rigid within 1e-3;
+            its rotation is replaced by the nearest exact one.
         K: float64 [3, 3], pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive.
         width: columns of the image, at least 1.
         height: rows of the image, at least 1.
@@ -50,15 +55,27 @@ class Camera:
                 raise IgsrError(f"{name} is {value!r} where a whole number of at least 1 belongs")
             object.__setattr__(self, name, int(value))
 
+    def __hash__(self) -> int:
+        return hash((self.width, self.height, *self.K.ravel(), *self.viewmat.ravel()))
+
+    def __repr__(self) -> str:
+        fx, fy = self.K[0, 0], self.K[1, 1]
+        return (
+            f"Camera({self.width}x{self.height}, focal lengths {numbers((fx, fy))}, "
+            f"centre {numbers(self.centre)})"
+        )
+
     @property
     def centre(self) -> np.ndarray:
-        """float64 [3]: where the camera stands, in world units."""
+        """float64 [3]: the camera's position in the world frame, in world units."""
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
 
-@dataclass(eq=False)
-class View:
+@dataclass(eq=False, repr=False)
+class View(ArrayEquality, NotebookPicture):
     """One photo with its camera.
+
+    Two views are equal (``==``) if all their fields are. A notebook shows the photo.
 
     Attributes:
         name: the photo's posix path relative to the capture; unique within it.
@@ -66,24 +83,26 @@ class View:
         split: "train" or "test".
         image: uint8 [H, W, 3] RGB, or [H, W, 4] RGB with straight (not premultiplied) alpha, with
             lens distortion already undone.
-        mask: bool [H, W], True where the pixel may be used, or None where all may: the given mask
-            and what undistortion could fill, joined.
-        weights: float32 [H, W], how much each pixel counts in fits beside a photo's, finite and
-            not negative, or None where all count 1. Only pictures that are not photos have them:
-            fits go by the photos, have at least five steps on those for one on such a picture, and
-            the last fifth of the steps on photos alone.
-        background: RGB in [0, 1] that stood behind what ``image`` shows without alpha, where that
-            is known: fits compare it to renders over that. None for photos.
+        mask: bool [H, W], True where a pixel may be used, or None if all may. It joins the given
+            mask and the pixels that undistortion could fill.
+        weights: float32 [H, W], confidence weight of each pixel in fits, finite and not negative,
+            or None for photos, whose pixels have the weight 1. A view with weights is a
+            pseudo-view: fits sample it less often than photos (at least five steps on photos for
+            one on a pseudo-view), and not at all in the last fifth of the steps.
+        background: RGB in [0, 1] behind the content of an ``image`` without alpha, where it is
+            known: fits render over it. None for photos.
 
     Raises:
         IgsrError: the image, mask or weights have another dtype or shape than the camera's size
-            asks for, a weight is negative or not finite, or the background is no colour or stands
-            behind an image with alpha.
+            asks for, a weight is negative or not finite, or the background is not a colour or is
+            given for an image with alpha.
     """
+
+    pictures_by: ClassVar[str] = "igsr.capture.thumbnails:view_pictures"
 
     name: str
     camera: Camera
-    split: str
+    split: Split
     image: np.ndarray
     mask: np.ndarray | None = None
     weights: np.ndarray | None = None
@@ -106,6 +125,12 @@ class View:
             if self.image.shape[2] == 4:
                 raise IgsrError(f"{self.name}: only an image without alpha has a background")
 
+    def __repr__(self) -> str:
+        parts = [repr(self.name), self.split, f"{self.camera.width}x{self.camera.height}"]
+        parts += ["alpha"] if self.image.shape[2] == 4 else []
+        parts += [name for name in ("mask", "weights") if getattr(self, name) is not None]
+        return f"View({', '.join(parts)})"
+
     def _check(
         self, what: str, array: object, dtype: type[np.generic], shapes: list[tuple[int, ...]]
     ) -> None:
@@ -121,18 +146,20 @@ class View:
             )
 
 
-@dataclass(eq=False)
-class Tracks:
+@dataclass(eq=False, repr=False)
+class Tracks(ArrayEquality):
     """Where photos see points: M observations.
 
+    Two are equal (``==``) if all their fields are.
+
     Attributes:
-        names: of the photos, as the views' names.
-        view: int64 [M], which of ``names``.
-        point: int64 [M], which of the points.
-        xy: float64 [M, 2], pixels of the photo with lens distortion undone (centres at +0.5).
+        names: names of the photos, as ``View.name``.
+        view: int64 [M], index into ``names``.
+        point: int64 [M], index of the point.
+        xy: float64 [M, 2], pixel coordinates in the undistorted photo (pixel centres at +0.5).
 
     Raises:
-        IgsrError: shapes differ, an index has nothing to point to, or a place is not finite.
+        IgsrError: shapes differ, an index is out of range, or a coordinate is not finite.
     """
 
     names: list[str]
@@ -150,22 +177,27 @@ class Tracks:
         if count and not (self.view.min() >= 0 and self.view.max() < len(self.names)):
             raise IgsrError("tracks: view has an index without a name")
 
+    def __repr__(self) -> str:
+        return f"Tracks({len(self.view)} observations in {len(self.names)} photos)"
 
-@dataclass(eq=False)
-class Points:
-    """A point cloud in the world frame.
+
+@dataclass(eq=False, repr=False)
+class Points(ArrayEquality):
+    """A point cloud of P points in the world frame.
+
+    Two are equal (``==``) if all their fields are.
 
     Attributes:
         xyz: float64 [P, 3], world units.
         rgb: uint8 [P, 3].
-        confidence: [P], how sure each place is, positive and in any unit: only the order counts.
-            None where nothing is known of it.
-        tracks: where photos see the points, or None where that is not known. They say how well
-            the cameras are known, to fits that move cameras.
+        confidence: float64 [P], confidence in each position, positive, in any unit: only the
+            order counts. None if it is not known.
+        tracks: where photos see the points, or None if it is not known. Fits that move cameras
+            take pose priors from them.
 
     Raises:
-        IgsrError: confidence has another shape or holds what is not a positive finite number, or
-            a track is of none of the points.
+        IgsrError: confidence has another shape or holds a number that is not positive and finite,
+            or a track refers to a point that does not exist.
     """
 
     xyz: np.ndarray
@@ -194,11 +226,18 @@ class Points:
                 "confidence holds a number that is not positive and finite; remove such points"
             )
 
+    def __repr__(self) -> str:
+        known = [name for name in ("confidence", "tracks") if getattr(self, name) is not None]
+        return f"Points({len(self.xyz)} points{''.join(f', {name}' for name in known)})"
+
     def seen_by(self, names: Iterable[str]) -> Points:
         """The points that at least two of these photos see, without tracks.
 
-        What only other photos show is not known to a fit of these. Where no tracks are known all
+        A fit of these photos must not know what only other photos show. Without tracks, all
         points are returned.
+
+        Args:
+            names: names of the photos, as ``View.name``.
         """
         if self.tracks is None or not len(self.tracks.view):
             return self
@@ -211,19 +250,30 @@ class Points:
         return Points(self.xyz[kept], self.rgb[kept], confidence)
 
 
-@dataclass(eq=False)
-class Capture:
-    """Photos, their cameras and, where the capture has them, points.
+@dataclass(eq=False, repr=False)
+class Capture(ArrayEquality, NotebookPicture):
+    """Photos with their cameras and, if the capture has them, points.
+
+    Two captures are equal (``==``) if all their fields are. A notebook shows a few photos.
 
     Attributes:
-        path: the folder or file the capture was loaded from.
+        path: the folder or file that the capture was loaded from.
         views: in the order of the file (``transforms.json``) or of the names (COLMAP).
-        points: or None.
+        points: the point cloud, or None.
     """
+
+    pictures_by: ClassVar[str] = "igsr.capture.thumbnails:capture_pictures"
 
     path: Path
     views: list[View]
     points: Points | None = None
+
+    def __repr__(self) -> str:
+        points = "no" if self.points is None else len(self.points.xyz)
+        return (
+            f"Capture({str(self.path)!r}, {len(self.views)} views: {len(self.train_views)} train, "
+            f"{len(self.test_views)} test; {points} points)"
+        )
 
     @property
     def train_views(self) -> list[View]:
@@ -232,24 +282,27 @@ class Capture:
 
     @property
     def test_views(self) -> list[View]:
-        """The views to score and never to fit."""
+        """The views held out for testing: scored, never fitted."""
         return [view for view in self.views if view.split == "test"]
 
     def with_holdout(self, every: int) -> Capture:
-        """The same capture with a new split; images are shared, not copied.
+        """Hold out every Nth view for testing.
 
         Args:
             every: of the views in the order of their names, those whose index is a multiple of
-                this become "test", all others "train" (the protocol of LLFF and 3DGS uses 8).
+                ``every`` become "test", all others "train". LLFF and 3DGS use 8.
+
+        Returns:
+            A capture with the new split. It shares the images with this one.
 
         Raises:
-            IgsrError: the split would leave no view to fit.
+            IgsrError: ``every`` is not a whole number of at least 2, or there is only one view.
         """
         if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 2:
             raise IgsrError(f"holdout is {every!r}; give a whole number of at least 2, such as 8")
         if len(self.views) < 2:
             raise IgsrError(
-                f"{self.path} has one view only, so none can be held out; leave holdout away"
+                f"{self.path} has one view only, so none can be held out; leave holdout out"
             )
         by_name = sorted(view.name for view in self.views)
         held_out = set(by_name[::every])
@@ -271,8 +324,8 @@ class Capture:
     def scene_extent(self) -> float:
         """1.1 times the largest distance of a training camera from ``scene_centre``, world units.
 
-        This is the length by which 3DGS scales its learning rates and thresholds (Kerbl et al.
-        2023). Where all cameras stand on one spot it would be 0 and freeze every fit: it is 1 then.
+        3DGS scales its learning rates and thresholds by this length (Kerbl et al. 2023). It is 1
+        if all cameras are at the same place: 0 would freeze every fit.
         """
         centres = self._centres()
         extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
@@ -280,11 +333,17 @@ class Capture:
 
 
 def nearest_rigid(matrix: np.ndarray, name: str) -> np.ndarray:
-    """The rigid 4x4 float64 matrix nearest to a given one that is rigid up to rounding.
+    """The rigid matrix nearest to one that is rigid up to rounding.
+
+    Args:
+        matrix: [4, 4], in any numeric dtype.
+        name: begins the error message.
+
+    Returns:
+        float64 [4, 4].
 
     Raises:
-        IgsrError: not [4, 4], not finite, or further than 1e-3 from rigid; ``name`` leads the
-            sentence.
+        IgsrError: the matrix is not [4, 4], not finite, or further than 1e-3 from rigid.
     """
     try:
         matrix = np.array(matrix, dtype=np.float64)
@@ -342,5 +401,5 @@ def _checked_intrinsics(K: np.ndarray) -> np.ndarray:
 
 
 def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """float64 [3, 3], pixels."""
+    """The pinhole matrix, float64 [3, 3], of focal lengths and principal point in pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

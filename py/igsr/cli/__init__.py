@@ -1,38 +1,90 @@
-"""The ``igsr`` command, a file per subcommand."""
+"""The ``igsr`` command, a file per subcommand.
+
+The table below is all that ``igsr --help`` reads: a subcommand's module, and with it torch and
+whatever else it needs, is imported when that subcommand runs.
+"""
 
 from __future__ import annotations
 
-import os
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 
-from igsr._core import __version__
-from igsr.cli.bench import bench_command
-from igsr.cli.compact import compact_command
-from igsr.cli.convert import convert_command
-from igsr.cli.denoise import app as denoise_app
-from igsr.cli.evaluate import eval_command
-from igsr.cli.export import export_command
-from igsr.cli.fit import fit_command
-from igsr.cli.info import info_command
-from igsr.cli.pose import pose_command
-from igsr.cli.refine import refine_command
-from igsr.cli.render import render_command
-from igsr.cli.study import study_command
-from igsr.cli.synth import synth_command
-from igsr.cli.view import PASSED_ON, view_command
+from igsr.cli.lazy_group import LazyCommand, LazyGroup
+from igsr.cli.process_options import MOST_THREADS, log_to_stderr, show_tracebacks, use_threads
+
+#: Options that ``igsr view`` does not know are the viewer's.
+_PASSED_ON = {"ignore_unknown_options": True}
+
+
+class _Commands(LazyGroup):
+    """The subcommands of ``igsr``, in the order of the help."""
+
+    table: ClassVar[dict[str, LazyCommand]] = {
+        "pose": LazyCommand(
+            "igsr.cli.pose", "pose_command", "Find the cameras of photos; write a COLMAP capture."
+        ),
+        "fit": LazyCommand(
+            "igsr.cli.fit", "fit_command", "Fit splats to the photos of a capture and score them."
+        ),
+        "refine": LazyCommand(
+            "igsr.cli.refine",
+            "refine_command",
+            "Fit few photos, then refit with denoised novel views that pass cross-validation.",
+        ),
+        "render": LazyCommand(
+            "igsr.cli.render", "render_command", "Render pictures, or a video around the scene."
+        ),
+        "eval": LazyCommand(
+            "igsr.cli.evaluate", "eval_command", "Score a scene against the photos of a capture."
+        ),
+        "info": LazyCommand(
+            "igsr.cli.info",
+            "info_command",
+            "Describe a scene or a capture, and this machine's backends.",
+        ),
+        "view": LazyCommand(
+            "igsr.cli.view",
+            "view_command",
+            "Show scenes in a window, one alone or two side by side.",
+            _PASSED_ON,
+        ),
+        "export": LazyCommand(
+            "igsr.cli.export", "export_command", "Write a capture for COLMAP or nerfstudio."
+        ),
+        "compact": LazyCommand(
+            "igsr.cli.compact", "compact_command", "Make a scene smaller within a limit on PSNR."
+        ),
+        "convert": LazyCommand(
+            "igsr.cli.convert", "convert_command", "Write a splat file in another format."
+        ),
+        "denoise": LazyCommand(
+            "igsr.cli.denoise", "app", "Make training pairs, train the denoiser, apply it."
+        ),
+        "study": LazyCommand(
+            "igsr.cli.study", "app", "Run the experiments of the literature and of docs/."
+        ),
+        "synth": LazyCommand(
+            "igsr.cli.synth", "synth_command", "Make synthetic captures with exact cameras."
+        ),
+        "bench": LazyCommand(
+            "igsr.cli.bench", "bench_command", "Measure speed and error of the backends."
+        ),
+    }
+
 
 app = typer.Typer(
+    cls=_Commands,
     help="Fit a Gaussian-splat scene from photos, with known cameras or without.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
 
 def _version(wanted: bool) -> None:
     if wanted:
+        from igsr._core import __version__
+
         typer.echo(f"igsr {__version__}")
         raise typer.Exit
 
@@ -41,31 +93,43 @@ def _version(wanted: bool) -> None:
 def _options(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_version, is_eager=True, help="Say which igsr this is."),
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
     ] = False,
+    debug: Annotated[
+        bool,
+        typer.Option(
+            "--debug", help="Print the traceback behind an error message. Also: IGSR_DEBUG=1."
+        ),
+    ] = False,
+    verbose: Annotated[
+        int,
+        typer.Option(
+            "--verbose",
+            "-v",
+            count=True,
+            show_default=False,
+            help="Log to stderr what happens; -vv logs details.",
+        ),
+    ] = 0,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            "--threads",
+            metavar="N",
+            min=1,
+            max=MOST_THREADS,
+            help="Use N threads. Default: all cores.",
+        ),
+    ] = None,
 ) -> None:
-    pass
-
-
-app.command("pose")(pose_command)
-app.command("refine")(refine_command)
-app.command("fit")(fit_command)
-app.command("render")(render_command)
-app.command("eval")(eval_command)
-app.command("info")(info_command)
-app.command("view", context_settings=PASSED_ON)(view_command)
-app.command("export")(export_command)
-app.command("compact")(compact_command)
-app.command("convert")(convert_command)
-app.add_typer(denoise_app, name="denoise")
-app.command("study")(study_command)
-app.command("synth")(synth_command)
-app.command("bench")(bench_command)
+    if debug:
+        show_tracebacks()
+    if threads is not None:
+        use_threads(threads)
+    if verbose:
+        log_to_stderr(verbose)
 
 
 def main() -> None:
     """Run the ``igsr`` command."""
-    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        # Mesa's layer that asks the desktop for its GPU prints an error where there is no desktop.
-        os.environ.setdefault("NODEVICE_SELECT", "1")
     app()

@@ -1,4 +1,4 @@
-"""``igsr bench``: speed and error."""
+"""``igsr bench``: speed and error of the backends."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ import typer
 
 from igsr._internal.atomic_write import check_writable
 from igsr._internal.json_file import write_json
-from igsr.cli.shared import BackendChoice, error_console, one_sentence, output_console
+from igsr.cli.error_messages import error_messages
+from igsr.cli.shared import (
+    BackendChoice,
+    error_console,
+    output_console,
+)
 from igsr.errors import IgsrError
 
 
@@ -26,7 +31,7 @@ class WorkloadChoice(str, enum.Enum):
 def bench_command(
     backends: Annotated[
         list[BackendChoice] | None,
-        typer.Option("--backend", help="Repeat it for several. Default: what auto stands for."),
+        typer.Option("--backend", help="Repeat it for several. Default: as auto."),
     ] = None,
     workloads: Annotated[
         list[WorkloadChoice] | None,
@@ -34,29 +39,30 @@ def bench_command(
     ] = None,
     garden: Annotated[
         Path | None,
-        typer.Option("--garden", metavar="FILE", help="gsplat's test_garden.npz, for W2."),
+        typer.Option("--garden", metavar="FILE", help="For W2: gsplat's test_garden.npz."),
     ] = None,
     capture: Annotated[
         Path | None,
-        typer.Option("--capture", metavar="CAPTURE", help="Photos of 400x400 for W3."),
+        typer.Option("--capture", metavar="CAPTURE", help="For W3: photos of 400x400 pixels."),
     ] = None,
     models: Annotated[
         Path | None,
         typer.Option(
             "--models",
             metavar="DIR",
-            help="Folder that keeps the models fitted for W3. Default: out/bench.",
+            help="For W3: folder that keeps the fitted models. Default: out/bench.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same workloads.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", help="Random seed of the workloads.")] = 0,
     seconds: Annotated[
-        float, typer.Option("--seconds", help="How long each row is repeated.")
+        float, typer.Option("--seconds", help="How long each row is repeated, in seconds.")
     ] = 2.0,
     plot: Annotated[
-        Path | None, typer.Option("--plot", metavar="PNG", help="Draw time against error.")
+        Path | None, typer.Option("--plot", metavar="PNG", help="Plot time against error.")
     ] = None,
     json_path: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the machine and all rows.")
+        Path | None,
+        typer.Option("--json", metavar="FILE", help="Write the machine and all rows."),
     ] = None,
     accuracy: Annotated[
         Path | None,
@@ -64,18 +70,18 @@ def bench_command(
             "--accuracy",
             metavar="FILE",
             help="Instead of workloads, measure every setting and write a page like "
-            "docs/accuracy.md, its plot beside it.",
+            "docs/how-it-works/accuracy.md, its plot beside it.",
         ),
     ] = None,
 ) -> None:
-    """Measure speed and error together, against the f64 reference.
+    """Measure speed, and error against the float64 reference, of the backends.
 
-    W1: rasterize only. W2: the garden, forward and backward. W3: a fit step on a capture. W4: how a
-    fit step grows with splats and pixels.
+    Workloads: W1 rasterize only; W2 the garden scene, forward and backward; W3 a fit step on a
+    capture; W4 how a fit step grows with splats and pixels.
     """
     from igsr import benchmark
 
-    with one_sentence():
+    with error_messages():
         if seed < 0:
             raise IgsrError(f"--seed must be at least 0, not {seed}.")
         if not 0.0 <= seconds <= 3600.0:

@@ -1,4 +1,4 @@
-"""``igsr compact``: the smallest model within a loss."""
+"""``igsr compact``: the smallest scene within a limit on PSNR."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rich.progress import Progress as ProgressBar
 
 from igsr._internal.atomic_write import check_writable
 from igsr._internal.json_file import write_json
+from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
@@ -22,10 +23,10 @@ from igsr.cli.shared import (
     HoldoutOption,
     JsonOption,
     SceneArgument,
+    SeedOption,
     background_color,
     error_console,
     load,
-    one_sentence,
     output_console,
     print_json,
     resolved,
@@ -39,15 +40,16 @@ from igsr.splats import Splats
 def compact_command(
     scene: SceneArgument,
     max_loss: Annotated[
-        str, typer.Option("--max-loss", metavar="DB", help="PSNR that may be lost, such as 0.1dB.")
+        str,
+        typer.Option("--max-loss", metavar="DB", help="PSNR that may be lost, such as 0.1dB."),
     ] = "0.1dB",
     capture_path: Annotated[
         Path | None,
         typer.Option(
             "--capture",
             metavar="CAPTURE",
-            help="The photos of the scene: refine to them and measure the loss on held-out ones. "
-            "Without it, both by pictures of SCENE from around it.",
+            help="Photos of the scene: fine-tune on them and measure the loss on held-out photos. "
+            "Without it, renders of SCENE from around it take their place.",
         ),
     ] = None,
     holdout: HoldoutOption = None,
@@ -55,8 +57,8 @@ def compact_command(
         float | None,
         typer.Option(
             "--psnr",
-            help="Without --capture: how good SCENE is, dB, for a change of it to be worth dB. "
-            "Default: what the report.json beside SCENE says, else 30.",
+            help="Without --capture: the PSNR of SCENE on its photos, against which a change "
+            "counts. Default: that of the report.json beside SCENE, else 30.",
         ),
     ] = None,
     out: Annotated[
@@ -64,7 +66,7 @@ def compact_command(
         typer.Option(
             "--out",
             metavar="PLY",
-            help="The smaller scene; the curve goes beside it as .json and .png. "
+            help="The smaller scene; its curve of size and PSNR goes beside it as .json and .png. "
             "Default: SCENE's name with .compact.ply.",
         ),
     ] = None,
@@ -72,20 +74,20 @@ def compact_command(
         int | None,
         typer.Option(
             "--sh-degree",
-            help="Degree of view-dependent colour of the smaller scene: a higher one needs fewer "
-            "splats, but more bytes for each. Default: SCENE's, or lower where that loses little.",
+            help="Spherical-harmonics degree of the smaller scene. A higher degree needs fewer "
+            "splats with more bytes each. Default: SCENE's, or lower where that loses little.",
         ),
     ] = None,
     steps: Annotated[
-        int, typer.Option("--steps", help="Refinement steps of a model that may be the result.")
+        int, typer.Option("--steps", help="Fine-tuning steps of each candidate.")
     ] = DEFAULT_STEPS,
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    seed: SeedOption = 0,
     background: BackgroundOption = None,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
-    """Make SCENE smaller: the fewest splats that lose no more than --max-loss."""
-    with one_sentence(lambda: "Interrupted; nothing is written."):
+    """Make SCENE smaller: the fewest splats that lose at most --max-loss of PSNR."""
+    with error_messages(lambda: "Interrupted; nothing is written."):
         name = resolved(backend)
         limit = _decibels("--max-loss", max_loss)
         target = scene.with_suffix(".compact.ply") if out is None else out
@@ -96,7 +98,7 @@ def compact_command(
         if capture_path is not None:
             capture = load(capture_path, holdout)
         elif holdout is not None:
-            raise IgsrError("--holdout chooses among photos; give --capture or leave it out.")
+            raise IgsrError("--holdout needs photos; give --capture, or leave --holdout out.")
         elif psnr is None:
             psnr = _reported_psnr(scene.parent / "report.json")
         curve, plot = target.with_suffix(".json"), target.with_suffix(".png")
@@ -131,7 +133,7 @@ def compact_command(
     )
     console.print(f"loses {result['loss']:.3f} dB of at most {limit:g}")
     console.print(
-        f"{report['protocol']['judge_views']} views that were not refined to, against "
+        f"measured on {report['protocol']['validation_views']} held-out views against "
         f"{report['protocol']['against']}",
         style="dim",
     )
@@ -144,12 +146,12 @@ def _decibels(option: str, text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 < value < 100.0:
-        raise IgsrError(f"{option} must be dB above 0 and below 100 such as 0.1dB, not {text!r}.")
+        raise IgsrError(f"{option} must be from 0 to 100 dB, such as 0.1dB, not {text!r}.")
     return value
 
 
 def _reported_psnr(path: Path) -> float | None:
-    """What the report of a fit says of its scene, or None where there is none to be read."""
+    """The PSNR in the report of a fit, or None if there is no such report."""
     try:
         psnr = json.loads(path.read_text(encoding="utf-8"))["psnr"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
@@ -159,7 +161,7 @@ def _reported_psnr(path: Path) -> float | None:
 
 @contextlib.contextmanager
 def _compact_bar(shown: bool) -> Iterator[Callable[[CompactProgress], None]]:
-    """A progress bar on stderr for the size that is tried, with its time left."""
+    """A progress bar on stderr for each candidate size, with its time left."""
     bar = ProgressBar(
         TextColumn("size {task.fields[trial]}: {task.fields[what]}"),
         BarColumn(bar_width=30),

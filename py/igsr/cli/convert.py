@@ -8,14 +8,12 @@ from typing import Annotated
 import typer
 
 from igsr._internal.atomic_write import check_writable
+from igsr.cli.error_messages import error_messages, print_message, warning_messages
 from igsr.cli.shared import (
     JsonOption,
     SceneArgument,
-    complain,
-    one_sentence,
     output_console,
     print_json,
-    warnings_as_sentences,
 )
 from igsr.splats import Splats
 
@@ -26,14 +24,14 @@ def convert_command(
         Path,
         typer.Argument(
             metavar="TARGET",
-            help="File to write; its ending is the format: .ply, .compressed.ply, .splat, .spz, "
+            help="File to write. Its ending sets the format: .ply, .compressed.ply, .splat, .spz, "
             ".sog, .glb or .gltf.",
         ),
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Write SCENE as TARGET, and say what TARGET's format cannot hold."""
-    with one_sentence(lambda: "Interrupted; nothing is written."), warnings_as_sentences():
+    """Write SCENE in the format of TARGET; name what that format cannot hold."""
+    with error_messages(lambda: "Interrupted; nothing is written."), warning_messages():
         check_writable(target)
         splats = Splats.load(scene)
         notes = splats.save(target)
@@ -53,7 +51,7 @@ def convert_command(
         )
         return
     for note in notes:
-        complain(note)
+        print_message(note)
     before = scene.stat().st_size
     output_console().print(
         f"{len(splats)} splats in {target}, {size} bytes ({size / max(before, 1):.2f} of {scene})"

@@ -8,12 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
-from igsr._internal.atomic_write import atomic_write
+from igsr.cli.settings_options import settings_options
 from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
@@ -31,23 +30,18 @@ from igsr.cli.shared import (
     resolved,
     stopped,
 )
+from igsr.denoiser.architecture import Architecture
+from igsr.denoiser.training.training_settings import Training
 from igsr.errors import IgsrError
-from igsr.evaluation.scores import (
-    default_background,
-    default_split,
-    known_background,
-    views_of_split,
-)
-from igsr.splats import Splats
 
 app = typer.Typer(
-    help="Clean what a poor splat model renders: training pairs, training, use.",
+    help="Clean renders of scenes with few photos: make training pairs, train, apply.",
     no_args_is_help=True,
 )
 
 
 class RecipeChoice(str, enum.Enum):
-    """How fits are made poor."""
+    """How fits are degraded for training pairs."""
 
     sparse = "sparse"
     underfit = "underfit"
@@ -57,18 +51,8 @@ class RecipeChoice(str, enum.Enum):
     leave_one_out = "leave-one-out"
 
 
-class LossChoice(str, enum.Enum):
-    """What training makes small."""
-
-    default = "default"
-    charbonnier = "charbonnier"
-    gan = "gan"
-    gan_lpips = "gan+lpips"
-    lpips = "lpips"
-
-
 class BackboneChoice(str, enum.Enum):
-    """Backbones of LPIPS."""
+    """Backbone of LPIPS."""
 
     alex = "alex"
     vgg = "vgg"
@@ -85,23 +69,25 @@ def pairs_command(
         list[RecipeChoice] | None,
         typer.Option("--recipe", help="Repeat it for several. Default: sparse, underfit, noise."),
     ] = None,
-    fits: Annotated[int, typer.Option("--fits", help="Per capture and recipe.")] = 1,
-    views: Annotated[int, typer.Option("--views", help="Unseen views rendered per fit.")] = 8,
+    fits: Annotated[int, typer.Option("--fits", help="Fits per capture and recipe.")] = 1,
+    views: Annotated[int, typer.Option("--views", help="Novel views rendered per fit.")] = 8,
     steps: Annotated[
-        int | None, typer.Option("--steps", help="Of each fit. Default: as igsr fit.")
+        int | None, typer.Option("--steps", help="Steps of each fit. Default: as igsr fit.")
     ] = None,
     all_views: Annotated[
-        bool, typer.Option("--all-views", help="Use the views that are held out, too.")
+        bool, typer.Option("--all-views", help="Also use the held-out views.")
     ] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same pairs.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Pairs are deterministic for a given seed.")
+    ] = 0,
     jobs: JobsOption = 1,
     ray: RayOption = False,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit captures poorly and keep renders of unseen views beside the true pictures.
+    """Make training pairs: degraded fits' renders of novel views beside the true photos.
 
-    What is finished is kept in --out, and the same command goes on from there.
+    Finished fits are kept in --out; the same command goes on from there.
     """
     from igsr.denoiser.training.pairs import DEFAULT_RECIPES, make_pairs
 
@@ -139,24 +125,26 @@ def pairs_command(
 
 
 @app.command("train")
+@settings_options(Training)
 def train_command(
-    pairs: Annotated[Path, typer.Option("--pairs", metavar="PAIRS", help="Of igsr denoise pairs.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for what comes out.")],
-    loss: Annotated[LossChoice, typer.Option("--loss", help="The last three are a paper's.")] = (
-        LossChoice.default
-    ),
-    a: Annotated[float, typer.Option("--a", help="gan+lpips: part that LPIPS has.")] = 0.9,
+    pairs: Annotated[
+        Path, typer.Option("--pairs", metavar="PAIRS", help="Folder that igsr denoise pairs made.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for weights, log and checkpoint.")
+    ],
+    given: dict[str, Any],
     features: Annotated[
         Path | None,
         typer.Option(
             "--features",
             metavar="FILE",
-            help="SqueezeNet 1.0's arrays (.npz), for a perceptual distance that is not LPIPS.",
+            help="SqueezeNet 1.0 arrays (.npz), for a perceptual distance that is not LPIPS.",
         ),
     ] = None,
     lpips: Annotated[
         BackboneChoice | None,
-        typer.Option("--lpips", help="True LPIPS with this backbone, which is downloaded."),
+        typer.Option("--lpips", help="LPIPS with this backbone, which is downloaded."),
     ] = None,
     # Not --start: torchrun would take it for the beginning of one of its own options.
     start: Annotated[
@@ -165,48 +153,42 @@ def train_command(
             "--weights", metavar="FILE", help="Weights to go on from, such as igsr's own."
         ),
     ] = None,
-    steps: Annotated[int, typer.Option("--steps", help="Batches.")] = 20_000,
-    batch: Annotated[int, typer.Option("--batch", help="Crops per step.")] = 8,
-    crop: Annotated[int, typer.Option("--crop", help="Side of a crop, pixels.")] = 128,
-    rate: Annotated[float, typer.Option("--rate", help="Adam's highest.")] = 1e-3,
-    weight_decay: Annotated[float, typer.Option("--weight-decay")] = 1e-4,
-    dropout: Annotated[float, typer.Option("--dropout")] = 0.0,
-    augment: Annotated[bool, typer.Option("--augment/--no-augment")] = True,
-    width: Annotated[int, typer.Option("--width", help="Channels at half resolution.")] = 32,
-    residual: Annotated[bool, typer.Option("--residual/--no-residual")] = True,
-    buffers: Annotated[bool, typer.Option("--buffers/--no-buffers")] = True,
+    width: Annotated[
+        int, typer.Option("--width", help="Channels at half resolution.")
+    ] = Architecture.width,
+    residual: Annotated[
+        bool, typer.Option("--residual/--no-residual", help="Add the output to the render.")
+    ] = Architecture.residual,
+    buffers: Annotated[
+        bool, typer.Option("--buffers/--no-buffers", help="Look at alpha, depth, normals ...")
+    ] = Architecture.buffers,
     photos: Annotated[
         str, typer.Option("--photos", help="concatenated, attention or none.")
-    ] = "concatenated",
-    device: Annotated[str, typer.Option("--device", help="torch's name of one.")] = "cpu",
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same weights.")] = 0,
+    ] = Architecture.photos,
+    device: Annotated[
+        str, typer.Option("--device", help="Where to train, as torch names it: cpu, cuda ...")
+    ] = "cpu",
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the last checkpoint in --out.")
+        bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train a denoiser. Several GPUs: torchrun --nproc-per-node N -m igsr.cli denoise train ..."""
-    from igsr.denoiser.network import Architecture
+    from igsr.denoiser.training.distributed import is_first_process
     from igsr.denoiser.training.perceptual_distance import (
         Distance,
         SqueezeNetDistance,
         lpips_distance,
     )
     from igsr.denoiser.training.plot_training import plot_training
-    from igsr.denoiser.training.train import (
-        LOG,
-        WEIGHTS,
-        Training,
-        TrainingProgress,
-        is_first_process,
-        train,
-    )
+    from igsr.denoiser.training.train_network import train
+    from igsr.denoiser.training.training_run import LOG, WEIGHTS, TrainingProgress
 
     with one_sentence(
         lambda: f"Interrupted; go on from the last checkpoint in {out} with --resume."
     ):
         if features is not None and lpips is not None:
-            raise IgsrError("--features and --lpips are two distances; give one.")
+            raise IgsrError("--features and --lpips both name a perceptual distance; give one.")
         distance: Distance | None = None
         if features is not None:
             distance = SqueezeNetDistance(features)
@@ -216,7 +198,8 @@ def train_command(
         files = sorted(pairs.glob("[!.]*.npz"))
         if not files:
             raise IgsrError(f"{pairs} holds no .npz of pairs; make some with igsr denoise pairs.")
-        with _bar(steps) as show:
+        training = Training(**given)
+        with _bar(training.steps) as show:
 
             def progress(now: TrainingProgress) -> None:
                 show(now.step, now.parts)
@@ -224,9 +207,7 @@ def train_command(
             train(
                 files,
                 out,
-                Training(
-                    steps, batch, crop, rate, weight_decay, dropout, augment, loss.value, a, seed
-                ),
+                training,
                 Architecture(width=width, residual=residual, buffers=buffers, photos=photos),
                 distance=distance,
                 start=start,
@@ -270,17 +251,22 @@ def _bar(steps: int) -> Iterator[Any]:
 
 @app.command("apply")
 def apply_command(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A splat .ply file.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Splats (.ply).")],
     capture_path: Annotated[
-        Path, typer.Option("--capture", metavar="CAPTURE", help="The photos it was fitted to.")
+        Path,
+        typer.Option(
+            "--capture", metavar="CAPTURE", help="The photos that the splats were fitted to."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the pictures.")],
     holdout: Annotated[
-        int | None, typer.Option("--holdout", help="Every how many views one is held out.")
+        int | None, typer.Option("--holdout", help="Hold out every Nth photo for testing.")
     ] = None,
     split: Annotated[
         SplitChoice | None,
-        typer.Option("--split", help="Views to render. Default: those held out, if there are."),
+        typer.Option(
+            "--split", help="Views to render. Default: the held-out views, if there are any."
+        ),
     ] = None,
     weights: Annotated[
         Path | None,
@@ -289,9 +275,11 @@ def apply_command(
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
-    """Render views of a scene and clean them: NAME.png, and NAME.confidence.png (white: sure)."""
+    """Render views and denoise them: NAME.png, and NAME.confidence.png (white: confident)."""
+    import numpy as np
     from PIL import Image
 
+    from igsr._internal.atomic_write import atomic_write
     from igsr.denoiser import (
         NetworkDenoiser,
         denoise,
@@ -300,6 +288,13 @@ def apply_command(
         photo_support,
         render_buffers,
     )
+    from igsr.evaluation.scores import (
+        default_background,
+        default_split,
+        known_background,
+        views_of_split,
+    )
+    from igsr.splats import Splats
 
     with one_sentence():
         denoiser = NetworkDenoiser(load_network(weights))

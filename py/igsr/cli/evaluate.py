@@ -1,4 +1,4 @@
-"""``igsr eval``: score splats."""
+"""``igsr eval``: score a scene against photos."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import typer
 from rich.table import Table
 
 from igsr import _core
+from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
@@ -19,7 +20,6 @@ from igsr.cli.shared import (
     SplitChoice,
     background_color,
     load,
-    one_sentence,
     output_console,
     print_json,
     protocol_line,
@@ -36,14 +36,15 @@ def eval_command(
     capture_path: CaptureArgument,
     holdout: HoldoutOption = None,
     split: Annotated[
-        SplitChoice | None, typer.Option("--split", help="Default: test views if there are any.")
+        SplitChoice | None,
+        typer.Option("--split", help="Views to score. Default: test if there are any, else train."),
     ] = None,
     background: BackgroundOption = None,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
     """Score SCENE against the photos of CAPTURE."""
-    with one_sentence():
+    with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)
         capture = load(capture_path, holdout)

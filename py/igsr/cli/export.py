@@ -1,4 +1,4 @@
-"""``igsr export``: write a capture in another form."""
+"""``igsr export``: write a capture in another format."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from igsr._internal.atomic_write import check_folder
 from igsr.capture import load_capture
 from igsr.capture.write_colmap import write_colmap
 from igsr.capture.write_transforms import write_transforms
-from igsr.cli.shared import CaptureArgument, JsonOption, one_sentence, output_console, print_json
+from igsr.cli.error_messages import error_messages
+from igsr.cli.shared import CaptureArgument, JsonOption, output_console, print_json
 
 
 class FormatChoice(str, enum.Enum):
-    """Files that describe cameras."""
+    """Formats of captures that can be written."""
 
     colmap = "colmap"
     colmap_text = "colmap-text"
@@ -25,15 +26,15 @@ class FormatChoice(str, enum.Enum):
 
 def export_command(
     capture_path: CaptureArgument,
-    out: Annotated[Path, typer.Option("--out", help="Folder; it must be new or empty.")],
+    out: Annotated[Path, typer.Option("--out", help="New or empty folder.")],
     form: Annotated[
         FormatChoice,
-        typer.Option("--format", help="colmap (binary), colmap-text, or nerfstudio's transforms."),
+        typer.Option("--format", help="colmap (binary), colmap-text, or transforms (nerfstudio)."),
     ] = FormatChoice.colmap,
     as_json: JsonOption = False,
 ) -> None:
-    """Write CAPTURE in another format: photos undistorted, at full resolution, masks as masks."""
-    with one_sentence(lambda: "Interrupted; nothing is written."):
+    """Write CAPTURE in another format: undistorted photos at full resolution, masks, cameras."""
+    with error_messages(lambda: "Interrupted; nothing is written."):
         check_folder(out)
         capture = load_capture(capture_path)
         if form is FormatChoice.transforms:

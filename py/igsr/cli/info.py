@@ -1,4 +1,4 @@
-"""``igsr info``: what is in a file, and what this machine has."""
+"""``igsr info``: what a file holds, and which backends this machine has."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ import numpy as np
 import typer
 
 from igsr import _core
-from igsr.capture import load_capture
-from igsr.cli.shared import JsonOption, one_sentence, output_console, print_json
+from igsr.cli.error_messages import error_messages
+from igsr.cli.shared import JsonOption, output_console, print_json
 from igsr.splats import SPLAT_ENDINGS, Splats
 
 
 def info_command(
-    path: Annotated[Path, typer.Argument(metavar="SCENE|CAPTURE", help="What to describe.")],
+    path: Annotated[
+        Path, typer.Argument(metavar="SCENE|CAPTURE", help="A splat file, or a capture.")
+    ],
     as_json: JsonOption = False,
 ) -> None:
-    """Describe a scene or a capture, and the backends of this machine."""
-    with one_sentence():
+    """Describe a scene or a capture, and this machine's backends."""
+    with error_messages():
         report = _scene_info(path) if path.suffix.lower() in SPLAT_ENDINGS else _capture_info(path)
         report["backends"] = _backends()
     if as_json:
@@ -61,11 +63,16 @@ def _scene_info(path: Path) -> dict[str, Any]:
 
 
 def _known(number: float) -> float | None:
-    """None where poses so far out that their mean overflows leave no number; JSON has none."""
+    """The number, or None if it is not finite: JSON has no such number.
+
+    The mean of camera centres overflows where a camera is absurdly far out.
+    """
     return float(number) if math.isfinite(number) else None
 
 
 def _capture_info(path: Path) -> dict[str, Any]:
+    from igsr.capture import load_capture
+
     capture = load_capture(path)
     sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in capture.views})
     points = None if capture.points is None else len(capture.points.xyz)
@@ -85,7 +92,7 @@ def _capture_info(path: Path) -> dict[str, Any]:
 
 
 def _backends() -> dict[str, str]:
-    """Each backend with what it runs on, or why it does not."""
+    """What each backend runs on, or why it is not available."""
     found = {}
     for name in ("cpu", "gpu", "reference"):
         try:

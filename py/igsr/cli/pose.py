@@ -19,23 +19,22 @@ from igsr.capture import Capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import FRAMES, has_photos
 from igsr.capture.write_colmap import write_colmap
+from igsr.cli.error_messages import error_messages, print_message, warning_messages
 from igsr.cli.shared import (
     JsonOption,
-    complain,
+    SeedOption,
     error_console,
     load,
-    one_sentence,
     output_console,
     print_json,
     stopped,
-    warnings_as_sentences,
 )
 from igsr.errors import IgsrError
 from igsr.pose import AUTO, capture_of, estimate, found_before, kept_cameras, photos_note, photos_of
 from igsr.pose.registry import ESTIMATORS
 
 FramesOption = Annotated[
-    int, typer.Option("--frames", help="How many frames are taken of each video.")
+    int, typer.Option("--frames", help="Number of frames taken from each video.")
 ]
 
 
@@ -44,14 +43,15 @@ EstimatorOption = Annotated[
     typer.Option(
         "--estimator",
         metavar="NAME",
-        help=f"What finds cameras: {', '.join(ESTIMATORS)}, or auto, the first of them that can "
-        "run here.",
+        help=f"What finds the cameras: {', '.join(ESTIMATORS)}, or auto, the first of these that "
+        "can run.",
     ),
 ]
 
 
 CheckpointOption = Annotated[
-    Path | None, typer.Option("--checkpoint", metavar="FILE", help="dust3r: the network's weights.")
+    Path | None,
+    typer.Option("--checkpoint", metavar="FILE", help="For dust3r: the weights."),
 ]
 
 
@@ -60,14 +60,22 @@ GraphOption = Annotated[
     typer.Option(
         "--graph",
         metavar="KIND",
-        help="dust3r: which pairs of photos it sees: complete, swin-K, logwin-K or oneref-K.",
+        help="For dust3r: which pairs of photos it sees: complete, swin-K, logwin-K or oneref-K.",
     ),
 ]
 
 
 @dataclass(frozen=True)
 class CameraFinder:
-    """What was said of how cameras are to be found."""
+    """The options that say how cameras are found.
+
+    Attributes:
+        estimator: a name of ``igsr.pose.registry.ESTIMATORS``, or "auto".
+        checkpoint: weights of dust3r's network, or None.
+        graph: which pairs of photos dust3r sees, or None for its default.
+        frames: number of frames taken from each video.
+        seed: of everything random.
+    """
 
     estimator: str
     checkpoint: Path | None
@@ -77,7 +85,7 @@ class CameraFinder:
 
     @property
     def options(self) -> dict[str, Any]:
-        """What goes to the estimator itself."""
+        """Keywords for the estimator itself: those that were given."""
         given = {"checkpoint": self.checkpoint, "graph": self.graph}
         return {name: value for name, value in given.items() if value is not None}
 
@@ -91,9 +99,24 @@ def capture_to_fit(
     resume: bool,
     shown: bool,
 ) -> tuple[Capture, bool]:
-    """The capture at a path, and whether its cameras were found here.
+    """Load the capture at a path; find the cameras first if it has none.
 
-    Photos without cameras get them, kept in ``out/capture``.
+    Cameras that are found are kept in ``out/capture``.
+
+    Args:
+        path: a capture, a folder of photos, or a video.
+        out: the folder of the fit.
+        holdout: hold out every ``holdout``-th view for testing, or None.
+        finder: how to find the cameras.
+        resume: use cameras that an earlier run found.
+        shown: whether progress is shown.
+
+    Returns:
+        The capture, and whether its cameras were found here (or by the run that is resumed).
+
+    Raises:
+        IgsrError: the capture cannot be loaded, its cameras cannot be found, or options that find
+            cameras were given for a capture that has them.
     """
     if holds_cameras(path) or not has_photos(path):
         if finder.options or finder.estimator != AUTO:
@@ -103,10 +126,10 @@ def capture_to_fit(
         return load(path, holdout), False
     kept = kept_cameras(path, out)
     if resume and found_before(path, kept):
-        complain(f"The cameras found before are used, from {kept}")
+        print_message(f"The cameras found before are used, from {kept}")
     else:
         report = _posed(path, kept, finder, plot=False, shown=shown, notes=photos_note(path))
-        complain(
+        print_message(
             f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
             f"{report['estimator']} and are kept in {kept}"
         )
@@ -125,21 +148,21 @@ def pose_command(
     checkpoint: CheckpointOption = None,
     graph: GraphOption = None,
     plot: Annotated[
-        bool, typer.Option("--plot", help="Draw cameras and points to poses.png in --out.")
+        bool, typer.Option("--plot", help="Draw cameras and points to --out/poses.png.")
     ] = False,
     frames: FramesOption = FRAMES,
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
+    seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the cameras of PHOTOS and write both as a COLMAP capture."""
-    with one_sentence(lambda: "Interrupted; nothing is written."), warnings_as_sentences():
+    """Find the cameras of PHOTOS and write photos and cameras as a COLMAP capture."""
+    with error_messages(lambda: "Interrupted; nothing is written."), warning_messages():
         check_folder(out)
         started = time.monotonic()
         given = photos[0] if len(photos) == 1 else photos
         if estimator == AUTO and isinstance(given, Path) and holds_cameras(given):
             raise IgsrError(
                 f"{given} has cameras already; fit it as it is, or name an --estimator to find "
-                "them anew"
+                "them again"
             )
         finder = CameraFinder(estimator, checkpoint, graph, frames, seed)
         report = _posed(given, out, finder, plot=plot, shown=not as_json)
@@ -149,8 +172,9 @@ def pose_command(
         return
     console = output_console()
     console.print(
-        f"{len(report['cameras'])} of {report['photos']} photos placed by {report['estimator']} in "
-        f"{report['seconds']:.1f} s, {report['points']} points, seed {seed}"
+        f"{len(report['cameras'])} of {report['photos']} photos registered by "
+        f"{report['estimator']} in {report['seconds']:.1f} s, {report['points']} points, "
+        f"seed {seed}"
     )
     console.print("  ".join([str(out), *([str(out / "poses.png")] if plot else [])]), style="dim")
 
@@ -164,9 +188,10 @@ def _posed(
     shown: bool,
     notes: dict[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Find cameras and write the capture; what ``igsr pose`` reports.
+    """Find cameras, write the capture, and return the report of ``igsr pose``.
 
-    With ``notes``, text files that lie beside the capture, what is there is replaced.
+    ``notes`` are text files to write beside the capture, by name. With them, a folder that is
+    there is replaced.
     """
     from igsr.pose.plot_poses import plot_poses
 
@@ -176,7 +201,7 @@ def _posed(
             loaded, finder.estimator, seed=finder.seed, progress=show, **finder.options
         )
     for sentence in found.warnings:
-        complain(sentence)
+        print_message(sentence)
     capture = capture_of(photos if isinstance(photos, Path) else Path("photos"), loaded, found)
     trusted = [
         mask
@@ -214,7 +239,7 @@ def _posed(
 
 @contextlib.contextmanager
 def _pose_bar(shown: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on stderr, one line for each stage of finding cameras."""
+    """A progress bar on stderr, a line for each stage of finding cameras."""
     bar = ProgressBar(
         TextColumn("{task.description} {task.completed}/{task.total}"),
         BarColumn(bar_width=30),

@@ -1,4 +1,4 @@
-"""``igsr refine``: from photos to a scene, with views added that nobody photographed."""
+"""``igsr refine``: fit photos, and improve the fit with denoised novel views."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBar
 
 from igsr.capture.photo_folder import FRAMES
+from igsr.cli.error_messages import error_messages, warning_messages
 from igsr.cli.pose import (
     CameraFinder,
     CheckpointOption,
@@ -20,124 +19,137 @@ from igsr.cli.pose import (
     GraphOption,
     capture_to_fit,
 )
+from igsr.cli.settings_options import settings_options
 from igsr.cli.shared import (
-    BackendChoice,
-    BackendOption,
     HoldoutOption,
     JsonOption,
     error_console,
-    one_sentence,
     output_console,
     print_json,
-    resolved,
     stopped,
-    warnings_as_sentences,
 )
 from igsr.errors import IgsrError
-from igsr.pose import AUTO
+from igsr.refinement.settings import AUTO, RefineSettings
 
+# What imports torch is imported by the command, so that --help answers at once.
 if TYPE_CHECKING:
     from igsr.capture import Capture
-    from igsr.refinement.results import RefineProgress
+    from igsr.refinement.results import Refined, RefineProgress
 
-#: What each part of a round does, for the bar.
-_DOING = {
-    "fit": "fit",
-    "look": "look from where no photo was taken",
-    "judge": "judge by photos left out",
-    "refit": "fit with the views added",
-    "test": "score",
+#: Stages as the progress bar calls them.
+_STAGES = {
+    "fit": "fit photos",
+    "novel_views": "render and denoise novel views",
+    "cross_validate": "cross-validate",
+    "refit": "refit with novel views",
+    "test": "score test views",
 }
 
 
+@settings_options(RefineSettings)
 def refine_command(
+    context: typer.Context,
     photos: Annotated[
         Path, typer.Argument(metavar="PHOTOS", help="A folder of photos, or a capture.")
     ],
     out: Annotated[
         Path,
-        typer.Option("--out", help="Folder for scene.ply, report.html, report.json, rounds/."),
+        typer.Option("--out", help="Folder for scene.ply, report.html, report.json and rounds/."),
     ],
-    rounds: Annotated[
-        str,
-        typer.Option("--rounds", help="At most so many, or auto: until one does not help, or 4."),
-    ] = AUTO,
+    given: dict[str, Any],
     holdout: HoldoutOption = None,
     photo_count: Annotated[
         int | None,
-        typer.Option("--photos", help="Use so many of the train photos, evenly spaced."),
+        typer.Option("--photos", metavar="N", help="Fit N of the train photos, evenly spaced."),
     ] = None,
-    steps: Annotated[int | None, typer.Option("--steps", help="Of each fit.")] = None,
-    backend: BackendOption = BackendChoice.auto,
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same bits.")] = 0,
     weights: Annotated[
         Path | None,
-        typer.Option("--weights", metavar="FILE", help="A denoiser. Default: igsr's own."),
+        typer.Option("--weights", metavar="FILE", help="The denoiser. Default: igsr's own."),
     ] = None,
     estimator: EstimatorOption = AUTO,
     network: CheckpointOption = None,
     graph: GraphOption = None,
     frames: FramesOption = FRAMES,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config",
+            metavar="FILE",
+            help="The report.json of an earlier run, for rounds, steps, backend, seed and "
+            "cross-validation. Options that are given here win.",
+        ),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the checkpoints in --out.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit photos, render views that nobody took, clean them, keep what helps, and fit again."""
-    from igsr.refinement.loop import check_arguments, refine, round_denoiser
-
-    with one_sentence(
+    """Fit few photos, then add denoised novel views and refit, while cross-validation improves."""
+    with error_messages(
         lambda: f"Interrupted; what is done is in {out}, the same command with --resume goes on."
     ):
-        name = resolved(backend)
-        most = _rounds(rounds)
-        check_arguments(most, steps, name, seed, out, resume)
+        settings = RefineSettings(**_given(context, given, config))
+        if photo_count is not None:
+            _check_photo_count(photos, holdout, photo_count)
+
+        from igsr._core import resolve_backend
+        from igsr.refinement.loop import refine, round_denoiser
+
+        resolve_backend(settings.backend)  # a missing GPU is found before cameras are looked for
         denoiser = round_denoiser(weights)
-        with warnings_as_sentences():
+        with warning_messages():
             capture, _ = capture_to_fit(
                 photos,
                 out,
                 holdout,
-                CameraFinder(estimator, network, graph, frames, seed),
+                CameraFinder(estimator, network, graph, frames, settings.seed),
                 resume=resume,
                 shown=not as_json,
             )
-        with _bar(shown=not as_json) as show, warnings_as_sentences():
+        if photo_count is not None:
+            capture = _some_photos(capture, photo_count)
+        with _bar(shown=not as_json) as show, warning_messages():
             refined = refine(
-                capture if photo_count is None else _some_photos(capture, photo_count),
-                most,
-                show,
-                steps=steps,
-                backend=name,
-                seed=seed,
-                denoiser=denoiser,
-                out=out,
-                resume=resume,
+                capture, progress=show, denoiser=denoiser, out=out, resume=resume, **vars(settings)
             )
-    accepted = sum(one.accepted for one in refined.rounds)
-    tests = [refined.first_test, *(one.test for one in refined.rounds if one.accepted)]
-    summary: dict[str, Any] = {
-        "accepted": accepted,
-        "tried": len(refined.rounds),
-        "stopped": refined.stopped,
-        "test": tests if refined.first_test else None,
-        "splats": len(refined.splats),
-        "seconds": {part: round(seconds, 2) for part, seconds in refined.seconds.items()},
-        "out": str(out),
-    }
     if as_json:
-        print_json(summary)
-        return
-    console = output_console()
-    console.print(
-        f"{accepted} of {len(refined.rounds)} rounds accepted; stopped: {refined.stopped}",
-        markup=False,
-    )
-    if refined.first_test:
-        steps_of = " -> ".join(f"{scores['psnr']:.2f}" for scores in tests if scores)
-        console.print(f"PSNR of the test views by round: {steps_of} dB")
-    names = ("scene.ply", "report.html", "report.json")
-    console.print("  ".join(str(out / file) for file in names), style="dim")
+        print_json(_summary(refined, out))
+    else:
+        _print_summary(refined, out)
+
+
+def _given(context: typer.Context, given: dict[str, Any], config: Path | None) -> dict[str, Any]:
+    """The settings of the command line, on top of those of an earlier run's report.
+
+    Raises:
+        IgsrError: the report cannot be read or has no settings.
+    """
+    if config is None:
+        return given
+    from igsr.refinement.report import settings_of
+
+    explicit = {
+        name: value
+        for name, value in given.items()
+        if getattr(context.get_parameter_source(name), "name", "") != "DEFAULT"
+    }
+    return settings_of(config) | explicit
+
+
+def _check_photo_count(photos: Path, holdout: int | None, count: int) -> None:
+    """Find a --photos that a folder of photos without cameras cannot have.
+
+    Raises:
+        IgsrError: there are fewer train photos, even if the cameras of all are found.
+    """
+    from igsr.capture.load import holds_cameras
+    from igsr.capture.photo_folder import VIDEO_SUFFIXES, has_photos, photo_sizes
+
+    names = [] if holds_cameras(photos) or not has_photos(photos) else list(photo_sizes(photos))
+    if not names or any(name.lower().endswith(VIDEO_SUFFIXES) for name in names):
+        return  # captures are loaded at once, and the frames of videos are chosen later
+    held_out = len(names[::holdout]) if holdout is not None and holdout > 1 else 0
+    _check_count(count, len(names) - held_out, photos)
 
 
 def _some_photos(capture: Capture, count: int) -> Capture:
@@ -145,39 +157,68 @@ def _some_photos(capture: Capture, count: int) -> Capture:
     from igsr.capture import Capture
 
     train = capture.train_views
-    if not 1 <= count <= len(train):
-        raise IgsrError(
-            f"--photos must be from 1 to {len(train)}, the train photos of {capture.path}, "
-            f"not {count}."
-        )
+    _check_count(count, len(train), capture.path)
     ids = [(2 * k + 1) * len(train) // (2 * count) for k in range(count)]
     return Capture(capture.path, [train[i] for i in ids] + capture.test_views, capture.points)
 
 
-def _rounds(text: str) -> int | str:
-    if text == AUTO:
-        return text
-    try:
-        return int(text)
-    except ValueError:
-        raise IgsrError(f"--rounds must be a whole number or auto, not {text!r}.") from None
+def _check_count(count: int, most: int, path: Path) -> None:
+    if not 1 <= count <= most:
+        raise IgsrError(
+            f"--photos must be from 1 to {most}, the train photos of {path}, not {count}."
+        )
+
+
+def _summary(refined: Refined, out: Path) -> dict[str, Any]:
+    """What --json prints."""
+    assert refined.stop is not None
+    accepted = [done for done in refined.rounds if done.accepted]
+    tests = [refined.first_test, *(done.test for done in accepted)]
+    return {
+        "accepted": len(accepted),
+        "tried": len(refined.rounds),
+        "stop_reason": refined.stop.reason.value,
+        "stopped": str(refined.stop),
+        "test": tests if refined.first_test else None,
+        "splats": len(refined.splats),
+        "seconds": {stage: round(seconds, 2) for stage, seconds in refined.seconds.items()},
+        "out": str(out),
+    }
+
+
+def _print_summary(refined: Refined, out: Path) -> None:
+    accepted = [done for done in refined.rounds if done.accepted]
+    console = output_console()
+    console.print(
+        f"{len(accepted)} of {len(refined.rounds)} rounds accepted; stopped: {refined.stop}",
+        markup=False,
+    )
+    if refined.first_test:
+        tests = [refined.first_test, *(done.test for done in accepted)]
+        by_round = " -> ".join(f"{scores['psnr']:.2f}" for scores in tests if scores)
+        console.print(f"PSNR of the test views by round: {by_round} dB")
+    names = ("scene.ply", "report.html", "report.json")
+    console.print("  ".join(str(out / file) for file in names), style="dim", markup=False)
 
 
 @contextlib.contextmanager
 def _bar(shown: bool) -> Iterator[Callable[[RefineProgress], None]]:
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as ProgressBar
+
     bar = ProgressBar(
         TextColumn("round {task.fields[round]}"),
         BarColumn(bar_width=30),
-        TextColumn("{task.fields[doing]}"),
+        TextColumn("{task.fields[stage]}"),
         TimeRemainingColumn(compact=True),
         console=error_console(),
         disable=not shown,
     )
-    task = bar.add_task("refine", total=1.0, round=0, doing="")
+    task = bar.add_task("refine", total=1.0, round=0, stage="")
     with stopped(bar):
 
         def show(now: RefineProgress) -> None:
             bar.start()
-            bar.update(task, completed=now.done, round=now.round, doing=_DOING[now.doing])
+            bar.update(task, completed=now.done, round=now.round, stage=_STAGES[now.stage])
 
         yield show

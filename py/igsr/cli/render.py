@@ -9,7 +9,9 @@ import typer
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.choices import Backend
 from igsr.capture import Camera, Capture, load_capture
+from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
     NAMED_COLORS,
     BackendChoice,
@@ -18,7 +20,6 @@ from igsr.cli.shared import (
     JsonOption,
     SceneArgument,
     background_color,
-    one_sentence,
     output_console,
     picture_name,
     print_json,
@@ -34,7 +35,7 @@ from igsr.splats import Splats
 def render_command(
     scene: SceneArgument,
     out: Annotated[
-        Path, typer.Option("--out", help="Folder for pictures, or .mp4 file with --orbit.")
+        Path, typer.Option("--out", help="Folder for the pictures; with --orbit, an .mp4 file.")
     ],
     cameras: Annotated[
         Path | None,
@@ -45,13 +46,14 @@ def render_command(
         typer.Option(
             "--orbit",
             metavar="FRAMES",
-            help="Write a video once around the scene; with --cameras, at their distance.",
+            help="Write a video of an orbit around the scene; with --cameras, at their distance.",
         ),
     ] = None,
     exr: Annotated[
         bool,
         typer.Option(
-            "--exr", help="EXR in 32-bit float: R, G, B, A and Z (expected depth) instead of PNG."
+            "--exr",
+            help="Write EXR, not PNG: 32-bit floats R, G, B, A and Z (expected depth).",
         ),
     ] = False,
     background: BackgroundOption = None,
@@ -59,7 +61,7 @@ def render_command(
     as_json: JsonOption = False,
 ) -> None:
     """Render SCENE to PNG or EXR pictures, or to a video around it."""
-    with one_sentence():
+    with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)
         capture = None if cameras is None else load_capture(cameras)
@@ -68,14 +70,14 @@ def render_command(
         )
         if orbit_frames is not None:
             if exr:
-                raise IgsrError("--exr writes pictures and --orbit a video; leave one out.")
+                raise IgsrError("--exr writes pictures and --orbit writes a video; leave one out.")
             if out.suffix.lower() not in (".mp4", ".mkv", ".mov"):
                 raise IgsrError(f"--out {out} must be a video file such as orbit.mp4 with --orbit.")
             files = [_write_orbit(splats, orbit(splats, capture, orbit_frames), out, color, name)]
         elif capture is not None:
             files = _write_pictures(splats, capture, out, color, name, exr)
         else:
-            raise IgsrError("Say where from: --cameras CAPTURE, --orbit FRAMES, or both.")
+            raise IgsrError("Name the cameras: --cameras CAPTURE, --orbit FRAMES, or both.")
     if as_json:
         print_json({"files": [str(file) for file in files], **_core.backend_info(name)})
     else:
@@ -89,7 +91,7 @@ def _write_orbit(
     path_cameras: list[Camera],
     out: Path,
     background: tuple[float, float, float],
-    backend: str,
+    backend: Backend,
 ) -> Path:
     from igsr.rendering.video import write_video
 
@@ -103,7 +105,7 @@ def _write_pictures(
     capture: Capture,
     out: Path,
     background: tuple[float, float, float],
-    backend: str,
+    backend: Backend,
     exr: bool,
 ) -> list[Path]:
     from PIL import Image

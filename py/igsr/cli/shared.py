@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from igsr._internal.choices import Backend, ResolvedBackend, Split
 from igsr.cli.error_messages import (
     INTERRUPTED,
     error_messages,
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as ProgressBar
 
     from igsr.capture import Capture
-    from igsr.evaluation import ScoredView
+    from igsr.evaluation import ScoredView, Scores
     from igsr.splats import Splats
 
 # The names that these had before.
@@ -101,12 +102,15 @@ HoldoutOption = Annotated[
         help="Hold out every Nth photo for testing, such as 8.",
     ),
 ]
+SeedOption = Annotated[
+    int, typer.Option("--seed", help="Random seed. Results are deterministic for a given seed.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 JobsOption = Annotated[
     int, typer.Option("--jobs", help="How many fits run at the same time; they share the cores.")
 ]
 RayOption = Annotated[
-    bool, typer.Option("--ray", help="Run fits on a Ray cluster (pip install 'igsr[ray]').")
+    bool, typer.Option("--ray", help="Run fits on a Ray cluster (pip install 'igsr\\[ray]').")
 ]
 CaptureArgument = Annotated[
     Path, typer.Argument(metavar="CAPTURE", help="Folder or file with photos and cameras.")
@@ -117,7 +121,7 @@ SceneArgument = Annotated[
 ]
 
 
-def resolved(backend: BackendChoice | FitBackendChoice) -> str:
+def resolved(backend: BackendChoice | FitBackendChoice) -> ResolvedBackend:
     """The name of the backend that runs: "cpu", "gpu" or "reference".
 
     Raises:
@@ -240,11 +244,11 @@ def stopped(bar: ProgressBar) -> Iterator[None]:
 def scored(
     splats: Splats,
     capture: Capture,
-    split: str,
+    split: Split,
     background: tuple[float, float, float],
-    backend: str,
+    backend: Backend,
     shown: bool,
-) -> tuple[dict[str, Any], list[ScoredView]]:
+) -> tuple[Scores, list[ScoredView]]:
     """Scores of a split, and the views for a contact sheet; with a progress bar if ``shown``.
 
     Raises:

@@ -1,113 +1,201 @@
-"""``igsr study``: protocols of the literature."""
+"""``igsr study``: experiments of the literature and of ``docs/``, a subcommand each.
+
+Every subcommand has the options of its own experiment only. Where an option is not given, the
+default is that of the function in ``igsr.study``.
+"""
 
 from __future__ import annotations
 
-import enum
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
-    BackendChoice,
-    BackendOption,
+    FitBackendChoice,
+    FitBackendOption,
     JobsOption,
     JsonOption,
     PresetChoice,
     RayOption,
     TimeLeft,
     error_console,
-    one_sentence,
     output_console,
     print_json,
     resolved,
 )
 from igsr.errors import IgsrError
 
-
-class StudyChoice(str, enum.Enum):
-    """Protocols of ``igsr study``."""
-
-    blender8 = "blender8"
-    few_photos = "few-photos"
-    pose_noise = "pose-noise"
-    poses = "poses"
-    denoiser_table = "denoiser-table"
-    table2 = "table2"
-    table3 = "table3"
-    sweep = "sweep"
-    refinement_ablation = "refinement-ablation"
-
-
-#: Studies of the loop, whose runs have rounds.
-LOOPS = (
-    StudyChoice.table2,
-    StudyChoice.table3,
-    StudyChoice.sweep,
-    StudyChoice.refinement_ablation,
+app = typer.Typer(
+    help="Run the experiments of the literature and of docs/: the same photos, seeds and scores "
+    "for every method.\n\nFinished runs are kept in --out; the same command continues from there.",
+    no_args_is_help=True,
 )
 
+DataArgument = Annotated[Path, typer.Argument(metavar="DATA", help="Folder with the scenes.")]
+OutOption = Annotated[
+    Path, typer.Option("--out", help="Folder for study.json, study.md, study.png and runs/.")
+]
+ScenesOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--scene",
+        metavar="NAME",
+        help="A folder in DATA. Repeat it for several. Default: the scenes in docs/.",
+    ),
+]
+PresetsOption = Annotated[
+    list[PresetChoice] | None,
+    typer.Option("--preset", help="Repeat it for several. Default: all."),
+]
+MethodsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--method",
+        metavar="NAME",
+        help="What continues from a fit. Repeat it for several: ours, no-denoiser, no-trust, "
+        "no-selection, no-outward, improvement, absolute or absolute-before.",
+    ),
+]
+SweptPhotosOption = Annotated[
+    list[str] | None,
+    typer.Option("--views", metavar="N", help="Number of photos. Repeat it for several."),
+]
+WeightsOption = Annotated[
+    Path | None,
+    typer.Option("--weights", metavar="FILE", help="Weights of a denoiser. Default: igsr's."),
+]
+StepsOption = Annotated[
+    int | None, typer.Option("--steps", help="Steps of each fit. Default: the preset's.")
+]
+FeaturesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--features",
+        metavar="FILE",
+        help="SqueezeNet 1.0's arrays (.npz), to score a perceptual distance (which is not LPIPS).",
+    ),
+]
+SeedsOption = Annotated[
+    int | None, typer.Option("--seeds", help="Number of seeds, from 0. Default: 3.")
+]
+OneSeedOption = Annotated[
+    int | None, typer.Option("--seeds", help="Number of seeds, from 0. Default: 1.")
+]
 
-def study_command(
-    protocol: Annotated[
-        StudyChoice,
-        typer.Argument(
-            help="blender8: NeRF Synthetic from eight photos. few-photos: real captures from 3, 6 "
-            "and 9 photos, or 3, 6 and 12 of the tankard. pose-noise: 20 views of NeRF Synthetic "
-            "with noise on their poses, which are kept or fitted. poses: cameras found in photos "
-            "against the true ones. denoiser-table: renders of poor fits before and after. table2, "
-            "table3, sweep: rounds of igsr refine beside those of the paper. refinement-ablation: "
-            "one round with parts of it taken out."
-        ),
-    ],
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder that holds the scenes.")],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for study.json, study.md, study.png and runs/.")
-    ],
-    scenes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--scene",
-            help="A folder in DATA; repeat it for several. Default: chair and lego; fern, "
-            "dtu_scan24 and tankard; for poses the sets of docs/pose_colmap.md; for "
-            "denoiser-table all that have cameras; chair, or tankard for table3, and fern too for "
-            "refinement-ablation.",
-        ),
-    ] = None,
+
+@app.command("blender8")
+def blender8_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
     views: Annotated[
         list[str] | None,
         typer.Option(
             "--views",
-            help="Repeat it for several. blender8: 75 or 76, the view that codes differ in; "
-            "few-photos and sweep: a number of photos. Default: all.",
+            metavar="75|76",
+            help="The list of view ids, named after the one id in which published code differs. "
+            "Repeat it for both. Default: both.",
         ),
     ] = None,
-    presets: Annotated[
-        list[PresetChoice] | None,
-        typer.Option("--preset", help="Repeat it for several. Default: all."),
-    ] = None,
+    presets: PresetsOption = None,
+    seeds: SeedsOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit NeRF Synthetic from eight photos."""
+    _run(
+        "blender8", _fit_line, data, out, jobs, ray, as_json,
+        scenes=scenes, views=views, presets=presets, seeds=seeds, backend=backend,
+    )  # fmt: skip
+
+
+@app.command("few-photos")
+def few_photos_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
+    views: SweptPhotosOption = None,
+    presets: PresetsOption = None,
+    seeds: SeedsOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit real captures from 3, 6 and 9 photos, or 3, 6 and 12 of the tankard."""
+    _run(
+        "few_photos", _fit_line, data, out, jobs, ray, as_json,
+        scenes=scenes, views=views, presets=presets, seeds=seeds, backend=backend,
+    )  # fmt: skip
+
+
+@app.command("pose-noise")
+def pose_noise_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
     noise: Annotated[
         float | None,
         typer.Option(
-            "--noise", help="pose-noise: standard deviation of camera-to-world's numbers. [0.01]"
+            "--noise",
+            help="Standard deviation of the noise on the entries of camera-to-world. Default: "
+            "0.01.",
         ),
     ] = None,
     raw_affine: Annotated[
-        bool,
-        typer.Option("--raw-affine", help="pose-noise: also keep the shear that noise brings."),
+        bool, typer.Option("--raw-affine", help="Also keep the shear that the noise brings.")
     ] = False,
+    seeds: SeedsOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit 20 views of NeRF Synthetic with noise on their poses, fixed or fitted jointly."""
+    _run(
+        "pose_noise", _pose_noise_line, data, out, jobs, ray, as_json,
+        scenes=scenes, noise=noise, raw_affine=raw_affine, seeds=seeds, backend=backend,
+    )  # fmt: skip
+
+
+@app.command("poses")
+def poses_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
     estimator: Annotated[
         str | None,
-        typer.Option("--estimator", metavar="NAME", help="poses: what finds cameras. [colmap]"),
+        typer.Option("--estimator", metavar="NAME", help="What finds cameras. Default: colmap."),
     ] = None,
+    seeds: OneSeedOption = None,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare the cameras found in photos with the true ones."""
+    _run(
+        "poses", _poses_line, data, out, jobs, ray, as_json,
+        scenes=scenes, estimator=estimator, seeds=seeds,
+    )  # fmt: skip
+
+
+@app.command("denoiser-table")
+def denoiser_table_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
     kinds: Annotated[
         list[str] | None,
         typer.Option(
             "--kind",
-            help="denoiser-table: 3, 6, 9 (photos), noise, paper (its noise and steps); repeat "
-            "it for several. Default: the first four.",
+            metavar="KIND",
+            help="Degraded reconstructions: from 3, 6 or 9 photos, noise, or paper (its noise and "
+            "steps). Repeat it for several. Default: the first four.",
         ),
     ] = None,
     denoisers: Annotated[
@@ -115,160 +203,211 @@ def study_command(
         typer.Option(
             "--denoiser",
             metavar="NAME=FILE",
-            help="denoiser-table: a further one beside igsr's; repeat it for several.",
+            help="Another denoiser to compare with igsr's. Repeat it for several.",
         ),
     ] = None,
-    methods: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--method",
-            help="table2, table3 and refinement-ablation: what goes on from a fit; repeat it for "
-            "several. ours, no-denoiser, no-trust, no-selection, no-outward, improvement, absolute "
-            "or absolute-before.",
-        ),
-    ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(
-            "--weights", metavar="FILE", help="Studies of the loop: the denoiser. Default: igsr's."
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option("--steps", help="Studies of the loop: of each fit.")
-    ] = None,
-    features: Annotated[
-        Path | None,
-        typer.Option(
-            "--features",
-            metavar="FILE",
-            help="denoiser-table and studies of the loop: SqueezeNet 1.0's arrays (.npz), to score "
-            "a perceptual distance that is not LPIPS.",
-        ),
-    ] = None,
+    features: FeaturesOption = None,
     pairs: Annotated[
         Path | None,
         typer.Option(
-            "--pairs",
-            metavar="PAIRS",
-            help="denoiser-table: training pairs, to say how alike their errors are.",
+            "--pairs", metavar="PAIRS", help="Training pairs, to compare their artifacts with."
         ),
     ] = None,
-    seeds: Annotated[
-        int | None,
-        typer.Option(
-            "--seeds",
-            help="Fits of each kind. [3; poses, denoiser-table, sweep, refinement-ablation: 1]",
-        ),
-    ] = None,
+    seeds: OneSeedOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
     jobs: JobsOption = 1,
     ray: RayOption = False,
-    backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a protocol of the literature: the same photos, seeds and scores for every preset.
+    """Score renders of degraded reconstructions before and after denoising."""
+    with error_messages():
+        files = None if denoisers is None else _files_by_name(denoisers)
+    _run(
+        "denoiser_table", _denoiser_line, data, out, jobs, ray, as_json,
+        scenes=scenes, kinds=kinds, denoisers=files, features=features, pairs=pairs, seeds=seeds,
+        backend=backend,
+    )  # fmt: skip
 
-    What is finished is kept in --out, and the same command goes on from there.
-    """
+
+@app.command("table2")
+def table2_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
+    methods: MethodsOption = None,
+    weights: WeightsOption = None,
+    steps: StepsOption = None,
+    features: FeaturesOption = None,
+    seeds: SeedsOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Refine from 10 photos, localized and scattered, beside the paper's Table 2."""
+    _run(
+        "table2", _rounds_line, data, out, jobs, ray, as_json,
+        scenes=scenes, methods=methods, weights=weights, steps=steps, features=features,
+        seeds=seeds, backend=backend,
+    )  # fmt: skip
+
+
+@app.command("table3")
+def table3_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
+    methods: MethodsOption = None,
+    weights: WeightsOption = None,
+    steps: StepsOption = None,
+    features: FeaturesOption = None,
+    seeds: SeedsOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Refine from 4 localized photos of a real object, beside the paper's Table 3."""
+    _run(
+        "table3", _rounds_line, data, out, jobs, ray, as_json,
+        scenes=scenes, methods=methods, weights=weights, steps=steps, features=features,
+        seeds=seeds, backend=backend,
+    )  # fmt: skip
+
+
+@app.command("sweep")
+def sweep_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
+    views: SweptPhotosOption = None,
+    weights: WeightsOption = None,
+    steps: StepsOption = None,
+    features: FeaturesOption = None,
+    seeds: OneSeedOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Refine from 4 to 15 photos with 1, 2 and 4 views a round, up to four rounds."""
+    _run(
+        "sweep", _rounds_line, data, out, jobs, ray, as_json,
+        scenes=scenes, views=views, weights=weights, steps=steps, features=features,
+        seeds=seeds, backend=backend,
+    )  # fmt: skip
+
+
+@app.command("refinement-ablation")
+def refinement_ablation_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
+    methods: MethodsOption = None,
+    weights: WeightsOption = None,
+    steps: StepsOption = None,
+    features: FeaturesOption = None,
+    seeds: OneSeedOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Refine by one round, with one part of the loop taken out at a time."""
+    _run(
+        "refinement_ablation", _rounds_line, data, out, jobs, ray, as_json,
+        scenes=scenes, methods=methods, weights=weights, steps=steps, features=features,
+        seeds=seeds, backend=backend,
+    )  # fmt: skip
+
+
+def _run(
+    name: str,
+    line: Callable[[dict[str, Any]], str],
+    data: Path,
+    out: Path,
+    jobs: int,
+    ray: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Run a function of ``igsr.study`` with the options that were given, and print its table."""
     from igsr import study
 
-    with one_sentence(
-        lambda: "Interrupted; finished fits are kept, the same command goes on from there."
+    with error_messages(
+        lambda: "Interrupted; finished runs are kept, the same command continues from there."
     ):
         console = error_console()
         time_left = TimeLeft()
 
         def on_run(done: int, total: int, row: dict[str, Any]) -> None:
-            left = time_left(done, total)
-            if protocol is StudyChoice.poses:
-                console.print(
-                    f"{done} of {total}: {row['scene']} seed {row['seed']}: {row['registered']} of "
-                    f"{row['photos']} placed in {row['seconds']:.0f} s; {left}"
-                )
-                return
-            if protocol in LOOPS:
-                last = {
-                    name: f"{method['rounds'][-1]['psnr']:.2f}"
-                    for name, method in row["methods"].items()
-                }
-                first = next(iter(row["methods"].values()))["rounds"][0]["psnr"]
-                told = ", ".join(f"{name} {psnr}" for name, psnr in last.items())
-                console.print(
-                    f"{done} of {total}: {row['scene']} {row['layout']} {row['photos']} seed "
-                    f"{row['seed']}: {first:.2f} dB, then {told}; {left}"
-                )
-                return
-            if protocol is StudyChoice.denoiser_table:
-                console.print(
-                    f"{done} of {total}: {row['scene']} {row['kind']} seed {row['seed']}: "
-                    f"{row['renders']} renders in {row['seconds']:.0f} s; {left}"
-                )
-                return
-            if protocol is StudyChoice.pose_noise:
-                kind = f"{row['noise']}, poses {row['poses']}"
-                psnr = row["refined"]["psnr"]
-            else:
-                kind, psnr = f"views {row['views']} {row['preset']}", row["psnr"]
-            console.print(
-                f"{done} of {total}: {row['scene']} {kind} seed {row['seed']}: "
-                f"{psnr:.2f} dB in {row['seconds']:.0f} s; {left}"
-            )
+            console.print(f"{done} of {total}: {line(row)}; {time_left(done, total)}")
 
-        studies: dict[StudyChoice, Callable[..., dict[str, Any]]] = {
-            StudyChoice.blender8: study.blender8,
-            StudyChoice.few_photos: study.few_photos,
-            StudyChoice.pose_noise: study.pose_noise,
-            StudyChoice.poses: study.poses,
-            StudyChoice.denoiser_table: study.denoiser_table,
-            StudyChoice.table2: study.table2,
-            StudyChoice.table3: study.table3,
-            StudyChoice.sweep: study.sweep,
-            StudyChoice.refinement_ablation: study.refinement_ablation,
-        }
-        run = studies[protocol]
-        given: dict[str, Any] = {
-            "scenes": scenes and tuple(scenes),
-            "views": views and tuple(views),
-            "presets": presets and tuple(choice.value for choice in presets),
-            "noise": noise,
-            "raw_affine": raw_affine or None,
-            "estimator": estimator,
-            "kinds": kinds and tuple(kinds),
-            "denoisers": denoisers and _files_by_name(denoisers),
-            "features": features,
-            "pairs": pairs,
-            "methods": methods and tuple(methods),
-            "weights": weights,
-            "steps": steps,
-            "seeds": seeds,
-            "backend": None if backend is BackendChoice.auto else backend,
-        }
-        given = {name: value for name, value in given.items() if value is not None}
-        foreign = [name for name in given if name not in inspect.signature(run).parameters]
-        if foreign:
-            singular = ("scenes", "presets", "kinds", "denoisers", "methods")
-            option = foreign[0].removesuffix("s") if foreign[0] in singular else foreign[0]
-            raise IgsrError(
-                f"--{option.replace('_', '-')} says nothing to {protocol.value}; leave it out."
-            )
-        if "backend" in inspect.signature(run).parameters:
-            given["backend"] = resolved(backend)
-        report = run(data, out, **given, jobs=jobs, on_run=on_run, ray=ray)
+        given = {name: _plain(value) for name, value in options.items() if value is not None}
+        report = getattr(study, name)(data, out, **given, jobs=jobs, on_run=on_run, ray=ray)
     if as_json:
         print_json(report)
         return
     output_console().print((out / "study.md").read_text(encoding="utf-8"), markup=False)
 
 
+def _plain(value: Any) -> Any:
+    """An option's value as the functions of ``igsr.study`` take it."""
+    if isinstance(value, FitBackendChoice):
+        return resolved(value)
+    if isinstance(value, list):
+        return tuple(one.value if isinstance(one, PresetChoice) else one for one in value)
+    return value
+
+
+def _fit_line(row: dict[str, Any]) -> str:
+    return (
+        f"{row['scene']} views {row['views']} {row['preset']} seed {row['seed']}: "
+        f"{row['psnr']:.2f} dB in {row['seconds']:.0f} s"
+    )
+
+
+def _pose_noise_line(row: dict[str, Any]) -> str:
+    return (
+        f"{row['scene']} {row['noise']}, poses {row['poses']} seed {row['seed']}: "
+        f"{row['refined']['psnr']:.2f} dB in {row['seconds']:.0f} s"
+    )
+
+
+def _poses_line(row: dict[str, Any]) -> str:
+    return (
+        f"{row['scene']} seed {row['seed']}: {row['registered']} of {row['photos']} registered in "
+        f"{row['seconds']:.0f} s"
+    )
+
+
+def _denoiser_line(row: dict[str, Any]) -> str:
+    return (
+        f"{row['scene']} {row['kind']} seed {row['seed']}: {row['renders']} renders in "
+        f"{row['seconds']:.0f} s"
+    )
+
+
+def _rounds_line(row: dict[str, Any]) -> str:
+    rounds = {name: method["rounds"] for name, method in row["methods"].items()}
+    first = next(iter(rounds.values()))[0]["psnr"]
+    last = ", ".join(f"{name} {of_method[-1]['psnr']:.2f}" for name, of_method in rounds.items())
+    return (
+        f"{row['scene']} {row['layout']} {row['photos']} seed {row['seed']}: {first:.2f} dB, "
+        f"then {last}"
+    )
+
+
 def _files_by_name(given: list[str]) -> dict[str, Path]:
     """NAME=FILE options as a dictionary.
 
     Raises:
-        IgsrError: one is of another form, or a name is given twice.
+        IgsrError: one has another form, or a name is given twice.
     """
-    out: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for text in given:
         name, _, file = text.partition("=")
-        if not name or not file or name in out:
+        if not name or not file or name in files:
             raise IgsrError(f"--denoiser must be NAME=FILE, each name once, not {text!r}.")
-        out[name] = Path(file)
-    return out
+        files[name] = Path(file)
+    return files

@@ -1,4 +1,4 @@
-"""``igsr synth``: make procedural captures."""
+"""``igsr synth``: make synthetic captures."""
 
 from __future__ import annotations
 
@@ -8,35 +8,41 @@ from typing import Annotated, Any
 
 import typer
 
-from igsr.cli.shared import JsonOption, error_console, one_sentence, output_console, print_json
+from igsr.cli.error_messages import error_messages
+from igsr.cli.shared import (
+    JsonOption,
+    error_console,
+    output_console,
+    print_json,
+)
 
 
 def synth_command(
-    scenes: Annotated[int, typer.Option("--scenes", metavar="N", help="How many.")],
+    scenes: Annotated[int, typer.Option("--scenes", metavar="N", help="How many scenes.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the captures.")],
-    seed: Annotated[int, typer.Option("--seed", help="Same seed, same scenes.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Random seed. Scenes are deterministic for a given seed.")
+    ] = 0,
     first: Annotated[int, typer.Option("--first", help="Number of the first scene.")] = 0,
-    size: Annotated[int, typer.Option("--size", help="Pixels of the photos' longer side.")] = 256,
-    views: Annotated[int, typer.Option("--views", help="Photos to fit, per scene.")] = 24,
-    test_views: Annotated[
-        int, typer.Option("--test-views", help="Photos to score, per scene.")
-    ] = 8,
-    spp: Annotated[int, typer.Option("--spp", help="Light paths per pixel, a square.")] = 16,
+    size: Annotated[int, typer.Option("--size", help="Longer side of the photos in pixels.")] = 256,
+    views: Annotated[int, typer.Option("--views", help="Train photos per scene.")] = 24,
+    test_views: Annotated[int, typer.Option("--test-views", help="Test photos per scene.")] = 8,
+    spp: Annotated[int, typer.Option("--spp", help="Light paths per pixel, a square number.")] = 16,
     jobs: Annotated[
         int | None,
-        typer.Option("--jobs", help="Scenes at a time, a core each. Default: all cores."),
+        typer.Option("--jobs", help="Scenes at the same time, a core each. Default: all."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make procedural captures: random scenes rendered with exact cameras, depth and masks.
+    """Make synthetic captures: random scenes rendered with exact cameras, depth and masks.
 
-    Needs Mitsuba 3 (pip install 'igsr[synth]'). What is finished is kept in --out, and the same
-    command goes on from there.
+    Needs Mitsuba 3 (pip install 'igsr\\[synth]'). Finished scenes are kept in --out; the same
+    command continues from there.
     """
     from igsr import synth
 
-    with one_sentence(
-        lambda: "Interrupted; finished scenes are kept, the same command goes on from there."
+    with error_messages(
+        lambda: "Interrupted; finished scenes are kept, the same command continues from there."
     ):
         console = error_console()
 

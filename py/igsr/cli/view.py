@@ -1,21 +1,39 @@
-"""``igsr view``: a scene in a window."""
+"""``igsr view``: a scene in a window.
+
+The viewer ``splat-view`` is a program of its own and reads cameras in one format, the
+``cameras.json`` that igsr writes. This command reads any other capture for it.
+"""
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 from typing import Annotated
 
 import typer
+from PIL import Image
 
+from igsr.capture import Capture, View, load_capture
+from igsr.capture.load import holds_cameras
+from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_files import png_names
 from igsr.cli.shared import INTERRUPTED, one_sentence
 from igsr.errors import IgsrError
 
-#: The viewer, a program of its own: windows are not this package's business.
+#: The viewer.
 PROGRAM = "splat-view"
-
+#: The viewer's file of cameras.
+CAMERAS = "cameras.json"
 #: Options that this command does not know are the viewer's.
 PASSED_ON = {"ignore_unknown_options": True}
+#: Longest side of the photos that the viewer lays over renders, pixels.
+PHOTO_SIDE = 1600
 
 
 def view_command(
@@ -23,11 +41,20 @@ def view_command(
         list[str],
         typer.Argument(
             metavar="SCENE...",
-            help="Splat files, or the folder of a fit or a refinement; then options of splat-view.",
+            help="Splat file, or the folder of a fit or a refinement; two are compared. "
+            "Options of splat-view may follow.",
         ),
     ],
+    cameras: Annotated[
+        str | None,
+        typer.Option(
+            "--cameras",
+            metavar="CAPTURE",
+            help="Capture whose cameras and photos to show. Default: what lies beside SCENE.",
+        ),
+    ] = None,
 ) -> None:
-    """Show splats in a window, two scenes side by side, by splat-view, which is installed apart."""
+    """Show splats in a window, or two scenes side by side. Needs the program splat-view."""
     with one_sentence():
         program = shutil.which(PROGRAM)
         if program is None:
@@ -35,8 +62,78 @@ def view_command(
                 f"{PROGRAM} is not installed; in igsr's source, run: "
                 "cargo install --locked --path crates/splat_view"
             )
-        try:
-            code = subprocess.run([program, *scenes], check=False).returncode
-        except KeyboardInterrupt:
-            code = INTERRUPTED
+        with tempfile.TemporaryDirectory(prefix="igsr-view-") as folder:
+            words = [program, *scenes]
+            readable = _cameras(cameras, Path(scenes[0]), Path(folder))
+            if readable is not None:
+                words += ["--cameras", str(readable)]
+            try:
+                code = subprocess.run(words, check=False).returncode
+            except KeyboardInterrupt:
+                code = INTERRUPTED
     raise typer.Exit(code if code >= 0 else 128 - code)
+
+
+def _cameras(named: str | None, scene: Path, folder: Path) -> Path | None:
+    """The ``cameras.json`` to show: of the capture that is named, else of the one beside the scene.
+
+    None where the viewer finds its own, or where there is none.
+    """
+    if named is not None:
+        return _readable(Path(named), folder)
+    capture = _beside(scene)
+    if capture is None:
+        return None
+    try:
+        return _readable(capture, folder)
+    except IgsrError as error:
+        # Nobody asked for them: the scene can be looked at without.
+        print(f"{error}; no cameras are shown.", file=sys.stderr)
+        return None
+
+
+def _beside(scene: Path) -> Path | None:
+    """The capture that a scene lies in, or that igsr keeps beside it."""
+    folder = scene if scene.is_dir() else scene.parent
+    if (folder / CAMERAS).is_file():
+        return None
+    return next((path for path in (folder, folder / "capture") if holds_cameras(path)), None)
+
+
+def _readable(capture: Path, folder: Path) -> Path:
+    """A capture's own ``cameras.json``, or one that is made of the capture in ``folder``."""
+    for path in (capture, capture / CAMERAS):
+        if path.name == CAMERAS and path.is_file():
+            return path
+    print(f"Reading {capture} ...", file=sys.stderr, flush=True)
+    write_for_viewer(load_capture(capture), folder)
+    return folder / CAMERAS
+
+
+def write_for_viewer(capture: Capture, folder: Path) -> None:
+    """Write a capture's cameras, and its photos undistorted and at most 1600 pixels wide or high.
+
+    Args:
+        capture: cameras and photos.
+        folder: where ``cameras.json`` goes, and the photos beside it under ``photos/``.
+
+    Raises:
+        IgsrError: the file of cameras cannot be written.
+        OSError: a photo cannot be written.
+    """
+    views = [
+        replace(view, name=f"photos/{name}")
+        for view, name in zip(capture.views, png_names(capture.views), strict=True)
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        list(pool.map(lambda view: _write_photo(view, folder / view.name), views))
+    write_cameras(folder / CAMERAS, views)
+
+
+def _write_photo(view: View, path: Path) -> None:
+    photo = Image.fromarray(view.image)
+    photo.thumbnail((PHOTO_SIDE, PHOTO_SIDE))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Read once and thrown away: speed counts, size does not.
+    photo.save(path, compress_level=1)

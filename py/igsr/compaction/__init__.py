@@ -1,4 +1,4 @@
-"""Fewer splats for the same pictures: prune by what they show, refine, and measure the loss."""
+"""Compaction: prune the splats that contribute least, fine-tune the rest, validate the loss."""
 
 from igsr.compaction.contribution import Contribution, contribution
 from igsr.compaction.plot_curve import write_plot

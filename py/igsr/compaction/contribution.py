@@ -1,4 +1,4 @@
-"""How much each splat adds to pictures: what may go is what nobody would miss."""
+"""How much each splat contributes to renders; pruning removes those that contribute least."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Contribution:
-    """What splats add to the pictures of some cameras. All float64 [N], zero where nothing is seen.
+    """Contribution of splats to the renders of some cameras. All float64 [N], 0 where not visible.
 
     Attributes:
         weight: blending weight, summed over pixels and pictures: the area a splat covers, in
@@ -41,11 +41,11 @@ class Contribution:
 def contribution(
     splats: Splats, cameras: Iterable[Camera], seed: int = 0, backend: str = "auto"
 ) -> Contribution:
-    """What each splat adds to what ``cameras`` see, over a random colour in each picture.
+    """Contribution of each splat to the renders of ``cameras``, over a random background in each.
 
     Args:
         splats: the scene.
-        cameras: where it is seen from.
+        cameras: of the renders.
         seed: of the backgrounds and the probes.
         backend: "auto", "cpu", "gpu" or "reference".
 

@@ -1,4 +1,4 @@
-"""Let the splats that are left take over what the removed ones showed."""
+"""Fine-tuning of pruned models: the remaining splats make up for the removed ones."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from igsr.splats import Splats
 #: Parameters of splats with the optimiser's moments, as ``_core.Fitter`` takes and returns them.
 State = dict[str, npt.NDArray[Any]]
 
-#: Steps after which a fit from nothing takes up one more SH degree. A refinement begins where all
-#: degrees are in use, or it would first unlearn what the model knows of them.
+#: A fit from scratch adds one SH degree after so many steps. Fine-tuning begins where all degrees
+#: are in use, or it would first unlearn the higher ones.
 STEPS_PER_DEGREE = 1000
 #: Steps between two looks at Ctrl-C and calls of the progress callback.
 CHUNK_STEPS = 10
@@ -26,7 +26,7 @@ MOMENTS = ("first_", "second_")
 
 
 def fresh_state(splats: Splats) -> State:
-    """``splats`` before their first step."""
+    """The optimiser state of ``splats`` before the first step: all moments zero."""
     state: State = {name: np.ascontiguousarray(getattr(splats, name)) for name in PARAMETERS}
     for moment in MOMENTS:
         state |= {moment + name: np.zeros_like(state[name]) for name in PARAMETERS}
@@ -35,13 +35,13 @@ def fresh_state(splats: Splats) -> State:
     return state
 
 
-def chosen(state: State, indices: npt.NDArray[np.intp]) -> State:
-    """Those splats alone, with their moments."""
+def subset(state: State, indices: npt.NDArray[np.intp]) -> State:
+    """The splats at ``indices`` [M] and their moments."""
     return {name: array[indices] for name, array in state.items() if name != "step"}
 
 
 def with_sh_degree(state: State, degree: int) -> State:
-    """The same without the SH bands above ``degree``, and with zeros for those missing below."""
+    """The state with SH bands up to ``degree``: higher ones cut, missing ones zero."""
     bands = (degree + 1) ** 2
     changed = {f"{prefix}sh" for prefix in ("", *MOMENTS)}
 
@@ -67,15 +67,15 @@ def refined(
     backend: str,
     on_steps: Callable[[int], None],
 ) -> State:
-    """``state``, with as many splats as it has, after more steps of fitting to ``views``.
+    """Fine-tune ``state`` to ``views``; the number of splats stays.
 
     Args:
         state: where to start; finite, at least one splat.
-        origin: what its means are relative to, [3].
-        views: what to fit; those with alpha over a new random colour in each step.
+        origin: [3] float64, what the means are relative to, world units.
+        views: what to fit to; those with alpha over a new random colour in each step.
         steps: optimiser steps.
-        settle: whether the centres' rate falls to where fits end; else it hardly falls, and
-            another refinement is to follow.
+        settle: whether the learning rate of the means decays to its final value; otherwise it
+            hardly decays, since another pruning round follows.
         seed: of the order of views and the colours.
         backend: "auto", "cpu" or "gpu".
         on_steps: called with the steps done.
@@ -84,7 +84,7 @@ def refined(
         IgsrError: the views or splats cannot be used; the message names what.
     """
     degree = round(state["sh"].shape[1] ** 0.5) - 1
-    # As if within a fit, from a third of it: there the rates suit a model that is nearly right.
+    # The learning rates are those of a fit from its last third on: they suit a nearly right model.
     first = max(STEPS_PER_DEGREE * degree, -(-steps // 2))
     settings = {
         "steps": first + steps if settle else 3 * (first + steps),

@@ -1,4 +1,4 @@
-"""Size against error of a compaction, as a picture."""
+"""Plot of a compaction: loss against number of splats and against bytes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
     figure.suptitle(
         f"{whole['splats']} splats, SH {whole['sh_degree']}, to {result['splats']}, "
         f"SH {result['sh_degree']}: {result['loss']:.2f} dB lost, against "
-        f"{report['protocol']['against']}, {report['protocol']['judge_views']} views",
+        f"{report['protocol']['against']}, {report['protocol']['validation_views']} views",
         fontsize=10,
         wrap=True,
     )
@@ -64,8 +64,8 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
             markeredgewidth=2,
             label="result",
         )
-        axis.plot([], [], "o", color=WITHIN, label="refined to the end")
-        axis.plot([], [], "o", color=WITHIN, markerfacecolor="none", label="after a round")
+        axis.plot([], [], "o", color=WITHIN, label="fine-tuned to the end")
+        axis.plot([], [], "o", color=WITHIN, markerfacecolor="none", label="after a pruning round")
         axis.axhline(
             report["max_loss"], color=BEYOND, linestyle="--", linewidth=1, label="--max-loss"
         )

@@ -1,4 +1,4 @@
-"""The smallest model within a loss: prune, refine, judge, and choose the next size by that."""
+"""Search for the smallest model within a loss: prune, fine-tune, validate, try the next size."""
 
 from __future__ import annotations
 
@@ -19,36 +19,41 @@ from igsr.capture import Capture
 from igsr.compaction.contribution import contribution
 from igsr.compaction.finetuning import (
     State,
-    chosen,
     fresh_state,
     refined,
     splats_of,
+    subset,
     with_sh_degree,
 )
-from igsr.compaction.yardstick import Verdict, Yardstick, own_yardstick, photo_yardstick
+from igsr.compaction.validation import (
+    Validation,
+    ValidationScore,
+    photo_validation,
+    self_validation,
+)
 from igsr.errors import IgsrError
 from igsr.fitting.run import check_fits
 from igsr.splats import MAX_SH_DEGREE, Splats
 
-#: Part of the splats that one round of pruning leaves. Many small rounds lose less than one large.
+#: Fraction of the splats that a pruning round keeps. Many small rounds lose less than one large.
 KEEP = 0.8
-#: Part of ``steps`` that follows each round.
+#: A pruning round is followed by ``steps`` divided by this.
 DESCENT_PART = 4
-#: What refining to the end may win back of the loss, dB; what needs more is given up.
-HOPE = 0.5
+#: Fine-tuning to the end recovers at most this much of the loss, dB; the search stops beyond it.
+RECOVERABLE = 0.5
 DEFAULT_STEPS = 4000
 
 
 @dataclass(frozen=True)
 class CompactProgress:
-    """Where a compaction stands.
+    """Progress of a compaction.
 
     Attributes:
-        trial: number of the model that is tried now, from 1.
-        splats: its size.
+        trial: number of the current candidate model, from 1.
+        splats: its number of splats.
         sh_degree: its SH degree.
-        step: refinement steps done, of ``steps``.
-        steps: refinement steps of this model.
+        step: fine-tuning steps done, of ``steps``.
+        steps: fine-tuning steps of this candidate.
     """
 
     trial: int
@@ -60,14 +65,14 @@ class CompactProgress:
 
 @dataclass(frozen=True)
 class Compaction:
-    """The smallest model found, and what else was tried.
+    """The smallest model found, and the curve of all sizes tried.
 
     Attributes:
         splats: the model.
         report: "max_loss", "whole" and "result" (rows of "curve"), "curve" (a row per size tried,
-            the whole model first: "splats", "sh_degree", "bytes", "loss", "psnr", "ssim",
-            "settled": whether it was refined to the end, "seconds"), "protocol", "steps", "seed",
-            "backend", "device", "instruction_set", "version". Losses and PSNR in dB.
+            the original model first: "splats", "sh_degree", "bytes", "loss", "psnr", "ssim",
+            "settled": whether it was fine-tuned to the end, "seconds"), "protocol", "steps",
+            "seed", "backend", "device", "instruction_set", "version". Losses and PSNR in dB.
     """
 
     splats: Splats
@@ -87,31 +92,33 @@ def compact(
     backend: str = "auto",
     progress: Callable[[CompactProgress], None] | None = None,
 ) -> Compaction:
-    """The smallest model whose pictures are as good as those of ``splats``, but for ``max_loss``.
+    """Find the smallest model that loses at most ``max_loss`` dB against ``splats``.
 
-    Round by round, the fifth of the splats that contribute least
-    (``igsr.compaction.contribution``) is removed and the others are refined, until the loss is
-    beyond hope. From there upwards, models are refined to the end until one is good. At that size,
-    lower SH degrees are tried.
-    The same arguments give the same bits on one backend and instruction set.
+    Each round prunes the fifth of the splats that contribute least
+    (``igsr.compaction.contribution``) and fine-tunes the others, until the loss is more than
+    fine-tuning can recover. From there upwards, models are fine-tuned to the end until one is
+    within the loss. At that size, lower SH degrees are tried.
+
+    Deterministic for a given seed on one backend and instruction set.
 
     Args:
-        splats: the whole model; splats that are not finite, which are never drawn, do not count.
-        max_loss: dB of PSNR that may be lost, above 0. With a capture the loss is the whole
-            model's PSNR less the smaller one's, on photos that judge and are not refined to: the
-            test views, or every eighth train view where there are none. Without a capture it is
-            10 log10(1 + MSE of the change / MSE of the model), on pictures of the model from
-            cameras around it.
+        splats: the original model; splats that are not finite are never drawn and do not count.
+        max_loss: dB of PSNR that may be lost, in (0, 100). With a capture the loss is the
+            original model's PSNR minus the smaller one's on held-out photos: the test views, or
+            every eighth train view where there are none. Without a capture it is
+            10 log10(1 + MSE of the change / MSE of the model), on renders of the original model
+            from cameras around it.
         capture: the photos that the model was fitted to.
-        psnr: without a capture, what the model's own PSNR is taken to be, dB; 30 if None.
+        psnr: without a capture, the PSNR assumed of the original model, dB; 30 if None.
         sh_degree: of the smaller model, 0-4: a higher one needs fewer splats but more bytes for
-            each. None is the whole model's, and lower ones are tried at the size found.
-        steps: refinement steps to the end; a quarter of it after each round of pruning.
+            each. None is the original model's; lower ones are tried at the size found.
+        steps: fine-tuning steps of a model that may be the result; a quarter of them after each
+            pruning round.
         seed: of everything random.
-        background: RGB in [0, 1] behind judged pictures; None is white where photos have alpha,
-            black where they have none, grey without a capture.
+        background: RGB in [0, 1] behind validation renders; None is white where photos have
+            alpha, black where they have none, grey without a capture.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
-        progress: called every few refinement steps.
+        progress: called every few fine-tuning steps.
 
     Raises:
         IgsrError: an argument cannot be used; the message names it.
@@ -120,17 +127,17 @@ def compact(
     _check_arguments(max_loss, capture, psnr, sh_degree, steps, seed, background)
     info = check_fits(backend)
     if splats.antialiased:
-        raise IgsrError("Antialiased splats cannot be made fewer: fits draw without that.")
+        raise IgsrError("Antialiased splats cannot be compacted: fits render without antialiasing.")
     name = info["backend"]
-    finite = chosen(fresh_state(splats), np.flatnonzero(splats.finite))
+    finite = subset(fresh_state(splats), np.flatnonzero(splats.finite))
     whole = splats_of(finite, splats.origin)
     if len(whole) == 0:
-        raise IgsrError("The scene has no finite splats to make fewer.")
+        raise IgsrError("The scene has no finite splats to compact.")
     if capture is None:
-        yardstick = own_yardstick(whole, background, psnr, name)
+        validation = self_validation(whole, background, psnr, name)
     else:
-        yardstick = photo_yardstick(whole, capture, background, name)
-    search = _Search(yardstick, whole.origin, max_loss, sh_degree, steps, seed, name, progress)
+        validation = photo_validation(whole, capture, background, name)
+    search = _Search(validation, whole.origin, max_loss, sh_degree, steps, seed, name, progress)
     best = search.run(whole)
     return Compaction(
         splats_of(best.state, whole.origin),
@@ -139,7 +146,7 @@ def compact(
             "whole": search.curve[0],
             "result": best.row,
             "curve": search.curve,
-            "protocol": yardstick.protocol,
+            "protocol": validation.protocol,
             "steps": int(steps),
             "seed": int(seed),
             **info,
@@ -149,8 +156,8 @@ def compact(
 
 
 @dataclass(frozen=True)
-class _Trial:
-    """A model with what its refinement can go on from, and its row of the curve."""
+class _Candidate:
+    """A model with its optimiser state, and its row of the curve."""
 
     state: State
     row: dict[str, Any]
@@ -161,11 +168,11 @@ class _Trial:
 
 
 class _Search:
-    """What is tried so far and what is the same for all trials."""
+    """The curve so far and what is the same for all trials."""
 
     def __init__(
         self,
-        yardstick: Yardstick,
+        validation: Validation,
         origin: npt.NDArray[np.float64],
         max_loss: float,
         sh_degree: int | None,
@@ -174,7 +181,7 @@ class _Search:
         backend: str,
         progress: Callable[[CompactProgress], None] | None,
     ) -> None:
-        self.yardstick = yardstick
+        self.validation = validation
         self.origin = origin
         self.max_loss = max_loss
         self.sh_degree = sh_degree
@@ -184,69 +191,75 @@ class _Search:
         self.progress = progress
         self.curve: list[dict[str, Any]] = []
 
-    def run(self, whole: Splats) -> _Trial:
+    def run(self, whole: Splats) -> _Candidate:
         """The smallest model within the loss."""
         started, state = time.perf_counter(), fresh_state(whole)
-        ladder = self._descend(self._recorded(state, self._verdict(state), True, started))
-        best, too_few = self._smallest_good(ladder)
-        if too_few is not None:
-            best = self._between(ladder, best, too_few)
-        return best if self.sh_degree is not None else self._fewer_bands(best)
+        rounds = self._prune_rounds(self._record(state, self._score(state), True, started))
+        best, too_small = self._smallest_within_loss(rounds)
+        if too_small is not None:
+            best = self._between(rounds, best, too_small)
+        return best if self.sh_degree is not None else self._lower_sh_degree(best)
 
-    def _descend(self, whole: _Trial) -> list[_Trial]:
-        """Models smaller and smaller, down to the first that is beyond hope."""
-        ladder = [whole]
+    def _prune_rounds(self, whole: _Candidate) -> list[_Candidate]:
+        """Smaller and smaller models, down to the first beyond recovery."""
+        rounds = [whole]
         steps = max(1, self.steps // DESCENT_PART)
-        while ladder[-1].count > 1 and self._hopeful(ladder[-1].row["loss"]):
-            count = max(1, int(KEEP * ladder[-1].count))
-            start = ladder[-1]
+        while rounds[-1].count > 1 and self._within_reach(rounds[-1].row["loss"]):
+            count = max(1, int(KEEP * rounds[-1].count))
+            start = rounds[-1]
             if self.sh_degree is not None:
                 start = replace(start, state=with_sh_degree(start.state, self.sh_degree))
-            ladder.append(self._tried(start, count, steps, settle=False))
-        return ladder
+            rounds.append(self._refined_candidate(start, count, steps, settle=False))
+        return rounds
 
-    def _smallest_good(self, ladder: list[_Trial]) -> tuple[_Trial, int | None]:
-        """From below, the first of the ladder within the loss, and the size of the one before."""
-        too_few = None
-        for trial in reversed(ladder):
-            if self._good(trial):
-                return trial, too_few
-            if self._hopeful(trial.row["loss"]):
-                trial = self._tried(trial, trial.count, self.steps, settle=True)
-                if self._good(trial):
-                    return trial, too_few
-            too_few = trial.count
-        return ladder[0], too_few
+    def _smallest_within_loss(self, rounds: list[_Candidate]) -> tuple[_Candidate, int | None]:
+        """From below, the first model within the loss, and the size of the one before."""
+        too_small = None
+        for candidate in reversed(rounds):
+            if self._within_loss(candidate):
+                return candidate, too_small
+            if self._within_reach(candidate.row["loss"]):
+                candidate = self._refined_candidate(
+                    candidate, candidate.count, self.steps, settle=True
+                )
+                if self._within_loss(candidate):
+                    return candidate, too_small
+            too_small = candidate.count
+        return rounds[0], too_small
 
-    def _between(self, ladder: list[_Trial], best: _Trial, too_few: int) -> _Trial:
-        """A last try half way to what is too few."""
-        count = round(math.sqrt(best.count * too_few))
-        if not too_few < count < best.count:
+    def _between(self, rounds: list[_Candidate], best: _Candidate, too_small: int) -> _Candidate:
+        """A last candidate half way (geometric mean) to the size that is too small."""
+        count = round(math.sqrt(best.count * too_small))
+        if not too_small < count < best.count:
             return best
-        start = next(trial for trial in ladder if trial.count == best.count)
-        trial = self._tried(start, count, self.steps, settle=True)
-        return trial if self._good(trial) else best
+        start = next(candidate for candidate in rounds if candidate.count == best.count)
+        candidate = self._refined_candidate(start, count, self.steps, settle=True)
+        return candidate if self._within_loss(candidate) else best
 
-    def _fewer_bands(self, best: _Trial) -> _Trial:
-        """The same with as low an SH degree as the loss allows."""
+    def _lower_sh_degree(self, best: _Candidate) -> _Candidate:
+        """The same number of splats with the lowest SH degree that the loss allows."""
         while (degree := best.row["sh_degree"] - 1) >= 0:
             state = with_sh_degree(best.state, degree)
-            if not self._hopeful(self._verdict(state).loss):
+            if not self._within_reach(self._score(state).loss):
                 break
-            trial = self._tried(_Trial(state, {}), best.count, self.steps, settle=True)
-            if not self._good(trial):
+            candidate = self._refined_candidate(
+                _Candidate(state, {}), best.count, self.steps, settle=True
+            )
+            if not self._within_loss(candidate):
                 break
-            best = trial
+            best = candidate
         return best
 
-    def _good(self, trial: _Trial) -> bool:
-        return bool(trial.row["loss"] <= self.max_loss)
+    def _within_loss(self, candidate: _Candidate) -> bool:
+        return bool(candidate.row["loss"] <= self.max_loss)
 
-    def _hopeful(self, loss: float) -> bool:
-        return loss <= self.max_loss + HOPE
+    def _within_reach(self, loss: float) -> bool:
+        return loss <= self.max_loss + RECOVERABLE
 
-    def _tried(self, start: _Trial, count: int, steps: int, settle: bool) -> _Trial:
-        """``start`` with its ``count`` most important splats, refined."""
+    def _refined_candidate(
+        self, start: _Candidate, count: int, steps: int, settle: bool
+    ) -> _Candidate:
+        """``start`` with its ``count`` most important splats, fine-tuned."""
         started = time.perf_counter()
         number = len(self.curve)
         degree = round(start.state["sh"].shape[1] ** 0.5) - 1
@@ -258,48 +271,50 @@ class _Search:
         on_steps(0)
         state = start.state
         if count < start.count:
-            cameras = [view.camera for view in self.yardstick.refine_views]
+            cameras = [view.camera for view in self.validation.train_views]
             splats = splats_of(state, self.origin)
             importance = contribution(splats, cameras, self.seed, self.backend).importance
             # Stable: equal importance must not depend on the sorting of one machine.
             most = np.argsort(-importance, kind="stable")[:count]
-            state = chosen(state, np.sort(most))
-        # Draws of its own, or every trial would see the photos in the same order.
+            state = subset(state, np.sort(most))
+        # A seed of its own, or every candidate would see the photos in the same order.
         seed = int(np.random.default_rng([self.seed, number]).integers(2**63))
         after = refined(
             state,
             self.origin,
-            self.yardstick.refine_views,
+            self.validation.train_views,
             steps,
             settle,
             seed,
             self.backend,
             on_steps,
         )
-        # A model that is nearer to the pictures than a few steps of fitting come is left alone.
-        verdict, state = min(
-            ((self._verdict(either), either) for either in (after, state)),
-            key=lambda judged: judged[0].loss,
+        # A few steps of fitting can make a model worse that is already very near: keep the better.
+        score, state = min(
+            ((self._score(either), either) for either in (after, state)),
+            key=lambda scored: scored[0].loss,
         )
-        return self._recorded(state, verdict, settle, started)
+        return self._record(state, score, settle, started)
 
-    def _verdict(self, state: State) -> Verdict:
-        return self.yardstick.judge(splats_of(state, self.origin), self.backend)
+    def _score(self, state: State) -> ValidationScore:
+        return self.validation.score(splats_of(state, self.origin), self.backend)
 
-    def _recorded(self, state: State, verdict: Verdict, settled: bool, started: float) -> _Trial:
+    def _record(
+        self, state: State, score: ValidationScore, settled: bool, started: float
+    ) -> _Candidate:
         model = splats_of(state, self.origin)
         row = {
             "splats": len(model),
             "sh_degree": model.sh_degree,
             "bytes": _bytes(model),
-            "loss": verdict.loss,
-            "psnr": verdict.psnr,
-            "ssim": verdict.ssim,
+            "loss": score.loss,
+            "psnr": score.psnr,
+            "ssim": score.ssim,
             "settled": settled,
             "seconds": round(time.perf_counter() - started, 3),
         }
         self.curve.append(row)
-        return _Trial(state, row)
+        return _Candidate(state, row)
 
 
 def _bytes(splats: Splats) -> int:

@@ -1,4 +1,4 @@
-"""What the rasterizer knows of a picture besides its colours."""
+"""What the rasterizer knows of a render beside its colours: depth, normals, support by photos."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def photo_support(splats: Splats, photos: Sequence[View], backend: str = "auto")
         backend: "auto", "cpu", "gpu" or "reference".
 
     Raises:
-        As ``render_buffers``.
+        IgsrError, RuntimeError: as ``render_buffers``.
     """
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)

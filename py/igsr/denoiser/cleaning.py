@@ -1,4 +1,4 @@
-"""``igsr.denoise``: a render made cleaner, and where the result may be trusted."""
+"""``igsr.denoise``: a cleaner picture from a render, and a confidence for each pixel."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from igsr.denoiser.architecture import MULTIPLE
 from igsr.denoiser.buffers import Buffers
 from igsr.denoiser.inputs import COLOR, PHOTOS, network_inputs
-from igsr.denoiser.network import MULTIPLE, REACH, DenoiserNetwork
+from igsr.denoiser.network import REACH, DenoiserNetwork
 from igsr.denoiser.warping import Source, Warped, warp_photos
 from igsr.denoiser.weights import load_network
 from igsr.errors import IgsrError
@@ -23,35 +24,41 @@ Float32 = npt.NDArray[np.float32]
 
 #: Expected error, in units of the colours' range, at which the confidence is a half.
 HALF_CONFIDENCE_ERROR = 0.05
-#: A change this many times as large as the error that is expected to remain is made by half: it is
-#: as likely wrong. On scenes unlike those trained on, what is not sure of itself goes wrong.
+#: Only half of a change is made if it is this many times as large as the error that is expected to
+#: remain: it is as likely wrong. On scenes unlike those of the training, unsure changes go wrong.
 DOUBT = 1.0
-#: Colours that would change by less than this, of 1, are left alone: a background that is right
-#: stays exactly so.
-UNSEEN_CHANGE = 1.5 / 255.0
-#: Pictures of more pixels go through the network in tiles of this side, without what is around.
+#: Colours that would change by less than this, in units of their range, are left alone: nobody sees
+#: it, and a background that is right stays exactly so.
+SMALLEST_CHANGE = 1.5 / 255.0
+#: Larger pictures go through the network in tiles of this side, pixels, which limits memory.
 TILE = 768
 assert TILE % MULTIPLE == 0
 assert REACH % MULTIPLE == 0
 
 
 class Denoiser(Protocol):
-    """Anything that cleans renders: a render, its buffers and photos to a picture and confidence.
-
-    Returns the picture float32 [H, W, 3] in [0, 1] and the confidence float32 [H, W] in [0, 1].
-    """
+    """Anything that denoises renders; see ``denoise``."""
 
     def __call__(self, render: Buffers, photos: Sequence[Source]) -> tuple[Float32, Float32]:
-        """Clean one render."""
+        """Denoise one render.
+
+        Args:
+            render: the colours and what the rasterizer knows of them.
+            photos: the photos to look colours up in.
+
+        Returns:
+            The picture, float32 [H, W, 3] in [0, 1], and the confidence, float32 [H, W] in [0, 1].
+        """
 
 
 class NetworkDenoiser:
-    """The denoiser that igsr trains.
+    """A denoiser with a network, such as igsr trains.
 
     Args:
         network: its network, ready for use (``load_network``).
-        doubt: a change this many times as large as the error that is expected to remain is made by
-            half; 0 makes every change, for one who weighs the picture by its confidence.
+        doubt: only half of a change is made if it is this many times as large as the error that
+            is expected to remain. 0 makes every change in full, for callers that weight the picture
+            by its confidence.
     """
 
     def __init__(self, network: DenoiserNetwork, doubt: float = DOUBT) -> None:
@@ -74,7 +81,7 @@ class NetworkDenoiser:
         squared = change.abs().amax(dim=0).square()
         both = squared + (self.doubt * expected).square()
         change *= squared / both.clamp_min(torch.finfo(both.dtype).tiny)
-        seen = change.abs().amax(dim=0) >= UNSEEN_CHANGE
+        seen = change.abs().amax(dim=0) >= SMALLEST_CHANGE
         cleaned = torch.where(seen, render + change, render)
         picture = cleaned.clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
         error: Float32 = expected.numpy()
@@ -104,19 +111,21 @@ def denoise(
     photos: Sequence[Source] = (),
     denoiser: Denoiser | None = None,
 ) -> tuple[Float32, Float32]:
-    """Clean a render of a poorly known scene.
+    """Denoise a render of a scene that was fitted from too few photos.
 
     Args:
-        render: of any size: ``igsr.denoiser.render_buffers`` (best), ``igsr.render``, or only a
-            picture [H, W, 3], uint8 or float in [0, 1]. The less is known, the less is mended.
-        photos: of ``igsr.denoiser.photo_sources``, with a render of ``render_buffers``: others have
-            no camera.
-        denoiser: what cleans; None is the one that comes with igsr.
+        render: of any size: what ``igsr.denoiser.render_buffers`` (best) or ``igsr.render`` gave,
+            or only a picture [H, W, 3], sRGB, uint8 or float in [0, 1]. The more the render knows
+            beside its colours, the more the denoiser can repair.
+        photos: what ``igsr.denoiser.photo_sources`` gave; only with a render of ``render_buffers``,
+            since others have no camera.
+        denoiser: what denoises; None is the denoiser that comes with igsr.
 
     Returns:
-        The picture, float32 [H, W, 3] in [0, 1], and the confidence, float32 [H, W] in [0, 1]:
-        0.05 / (0.05 + expected absolute error of the colours), so a half where colours are expected
-        to be a twentieth of their range off. NaN pixels are filled in and have confidence 0.
+        The picture, float32 [H, W, 3] in [0, 1], and the confidence, float32 [H, W] in [0, 1].
+        The confidence is 0.05 / (0.05 + expected absolute error of the colours): a half where
+        colours are expected to be off by a twentieth of their range. NaN pixels are filled in and
+        have confidence 0.
 
     Raises:
         IgsrError: an array has another shape or dtype, photos are of another kind or could not be

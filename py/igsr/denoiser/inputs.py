@@ -1,4 +1,4 @@
-"""The channels that the network looks at, made from a render's buffers and the photos."""
+"""The input channels of the network, made from a render's buffers and the warped photos."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def network_inputs(buffers: Buffers, warped: Warped) -> Float32:
 
     Colour, clamped to [0, 1]; alpha; depth as its ratio to the picture's median, less one; its
     relative deviation; the normal; the footprint; the support; for each photo its colour, whether
-    it is valid, and its angle; and likewise the background: a floater before it is mended by
+    it is valid, and its angle; and likewise the background: a floater before it is removed by
     taking its colour, whatever that is. What ``buffers`` lacks (None) is zero, as where nothing is
     drawn.
     """

@@ -1,4 +1,4 @@
-"""What the photos show at the surface that a render shows."""
+"""Photos warped to a render: the colours that they show at the surface in each of its pixels."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Float32 = npt.NDArray[np.float32]
 #: A photo sees a point if the depth rendered from the photo differs from the point's by no more
 #: than this part of it.
 SAME_DEPTH = 0.03
-#: Of more photos, the ones that look from nearest at the middle of what is seen are looked up.
+#: Of more photos, those whose directions to the middle of the surface are nearest are looked up.
 CONSIDERED = 8
 #: Stands for the cosine of an angle where a photo does not see a point.
-UNSEEN = -2.0
+NOT_VISIBLE = -2.0
 #: Below this alpha a render has no surface to look up.
 SURFACE_ALPHA = 0.5
-#: So many pixels are looked up at a time, in whole rows: each takes some 300 bytes meanwhile.
+#: So many pixels are looked up at a time, in whole rows. Each takes some 300 bytes meanwhile.
 BAND = 1 << 20
 
 
@@ -87,7 +87,7 @@ def photo_sources(
 def warp_photos(
     camera: Camera, depth: Float32, alpha: Float32, sources: Sequence[Source], keep: int
 ) -> Warped:
-    """Look up each pixel's surface in the photos; keep the ones that look from nearest.
+    """Look up each pixel's surface in the photos; keep those with the nearest directions.
 
     Args:
         camera: of the render.
@@ -125,9 +125,9 @@ def _best(
     for cosine, photo in zip(best.values, best.indices, strict=True):
         found = torch.zeros(points.shape[1], 3)
         for index, source in enumerate(near):
-            chosen = torch.nonzero((photo == index) & (cosine > UNSEEN))[:, 0]
+            chosen = torch.nonzero((photo == index) & (cosine > NOT_VISIBLE))[:, 0]
             found[chosen] = _colors(source, at[index][:, chosen])
-        seen = torch.where(cosine > UNSEEN, cosine.clamp(-1.0, 1.0).acos(), torch.pi)
+        seen = torch.where(cosine > NOT_VISIBLE, cosine.clamp(-1.0, 1.0).acos(), torch.pi)
         out.append((found.numpy(), seen.numpy()))
     return out
 
@@ -159,7 +159,7 @@ def _surface_points(camera: Camera, depth: Float32, surface: npt.NDArray[np.bool
 
 
 def _looked_up(source: Source, camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine [N] between the directions, ``UNSEEN`` where a photo sees no point; pixels [2, N]."""
+    """Cosine [N] between the directions or ``NOT_VISIBLE``, and pixels [2, N] in the photo."""
     photo = source.camera
     # Points stay in a camera's axes: float32 has no room for a scene far from the world's origin.
     between = torch.from_numpy(photo.viewmat @ np.linalg.inv(camera.viewmat)).float()
@@ -177,7 +177,7 @@ def _looked_up(source: Source, camera: Camera, points: Tensor) -> tuple[Tensor, 
     seen &= torch.from_numpy(source.usable).reshape(-1)[pixel]
     lengths = _dot(inside, inside) * _dot(turned, turned)
     cosine = _dot(inside, turned) * lengths.clamp_min(1e-30).rsqrt()
-    return torch.where(seen, cosine, UNSEEN), torch.stack([x, y])
+    return torch.where(seen, cosine, NOT_VISIBLE), torch.stack([x, y])
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

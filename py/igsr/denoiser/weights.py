@@ -13,7 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from igsr._internal.atomic_write import atomic_write
-from igsr.denoiser.network import Architecture, DenoiserNetwork
+from igsr.denoiser.architecture import Architecture
+from igsr.denoiser.network import DenoiserNetwork
 from igsr.errors import IgsrError
 
 #: The denoiser that comes with igsr.
@@ -51,7 +52,7 @@ def load_network(path: str | os.PathLike[str] | None = None) -> DenoiserNetwork:
     if path is None and not SHIPPED.is_file():
         raise IgsrError(
             "this igsr has no weights of its own for the denoiser; give --weights FILE "
-            "(denoiser= in Python), which igsr denoise train makes (docs/denoiser.md)"
+            "(denoiser= in Python), which igsr denoise train makes (docs/guides/denoising.md)"
         )
     path = SHIPPED if path is None else Path(path)
     try:

@@ -1,36 +1,42 @@
-"""Score splats against the photos of a capture."""
+"""``evaluate``: score splats on the photos of a capture."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.array_equality import ArrayEquality
+from igsr._internal.choices import Backend, Split
 from igsr.capture import Capture, View
 from igsr.errors import IgsrError
 from igsr.evaluation import metrics
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
+logger = logging.getLogger(__name__)
+
+#: Names of the metrics, in the order of tables.
 METRICS = ("psnr", "ssim", "ms_ssim", "flip")
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class ScoredView:
-    """One photo, its render and what they scored.
+@dataclass(frozen=True, eq=False, repr=False)
+class ScoredView(ArrayEquality):
+    """One photo, its render and their scores.
 
     Attributes:
         name: the view's name in the capture.
         photo: uint8 [H, W, 3], composited over the background if it had alpha.
         render: uint8 [H, W, 3].
-        mask: bool [H, W] of the pixels that counted, or None for all.
-        scores: "psnr", "ssim", "ms_ssim" (None where the picture is too small), "flip".
+        mask: bool [H, W], True for pixels that counted, or None if all did.
+        scores: "psnr" in dB, "ssim", "ms_ssim" (None if the picture is too small) and "flip".
     """
 
     name: str
@@ -39,26 +45,115 @@ class ScoredView:
     mask: metrics.Mask | None
     scores: dict[str, float | None]
 
+    def __repr__(self) -> str:
+        return f"ScoredView({self.name!r}, PSNR {self.scores['psnr']:.2f} dB)"
+
+
+class ViewScores(TypedDict):
+    """The scores of one view: a row of ``Scores.views``."""
+
+    name: str
+    psnr: float
+    ssim: float
+    ms_ssim: float | None
+    flip: float
+    width: int
+    height: int
+    masked: bool
+
+
+class Protocol(TypedDict, total=False):
+    """How views were scored, for reports.
+
+    ``split`` is "test" or "train", ``views`` their number, ``background`` RGB in [0, 1];
+    ``pixels``, ``ssim`` and ``flip`` are in words. Commands add ``holdout``: every how many views
+    one was held out.
+    """
+
+    split: str
+    views: int
+    background: list[float]
+    pixels: str
+    ssim: str
+    flip: str
+    holdout: int | None
+
+
+class Scores(dict[str, Any]):
+    """What ``evaluate`` returns: mean scores over the views of a split, and the scores of each.
+
+    It is a dictionary, so ``scores["psnr"]``, ``{**scores}`` and ``json.dumps(scores)`` work. Its
+    items are typed attributes too: ``scores.psnr``.
+    """
+
+    @property
+    def psnr(self) -> float:
+        """Peak signal-to-noise ratio in dB, at most 100. Higher is better."""
+        return float(self["psnr"])
+
+    @property
+    def ssim(self) -> float:
+        """Structural similarity, 1 for equal pictures. Higher is better."""
+        return float(self["ssim"])
+
+    @property
+    def ms_ssim(self) -> float | None:
+        """Multi-scale SSIM over the views that are large enough for it, or None if none is."""
+        value: float | None = self["ms_ssim"]
+        return value
+
+    @property
+    def flip(self) -> float:
+        """LDR-FLIP error, 0 for equal pictures. Lower is better."""
+        return float(self["flip"])
+
+    @property
+    def protocol(self) -> Protocol:
+        """How the views were scored."""
+        protocol: Protocol = self["protocol"]
+        return protocol
+
+    @property
+    def views(self) -> list[ViewScores]:
+        """The scores of each view, in the order of the capture."""
+        views: list[ViewScores] = self["views"]
+        return views
+
+    def __repr__(self) -> str:
+        ms_ssim = "-" if self.ms_ssim is None else f"{self.ms_ssim:.4f}"
+        return (
+            f"Scores(PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}, MS-SSIM {ms_ssim}, "
+            f"FLIP {self.flip:.4f}; {len(self.views)} {self.protocol['split']} views)"
+        )
+
 
 def default_background(capture: Capture) -> tuple[float, float, float]:
-    """White where photos have alpha, as the NeRF-Synthetic papers score; else black."""
+    """White if photos have alpha, as papers score NeRF Synthetic; else black. RGB in [0, 1]."""
     return known_background(capture.views) or BLACK
 
 
 def known_background(views: Sequence[View]) -> tuple[float, float, float] | None:
-    """White behind photos with alpha; None where photos have none, and show what there is."""
+    """White if photos have alpha; None if they show their own background. RGB in [0, 1]."""
     return WHITE if any(view.image.shape[2] == 4 for view in views) else None
 
 
-def default_split(capture: Capture) -> str:
-    """ "test" if the capture has test views, else "train"."""
+def default_split(capture: Capture) -> Split:
+    """The split to score: "test" if the capture has test views, else "train"."""
     return "test" if capture.test_views else "train"
 
 
 def over_background(
     image: npt.NDArray[np.uint8], background: Sequence[float]
 ) -> npt.NDArray[np.uint8]:
-    """An RGB photo as it is; an RGBA photo (straight alpha) over ``background``, in 8 bits."""
+    """Composite a photo over a background.
+
+    Args:
+        image: uint8 [H, W, 3], or [H, W, 4] with straight alpha.
+        background: RGB in [0, 1].
+
+    Returns:
+        uint8 [H, W, 3]; an image without alpha is returned as it is.
+    """
     if image.shape[2] == 3:
         return image
     alpha = image[..., 3:].astype(np.float64) / 255.0
@@ -67,11 +162,11 @@ def over_background(
     return np.floor(np.clip(mixed, 0.0, 255.0) + 0.5).astype(np.uint8)
 
 
-def views_of_split(capture: Capture, split: str) -> list[View]:
+def views_of_split(capture: Capture, split: Split) -> list[View]:
     """The capture's "train" or "test" views.
 
     Raises:
-        IgsrError: there are none, or the name is another one.
+        IgsrError: there are none, or ``split`` is another name.
     """
     if split not in ("train", "test"):
         raise IgsrError(f'split must be "train" or "test", not {split!r}.')
@@ -86,9 +181,18 @@ def score_views(
     splats: Splats,
     views: Sequence[View],
     background: Sequence[float],
-    backend: str = "auto",
+    backend: Backend = "auto",
 ) -> Iterator[ScoredView]:
-    """Render and score views one by one (so that only what the caller keeps stays in memory).
+    """Render and score views one by one, so that only what the caller keeps stays in memory.
+
+    Args:
+        splats: the scene.
+        views: the photos with their cameras.
+        background: RGB in [0, 1], behind renders and behind photos with alpha.
+        backend: "auto", "cpu", "gpu" or "reference".
+
+    Yields:
+        Each view with its scores.
 
     Raises:
         IgsrError: as ``check_masks``, before anything is rendered.
@@ -102,10 +206,10 @@ def score_views(
 
 
 def check_masks(views: Sequence[View]) -> None:
-    """Find views that cannot be scored.
+    """Check that each view can be scored.
 
     Raises:
-        IgsrError: a mask leaves no pixel to score.
+        IgsrError: a mask leaves no pixel to score; the message names the view.
     """
     for view in views:
         if view.mask is not None and not view.mask.any():
@@ -115,34 +219,36 @@ def check_masks(views: Sequence[View]) -> None:
 def evaluate(
     splats: Splats,
     capture: Capture,
-    split: str = "test",
+    split: Split = "test",
     background: Sequence[float] | None = None,
-    backend: str = "auto",
+    backend: Backend = "auto",
     on_view: Callable[[ScoredView], None] | None = None,
-) -> dict[str, Any]:
+) -> Scores:
     """Score ``splats`` on the views of one split.
 
-    The 8-bit picture is scored (see ``igsr.evaluation.metrics``), masked pixels do not count,
-    photos with alpha are composited over ``background``, which is also the renders' background.
+    Scores are of the 8-bit pictures (see ``igsr.evaluation.metrics``). Masked pixels do not count.
+    Photos with alpha are composited over ``background``, which is also behind the renders.
 
     Args:
         splats: the scene.
         capture: the photos and cameras.
         split: "test" or "train".
-        background: RGB in [0, 1]; None is white where photos have alpha, else black.
-        backend: "auto", "cpu", "gpu" or "reference".
-        on_view: called with each view once it is scored (progress, contact sheets).
+        background: RGB in [0, 1]; None is white if photos have alpha, else black.
+        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu" or "reference".
+        on_view: called with each view once it is scored, for progress and contact sheets.
 
     Returns:
-        "psnr", "ssim", "ms_ssim", "flip": means over the views ("ms_ssim" over those large enough
-        for it, None if none is); "protocol": how it was scored; "views": one row per view.
+        Means over the views, and the scores of each view.
 
     Raises:
-        IgsrError: the split has no views, or a mask leaves nothing to score.
+        IgsrError: the split has no views, a mask leaves no pixel to score, or an argument cannot
+            be used.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     if background is None:
         background = default_background(capture)
     views = views_of_split(capture, split)
+    logger.info("scoring %d %s views of %s with %r", len(views), split, capture.path, splats)
     rows: list[dict[str, Any]] = []
     for scored in score_views(splats, views, background, backend):
         height, width = scored.photo.shape[:2]
@@ -170,7 +276,7 @@ def evaluate(
         "ssim": "11x11 Gaussian window, sigma 1.5, zero-padded (3DGS)",
         "flip": "LDR-FLIP, 67 pixels per degree",
     }
-    return {**means, "protocol": protocol, "views": rows}
+    return Scores(**means, protocol=protocol, views=rows)
 
 
 def _known(values: Iterator[float | None]) -> list[float]:

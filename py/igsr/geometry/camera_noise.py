@@ -1,4 +1,4 @@
-"""Noise on cameras: poses made wrong on purpose, for studies and for training pairs."""
+"""Noise on camera poses, for studies and for training pairs of the denoiser."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from igsr.capture.types import intrinsic_matrix
 
 Float64 = npt.NDArray[np.float64]
 
-#: Of NeRF Synthetic's cameras from the origin, world units.
+#: Distance of NeRF Synthetic's cameras from the origin, world units.
 VIEWING_DISTANCE = 4.03
-
 
 #: Kinds of noise: on all twelve numbers of camera-to-world, then made rigid again; the same with
 #: the shear kept; turns about a random axis through the camera's centre.
@@ -35,10 +34,10 @@ class Noise:
 
 
 def noise_unit(views: Sequence[View]) -> float:
-    """World units that stand for one of NeRF Synthetic's: noise on positions is in those.
+    """Unit of length for noise on positions: what one unit of NeRF Synthetic is in this scene.
 
-    Its cameras stand ``VIEWING_DISTANCE`` from what they look at; these look at the point nearest
-    to all their axes.
+    NeRF Synthetic's cameras stand ``VIEWING_DISTANCE`` from their focus point. The focus point of
+    ``views`` is the point nearest to all optical axes.
     """
     # Each axis contributes the part of an offset from it that is across it.
     across = []

@@ -20,7 +20,7 @@ DEFAULT_ELEVATION_DEGREES = 20.0
 
 
 def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
-    """``frames`` cameras once around the scene.
+    """``frames`` cameras on a circle around the scene.
 
     With a capture, the circle is fitted to its cameras: around the point they look at, at their
     median distance and height, with their up direction, and with the first camera's lens. Without

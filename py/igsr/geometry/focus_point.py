@@ -1,4 +1,4 @@
-"""The point that cameras look at."""
+"""The focus point: where the optical axes of cameras meet."""
 
 from __future__ import annotations
 
@@ -11,9 +11,15 @@ Float64 = npt.NDArray[np.float64]
 
 
 def focus_point(cameras: list[Camera]) -> Float64:
-    """The point [3] nearest to all optical axes, in the least-squares sense.
+    """The point nearest to all optical axes, in the least-squares sense.
 
     A small pull towards a point in front of the cameras keeps parallel axes solvable.
+
+    Args:
+        cameras: at least one.
+
+    Returns:
+        float64 [3], world frame.
     """
     centres = np.stack([camera.centre for camera in cameras])
     axes = np.stack([camera.viewmat[2, :3] for camera in cameras])

@@ -1,11 +1,11 @@
-"""How right estimated cameras are, in the measures of the literature.
+"""Pose errors and accuracy, by the measures of the literature.
 
-RRA@t and RTA@t are the parts of all pairs of photos whose relative rotation, and whose direction of
-relative translation, are off by less than t degrees; mAA@30 is the area under the curve of the
-smaller of the two for t from 1 to 30 degrees (Wang et al., PoseDiffusion, ICCV 2023). Pairs with a
-photo that was not placed count as wrong. ATE is the root mean square distance of the cameras'
-centres (Sturm et al., IROS 2012) after the similarity of ``igsr.geometry.similarity``,
-which two cameras suffice for.
+RRA@t and RTA@t are the fractions of all pairs of photos whose relative rotation, and whose
+direction of relative translation, are off by less than t degrees; mAA@30 is the area under the
+curve of the smaller of the two for t from 1 to 30 degrees (Wang et al., PoseDiffusion, ICCV 2023).
+Pairs with a photo that is not registered count as wrong. ATE is the root mean square distance
+of the cameras' centres (Sturm et al., IROS 2012) after alignment by the similarity of
+``igsr.geometry.similarity``, for which two cameras suffice.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def pose_accuracy(
     """Compare estimated cameras with true ones; neither scale nor frame of the world matters.
 
     Args:
-        cameras: per photo; None where it was not placed.
+        cameras: per photo; None where it is not registered.
         true_cameras: per photo.
 
     Returns:

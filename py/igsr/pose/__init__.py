@@ -1,4 +1,4 @@
-"""Cameras of photos that have none.
+"""Pose estimation: cameras for photos that have none, by COLMAP or a pose network.
 
 >>> import igsr
 >>> capture = igsr.estimate_poses("photos")
@@ -56,17 +56,17 @@ def estimate_poses(
         estimator: "colmap" (nothing to download), "dust3r" (a network, whose checkpoint the user
             has), or "auto": the cameras that the folder already has, else DUSt3R where a checkpoint
             is found, else COLMAP.
-        seed: of everything random; same seed, same bits.
+        seed: random seed; deterministic for a given seed.
         frames: how many frames are taken of each video.
         progress: called with a stage, how much of it is done, and how much there is.
         options: of the estimator alone: DUSt3R's ``checkpoint``, ``graph`` and ``cameras``.
 
     Returns:
-        The photos that could be placed, upright and with lens distortion undone, in one world of
-        unknown scale; all are for training. What could not be placed is named in a warning.
+        The registered photos, upright and undistorted, in one world frame of unknown scale; all are
+        train views. A warning names the photos that are not registered.
 
     Raises:
-        IgsrError: fewer than two photos can be read or placed, or an argument cannot be used.
+        IgsrError: fewer than two photos can be read or registered, or an argument cannot be used.
     """
     if estimator == AUTO and isinstance(photos, (str, os.PathLike)) and holds_cameras(photos):
         return load_capture(photos)
@@ -119,18 +119,18 @@ def estimate(
     make = ESTIMATORS[estimator].make
     foreign = [name for name in options if name not in inspect.signature(make).parameters]
     if foreign:
-        raise IgsrError(f"{foreign[0]} says nothing to {estimator}; leave it out")
+        raise IgsrError(f"{foreign[0]} is no option of {estimator}; leave it out")
     found = make(**options)(photos, seed=seed, progress=progress)
     if sum(camera is not None for camera in found.cameras) < FEWEST:
         raise IgsrError(
-            f"No camera could be found: the {len(photos)} photos ({photos[0].name} and others) "
-            "show too little in common; take them from nearer to each other, of one still thing"
+            f"No cameras found: the {len(photos)} photos ({photos[0].name} and others) have too "
+            "few matches; take photos of one static scene that overlap more"
         )
     return estimator, found
 
 
 def capture_of(path: Path, photos: Sequence[Photo], found: Estimate) -> Capture:
-    """The photos that an estimate placed as a capture, with lens distortion undone.
+    """The registered photos of an estimate as a capture, with lens distortion undone.
 
     Raises:
         IgsrError: a lens bends so much that nothing of its photo is left.

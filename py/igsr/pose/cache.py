@@ -1,4 +1,4 @@
-"""Cameras that were found before, kept beside what was made with them."""
+"""Cache of estimated cameras, in the output folder of the fit that uses them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import VIDEO_SUFFIXES, photo_sizes
 from igsr.errors import IgsrError
 
-#: In the folder of the cameras: names and bytes of the photos that were given.
+#: File in the cache: names and sizes in bytes of the photos that cameras were estimated for.
 GIVEN = "photos.json"
 
 
 def kept_cameras(photos: Path, out: Path) -> Path:
-    """Where the cameras of photos are kept that are found for what goes to ``out``.
+    """The folder that caches the estimated cameras of ``photos`` for the output folder ``out``.
 
     Raises:
-        IgsrError: the photos lie there themselves, or something else that would be replaced.
+        IgsrError: the photos themselves lie there, or other files that would be replaced.
     """
     kept = out / "capture"
     if kept.resolve() in (photos.resolve(), *photos.resolve().parents):
@@ -29,15 +29,15 @@ def kept_cameras(photos: Path, out: Path) -> Path:
 
 
 def photos_note(photos: Path) -> dict[str, str]:
-    """What says, beside cameras that are kept, which photos they were looked for in."""
+    """The note in the cache that says which photos the cameras were estimated for."""
     return {GIVEN: json.dumps(photo_sizes(photos), indent=1)}
 
 
 def found_before(photos: Path, kept: Path) -> bool:
-    """Whether ``kept`` has cameras to go on with.
+    """Whether the cache ``kept`` holds cameras of ``photos``.
 
     Raises:
-        IgsrError: they are of other photos.
+        IgsrError: it holds cameras of other photos.
     """
     if not holds_cameras(kept):
         return False
@@ -50,9 +50,9 @@ def found_before(photos: Path, kept: Path) -> bool:
 
 
 def not_placed(capture: Capture) -> list[str]:
-    """Names of photos that no camera was found for, if cameras had to be found.
+    """Names of the photos that are not registered, if the cameras were estimated.
 
-    A capture may have fewer views than were placed: what was is kept beside its cameras.
+    They come from the cache, since a capture may hold fewer views than were registered.
     """
     given = _given(capture.path) or {}
     photos = capture.path / "images"
@@ -74,7 +74,7 @@ def _without_suffix(name: str) -> str:
 
 
 def _given(kept: Path) -> dict[str, int] | None:
-    """What ``photos_note`` was; None where nothing of that kind is."""
+    """The content of ``photos_note``; None where there is none."""
     try:
         found = json.loads((kept / GIVEN).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

@@ -1,13 +1,12 @@
-"""Cameras by structure from motion, through pycolmap: features, matches, photo after photo.
+"""Cameras by incremental structure from motion, through pycolmap: SIFT features, matches, mapping.
 
-Nothing is downloaded, and nothing is learnt: where photos share too few recognisable places, they
-are not placed. What is matched decides more than how: all pairs of few photos, and of many those
-that lie near in the order of names or whose largest features look alike (Wu, "Towards Linear-time
-Incremental Structure from Motion", 3DV 2013, section 3).
+Nothing is downloaded. Photos with too few matches are not registered. Of few photos all pairs are
+matched; of many, those near in the order of names and those whose largest features match (Wu,
+"Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3).
 
 Photos that EXIF gives no focal length get one from the fundamental matrices of all pairs together
 (Sweeney et al., "Optimizing the Viewing Graph for Structure-from-Motion", ICCV 2015) before the
-first is placed: a start at a wrong focal length is where few photos fail most.
+first is registered: with few photos, a wrong initial focal length is the most common failure.
 """
 
 from __future__ import annotations
@@ -40,17 +39,17 @@ Float64 = npt.NDArray[np.float64]
 LONGEST = 1600
 #: Up to this many photos, every pair is matched.
 EXHAUSTIVE = 60
-#: Of more photos, each is matched with those that follow it by name and those that look alike.
+#: Of more photos, each is matched with those that follow it by name and those most similar to it.
 FOLLOWING = 8
-ALIKE = 16
-#: Largest features by which photos are found to look alike, and least matches of them.
-GLANCE = 128
-LEAST_ALIKE = 4
+MOST_SIMILAR = 16
+#: Number of largest features by which similar photos are found, and least matches of them.
+PRESELECTION_FEATURES = 128
+LEAST_SIMILAR = 4
 #: Where nothing is known: the focal length over the longer side; 42 degrees, COLMAP's own.
 GUESSED_FOCAL = 1.2
 #: Photos and pairs done between two calls of progress; Ctrl-C is heard then.
 FEATURES_AT_ONCE, PAIRS_AT_ONCE = 4, 40
-#: Up to this many photos, what was not placed is tried with less evidence.
+#: Up to this many photos, unregistered ones are tried again with lower thresholds.
 FEW = 60
 #: Squared errors may grow by this factor for lenses to count as free of distortion: photos that are
 #: not resampled stay sharp, and from few photos a distortion is often no more than a wrong focal.
@@ -62,7 +61,7 @@ MANY = 200
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a photo needs to be placed; COLMAP's names and, first, COLMAP's numbers.
+    """Thresholds for registering a photo, by COLMAP's names; the first set has COLMAP's values.
 
     Attributes:
         init_min_num_inliers: matches of the first pair.
@@ -100,7 +99,7 @@ class Colmap:
     def __call__(
         self, photos: Sequence[Photo], *, seed: int = 0, progress: Progress | None = None
     ) -> Estimate:
-        """Place what can be placed; see ``Estimator``.
+        """Register as many photos as possible; see ``Estimator``.
 
         The largest set of photos that hang together is kept. The same photos and seed give the same
         bits on the same machine.
@@ -126,7 +125,7 @@ class Colmap:
 
 @contextlib.contextmanager
 def _guarded(seed: int) -> Iterator[None]:
-    """pycolmap without its log, its random numbers from a seed, its failures as sentences."""
+    """pycolmap without its log, with a fixed seed, and with failures as error messages."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel
@@ -230,7 +229,7 @@ def _write(photo: Photo, path: Path, mask_path: Path | None) -> None:
         usable = np.ones(grey.shape, dtype=bool) if photo.mask is None else photo.mask
         if image.shape[2] == 4:
             usable = usable & (image[..., 3] > 0)
-        # What is hidden must not matter to the features beside it.
+        # Masked pixels must not influence the features next to them.
         grey[~usable] = round(grey[usable].mean()) if usable.any() else 0
         Image.fromarray(255 * usable.astype(np.uint8)).save(mask_path)
     Image.fromarray(grey).save(path, compress_level=1)
@@ -276,51 +275,51 @@ def _pairs(count: int, database: Path) -> list[tuple[int, int]]:
     if count <= EXHAUSTIVE:
         return [(a, b) for a in range(count) for b in range(a + 1, count)]
     pairs = {(a, b) for a in range(count) for b in range(a + 1, min(a + 1 + FOLLOWING, count))}
-    alike = _alike(_glances(count, database))
+    similar = _similarity(_largest_features(count, database))
     for a in range(count):
-        best = np.argsort(-alike[a], kind="stable")[:ALIKE]
-        pairs |= {(min(a, int(b)), max(a, int(b))) for b in best if alike[a, b] >= LEAST_ALIKE}
+        best = np.argsort(-similar[a], kind="stable")[:MOST_SIMILAR]
+        pairs |= {(min(a, int(b)), max(a, int(b))) for b in best if similar[a, b] >= LEAST_SIMILAR}
     return sorted(pairs)
 
 
-def _glances(count: int, database: Path) -> list[npt.NDArray[np.float32]]:
+def _largest_features(count: int, database: Path) -> list[npt.NDArray[np.float32]]:
     """Descriptors of length 1 of each photo's largest features."""
     import pycolmap
 
-    glances = []
+    largest_of = []
     with pycolmap.Database.open(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         for index in range(count):
             image_id = ids.get(_file(index))
             if image_id is None:
-                glances.append(np.zeros((0, 128), dtype=np.float32))
+                largest_of.append(np.zeros((0, 128), dtype=np.float32))
                 continue
             keypoints = opened.read_keypoints(image_id)
             descriptors = opened.read_descriptors(image_id).data.astype(np.float32)
             # The determinant of a feature's affine shape is the square of its size.
             size = np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2)))
-            largest = descriptors[np.argsort(-size, kind="stable")[:GLANCE]]
+            largest = descriptors[np.argsort(-size, kind="stable")[:PRESELECTION_FEATURES]]
             lengths = np.linalg.norm(largest, axis=1, keepdims=True)
-            glances.append(largest / np.maximum(lengths, 1e-9))
-    return glances
+            largest_of.append(largest / np.maximum(lengths, 1e-9))
+    return largest_of
 
 
-def _alike(glances: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
+def _similarity(descriptors: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
     """How many of the largest features of each two photos are each other's clear best, [N, N]."""
-    count, most = len(glances), max(len(glance) for glance in glances)
+    count, most = len(descriptors), max(len(features) for features in descriptors)
     padded = np.zeros((count, most, 128), dtype=np.float32)
-    for index, glance in enumerate(glances):
-        padded[index, : len(glance)] = glance
+    for index, features in enumerate(descriptors):
+        padded[index, : len(features)] = features
     counts = np.zeros((count, count), dtype=np.int64)
     rows = np.arange(most)
     for a in range(count - 1):
         others = padded[a + 1 :]
-        alike = (others @ padded[a].T).swapaxes(1, 2)  # [photo, feature of a, feature of photo]
-        best = alike.argmax(axis=2)
-        mutual = np.take_along_axis(alike.argmax(axis=1), best, axis=1) == rows
-        first = np.take_along_axis(alike, best[..., None], axis=2)[..., 0]
-        np.put_along_axis(alike, best[..., None], -1.0, axis=2)
-        near, next_near = (np.maximum(2.0 - 2.0 * s, 0.0) for s in (first, alike.max(axis=2)))
+        similar = (others @ padded[a].T).swapaxes(1, 2)  # [photo, feature of a, feature of photo]
+        best = similar.argmax(axis=2)
+        mutual = np.take_along_axis(similar.argmax(axis=1), best, axis=1) == rows
+        first = np.take_along_axis(similar, best[..., None], axis=2)[..., 0]
+        np.put_along_axis(similar, best[..., None], -1.0, axis=2)
+        near, next_near = (np.maximum(2.0 - 2.0 * s, 0.0) for s in (first, similar.max(axis=2)))
         # Of squared distances, Lowe's ratio is 0.8 squared.
         counts[a, a + 1 :] = (mutual & (near < 0.64 * next_near)).sum(axis=1)
     return counts + counts.T
@@ -362,17 +361,17 @@ def _map(count: int, database: Path, evidence: Evidence, seed: int, show: Progre
     options.triangulation.min_angle = evidence.filter_min_tri_angle
     # Two photos alone tell a focal length too badly to better EXIF's or the fundamental matrix's.
     options.ba_refine_focal_length = options.ba_refine_extra_params = count > 2
-    placed = 0
+    registered = 0
 
     def start() -> None:
-        nonlocal placed
-        placed = 2
-        show("mapping", placed, count)
+        nonlocal registered
+        registered = 2
+        show("mapping", registered, count)
 
     def next_photo() -> None:
-        nonlocal placed
-        placed = min(placed + 1, count)
-        show("mapping", placed, count)
+        nonlocal registered
+        registered = min(registered + 1, count)
+        show("mapping", registered, count)
 
     models = pycolmap.ReconstructionManager()
     with pycolmap.Database.open(database) as opened:
@@ -433,13 +432,13 @@ def _estimate(photos: Sequence[Photo], model: Any | None, step: int) -> Estimate
     lost = [photo.name for photo, camera in zip(photos, cameras, strict=True) if camera is None]
     if lost:
         sentences.append(
-            f"{len(photos) - len(lost)} of {len(photos)} photos could be placed; not placed, for "
-            f"want of places that they share with these: {', '.join(lost)}."
+            f"{len(photos) - len(lost)} of {len(photos)} photos are registered; too few "
+            f"matches for: {', '.join(lost)}."
         )
     if step >= DOUBTFUL:
         sentences.append(
-            "The photos share few places, so cameras were found with less evidence than usual and "
-            "may be wrong; look at the plot, or add photos between those that you have."
+            "The photos have few matches, so cameras were found with lower thresholds and may be "
+            "wrong; check the plot, or add photos between those that you have."
         )
     points = _points(photos, model, index_of)
     if points is not None:
@@ -482,7 +481,7 @@ def _tracks(
     cameras: Sequence[Camera | None],
     lenses: Sequence[Lens | None],
 ) -> Tracks:
-    """Where the photos that were placed see the points, with lens distortion undone."""
+    """Where the registered photos see the points, with lens distortion undone."""
     rows = {point_id: row for row, point_id in enumerate(sorted(model.point3D_ids()))}
     view: list[int] = []
     point: list[int] = []
@@ -492,12 +491,12 @@ def _tracks(
             view.append(number)
             point.append(rows[observed.point3D_id])
             places.append(observed.xy)
-    placed = list(index_of.values())
+    registered = list(index_of.values())
     tracks = Tracks(
-        [photos[index].name for index in placed],
+        [photos[index].name for index in registered],
         np.array(view, dtype=np.int64),
         np.array(point, dtype=np.int64),
         np.array(places, dtype=np.float64).reshape(-1, 2),
     )
-    placed_cameras = [camera for camera in cameras if camera is not None]
-    return straightened(tracks, xyz, placed_cameras, [lenses[index] for index in placed])
+    registered_cameras = [camera for camera in cameras if camera is not None]
+    return straightened(tracks, xyz, registered_cameras, [lenses[index] for index in registered])

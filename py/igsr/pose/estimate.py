@@ -1,4 +1,4 @@
-"""What finds cameras, and what it returns: the seam that every estimator fits into."""
+"""The interface of pose estimators: what they take and what they return."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
 from igsr.capture.undistort import Lens
 
-#: Called with what is being done, how much of it is done, and how much there is.
+#: Called with the stage, how much of it is done, and how much there is.
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(eq=False)
 class Estimate:
-    """Cameras of photos, one world frame for all, and what else an estimator found out.
+    """Cameras of photos in one world frame, and what else an estimator found.
 
     Attributes:
         cameras: per photo, pinhole, in pixels of the photo (centres at +0.5), or None where the
-            photo could not be placed.
+            photo is not registered.
         points: in the world frame, with confidence, or None.
         depths: per photo float32 [h, w], z-depth along the camera's axis in world units, NaN where
             it is not known, at any resolution of the photo's aspect; or None.
-        trusted: per photo bool of the shape of its depth, True where the depth may be trusted; or
+        trusted: per photo bool of the shape of its depth, True where the depth is confident; or
             None.
-        warnings: sentences for the user: what could not be placed, and why.
+        warnings: messages for the user: which photos are not registered, and why.
         lenses: per photo the distortion that ``cameras`` leave out, None for none; an empty list
             says none for all. ``igsr.estimate_poses`` undoes it.
     """
@@ -42,7 +42,7 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """What finds cameras of photos."""
+    """A pose estimator."""
 
     name: str
 
@@ -53,10 +53,11 @@ class Estimator(Protocol):
 
         Args:
             photos: upright, their names unique.
-            seed: of everything random; same seed, same bits.
+            seed: random seed; deterministic for a given seed.
             progress: called with a stage ("pairs", "alignment", "features", "matching" or
                 "mapping"), how much of it is done, and how much there is.
 
         Raises:
-            IgsrError: the estimator cannot be used at all; photos that cannot be placed are None.
+            IgsrError: the estimator cannot be used at all. Unregistered photos are no error: their
+                cameras are None.
         """

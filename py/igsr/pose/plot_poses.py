@@ -1,4 +1,4 @@
-"""A picture of cameras and points from three sides, for a look at whether poses can be right."""
+"""Plot of cameras and points from three sides, to check poses by eye."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The estimators there are, by name; another one is a file of its own and an entry here."""
+"""The pose estimators by name; a new one is a file of its own and an entry here."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Entry:
     """How an estimator is made.
 
     Attributes:
-        make: its parameters are the options that the estimator has.
+        make: makes it; its parameters are the options of the estimator.
         ready: whether it can run here with these options; "auto" takes the first that can.
     """
 

@@ -1,51 +1,53 @@
-"""Unseen views: cameras near the photos', looking at what they look at.
+"""Novel views: cameras near the photos' cameras, which look at what these look at.
 
-A camera's neighbourhood is where it can turn to about the point that it looks at: eight ways to
-lean out, by ``STEP`` degrees each, and the middle between it and each of the others near it. What
-is not near a known camera already is unseen. Views between photos come first, then those beyond;
-where views from beyond are added to the known ones, the next round starts from there.
+Around each known camera, candidates are eight ways to lean out by ``STEP`` degrees about the point
+that it looks at, and the middle between it and each other camera nearby. A candidate is novel if it
+is not close to a known camera. Views between known cameras come first, then those beyond them. The
+cameras of views that a round adds are known in the next round, which so reaches further out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.deprecation import renamed_names
 from igsr.capture import Camera
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 
-#: Degrees from a known camera to an unseen one, about what they look at.
+#: Degrees from a known camera to a novel view, about what they look at.
 STEP = 12.0
-#: Nearer than this part of a step to a known camera a view is not unseen.
-SEEN = 0.6
-#: Two cameras further apart than this, degrees, have nothing between them that is known.
+#: A view nearer to a known camera than this part of a step is not novel.
+LEAST_STEP = 0.6
+#: Two cameras further apart than this, degrees, have nothing known between them.
 GAP = 60.0
-#: Ways to lean out.
-COMPASS = 8
-#: A view of which more than this share is nearer than ``CLOSE`` of the distance to what it looks at
-#: stands inside the scene, or behind something.
+#: Directions to lean out in.
+DIRECTIONS = 8
+#: A view is inside the scene, or behind something, where more than this share of its pixels is
+#: nearer than ``CLOSE`` times the distance to what it looks at.
 CLOSE_SHARE, CLOSE = 0.1, 0.35
-#: Where a render covers less than this there is nothing to look at.
+#: A pixel of less alpha than this shows no surface.
 SURFACE_ALPHA = 0.5
-#: Views are looked at in this size, pixels of the longer side, to find that out.
-GLANCE = 96
+#: Longer side, in pixels, of the small renders that tell where surfaces are.
+DEPTH_RENDER_SIDE = 96
 
 
 @dataclass(frozen=True, eq=False)
-class UnseenView:
+class NovelView:
     """A camera that no photo was taken from.
 
     Attributes:
         camera: pinhole camera with the size and focal length of the known camera that it was
-            turned away from.
+            derived from.
         angle: degrees to the nearest known camera, about what that looks at.
-        between: whether it lies between known cameras and not beyond them.
+        between: whether it lies between known cameras, not beyond them.
     """
 
     camera: Camera
@@ -53,20 +55,20 @@ class UnseenView:
     between: bool
 
 
-def unseen_views(
+def novel_views(
     splats: Splats, known: Sequence[Camera], count: int, backend: str = "auto"
-) -> list[UnseenView]:
-    """Cameras worth rendering: near known ones but not at them, spread out, never inside the scene.
+) -> list[NovelView]:
+    """Cameras near known ones but not at them, spread out, and never inside the scene.
 
     Args:
-        splats: the scene as it is known.
-        known: cameras of the photos, and of views accepted before.
-        count: how many to return at most.
+        splats: the scene so far.
+        known: cameras of the photos, and of views that earlier rounds added.
+        count: most views that are returned.
         backend: "auto", "cpu", "gpu" or "reference".
 
     Returns:
-        Those between known cameras first, each group with the ones farthest from all others first.
-        Fewer than ``count``, or none, where there is nothing unseen nearby.
+        Those between known cameras first; in each group the ones farthest from all others first.
+        Fewer than ``count``, or none, where there is no more room for them.
     """
     distances = [_viewing_distance(splats, camera, backend) for camera in known]
     looking = [
@@ -76,51 +78,73 @@ def unseen_views(
     ]
     centres = np.array([camera.centre for camera, _ in looking]).reshape(-1, 3)
     targets = np.array([_target(*one) for one in looking]).reshape(-1, 3)
-    found: list[tuple[UnseenView, float]] = []
+    found: list[tuple[NovelView, float]] = []
     for k, (camera, distance) in enumerate(looking):
         others = [one for i, (one, _) in enumerate(looking) if i != k]
         for candidate, reach, between in _neighbourhood(camera, distance, others):
             angle = float(_angles(targets, centres, candidate.centre).min())
-            if angle >= SEEN * STEP:
-                found.append((UnseenView(candidate, angle, between), reach))
-    chosen: list[UnseenView] = []
+            if angle >= LEAST_STEP * STEP:
+                found.append((NovelView(candidate, angle, between), reach))
+    chosen: list[NovelView] = []
     for between in (True, False):
         group = [pair for pair in found if pair[0].between == between]
-        new = np.array([view.camera.centre for view in chosen]).reshape(-1, 3)
-        around = np.concatenate([centres, new])
-        apart = np.array(
-            [_angles(_target(v.camera, d), v.camera.centre, around).min() for v, d in group]
-        )
-        while len(chosen) < count and len(apart) and apart.max() >= SEEN * STEP:
-            best = int(np.argmax(apart))
-            view, reach = group[best]
-            apart[best] = 0.0
-            if not _is_outside(splats, view.camera, reach, backend):
-                continue
-            chosen.append(view)
-            for i, (other, its_reach) in enumerate(group):
-                target = _target(other.camera, its_reach)
-                away = _angles(target, other.camera.centre, view.camera.centre)
-                apart[i] = min(apart[i], float(away))
+        _add_farthest(chosen, group, count, centres, splats, backend)
     return chosen
+
+
+def _add_farthest(
+    chosen: list[NovelView],
+    group: Sequence[tuple[NovelView, float]],
+    count: int,
+    centres: Float64,
+    splats: Splats,
+    backend: str,
+) -> None:
+    """Append views of a group, farthest from known cameras and chosen views first.
+
+    Args:
+        chosen: views so far, at most ``count`` in the end.
+        group: views, each with its distance to what it looks at.
+        count: most views that are chosen.
+        centres: [N, 3] centres of the known cameras, world.
+        splats: the scene, which no view may stand inside of.
+        backend: what renders.
+    """
+    new = np.array([view.camera.centre for view in chosen]).reshape(-1, 3)
+    around = np.concatenate([centres, new])
+    apart = np.array(
+        [_angles(_target(v.camera, d), v.camera.centre, around).min() for v, d in group]
+    )
+    while len(chosen) < count and len(apart) and apart.max() >= LEAST_STEP * STEP:
+        best = int(np.argmax(apart))
+        view, reach = group[best]
+        apart[best] = 0.0
+        if not _is_outside(splats, view.camera, reach, backend):
+            continue
+        chosen.append(view)
+        for i, (other, its_reach) in enumerate(group):
+            target = _target(other.camera, its_reach)
+            away = _angles(target, other.camera.centre, view.camera.centre)
+            apart[i] = min(apart[i], float(away))
 
 
 def _neighbourhood(
     camera: Camera, distance: float, others: Sequence[Camera]
 ) -> list[tuple[Camera, float, bool]]:
-    """Cameras around one, how far each is from what it looks at, and whether it is between."""
+    """Cameras around one, each one's distance to what it looks at, and whether it is between."""
     out = []
     for other in others:
         gap = _angle(camera, other, distance)
         if STEP < gap <= GAP:
             out.append((*_towards(camera, other, distance, 0.5), True))
-    for k in range(COMPASS):
-        turn = 2.0 * np.pi * k / COMPASS
+    for k in range(DIRECTIONS):
+        turn = 2.0 * np.pi * k / DIRECTIONS
         out.append((_leaning(camera, distance, np.cos(turn), np.sin(turn)), distance, False))
     return out
 
 
 def _target(camera: Camera, distance: float) -> Float64:
+    """The point [3], world, on a camera's axis at a distance."""
     return np.asarray(camera.centre + distance * camera.viewmat[2, :3])
 
 
@@ -136,7 +160,7 @@ def _leaning(camera: Camera, distance: float, right: float, down: float) -> Came
 
 
 def _towards(camera: Camera, other: Camera, distance: float, part: float) -> tuple[Camera, float]:
-    """A camera on the arc from one to another, about what the first looks at, and how far off."""
+    """A camera on the arc between two, about what the first looks at, and its distance to that."""
     target = _target(camera, distance)
     there = other.centre - target
     far = float(np.linalg.norm(there))
@@ -176,9 +200,9 @@ def _angles(target: Float64, centre: Float64, others: Float64) -> Float64:
     return np.where(lengths > 0.0, angle, 180.0)
 
 
-def _glance(camera: Camera) -> Camera:
+def _small(camera: Camera) -> Camera:
     """The same camera with a small picture."""
-    scale = min(1.0, GLANCE / max(camera.width, camera.height))
+    scale = min(1.0, DEPTH_RENDER_SIDE / max(camera.width, camera.height))
     width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
     K = camera.K.copy()
     K[0] *= width / camera.width
@@ -188,13 +212,19 @@ def _glance(camera: Camera) -> Camera:
 
 def _viewing_distance(splats: Splats, camera: Camera, backend: str) -> float | None:
     """Median depth of what a camera sees; None where it sees nothing."""
-    seen = render(splats, _glance(camera), backend=backend)
+    seen = render(splats, _small(camera), backend=backend)
     depths = seen.expected_depth[seen.alpha > SURFACE_ALPHA]
     return float(np.median(depths)) if len(depths) else None
 
 
 def _is_outside(splats: Splats, camera: Camera, distance: float, backend: str) -> bool:
-    """Whether a camera sees the scene from in front: little too near, and something at all."""
-    seen = render(splats, _glance(camera), backend=backend)
+    """Whether a camera stands in front of the scene: few pixels are close, some show a surface."""
+    seen = render(splats, _small(camera), backend=backend)
     near = (seen.alpha > SURFACE_ALPHA) & (seen.expected_depth < CLOSE * distance)
     return bool(near.mean() <= CLOSE_SHARE and (seen.alpha > SURFACE_ALPHA).any())
+
+
+if not TYPE_CHECKING:
+    __getattr__ = renamed_names(
+        __name__, UnseenView="NovelView", unseen_views="novel_views", SEEN="LEAST_STEP"
+    )

@@ -2,58 +2,121 @@
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
+from typing import Literal
 
+from igsr._internal.deprecation import renamed_attributes
 from igsr.capture import Capture
-from igsr.refinement.selection import Candidate, Passed
+from igsr.refinement.selection import Candidate, Rejected
 from igsr.splats import Splats
 
+#: What a refinement does, in the order of a round: find cameras; fit the photos; render, denoise
+#: and select novel views; cross-validate; fit the photos and novel views; score the test views.
+Stage = Literal["pose", "fit", "novel_views", "cross_validate", "refit", "test"]
+#: Stages by the names that reports of format 1 and ``RefineProgress.doing`` have for them.
+OLD_STAGES: dict[str, Stage] = {"look": "novel_views", "judge": "cross_validate"}
+#: Mean scores by name ("psnr", "ssim", "ms_ssim", "flip"); None where a score is not defined.
+Scores = dict[str, float | None]
 
+
+class StopReason(enum.Enum):
+    """Why there was no further round."""
+
+    ROUNDS_DONE = "rounds_done"
+    TOO_FEW_PHOTOS = "too_few_photos"
+    NO_NOVEL_VIEW = "no_novel_view"
+    NONE_SELECTED = "none_selected"
+    NOT_ACCEPTED = "not_accepted"
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Why a refinement ended; ``str`` of it is a message for people.
+
+    Attributes:
+        reason: what ended it.
+        count: what the reason counts. ``ROUNDS_DONE``: the rounds. ``TOO_FEW_PHOTOS``: the photos
+            that cross-validation needs. ``NONE_SELECTED``: the novel views that were rejected.
+            ``NOT_ACCEPTED``: the number of the round that was rolled back. ``NO_NOVEL_VIEW``: 0.
+    """
+
+    reason: StopReason
+    count: int = 0
+
+    def __str__(self) -> str:
+        rounds = "1 round is" if self.count == 1 else f"{self.count} rounds are"
+        views = "the only novel view" if self.count == 1 else f"all {self.count} novel views"
+        return {
+            StopReason.ROUNDS_DONE: f"{rounds} done",
+            StopReason.TOO_FEW_PHOTOS: f"cross-validation needs at least {self.count} photos",
+            StopReason.NO_NOVEL_VIEW: "there is no novel view near the photos",
+            StopReason.NONE_SELECTED: f"{views} had too little confidence or gain",
+            StopReason.NOT_ACCEPTED: f"round {self.count} did not improve cross-validation scores",
+        }[self.reason]
+
+
+def _old_stage(stage: Stage) -> str:
+    return next((old for old, new in OLD_STAGES.items() if new == stage), stage)
+
+
+@renamed_attributes(doing=("stage", _old_stage))
 @dataclass(frozen=True)
 class RefineProgress:
     """Where a refinement stands.
 
     Attributes:
         round: 0 is the fit to the photos alone.
-        doing: "pose" (find cameras), "fit", "look" (render and clean unseen views), "judge",
-            "refit" or "test".
-        done: part of all that may be to do, in [0, 1]; it ends early if a round does not help.
+        stage: what it is doing.
+        done: part of all the work that there may be, in [0, 1]. A round that is rolled back ends
+            the refinement early.
         seconds: so far.
     """
 
     round: int
-    doing: str
+    stage: Stage
     done: float
     seconds: float
 
 
+@renamed_attributes(
+    chosen="selected",
+    passed="rejected",
+    before="validation_before",
+    left_out="validation_after",
+)
 @dataclass(frozen=True, eq=False)
 class Round:
     """What one round did.
 
     Attributes:
-        chosen: the views that were added, the one worth most first. Those of earlier rounds were
-            rendered and cleaned anew, and are not in it.
-        passed: those that were looked at and not chosen.
-        before: scores ("psnr", "ssim", "flip") of photos left out, by fits without the round's
-            views.
-        left_out: the same by fits with them. Both are empty where rounds are not judged.
-        accepted: whether with them the geometric mean of root squared error, 1 - SSIM and FLIP is
-            less; if not, the round's splats are not kept. Always where rounds are not judged.
-        splats: after the round; None where it was not accepted.
-        test: mean scores of the capture's test views by those, which decide nothing; None without
-            splats or views.
+        selected: novel views that were added, the one of the largest gain first. Views of earlier
+            rounds are not among them; they were rendered and denoised again.
+        rejected: novel views that were not added.
+        validation_before: mean scores ("psnr", "ssim", "flip") of the held-out photos of all
+            folds, before the round.
+        validation_after: the same after the round. Both are empty without cross-validation.
+        accepted: whether the geometric mean of root squared error, 1 - SSIM and FLIP of the
+            held-out photos fell; if not, the round was rolled back. True without cross-validation.
+        splats: after the round; None where it was rolled back.
+        test: mean scores of the capture's test views; they decide nothing. None where the round
+            was rolled back or there are no test views.
     """
 
-    chosen: list[Candidate]
-    passed: list[Passed]
-    before: dict[str, float]
-    left_out: dict[str, float]
+    selected: list[Candidate]
+    rejected: list[Rejected]
+    validation_before: dict[str, float]
+    validation_after: dict[str, float]
     accepted: bool
     splats: Splats | None
-    test: dict[str, float | None] | None
+    test: Scores | None
 
 
+def _old_message(stop: Stop | None) -> str:
+    return "" if stop is None else str(stop)
+
+
+@renamed_attributes(stopped=("stop", _old_message), passed="rejected")
 @dataclass(frozen=True, eq=False)
 class Refined:
     """What ``refine`` returns.
@@ -61,21 +124,20 @@ class Refined:
     Attributes:
         splats: after the last round that was accepted.
         first: after the fit to the photos alone, which is round 0.
-        first_test: mean scores of the capture's test views by those, if it has any.
+        first_test: mean scores of the capture's test views by ``first``, if it has any.
         capture: photos and cameras.
-        rounds: those that were tried, in order; only the last can be one that was not accepted.
-        stopped: why there was no further round; empty while there may be one.
-        passed: views that were looked at for a round that then was not begun.
-        seconds: that each part but finding cameras took, by the names of
-            ``RefineProgress.doing``, with what earlier calls took by the report that this one
-            went on from.
+        rounds: those that were tried, in order; only the last one can have been rolled back.
+        stop: why there was no further round; None while there may be one.
+        rejected: novel views of a round that was not begun, since none of them was selected.
+        seconds: that each stage but "pose" took, by its name, with the time of earlier calls that
+            this one resumed.
     """
 
     splats: Splats
     first: Splats
-    first_test: dict[str, float | None] | None
+    first_test: Scores | None
     capture: Capture
     rounds: list[Round]
-    stopped: str
-    passed: list[Passed]
+    stop: Stop | None
+    rejected: list[Rejected]
     seconds: dict[str, float]

@@ -1,115 +1,139 @@
-"""Which rendered views to trust, and where: without the true pictures.
+"""Which novel views to add, and how much each of their pixels counts: without the true pictures.
 
 The denoiser says how wrong it expects each colour to be still. A pixel counts as much as a
-measurement of that error would beside a photo's; a view is worth what it would change where it can
-be trusted.
+measurement of that error would beside a photo's: its confidence weight. A view's gain is how much
+it would change, where its weights are high.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.deprecation import renamed_attributes, renamed_names
 from igsr.denoiser import Buffers, Denoiser, Source, denoise
 from igsr.denoiser.cleaning import HALF_CONFIDENCE_ERROR
-from igsr.refinement.novel_views import UnseenView
+from igsr.refinement.novel_views import NovelView
 
 Float32 = npt.NDArray[np.float32]
 
-#: Error of a photo's colours as splats see them: noise, and what the model cannot show. A pixel
-#: that is expected to be as wrong counts half.
+#: Error of a photo's colours as splats reproduce them: noise, and what the model cannot show. A
+#: pixel with this expected error has a confidence weight of one half.
 PHOTO_ERROR = 0.06
-#: A view whose pixels count less than this on average is not one to learn from.
-LEAST_TRUST = 0.15
-#: Nor is one that is worth less than this: an eighth of a level of 8 bits, trusted everywhere.
-LEAST_WORTH = 0.0005
+#: A view is selected only if its pixels' mean confidence weight is at least this.
+LEAST_CONFIDENCE = 0.15
+#: And if its gain is at least this: an eighth of an 8-bit level, with full confidence everywhere.
+LEAST_GAIN = 0.0005
 
 
+@renamed_attributes(
+    picture="denoised", trust="confidence", worth="gain", mean_trust="mean_confidence"
+)
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An unseen view, rendered and cleaned.
+    """A novel view, rendered and denoised, that may be added.
 
     Attributes:
-        view: where from.
-        render: uint8 [H, W, 3], before.
-        picture: uint8 [H, W, 3], after.
-        trust: float32 [H, W] in [0, 1]: how much each pixel counts beside a photo's.
-        worth: mean over the pixels of trust times what cleaning changed, in units of the colours'
-            range.
+        view: its camera.
+        render: uint8 [H, W, 3], what the splats show.
+        denoised: uint8 [H, W, 3], the same after denoising.
+        confidence: float32 [H, W] in [0, 1], each pixel's weight beside a photo's pixel, which
+            has 1.
+        gain: mean over the pixels of confidence weight times absolute change by denoising, in
+            units of the colours' range.
     """
 
-    view: UnseenView
+    view: NovelView
     render: npt.NDArray[np.uint8]
-    picture: npt.NDArray[np.uint8]
-    trust: Float32
-    worth: float
+    denoised: npt.NDArray[np.uint8]
+    confidence: Float32
+    gain: float
 
     @property
-    def mean_trust(self) -> float:
-        """Over all pixels."""
-        return float(self.trust.mean())
+    def mean_confidence(self) -> float:
+        """Mean confidence weight over all pixels."""
+        return float(self.confidence.mean())
 
 
+@renamed_attributes(worth="gain", mean_trust="mean_confidence")
 @dataclass(frozen=True, eq=False)
-class Passed:
-    """An unseen view that was not added: where from, and what ``Candidate`` says of it."""
+class Rejected:
+    """A candidate that was not selected, without its pictures."""
 
-    view: UnseenView
-    mean_trust: float
-    worth: float
+    view: NovelView
+    mean_confidence: float
+    gain: float
 
 
-def passed(one: Candidate) -> Passed:
+def rejected(candidate: Candidate) -> Rejected:
     """A candidate without its pictures."""
-    return Passed(one.view, one.mean_trust, one.worth)
+    return Rejected(candidate.view, candidate.mean_confidence, candidate.gain)
 
 
-def candidate(
-    view: UnseenView, buffers: Buffers, photos: Sequence[Source], denoiser: Denoiser | None = None
+def denoised_candidate(
+    view: NovelView, buffers: Buffers, photos: Sequence[Source], denoiser: Denoiser | None = None
 ) -> Candidate:
-    """Clean a render and say how far it can be trusted.
+    """Denoise a render, and find its confidence weights and gain.
 
-    Where photos have masks, what no photo shows is not of the scene that is asked for: a pixel
-    counts by how much of it photos show.
+    Where photos have masks, what no photo shows is no part of the scene that is wanted: a pixel's
+    weight is scaled by how much of what it shows photos see inside their masks.
 
     Args:
         view: where it was rendered from.
-        buffers: of ``render_buffers``.
-        photos: of ``photo_sources``.
-        denoiser: what cleans; None is the one that comes with igsr.
+        buffers: of ``igsr.denoiser.render_buffers``.
+        photos: of ``igsr.denoiser.photo_sources``.
+        denoiser: None is the one that comes with igsr.
 
     Raises:
         IgsrError: as ``igsr.denoise``.
     """
-    cleaned, confidence = denoise(buffers, photos, denoiser)
-    trust = trust_of(confidence)
+    denoised, certainty = denoise(buffers, photos, denoiser)
+    confidence = confidence_weights(certainty)
     if buffers.support is not None and not all(photo.usable.all() for photo in photos):
-        trust *= np.clip(buffers.support, 0.0, 1.0)
-    seen = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
-    change = np.abs(cleaned - seen).mean(axis=-1)
-    worth = float((trust * change).mean())
-    return Candidate(view, _bytes(seen), _bytes(cleaned), trust, worth)
+        confidence *= np.clip(buffers.support, 0.0, 1.0)
+    render = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
+    change = np.abs(denoised - render).mean(axis=-1)
+    gain = float((confidence * change).mean())
+    return Candidate(view, _to_uint8(render), _to_uint8(denoised), confidence, gain)
 
 
-def trust_of(confidence: Float32) -> Float32:
-    """Weights [H, W] of pixels beside a photo's, from the denoiser's confidence.
+def confidence_weights(certainty: Float32) -> Float32:
+    """Weights [H, W] of pixels beside a photo's, from the confidence map that a denoiser returns.
 
-    Least squares weights measurements by the inverse of their variance: with the expected error e
-    and a photo's own, s, that is s^2 / (s^2 + e^2).
+    Least squares weights measurements by their inverse variance. With the expected error e and the
+    photos' own error s, that is s^2 / (s^2 + e^2).
     """
-    sure = np.clip(confidence, 1e-6, 1.0)
-    error = HALF_CONFIDENCE_ERROR * (1.0 / sure - 1.0)
+    certain = np.clip(certainty, 1e-6, 1.0)
+    error = HALF_CONFIDENCE_ERROR * (1.0 / certain - 1.0)
     return (PHOTO_ERROR**2 / (PHOTO_ERROR**2 + error**2)).astype(np.float32)
 
 
-def select(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
-    """The ``count`` views that are worth most, of those that can be trusted; the best first."""
-    some = [one for one in candidates if one.mean_trust >= LEAST_TRUST and one.worth >= LEAST_WORTH]
-    return sorted(some, key=lambda one: one.worth, reverse=True)[:count]
+def select_views(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
+    """At most ``count`` candidates of enough confidence and gain; the largest gain first."""
+    usable = [
+        candidate
+        for candidate in candidates
+        if candidate.mean_confidence >= LEAST_CONFIDENCE and candidate.gain >= LEAST_GAIN
+    ]
+    return sorted(usable, key=lambda candidate: candidate.gain, reverse=True)[:count]
 
 
-def _bytes(colors: Float32) -> npt.NDArray[np.uint8]:
+def _to_uint8(colors: Float32) -> npt.NDArray[np.uint8]:
     return np.rint(255.0 * colors).astype(np.uint8)
+
+
+if not TYPE_CHECKING:
+    __getattr__ = renamed_names(
+        __name__,
+        LEAST_TRUST="LEAST_CONFIDENCE",
+        LEAST_WORTH="LEAST_GAIN",
+        Passed="Rejected",
+        passed="rejected",
+        candidate="denoised_candidate",
+        trust_of="confidence_weights",
+        select="select_views",
+    )

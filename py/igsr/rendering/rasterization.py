@@ -1,14 +1,14 @@
 """``rasterization``: the renderer as a differentiable torch function, called like gsplat's.
 
-Argument names, order, defaults, shapes and the returned triple follow gsplat 1.5, so that a gsplat
-user switches by changing an import and gsplat's strategies run on it. What this renderer does not
-do raises ValueError by the argument's name.
+Argument names, defaults, shapes and the returned triple follow gsplat 1.5 and its development
+branch of 2026. A gsplat user switches by changing an import, and gsplat's strategies run on it.
+Arguments that this renderer does not support are refused by name.
 
 Two autograd functions do the work, one per half of the pipeline: ``_Project`` and ``_Rasterize``.
-Between them lie ``means2d`` (so that ``meta["means2d"].grad`` exists, which density control reads)
-and ``factors``, the upper-triangular factor of each conic: the same information as a covariance
-without its cancellation for long needles. Everything that gsplat offers around them (further
-channels, normals, backgrounds and masks per pixel) is composed of the two in torch.
+Between them are ``means2d`` (density control reads ``meta["means2d"].grad``) and ``factors``, the
+upper-triangular factor of each conic. It has the information of a covariance, without its
+cancellation for long needles. Everything that gsplat offers around them (further channels, normals,
+backgrounds and masks per pixel) is composed of the two in torch.
 """
 
 from __future__ import annotations
@@ -25,10 +25,12 @@ import torch
 from torch import Tensor
 
 from igsr import _core
+from igsr._internal.choices import Backend
 from igsr.rendering.normals import facing_normals
 from igsr.rendering.rasterization_arguments import FLOAT32_MAX, check_arguments
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RasterizeMode = Literal["classic", "antialiased"]
 
 #: Colour channels that one pass of the kernels draws.
 GROUP = 3
@@ -43,7 +45,7 @@ IMAGE = ("color", "alpha", "depth", "transmittance")
 
 @dataclass(frozen=True)
 class _Settings:
-    """What both halves need and autograd does not track."""
+    """Arguments that both halves need and autograd does not track."""
 
     width: int
     height: int
@@ -56,15 +58,16 @@ class _Settings:
 
 
 def _array(tensor: Tensor, dtype: Any) -> npt.NDArray[Any]:
-    """To the host; for a contiguous tensor of that dtype on the CPU the same memory."""
+    """A tensor as an array in host memory: its own memory if it is contiguous, there, and of that
+    dtype."""
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=dtype)
 
 
 def _tensor(array: npt.NDArray[Any], like: Tensor) -> Tensor:
-    """Back to the device and dtype of ``like``; the same memory where nothing changes.
+    """An array as a tensor with the device and dtype of ``like``; its own memory if it can be.
 
-    What float64 holds and float32 cannot, as the gradient of a splat of 1e38 units, stays finite
-    there, and so do sums of that over a thousand cameras.
+    A number too large for float32, such as the gradient of a splat of 1e38 units, becomes one whose
+    sum over a thousand cameras is still finite.
     """
     if array.dtype == np.float64 and like.dtype == torch.float32:
         limit = float(np.finfo(np.float32).max) / 1024.0
@@ -118,8 +121,8 @@ class _Project(torch.autograd.Function):
         options = _project_options(viewmat, K, settings)
         projected = _core.project(**inputs, **options)
         outputs = tuple(_tensor(projected[name], means) for name in PROJECTED)
-        # The arrays share memory with these tensors: only what autograd saves is refused in
-        # backward() when the caller has changed it in place since.
+        # The arrays share memory with these tensors. autograd notices changes in place only of
+        # tensors that are saved here; backward() then refuses.
         ctx.save_for_backward(means, quats, scales, opacities, colors, viewmat, K, *outputs)
         ctx.inputs, ctx.options, ctx.projected = inputs, options, projected
         ctx.mark_non_differentiable(*outputs[len(DIFFERENTIABLE) :])
@@ -160,7 +163,7 @@ class _Rasterize(torch.autograd.Function):
         *projected: Tensor,
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
-        # What of the picture the loss does not use comes as None instead of as zeros.
+        # Gradients of outputs that the loss does not use come as None, not as zeros.
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(background, *projected)
         ctx.projected = _projected_arrays(projected, dtype)
@@ -218,21 +221,22 @@ def rasterization(
     Ks: Tensor,
     width: int,
     height: int,
+    *,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = _core.TILE_SIZE,
+    tile_size: int | None = _core.TILE_SIZE,
     backgrounds: Tensor | None = None,
     render_mode: RenderMode = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
-    rasterize_mode: str = "classic",
+    rasterize_mode: RasterizeMode = "classic",
     channel_chunk: int = 32,
     distributed: bool = False,
-    camera_model: str = "pinhole",
+    camera_model: Literal["pinhole"] = "pinhole",
     segmented: bool = False,
     covars: Tensor | None = None,
     with_ut: bool = False,
@@ -243,24 +247,38 @@ def rasterization(
     ftheta_coeffs: Any = None,
     rolling_shutter: Any = None,
     viewmats_rs: Tensor | None = None,
-    backend: str = "auto",
+    macro_tile: bool = False,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
+    lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None,
+    ut_params: Any = None,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None,
+    nht_params: Any = None,
+    backend: Backend = "auto",
     masks: Tensor | None = None,
     render_normals: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render N Gaussians into C cameras, differentiably.
+    """Render N Gaussians from C cameras, differentiably.
+
+    ``rasterization(**splats.to_torch(), viewmats=..., Ks=..., width=..., height=...)`` renders
+    ``Splats``. Arguments behind ``height`` are keyword-only.
 
     Gradients reach ``means``, ``quats``, ``scales``, ``opacities``, ``colors``, ``viewmats``,
     ``Ks`` (fx, fy, cx, cy) and ``backgrounds``. Splat tensors are float32; with backend
     "reference" they may all be float64, and then everything is computed and returned in it.
     Cameras are float32 or float64.
 
-    Tensors may lie on any torch device (all on one); the result lies there too. The kernels take
-    arrays in host memory (from which backend "gpu" feeds its own device). Tensors on the CPU that
-    are contiguous are used where they lie; of others, this is copied each call, for every camera,
-    in bytes in float32 with P = ceil(D / 3) passes, or one with "D" and "ED", and one more for
-    ``render_normals`` behind colours:
+    Tensors may be on any torch device (all on one); the result is on it too. The kernels take
+    arrays in host memory (from which backend "gpu" feeds its own device). Contiguous tensors on the
+    CPU are used in place. Others are copied in each call, for every camera: this many bytes in
+    float32, with P = ceil(D / 3) passes (one for "D" and "ED"; one more for ``render_normals``
+    with colours):
 
-        forward     to the host    44 + 12 K per splat (K = 1 for direct colours), and then
+        forward     to the host    44 + 12 K per splat (K = 1 for direct colors), and then
                                    48 P per splat (per drawn splat if ``packed``)
                     to the device  48 per splat, and then 24 P per pixel
         backward    to the host    at most 20 P per pixel (color 12, alpha 4, depth 4; what the
@@ -271,44 +289,48 @@ def rasterization(
     Args:
         means: [N, 3] centres, world frame.
         quats: [N, 4] rotations w x y z, normalised inside.
-        scales: [N, 3] standard deviations (not logarithms; a splat with a negative one is not
-            drawn).
+        scales: [N, 3] standard deviations in world units (not logarithms; a splat with a negative
+            one is not drawn).
         opacities: [N] in [0, 1] (not logits).
-        colors: [N, D] or [C, N, D] colours or other features, any D >= 1; with ``sh_degree``,
+        colors: [N, D] or [C, N, D] colors or other features, any D >= 1; with ``sh_degree``,
             [N, K, 3] or [C, N, K, 3] spherical-harmonics coefficients with
-            K >= (sh_degree + 1)^2, and D = 3. Channels are drawn three at a time, each three at
-            the cost of a whole pass over the 2D splats.
+            K >= (sh_degree + 1)^2, and D = 3. Channels are drawn three at a time; every three
+            cost a whole pass over the 2D splats.
         viewmats: [C, 4, 4] rigid world-to-camera matrices, OpenCV axes.
         Ks: [C, 3, 3] pinhole matrices in pixels without skew; pixel centres at +0.5.
         width, height: picture size in pixels.
-        near_plane, far_plane: splats whose centre's camera-space z is outside are not drawn;
-            far_plane may be inf.
+        near_plane, far_plane: world units; splats whose centre has a camera-space z outside are
+            not drawn. far_plane may be inf.
         radius_clip: splats whose ``radii`` are both at most this many pixels are not drawn.
         eps2d: variance in square pixels added to every projected Gaussian.
-        sh_degree: degree to evaluate, 0-4, or None for direct colours.
+        sh_degree: spherical-harmonics degree to evaluate, 0-4, or None for direct colors.
         packed: True (gsplat's default) returns per-splat ``meta`` entries only for the nnz
             visible (camera, splat) pairs, [nnz, ...] with ``camera_ids`` and ``gaussian_ids``;
             False returns them [C, N, ...], zero ``radii`` meaning not visible. The picture does
             not depend on it; pass the strategy's ``packed`` the same value, as with gsplat.
-        backgrounds: [C, D] colour behind the splats, or [C, height, width, D] one per pixel; None
-            is black. There is none behind depth and normals.
+        backgrounds: [C, D] color behind the splats, or [C, height, width, D], one per pixel; None
+            is black. Depth and normals have no background.
         render_mode: "RGB"; "D" accumulated depth; "ED" expected depth (accumulated / alpha, 0
             where alpha is 0); "RGB+D", "RGB+ED" with the depth as last channel.
         absgrad: True leaves in ``meta["means2d"].absgrad``, after ``backward()``, the sum over
             pixels of the absolute gradients of ``means2d``, shaped like it, for
-            ``DefaultStrategy(absgrad=True)``. They are absolute values of what one pass knows,
-            so with at most three channels and without ``render_normals``.
+            ``DefaultStrategy(absgrad=True)``. They are known within one pass only: it needs at
+            most three channels, and no ``render_normals``.
         rasterize_mode: "classic", or "antialiased": opacities times
             sqrt(det(S) / det(S + eps2d I)) with S the projected 2D covariance (Mip-Splatting's 2D
             filter); ``meta["opacities"]`` are those.
-        channel_chunk: accepted as gsplat has it; nothing depends on it.
+        channel_chunk: accepted as in gsplat 1.5; it has no effect.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu", "reference".
         masks: [C, height, width] bool; where False the pixel shows the background, its alpha,
-            depth and normal are 0, and it passes no gradient to the splats and the camera. What
-            gsplat's ``rasterize_to_pixels`` means by tile masks, per pixel; it saves no time.
+            depth and normal are 0, and it passes no gradient to the splats and the camera. These
+            are the tile masks of gsplat's ``rasterize_to_pixels``, per pixel; they save no time.
         render_normals: True adds ``meta["render_normals"]``.
-
-        All other arguments are gsplat's and accepted at their defaults only.
+        tile_size, sparse_grad, distributed, camera_model, segmented, covars, with_ut, with_eval3d,
+            radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter,
+            viewmats_rs: gsplat 1.5's, accepted at their defaults only.
+        macro_tile, return_normals, global_z_order, rays, lidar_coeffs, external_distortion_coeffs,
+            ut_params, extra_signals, extra_signals_sh_degree, renderer_config, nht_params: of
+            gsplat's development branch, accepted at their defaults only.
 
     Returns:
         ``render_colors`` [C, height, width, X] with X = D, 1 or D + 1 by ``render_mode``,
@@ -317,14 +339,13 @@ def rasterization(
         ``depths``, ``conics`` (xx, xy, yy), ``opacities``, ``batch_ids``, ``camera_ids``,
         ``gaussian_ids``, ``width``, ``height``, ``tile_size``, ``tile_width``, ``tile_height``,
         ``n_batches``, ``n_cameras`` (gsplat's lists of tiles, ``isect_ids`` and the like, are
-        not there); and ``render_normals`` [C, height, width, 3] if asked for:
-        each splat's shortest axis, turned to face the camera, in the world frame, accumulated
-        with the weights of the colours (so of length alpha at most), as gsplat's
-        ``rasterization_2dgs`` returns it.
+        not there); and ``render_normals`` [C, height, width, 3] if asked for: the shortest axis
+        of each splat, turned to face the camera, in the world frame, accumulated with the weights
+        of the colors (so at most alpha long), as gsplat's ``rasterization_2dgs`` returns it.
 
     Raises:
         ValueError: an argument has the wrong type, dtype, shape, device or value, or is one of
-            gsplat's that is not supported; the message begins with its name.
+            gsplat's that is not supported. The message begins with the argument's name.
         RuntimeError: backend "gpu" was asked for and no adapter answers; or, in ``backward()``,
             a tensor that it needs was changed in place since.
     """
@@ -357,7 +378,7 @@ def rasterization(
         view = dict(zip(PROJECTED, outputs, strict=True))
         if radius_clip > 0.0:
             radii = view["radii"]
-            # Of the whole numbers that ``meta`` has, as gsplat compares them.
+            # gsplat compares the whole numbers that ``meta`` has.
             view["radii"] = radii * (torch.ceil(radii) > radius_clip).any(dim=-1, keepdim=True)
         if further is not None:
             view["further"] = further[c] if per_camera_colors else further
@@ -370,7 +391,7 @@ def rasterization(
             view = {name: per_splat.index_select(0, ids[-1]) for name, per_splat in view.items()}
         views.append(view)
 
-    # One tensor for all cameras lies in the graph: the strategies read its gradient.
+    # The graph has one tensor for all cameras: the strategies read its gradient.
     joined = {name: _joined([view[name] for view in views], packed) for name in PROJECTED}
     means2d = joined["means2d"]
     counts = [len(view["means2d"]) for view in views]
@@ -395,7 +416,7 @@ def rasterization(
         "batch_ids": None,
         "camera_ids": None,
         "gaussian_ids": None,
-        # Nothing that exceeds int32 is a useful radius, and the cast of inf is undefined.
+        # The cast of inf to int32 is undefined, and no useful radius is that large.
         "radii": torch.ceil(joined["radii"]).clamp(max=2.0**30).to(torch.int32),
         "means2d": means2d,
         "depths": joined["depths"],
@@ -403,7 +424,7 @@ def rasterization(
         "opacities": joined["opacities"],
         "width": width,
         "height": height,
-        "tile_size": tile_size,
+        "tile_size": _core.TILE_SIZE,
         "tile_width": math.ceil(width / _core.TILE_SIZE),
         "tile_height": math.ceil(height / _core.TILE_SIZE),
         "n_batches": 1,
@@ -420,16 +441,16 @@ def rasterization(
 
 
 def _joined(tensors: list[Tensor], packed: bool) -> Tensor:
-    """Of all cameras: one behind the other if packed, else along a new first dimension."""
+    """Tensors of all cameras: concatenated if packed, else stacked along a new dimension."""
     if len(tensors) == 1:  # nothing to copy
         return tensors[0] if packed else tensors[0][None]
     return torch.cat(tensors) if packed else torch.stack(tensors)
 
 
 def _absgrad_keeper(means2d: Tensor, of_camera: int | slice) -> Callable[[Tensor], None]:
-    """What a backward pass calls to leave a camera's part in ``means2d.absgrad``, as gsplat does.
+    """A function for the backward pass that writes a camera's part of ``means2d.absgrad``.
 
-    ``means2d`` lies before the pass in the graph, so holding it there makes no cycle.
+    ``means2d`` comes before the pass in the graph, so a reference to it makes no cycle.
     """
 
     def keep(absolute: Tensor) -> None:
@@ -441,10 +462,10 @@ def _absgrad_keeper(means2d: Tensor, of_camera: int | slice) -> Callable[[Tensor
 
 
 def _grouped(colors: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Colours [..., D] as the first three channels and the others, zeros after the last.
+    """Colors [..., D] as the first three channels and the others, padded with zeros.
 
-    The first three go through the projection, which does not draw a splat that is not finite. For
-    the others to have the same effect, NaN there is carried over.
+    The first three go through the projection, which does not draw a splat that is not finite. NaN
+    in the others is carried over to them, to have the same effect.
     """
     channels = colors.shape[-1]
     if channels <= GROUP:
@@ -466,7 +487,7 @@ def _draw(
     """One camera's picture [H, W, X], alpha [H, W, 1] and normals [H, W, 3], if asked for.
 
     ``background`` is [D] or [H, W, D], ``mask`` [H, W]. Every group of three channels is a pass of
-    its own over the same 2D splats; autograd adds up what the passes say about them.
+    its own over the same 2D splats; autograd adds up their gradients.
     """
     in_color = render_mode in COLOR_MODES
     groups = [view["colors"]]
@@ -488,23 +509,23 @@ def _draw(
         )
         for group, group_behind in zip(groups, behind.split(GROUP), strict=True)
     ]
-    # The same in every pass, so the gradient of one pass is the whole one.
+    # These are the same in every pass, so the gradient through one pass is complete.
     _, alpha, depth, transmittance = (image[..., None] for image in passes[0])
 
     pieces = [color for color, *_ in passes[:color_groups]]
     if in_color and channels % GROUP:
         pieces[-1] = pieces[-1][..., : channels % GROUP]
     if render_mode.endswith("ED"):
-        # 0 where nothing is drawn; where something is, alpha is at least 1/255.
+        # The depth is 0 where nothing is drawn; elsewhere alpha is at least 1/255.
         depth = depth / alpha.clamp(min=1e-3)
     if render_mode != "RGB":
         pieces.append(depth)
-    # Always a copy, which the caller may change: the backward pass needs the pieces.
+    # A copy, which the caller may change: the backward pass needs the pieces.
     picture = torch.cat(pieces, dim=-1) if len(pieces) > 1 else pieces[0].clone()
     normals = passes[-1][0] if "normals" in view else None
 
     if background is not None and in_color:
-        # Behind the depth there is nothing.
+        # The depth has no background.
         background = torch.nn.functional.pad(background, (0, picture.shape[-1] - channels))
         if background.dim() == 3:
             picture = picture + transmittance * background

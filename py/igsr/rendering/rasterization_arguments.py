@@ -1,4 +1,4 @@
-"""What ``rasterization`` refuses before any work: each message begins with the argument's name."""
+"""Checks of ``rasterization``'s arguments: each message begins with the argument's name."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from igsr.splats import MAX_SH_DEGREE
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 
-#: What the renderer can hold.
+#: The largest number the renderer can hold.
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 
-#: gsplat arguments that exist to be refused by name, with the only value accepted.
+#: Arguments of gsplat that are not supported, with their default: the only value accepted.
 _UNSUPPORTED_DEFAULTS: dict[str, Any] = {
     "tile_size": _core.TILE_SIZE,
     "sparse_grad": False,
@@ -36,11 +36,36 @@ _UNSUPPORTED_DEFAULTS: dict[str, Any] = {
     "ftheta_coeffs": None,
     "rolling_shutter": None,
     "viewmats_rs": None,
+    "macro_tile": False,
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "ut_params": None,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
+    "nht_params": None,
+}
+#: What to do instead.
+_INSTEAD = {
+    "covars": "give quats and scales",
+    "camera_model": "undistort the photos first, as igsr.load_capture does",
+    "radial_coeffs": "undistort the photos first, as igsr.load_capture does",
+    "tangential_coeffs": "undistort the photos first, as igsr.load_capture does",
+    "thin_prism_coeffs": "undistort the photos first, as igsr.load_capture does",
+    "return_normals": "render_normals=True adds normals to meta",
+    "extra_signals": "append the signals to colors as further channels",
 }
 
 
 def check_arguments(arguments: dict[str, Any]) -> None:
-    """``arguments`` of ``rasterization`` by name, all of them."""
+    """Check all arguments of ``rasterization``, by name.
+
+    Raises:
+        ValueError: an argument cannot be used; the message begins with its name.
+    """
     _check_unsupported(arguments)
     _check_settings(arguments)
     _check_splats(arguments)
@@ -53,15 +78,18 @@ def check_arguments(arguments: dict[str, Any]) -> None:
 def _check_unsupported(arguments: dict[str, Any]) -> None:
     for name, default in _UNSUPPORTED_DEFAULTS.items():
         value = arguments[name]
+        if name == "tile_size" and value is None:
+            continue  # the default of gsplat's development branch
         if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
-            continue  # gsplat's own default, an enum that is not ours to import
+            continue  # gsplat's default is its own enum, which is not imported here
         if value is default:
             continue
         # Arrays do not compare to one truth value, and would fill the screen.
         plain = isinstance(value, (str, bool, numbers.Number))
         if not plain or value != default:
             shown = repr(value) if plain else f"a {type(value).__name__}"
-            raise ValueError(f"{name}: only {default!r} is supported, not {shown}")
+            instead = f"; {_INSTEAD[name]}" if name in _INSTEAD else ""
+            raise ValueError(f"{name}: only {default!r} is supported, not {shown}{instead}")
 
 
 def _check_settings(arguments: dict[str, Any]) -> None:

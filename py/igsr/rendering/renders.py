@@ -1,31 +1,39 @@
-"""Render splats from one camera."""
+"""Render splats from one camera, with numpy arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
+from igsr._internal.array_equality import ArrayEquality
+from igsr._internal.choices import Backend
+from igsr._internal.notebook import NotebookPicture
 from igsr.capture import Camera
 from igsr.errors import IgsrError
 from igsr.splats import FloatArray, Splats
 
 
-@dataclass(frozen=True)
-class Render:
-    """What one camera sees. All float32.
+@dataclass(frozen=True, eq=False, repr=False)
+class Render(ArrayEquality, NotebookPicture):
+    """What one camera sees. All arrays are float32.
+
+    Two renders are equal (``==``) if all their arrays are. A notebook shows the picture.
 
     Attributes:
-        color: [H, W, 3], not clamped: SH may exceed 1.
+        color: [H, W, 3], RGB over the background. Not clamped: SH may exceed 1.
         alpha: [H, W], accumulated opacity in [0, 1].
-        depth: [H, W], accumulated camera-space z, sum of weight * z.
-        expected_depth: [H, W], depth / alpha, 0 where alpha is 0.
-        transmittance: [H, W], the share of background that shows, stored rather than 1 - alpha.
+        depth: [H, W], accumulated camera-space z, the sum of weight * z, in world units.
+        expected_depth: [H, W], depth / alpha, 0 where alpha is 0, in world units.
+        transmittance: [H, W], the share of the background that shows. It is what the renderer
+            multiplied up, which is more precise than 1 - alpha.
     """
+
+    pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:render_pictures"
 
     color: FloatArray
     alpha: FloatArray
@@ -33,8 +41,12 @@ class Render:
     expected_depth: FloatArray
     transmittance: FloatArray
 
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        return f"Render({width}x{height})"
+
     def to_uint8(self) -> npt.NDArray[np.uint8]:
-        """The picture a user sees, uint8 [H, W, 3]: clamped to [0, 1] and rounded."""
+        """The picture in 8 bits, uint8 [H, W, 3]: ``color`` clamped to [0, 1] and rounded."""
         finite = np.nan_to_num(self.color, nan=0.0, posinf=1.0, neginf=0.0)
         return (np.clip(finite, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
@@ -43,18 +55,24 @@ def render(
     splats: Splats,
     camera: Camera,
     background: Sequence[float] = (0.0, 0.0, 0.0),
-    backend: str = "auto",
+    backend: Backend = "auto",
 ) -> Render:
-    """Render ``splats`` as ``camera`` sees them.
+    """Render ``splats`` from one camera.
+
+    The result is deterministic: the same on every run and with any number of threads.
 
     Args:
         splats: the scene.
         camera: pinhole camera, OpenCV axes, pixel centres at +0.5, world frame of the capture.
         background: RGB in [0, 1] behind the splats.
-        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu" or "reference".
+        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu", or "reference"
+            (computes in float64).
+
+    Returns:
+        Color, alpha, depth and transmittance of each pixel.
 
     Raises:
-        IgsrError: an argument is unusable; the message names it.
+        IgsrError: an argument cannot be used; the message names it.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     try:
@@ -76,12 +94,15 @@ def render(
 
 
 def project(splats: Splats, camera: Camera, backend: str) -> dict[str, npt.NDArray[Any]]:
-    """The splats as 2D Gaussians in one camera's picture: what ``_core.rasterize`` draws.
+    """Project splats to 2D Gaussians in the picture of one camera.
 
     Args:
         splats: the scene.
         camera: pinhole camera, OpenCV axes, world frame of the capture.
         backend: "cpu", "gpu" or "reference".
+
+    Returns:
+        What ``_core.project`` returns and ``_core.rasterize`` takes.
 
     Raises:
         ValueError: the parameters cannot be drawn; the message names the argument.
@@ -123,7 +144,15 @@ def _render_arrays(
 def viewmat_about(
     origin: npt.NDArray[np.float64], viewmat: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """World-to-camera [4, 4] for points given relative to ``origin``, composed in float64."""
+    """The world-to-camera matrix for points that are relative to ``origin``.
+
+    Args:
+        origin: float64 [3], world frame.
+        viewmat: [4, 4], world to camera.
+
+    Returns:
+        float64 [4, 4], composed in float64.
+    """
     composed = np.array(viewmat, dtype=np.float64)
     composed[:3, 3] += composed[:3, :3] @ origin
     return composed

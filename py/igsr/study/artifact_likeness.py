@@ -7,8 +7,8 @@ part of the error's power in each octave of spatial frequency, and how much of i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,27 @@ OCTAVES = 0.5 / 2.0 ** np.arange(6)[::-1]
 #: The part of the pixels, those with the largest errors, whose share of the power is taken.
 WORST = 0.1
 NAMES = (*(f"power up to {edge:.3g} cycles per pixel" for edge in OCTAVES), "power in worst tenth")
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How far real renders' errors are from synthetic ones', beside what that can be.
+
+    Attributes:
+        distance: octaves between the two sets; None where one has no render, here and below.
+        within: octaves between two halves of the synthetic files: what chance makes of it.
+        noise: octaves between the real set and white noise: what a recipe unlike it would have.
+        real: median signature of the real set, by ``NAMES``; empty without renders.
+        synthetic: median signature of the synthetic set.
+        renders: how many each set has, by "real" and "synthetic".
+    """
+
+    distance: float | None
+    within: float | None
+    noise: float | None
+    real: dict[str, float]
+    synthetic: dict[str, float]
+    renders: dict[str, int]
 
 
 def signatures(pairs: Sequence[Pairs]) -> Float64:
@@ -62,15 +83,8 @@ def distance(first: Float64, second: Float64) -> float:
     return float(np.mean(np.abs(medians[0] - medians[1])))
 
 
-def likeness(real: Sequence[Pairs], synthetic: Sequence[Pairs], seed: int = 0) -> dict[str, Any]:
-    """How far real renders' errors are from synthetic ones', beside what that can be.
-
-    Returns:
-        "distance" between the two sets; "within" between two halves of the synthetic files, which
-        is what chance makes of it; "noise" between the real set and white noise, which is what a
-        poor recipe would have; "real" and "synthetic", the medians by name; "renders" of each. None
-        for a distance where a set has no render.
-    """
+def likeness(real: Sequence[Pairs], synthetic: Sequence[Pairs], seed: int = 0) -> Likeness:
+    """How far real renders' errors are from synthetic ones'; ``seed`` draws the white noise."""
     sets = {"real": signatures(real), "synthetic": signatures(synthetic)}
     halves = [signatures(synthetic[start::2]) for start in (0, 1)]
     random = np.random.default_rng(seed)
@@ -79,24 +93,30 @@ def likeness(real: Sequence[Pairs], synthetic: Sequence[Pairs], seed: int = 0) -
     def between(first: Float64, second: Float64) -> float | None:
         return distance(first, second) if len(first) and len(second) else None
 
-    return {
-        "distance": between(sets["real"], sets["synthetic"]),
-        "within": between(*halves),
-        "noise": between(sets["real"], noise),
-        **{
-            name: dict(zip(NAMES, np.median(rows, axis=0).tolist(), strict=True))
-            if len(rows)
-            else {}
-            for name, rows in sets.items()
-        },
-        "renders": {name: len(rows) for name, rows in sets.items()},
-    }
+    return Likeness(
+        distance=between(sets["real"], sets["synthetic"]),
+        within=between(*halves),
+        noise=between(sets["real"], noise),
+        real=_medians(sets["real"]),
+        synthetic=_medians(sets["synthetic"]),
+        renders={name: len(rows) for name, rows in sets.items()},
+    )
+
+
+def _medians(rows: Float64) -> dict[str, float]:
+    if not len(rows):
+        return {}
+    return dict(zip(NAMES, np.median(rows, axis=0).tolist(), strict=True))
 
 
 def plot_likeness(
-    path: Path, found: dict[str, Any], real: Sequence[Pairs], synthetic: Sequence[Pairs]
+    path: Path, found: Likeness, real: Sequence[Pairs], synthetic: Sequence[Pairs]
 ) -> None:
-    """A real artifact beside a synthetic one, render and error, and both sets' spectra."""
+    """Plot a real artifact beside a synthetic one, render and error, and both sets' spectra.
+
+    Raises:
+        IgsrError: the file cannot be written.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
@@ -104,7 +124,10 @@ def plot_likeness(
         [["real", "real error", "spectra"], ["synthetic", "synthetic error", "spectra"]],
         width_ratios=[1, 1, 1.6],
     )
-    for name, pairs in (("real", real), ("synthetic", synthetic)):
+    for name, pairs, medians in (
+        ("real", real, found.real),
+        ("synthetic", synthetic, found.synthetic),
+    ):
         if pairs:
             one = pairs[0]
             seen, truth = (np.moveaxis(x[0], 0, -1) for x in (one.inputs[:, :COLOR], one.truth))
@@ -114,7 +137,7 @@ def plot_likeness(
         for shown in (name, f"{name} error"):
             axes[shown].set_title(shown, fontsize=9)
             axes[shown].set_axis_off()
-        shares = list(found[name].values())[: len(OCTAVES)]
+        shares = list(medians.values())[: len(OCTAVES)]
         if shares:
             axes["spectra"].loglog(OCTAVES, shares, "o-", label=name)
     axes["spectra"].set_xticks(OCTAVES, [f"{edge:.3g}" for edge in OCTAVES])
@@ -123,7 +146,7 @@ def plot_likeness(
     axes["spectra"].set_ylabel("share of the error's power")
     axes["spectra"].grid(alpha=0.3, which="both")
     axes["spectra"].legend()
-    if found["distance"] is not None:
-        axes["spectra"].set_title(f"{found['distance']:.2f} octaves apart", fontsize=9)
+    if found.distance is not None:
+        axes["spectra"].set_title(f"{found.distance:.2f} octaves apart", fontsize=9)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from igsr import _core
-from igsr._internal.atomic_write import atomic_write
 from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.capture import Camera, load_capture
 from igsr.capture.load import holds_cameras
@@ -19,6 +17,8 @@ from igsr.capture.photo_folder import Photo, load_photos
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.registry import ESTIMATORS
+from igsr.study.markdown_table import cell, markdown_table
+from igsr.study.study_files import headed, text_of, write_study_files
 
 SCENES = (
     "strecha_fountain",
@@ -141,31 +141,24 @@ def poses(
         "protocol": {"name": "poses", "estimator": estimator, "seeds": seeds},
         "runs": rows,
     }
-    with atomic_write(Path(out) / "study.json") as temporary:
-        temporary.write_text(json.dumps(report, indent=2, allow_nan=False), encoding="utf-8")
-    with atomic_write(Path(out) / "study.md") as temporary:
-        temporary.write_text(markdown(report), encoding="utf-8")
+    write_study_files(Path(out), report, markdown(report))
     return report
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """The table of the study."""
-    lines = [
-        f"# {report['title']}",
-        "",
-        f"igsr {report['igsr']}; {json.dumps(report['protocol'])}",
-        "",
-        "RRA, RTA and mAA are parts of all pairs of photos, those not placed included; rotation is "
-        "in degrees, ATE in units of the true world and relative to the cameras' spread, focal the "
-        "relative error.",
-        "",
-        f"| scene | seed | {' | '.join(name.replace('_', ' ') for name in COLUMNS)} |",
-        f"| --- | ---: | {' | '.join(['---:'] * len(COLUMNS))} |",
+    """``study.md``: one line per scene and seed."""
+    rows = [
+        [row["scene"], row["seed"], *(cell(row.get(name), form) for name, form in COLUMNS.items())]
+        for row in report["runs"]
     ]
-    for row in report["runs"]:
-        cells = [
-            "-" if row.get(name) is None else format(row[name], form)
-            for name, form in COLUMNS.items()
+    heads = ["scene", "seed", *(name.replace("_", " ") for name in COLUMNS)]
+    return text_of(
+        [
+            *headed(report),
+            "RRA, RTA and mAA are parts of all pairs of photos, those not registered included; "
+            "rotation is in degrees, ATE in units of the true world and relative to the cameras' "
+            "spread, focal the relative error.",
+            "",
+            *markdown_table(heads, rows, left=1),
         ]
-        lines.append(f"| {row['scene']} | {row['seed']} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    )

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+from igsr import _core
+from igsr._internal.atomic_write import atomic_write
+from igsr._internal.resumable_jobs import Run, finished_runs
+from igsr.capture import load_capture
+from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance
+from igsr.denoiser.weights import load_network
 from igsr.errors import IgsrError
-from igsr.refinement.loop import CHOSEN
-from igsr.study.loop_runs import OURS, Rounds, studied
+from igsr.fitting.presets import preset_settings
+from igsr.refinement.stages import SELECTED
+from igsr.study.loop_methods import METHODS, OURS, PAPER, Method
+from igsr.study.loop_runs import FAR, NEAR, RunSpec, StudySpec, run_refinement, split
+from igsr.study.loop_tables import plot_rounds, summarized, write_run_sheet, write_table
 
-Path = str | os.PathLike[str]
+PathLike = str | os.PathLike[str]
 OnRun = Callable[[int, int, dict[str, Any]], None]
 
 #: What the paper reports (PSNR / SSIM / LPIPS), to stand beside ours.
@@ -34,14 +47,28 @@ ABLATION_PHOTOS = {"tankard": 6, "fern": 3}
 ABLATION_METHODS = (*OURS, "improvement")
 
 
+@dataclass(frozen=True)
+class _Options:
+    """What every study takes; see ``table2``."""
+
+    weights: PathLike | None
+    features: PathLike | None
+    steps: int | None
+    seeds: int
+    backend: str
+    jobs: int
+    on_run: OnRun | None
+    ray: bool
+
+
 def table2(
-    data: Path,
-    out: Path,
+    data: PathLike,
+    out: PathLike,
     *,
     scenes: tuple[str, ...] = ("chair",),
     methods: tuple[str, ...] = TABLE2_METHODS,
-    weights: Path | None = None,
-    features: Path | None = None,
+    weights: PathLike | None = None,
+    features: PathLike | None = None,
     steps: int | None = None,
     seeds: int = 3,
     backend: str = "cpu",
@@ -49,21 +76,21 @@ def table2(
     on_run: OnRun | None = None,
     ray: bool = False,
 ) -> dict[str, Any]:
-    """A round of the paper's from 10 photos, localized and scattered, and two of ours.
+    """One round of the paper's from 10 photos, localized and scattered, and two rounds of ours.
 
     Args:
         data: folder that holds the scenes.
         out: folder for ``study.json``, ``study.md``, ``study.png``, a sheet of a held-out view by
-            round for each choice of photos, ``runs/`` and ``rounds/``, what each loop leaves; what
-            is there is not done again.
+            round for each choice of photos, ``runs/``, and ``rounds/`` for the files of each loop.
+            Finished runs are not done again.
         scenes: names of folders in ``data``.
-        methods: of ``igsr.study.loop_runs.METHODS``; the paper's add their best 2.
+        methods: of ``igsr.study.loop_methods.METHODS``; the paper's add their best 2.
         weights: the denoiser's file; None is igsr's own.
         features: SqueezeNet's arrays (.npz), for the perceptual distance.
         steps: of each fit; None is the default preset's.
         seeds: how many seeds, from 0.
         backend: what fits and renders.
-        jobs: runs at a time, each in a process of its own with its share of the cores.
+        jobs: runs at the same time, each in its own process with its share of the cores.
         on_run: called with (done, all, the run's row) after each run.
         ray: runs go over a Ray cluster instead (``pip install 'igsr[ray]'``).
 
@@ -76,25 +103,23 @@ def table2(
         IgsrError: a scene cannot be read or has too few photos, or a fit fails.
     """
     kinds = [(scene, layout, 10) for scene in scenes for layout in ("localized", "scattered")]
-    rounds = [
-        Rounds(name, name, CHOSEN, 2, True) if name in OURS else Rounds(name, name, 2, 1, True)
+    chosen = [
+        Method(name, name, SELECTED, 2, True) if name in OURS else Method(name, name, 2, 1, True)
         for name in methods
     ]
     title = "Table 2: 10 photos, one round of the paper's and two of ours"
-    return studied(
-        title, TABLE2_PAPER, data, out, kinds, rounds, weights, features, steps, seeds, backend,
-        jobs, on_run, ray,
-    )  # fmt: skip
+    options = _Options(weights, features, steps, seeds, backend, jobs, on_run, ray)
+    return _study(title, TABLE2_PAPER, data, out, kinds, chosen, options)
 
 
 def table3(
-    data: Path,
-    out: Path,
+    data: PathLike,
+    out: PathLike,
     *,
     scenes: tuple[str, ...] = ("tankard",),
     methods: tuple[str, ...] = TABLE3_METHODS,
-    weights: Path | None = None,
-    features: Path | None = None,
+    weights: PathLike | None = None,
+    features: PathLike | None = None,
     steps: int | None = None,
     seeds: int = 3,
     backend: str = "cpu",
@@ -107,22 +132,20 @@ def table3(
     The paper's methods add their best one. Raises as ``table2``.
     """
     kinds = [(scene, "localized", 4) for scene in scenes]
-    rounds = [Rounds(name, name, CHOSEN if name in OURS else 1, 2, True) for name in methods]
+    chosen = [Method(name, name, SELECTED if name in OURS else 1, 2, True) for name in methods]
     title = "Table 3: two rounds, 4 localized photos"
-    return studied(
-        title, TABLE3_PAPER, data, out, kinds, rounds, weights, features, steps, seeds, backend,
-        jobs, on_run, ray,
-    )  # fmt: skip
+    options = _Options(weights, features, steps, seeds, backend, jobs, on_run, ray)
+    return _study(title, TABLE3_PAPER, data, out, kinds, chosen, options)
 
 
 def sweep(
-    data: Path,
-    out: Path,
+    data: PathLike,
+    out: PathLike,
     *,
     scenes: tuple[str, ...] = ("chair",),
     views: tuple[str, ...] = SWEPT_PHOTOS,
-    weights: Path | None = None,
-    features: Path | None = None,
+    weights: PathLike | None = None,
+    features: PathLike | None = None,
     steps: int | None = None,
     seeds: int = 1,
     backend: str = "cpu",
@@ -137,22 +160,20 @@ def sweep(
     if not views or not all(text.isdecimal() and int(text) > 0 for text in views):
         raise IgsrError(f"views must be numbers of photos, not {', '.join(views) or 'none'}.")
     kinds = [(scene, "scattered", int(text)) for scene in scenes for text in views]
-    rounds = [Rounds(f"ours-{count}", "ours", count, SWEPT_ROUNDS, False) for count in SWEPT_VIEWS]
+    chosen = [Method(f"ours-{count}", "ours", count, SWEPT_ROUNDS, False) for count in SWEPT_VIEWS]
     title = "Photos, rounds and views added per round"
-    return studied(
-        title, (), data, out, kinds, rounds, weights, features, steps, seeds, backend,
-        jobs, on_run, ray,
-    )  # fmt: skip
+    options = _Options(weights, features, steps, seeds, backend, jobs, on_run, ray)
+    return _study(title, (), data, out, kinds, chosen, options)
 
 
 def refinement_ablation(
-    data: Path,
-    out: Path,
+    data: PathLike,
+    out: PathLike,
     *,
     scenes: tuple[str, ...] = tuple(ABLATION_PHOTOS),
     methods: tuple[str, ...] = ABLATION_METHODS,
-    weights: Path | None = None,
-    features: Path | None = None,
+    weights: PathLike | None = None,
+    features: PathLike | None = None,
     steps: int | None = None,
     seeds: int = 1,
     backend: str = "cpu",
@@ -166,9 +187,121 @@ def refinement_ablation(
     ``table2``. Raises as ``table2``.
     """
     kinds = [(scene, "even", ABLATION_PHOTOS.get(scene, 10)) for scene in scenes]
-    rounds = [Rounds(name, name, CHOSEN if name in OURS else 2, 1, False) for name in methods]
+    chosen = [Method(name, name, SELECTED if name in OURS else 2, 1, False) for name in methods]
     title = "One round, with parts of the loop taken out"
-    return studied(
-        title, (), data, out, kinds, rounds, weights, features, steps, seeds, backend,
-        jobs, on_run, ray,
-    )  # fmt: skip
+    options = _Options(weights, features, steps, seeds, backend, jobs, on_run, ray)
+    return _study(title, (), data, out, kinds, chosen, options)
+
+
+def _study(
+    title: str,
+    paper: Sequence[str],
+    data: PathLike,
+    out: PathLike,
+    kinds: Sequence[tuple[str, str, int]],
+    methods: Sequence[Method],
+    options: _Options,
+) -> dict[str, Any]:
+    """Do the runs of a study, and write its report, table, plot and sheets.
+
+    Args:
+        title: of the table.
+        paper: the paper's own figures, to stand under it.
+        data, out: as in ``table2``.
+        kinds: (scene, layout, number of photos) of each kind of run.
+        methods: that continue from each fit.
+        options: as in ``table2``.
+
+    Raises:
+        IgsrError: an argument cannot be used, a scene cannot be read or has too few photos, or a
+            fit fails.
+    """
+    _check(methods, options)
+    out = Path(out)
+    study = StudySpec(
+        str(out),
+        tuple(methods),
+        None if options.weights is None else str(options.weights),
+        None if options.features is None else str(options.features),
+        options.steps,
+    )
+    specs = [
+        RunSpec(scene, layout, photos, seed, options.backend)
+        for seed in range(options.seeds)
+        for scene, layout, photos in kinds
+    ]
+    for spec in specs:  # an error in the last scene must not come up hours later
+        split(load_capture(Path(data) / spec.scene), spec)
+    rows = finished_runs(
+        out / "runs",
+        [_job(spec, study) for spec in specs],
+        partial(run_refinement, study),
+        str(data),
+        options.jobs,
+        options.on_run,
+        options.ray,
+    )
+    report = _report(title, paper, kinds, study, options, rows)
+    with atomic_write(out / "study.json") as temporary:
+        temporary.write_text(json.dumps(report, indent=2, allow_nan=False), encoding="utf-8")
+    write_table(out / "study.md", report)
+    plot_rounds(out / "study.png", report)
+    for spec in (spec for spec in specs if spec.seed == 0):
+        write_run_sheet(out, spec, methods)
+    return report
+
+
+def _check(methods: Sequence[Method], options: _Options) -> None:
+    """Find what cannot be used before the first fit."""
+    if options.seeds < 1 or options.jobs < 1:
+        raise IgsrError("seeds and jobs must be at least 1.")
+    for one in methods:
+        if one.method not in METHODS:
+            raise IgsrError(f"methods must be of {', '.join(METHODS)}, not {one.method!r}.")
+        if one.method in PAPER and options.features is None:
+            raise IgsrError(
+                f"method {one.method} chooses by a perceptual distance; give --features "
+                "squeezenet.npz, or leave it out with --method."
+            )
+    load_network(options.weights)
+    if options.features is not None:
+        SqueezeNetDistance(options.features)
+
+
+def _job(spec: RunSpec, study: StudySpec) -> Run:
+    """A run, with all that its result depends on."""
+    settings = preset_settings("default", spec.photos, steps=study.steps) | study.file_hashes
+    settings["methods"] = [list(vars(one).values()) for one in study.methods]
+    return Run(spec.name, spec, settings, scene=spec.scene)
+
+
+def _report(
+    title: str,
+    paper: Sequence[str],
+    kinds: Sequence[tuple[str, str, int]],
+    study: StudySpec,
+    options: _Options,
+    rows: Sequence[dict[str, Any]],
+) -> dict[str, Any]:
+    """What ``study.json`` holds."""
+    scenes: dict[str, Any] = {}
+    for kind in kinds:
+        same = [row for row in rows if (row["scene"], row["layout"], row["photos"]) == kind]
+        scene, layout, photos = kind
+        scenes.setdefault(scene, {})[f"{layout} {photos}"] = summarized(same)
+    layouts = dict.fromkeys(layout for _, layout, _ in kinds)
+    return {
+        "title": title,
+        "igsr": _core.__version__,
+        "protocol": {
+            "seeds": options.seeds,
+            "backend": options.backend,
+            "near": NEAR,
+            "far": FAR,
+            "rounds": [vars(one) for one in study.methods],
+            "weights": study.file_hashes["weights"],
+        },
+        "scenes": scenes,
+        "runs": list(rows),
+        "paper": list(paper),
+    } | {layout: summarized([row for row in rows if row["layout"] == layout]) for layout in layouts}

@@ -1,16 +1,22 @@
-"""What the rounds of a study come to: means over seeds and scenes, a Markdown table, a plot."""
+"""The results of a study of the loop: means over seeds and scenes, a table, a plot and sheets."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from PIL import Image
 
 from igsr._internal.atomic_write import atomic_write
+from igsr.study.loop_methods import Method
+from igsr.study.loop_runs import RunSpec
+from igsr.study.picture_sheet import write_sheet
 
-#: Scores of the table: how they are headed and written.
+#: Scores of the table: their headings and formats.
 COLUMNS = {
     "psnr": ("PSNR, dB", ".2f"),
     "ssim": ("SSIM", ".4f"),
@@ -129,3 +135,36 @@ def plot_rounds(path: Path, report: dict[str, Any]) -> None:
     figure.suptitle(report["title"], fontsize=10)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=120)
+
+
+def write_run_sheet(out: Path, spec: RunSpec, methods: Sequence[Method]) -> None:
+    """A held-out view after each round, and the two views of the largest gain in the first round.
+
+    Raises:
+        IgsrError: the file cannot be written.
+    """
+    folder = out / "rounds" / spec.name
+    truth, first = _picture(folder / "truth.png"), _picture(folder / "first.png")
+    if truth is None or first is None:
+        warnings.warn(f"{folder} has no pictures: no sheet of {spec.name} is drawn.", stacklevel=4)
+        return
+    sheet = {}
+    for method in methods:
+        row = {"truth": truth, "round 0": first}
+        shown = first
+        for number in range(1, max(one.rounds for one in methods) + 1):
+            after = _picture(folder / method.name / f"round{number}.png")
+            shown = shown if after is None else after
+            row[f"round {number}"] = shown
+        for k in range(min(2, max(one.views for one in methods))):
+            added = _picture(folder / method.name / "rounds" / "1" / f"view-{k}.after.png")
+            row[f"added view {k + 1}"] = np.full_like(truth, 255) if added is None else added
+        sheet[method.name] = row
+    write_sheet(out / f"{spec.scene}-{spec.layout}{spec.photos}.png", sheet)
+
+
+def _picture(path: Path) -> npt.NDArray[np.uint8] | None:
+    if not path.is_file():
+        return None
+    with Image.open(path) as picture:
+        return np.asarray(picture)

@@ -1,4 +1,4 @@
-"""Cameras made wrong on purpose: what fixed and joint poses make of them.
+"""Noise on camera poses: fits with poses fixed and with joint poses, scored side by side.
 
 Twenty train views of a NeRF-Synthetic scene get noise on their poses and are fitted with poses
 fixed and joint, beside a fit with the true ones. Held-out views are scored in the three ways of
@@ -7,7 +7,6 @@ fixed and joint, beside a fit with the true ones. Held-out views are scored in t
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,6 +28,8 @@ from igsr.fitting.run import fit_with_cameras
 from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
+from igsr.study.markdown_table import markdown_table
+from igsr.study.study_files import headed, text_of, write_study_files
 
 Float64 = npt.NDArray[np.float64]
 
@@ -181,17 +182,13 @@ def pose_noise(
         ],
         "runs": rows,
     }
-    out = Path(out)
-    with atomic_write(out / "study.json") as temporary:
-        temporary.write_text(json.dumps(report, indent=2, allow_nan=False), encoding="utf-8")
-    with atomic_write(out / "study.md") as temporary:
-        temporary.write_text(markdown(report), encoding="utf-8")
-    _plot(out / "study.png", report)
+    write_study_files(Path(out), report, markdown(report))
+    _plot(Path(out) / "study.png", report)
     return report
 
 
 def compared(rows: list[dict[str, Any]], noise: str, scene: str) -> dict[str, Any]:
-    """One line of the table: means over seeds (and scenes, for "mean") and what they come to.
+    """One line of the table: means over seeds (and scenes, for "mean").
 
     "recovered" is the part of the dB lost to noise, both scored aligned, that joint poses bring
     back; "short_of_clean" the dB between clean and joint, both scored refined.
@@ -231,32 +228,33 @@ def _spread(rows: list[dict[str, Any]]) -> float | None:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """The table of the study."""
-    lines = [
-        f"# {report['title']}",
-        "",
-        f"igsr {report['igsr']}; {json.dumps(report['protocol'])}",
-        "",
-        "PSNR in dB, raw / aligned / refined.",
-        "",
-        "| noise | scene | fixed | joint | clean | recovered | short of clean "
-        "| rotation, degrees | centre, world units |",
-        "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
-    ]
-    for line in report["summary"]:
-        cells = [
-            " / ".join(f"{line[name][way]['psnr']:.2f}" for way in WAYS)
-            + (f" ± {spread:.2f}" if (spread := line[name]["psnr_spread"]) is not None else "")
-            for name in ("fixed", "joint", "clean")
+    """``study.md``: one line per noise and scene, then the means over scenes."""
+    fits = ("fixed", "joint", "clean")
+    rows = [
+        [
+            line["noise"],
+            line["scene"],
+            *(_psnrs(line[name]) for name in fits),
+            "-" if line["recovered"] is None else f"{100 * line['recovered']:.0f} %",
+            f"{line['short_of_clean']:.2f}",
+            *(
+                f"{before:.{digits}f} → {after:.{digits}f} ({before / after:.1f} ×)"
+                for error, digits in (("rotation", 3), ("centre", 4))
+                for before, after in [(line[error]["before"], line[error]["after"])]
+            ),
         ]
-        recovered = line["recovered"]
-        cells.append("-" if recovered is None else f"{100 * recovered:.0f} %")
-        cells.append(f"{line['short_of_clean']:.2f}")
-        for error, digits in (("rotation", 3), ("centre", 4)):
-            before, after = line[error]["before"], line[error]["after"]
-            cells.append(f"{before:.{digits}f} → {after:.{digits}f} ({before / after:.1f} ×)")
-        lines.append(f"| {line['noise']} | {line['scene']} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        for line in report["summary"]
+    ]
+    heads = ["noise", "scene", *fits, "recovered", "short of clean"]
+    heads += ["rotation, degrees", "centre, world units"]
+    note = "PSNR in dB, raw / aligned / refined."
+    return text_of([*headed(report), note, "", *markdown_table(heads, rows, left=2)])
+
+
+def _psnrs(scores: dict[str, Any]) -> str:
+    spread = scores["psnr_spread"]
+    psnrs = " / ".join(f"{scores[way]['psnr']:.2f}" for way in WAYS)
+    return psnrs + ("" if spread is None else f" ± {spread:.2f}")
 
 
 def _plot(path: Path, report: dict[str, Any]) -> None:

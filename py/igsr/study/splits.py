@@ -11,7 +11,7 @@ import numpy.typing as npt
 from igsr.capture import Camera, Capture
 from igsr.errors import IgsrError
 
-#: Every how many photos LLFF's protocol holds one out.
+#: LLFF's protocol holds out every 8th photo for testing.
 HOLDOUT = 8
 #: DTU's train photos by number, as PixelNeRF chose them: few-view papers take the first 3, 6 or 9.
 DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)
@@ -80,20 +80,20 @@ def _split(capture: Capture, train: Sequence[int], test: Sequence[int]) -> Captu
 
 
 def localized(cameras: Sequence[Camera], count: int) -> list[int]:
-    """The ``count`` cameras that look most like camera 0 does, that one first."""
-    looks = _looks(cameras)
-    return [int(i) for i in np.argsort(-(looks @ looks[0]), kind="stable")[:count]]
+    """The ``count`` cameras whose viewing directions are nearest to camera 0's, that one first."""
+    directions = _directions(cameras)
+    return [int(i) for i in np.argsort(-(directions @ directions[0]), kind="stable")[:count]]
 
 
 def scattered(cameras: Sequence[Camera], count: int) -> list[int]:
-    """``count`` cameras that look as differently as can be: farthest points from camera 0 on."""
-    looks = _looks(cameras)
+    """``count`` cameras with viewing directions far apart: farthest points from camera 0 on."""
+    directions = _directions(cameras)
     chosen = [0]
-    nearest = looks @ looks[0]
+    nearest = directions @ directions[0]
     while len(chosen) < min(count, len(cameras)):
         nearest[chosen] = np.inf
         chosen.append(int(np.argmin(nearest)))
-        nearest = np.maximum(nearest, looks @ looks[chosen[-1]])
+        nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
     return chosen
 
 
@@ -102,6 +102,6 @@ def spread_out(total: int, count: int) -> list[int]:
     return [int(i) for i in np.linspace(0, total - 1, min(count, total)).round()]
 
 
-def _looks(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
-    """Which way each camera looks, [N, 3], of length 1."""
+def _directions(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
+    """Viewing direction of each camera, world frame, float64 [N, 3], of length 1."""
     return np.stack([camera.viewmat[2, :3] for camera in cameras]).astype(np.float64)

@@ -1,8 +1,7 @@
-"""What a study's fits come to: ``study.json``, a Markdown table and a plot."""
+"""Means and spreads of a study's fits: ``study.json``, a Markdown table and a plot."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,8 @@ import numpy as np
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
+from igsr.study.markdown_table import markdown_table
+from igsr.study.study_files import headed, text_of, write_study_files
 
 #: Scores in the order of the table: how they are headed and written. Not every study has all.
 SCORES = {
@@ -57,10 +58,7 @@ def write_study(
         "scenes": scenes,
         "runs": rows,
     }
-    with atomic_write(out / "study.json") as temporary:
-        temporary.write_text(json.dumps(report, indent=2, allow_nan=False), encoding="utf-8")
-    with atomic_write(out / "study.md") as temporary:
-        temporary.write_text(markdown(report), encoding="utf-8")
+    write_study_files(out, report, markdown(report))
     _plot(out / "study.png", report)
     return report
 
@@ -83,26 +81,18 @@ def _groups(report: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
 def markdown(report: dict[str, Any]) -> str:
     """The table of a study, mean ± spread over seeds."""
     shown = [score for score in SCORES if score in next(iter(report["mean"].values()))]
-    lines = [
-        f"# {report['title']}",
-        "",
-        f"igsr {report['igsr']}; {json.dumps(report['protocol'])}",
-        "",
-        f"| scene | views | preset | {' | '.join(SCORES[score][0] for score in shown)} |",
-        f"| --- | --- | --- |{' ---: |' * len(shown)}",
+    rows = [
+        [scene, views, preset, *(_with_spread(scores, score) for score in shown)]
+        for scene, views, presets in [*_groups(report), ("mean", "all", report["mean"])]
+        for preset, scores in presets.items()
     ]
-    for scene, views, presets in [*_groups(report), ("mean", "all", report["mean"])]:
-        for preset, scores in presets.items():
-            cells = []
-            for score in shown:
-                digits = SCORES[score][1]
-                spread = scores[f"{score}_spread"]
-                cell = format(scores[score], digits)
-                if spread is not None:
-                    cell += f" ± {spread:{digits}}"
-                cells.append(cell)
-            lines.append(f"| {scene} | {views} | {preset} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    heads = ["scene", "views", "preset", *(SCORES[score][0] for score in shown)]
+    return text_of([*headed(report), *markdown_table(heads, rows, left=3)])
+
+
+def _with_spread(scores: dict[str, Any], score: str) -> str:
+    form, spread = SCORES[score][1], scores[f"{score}_spread"]
+    return format(scores[score], form) + ("" if spread is None else f" ± {spread:{form}}")
 
 
 def _plot(path: Path, report: dict[str, Any]) -> None:

@@ -1,33 +1,176 @@
-//! adam: one optimiser step of a run of values.
+//! adam: one optimiser step of all parameters, a block of splats at a time.
 
+use glam::{Mat3, Quat, Vec3};
 use pulp::{Simd, WithSimd};
+use rayon::prelude::*;
 
-use crate::fit::ADAM;
+use super::project::Splat;
+use super::project_backward::VSplat;
+use super::simd::dispatch;
+use crate::constants::{ADAM, QUAT_NORM2_MIN};
+use crate::fit_device::noise_normal;
+use crate::sh;
+use crate::splats::SplatSlices;
+use crate::stages::{AdamState, AdamStep, Rates, SplatGradients};
 
-/// Bias corrections of one step, shared by all parameters.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Bias {
-    first: f32,
-    second: f32,
+/// Splats whose gradients are gathered before Adam runs over them: they stay in the cache.
+pub(super) const BLOCK: usize = 64;
+
+/// Gradients of a block of splats, laid out as the parameters are.
+pub(super) struct BlockGradients {
+    pub means: Vec<[f32; 3]>,
+    pub quats: Vec<[f32; 4]>,
+    pub scales: Vec<[f32; 3]>,
+    pub opacities: Vec<f32>,
+    pub sh: Vec<[f32; 3]>,
 }
 
-impl Bias {
-    /// For step number `step`, from 1.
-    pub fn new(step: u32) -> Self {
-        let power = |beta: f32| 1.0 - f64::from(beta).powi(step.min(i32::MAX as u32) as i32);
-        Self { first: (1.0 / power(ADAM.0)) as f32, second: (1.0 / power(ADAM.1)) as f32 }
+impl BlockGradients {
+    /// All zero, with `stride` coefficients per splat.
+    pub fn new(stride: usize) -> Self {
+        Self {
+            means: vec![[0.0; 3]; BLOCK],
+            quats: vec![[0.0; 4]; BLOCK],
+            scales: vec![[0.0; 3]; BLOCK],
+            opacities: vec![0.0; BLOCK],
+            sh: vec![[0.0; 3]; BLOCK * stride],
+        }
+    }
+
+    /// Takes what belongs to splat `k` of the block, coefficients apart.
+    #[inline(always)]
+    pub fn set(&mut self, k: usize, v: &VSplat) {
+        self.means[k] = v.v_mean;
+        self.quats[k] = v.v_quat;
+        self.scales[k] = v.v_scales;
+        self.opacities[k] = v.v_opacity;
     }
 }
 
-/// Adam (Kingma and Ba, 2015, algorithm 1) on a run of values, each with its own rate. All slices
-/// have one length.
-pub(super) struct Adam<'a> {
-    pub values: &'a mut [f32],
-    pub first: &'a mut [f32],
-    pub second: &'a mut [f32],
-    pub gradient: &'a [f32],
-    pub rates: &'a [f32],
-    pub bias: Bias,
+/// The same rates for every splat of a block, laid out as the parameters are.
+struct BlockRates {
+    means: Vec<f32>,
+    quats: Vec<f32>,
+    scales: Vec<f32>,
+    opacities: Vec<f32>,
+    sh: Vec<f32>,
+}
+
+impl BlockRates {
+    fn new(rates: &Rates, stride: usize) -> Self {
+        let row: Vec<f32> =
+            (0..3 * stride).map(|k| if k < 3 { rates.sh0 } else { rates.sh_rest }).collect();
+        Self {
+            means: vec![rates.means; 3 * BLOCK],
+            quats: vec![rates.quats; 4 * BLOCK],
+            scales: vec![rates.scales; 3 * BLOCK],
+            opacities: vec![rates.opacities; BLOCK],
+            sh: row.repeat(BLOCK),
+        }
+    }
+}
+
+/// A step as every block of splats takes it.
+pub(super) struct BlockStep {
+    step: AdamStep,
+    frozen: bool,
+    rates: BlockRates,
+    bias: [f32; 2],
+    /// Gradients of the regularisers by one opacity and one scale.
+    opacity_pull: f32,
+    scale_pull: f32,
+    /// Floats of colour per splat: stored, and of the degree in use.
+    stored: usize,
+    used: usize,
+}
+
+impl BlockStep {
+    /// For `n` splats that store SH up to `sh_degree`.
+    pub fn new(step: &AdamStep, n: usize, sh_degree: u32) -> Self {
+        let stride = sh::coeffs(sh_degree);
+        Self {
+            step: *step,
+            frozen: step.is_frozen(),
+            rates: BlockRates::new(&step.rates, stride),
+            bias: step.bias().map(|bias| bias as f32),
+            opacity_pull: step.opacity_regularizer / n as f32,
+            scale_pull: step.scale_regularizer / (3 * n) as f32,
+            stored: 3 * stride,
+            used: 3 * sh::coeffs(step.sh_degree.min(sh_degree)),
+        }
+    }
+
+    /// Adds the regularisers' gradients to those of one splat.
+    #[inline(always)]
+    pub fn pull(&self, splat: &Splat, v: &mut VSplat) {
+        v.v_opacity += self.opacity_pull * splat.opacity_slope;
+        for (v, scale) in v.v_scales.iter_mut().zip(splat.scales.to_array()) {
+            *v += self.scale_pull * scale;
+        }
+    }
+
+    /// Moves a block of splats, the first of them splat `first_id` of the scene.
+    #[inline(always)]
+    pub fn apply(
+        &self,
+        values: SplatSlices<'_>,
+        [first, second]: [SplatSlices<'_>; 2],
+        gradients: &BlockGradients,
+        first_id: usize,
+    ) {
+        if self.frozen {
+            return;
+        }
+        let n = values.means.len();
+        macro_rules! adam {
+            ($name:ident, $row:expr, $used:expr) => {
+                dispatch(Adam {
+                    values: bytemuck::cast_slice_mut(values.$name),
+                    first: bytemuck::cast_slice_mut(first.$name),
+                    second: bytemuck::cast_slice_mut(second.$name),
+                    gradient: bytemuck::cast_slice(&gradients.$name),
+                    rates: &self.rates.$name,
+                    bias: self.bias,
+                    row: $row,
+                    used: $used,
+                })
+            };
+        }
+        adam!(means, 3 * n, 3 * n);
+        adam!(quats, 4 * n, 4 * n);
+        adam!(scales, 3 * n, 3 * n);
+        adam!(opacities, n, n);
+        if self.used == self.stored {
+            adam!(sh, self.stored * n, self.stored * n);
+        } else {
+            adam!(sh, self.stored, self.used);
+        }
+        if self.step.noise > 0.0 {
+            for k in 0..n {
+                values.means[k] = explore(
+                    values.means[k],
+                    values.quats[k],
+                    values.scales[k],
+                    values.opacities[k],
+                    &self.step,
+                    first_id + k,
+                );
+            }
+        }
+    }
+}
+
+/// Adam (Kingma and Ba, 2015, algorithm 1) on rows of values, each with its own rate: on the first
+/// `used` of every `row` values. All slices have room for as many as `values`.
+struct Adam<'a> {
+    values: &'a mut [f32],
+    first: &'a mut [f32],
+    second: &'a mut [f32],
+    gradient: &'a [f32],
+    rates: &'a [f32],
+    bias: [f32; 2],
+    row: usize,
+    used: usize,
 }
 
 impl WithSimd for Adam<'_> {
@@ -37,16 +180,82 @@ impl WithSimd for Adam<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let (beta1, beta2, epsilon) = ADAM;
-        let n = self.values.len();
-        let (first, second) = (&mut self.first[..n], &mut self.second[..n]);
-        let (gradient, rates) = (&self.gradient[..n], &self.rates[..n]);
-        for k in 0..n {
-            let g = gradient[k];
-            let m = beta1 * first[k] + (1.0 - beta1) * g;
-            let v = beta2 * second[k] + (1.0 - beta2) * g * g;
-            let size = (v * self.bias.second).sqrt() + epsilon;
-            self.values[k] -= rates[k] * (m * self.bias.first) / size;
-            (first[k], second[k]) = (m, v);
+        let [bias1, bias2] = self.bias;
+        for start in (0..self.values.len()).step_by(self.row) {
+            let n = self.used;
+            let values = &mut self.values[start..][..n];
+            let (first, second) = (&mut self.first[start..][..n], &mut self.second[start..][..n]);
+            let (gradient, rates) = (&self.gradient[start..][..n], &self.rates[start..][..n]);
+            for k in 0..n {
+                let g = gradient[k];
+                let m = beta1 * first[k] + (1.0 - beta1) * g;
+                let v = beta2 * second[k] + (1.0 - beta2) * g * g;
+                let size = (v * bias2).sqrt() + epsilon;
+                values[k] -= rates[k] * (m * bias1) / size;
+                (first[k], second[k]) = (m, v);
+            }
         }
     }
+}
+
+/// 3DGS-MCMC's exploration: nearly transparent splats take a random step shaped by their covariance.
+#[inline(always)]
+fn explore(
+    mean: [f32; 3],
+    quat: [f32; 4],
+    log_scales: [f32; 3],
+    logit: f32,
+    step: &AdamStep,
+    id: usize,
+) -> [f32; 3] {
+    let opacity = 1.0 / (1.0 + (-logit).exp());
+    let gate = 1.0 / (1.0 + (-100.0 * (0.005 - opacity)).exp());
+    let [w, x, y, z] = quat;
+    // Under this gate the step is under 1e-7 of the splat's size times the rate. A quaternion that
+    // names no rotation has no covariance.
+    if gate < 1e-7 || w * w + x * x + y * y + z * z < QUAT_NORM2_MIN {
+        return mean;
+    }
+    let axes = Mat3::from_quat(Quat::from_xyzw(x, y, z, w).normalize());
+    let scales = Vec3::from(log_scales).exp();
+    let z = Vec3::from(noise_normal(step.noise_seed, id as u32));
+    let moved = axes * (scales * scales * (axes.transpose() * z)) * (gate * step.noise);
+    let out = Vec3::from(mean) + moved;
+    if out.is_finite() { out.to_array() } else { mean }
+}
+
+pub(super) fn adam(state: &mut AdamState<f32>, gradients: &SplatGradients<f32>, step: &AdamStep) {
+    let AdamState { splats, first, second } = state;
+    let (n, degree, stride) = (splats.len(), splats.sh_degree, splats.stride());
+    let plan = BlockStep::new(step, n, degree);
+    (splats.blocks_mut(BLOCK), first.blocks_mut(BLOCK), second.blocks_mut(BLOCK))
+        .into_par_iter()
+        .enumerate()
+        .for_each_init(
+            || BlockGradients::new(stride),
+            |v_block, (block, (values, first, second))| {
+                let first_id = block * BLOCK;
+                let n = values.means.len();
+                for k in 0..n {
+                    let i = first_id + k;
+                    let mut v = VSplat {
+                        v_mean: gradients.v_means[i],
+                        v_quat: gradients.v_quats[i],
+                        v_scales: gradients.v_scales[i],
+                        v_opacity: gradients.v_opacities[i],
+                    };
+                    let splat = Splat::activate(
+                        values.means[k],
+                        values.quats[k],
+                        values.scales[k],
+                        values.opacities[k],
+                    );
+                    plan.pull(&splat, &mut v);
+                    v_block.set(k, &v);
+                }
+                v_block.sh[..n * stride]
+                    .copy_from_slice(&gradients.v_colors[first_id * stride..][..n * stride]);
+                plan.apply(values, [first, second], v_block, first_id);
+            },
+        );
 }

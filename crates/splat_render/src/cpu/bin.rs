@@ -5,8 +5,10 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::project::Splat2d;
+use super::tile::TileSplat;
 use crate::constants::{ALPHA_MIN, TILE};
 use crate::error::{Error, Result};
+use crate::stages::Projected;
 
 /// Splats per parallel task.
 pub(super) const CHUNK: usize = 1024;
@@ -196,11 +198,7 @@ fn sort_by_depth(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
 }
 
 /// Tiles of all splats, in parallel over chunks.
-pub(super) fn touched_tiles(
-    splats: &[Option<Splat2d>],
-    width: u32,
-    height: u32,
-) -> Vec<ChunkTiles> {
+fn touched_tiles(splats: &[Option<Splat2d>], width: u32, height: u32) -> Vec<ChunkTiles> {
     splats
         .par_chunks(CHUNK)
         .map(|chunk| {
@@ -214,6 +212,39 @@ pub(super) fn touched_tiles(
             tiles
         })
         .collect()
+}
+
+/// 2D splats, None where they are not drawn.
+fn splats2d(projected: &Projected<f32>) -> Vec<Option<Splat2d>> {
+    (0..projected.len())
+        .map(|i| {
+            projected.is_drawn(i).then(|| Splat2d {
+                mean: projected.means2d[i],
+                factor: projected.factors[i],
+                depth: projected.depths[i],
+                color: projected.colors[i],
+                opacity: projected.opacities[i],
+                radii: projected.radii[i],
+            })
+        })
+        .collect()
+}
+
+/// What the rasterize stages read.
+pub(super) struct Binned {
+    pub splats: Vec<TileSplat>,
+    pub bins: Bins,
+}
+
+pub(super) fn bin(projected: &Projected<f32>) -> Result<Binned> {
+    let splats = splats2d(projected);
+    let chunks = touched_tiles(&splats, projected.width, projected.height);
+    let tiles = projected.width.div_ceil(TILE) * projected.height.div_ceil(TILE);
+    let mut bins = Bins::default();
+    bins.fill(&chunks, tiles as usize, |i| projected.depths[i])?;
+    let splats =
+        splats.iter().map(|s| s.as_ref().map_or_else(TileSplat::default, TileSplat::new)).collect();
+    Ok(Binned { splats, bins })
 }
 
 #[cfg(test)]
@@ -234,6 +265,7 @@ mod tests {
         let ids: Vec<u64> = keys.iter().map(|k| k & 0xffff_ffff).collect();
         assert_eq!(ids, [4, 1, 3, 2, 6, 0, 5]);
     }
+
     /// Every tile with a pixel that a splat reaches is listed, and hardly any other.
     #[test]
     fn tiles_are_those_that_splats_reach() {

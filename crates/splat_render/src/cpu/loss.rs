@@ -4,8 +4,10 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::simd::dispatch;
-use super::ssim_window::{HALF, Rows};
-use crate::fit::{SSIM_C, Weight};
+use super::ssim_window::{HALF, RUN, Rows};
+use crate::constants::SSIM_C;
+use crate::stages::{self, Image};
+use crate::target::{Target, Weight};
 
 /// Rows per task.
 const BAND: usize = 64;
@@ -71,11 +73,16 @@ impl WithSimd for Slopes<'_> {
             for (map, line) in lines.iter_mut().enumerate() {
                 filtered.filter_column(s, map, row - self.rows.start, line);
             }
-            let [line0, line1, line2, line3] = &mut lines;
-            let vectors = line0.as_flattened_mut().iter_mut().zip(line1.as_flattened_mut());
-            let vectors = vectors.zip(line2.as_flattened_mut()).zip(line3.as_flattened_mut());
-            for (((line0, line1), line2), line3) in vectors {
-                let (mu_x, mu_y, squares, xy) = (*line0, *line1, *line2, *line3);
+            // Each line's filtered map gives way to what becomes of it.
+            let [mu_line, xx_line, xy_line, ssim_line] = &mut lines;
+            let n = mu_line.len() * RUN;
+            let mu_line = &mut mu_line.as_flattened_mut()[..n];
+            let xx_line = &mut xx_line.as_flattened_mut()[..n];
+            let xy_line = &mut xy_line.as_flattened_mut()[..n];
+            let ssim_line = &mut ssim_line.as_flattened_mut()[..n];
+            for k in 0..n {
+                let (mu_x, mu_y) = (mu_line[k], xx_line[k]);
+                let (squares, xy) = (xy_line[k], ssim_line[k]);
                 let mu_xy = s.mul_f32s(mu_x, mu_y);
                 let (mu_xx, mu_yy) = (s.mul_f32s(mu_x, mu_x), s.mul_f32s(mu_y, mu_y));
                 let s_xy = s.sub_f32s(xy, mu_xy);
@@ -94,10 +101,10 @@ impl WithSimd for Slopes<'_> {
                     s.mul_f32s(mu_x, s.mul_f32s(s.mul_f32s(ssim, inverse), b2)),
                 );
                 let through = s.mul_add_e_f32s(s.mul_f32s(two, v_xx), mu_x, s.mul_f32s(v_xy, mu_y));
-                *line0 = s.sub_f32s(s.mul_f32s(two, direct), through);
-                *line1 = v_xx;
-                *line2 = v_xy;
-                *line3 = ssim;
+                mu_line[k] = s.sub_f32s(s.mul_f32s(two, direct), through);
+                xx_line[k] = v_xx;
+                xy_line[k] = v_xy;
+                ssim_line[k] = ssim;
             }
             let to = (row - self.rows.start) * width;
             let at = row * width;
@@ -226,9 +233,8 @@ impl Loss {
     ) -> f32 {
         let pixels = x[0].len();
         let all = Weight { sum: pixels as f64, count: pixels as f64 };
-        let Weight { sum, count } = weights.map_or(all, Weight::of);
-        // A photo that is masked out everywhere asks for nothing.
-        let scale = if count > 0.0 { 1.0 / (3.0 * count) } else { 0.0 };
+        let weight = weights.map_or(all, Weight::of);
+        let scale = weight.scale();
         let band = BAND * width;
         let bands =
             |band_index: usize| band_index * BAND..((band_index + 1) * BAND).min(pixels / width);
@@ -242,11 +248,10 @@ impl Loss {
             .into_par_iter()
             .zip(&mut self.slopes)
             .flat_map(|(c, [mu, xx, xy])| {
-                mu.par_chunks_mut(band)
-                    .zip(xx.par_chunks_mut(band))
-                    .zip(xy.par_chunks_mut(band))
+                (mu.par_chunks_mut(band), xx.par_chunks_mut(band), xy.par_chunks_mut(band))
+                    .into_par_iter()
                     .enumerate()
-                    .map(move |(index, ((mu, xx), xy))| {
+                    .map(move |(index, (mu, xx, xy))| {
                         dispatch(Slopes {
                             x: x[c],
                             y: y[c],
@@ -282,15 +287,37 @@ impl Loss {
             .collect::<Vec<f64>>()
             .iter()
             .sum();
-        let s = f64::from(ssim_weight);
-        ((1.0 - s) * l1 * scale + s * (3.0 * sum - ssim) * scale) as f32
+        weight.loss(f64::from(ssim_weight), l1, ssim) as f32
     }
+}
+
+pub(super) fn loss(
+    image: &Image<f32>,
+    target: &Target,
+    background: [f32; 3],
+    ssim_weight: f32,
+) -> stages::Loss<f32> {
+    let picture: [Vec<f32>; 3] =
+        std::array::from_fn(|c| image.color.iter().map(|color| color[c]).collect());
+    let mut photo: [Vec<f32>; 3] = Default::default();
+    target.composite(background, &mut photo);
+    let mut loss = Loss::default();
+    let value = loss.run(
+        picture.each_ref().map(|plane| plane.as_slice()),
+        photo.each_ref().map(|plane| plane.as_slice()),
+        target.weights.as_deref(),
+        image.width as usize,
+        ssim_weight,
+    );
+    let [r, g, b] = &loss.v_color;
+    let v_color = (0..r.len()).map(|pixel| [r[pixel], g[pixel], b[pixel]]).collect();
+    stages::Loss { value, v_color }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fit::SSIM_WINDOW;
+    use crate::constants::SSIM_WINDOW;
     use rand::{Rng, SeedableRng};
 
     /// The loss in f64, straight from its definition.

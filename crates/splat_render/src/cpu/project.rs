@@ -1,11 +1,12 @@
 //! project: splats and camera to 2D splats, f32.
 
 use glam::{Mat3, Vec2, Vec3};
+use rayon::prelude::*;
 
 use crate::camera::Camera;
 use crate::constants::{ALPHA_MIN, QUAT_NORM2_MIN};
 use crate::sh;
-use crate::stages::{Colors, ProjectOptions, SplatParams};
+use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 
 /// A camera and the stage's options, rounded to f32 once.
 #[derive(Debug, Clone, Copy)]
@@ -20,6 +21,8 @@ pub(super) struct View {
     pub limits: [f32; 4],
     pub size: Vec2,
     pub options: ProjectOptions,
+    /// Least depth that is drawn.
+    pub nearest: f32,
 }
 
 impl View {
@@ -35,6 +38,7 @@ impl View {
             limits: camera.jacobian_limits().map(|l| l as f32),
             size: Vec2::new(camera.width as f32, camera.height as f32),
             options: *options,
+            nearest: options.nearest(),
         }
     }
 }
@@ -59,24 +63,37 @@ impl Splat {
         self
     }
 
+    /// A splat as it is given to the stages.
     #[inline(always)]
     pub fn load(splats: &SplatParams<'_, f32>, i: usize) -> Self {
-        let (scales, opacity) = (Vec3::from(splats.scales[i]), splats.opacities[i]);
-        // A logit of +inf is poisoned too, though its sigmoid is not.
-        let opacity = if opacity.is_finite() { opacity } else { f32::NAN };
-        // o (1 - o) would be 0 where o rounds to 1.
-        let e = (-opacity.abs()).exp();
+        let (scales, opacity) = (splats.scales[i], splats.opacities[i]);
+        if splats.raw {
+            return Self::activate(splats.means[i], splats.quats[i], scales, opacity);
+        }
         Self {
             mean: Vec3::from(splats.means[i]),
             quat: splats.quats[i],
+            scales: Vec3::from(scales),
+            opacity: if opacity.is_finite() { opacity } else { f32::NAN },
+            opacity_slope: 1.0,
+        }
+    }
+
+    /// A splat as it is fitted: from log-scales and an opacity logit.
+    #[inline(always)]
+    pub fn activate(mean: [f32; 3], quat: [f32; 4], log_scales: [f32; 3], logit: f32) -> Self {
+        let log_scales = Vec3::from(log_scales);
+        // A logit of +inf is poisoned too, though its sigmoid is not.
+        let logit = if logit.is_finite() { logit } else { f32::NAN };
+        // o (1 - o) would be 0 where o rounds to 1.
+        let e = (-logit.abs()).exp();
+        Self {
+            mean: Vec3::from(mean),
+            quat,
             // A log-scale of -inf is no splat of size 0 but a poisoned one: NaN is culled.
-            scales: match (splats.raw, scales.is_finite()) {
-                (true, true) => scales.exp(),
-                (true, false) => Vec3::NAN,
-                (false, _) => scales,
-            },
-            opacity: if splats.raw { 1.0 / (1.0 + (-opacity).exp()) } else { opacity },
-            opacity_slope: if splats.raw { e / ((1.0 + e) * (1.0 + e)) } else { 1.0 },
+            scales: if log_scales.is_finite() { log_scales.exp() } else { Vec3::NAN },
+            opacity: 1.0 / (1.0 + (-logit).exp()),
+            opacity_slope: e / ((1.0 + e) * (1.0 + e)),
         }
     }
 }
@@ -105,7 +122,7 @@ pub(super) struct Geometry {
 #[inline(always)]
 pub(super) fn geometry(view: &View, splat: &Splat) -> Option<Geometry> {
     let t = view.rotation * splat.mean + view.translation;
-    if !(t.z >= view.options.near && t.z <= view.options.far && t.is_finite()) {
+    if !(t.z >= view.nearest && t.z <= view.options.far && t.is_finite()) {
         return None;
     }
     let [w, x, y, z] = splat.quat;
@@ -248,4 +265,27 @@ pub(super) fn project_splat(
         opacity,
         radii: radii.to_array(),
     })
+}
+
+pub(super) fn project(
+    splats: &SplatParams<'_, f32>,
+    camera: &Camera,
+    options: &ProjectOptions,
+) -> Projected<f32> {
+    let view = View::new(camera, options);
+    let list: Vec<Option<Splat2d>> = (0..splats.len())
+        .into_par_iter()
+        .map(|i| project_splat(&view, &Splat::load(splats, i), &splats.colors, i))
+        .collect();
+    let mut out = Projected::culled(splats.len(), camera.width, camera.height);
+    for (i, splat) in list.iter().enumerate() {
+        let Some(splat) = splat else { continue };
+        out.means2d[i] = splat.mean;
+        out.factors[i] = splat.factor;
+        out.depths[i] = splat.depth;
+        out.colors[i] = splat.color;
+        out.opacities[i] = splat.opacity;
+        out.radii[i] = splat.radii;
+    }
+    out
 }

@@ -3,13 +3,15 @@
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::bin::Bins;
+use super::bin::{Binned, Bins, bin};
 use super::simd::dispatch;
 use super::tile::{
     LIVE_INTERVAL, PIXELS, Pixels, Place, Reached, SIDE, TileSplat, Vectors, centers, live_vectors,
     take,
 };
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
+use crate::error::Result;
+use crate::stages::{Image, Projected};
 
 /// A picture as planes, row-major, H x W each.
 #[derive(Debug, Clone, Default)]
@@ -32,12 +34,15 @@ impl Planes {
     pub fn bands(&mut self) -> impl IndexedParallelIterator<Item = [&mut [f32]; 5]> {
         let band = SIDE * self.width;
         let [r, g, b, d, t] = &mut self.planes;
-        r.par_chunks_mut(band)
-            .zip(g.par_chunks_mut(band))
-            .zip(b.par_chunks_mut(band))
-            .zip(d.par_chunks_mut(band))
-            .zip(t.par_chunks_mut(band))
-            .map(|((((r, g), b), d), t)| [r, g, b, d, t])
+        (
+            r.par_chunks_mut(band),
+            g.par_chunks_mut(band),
+            b.par_chunks_mut(band),
+            d.par_chunks_mut(band),
+            t.par_chunks_mut(band),
+        )
+            .into_par_iter()
+            .map(|(r, g, b, d, t)| [r, g, b, d, t])
     }
 }
 
@@ -124,7 +129,7 @@ fn blend<S: Simd, const DEPTH: bool>(
 
 /// Renders every tile into `out`, which must have the picture's size; the depth plane is zero
 /// without `DEPTH`, which a fit does not look at.
-pub(super) fn rasterize<const DEPTH: bool>(
+pub(super) fn rasterize_tiles<const DEPTH: bool>(
     splats: &[TileSplat],
     bins: &Bins,
     background: [f32; 3],
@@ -147,4 +152,20 @@ pub(super) fn rasterize<const DEPTH: bool>(
             });
         }
     });
+}
+
+pub(super) fn rasterize(projected: &Projected<f32>, background: [f32; 3]) -> Result<Image<f32>> {
+    let Binned { splats, bins } = bin(projected)?;
+    let mut planes = Planes::default();
+    planes.resize(projected.width, projected.height);
+    rasterize_tiles::<true>(&splats, &bins, background, &mut planes);
+    let [r, g, b, depth, transmittance] = planes.planes;
+    Ok(Image {
+        width: projected.width,
+        height: projected.height,
+        color: (0..r.len()).map(|pixel| [r[pixel], g[pixel], b[pixel]]).collect(),
+        alpha: transmittance.iter().map(|t| 1.0 - t).collect(),
+        depth,
+        transmittance,
+    })
 }

@@ -4,7 +4,7 @@
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::bin::Bins;
+use super::bin::{Binned, Bins, CHUNK, bin};
 use super::project_backward::V2d;
 use super::rasterize::Planes;
 use super::simd::dispatch;
@@ -13,6 +13,8 @@ use super::tile::{
     offsets, take,
 };
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
+use crate::error::Result;
+use crate::stages::{Image, ImageGradients, Projected, ProjectedGradients};
 
 /// Sums over a tile's pixels for one splat: v_alpha * gaussian times (1, u, v, uu, uv, vv), then
 /// the gradients of R, G and B; with depth one more for it; with absolute two more, of the absolute
@@ -165,7 +167,7 @@ fn add_product(sum: &mut Pixels, sign: f32, a: &Pixels, b: &Pixels) {
 }
 
 /// Fills `sums[position]` for every (tile, splat) pair of `bins`.
-pub(super) fn rasterize_backward<const N: usize>(
+pub(super) fn rasterize_backward_tiles<const N: usize>(
     splats: &[TileSplat],
     bins: &Bins,
     picture: PictureGradients<'_>,
@@ -234,4 +236,73 @@ pub(super) fn gather<const N: usize>(splat: &TileSplat, pairs: &[PairSums<N>]) -
     let v_mean_absolute =
         if N >= ABSOLUTE_SUMS { [k * p * total[10], k * total[11]] } else { [0.0; 2] };
     (v, v_mean_absolute)
+}
+
+/// Gradients of all 2D splats, each with the absolute one of its centre where `N` has it.
+fn gradients<const N: usize>(
+    Binned { splats, bins }: &Binned,
+    picture: PictureGradients<'_>,
+) -> Vec<(V2d, [f32; 2])> {
+    let mut sums: Vec<PairSums<N>> = Vec::new();
+    rasterize_backward_tiles(splats, bins, picture, &mut sums);
+    splats
+        .par_chunks(CHUNK)
+        .enumerate()
+        .flat_map_iter(|(chunk, splats)| {
+            let (first, mut pairs) = (chunk * CHUNK, Vec::new());
+            bins.take_pairs(first..first + splats.len(), &sums, &mut pairs);
+            let gather = |(k, splat)| gather(splat, &pairs[bins.pairs_of(first, first + k)]);
+            splats.iter().enumerate().map(gather).collect::<Vec<_>>()
+        })
+        .collect()
+}
+
+pub(super) fn rasterize_backward(
+    projected: &Projected<f32>,
+    image: &Image<f32>,
+    v_image: &ImageGradients<f32>,
+    absolute: bool,
+) -> Result<ProjectedGradients<f32>> {
+    let binned = bin(projected)?;
+    let channel = |rows: &[[f32; 3]], c: usize| rows.iter().map(|p| p[c]).collect::<Vec<_>>();
+    let planes = Planes {
+        width: image.width as usize,
+        height: image.height as usize,
+        planes: [
+            channel(&image.color, 0),
+            channel(&image.color, 1),
+            channel(&image.color, 2),
+            image.depth.clone(),
+            image.transmittance.clone(),
+        ],
+    };
+    let v_color: [Vec<f32>; 3] = std::array::from_fn(|c| channel(&v_image.v_color, c));
+    let picture = PictureGradients {
+        image: &planes,
+        v_color: &v_color,
+        v_alpha: Some(&v_image.v_alpha),
+        v_depth: Some(&v_image.v_depth),
+    };
+    let list = if absolute {
+        gradients::<ABSOLUTE_SUMS>(&binned, picture)
+    } else {
+        gradients::<DEPTH_SUMS>(&binned, picture)
+    };
+    let mut v_background = [0.0f64; 3];
+    for (t, v) in image.transmittance.iter().zip(&v_image.v_color) {
+        for (sum, v) in v_background.iter_mut().zip(v) {
+            *sum += f64::from(*t) * f64::from(*v);
+        }
+    }
+    let v_factors = list.iter().zip(&projected.factors).map(|((v, _), &f)| v.v_factor(f));
+    Ok(ProjectedGradients {
+        v_means2d: list.iter().map(|(v, _)| v.v_mean).collect(),
+        v_factors: v_factors.collect(),
+        v_depths: list.iter().map(|(v, _)| v.v_depth).collect(),
+        v_colors: list.iter().map(|(v, _)| v.v_color).collect(),
+        v_opacities: list.iter().map(|(v, _)| v.v_opacity).collect(),
+        v_background: v_background.map(|v| v as f32),
+        v_means2d_absolute: absolute
+            .then(|| list.iter().map(|&(_, v_absolute)| v_absolute).collect()),
+    })
 }

@@ -2,7 +2,7 @@
 
 use pulp::Simd;
 
-use crate::fit::SSIM_WINDOW;
+use crate::constants::SSIM_WINDOW;
 
 /// Taps on each side of the window's centre.
 pub(super) const HALF: usize = SSIM_WINDOW.len() / 2;

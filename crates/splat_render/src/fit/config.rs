@@ -1,9 +1,9 @@
 //! Settings of a fit.
 
 use super::cameras::CameraConfig;
-use super::device::Rates;
 use crate::constants::SH_DEGREE_MAX;
 use crate::error::{Error, Result};
+use crate::stages::Rates;
 
 /// How the number of splats is controlled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

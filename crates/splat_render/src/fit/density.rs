@@ -5,7 +5,8 @@ use glam::{Mat3, Quat, Vec3};
 use rand::Rng;
 use rand_pcg::Pcg64;
 
-use super::params::{DensityStats, FitState, SplatArrays};
+use crate::fit_device::{DensityStats, FitState};
+use crate::splats::SplatArrays;
 
 /// Splats fainter than this are dead (both papers).
 const OPACITY_DEAD: f32 = 0.005;

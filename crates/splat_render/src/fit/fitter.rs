@@ -9,15 +9,15 @@ use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
 
-use super::cameras::{CameraState, Cameras, scene_distance};
+use super::cameras::{CameraState, Cameras, PosePrior, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
-use super::device::{FitDevice, Rates, StepInput, Target};
-use super::hold::Hold;
 use super::hull::Hull;
-use super::params::FitState;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
+use crate::fit_device::{FitDevice, FitState, StepInput};
+use crate::stages::Rates;
+use crate::target::Target;
 
 /// Density control starts after this many steps and then runs every so many.
 const REFINE: (u32, u32) = (300, 100);
@@ -187,7 +187,7 @@ impl Fitter {
     }
 
     /// Holds cameras that are fitted by what else is known of them; before anything else.
-    pub fn hold_cameras(&mut self, holds: Vec<Hold>) -> Result<()> {
+    pub fn hold_cameras(&mut self, holds: Vec<PosePrior>) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("holds", "are of cameras that are not fitted"));
         };

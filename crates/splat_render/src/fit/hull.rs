@@ -2,9 +2,9 @@
 
 use glam::DVec3;
 
-use super::device::Target;
-use super::params::SplatArrays;
 use crate::camera::Camera;
+use crate::splats::SplatArrays;
+use crate::target::Target;
 
 /// Silhouettes of the photos that have alpha.
 #[derive(Debug, Default)]

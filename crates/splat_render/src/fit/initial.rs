@@ -2,9 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::params::SplatArrays;
 use crate::error::{Error, Result};
 use crate::sh;
+use crate::splats::SplatArrays;
 
 /// Opacity of a splat that stands for a point (3DGS).
 const OPACITY: f32 = 0.1;

@@ -1,23 +1,25 @@
-//! Fitting splats to photos with known cameras.
+//! Fitting splats to photos: which photo, rates and background each step has ([`Fitter`]), when splats
+//! come and go, and how cameras move with them. The steps themselves run on a [`FitDevice`].
 
 mod cameras;
 mod config;
 mod density;
-mod device;
 mod fitter;
-mod hold;
 mod hull;
 mod initial;
-mod params;
 
-pub use cameras::{CameraConfig, CameraState, Cameras, Focal, scene_distance};
+pub use cameras::{CameraConfig, CameraState, Cameras, Focal, PosePrior, scene_distance};
 pub use config::{Background, DensityControl, FitConfig};
-pub(crate) use device::dropout_threshold;
-pub use device::{
-    ADAM, CameraGradient, FitDevice, Rates, SSIM_C, SSIM_WINDOW, StepInput, Target, Weight,
-    is_dropped, noise_normal,
-};
 pub use fitter::{Fitter, scene_extent};
-pub use hold::Hold;
 pub use initial::splats_from_points;
-pub use params::{DensityStats, FitState, SplatArrays};
+
+pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
+pub use crate::fit_device::{
+    CameraGradient, DensityStats, FitDevice, FitState, StepInput, is_dropped, noise_normal,
+};
+pub use crate::splats::SplatArrays;
+pub use crate::stages::Rates;
+pub use crate::target::{Target, Weight};
+
+/// [`PosePrior`] under its first name.
+pub use cameras::PosePrior as Hold;

@@ -7,6 +7,7 @@ use std::ops::Range;
 
 use super::device::{Gpu, Op};
 use super::layout::{ALL_SPLATS, Chunk, ChunkCount, SortPass, StatusHead};
+use super::project::Projection;
 use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
@@ -112,19 +113,13 @@ impl SplatBins {
     }
 
     /// Sorts the splats by depth.
-    pub fn depth_ops(
-        &self,
-        gpu: &Gpu,
-        view: &wgpu::Buffer,
-        chunk: &TileChunk,
-        splats2d: &wgpu::Buffer,
-    ) -> Vec<Op> {
+    pub fn depth_ops(&self, gpu: &Gpu, drawn: Projection<'_>, chunk: &TileChunk) -> Vec<Op> {
         let keys = gpu.op(
             Kernel::DepthKeys,
             &[
-                view.into(),
+                drawn.view.into(),
                 (&chunk.uniform).into(),
-                splats2d.into(),
+                drawn.splats2d.into(),
                 (&self.keys[0]).into(),
                 (&self.order[0]).into(),
                 (&self.offsets).into(),
@@ -138,13 +133,7 @@ impl SplatBins {
     }
 
     /// Counts the pairs of a chunk: [`Self::offsets`] and the chunk's entry in [`Self::status`].
-    pub fn count_ops(
-        &self,
-        gpu: &Gpu,
-        view: &wgpu::Buffer,
-        chunk: &TileChunk,
-        splats2d: &wgpu::Buffer,
-    ) -> Vec<Op> {
+    pub fn count_ops(&self, gpu: &Gpu, drawn: Projection<'_>, chunk: &TileChunk) -> Vec<Op> {
         let scan = [
             (&chunk.uniform).into(),
             (&self.offsets).into(),
@@ -155,9 +144,9 @@ impl SplatBins {
             gpu.op(
                 Kernel::TileCounts,
                 &[
-                    view.into(),
+                    drawn.view.into(),
                     (&chunk.uniform).into(),
-                    splats2d.into(),
+                    drawn.splats2d.into(),
                     (&self.keys[0]).into(),
                     self.order().into(),
                     (&self.offsets).into(),
@@ -173,17 +162,16 @@ impl SplatBins {
     pub fn pair_ops(
         &self,
         gpu: &Gpu,
-        view: &wgpu::Buffer,
+        drawn: Projection<'_>,
         chunk: &TileChunk,
-        splats2d: &wgpu::Buffer,
         pairs: &PairBins,
     ) -> Vec<Op> {
         let mut ops = vec![gpu.op(
             Kernel::Emit,
             &[
-                view.into(),
+                drawn.view.into(),
                 (&chunk.uniform).into(),
-                splats2d.into(),
+                drawn.splats2d.into(),
                 (&self.status).into(),
                 self.order().into(),
                 (&self.offsets).into(),
@@ -248,8 +236,7 @@ impl SplatBins {
     pub fn plan(
         &self,
         gpu: &Gpu,
-        view: &wgpu::Buffer,
-        splats2d: &wgpu::Buffer,
+        drawn: Projection<'_>,
         tiles: u32,
         slot_floats: usize,
     ) -> Result<(Vec<Range<u32>>, u32)> {
@@ -257,21 +244,9 @@ impl SplatBins {
         let (mut open, mut done) = (std::iter::once(0..tiles).collect::<Vec<_>>(), Vec::new());
         let mut capacity = 0;
         while let Some(range) = open.pop() {
-            let chunk = TileChunk::new(
-                gpu,
-                Chunk {
-                    tile_begin: range.start,
-                    tile_end: range.end,
-                    capacity: u32::MAX,
-                    splats: self.splats,
-                    index: 0,
-                    is_first: 1,
-                    is_last: 1,
-                    list_begin: 0,
-                    list_end: u32::MAX,
-                },
-            );
-            let ops = self.count_ops(gpu, view, &chunk, splats2d);
+            let whole = Chunk::whole(tiles, self.splats, u32::MAX);
+            let part = Chunk { tile_begin: range.start, tile_end: range.end, ..whole };
+            let ops = self.count_ops(gpu, drawn, &TileChunk::new(gpu, part));
             let bytes = size_of::<StatusHead>() + size_of::<ChunkCount>();
             let status = gpu.download(&ops, &[(&self.status, bytes as u64)])?;
             let count: ChunkCount =

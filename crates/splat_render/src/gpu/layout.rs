@@ -1,11 +1,14 @@
-//! Structs shared with WGSL (`shared.wgsl`) and the row lengths of the flat buffers. A test holds
+//! Structs shared with WGSL (`shaders/shared.wgsl`) and the row lengths of the flat buffers. A test holds
 //! offsets and sizes against naga's reflection of the shaders.
+
+use std::ops::Range;
 
 use bytemuck::{Pod, Zeroable};
 
 use crate::camera::Camera;
 use crate::constants::TILE;
-use crate::stages::{Colors, ProjectOptions, SplatParams};
+use crate::stages::{AdamStep, Colors, ProjectOptions, Rates, SplatParams};
+use crate::target::Weight;
 
 /// Floats per splat in the geometry buffer: mean 3, scales 3, quaternion 4 (wxyz), opacity 1.
 pub(super) const GEOMETRY: usize = 11;
@@ -20,8 +23,7 @@ pub(super) const GRADIENT_ABSOLUTE: usize = GRADIENT + 2;
 /// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.
 pub(super) const CAMERA: usize = 16;
 
-/// Floats per splat of what density control watches: sum of gradient lengths, steps seen, largest
-/// extent.
+/// Floats per splat of what density control watches: sum of gradient lengths, steps seen.
 pub(super) const STATS: usize = 2;
 
 /// Splats per workgroup of the per-splat kernels; windows are multiples of it, which also keeps
@@ -84,7 +86,7 @@ impl View {
             jacobian_limits: camera.jacobian_limits().map(|v| v as f32),
             focal: [camera.fx as f32, camera.fy as f32],
             principal: [camera.cx as f32, camera.cy as f32],
-            near: options.near,
+            near: options.nearest(),
             far: options.far,
             blur: options.blur,
             antialiased: u32::from(options.antialiased),
@@ -115,6 +117,35 @@ pub(super) struct Chunk {
     pub is_last: u32,
     pub list_begin: u32,
     pub list_end: u32,
+}
+
+impl Chunk {
+    /// All `tiles` of a picture at once, for `splats` splats and room for `capacity` pairs.
+    pub fn whole(tiles: u32, splats: u32, capacity: u32) -> Self {
+        Self {
+            tile_begin: 0,
+            tile_end: tiles,
+            capacity,
+            splats,
+            index: 0,
+            is_first: 1,
+            is_last: 1,
+            list_begin: 0,
+            list_end: u32::MAX,
+        }
+    }
+
+    /// The same picture, cut into these runs of tiles.
+    pub fn parts(self, runs: &[Range<u32>]) -> impl Iterator<Item = Self> {
+        let last = runs.len().saturating_sub(1);
+        runs.iter().enumerate().map(move |(i, run)| Self {
+            tile_begin: run.start,
+            tile_end: run.end,
+            is_first: u32::from(i == 0),
+            is_last: u32::from(i == last),
+            ..self
+        })
+    }
 }
 
 /// One pass of the radix sort.
@@ -178,4 +209,41 @@ pub(super) struct Step {
     pub l1: f32,
     pub ssim: f32,
     pub has_weights: u32,
+    pub frozen: u32,
+}
+
+impl Step {
+    /// What adam is to do to `splats` splats.
+    pub fn of_adam(step: &AdamStep, splats: u32) -> Self {
+        let n = f64::from(splats.max(1));
+        let Rates { means, quats, scales, opacities, sh0, sh_rest } = step.rates;
+        let [bias_first, bias_second] = step.bias().map(|bias| bias as f32);
+        Self {
+            means,
+            quats,
+            scales,
+            opacities,
+            sh0,
+            sh_rest,
+            bias_first,
+            bias_second,
+            opacity_pull: (f64::from(step.opacity_regularizer) / n) as f32,
+            scale_pull: (f64::from(step.scale_regularizer) / (3.0 * n)) as f32,
+            noise: step.noise,
+            noise_seed: step.noise_seed,
+            frozen: u32::from(step.is_frozen()),
+            ..Self::zeroed()
+        }
+    }
+
+    /// The same, with what the loss is told of a photo.
+    pub fn with_loss(self, ssim_weight: f32, weight: Weight, has_weights: bool) -> Self {
+        let (ssim, scale) = (f64::from(ssim_weight), weight.scale());
+        Self {
+            l1: ((1.0 - ssim) * scale) as f32,
+            ssim: (ssim * scale) as f32,
+            has_weights: u32::from(has_weights),
+            ..self
+        }
+    }
 }

@@ -1,9 +1,20 @@
 //! loss: L1 and D-SSIM of the picture against a photo, with the picture's gradient.
 
+use bytemuck::Zeroable;
+
 use super::device::{Gpu, Op};
+use super::layout::{Step, View};
 use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::Result;
+use crate::stages::{Image, Loss};
+use crate::target::Target;
+
+/// A photo's pixels as the kernels read them: opaque where it has no alpha.
+pub(super) fn rgba(target: &Target) -> Vec<[u8; 4]> {
+    let pixels = target.pixels.chunks_exact(target.channels as usize);
+    pixels.map(|p| [p[0], p[1], p[2], p.get(3).copied().unwrap_or(255)]).collect()
+}
 
 /// What the loss reads and writes for pictures of one size.
 #[derive(Debug)]
@@ -14,6 +25,10 @@ pub(super) struct LossBuffers {
     pub weights: wgpu::Buffer,
     /// `[9 * H * W]`
     slopes: wgpu::Buffer,
+    /// `[H * W]` gradients of colour and, 0, accumulated depth.
+    pub v_picture: wgpu::Buffer,
+    /// `[H * W]` colour . v_color.
+    pub totals: wgpu::Buffer,
     /// `[workgroups * 2]` weighted sums of SSIM and of |x - y|.
     pub sums: wgpu::Buffer,
     groups: [u32; 2],
@@ -28,6 +43,8 @@ impl LossBuffers {
             photo: gpu.bindable("photo", 4 * pixels)?,
             weights: gpu.bindable("weights", 4 * pixels)?,
             slopes: gpu.bindable("slopes of SSIM", 36 * pixels)?,
+            v_picture: gpu.bindable("v_picture", 16 * pixels)?,
+            totals: gpu.bindable("totals", 4 * pixels)?,
             sums: gpu.bindable("loss sums", 8 * u64::from(groups[0] * groups[1]))?,
             groups,
         })
@@ -56,8 +73,6 @@ impl LossBuffers {
         view: &wgpu::Buffer,
         step: &wgpu::Buffer,
         picture: &wgpu::Buffer,
-        v_picture: &wgpu::Buffer,
-        totals: &wgpu::Buffer,
     ) -> Vec<Op> {
         let bindings = [
             view.into(),
@@ -66,8 +81,8 @@ impl LossBuffers {
             (&self.photo).into(),
             (&self.weights).into(),
             (&self.slopes).into(),
-            v_picture.into(),
-            totals.into(),
+            (&self.v_picture).into(),
+            (&self.totals).into(),
             (&self.sums).into(),
         ];
         vec![
@@ -75,4 +90,35 @@ impl LossBuffers {
             gpu.op(Kernel::LossGradient, &bindings, self.groups),
         ]
     }
+}
+
+pub(super) fn loss(
+    gpu: &Gpu,
+    image: &Image<f32>,
+    target: &Target,
+    background: [f32; 3],
+    ssim_weight: f32,
+) -> Result<Loss<f32>> {
+    let (width, height) = (image.width, image.height);
+    let pixels = u64::from(width) * u64::from(height);
+    let mut buffers = LossBuffers::new(gpu, width, height)?;
+    buffers.photo = gpu.upload("photo", &rgba(target))?;
+    if let Some(weights) = &target.weights {
+        buffers.weights = gpu.upload("weights", weights)?;
+    }
+    let picture: Vec<[f32; 4]> = image.color.iter().map(|&[r, g, b]| [r, g, b, 0.0]).collect();
+    gpu.bindable_bytes("picture", 16 * pixels)?;
+    let picture = gpu.upload("picture", &picture)?;
+    let view = gpu.uniform(&View::of_picture(width, height, background));
+    let weight = target.weight();
+    let step = Step::zeroed().with_loss(ssim_weight, weight, target.weights.is_some());
+    let ops = buffers.ops(gpu, &view, &gpu.uniform(&step), &picture);
+    let wanted = [(&buffers.v_picture, 16 * pixels), (&buffers.sums, buffers.sum_bytes())];
+    let data = gpu.download(&ops, &wanted)?;
+    let v_picture: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&data[0]);
+    let [ssim, l1] = LossBuffers::total(&data[1]);
+    Ok(Loss {
+        value: weight.loss(f64::from(ssim_weight), l1, ssim) as f32,
+        v_color: v_picture.iter().map(|v| [v[0], v[1], v[2]]).collect(),
+    })
 }

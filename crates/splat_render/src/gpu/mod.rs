@@ -1,11 +1,13 @@
 //! The stages as WGSL kernels on any Vulkan, Metal or DX12 device, through wgpu.
 //!
-//! Nothing here needs subgroups (only llvmpipe uses them: tile_subgroup.wgsl), more than 16 KiB of
+//! Nothing here needs subgroups (only llvmpipe uses them: shaders/tile_subgroup.wgsl), more than 16 KiB of
 //! workgroup memory, more than eight storage buffers per kernel, or one workgroup waiting for another;
 //! sums are taken in a fixed order, so that runs repeat bit for bit on a device. What does not fit one
 //! binding is done in parts: splats in windows, tiles in chunks. Neither changes a bit of the result.
 
+mod adam;
 mod bin;
+mod desktop;
 mod device;
 mod fit;
 mod layout;
@@ -27,9 +29,10 @@ pub use shaders::shared_wgsl;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
-    Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, SplatGradients,
-    SplatParams, Stages,
+    AdamState, AdamStep, Image, ImageGradients, Loss, ProjectOptions, Projected,
+    ProjectedGradients, SplatGradients, SplatParams, Stages, check,
 };
+use crate::target::Target;
 
 impl Stages<f32> for Gpu {
     fn project(
@@ -38,8 +41,7 @@ impl Stages<f32> for Gpu {
         camera: &Camera,
         options: &ProjectOptions,
     ) -> Result<Projected<f32>> {
-        splats.validate()?;
-        camera.validate()?;
+        check::project(splats, camera, options)?;
         project::project(self, splats, camera, options)
     }
 
@@ -56,8 +58,7 @@ impl Stages<f32> for Gpu {
         v_image: &ImageGradients<f32>,
         absolute: bool,
     ) -> Result<ProjectedGradients<f32>> {
-        projected.validate()?;
-        v_image.validate(projected, image)?;
+        check::rasterize_backward(projected, image, v_image)?;
         rasterize_backward::rasterize_backward(
             self, projected, background, image, v_image, absolute,
         )
@@ -71,10 +72,28 @@ impl Stages<f32> for Gpu {
         projected: &Projected<f32>,
         v_projected: &ProjectedGradients<f32>,
     ) -> Result<SplatGradients<f32>> {
-        splats.validate()?;
-        camera.validate()?;
-        projected.validate()?;
-        v_projected.validate(splats.len(), projected.len())?;
+        check::project_backward(splats, camera, options, projected, v_projected)?;
         project_backward::project_backward(self, splats, camera, options, projected, v_projected)
+    }
+
+    fn loss(
+        &self,
+        image: &Image<f32>,
+        target: &Target,
+        background: [f32; 3],
+        ssim_weight: f32,
+    ) -> Result<Loss<f32>> {
+        check::loss(image, target, ssim_weight)?;
+        loss::loss(self, image, target, background, ssim_weight)
+    }
+
+    fn adam(
+        &self,
+        state: &mut AdamState<f32>,
+        gradients: &SplatGradients<f32>,
+        step: &AdamStep,
+    ) -> Result<()> {
+        check::adam(state, gradients, step)?;
+        adam::adam(self, state, gradients, step)
     }
 }

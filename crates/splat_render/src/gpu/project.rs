@@ -22,6 +22,18 @@ pub(super) struct SplatBuffers {
     pub colors: wgpu::Buffer,
 }
 
+/// A camera and the 2D splats it sees, on the device: what all stages after project read.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Projection<'a> {
+    /// A [`View`].
+    pub view: &'a wgpu::Buffer,
+    /// `[N]` of [`Splat2d`].
+    pub splats2d: &'a wgpu::Buffer,
+}
+
+/// Floats of a [`Splat2d`].
+pub(super) const SPLAT_2D: usize = size_of::<Splat2d>() / 4;
+
 /// The number of splats as the kernels count them.
 pub(super) fn count(splats: usize) -> Result<u32> {
     // Far above what fits any device, and low enough that no index overflows.
@@ -61,7 +73,7 @@ impl SplatBuffers {
 
     /// Windows of splats whose widest rows can be bound at once.
     pub fn windows(&self, gpu: &Gpu) -> Vec<Range<u32>> {
-        let floats = self.color_floats.max((GEOMETRY.max(GRADIENT).max(12)) as u64);
+        let floats = self.color_floats.max((GEOMETRY.max(GRADIENT).max(SPLAT_2D)) as u64);
         gpu.windows(self.splats, 4 * floats)
     }
 }
@@ -73,12 +85,7 @@ pub(super) fn rows<'a>(buffer: &'a wgpu::Buffer, window: &Range<u32>, floats: u6
 }
 
 /// Projects all splats.
-pub(super) fn project_ops(
-    gpu: &Gpu,
-    view: &wgpu::Buffer,
-    splats: &SplatBuffers,
-    splats2d: &wgpu::Buffer,
-) -> Vec<Op> {
+pub(super) fn project_ops(gpu: &Gpu, to: Projection<'_>, splats: &SplatBuffers) -> Vec<Op> {
     let mut ops = Vec::new();
     for window in splats.windows(gpu) {
         let count = window.len() as u32;
@@ -86,11 +93,11 @@ pub(super) fn project_ops(
         ops.push(gpu.op(
             Kernel::Project,
             &[
-                view.into(),
+                to.view.into(),
                 (&uniform).into(),
                 rows(&splats.geometry, &window, GEOMETRY as u64),
                 rows(&splats.colors, &window, splats.color_floats),
-                rows(splats2d, &window, 12),
+                rows(to.splats2d, &window, SPLAT_2D as u64),
             ],
             gpu.groups(count, SPLATS_PER_GROUP),
         ));
@@ -109,7 +116,8 @@ pub(super) fn project(
     let view = gpu.uniform(&View::of_camera(camera, options, splats));
     let bytes = (n * size_of::<Splat2d>()) as u64;
     let splats2d = gpu.buffer("splats2d", bytes)?;
-    let ops = project_ops(gpu, &view, &buffers, &splats2d);
+    let to = Projection { view: &view, splats2d: &splats2d };
+    let ops = project_ops(gpu, to, &buffers);
     let data = gpu.download(&ops, &[(&splats2d, bytes)])?;
     let mut out = Projected::culled(n, camera.width, camera.height);
     for (i, bytes) in data[0].chunks_exact(size_of::<Splat2d>()).enumerate() {

@@ -2,12 +2,14 @@
 
 use super::device::{Gpu, Op};
 use super::layout::{CAMERA, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, View, Window};
-use super::project::{SplatBuffers, rows};
+use super::project::{Projection, SPLAT_2D, SplatBuffers, geometry_rows, rows};
 use super::rasterize::splats2d;
 use super::shaders::Kernel;
 use crate::camera::Camera;
 use crate::error::Result;
-use crate::stages::{ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams};
+use crate::stages::{
+    Colors, ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams,
+};
 
 /// Workgroups of one pass over all splats, which is also the number of camera sums.
 pub(super) fn camera_sums(splats: u32) -> u32 {
@@ -54,12 +56,30 @@ impl GradientBuffers {
     }
 }
 
+impl GradientBuffers {
+    /// With these gradients, the camera's apart.
+    pub fn upload(gpu: &Gpu, v: &SplatGradients<f32>) -> Result<Self> {
+        let as_splats = SplatParams {
+            means: &v.v_means,
+            quats: &v.v_quats,
+            scales: &v.v_scales,
+            opacities: &v.v_opacities,
+            colors: Colors::Direct(&v.v_colors),
+            raw: true,
+        };
+        Ok(Self {
+            geometry: gpu.upload("v_geometry", &geometry_rows(&as_splats))?,
+            colors: gpu.upload("v_colors", &v.v_colors)?,
+            camera: gpu.buffer("v_camera", 0)?,
+        })
+    }
+}
+
 /// Differentiates the projection of all splats.
 pub(super) fn project_backward_ops(
     gpu: &Gpu,
-    view: &wgpu::Buffer,
+    drawn: Projection<'_>,
     splats: &SplatBuffers,
-    splats2d: &wgpu::Buffer,
     v_splats2d: &wgpu::Buffer,
     gradients: &GradientBuffers,
 ) -> Vec<Op> {
@@ -70,11 +90,11 @@ pub(super) fn project_backward_ops(
         ops.push(gpu.op(
             Kernel::ProjectBackward,
             &[
-                view.into(),
+                drawn.view.into(),
                 (&uniform).into(),
                 rows(&splats.geometry, &window, GEOMETRY as u64),
                 rows(&splats.colors, &window, splats.color_floats),
-                rows(splats2d, &window, 12),
+                rows(drawn.splats2d, &window, SPLAT_2D as u64),
                 rows(v_splats2d, &window, GRADIENT as u64),
                 rows(&gradients.geometry, &window, GEOMETRY as u64),
                 rows(&gradients.colors, &window, splats.color_floats),
@@ -115,7 +135,8 @@ pub(super) fn project_backward(
     let splats2d = gpu.upload("splats2d", &splats2d(projected))?;
     let v_splats2d = gpu.upload("v_splats2d", &gradient_rows(v_projected))?;
     let gradients = GradientBuffers::new(gpu, &buffers)?;
-    let ops = project_backward_ops(gpu, &view, &buffers, &splats2d, &v_splats2d, &gradients);
+    let drawn = Projection { view: &view, splats2d: &splats2d };
+    let ops = project_backward_ops(gpu, drawn, &buffers, &v_splats2d, &gradients);
     let sums = u64::from(camera_sums(buffers.splats));
     let data = gpu.download(
         &ops,

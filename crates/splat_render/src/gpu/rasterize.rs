@@ -1,17 +1,22 @@
 //! rasterize: 2D splats to a picture.
 
+use bytemuck::Zeroable;
+
 use super::bin::{PairBins, SplatBins, TileChunk, tile_count};
 use super::device::{Gpu, Op};
 use super::layout::{Chunk, GRADIENT, Splat2d, View};
-use super::project::count;
+use super::project::{Projection, count};
 use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{Image, Projected};
 
-/// 2D splats as the kernels read them.
+/// 2D splats as the kernels read them; those that are not drawn are culled.
 pub(super) fn splats2d(projected: &Projected<f32>) -> Vec<Splat2d> {
     (0..projected.len())
         .map(|i| {
+            if !projected.is_drawn(i) {
+                return Splat2d::zeroed();
+            }
             let [p, q, r] = projected.factors[i];
             Splat2d {
                 mean: projected.means2d[i],
@@ -52,68 +57,67 @@ impl Binned {
         let splats2d = gpu.upload("splats2d", &splats2d(projected))?;
         let bins = SplatBins::new(gpu, splats, 1)?;
         let tiles = tile_count(projected.width, projected.height);
-        let all = Chunk {
-            tile_begin: 0,
-            tile_end: tiles,
-            capacity: u32::MAX,
-            splats,
-            index: 0,
-            is_first: 1,
-            is_last: 1,
-            list_begin: 0,
-            list_end: u32::MAX,
-        };
-        gpu.submit(&[&bins.depth_ops(gpu, &view, &TileChunk::new(gpu, all), &splats2d)])?;
-        let (ranges, capacity) = bins.plan(gpu, &view, &splats2d, tiles, slot_floats)?;
+        let drawn = Projection { view: &view, splats2d: &splats2d };
+        let all = TileChunk::new(gpu, Chunk::whole(tiles, splats, u32::MAX));
+        gpu.submit(&[&bins.depth_ops(gpu, drawn, &all)])?;
+        let (runs, capacity) = bins.plan(gpu, drawn, tiles, slot_floats)?;
         let pairs = PairBins::new(gpu, capacity, tiles)?;
-        let last = ranges.len() - 1;
-        let chunks = ranges
-            .iter()
-            .enumerate()
-            .map(|(i, range)| {
-                let chunk = Chunk {
-                    tile_begin: range.start,
-                    tile_end: range.end,
-                    capacity,
-                    is_first: u32::from(i == 0),
-                    is_last: u32::from(i == last),
-                    ..all
-                };
-                TileChunk::new(gpu, chunk)
-            })
-            .collect();
+        let parts = Chunk::whole(tiles, splats, capacity).parts(&runs);
+        let chunks = parts.map(|chunk| TileChunk::new(gpu, chunk)).collect();
         Ok(Self { view, splats2d, splats, bins, pairs, chunks, capacity })
+    }
+
+    /// The camera and its 2D splats.
+    pub fn projection(&self) -> Projection<'_> {
+        Projection { view: &self.view, splats2d: &self.splats2d }
     }
 
     /// Fills the pair lists for a chunk.
     pub fn chunk_ops(&self, gpu: &Gpu, chunk: &TileChunk) -> Vec<Op> {
-        let mut ops = self.bins.count_ops(gpu, &self.view, chunk, &self.splats2d);
-        ops.extend(self.bins.pair_ops(gpu, &self.view, chunk, &self.splats2d, &self.pairs));
+        let mut ops = self.bins.count_ops(gpu, self.projection(), chunk);
+        ops.extend(self.bins.pair_ops(gpu, self.projection(), chunk, &self.pairs));
         ops
     }
 }
 
-/// Rasterizes a chunk's tiles.
+/// A picture on the device.
+#[derive(Debug)]
+pub(super) struct PictureBuffers {
+    /// `[H * W]` colour and final transmittance.
+    pub picture: wgpu::Buffer,
+    /// `[H * W]` accumulated depths.
+    pub depths: wgpu::Buffer,
+}
+
+impl PictureBuffers {
+    /// For so many pixels.
+    pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
+        Ok(Self {
+            picture: gpu.bindable("picture", 16 * pixels)?,
+            depths: gpu.bindable("depths", 4 * pixels)?,
+        })
+    }
+}
+
+/// Rasterizes a chunk's tiles, whose pair lists are filled.
 pub(super) fn rasterize_ops(
     gpu: &Gpu,
-    view: &wgpu::Buffer,
+    drawn: Projection<'_>,
     chunk: &TileChunk,
-    splats2d: &wgpu::Buffer,
     pairs: &PairBins,
-    picture: &wgpu::Buffer,
-    depths: &wgpu::Buffer,
+    to: &PictureBuffers,
 ) -> Vec<Op> {
     let op = |pass: &wgpu::Buffer| {
         gpu.op(
             Kernel::Rasterize,
             &[
-                view.into(),
+                drawn.view.into(),
                 pass.into(),
-                splats2d.into(),
+                drawn.splats2d.into(),
                 (&pairs.tile_begin).into(),
                 pairs.splat_from_pair(chunk.tiles()).into(),
-                picture.into(),
-                depths.into(),
+                (&to.picture).into(),
+                (&to.depths).into(),
             ],
             gpu.groups(chunk.tiles(), 1),
         )
@@ -128,23 +132,14 @@ pub(super) fn rasterize(
 ) -> Result<Image<f32>> {
     let (width, height) = (projected.width, projected.height);
     let pixels = u64::from(width) * u64::from(height);
-    let picture = gpu.bindable("picture", 16 * pixels)?;
-    let depths = gpu.bindable("depths", 4 * pixels)?;
+    let to = PictureBuffers::new(gpu, pixels)?;
     let binned = Binned::new(gpu, projected, background, GRADIENT)?;
     let mut ops = Vec::new();
     for chunk in &binned.chunks {
         ops.extend(binned.chunk_ops(gpu, chunk));
-        ops.extend(rasterize_ops(
-            gpu,
-            &binned.view,
-            chunk,
-            &binned.splats2d,
-            &binned.pairs,
-            &picture,
-            &depths,
-        ));
+        ops.extend(rasterize_ops(gpu, binned.projection(), chunk, &binned.pairs, &to));
     }
-    let data = gpu.download(&ops, &[(&picture, 16 * pixels), (&depths, 4 * pixels)])?;
+    let data = gpu.download(&ops, &[(&to.picture, 16 * pixels), (&to.depths, 4 * pixels)])?;
     let picture: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&data[0]);
     Ok(Image {
         width,

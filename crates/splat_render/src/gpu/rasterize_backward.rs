@@ -3,6 +3,7 @@
 use super::bin::{PairBins, SplatBins, TileChunk};
 use super::device::{Gpu, Op};
 use super::layout::{GRADIENT, GRADIENT_ABSOLUTE};
+use super::project::Projection;
 use super::rasterize::Binned;
 use super::shaders::Kernel;
 use crate::error::Result;
@@ -26,11 +27,9 @@ pub(super) struct BackwardBuffers {
 /// Differentiates a chunk's tiles, whose pair lists are filled, and adds to the splats' gradients.
 pub(super) fn rasterize_backward_ops(
     gpu: &Gpu,
-    view: &wgpu::Buffer,
+    drawn: Projection<'_>,
     chunk: &TileChunk,
-    splats2d: &wgpu::Buffer,
-    bins: &SplatBins,
-    pairs: &PairBins,
+    (bins, pairs): (&SplatBins, &PairBins),
     buffers: &BackwardBuffers,
     absolute: bool,
 ) -> Vec<Op> {
@@ -45,9 +44,9 @@ pub(super) fn rasterize_backward_ops(
         gpu.op(
             rasterize_backward,
             &[
-                view.into(),
+                drawn.view.into(),
                 pass.into(),
-                splats2d.into(),
+                drawn.splats2d.into(),
                 (&pairs.tile_begin).into(),
                 pairs.splat_from_pair(chunk.tiles()).into(),
                 pairs.slot_from_pair(chunk.tiles()).into(),
@@ -64,7 +63,7 @@ pub(super) fn rasterize_backward_ops(
         &[
             (&chunk.uniform).into(),
             (&bins.status).into(),
-            splats2d.into(),
+            drawn.splats2d.into(),
             bins.order().into(),
             (&bins.offsets).into(),
             (&buffers.slots).into(),
@@ -116,11 +115,9 @@ pub(super) fn rasterize_backward(
         ops.extend(binned.chunk_ops(gpu, chunk));
         ops.extend(rasterize_backward_ops(
             gpu,
-            &binned.view,
+            binned.projection(),
             chunk,
-            &binned.splats2d,
-            &binned.bins,
-            &binned.pairs,
+            (&binned.bins, &binned.pairs),
             &buffers,
             absolute,
         ));

@@ -4,7 +4,7 @@
 use super::bin::{SplatBins, TileChunk};
 use super::device::{Gpu, Op};
 use super::layout::{Chunk, Splat2d, View};
-use super::project::{SplatBuffers, project_ops};
+use super::project::{Projection, SplatBuffers, project_ops};
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{Colors, ProjectOptions, SplatParams};
@@ -16,8 +16,8 @@ pub struct ResidentSplats {
     sh_degree: u32,
     sh_stride: u32,
     raw: bool,
-    pub(super) view: wgpu::Buffer,
-    pub(super) splats2d: wgpu::Buffer,
+    view: wgpu::Buffer,
+    splats2d: wgpu::Buffer,
     pub(super) bins: SplatBins,
     project: Vec<Op>,
     sort: Vec<Op>,
@@ -32,24 +32,15 @@ impl ResidentSplats {
         let view = gpu.uniform(&View::of_picture(1, 1, [0.0; 3]));
         let splats2d = gpu.bindable("splats2d", u64::from(count) * size_of::<Splat2d>() as u64)?;
         let bins = SplatBins::new(gpu, count, 1)?;
-        let all = Chunk {
-            tile_begin: 0,
-            tile_end: 0,
-            capacity: 0,
-            splats: count,
-            index: 0,
-            is_first: 1,
-            is_last: 1,
-            list_begin: 0,
-            list_end: u32::MAX,
-        };
+        let all = TileChunk::new(gpu, Chunk::whole(0, count, 0));
+        let drawn = Projection { view: &view, splats2d: &splats2d };
         let (sh_degree, sh_stride) = match splats.colors {
             Colors::Direct(_) => (0, 0),
             Colors::Sh { degree, stride, .. } => (degree, stride as u32),
         };
         Ok(Self {
-            project: project_ops(gpu, &view, &buffers, &splats2d),
-            sort: bins.depth_ops(gpu, &view, &TileChunk::new(gpu, all), &splats2d),
+            project: project_ops(gpu, drawn, &buffers),
+            sort: bins.depth_ops(gpu, drawn, &all),
             sh_degree,
             sh_stride,
             raw: splats.raw,
@@ -83,8 +74,14 @@ impl ResidentSplats {
         [project, sort]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 2],
     ) -> Result<()> {
         camera.validate()?;
+        options.validate()?;
         self.record_view(gpu, encoder, &self.view(camera, options, sh_degree), [project, sort]);
         Ok(())
+    }
+
+    /// The last camera and its 2D splats.
+    pub(super) fn projection(&self) -> Projection<'_> {
+        Projection { view: &self.view, splats2d: &self.splats2d }
     }
 
     /// What the kernels are told of a camera.

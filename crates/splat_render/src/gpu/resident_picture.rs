@@ -7,7 +7,7 @@ use std::ops::Range;
 use super::bin::{PairBins, TileChunk, pair_limit, tile_count};
 use super::device::Gpu;
 use super::layout::{Chunk, ChunkCount, StatusHead, View};
-use super::rasterize::rasterize_ops;
+use super::rasterize::{PictureBuffers, rasterize_ops};
 use super::resident::ResidentSplats;
 use crate::camera::Camera;
 use crate::constants::TILE;
@@ -19,8 +19,7 @@ use crate::stages::ProjectOptions;
 pub struct ResidentPicture {
     width: u32,
     height: u32,
-    picture: wgpu::Buffer,
-    depths: wgpu::Buffer,
+    buffers: PictureBuffers,
     pairs: PairBins,
     /// Pairs that `pairs` has room for.
     capacity: u32,
@@ -34,8 +33,7 @@ impl ResidentPicture {
         Ok(Self {
             width,
             height,
-            picture: gpu.bindable("picture", 16 * pixels)?,
-            depths: gpu.bindable("depths", 4 * pixels)?,
+            buffers: PictureBuffers::new(gpu, pixels)?,
             pairs: PairBins::new(gpu, 0, tile_count(width, height))?,
             capacity: 0,
             counted: gpu.readable(size_of::<ChunkCount>() as u64),
@@ -44,7 +42,7 @@ impl ResidentPicture {
 
     /// `[H * W]` colour without background, and final transmittance, row-major.
     pub fn picture(&self) -> &wgpu::Buffer {
-        &self.picture
+        &self.buffers.picture
     }
 
     /// Draws the columns of what a camera sees: submits project, sort and a count of the pairs, waits
@@ -63,6 +61,7 @@ impl ResidentPicture {
         [project, sort, mut bin, mut rasterize]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 4],
     ) -> Result<()> {
         camera.validate()?;
+        options.validate()?;
         let width = columns.end.saturating_sub(columns.start);
         let fits = tile_count(width, camera.height) <= tile_count(self.width, self.height)
             && u64::from(width) * u64::from(camera.height)
@@ -77,27 +76,17 @@ impl ResidentPicture {
                 ),
             ));
         }
-        let whole = splats.view(camera, options, sh_degree);
+        let all = splats.view(camera, options, sh_degree);
         let view = View {
-            principal: [whole.principal[0] - columns.start as f32, whole.principal[1]],
+            principal: [all.principal[0] - columns.start as f32, all.principal[1]],
             width,
             tiles_x: width.div_ceil(TILE),
-            ..whole
+            ..all
         };
         let tiles = tile_count(width, camera.height);
-        let all = Chunk {
-            tile_begin: 0,
-            tile_end: tiles,
-            capacity: u32::MAX,
-            splats: splats.len(),
-            index: 0,
-            is_first: 1,
-            is_last: 1,
-            list_begin: 0,
-            list_end: u32::MAX,
-        };
-        let (view_buffer, splats2d, bins) = (&splats.view, &splats.splats2d, &splats.bins);
-        let count = bins.count_ops(gpu, view_buffer, &TileChunk::new(gpu, all), splats2d);
+        let (drawn, bins) = (splats.projection(), &splats.bins);
+        let whole = Chunk::whole(tiles, splats.len(), u32::MAX);
+        let count = bins.count_ops(gpu, drawn, &TileChunk::new(gpu, whole));
         let mut first = gpu.device.create_command_encoder(&Default::default());
         splats.record_view(gpu, &mut first, &view, [project, sort]);
         Gpu::record_pass(&mut first, &count, None);
@@ -109,10 +98,10 @@ impl ResidentPicture {
         let ChunkCount { total, .. } = bytemuck::pod_read_unaligned(&data[0]);
 
         let is_whole = total <= pair_limit(gpu, 1);
-        let (ranges, most) = if is_whole {
+        let (runs, most) = if is_whole {
             (std::iter::once(0..tiles).collect(), total)
         } else {
-            bins.plan(gpu, view_buffer, splats2d, tiles, 1)?
+            bins.plan(gpu, drawn, tiles, 1)?
         };
         if most > self.capacity {
             // Some more than this frame needs, so that not every frame of an approach makes room.
@@ -120,36 +109,15 @@ impl ResidentPicture {
             self.pairs = PairBins::new(gpu, room, tile_count(self.width, self.height))?;
             self.capacity = room;
         }
-        let last = ranges.len() - 1;
-        for (i, range) in ranges.iter().enumerate() {
-            let chunk = TileChunk::new(
-                gpu,
-                Chunk {
-                    tile_begin: range.start,
-                    tile_end: range.end,
-                    capacity: self.capacity,
-                    is_first: u32::from(i == 0),
-                    is_last: u32::from(i == last),
-                    ..all
-                },
-            );
+        let whole = Chunk { capacity: self.capacity, ..whole };
+        for chunk in whole.parts(&runs) {
+            let chunk = TileChunk::new(gpu, chunk);
             // The whole picture's pairs are counted already.
-            let mut ops = Vec::new();
-            if !is_whole {
-                ops = bins.count_ops(gpu, view_buffer, &chunk, splats2d);
-            }
-            ops.extend(bins.pair_ops(gpu, view_buffer, &chunk, splats2d, &self.pairs));
+            let mut ops = if is_whole { Vec::new() } else { bins.count_ops(gpu, drawn, &chunk) };
+            ops.extend(bins.pair_ops(gpu, drawn, &chunk, &self.pairs));
             Gpu::record_pass(encoder, &ops, bin.take());
-            let ops = rasterize_ops(
-                gpu,
-                view_buffer,
-                &chunk,
-                splats2d,
-                &self.pairs,
-                &self.picture,
-                &self.depths,
-            );
-            let stamps = if i == last { rasterize.take() } else { None };
+            let ops = rasterize_ops(gpu, drawn, &chunk, &self.pairs, &self.buffers);
+            let stamps = if chunk.chunk.is_last == 1 { rasterize.take() } else { None };
             Gpu::record_pass(encoder, &ops, stamps);
         }
         gpu.check()

@@ -3,8 +3,9 @@
 use std::fmt::Write;
 
 use super::layout::{CAMERA, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS};
-use crate::constants::{ALPHA_MAX, ALPHA_MIN, QUAT_NORM2_MIN, TILE, TRANSMITTANCE_MIN};
-use crate::fit::{ADAM, SSIM_C, SSIM_WINDOW};
+use crate::constants::{
+    ADAM, ALPHA_MAX, ALPHA_MIN, QUAT_NORM2_MIN, SSIM_C, SSIM_WINDOW, TILE, TRANSMITTANCE_MIN,
+};
 use crate::sh;
 
 /// What a binding is to a shader.
@@ -30,18 +31,25 @@ pub(super) struct Source {
     pub segmented: bool,
 }
 
-const SHARED: &str = include_str!("shared.wgsl");
-const GEOMETRY_WGSL: &str = include_str!("geometry.wgsl");
-const BIN_TILES: &str = include_str!("bin_tiles.wgsl");
-const BACKWARD: &str = include_str!("rasterize_backward.wgsl");
+const SHARED: &str = include_str!("shaders/shared.wgsl");
+const GEOMETRY_WGSL: &str = include_str!("shaders/geometry.wgsl");
+const BIN_TILES: &str = include_str!("shaders/bin_tiles.wgsl");
+const BACKWARD: &str = include_str!("shaders/rasterize_backward.wgsl");
 const BACKWARD_BINDINGS: [Access; 10] =
     [Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite];
-const BACKWARD_SUM: &str = include_str!("rasterize_backward_sum.wgsl");
+const BACKWARD_SUM: &str = include_str!("shaders/rasterize_backward_sum.wgsl");
 const BACKWARD_SUM_BINDINGS: [Access; 7] = [Uniform, Read, Read, Read, Read, Read, ReadWrite];
-const TILE_WORK: [&str; 2] = [include_str!("tile_memory.wgsl"), include_str!("tile_subgroup.wgsl")];
+const TILE_WORK: [&str; 2] =
+    [include_str!("shaders/tile_memory.wgsl"), include_str!("shaders/tile_subgroup.wgsl")];
 const TILE_SUMS: [&str; 2] = [
-    concat!(include_str!("tile_memory.wgsl"), include_str!("tile_sums_memory.wgsl")),
-    concat!(include_str!("tile_subgroup.wgsl"), include_str!("tile_sums_subgroup.wgsl")),
+    concat!(
+        include_str!("shaders/tile_memory.wgsl"),
+        include_str!("shaders/tile_sums_memory.wgsl")
+    ),
+    concat!(
+        include_str!("shaders/tile_subgroup.wgsl"),
+        include_str!("shaders/tile_sums_subgroup.wgsl")
+    ),
 ];
 // The backward kernels once without and once with sums of absolute gradients, so that who does not
 // ask for those does not pay for them.
@@ -53,56 +61,56 @@ pub(super) static SOURCES: [Source; 14] = [
     Source {
         name: "project",
         shared_work: None,
-        parts: &[SHARED, GEOMETRY_WGSL, include_str!("project.wgsl")],
+        parts: &[SHARED, GEOMETRY_WGSL, include_str!("shaders/project.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {
         name: "project_backward",
         shared_work: None,
-        parts: &[SHARED, GEOMETRY_WGSL, include_str!("project_backward.wgsl")],
+        parts: &[SHARED, GEOMETRY_WGSL, include_str!("shaders/project_backward.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_count",
         shared_work: None,
-        parts: &[SHARED, BIN_TILES, include_str!("bin_count.wgsl")],
+        parts: &[SHARED, BIN_TILES, include_str!("shaders/bin_count.wgsl")],
         bindings: &[Uniform, Uniform, Read, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_scan",
         shared_work: None,
-        parts: &[SHARED, include_str!("bin_scan.wgsl")],
+        parts: &[SHARED, include_str!("shaders/bin_scan.wgsl")],
         bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite],
         segmented: true,
     },
     Source {
         name: "bin_emit",
         shared_work: None,
-        parts: &[SHARED, BIN_TILES, include_str!("bin_emit.wgsl")],
+        parts: &[SHARED, BIN_TILES, include_str!("shaders/bin_emit.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_sort",
         shared_work: None,
-        parts: &[SHARED, include_str!("bin_sort.wgsl")],
+        parts: &[SHARED, include_str!("shaders/bin_sort.wgsl")],
         bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
         segmented: true,
     },
     Source {
         name: "bin_ranges",
         shared_work: None,
-        parts: &[SHARED, include_str!("bin_ranges.wgsl")],
+        parts: &[SHARED, include_str!("shaders/bin_ranges.wgsl")],
         bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "rasterize",
         shared_work: Some(TILE_WORK),
-        parts: &[SHARED, include_str!("rasterize.wgsl")],
+        parts: &[SHARED, include_str!("shaders/rasterize.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite],
         segmented: false,
     },
@@ -137,14 +145,14 @@ pub(super) static SOURCES: [Source; 14] = [
     Source {
         name: "loss",
         shared_work: None,
-        parts: &[SHARED, include_str!("loss.wgsl")],
+        parts: &[SHARED, include_str!("shaders/loss.wgsl")],
         bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "adam",
         shared_work: None,
-        parts: &[SHARED, include_str!("adam.wgsl")],
+        parts: &[SHARED, include_str!("shaders/adam.wgsl")],
         bindings: &[
             Uniform, Uniform, Uniform, Read, ReadWrite, Read, ReadWrite, ReadWrite, Read, Read,
             ReadWrite,
@@ -288,6 +296,19 @@ pub fn shared_wgsl() -> String {
     constants(1) + SHARED
 }
 
+/// The text with every line that has `{row}` in it repeated, once for each of so many rows of pixels.
+fn repeat_rows(text: &str, rows: u32) -> String {
+    let mut out = String::with_capacity(2 * text.len());
+    for line in text.split_inclusive('\n') {
+        if line.contains("{row}") && !line.trim_start().starts_with("//") {
+            (0..rows).for_each(|row| out.push_str(&line.replace("{row}", &row.to_string())));
+        } else {
+            out.push_str(line);
+        }
+    }
+    out
+}
+
 impl Source {
     /// The whole text that is compiled, with threads that own so many rows of pixels, and that are
     /// one subgroup per tile or not.
@@ -297,7 +318,7 @@ impl Source {
             text.push_str(texts[usize::from(subgroups)]);
         }
         for part in self.parts {
-            text.push_str(part);
+            text.push_str(&repeat_rows(part, rows));
         }
         text
     }
@@ -486,7 +507,8 @@ mod tests {
             noise_seed,
             l1,
             ssim,
-            has_weights
+            has_weights,
+            frozen
         );
         assert_layout(
             "bin_scan",

@@ -8,16 +8,15 @@ use std::io::{BufRead, Read};
 use super::bytes::{Bytes, Named, f32_at, u32_at};
 use super::limits;
 use super::morton::morton_order;
-use super::ply::write_comments;
-use super::ply_header::{Element, Header, Kind};
+use super::ply_header::{Element, Header, Kind, write_comments};
 use super::prepare::{Room, prepare, say_clipped};
 use super::quantize::{
     SmallestThree, color_of_dc, dc_of_color, logit_of_byte, opacity_byte, to_f32, to_f64, unit_bits,
 };
 use super::{Format, Loaded, SplatFile};
 use crate::error::Result;
-use crate::fit::SplatArrays;
 use crate::sh;
+use crate::splats::SplatArrays;
 
 /// Splats that share bounds.
 const CHUNK: usize = 256;

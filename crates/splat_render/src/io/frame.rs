@@ -5,8 +5,8 @@
 //! changes the signs of y and z, of two components of each rotation and of some SH coefficients,
 //! so that nothing is rounded.
 
-use crate::fit::SplatArrays;
 use crate::sh;
+use crate::splats::SplatArrays;
 
 /// The half turn of a point.
 pub fn turn_point<T: std::ops::Neg<Output = T>>([x, y, z]: [T; 3]) -> [T; 3] {

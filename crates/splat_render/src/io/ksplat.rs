@@ -11,8 +11,8 @@ use super::quantize::{dc_of_color, logit_of_byte};
 use super::splat::log_scale;
 use super::{Format, Loaded, SplatFile};
 use crate::error::Result;
-use crate::fit::SplatArrays;
 use crate::sh;
+use crate::splats::SplatArrays;
 
 const HEADER: usize = 4096;
 const SECTION_HEADER: usize = 1024;

@@ -1,4 +1,4 @@
-//! Splat files: read whatever people have, write whatever they need; `docs/formats.md` says what
+//! Splat files: read whatever people have, write whatever they need; `docs/guides/formats.md` says what
 //! each format holds.
 //!
 //! Files are untrusted. Every size that a file claims is held against the bytes that are there
@@ -7,6 +7,7 @@
 mod atomic;
 mod bytes;
 mod compressed_ply;
+mod exr;
 mod format;
 mod frame;
 mod gltf;
@@ -20,40 +21,21 @@ mod quantize;
 mod sh_rotation;
 mod sog;
 mod splat;
+mod splat_file;
 mod spz;
 
 pub use atomic::write_atomically;
+pub use exr::{ExrPicture, write_exr};
 pub use format::Format;
+pub use splat_file::{Loaded, SplatFile};
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
 
-use crate::error::{Error, Result};
-use crate::fit::SplatArrays;
+use crate::error::Result;
 use bytes::Named;
-
-/// Splats with the f64 point that their means are relative to.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct SplatFile {
-    /// Parameters as fitted: log-scales, opacity logits, SH.
-    pub splats: SplatArrays,
-    /// World position = origin + mean.
-    pub origin: [f64; 3],
-    /// Whether they were trained with, and want, antialiased opacities.
-    pub antialiased: bool,
-}
-
-/// A file that was read.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Loaded {
-    /// What it holds.
-    pub file: SplatFile,
-    /// What it was written in.
-    pub format: Format,
-    /// One sentence for each thing in it that was passed over.
-    pub notes: Vec<String>,
-}
+use ply_header::Header;
 
 /// Reads a file of any format in [`Format`], told by its content, or by its ending where the
 /// content has no mark.
@@ -65,7 +47,7 @@ pub fn read_splats(path: &Path) -> Result<Loaded> {
     let mut reader = BufReader::new(file);
     let format = Format::of(reader.fill_buf().map_err(unreadable)?, &named)?;
     if format == Format::Ply {
-        return ply::read(&mut reader, size, &named);
+        return read_any_ply(&mut reader, size, &named);
     }
     limits::check_file_size(&named, size)?;
     let mut bytes = Vec::new();
@@ -80,11 +62,21 @@ pub fn parse_splats(bytes: &[u8], path: &Path) -> Result<Loaded> {
     parse(bytes, Format::of(bytes, &named)?, &named)
 }
 
+/// Reads a `.ply` of `size` bytes: what its header says tells INRIA's from a compressed one.
+fn read_any_ply(reader: &mut impl BufRead, size: u64, named: &Named<'_>) -> Result<Loaded> {
+    let header = Header::read(reader, named)?;
+    if header.starts_with("chunk") {
+        compressed_ply::read(reader, &header, size, named)
+    } else {
+        ply::read(reader, &header, size, named)
+    }
+}
+
 fn parse(mut bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> {
     match format {
         Format::Ply | Format::CompressedPly => {
             let size = bytes.len() as u64;
-            ply::read(&mut bytes, size, named)
+            read_any_ply(&mut bytes, size, named)
         }
         Format::Splat => splat::parse(bytes, named),
         Format::Ksplat => ksplat::parse(bytes, named),
@@ -121,16 +113,11 @@ pub fn read_ply(path: &Path) -> Result<SplatFile> {
     let named = Named(path);
     let file = File::open(path).map_err(|e| named.bad(format!("cannot be opened ({e})")))?;
     let size = file.metadata().map_err(|e| named.bad(format!("cannot be read ({e})")))?.len();
-    Ok(ply::read(&mut BufReader::new(file), size, &named)?.file)
+    Ok(read_any_ply(&mut BufReader::new(file), size, &named)?.file)
 }
 
 /// Writes INRIA's `.ply`, whatever the path is called.
 pub fn write_ply(path: &Path, file: &SplatFile) -> Result<()> {
     file.splats.validate()?;
     write_atomically(path, |out| ply::write(out, file))
-}
-
-/// The error of splats that a format has no way to hold.
-fn unfit(what: &str) -> Error {
-    Error::argument("splats", format!("{what}; write a .ply, which has no such limit"))
 }

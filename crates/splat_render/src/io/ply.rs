@@ -8,20 +8,21 @@
 use std::io::{BufRead, Write};
 
 use super::bytes::{Named, f32_at};
-use super::ply_header::{Header, Kind};
-use super::{Format, Loaded, SplatFile, compressed_ply};
+use super::ply_header::{Header, Kind, write_comments};
+use super::{Format, Loaded, SplatFile};
 use crate::constants::SH_DEGREE_MAX;
 use crate::error::Result;
-use crate::fit::SplatArrays;
 use crate::sh;
+use crate::splats::SplatArrays;
 
-/// Reads a `.ply` of `size` bytes, row by row; sizes are checked before anything is allocated. A
-/// compressed one is handed on.
-pub fn read(reader: &mut impl BufRead, size: u64, named: &Named<'_>) -> Result<Loaded> {
-    let header = Header::read(reader, named)?;
-    if header.starts_with("chunk") {
-        return compressed_ply::read(reader, &header, size, named);
-    }
+/// Reads what follows the header of a `.ply` of `size` bytes, row by row; sizes are checked before
+/// anything is allocated.
+pub fn read(
+    reader: &mut impl BufRead,
+    header: &Header,
+    size: u64,
+    named: &Named<'_>,
+) -> Result<Loaded> {
     let vertex = &header.elements[0];
     if vertex.name != "vertex" {
         return Err(named.bad(format!("starts with '{}' where 'vertex' belongs", vertex.name)));
@@ -83,19 +84,6 @@ pub fn read(reader: &mut impl BufRead, size: u64, named: &Named<'_>) -> Result<L
         format: Format::Ply,
         notes: Vec::new(),
     })
-}
-
-/// The header's first lines, which hold what .ply has no property for.
-pub fn write_comments(out: &mut impl Write, file: &SplatFile) -> std::io::Result<()> {
-    writeln!(out, "ply\nformat binary_little_endian 1.0")?;
-    if file.origin != [0.0; 3] {
-        let [x, y, z] = file.origin;
-        writeln!(out, "comment origin {x:?} {y:?} {z:?}")?;
-    }
-    if file.antialiased {
-        writeln!(out, "comment antialiased")?;
-    }
-    Ok(())
 }
 
 /// Writes all of `file`: nothing is rounded and nothing left out.

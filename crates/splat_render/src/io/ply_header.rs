@@ -1,9 +1,10 @@
 //! The text at the head of a `.ply`.
 
-use std::io::{BufRead, Read};
+use std::io::{BufRead, Read, Write};
 
 use super::bytes::Named;
 use super::limits::SPLATS_MAX;
+use super::splat_file::SplatFile;
 use crate::error::Result;
 
 /// Longest header that is read: real ones are under 3 kB.
@@ -167,4 +168,17 @@ impl Header {
     pub fn starts_with(&self, name: &str) -> bool {
         self.elements.first().is_some_and(|element| element.name == name)
     }
+}
+
+/// The header's first lines, which hold what .ply has no property for.
+pub fn write_comments(out: &mut impl Write, file: &SplatFile) -> std::io::Result<()> {
+    writeln!(out, "ply\nformat binary_little_endian 1.0")?;
+    if file.origin != [0.0; 3] {
+        let [x, y, z] = file.origin;
+        writeln!(out, "comment origin {x:?} {y:?} {z:?}")?;
+    }
+    if file.antialiased {
+        writeln!(out, "comment antialiased")?;
+    }
+    Ok(())
 }

@@ -3,8 +3,10 @@
 use std::borrow::Cow;
 
 use super::SplatFile;
-use crate::fit::SplatArrays;
+use crate::constants::QUAT_NORM2_MIN;
+use crate::error::Error;
 use crate::sh;
+use crate::splats::SplatArrays;
 
 /// What a format has room for.
 pub struct Room {
@@ -17,9 +19,6 @@ pub struct Room {
     /// Whether it holds the antialiased flag.
     pub antialiased: bool,
 }
-
-/// Least squared length of a rotation that is drawn: that of the project stage.
-const QUAT_NORM2_MIN: f32 = 1e-12;
 
 /// The splats that a format with this room gets.
 pub fn prepare<'a>(
@@ -107,4 +106,9 @@ fn cut_degree(splats: &SplatArrays, degree: u32) -> SplatArrays {
         sh_degree: degree,
         ..splats.clone()
     }
+}
+
+/// The error of splats that a format has no way to hold.
+pub fn unfit(what: &str) -> Error {
+    Error::argument("splats", format!("{what}; write a .ply, which has no such limit"))
 }

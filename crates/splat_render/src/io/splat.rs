@@ -3,11 +3,11 @@
 //! Position and scale as floats, colour and opacity as bytes, rotation wxyz as bytes.
 
 use super::bytes::{Named, f32_at};
-use super::prepare::{Room, prepare, say_clipped};
+use super::prepare::{Room, prepare, say_clipped, unfit};
 use super::quantize::{color_of_dc, dc_of_color, logit_of_byte, opacity_byte, to_f64, unit_byte};
-use super::{Format, Loaded, SplatFile, unfit};
+use super::{Format, Loaded, SplatFile};
 use crate::error::Result;
-use crate::fit::SplatArrays;
+use crate::splats::SplatArrays;
 
 /// Bytes per splat.
 const ROW: usize = 32;

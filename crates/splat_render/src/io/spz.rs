@@ -15,13 +15,13 @@ use ruzstd::decoding::StreamingDecoder;
 use super::bytes::{Bytes, Named, u32_at, u64_at};
 use super::frame::{sh_signs, turn_point, turn_quat};
 use super::limits::check_claim;
-use super::prepare::{Room, prepare, say_clipped};
+use super::prepare::{Room, prepare, say_clipped, unfit};
 use super::quantize::{SmallestThree, logit_of_byte, opacity_byte, to_f32, to_f64, unit_byte};
-use super::{Format, Loaded, SplatFile, unfit};
+use super::{Format, Loaded, SplatFile};
 use crate::constants::SH_DEGREE_MAX;
 use crate::error::Result;
-use crate::fit::SplatArrays;
 use crate::sh;
+use crate::splats::SplatArrays;
 
 const MAGIC: &[u8; 4] = b"NGSP";
 const HEADER: usize = 16;

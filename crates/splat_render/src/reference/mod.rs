@@ -1,7 +1,9 @@
 //! The oracle: f64, short, plain, no tiles, no tricks. Every other implementation is tested
 //! against it, stage by stage.
 
+mod adam;
 mod kinks;
+mod loss;
 mod project;
 mod project_backward;
 mod rasterize;
@@ -13,9 +15,10 @@ pub use rasterize::band_pixels;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
-    Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, SplatGradients,
-    SplatParams, Stages,
+    AdamState, AdamStep, Image, ImageGradients, Loss, ProjectOptions, Projected,
+    ProjectedGradients, SplatGradients, SplatParams, Stages, check,
 };
+use crate::target::Target;
 
 /// The f64 reference implementation.
 #[derive(Debug, Clone, Copy, Default)]
@@ -28,8 +31,7 @@ impl Stages<f64> for Reference {
         camera: &Camera,
         options: &ProjectOptions,
     ) -> Result<Projected<f64>> {
-        splats.validate()?;
-        camera.validate()?;
+        check::project(splats, camera, options)?;
         Ok(project::project(splats, camera, options))
     }
 
@@ -46,8 +48,7 @@ impl Stages<f64> for Reference {
         v_image: &ImageGradients<f64>,
         absolute: bool,
     ) -> Result<ProjectedGradients<f64>> {
-        projected.validate()?;
-        v_image.validate(projected, image)?;
+        check::rasterize_backward(projected, image, v_image)?;
         Ok(rasterize_backward::rasterize_backward(projected, background, v_image, absolute))
     }
 
@@ -59,9 +60,29 @@ impl Stages<f64> for Reference {
         projected: &Projected<f64>,
         v_projected: &ProjectedGradients<f64>,
     ) -> Result<SplatGradients<f64>> {
-        splats.validate()?;
-        camera.validate()?;
-        v_projected.validate(splats.len(), projected.len())?;
+        check::project_backward(splats, camera, options, projected, v_projected)?;
         Ok(project_backward::project_backward(splats, camera, options, projected, v_projected))
+    }
+
+    fn loss(
+        &self,
+        image: &Image<f64>,
+        target: &Target,
+        background: [f64; 3],
+        ssim_weight: f32,
+    ) -> Result<Loss<f64>> {
+        check::loss(image, target, ssim_weight)?;
+        Ok(loss::loss(image, target, background, ssim_weight))
+    }
+
+    fn adam(
+        &self,
+        state: &mut AdamState<f64>,
+        gradients: &SplatGradients<f64>,
+        step: &AdamStep,
+    ) -> Result<()> {
+        check::adam(state, gradients, step)?;
+        adam::adam(state, gradients, step);
+        Ok(())
     }
 }

@@ -49,7 +49,7 @@ pub(super) fn geometry(
     let rotation = camera.rotation();
     let t = rotation * DVec3::from(splats.means[i]) + camera.translation();
     // Written so that NaN is culled.
-    if !(t.is_finite() && t.z >= f64::from(options.near) && t.z <= f64::from(options.far)) {
+    if !(t.is_finite() && t.z >= f64::from(options.nearest()) && t.z <= f64::from(options.far)) {
         return None;
     }
     let [w, x, y, z] = splats.quats[i];

@@ -3,10 +3,9 @@
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
 use crate::stages::{Image, Projected};
 
-/// Visible splats by (f32 depth, index).
+/// Drawn splats by (f32 depth, index).
 pub(super) fn order(projected: &Projected<f64>) -> Vec<usize> {
-    let mut ids: Vec<usize> =
-        (0..projected.len()).filter(|&i| projected.radii[i] != [0.0; 2]).collect();
+    let mut ids: Vec<usize> = (0..projected.len()).filter(|&i| projected.is_drawn(i)).collect();
     ids.sort_by(|&a, &b| (projected.depths[a] as f32).total_cmp(&(projected.depths[b] as f32)));
     ids
 }

@@ -10,7 +10,7 @@ use splat_render::{
 
 use super::*;
 
-/// Bounds of `docs/numerics.md`.
+/// Bounds of `docs/how-it-works/numerics.md`.
 #[derive(Debug, Clone, Copy)]
 pub struct Bounds {
     /// Largest difference of a picture, given identical 2D splats.

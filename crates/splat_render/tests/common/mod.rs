@@ -1,16 +1,21 @@
 //! Seeded random scenes, f32/f64 conversions and comparators, shared by the tests of all backends.
 #![allow(dead_code)] // Each test binary uses its own part.
 
+pub mod agreement;
 pub mod conformance;
 pub mod hard_cases;
 pub mod narrowed;
+pub mod optimisation;
 pub mod properties;
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 use splat_render::constants::BLUR;
-use splat_render::stages::{Colors, Image, ImageGradients, Projected, ProjectedGradients};
+use splat_render::splats::SplatArrays;
+use splat_render::stages::{
+    AdamState, Colors, Image, ImageGradients, Projected, ProjectedGradients,
+};
 use splat_render::{Camera, SplatGradients, SplatParams};
 
 /// A seeded generator.
@@ -145,6 +150,34 @@ pub fn widen_projected_gradients(g: &ProjectedGradients<f32>) -> ProjectedGradie
         v_opacities: widen1(&g.v_opacities),
         v_background: g.v_background.map(f64::from),
         v_means2d_absolute: g.v_means2d_absolute.as_deref().map(widen),
+    }
+}
+
+pub fn widen_splat_gradients(g: &SplatGradients<f32>) -> SplatGradients<f64> {
+    SplatGradients {
+        v_means: widen(&g.v_means),
+        v_quats: widen(&g.v_quats),
+        v_scales: widen(&g.v_scales),
+        v_opacities: widen1(&g.v_opacities),
+        v_colors: widen(&g.v_colors),
+        v_viewmat: g.v_viewmat,
+        v_intrinsics: g.v_intrinsics,
+    }
+}
+
+pub fn widen_adam_state(state: &AdamState<f32>) -> AdamState<f64> {
+    let wide = |arrays: &SplatArrays| SplatArrays {
+        means: widen(&arrays.means),
+        quats: widen(&arrays.quats),
+        scales: widen(&arrays.scales),
+        opacities: widen1(&arrays.opacities),
+        sh: widen(&arrays.sh),
+        sh_degree: arrays.sh_degree,
+    };
+    AdamState {
+        splats: wide(&state.splats),
+        first: wide(&state.first),
+        second: wide(&state.second),
     }
 }
 

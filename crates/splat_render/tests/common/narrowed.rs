@@ -1,7 +1,9 @@
 //! The reference behind the f32 interface, so that what every implementation must get through is
 //! also asked of the oracle.
 
+use splat_render::fit::Target;
 use splat_render::reference::Reference;
+use splat_render::stages::{AdamState, AdamStep, Loss};
 use splat_render::{
     Camera, Colors, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, Result,
     SplatGradients, SplatParams, Stages,
@@ -101,5 +103,41 @@ impl Stages<f32> for Narrowed {
             v_viewmat: v.v_viewmat,
             v_intrinsics: v.v_intrinsics,
         })
+    }
+
+    fn loss(
+        &self,
+        image: &Image<f32>,
+        target: &Target,
+        background: [f32; 3],
+        ssim_weight: f32,
+    ) -> Result<Loss<f32>> {
+        let background = background.map(f64::from);
+        let loss = Reference.loss(&widen_image(image), target, background, ssim_weight)?;
+        Ok(Loss { value: narrow1(&[loss.value])[0], v_color: narrow(&loss.v_color) })
+    }
+
+    fn adam(
+        &self,
+        state: &mut AdamState<f32>,
+        gradients: &SplatGradients<f32>,
+        step: &AdamStep,
+    ) -> Result<()> {
+        let mut wide = widen_adam_state(state);
+        Reference.adam(&mut wide, &widen_splat_gradients(gradients), step)?;
+        let narrowed = |arrays: &SplatArrays<f64>| SplatArrays {
+            means: narrow(&arrays.means),
+            quats: narrow(&arrays.quats),
+            scales: narrow(&arrays.scales),
+            opacities: narrow1(&arrays.opacities),
+            sh: narrow(&arrays.sh),
+            sh_degree: arrays.sh_degree,
+        };
+        *state = AdamState {
+            splats: narrowed(&wide.splats),
+            first: narrowed(&wide.first),
+            second: narrowed(&wide.second),
+        };
+        Ok(())
     }
 }

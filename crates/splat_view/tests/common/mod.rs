@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use glam::{DMat4, DVec3};
+use splat_render::Camera;
 use splat_render::fit::SplatArrays;
 use splat_render::io::{SplatFile, write_splats};
 
@@ -79,6 +81,26 @@ pub fn write(path: &Path, file: &SplatFile) {
     write_splats(path, file).expect("a splat file");
 }
 
+/// A file of cameras as igsr writes it, with photos that are not there.
+pub fn cameras_json(cameras: &[Camera]) -> String {
+    let frame = |(i, camera): (usize, &Camera)| {
+        let to_world = camera.viewmat.inverse() * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
+        let rows: Vec<[f64; 4]> = (0..4).map(|i| to_world.row(i).to_array()).collect();
+        format!(
+            "{{\"file_path\": \"{i}.png\", \"w\": {}, \"h\": {}, \"fl_x\": {}, \"fl_y\": {}, \
+             \"cx\": {}, \"cy\": {}, \"transform_matrix\": {rows:?}}}",
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+        )
+    };
+    let frames: Vec<String> = cameras.iter().enumerate().map(frame).collect();
+    format!("{{\"camera_model\": \"PINHOLE\", \"frames\": [{}]}}", frames.join(", "))
+}
+
+/// Writes that file.
+pub fn write_cameras(path: &Path, cameras: &[Camera]) {
+    std::fs::write(path, cameras_json(cameras)).expect("cameras");
+}
+
 /// The program, without any display.
 pub fn program() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_splat-view"));
@@ -110,11 +132,11 @@ pub fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).trim_end().to_owned()
 }
 
-/// Asserts that the program ended with one sentence that holds the words.
+/// Asserts that the program ended with one error message that contains the words.
 pub fn refused(output: &Output, words: &[&str]) {
     let text = said(output);
     assert_eq!(output.status.code(), Some(1), "{text}");
-    assert_eq!(text.lines().count(), 1, "not one sentence: {text}");
+    assert_eq!(text.lines().count(), 1, "not one message: {text}");
     assert!(text.ends_with('.') && !text.contains("panicked"), "{text}");
     for word in words {
         assert!(text.contains(word), "{word} is not in: {text}");

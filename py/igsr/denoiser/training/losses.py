@@ -1,7 +1,7 @@
 """What a denoiser is trained to make small: the default and the three losses of the paper.
 
 The default counts ratios: a render that is nearly right and one that is all wrong weigh the same,
-as they do in mean decibels, and an error made there costs what it is worth.
+as they do in mean decibels.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from igsr.denoiser.training.perceptual_distance import Distance
+from igsr.denoiser.training.training_settings import LOSSES
 from igsr.errors import IgsrError
 
-#: Names of ``--loss``. The last three are the paper's.
-LOSSES = ("default", "charbonnier", "gan", "gan+lpips", "lpips")
 #: Parts of the default, beside the squared error's ratio, which counts 1.
 STRUCTURE, PERCEPTUAL, LIKELIHOOD = 1.0, 0.1, 0.1
 #: Part of "charbonnier" that the perceptual distance has.
@@ -25,7 +24,7 @@ CHARBONNIER_PERCEPTUAL = 0.05
 STRUCTURE_SIDE = 11
 #: Below this the distance of two colours counts by its square (Charbonnier).
 CHARBONNIER = 1e-3
-#: Squared errors, 1 - SSIM and perceptual distances that are not worth making smaller.
+#: Squared errors, 1 - SSIM and perceptual distances that need not get smaller.
 SQUARED_FLOOR, STRUCTURE_FLOOR, PERCEPTUAL_FLOOR = 1e-4, 1e-3, 0.01
 #: The perceptual distance is taken of one in so many pictures of a batch: of all of them it would
 #: take half as long again as the network.
@@ -197,8 +196,8 @@ class Loss:
                 parts["perceptual"] = CHARBONNIER_PERCEPTUAL, distance
         if self.discriminator is not None:
             weight = 1.0 if self.name == "gan" else 1.0 - self.a
-            judged = self.discriminator(_clamped(prediction.image))
-            parts["gan"] = weight, F.softplus(-judged).mean()
+            logits = self.discriminator(_clamped(prediction.image))
+            parts["gan"] = weight, F.softplus(-logits).mean()
         if self.name.endswith("lpips") and self.distance is not None:
             weight = 1.0 if self.name == "lpips" else self.a
             parts["perceptual"] = weight, perceptual(prediction, self.distance)

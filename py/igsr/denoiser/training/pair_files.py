@@ -47,6 +47,12 @@ def packed(inputs: npt.NDArray[np.float32]) -> Bytes:
     return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
 
+def unpacked(inputs: Bytes) -> npt.NDArray[np.float32]:
+    """Network inputs float32 [``CHANNELS``, H, W] from 8 bits."""
+    channels: npt.NDArray[np.float32] = inputs * SCALE[:, None, None] + OFFSET[:, None, None]
+    return channels
+
+
 def write_pairs(path: Path, pairs: Pairs) -> None:
     """Write the pairs of a fit as ``.npz``, under a temporary name first.
 

@@ -1,4 +1,4 @@
-"""Training pairs: renders of fits that have too little to go on, beside the true pictures."""
+"""Make training pairs: renders of fits degraded on purpose, beside the true pictures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.capture import Capture, View, load_capture
 from igsr.denoiser.inputs import CHANNELS, COLOR
-from igsr.denoiser.training.pair_files import write_pairs
+from igsr.denoiser.training.pair_files import Pairs, write_pairs
 from igsr.denoiser.training.pair_renders import check_one_size, rendered_pairs
 from igsr.errors import IgsrError
 from igsr.evaluation.metrics import psnr
@@ -24,9 +24,9 @@ from igsr.fitting.presets import PAPER_STEPS, preset_settings
 from igsr.fitting.run import fingerprint, fit_with_cameras
 from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
 
-#: Kinds of fits. "sparse" has 3 to 16 photos; "underfit" stops early; "noise" has wrong cameras;
-#: "paper" is the paper's recipe, "scattered" its other one; "leave-one-out" leaves one photo of the
-#: capture out of each fit, for a capture of one's own.
+#: How fits are degraded. "sparse" has 3 to 16 photos; "underfit" stops early; "noise" has noise on
+#: its cameras; "paper" is the paper's recipe, "scattered" its other one; "leave-one-out" leaves one
+#: photo of the capture out of each fit, for a capture of one's own.
 DEFAULT_RECIPES = ("sparse", "underfit", "noise")
 RECIPES = (*DEFAULT_RECIPES, "paper", "scattered", "leave-one-out")
 #: Photos of a "sparse" or "underfit" fit.
@@ -37,13 +37,24 @@ NOISY_PHOTOS, SCATTERED_PHOTOS = 20, 60
 SCATTERED_STEPS = 1000
 #: Standard deviations of camera-to-world's numbers, and degrees of turns.
 MATRIX_NOISE, TURN_NOISE = (0.003, 0.02), (0.2, 2.0)
-#: Of the photos fitted, so many are rendered too: what is good already must be seen in training.
+#: Of the photos fitted, so many are rendered too: training needs renders that are good already.
 FITTED_RENDERED = 1
 
 
 @dataclass(frozen=True)
 class PairFit:
-    """One fit that pairs are made from; everything that they depend on."""
+    """One fit that pairs are made from; everything that they depend on.
+
+    Attributes:
+        capture: its whole path.
+        recipe: of ``RECIPES``.
+        number: of the fit among those of its capture and recipe; for "leave-one-out" of the photo.
+        views: novel views to render.
+        steps: of the fit, where the recipe does not say; None is the default preset's.
+        seed: of everything that is drawn.
+        backend: what fits and renders.
+        all_views: use the held-out views too.
+    """
 
     capture: str
     recipe: str
@@ -64,6 +75,32 @@ class PairFit:
     def name(self) -> str:
         """Of its files; ``capture_of_pairs`` reads it."""
         return f"{self.scene}-{self.recipe}-{self.number}-seed{self.seed}-{self.backend}"
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a fit is made from.
+
+    Attributes:
+        train: photos to fit, with the cameras that the recipe gives them.
+        novel: views to render, with their true cameras.
+        steps: of the fit; None is the default preset's.
+        noise: on the cameras of ``train``, if any.
+        held_out: the photo that "leave-one-out" leaves out.
+    """
+
+    train: list[View]
+    novel: list[View]
+    steps: int | None
+    noise: Noise | None = None
+    held_out: str | None = None
+
+    @property
+    def note(self) -> dict[str, str]:
+        """What the row of the fit says of it."""
+        if self.held_out is not None:
+            return {"left_out": self.held_out}
+        return {} if self.noise is None else {"noise": str(self.noise)}
 
 
 def capture_of_pairs(file: str) -> str:
@@ -87,7 +124,7 @@ def make_pairs(
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
     ray: bool = False,
 ) -> list[dict[str, Any]]:
-    """Fit captures poorly in the ways of ``recipes`` and write what renders look like, and should.
+    """Degrade fits in the ways of ``recipes``; write their renders beside the true pictures.
 
     Args:
         captures: folders or files that ``igsr.load_capture`` reads, with no two names alike.
@@ -95,11 +132,11 @@ def make_pairs(
             whose row is there is not done again.
         recipes: names of ``RECIPES``.
         fits: fits per capture and recipe ("leave-one-out" has one per photo instead).
-        views: unseen views rendered per fit, after noise also fitted ones from their true cameras;
-            as many as there are, if fewer. "paper" renders all.
+        views: novel views rendered per fit, with noise also fitted ones from their true cameras; as
+            many as there are, if fewer. "paper" renders all.
         steps: of each fit, where the recipe does not say; None is the default preset's.
-        all_views: use the views too that a capture holds out to be scored, as of captures that
-            nothing is ever scored on; without, what is trained never sees them.
+        all_views: also use the views that a capture holds out for testing, for captures that
+            nothing is ever scored on. Without, they never get into the training.
         seed: of everything that is drawn.
         backend: what fits and renders.
         jobs: fits at a time, each in a process of its own.
@@ -148,7 +185,7 @@ def make_pairs(
                     backend,
                     all_views,
                 )
-                check_one_size(_chosen(capture, one, _random(one))[1])
+                check_one_size(_planned(capture, one, _random(one)).novel)
                 runs.append(Run(one.name, one, settings, out / f"{one.name}.npz"))
     names = [run.name for run in runs]
     twice = {run.what.scene for run in runs if names.count(run.name) > 1}
@@ -161,39 +198,49 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
     """Make the pairs of one fit; for a process of its own. Paths are whole: ``data`` is unused."""
     capture = load_capture(one.capture)
     random = _random(one)
-    train, unseen, steps, about = _chosen(capture, one, random)
-    given = Capture(capture.path, train, None if about.get("noise") else capture.points)
+    plan = _planned(capture, one, random)
+    points = capture.points if plan.noise is None else None  # they tell where cameras were
     splats, _ = fit_with_cameras(
-        given, backend=one.backend, seed=one.seed + one.number, steps=steps, hull=_hull(one)
+        Capture(capture.path, plan.train, points),
+        backend=one.backend,
+        seed=one.seed + one.number,
+        steps=plan.steps,
+        hull=_hull(one),
     )
-    has_alpha = train[0].image.shape[2] == 4
+    has_alpha = plan.train[0].image.shape[2] == 4
     background: tuple[float, ...] | None = None
     if has_alpha:
         background = WHITE if random.uniform() < 0.7 else tuple(random.uniform(size=3))
-    shown = [train[i] for i in random.permutation(len(train))]
-    fitted = [view for view in shown if _size(view) == _size(unseen[0])][:FITTED_RENDERED]
+    shuffled = [plan.train[i] for i in random.permutation(len(plan.train))]
+    fitted = [view for view in shuffled if _size(view) == _size(plan.novel[0])][:FITTED_RENDERED]
     if one.recipe == "paper":  # which renders all views from their true cameras
         fitted = []
-    pairs = rendered_pairs(splats, train, unseen + fitted, background, one.backend)
+    pairs = rendered_pairs(splats, plan.train, plan.novel + fitted, background, one.backend)
     file = f"{one.name}.npz"
     write_pairs(out / file, pairs)
-    seen, true, masks = pairs.inputs[:, :COLOR], pairs.truth, pairs.masks
-    before = [
-        psnr(np.moveaxis(seen[k], 0, -1), np.moveaxis(true[k], 0, -1), masks[k])
-        for k in range(len(unseen))
-        if masks[k].any()
-    ]
-    if not before:
-        raise IgsrError(f"{capture.path}: the masks of the views to render leave no pixel.")
     return {
         "pairs": file,
         "recipe": one.recipe,
-        "photos": len(train),
-        "steps": steps,
+        "photos": len(plan.train),
+        "steps": plan.steps,
         "renders": len(pairs.truth),
-        "psnr": float(np.mean(before)),
-        **about,
+        "psnr": _mean_psnr(pairs, len(plan.novel), capture.path),
+        **plan.note,
     }
+
+
+def _mean_psnr(pairs: Pairs, views: int, capture: Path) -> float:
+    """Of the first ``views`` renders, over the pixels whose truth is known."""
+    psnrs = [
+        psnr(np.moveaxis(inputs[:COLOR], 0, -1), np.moveaxis(truth, 0, -1), mask)
+        for inputs, truth, mask in zip(
+            pairs.inputs[:views], pairs.truth[:views], pairs.masks[:views], strict=True
+        )
+        if mask.any()
+    ]
+    if not psnrs:
+        raise IgsrError(f"{capture}: the masks of the views to render leave no pixel.")
+    return float(np.mean(psnrs))
 
 
 def _random(one: PairFit) -> np.random.Generator:
@@ -216,51 +263,52 @@ def _hull(one: PairFit) -> bool | None:
     return False if one.recipe in ("noise", "paper", "scattered") else None
 
 
-def _chosen(
-    capture: Capture, one: PairFit, random: np.random.Generator
-) -> tuple[list[View], list[View], int | None, dict[str, Any]]:
-    """Photos to fit (their cameras as the recipe has them), views to render, steps, and a note."""
+def _planned(capture: Capture, one: PairFit, random: np.random.Generator) -> _Plan:
+    """Which photos to fit, how, and which views to render.
+
+    Raises:
+        IgsrError: the capture has too few views.
+    """
     views = _used(capture, one.all_views)
     if one.recipe == "leave-one-out":
         train = [replace(v, split="train") for i, v in enumerate(views) if i != one.number]
         if len(train) < 2:
             raise IgsrError(f"{capture.path} has {len(views)} photos; leave-one-out needs 3.")
-        return train, [views[one.number]], one.steps, {"left_out": views[one.number].name}
+        left = views[one.number]
+        return _Plan(train, [left], one.steps, held_out=left.name)
     count = {
         "paper": NOISY_PHOTOS,
         "noise": NOISY_PHOTOS,
         "scattered": SCATTERED_PHOTOS,
     }.get(one.recipe) or int(random.choice(FEW))
     # The paper fits 20 of the views and renders all: they are not where they were fitted.
-    held = 0 if one.recipe == "paper" else max(1, min(one.views, len(views) // 4))
-    count = min(count, len(views) - held)
+    held_out = 0 if one.recipe == "paper" else max(1, min(one.views, len(views) // 4))
+    count = min(count, len(views) - held_out)
     if count < 2:
         raise IgsrError(
             f"{capture.path} has {len(views)} views; {one.recipe} needs more to render."
         )
     order = random.permutation(len(views))
     train = [replace(views[i], split="train") for i in order[:count]]
-    unseen = [views[i] for i in order[count : count + one.views]]
+    novel = [views[i] for i in order[count : count + one.views]]
     if one.recipe == "sparse":
-        return train, unseen, one.steps, {}
+        return _Plan(train, novel, one.steps)
     if one.recipe == "scattered":
-        return train, unseen, SCATTERED_STEPS, {}
+        return _Plan(train, novel, SCATTERED_STEPS)
     if one.recipe == "underfit":
         whole = one.steps or preset_settings("default", count)["steps"]
-        return train, unseen, max(1, int(random.uniform(0.25, 0.75) * whole)), {}
-    steps = one.steps
-    if one.recipe == "paper":
-        noise, steps = Noise(AFFINE, 0.01), PAPER_STEPS
-    else:
-        kind, least, most = (
-            (MATRIX, *MATRIX_NOISE) if random.uniform() < 0.5 else (TURN, *TURN_NOISE)
-        )
-        size = least * (most / least) ** random.uniform()
-        noise, steps = Noise(kind, float(size)), one.steps
+        return _Plan(train, novel, max(1, int(random.uniform(0.25, 0.75) * whole)))
+    noise = Noise(AFFINE, 0.01) if one.recipe == "paper" else _drawn_noise(random)
     unit = noise_unit(train)
-    # No photo was fitted from where it is: as in the paper, all views may be rendered.
-    unseen = [views[i] for i in (*order[count:], *order[:count])]
-    if one.recipe != "paper":
-        unseen = unseen[: one.views]
     noisy = [noisy_view(view, noise, random, unit) for view in train]
-    return noisy, unseen, steps, {"noise": str(noise)}
+    # No photo was fitted from where it is: as in the paper, all views may be rendered.
+    novel = [views[i] for i in (*order[count:], *order[:count])]
+    if one.recipe == "paper":
+        return _Plan(noisy, novel, PAPER_STEPS, noise)
+    return _Plan(noisy, novel[: one.views], one.steps, noise)
+
+
+def _drawn_noise(random: np.random.Generator) -> Noise:
+    """Noise of either kind, its size log-uniform."""
+    kind, least, most = (MATRIX, *MATRIX_NOISE) if random.uniform() < 0.5 else (TURN, *TURN_NOISE)
+    return Noise(kind, float(least * (most / least) ** random.uniform()))

@@ -45,7 +45,8 @@ class SqueezeNetDistance(nn.Module):
     """Distance of SqueezeNet 1.0 features, each pixel's normalised to unit length.
 
     The mean over compared layers of the mean over pixels of the squared difference; 0 for equal
-    pictures, about 0.1 to 0.6 for renders of poor fits. Differentiable; its weights are fixed.
+    pictures, about 0.1 to 0.6 for renders of degraded reconstructions. Differentiable; its weights
+    are fixed.
 
     Args:
         path: ``.npz`` with the Caffe model's arrays ("conv1.weight", "fire2/conv1x1_1.bias").

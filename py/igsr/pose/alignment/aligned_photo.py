@@ -16,7 +16,7 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class AlignedPhoto:
-    """A placed photo.
+    """A registered photo.
 
     Attributes:
         camera: in pixels of the photo.

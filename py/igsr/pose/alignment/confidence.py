@@ -1,4 +1,4 @@
-"""Which depths of aligned photos may be trusted."""
+"""Which depths of aligned photos are confident."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from igsr.pose.alignment.aligned_photo import AlignedPhoto
 
 Bool = npt.NDArray[np.bool_]
 
-#: A depth is trusted where its raw confidence (1 says nothing) is above this.
+#: A depth is confident where its raw confidence (1 says nothing) is above this.
 TRUSTED = 3.0
 #: A pixel stands before another photo's surface where its depth is below this part of that.
 IN_FRONT = 0.95

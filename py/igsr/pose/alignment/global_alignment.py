@@ -1,6 +1,7 @@
 """Global alignment: from pointmaps of pairs of photos to cameras and depths of all of them.
 
-DUSt3R's (Wang et al. 2024, section 3.4). ``docs/alignment.md`` says where ours differs and why.
+DUSt3R's (Wang et al. 2024, section 3.4). ``docs/how-it-works/alignment.md`` says where
+ours differs and why.
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ class Alignment:
     """What the alignment found.
 
     Attributes:
-        photos: None where one could not be placed.
+        photos: None where one is not registered.
         pairs: the directed pairs that were aligned.
         start_loss: the objective after the start; its unit is the median depth.
         loss: the objective at the end.
-        warnings: sentences that name the photos without a place.
+        warnings: messages that name the photos that are not registered.
     """
 
     photos: list[AlignedPhoto | None]
@@ -78,7 +79,7 @@ def align(
     Pairs that have nothing in common are left out. Of photos that then fall into groups, the group
     with most fixed poses is placed, and of those with equally many the largest.
 
-    The same predictions and seed give the same bits on the same number of threads.
+    Deterministic for given predictions, seed and number of threads.
 
     Args:
         predictions: of directed pairs.

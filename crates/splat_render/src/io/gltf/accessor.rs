@@ -2,10 +2,10 @@
 
 use serde_json::Value;
 
-use super::super::bytes::{f32_at, u16_at};
-use super::super::limits::SPLATS_MAX;
 use super::document::{Document, number};
 use crate::error::Result;
+use crate::io::bytes::{f32_at, u16_at};
+use crate::io::limits::SPLATS_MAX;
 
 /// Component types: bytes, and the number and the unit of a normalized one at a byte.
 #[derive(Clone, Copy)]

@@ -8,11 +8,11 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
-use super::super::Format;
-use super::super::bytes::{Bytes, Named, u32_at};
-use super::super::limits;
 use super::{CHUNK_BINARY, CHUNK_JSON, MAGIC, TEXT_MAX};
 use crate::error::Result;
+use crate::io::Format;
+use crate::io::bytes::{Bytes, Named, u32_at};
+use crate::io::limits;
 
 /// Most values in the JSON. In memory each may take 80 times its text; splats take a few hundred.
 const VALUES_MAX: usize = 1 << 18;

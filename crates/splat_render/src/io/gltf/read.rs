@@ -3,13 +3,6 @@
 use glam::{DQuat, DVec3};
 use serde_json::Value;
 
-use super::super::bytes::Named;
-use super::super::frame;
-use super::super::limits::check_claim;
-use super::super::quantize::{logit, to_f32, to_f64};
-use super::super::sh_rotation::ShRotation;
-use super::super::splat::log_scale;
-use super::super::{Format, Loaded, SplatFile};
 use super::accessor::Accessor;
 use super::document::{Document, number};
 use super::scene::{Placed, placed_meshes};
@@ -17,8 +10,15 @@ use super::{
     ANTIALIASED, COLOR_SPACE, EXTENSION, KERNEL, OPACITY, ROTATION, SCALE, SH_DEGREE, sh_name,
 };
 use crate::error::Result;
-use crate::fit::SplatArrays;
+use crate::io::bytes::Named;
+use crate::io::frame;
+use crate::io::limits::check_claim;
+use crate::io::quantize::{logit, to_f32, to_f64};
+use crate::io::sh_rotation::ShRotation;
+use crate::io::splat::log_scale;
+use crate::io::{Format, Loaded, SplatFile};
 use crate::sh;
+use crate::splats::SplatArrays;
 
 /// Splats of one primitive at one place.
 struct Part<'a> {

@@ -4,18 +4,18 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Map, Value, json};
 
-use super::super::frame;
-use super::super::prepare::{Room, prepare};
-use super::super::quantize::{sigmoid, to_f32, to_f64};
-use super::super::splat::linear_scale;
-use super::super::{Format, SplatFile, unfit};
 use super::{
     ANTIALIASED, CHUNK_BINARY, CHUNK_JSON, COLOR_SPACE, EXTENSION, FLOAT, KERNEL, MAGIC, OPACITY,
     ROTATION, SCALE, SH_DEGREE, TEXT_MAX, sh_name,
 };
 use crate::error::Result;
-use crate::fit::SplatArrays;
+use crate::io::frame;
+use crate::io::prepare::{Room, prepare, unfit};
+use crate::io::quantize::{sigmoid, to_f32, to_f64};
+use crate::io::splat::linear_scale;
+use crate::io::{Format, SplatFile};
 use crate::sh;
+use crate::splats::SplatArrays;
 
 const ROOM: Room =
     Room { name: "glTF file", sh_degree: SH_DEGREE, origin: true, antialiased: true };

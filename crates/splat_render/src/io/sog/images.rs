@@ -6,10 +6,10 @@ use image_webp::{ColorType, WebPDecoder, WebPEncoder};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-use super::super::bytes::Named;
-use super::super::limits::unpacked_max;
 use super::META;
 use crate::error::Result;
+use crate::io::bytes::Named;
+use crate::io::limits::unpacked_max;
 
 /// Pixels that an image may have beyond those that are used: writers round sizes up.
 const SPARE_PIXELS: u64 = 1 << 16;

@@ -2,9 +2,9 @@
 
 use serde_json::{Value, json};
 
-use super::super::bytes::Named;
 use super::{CODES, SH_DEGREE};
 use crate::error::Result;
+use crate::io::bytes::Named;
 
 /// The whole of it.
 pub struct Meta {

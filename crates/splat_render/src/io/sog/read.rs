@@ -1,14 +1,14 @@
 //! Reading a `.sog`.
 
-use super::super::bytes::Named;
-use super::super::limits::check_claim;
-use super::super::quantize::{SmallestThree, logit_of_byte, to_f32};
-use super::super::{Format, Loaded, SplatFile};
 use super::images::Bundle;
 use super::meta::{Meta, Rest};
 use super::{PALETTE_COLUMNS, ROTATION_TAG};
 use crate::error::Result;
-use crate::fit::SplatArrays;
+use crate::io::bytes::Named;
+use crate::io::limits::check_claim;
+use crate::io::quantize::{SmallestThree, logit_of_byte, to_f32};
+use crate::io::{Format, Loaded, SplatFile};
+use crate::splats::SplatArrays;
 
 /// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {

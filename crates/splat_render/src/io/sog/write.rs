@@ -1,16 +1,16 @@
 //! Writing a `.sog`.
 
-use super::super::morton::morton_order;
-use super::super::prepare::{Room, prepare};
-use super::super::quantize::{SmallestThree, opacity_byte, to_f64, unit_byte};
-use super::super::{SplatFile, unfit};
 use super::codebook::{codebook, nearest};
 use super::images::{Image, webp, zipped};
 use super::meta::{Coded, Meta, Rest};
 use super::palette::palette;
 use super::{META, PALETTE_COLUMNS, ROTATION_TAG, SH_DEGREE};
 use crate::error::Result;
-use crate::fit::SplatArrays;
+use crate::io::SplatFile;
+use crate::io::morton::morton_order;
+use crate::io::prepare::{Room, prepare, unfit};
+use crate::io::quantize::{SmallestThree, opacity_byte, to_f64, unit_byte};
+use crate::splats::SplatArrays;
 
 const ROOM: Room = Room { name: ".sog", sh_degree: SH_DEGREE, origin: false, antialiased: true };
 

@@ -1,0 +1,54 @@
+//! The settings of a fit, from a dict.
+
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use splat_render::fit::{Background, CameraConfig, DensityControl, FitConfig, Focal, Rates};
+
+use crate::arguments::{choice, setting};
+
+/// The settings of a fit; what is absent or None takes the default.
+pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
+    let default = FitConfig::default();
+    let densities = [
+        ("mcmc", DensityControl::Mcmc),
+        ("original", DensityControl::Original),
+        ("fixed", DensityControl::Fixed),
+    ];
+    let focals =
+        [("fixed", Focal::Fixed), ("shared", Focal::Shared), ("per-camera", Focal::PerCamera)];
+    let density = choice(config, "density", &densities)?.unwrap_or(default.density);
+    let focal = choice(config, "focal", &focals)?.unwrap_or(Focal::Fixed);
+    let poses = choice(config, "poses", &[("fixed", false), ("joint", true)])?.unwrap_or(false);
+    let frozen = setting(config, "frozen")?.unwrap_or(false);
+    let number = |name: &str, default: f32| PyResult::Ok(setting(config, name)?.unwrap_or(default));
+    let cameras = if poses || focal != Focal::Fixed {
+        let default = CameraConfig::default();
+        Some(CameraConfig {
+            poses,
+            focal,
+            rate: number("camera_rate", default.rate)?,
+            decay: number("camera_decay", default.decay)?,
+            warm_up: number("camera_warm_up", default.warm_up)?,
+            // Splats that stay where they are hold the cameras by themselves.
+            anchored: !frozen,
+        })
+    } else {
+        None
+    };
+    let background =
+        setting::<[f32; 3]>(config, "background")?.map_or(Background::Random, Background::Color);
+    Ok(FitConfig {
+        steps: setting(config, "steps")?.unwrap_or(default.steps),
+        first_step: setting(config, "first_step")?.unwrap_or(default.first_step),
+        seed: setting(config, "seed")?.unwrap_or(default.seed),
+        sh_degree: setting(config, "sh_degree")?.unwrap_or(default.sh_degree),
+        max_splats: setting(config, "max_splats")?.unwrap_or(default.max_splats),
+        density,
+        background,
+        dropout: setting(config, "dropout")?.unwrap_or(default.dropout),
+        hull: setting(config, "hull")?.unwrap_or(default.hull),
+        rates: if frozen { Rates::ZERO } else { default.rates },
+        cameras,
+        ..default
+    })
+}

@@ -1,0 +1,105 @@
+//! Everything a fit needs to go on, as dicts of numpy arrays: splats, optimiser moments, cameras.
+
+use glam::DMat4;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use splat_render::fit::{CameraState, DensityStats, FitState, Hold};
+
+use crate::arrays::{elements, entry, rows, shaped, shaped_rows};
+use crate::camera::viewmat;
+use crate::splat_arrays::splat_arrays_from;
+
+/// Reads the state of a fit and the steps done. Without moments, the fit is new and starts at
+/// `first_step`.
+pub fn state_from(dict: &Bound<'_, PyDict>, first_step: u32) -> PyResult<(FitState, u32)> {
+    let splats = splat_arrays_from(dict, "")?;
+    if !dict.contains("step")? {
+        return Ok((FitState::new(splats), first_step));
+    }
+    let n = splats.len() as isize;
+    let stat = |name: &str| -> PyResult<Vec<f32>> {
+        Ok(elements(name, &entry(dict, name)?, &[n])?.to_vec())
+    };
+    let step = entry::<u32>(dict, "step")?;
+    let state = FitState {
+        splats,
+        first: splat_arrays_from(dict, "first_")?,
+        second: splat_arrays_from(dict, "second_")?,
+        stats: DensityStats { grad_sum: stat("stats_grad_sum")?, seen: stat("stats_seen")? },
+    };
+    Ok((state, elements("step", &step, &[1])?[0]))
+}
+
+/// Reads the state of the cameras, if the dict holds one.
+pub fn camera_state_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Option<CameraState>> {
+    if !dict.contains("camera_viewmats")? {
+        return Ok(None);
+    }
+    let n = count as isize;
+    let table = |name: &str| -> PyResult<Vec<[f64; 7]>> {
+        Ok(rows(name, &entry::<f64>(dict, name)?, &[n])?.to_vec())
+    };
+    let viewmats = entry::<f64>(dict, "camera_viewmats")?;
+    let viewmats = rows::<f64, 4>("camera_viewmats", &viewmats, &[n, 4])?.as_chunks::<4>().0;
+    let intrinsics = entry::<f64>(dict, "camera_intrinsics")?;
+    let distances = entry::<f64>(dict, "camera_distances")?;
+    let rounds = entry::<u32>(dict, "camera_rounds")?;
+    Ok(Some(CameraState {
+        viewmats: viewmats.iter().map(viewmat).collect(),
+        intrinsics: rows("camera_intrinsics", &intrinsics, &[n])?.to_vec(),
+        first: table("camera_first")?,
+        second: rows("camera_second", &entry::<f64>(dict, "camera_second")?, &[n])?.to_vec(),
+        gradients: table("camera_gradients")?,
+        distances: elements("camera_distances", &distances, &[n])?.to_vec(),
+        rounds: elements("camera_rounds", &rounds, &[1])?[0],
+    }))
+}
+
+/// Pose priors of the cameras: `viewmats` [V, 4, 4], `intrinsics` [V, 4], `information` [V, 6, 6] (the
+/// inverse covariance of rotation and translation), `focal_information` [V] (of the logarithm of the
+/// focal length).
+pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<Hold>> {
+    let n = count as isize;
+    let viewmats = entry::<f64>(dict, "viewmats")?;
+    let viewmats = rows::<f64, 4>("viewmats", &viewmats, &[n, 4])?.as_chunks::<4>().0;
+    let intrinsics = entry::<f64>(dict, "intrinsics")?;
+    let intrinsics = rows::<f64, 4>("intrinsics", &intrinsics, &[n])?;
+    let information = entry::<f64>(dict, "information")?;
+    let information = rows::<f64, 6>("information", &information, &[n, 6])?.as_chunks::<6>().0;
+    let focal_information = entry::<f64>(dict, "focal_information")?;
+    let focal_information = elements("focal_information", &focal_information, &[n])?;
+    let hold = |i: usize| {
+        let [fx, fy, ..] = intrinsics[i];
+        Hold {
+            viewmat: viewmat(&viewmats[i]),
+            focal: [fx, fy],
+            pose: information[i],
+            log_focal: focal_information[i],
+        }
+    };
+    Ok((0..count).map(hold).collect())
+}
+
+/// Writes what [`camera_state_from`] reads.
+pub fn set_camera_state(dict: &Bound<'_, PyDict>, state: CameraState) -> PyResult<()> {
+    let (py, n) = (dict.py(), state.viewmats.len());
+    set_cameras(dict, &state.viewmats, state.intrinsics)?;
+    dict.set_item("camera_first", shaped_rows(py, state.first, &[n])?)?;
+    dict.set_item("camera_second", shaped_rows(py, state.second, &[n])?)?;
+    dict.set_item("camera_gradients", shaped_rows(py, state.gradients, &[n])?)?;
+    dict.set_item("camera_distances", shaped(py, state.distances, &[n])?)?;
+    dict.set_item("camera_rounds", shaped(py, vec![state.rounds], &[1])?)
+}
+
+/// Writes `camera_viewmats` [V, 4, 4] and `camera_intrinsics` [V, 4].
+pub fn set_cameras(
+    dict: &Bound<'_, PyDict>,
+    viewmats: &[DMat4],
+    intrinsics: Vec<[f64; 4]>,
+) -> PyResult<()> {
+    let (py, n) = (dict.py(), viewmats.len());
+    let table: Vec<[f64; 4]> =
+        viewmats.iter().flat_map(|m| m.transpose().to_cols_array_2d()).collect();
+    dict.set_item("camera_viewmats", shaped_rows(py, table, &[n, 4])?)?;
+    dict.set_item("camera_intrinsics", shaped_rows(py, intrinsics, &[n])?)
+}

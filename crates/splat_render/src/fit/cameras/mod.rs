@@ -1,0 +1,249 @@
+//! Cameras under optimisation: poses and focal lengths that are not exact, fitted with the splats.
+//!
+//! A camera turns about its own centre and moves along its own axes. Both show the scene in nearly
+//! the same way, so Adam does not work on them but on coordinates in which every unit step moves the
+//! picture of the scene by one pixel, whichever way it points (as CamP, Park et al. 2023).
+//!
+//! Cameras and splats together may be turned, moved and scaled without any photo showing it. After
+//! each round the cameras are brought back by the similarity that fits them best to where they
+//! began, so that they do not drift.
+
+mod anchor;
+mod cholesky;
+mod config;
+mod motion;
+mod pose_prior;
+mod preconditioning;
+#[cfg(test)]
+mod tests;
+
+use glam::DMat4;
+
+pub use config::{CameraConfig, Focal};
+pub use pose_prior::PosePrior;
+pub use preconditioning::scene_distance;
+
+use crate::camera::Camera;
+use crate::error::{Error, Result};
+use crate::fit_device::CameraGradient;
+use anchor::anchor;
+use motion::{POSE, PoseMatrix, move_by, tangent};
+use preconditioning::{all_scales, focal_pixels};
+
+/// Adam's decay of the first and second moments and its epsilon. A camera has one step a round: the
+/// second moment must forget within tens of them.
+const ADAM: (f64, f64, f64) = (0.9, 0.99, 1e-15);
+
+/// Everything needed to go on bit for bit; one entry per camera.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct CameraState {
+    /// World-to-camera matrices.
+    pub viewmats: Vec<DMat4>,
+    /// (fx, fy, cx, cy), pixels.
+    pub intrinsics: Vec<[f64; 4]>,
+    /// Adam's first moments: the pose's six, then that of the focal length's logarithm (a shared
+    /// one's in every row alike).
+    pub first: Vec<[f64; 7]>,
+    /// Adam's second moments: the pose's as a whole, the focal length's.
+    pub second: Vec<[f64; 2]>,
+    /// Gradients of the round under way, of the same parameters before preconditioning.
+    pub gradients: Vec<[f64; 7]>,
+    /// Distances to the scene at the fit's start, world units.
+    pub distances: Vec<f64>,
+    /// Steps of Adam done.
+    pub rounds: u32,
+}
+
+/// Cameras being fitted.
+#[derive(Debug)]
+pub struct Cameras {
+    initial: Vec<Camera>,
+    now: Vec<Camera>,
+    /// From steps in pixels to turns and moves.
+    scales: Vec<PoseMatrix>,
+    /// What else is known of each camera; empty where nothing is.
+    holds: Vec<PosePrior>,
+    /// Pixels by which the picture moves where the logarithm of the focal length grows by 1.
+    focal_pixels: Vec<f64>,
+    config: CameraConfig,
+    state: CameraState,
+}
+
+impl Cameras {
+    /// Cameras and how far the scene is from each, world units.
+    pub fn new(initial: &[Camera], distances: Vec<f64>, config: CameraConfig) -> Self {
+        let rows = vec![[0.0; POSE + 1]; initial.len()];
+        let state = CameraState {
+            first: rows.clone(),
+            second: vec![[0.0; 2]; initial.len()],
+            gradients: rows,
+            distances: distances.clone(),
+            ..CameraState::default()
+        };
+        Self {
+            scales: all_scales(initial, &distances, &[]),
+            holds: Vec::new(),
+            focal_pixels: initial.iter().map(focal_pixels).collect(),
+            initial: initial.to_vec(),
+            now: initial.to_vec(),
+            config,
+            state,
+        }
+    }
+
+    /// Holds the cameras, one entry for each, from before their first step or [`Cameras::resume`].
+    pub fn hold(&mut self, holds: Vec<PosePrior>) -> Result<()> {
+        if holds.len() != self.initial.len() {
+            let count = self.initial.len();
+            return Err(Error::argument(
+                "holds",
+                format!("must have one entry for {count} cameras"),
+            ));
+        }
+        for (k, hold) in holds.iter().enumerate() {
+            hold.validate(k)?;
+        }
+        self.scales = all_scales(&self.initial, &self.state.distances, &holds);
+        self.holds = holds;
+        Ok(())
+    }
+
+    /// Goes on from a state that [`Cameras::state`] gave.
+    pub fn resume(&mut self, state: CameraState) -> Result<()> {
+        let n = self.initial.len();
+        let lengths = [
+            state.viewmats.len(),
+            state.intrinsics.len(),
+            state.first.len(),
+            state.second.len(),
+            state.gradients.len(),
+            state.distances.len(),
+        ];
+        if lengths.iter().any(|&length| length != n) {
+            return Err(Error::argument("cameras", format!("must have one row for {n} cameras")));
+        }
+        for (k, camera) in self.now.iter_mut().enumerate() {
+            let [fx, fy, cx, cy] = state.intrinsics[k];
+            *camera = Camera { viewmat: state.viewmats[k], fx, fy, cx, cy, ..*camera };
+            camera.validate()?;
+        }
+        let moments = [&state.first, &state.gradients].map(|rows| rows.as_flattened());
+        let moments = moments.into_iter().chain([state.second.as_flattened()]).flatten();
+        if !moments.copied().all(f64::is_finite) {
+            return Err(Error::argument("cameras", "has a moment that is not finite"));
+        }
+        if !state.distances.iter().all(|d| d.is_finite() && *d > 0.0) {
+            return Err(Error::argument("cameras", "has a distance that is not positive"));
+        }
+        self.scales = all_scales(&self.initial, &state.distances, &self.holds);
+        self.state = state;
+        Ok(())
+    }
+
+    /// Where the fit stands.
+    pub fn state(&self) -> CameraState {
+        let intrinsics = |c: &Camera| [c.fx, c.fy, c.cx, c.cy];
+        CameraState {
+            viewmats: self.now.iter().map(|c| c.viewmat).collect(),
+            intrinsics: self.now.iter().map(intrinsics).collect(),
+            ..self.state.clone()
+        }
+    }
+
+    /// The cameras as they are now.
+    pub fn now(&self) -> &[Camera] {
+        &self.now
+    }
+
+    /// Whether cameras move at this point of the fit, 0..1.
+    pub fn moving(&self, progress: f64) -> bool {
+        progress >= f64::from(self.config.warm_up)
+    }
+
+    /// Adds gradients of steps to those of the round.
+    pub fn add(&mut self, gradients: &[CameraGradient]) {
+        for gradient in gradients {
+            let row = tangent(&self.now[gradient.view], gradient);
+            // A picture that left f32 says nothing of where to go.
+            if row.iter().all(|v| v.is_finite()) {
+                for (sum, v) in self.state.gradients[gradient.view].iter_mut().zip(row) {
+                    *sum += v;
+                }
+            }
+        }
+    }
+
+    /// Moves the cameras by the gradients of the round.
+    pub fn step(&mut self, progress: f64) {
+        let warm_up = f64::from(self.config.warm_up);
+        let since = ((progress - warm_up) / (1.0 - warm_up).max(1e-9)).clamp(0.0, 1.0);
+        let rate = f64::from(self.config.rate) * f64::from(self.config.decay).powf(since);
+        self.state.rounds += 1;
+        let mut gradients = std::mem::take(&mut self.state.gradients);
+        self.state.gradients = vec![[0.0; POSE + 1]; gradients.len()];
+        if self.config.focal == Focal::Shared {
+            let sum: f64 = gradients.iter().map(|row| row[POSE]).sum();
+            gradients.iter_mut().for_each(|row| row[POSE] = sum);
+        }
+        let mean_pixels = self.focal_pixels.iter().sum::<f64>() / self.now.len() as f64;
+        for (k, row) in gradients.iter().enumerate() {
+            let scale = self.scales[k];
+            let pixels = match self.config.focal {
+                Focal::Shared => mean_pixels,
+                _ => self.focal_pixels[k],
+            };
+            let hold = self.holds.get(k).copied();
+            // A step is as long as the shorter of a pixel and what is known already.
+            let pixels = hold.map_or(pixels, |hold| pixels.hypot(hold.log_focal.sqrt()));
+            let mut in_pixels = [0.0; POSE + 1];
+            for (line, v) in scale.iter().zip(row) {
+                for (out, s) in in_pixels.iter_mut().zip(line) {
+                    *out += s * v;
+                }
+            }
+            in_pixels[POSE] = row[POSE] / pixels;
+            let moved = self.adam(k, in_pixels, rate);
+            let mut pose = [0.0; POSE];
+            for (out, line) in pose.iter_mut().zip(&scale) {
+                *out = line.iter().zip(moved).map(|(s, v)| s * v).sum();
+            }
+            let camera = &mut self.now[k];
+            if self.config.poses {
+                move_by(camera, pose);
+                if let Some(hold) = hold {
+                    hold.pull_pose(camera, &scale, rate);
+                }
+            }
+            if self.config.focal != Focal::Fixed {
+                let factor = (moved[POSE] / pixels).exp();
+                (camera.fx, camera.fy) = (camera.fx * factor, camera.fy * factor);
+                if let Some(hold) = hold {
+                    hold.pull_focal(camera, pixels * pixels, rate);
+                }
+            }
+        }
+        if self.config.anchored && self.config.poses {
+            anchor(&mut self.now, &self.initial, &self.state.distances);
+        }
+    }
+
+    /// Adam with one second moment for the pose as a whole: its coordinates have one unit, and the
+    /// slope says how far to go along each of them. A moment for each would move the camera as far
+    /// along those that the photo hardly shows.
+    fn adam(&mut self, k: usize, gradient: [f64; 7], rate: f64) -> [f64; 7] {
+        let (beta1, beta2, epsilon) = ADAM;
+        let bias = |beta: f64| 1.0 - beta.powi(self.state.rounds.min(i32::MAX as u32) as i32);
+        let (bias1, bias2) = (bias(beta1), bias(beta2));
+        let (first, second) = (&mut self.state.first[k], &mut self.state.second[k]);
+        let squares = gradient.map(|g| g * g);
+        let squares = [squares[..POSE].iter().sum(), squares[POSE]];
+        for (second, square) in second.iter_mut().zip(squares) {
+            *second = beta2 * *second + (1.0 - beta2) * square;
+        }
+        std::array::from_fn(|i| {
+            first[i] = beta1 * first[i] + (1.0 - beta1) * gradient[i];
+            let second = second[usize::from(i == POSE)];
+            -rate * (first[i] / bias1) / ((second / bias2).sqrt() + epsilon)
+        })
+    }
+}

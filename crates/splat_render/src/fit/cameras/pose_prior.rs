@@ -1,0 +1,91 @@
+//! What else than the photos' colours says of a camera: where it stood, and how surely.
+//!
+//! Points that were recognised in several photos tell a camera to hundredths of a pixel, which the
+//! colours of a fit do not. A held camera takes steps that are small along what is known and as large
+//! as ever along what is not, and is drawn back towards where it was told to stand: so far that a
+//! steady push ends one standard deviation away.
+
+use glam::DMat4;
+
+use super::cholesky::inverse_cholesky;
+use super::motion::{POSE, PoseMatrix, between, move_by};
+use crate::camera::Camera;
+use crate::error::{Error, Result};
+
+/// Where a camera is told to stand, and the information about it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PosePrior {
+    /// World to camera.
+    pub viewmat: DMat4,
+    /// Focal lengths, pixels.
+    pub focal: [f64; 2],
+    /// Inverse of the covariance of turn (radians) about and move (world units) along x, y, z of the
+    /// camera, as [`move_by`] takes them; symmetric, zero where nothing is known.
+    pub pose: PoseMatrix,
+    /// Inverse of the variance of the focal length's logarithm; zero where nothing is known.
+    pub log_focal: f64,
+}
+
+impl PosePrior {
+    /// Checks that every entry can be used; `k` is the camera's number.
+    pub fn validate(&self, k: usize) -> Result<()> {
+        let information = self.pose.as_flattened().iter().chain([&self.log_focal]);
+        let diagonal = (0..POSE).map(|i| self.pose[i][i]).chain([self.log_focal]);
+        let place = self.viewmat.to_cols_array().into_iter().chain(self.focal);
+        if !information.copied().chain(place).all(f64::is_finite)
+            || !diagonal.into_iter().all(|v| v >= 0.0)
+            || !self.focal.iter().all(|&f| f > 0.0)
+        {
+            return Err(Error::argument(
+                format!("holds[{k}]"),
+                "must be finite, with positive focal lengths and information that is not negative",
+            ));
+        }
+        Ok(())
+    }
+
+    /// Draws a camera back by what balances a push of `rate` one standard deviation away.
+    ///
+    /// `scale` takes steps of length 1 to poses; they are made with this hold's information, so that
+    /// none goes further than a standard deviation.
+    pub fn pull_pose(&self, camera: &mut Camera, scale: &PoseMatrix, rate: f64) {
+        if self.pose == [[0.0; POSE]; POSE] {
+            return;
+        }
+        let told = Camera { viewmat: self.viewmat, ..*camera };
+        let off = between(&told, camera);
+        // With T the scale and I the information, off - rate T (1 + rate T'IT)^-1 T'I off solves
+        // ((TT')^-1 + rate I) x = (TT')^-1 off, which weighs the way back against a step's length.
+        let weighed: PoseMatrix = product(&self.pose, scale);
+        let within: PoseMatrix = std::array::from_fn(|i| {
+            std::array::from_fn(|j| {
+                let along: f64 = (0..POSE).map(|k| scale[k][i] * weighed[k][j]).sum();
+                rate * along + if i == j { 1.0 } else { 0.0 }
+            })
+        });
+        let inverse = inverse_cholesky(within);
+        let push: [f64; POSE] =
+            std::array::from_fn(|i| rate * (0..POSE).map(|k| weighed[k][i] * off[k]).sum::<f64>());
+        let half: [f64; POSE] =
+            std::array::from_fn(|i| (0..POSE).map(|k| inverse[i][k] * push[k]).sum());
+        let whole: [f64; POSE] =
+            std::array::from_fn(|i| (0..POSE).map(|k| inverse[k][i] * half[k]).sum());
+        let left = std::array::from_fn(|i| {
+            off[i] - (0..POSE).map(|k| scale[i][k] * whole[k]).sum::<f64>()
+        });
+        *camera = told;
+        move_by(camera, left);
+    }
+
+    /// The same of the focal length; its logarithm's steps of length 1 are 1 / sqrt(`measure`).
+    pub fn pull_focal(&self, camera: &mut Camera, measure: f64, rate: f64) {
+        let off = (camera.fx / self.focal[0]).ln();
+        let back = off * rate * self.log_focal / (measure + rate * self.log_focal);
+        let factor = (-back).exp();
+        (camera.fx, camera.fy) = (camera.fx * factor, camera.fy * factor);
+    }
+}
+
+fn product(a: &PoseMatrix, b: &PoseMatrix) -> PoseMatrix {
+    std::array::from_fn(|i| std::array::from_fn(|j| (0..POSE).map(|k| a[i][k] * b[k][j]).sum()))
+}

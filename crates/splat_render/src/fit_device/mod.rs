@@ -1,0 +1,146 @@
+//! Where a fit's steps run: the seam between the fitting loop and the backends.
+
+mod random;
+mod state;
+
+pub(crate) use random::dropout_threshold;
+pub use random::{is_dropped, noise_normal};
+pub use state::{DensityStats, FitState};
+
+use crate::camera::Camera;
+use crate::error::{Error, Result};
+use crate::stages::{AdamStep, Rates};
+use crate::target::Target;
+
+/// Gradient of a step's loss with respect to its camera.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct CameraGradient {
+    /// Which target.
+    pub view: usize,
+    /// Rows of the gradient of the viewmat's upper 3x4 block.
+    pub v_viewmat: [[f64; 4]; 3],
+    /// Gradient of (fx, fy, cx, cy).
+    pub v_intrinsics: [f64; 4],
+}
+
+/// What one step is to do.
+#[derive(Debug, Clone, Copy)]
+pub struct StepInput {
+    /// Which target.
+    pub view: usize,
+    /// Its camera, relative to the scene's origin.
+    pub camera: Camera,
+    /// Render background, and what a target with alpha is composited over.
+    pub background: [f32; 3],
+    /// SH degree in use.
+    pub sh_degree: u32,
+    /// Step sizes.
+    pub rates: Rates,
+    /// Number of this step, from 1, for Adam's bias correction.
+    pub step: u32,
+    /// Weight of D-SSIM in the loss; L1 has the rest.
+    pub ssim_weight: f32,
+    /// Added to the loss: this times the mean opacity.
+    pub opacity_regularizer: f32,
+    /// Added to the loss: this times the mean scale (over splats and axes, world units).
+    pub scale_regularizer: f32,
+    /// Size of the exploration noise on the centres (3DGS-MCMC, eq. 8), 0 for none. After Adam's
+    /// update: mean += C (z * noise / (1 + exp(-100 (0.005 - opacity)))) with C the splat's 3D
+    /// covariance, z from [`noise_normal`] and the parameters as updated.
+    pub noise: f32,
+    /// Part of the splats that this step leaves out, those of [`is_dropped`]; the opacities of the
+    /// others are divided by 1 - dropout, so that the picture stays as opaque on the whole.
+    pub dropout: f32,
+    /// Seed of noise and dropout; differs from step to step.
+    pub noise_seed: u32,
+    /// Whether [`FitDevice::camera_gradients`] will ask for this step's.
+    pub camera_gradient: bool,
+}
+
+impl StepInput {
+    /// Checks what a device is given, against the photos it holds, and returns the step's photo's
+    /// entry: one of `sizes`, `(width, height)` in pixels.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] that names the field.
+    pub fn validate(&self, sizes: impl ExactSizeIterator<Item = (u32, u32)>) -> Result<()> {
+        let (count, mut sizes) = (sizes.len(), sizes);
+        let Some((width, height)) = sizes.nth(self.view) else {
+            return Err(Error::argument(
+                "view",
+                format!("must be less than {count}, the number of photos, got {}", self.view),
+            ));
+        };
+        self.camera.validate()?;
+        if (self.camera.width, self.camera.height) != (width, height) {
+            return Err(Error::argument(
+                "camera",
+                format!(
+                    "is {} x {} where its photo is {width} x {height}",
+                    self.camera.width, self.camera.height
+                ),
+            ));
+        }
+        if !(0.0..1.0).contains(&self.dropout) {
+            return Err(Error::argument(
+                "dropout",
+                format!("must be at least 0 and less than 1, got {}", self.dropout),
+            ));
+        }
+        if !(0.0..=1.0).contains(&self.ssim_weight) {
+            return Err(Error::argument(
+                "ssim_weight",
+                format!("must lie in 0..=1, got {}", self.ssim_weight),
+            ));
+        }
+        self.adam().validate()
+    }
+
+    /// The optimiser's part of the step.
+    pub fn adam(&self) -> AdamStep {
+        AdamStep {
+            number: self.step,
+            rates: self.rates,
+            sh_degree: self.sh_degree,
+            opacity_regularizer: self.opacity_regularizer,
+            scale_regularizer: self.scale_regularizer,
+            noise: self.noise,
+            noise_seed: self.noise_seed,
+        }
+    }
+}
+
+/// A backend that keeps splats, optimiser state and photos where its kernels run.
+///
+/// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p
+/// and channels c, with s the SSIM weight, zero padding in the window, plus the two regularisers.
+/// Every parameter takes an Adam step in every step, seen or not. With [`Rates::ZERO`] nothing moves
+/// ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss, the density statistics and
+/// the cameras' gradients are as ever.
+pub trait FitDevice: Send {
+    /// Takes the photos, once.
+    fn set_targets(&mut self, targets: Vec<Target>) -> Result<()>;
+
+    /// Replaces the state.
+    fn upload(&mut self, state: FitState) -> Result<()>;
+
+    /// A copy of the state as it is now.
+    fn download(&mut self) -> Result<FitState>;
+
+    /// Lets `change` work on the state; splats may come and go.
+    fn edit(&mut self, change: &mut dyn FnMut(&mut FitState)) -> Result<()> {
+        let mut state = self.download()?;
+        change(&mut state);
+        self.upload(state)
+    }
+
+    /// One step: project, bin, rasterize, loss, rasterize_backward, project_backward, Adam, noise,
+    /// density statistics.
+    fn step(&mut self, input: &StepInput) -> Result<()>;
+
+    /// Gradients of the cameras of all steps since the last call that were to have them, in order.
+    fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>>;
+
+    /// Loss of the last step (before its update, regularisers not included).
+    fn loss(&mut self) -> Result<f32>;
+}

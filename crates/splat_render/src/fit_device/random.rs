@@ -1,0 +1,50 @@
+//! What is random in a step: which splats it leaves out and the exploration noise. Each draw comes
+//! from a seed and a splat's index, the same on every device.
+
+/// PCG's output function on one 32-bit word.
+fn hash(x: u32) -> u32 {
+    let state = x.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+    let word = ((state >> ((state >> 28) + 4)) ^ state).wrapping_mul(277_803_737);
+    (word >> 22) ^ word
+}
+
+/// The hash value below which a splat is dropped.
+pub(crate) fn dropout_threshold(rate: f32) -> u32 {
+    (f64::from(rate) * 4_294_967_296.0) as u32
+}
+
+/// Whether a step with this seed and dropout leaves out the splat `index` (DropGaussian, Park et
+/// al. 2025). The same on every backend.
+pub fn is_dropped(seed: u32, index: u32, rate: f32) -> bool {
+    hash(index ^ hash(seed ^ 0x5bd1_e995)) < dropout_threshold(rate)
+}
+
+/// Three standard normal numbers from (seed, splat index): integer hash (PCG output function
+/// applied thrice), then Box-Muller. The same on every backend up to the rounding of log, sqrt, cos.
+pub fn noise_normal(seed: u32, index: u32) -> [f32; 3] {
+    // In (0, 1]: the logarithm stays finite.
+    let unit = |h: u32| ((h >> 8) as f32 + 1.0) * (1.0 / 16_777_216.0);
+    let base = hash(index ^ hash(seed));
+    let draw: [f32; 4] = std::array::from_fn(|k| unit(hash(base.wrapping_add(k as u32))));
+    let (r0, r1) = ((-2.0 * draw[0].ln()).sqrt(), (-2.0 * draw[2].ln()).sqrt());
+    let (a0, a1) = (std::f32::consts::TAU * draw[1], std::f32::consts::TAU * draw[3]);
+    [r0 * a0.cos(), r0 * a0.sin(), r1 * a1.cos()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dropout_leaves_out_its_part_and_other_splats_each_step() {
+        let dropped = |seed, rate| (0..100_000).filter(move |&i| is_dropped(seed, i, rate));
+        assert_eq!(dropped(3, 0.0).count(), 0);
+        for (seed, rate) in [(0, 0.1), (7, 0.3), (u32::MAX, 0.9)] {
+            let part = dropped(seed, rate).count() as f32 / 1e5;
+            assert!((part - rate).abs() < 0.01, "{part} where {rate} was asked for");
+        }
+        // Two steps agree by chance only.
+        let both = dropped(1, 0.3).filter(|&i| is_dropped(2, i, 0.3)).count() as f32 / 1e5;
+        assert!((both - 0.09).abs() < 0.01, "{both}");
+    }
+}

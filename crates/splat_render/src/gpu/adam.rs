@@ -1,0 +1,170 @@
+//! adam: one optimiser step of all parameters, the exploration noise, and what density control
+//! watches.
+
+use bytemuck::Zeroable;
+
+use super::device::{Gpu, Op};
+use super::layout::{GEOMETRY, GRADIENT, SPLATS_PER_GROUP, STATS, StatusHead, Step, View, Window};
+use super::project::{Projection, SPLAT_2D, SplatBuffers, rows};
+use super::project_backward::GradientBuffers;
+use super::shaders::Kernel;
+use crate::error::Result;
+use crate::splats::{SplatArrays, SplatParams};
+use crate::stages::{AdamState, AdamStep, SplatGradients};
+
+/// Floats of colour per workgroup.
+const COLOR_FLOATS_PER_GROUP: u32 = 256;
+
+/// Splats under optimisation, on the device.
+#[derive(Debug)]
+pub(super) struct AdamBuffers {
+    /// Parameters.
+    pub splats: SplatBuffers,
+    /// First moments.
+    pub first: SplatBuffers,
+    /// Second moments.
+    pub second: SplatBuffers,
+    /// `[N * STATS]`
+    pub stats: wgpu::Buffer,
+}
+
+/// What a step reads besides [`AdamBuffers`].
+#[derive(Debug)]
+pub(super) struct AdamInput<'a> {
+    /// The camera and its 2D splats, for the statistics.
+    pub drawn: Projection<'a>,
+    /// A [`Step`].
+    pub step: &'a wgpu::Buffer,
+    /// A [`StatusHead`]: no step is done after an overflow.
+    pub status: &'a wgpu::Buffer,
+    pub gradients: &'a GradientBuffers,
+    /// `[N * GRADIENT]`, for the statistics.
+    pub v_splats2d: &'a wgpu::Buffer,
+}
+
+/// Parameters or moments from what their buffers hold.
+pub(super) fn arrays_from_bytes(geometry: &[u8], colors: &[u8], sh_degree: u32) -> SplatArrays {
+    let mut out = SplatArrays {
+        sh: bytemuck::pod_collect_to_vec(colors),
+        sh_degree,
+        ..SplatArrays::default()
+    };
+    for bytes in geometry.chunks_exact(GEOMETRY * 4) {
+        let row: [f32; GEOMETRY] = bytemuck::pod_read_unaligned(bytes);
+        out.means.push([row[0], row[1], row[2]]);
+        out.scales.push([row[3], row[4], row[5]]);
+        out.quats.push([row[6], row[7], row[8], row[9]]);
+        out.opacities.push(row[10]);
+    }
+    out
+}
+
+impl AdamBuffers {
+    /// Copies parameters, first and second moments, and statistics to the device.
+    pub fn upload(
+        gpu: &Gpu,
+        [splats, first, second]: [SplatParams<'_, f32>; 3],
+        stats: &[[f32; STATS]],
+    ) -> Result<Self> {
+        Ok(Self {
+            splats: SplatBuffers::upload(gpu, &splats)?,
+            first: SplatBuffers::upload(gpu, &first)?,
+            second: SplatBuffers::upload(gpu, &second)?,
+            stats: gpu.upload("stats", stats)?,
+        })
+    }
+
+    /// The commands of a step.
+    pub fn ops(&self, gpu: &Gpu, input: &AdamInput<'_>) -> Vec<Op> {
+        let Self { splats, first, second, stats } = self;
+        let (geometry, colors) = (GEOMETRY as u64, splats.color_floats);
+        let mut ops = Vec::new();
+        for window in splats.windows(gpu) {
+            let count = window.len() as u32;
+            let uniform = gpu.uniform(&Window { first: window.start, count });
+            let op = |kernel, floats, arrays: [&wgpu::Buffer; 4], groups| {
+                let [values, gradient, first, second] =
+                    arrays.map(|array| rows(array, &window, floats));
+                let bindings = [
+                    input.drawn.view.into(),
+                    input.step.into(),
+                    (&uniform).into(),
+                    input.status.into(),
+                    values,
+                    gradient,
+                    first,
+                    second,
+                    rows(input.drawn.splats2d, &window, SPLAT_2D as u64),
+                    rows(input.v_splats2d, &window, GRADIENT as u64),
+                    rows(stats, &window, STATS as u64),
+                ];
+                gpu.op(kernel, &bindings, groups)
+            };
+            ops.push(op(
+                Kernel::AdamGeometry,
+                geometry,
+                [&splats.geometry, &input.gradients.geometry, &first.geometry, &second.geometry],
+                gpu.groups(count, SPLATS_PER_GROUP),
+            ));
+            ops.push(op(
+                Kernel::AdamColors,
+                colors,
+                [&splats.colors, &input.gradients.colors, &first.colors, &second.colors],
+                gpu.groups(count * colors as u32, COLOR_FLOATS_PER_GROUP),
+            ));
+        }
+        ops
+    }
+}
+
+pub(super) fn adam(
+    gpu: &Gpu,
+    state: &mut AdamState<f32>,
+    gradients: &SplatGradients<f32>,
+    step: &AdamStep,
+) -> Result<()> {
+    let n = state.splats.len();
+    let degree = state.splats.sh_degree;
+    let params = [&state.splats, &state.first, &state.second].map(|a| a.params(degree));
+    let buffers = AdamBuffers::upload(gpu, params, &vec![[0.0; STATS]; n])?;
+    let given = GradientBuffers::upload(gpu, gradients)?;
+    let count = buffers.splats.splats;
+    let view = gpu.uniform(&View {
+        sh_degree: step.sh_degree.min(degree),
+        sh_stride: state.splats.stride() as u32,
+        ..View::of_picture(1, 1, [0.0; 3])
+    });
+    let status = gpu.upload(
+        "status",
+        &[StatusHead { splats: count, step: step.number, ..StatusHead::zeroed() }],
+    )?;
+    // All culled: the statistics are the fit's affair.
+    let splats2d = gpu.upload("splats2d", &vec![[0.0f32; SPLAT_2D]; n])?;
+    let v_splats2d = gpu.upload("v_splats2d", &vec![[0.0f32; GRADIENT]; n])?;
+    let ops = buffers.ops(
+        gpu,
+        &AdamInput {
+            drawn: Projection { view: &view, splats2d: &splats2d },
+            step: &gpu.uniform(&Step::of_adam(step, count)),
+            status: &status,
+            gradients: &given,
+            v_splats2d: &v_splats2d,
+        },
+    );
+    let sizes = [(n * GEOMETRY * 4) as u64, n as u64 * buffers.splats.color_floats * 4];
+    let AdamBuffers { splats, first, second, .. } = &buffers;
+    let data = gpu.download(
+        &ops,
+        &[
+            (&splats.geometry, sizes[0]),
+            (&splats.colors, sizes[1]),
+            (&first.geometry, sizes[0]),
+            (&first.colors, sizes[1]),
+            (&second.geometry, sizes[0]),
+            (&second.colors, sizes[1]),
+        ],
+    )?;
+    let arrays = |k: usize| arrays_from_bytes(&data[2 * k], &data[2 * k + 1], degree);
+    *state = AdamState { splats: arrays(0), first: arrays(1), second: arrays(2) };
+    Ok(())
+}

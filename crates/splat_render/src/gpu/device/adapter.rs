@@ -1,0 +1,206 @@
+//! Choosing an adapter and opening the device on it.
+
+use std::future::Future;
+use std::pin::pin;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::task::{Context, Poll, Waker};
+
+use super::{GROUPS_MAX, Gpu, ROWS, list_limit, note};
+use crate::constants::TILE;
+use crate::error::{Error, Result};
+use crate::gpu::shaders::{Access, Kernel, SOURCES, Source};
+
+/// Futures of wgpu's native backends are ready at once or after `poll`.
+fn ready<T>(future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    loop {
+        if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
+            return value;
+        }
+        std::thread::yield_now();
+    }
+}
+
+/// Real GPUs first.
+fn rank(kind: wgpu::DeviceType) -> u32 {
+    match kind {
+        wgpu::DeviceType::DiscreteGpu => 0,
+        wgpu::DeviceType::VirtualGpu => 1,
+        wgpu::DeviceType::IntegratedGpu => 2,
+        wgpu::DeviceType::Other => 3,
+        wgpu::DeviceType::Cpu => 4,
+    }
+}
+
+/// wgpu as this crate opens it.
+fn instance() -> wgpu::Instance {
+    crate::gpu::desktop::silence_device_select();
+    wgpu::Instance::new(wgpu::InstanceDescriptor {
+        // Debug layers are asked for by wgpu's environment variables alone.
+        flags: wgpu::InstanceFlags::empty().with_env(),
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    })
+}
+
+/// Adapters that can run the kernels, the best first.
+fn adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
+    let mut adapters = ready(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    adapters.retain(|a| {
+        let downlevel = a.get_downlevel_capabilities();
+        downlevel.flags.contains(wgpu::DownlevelFlags::COMPUTE_SHADERS)
+    });
+    adapters.sort_by_key(|a| rank(a.get_info().device_type));
+    adapters
+}
+
+impl Gpu {
+    /// Opens the best adapter: a real GPU where there is one, else, if `software_allowed`, a
+    /// software one such as lavapipe.
+    pub fn new(software_allowed: bool) -> Result<Self> {
+        let mut adapters = adapters(&instance());
+        let software_only =
+            adapters.first().is_some_and(|a| a.get_info().device_type == wgpu::DeviceType::Cpu);
+        if !software_allowed {
+            adapters.retain(|a| a.get_info().device_type != wgpu::DeviceType::Cpu);
+        }
+        let Some(adapter) = adapters.first() else {
+            return Err(Error::Device(
+                if software_only {
+                    "backend gpu: only a software adapter answers; ask for it by name or use \
+                     backend cpu, which is faster"
+                } else {
+                    "backend gpu: no Vulkan, Metal or DX12 adapter answers; install a driver \
+                     (mesa-vulkan-drivers has one for machines without a GPU) or use backend cpu"
+                }
+                .to_owned(),
+            ));
+        };
+        Self::open(adapter)
+    }
+
+    /// Opens the best adapter that can show pictures in a window, a software one where there is no
+    /// other, and the window's surface on it.
+    pub fn for_window(
+        window: impl Into<wgpu::SurfaceTarget<'static>>,
+    ) -> Result<(Self, wgpu::Adapter, wgpu::Surface<'static>)> {
+        let instance = instance();
+        let mut adapters = adapters(&instance);
+        // Without a driver there is no surface either, and wgpu's error for that names nothing.
+        if !adapters.is_empty() {
+            let surface = instance
+                .create_surface(window)
+                .map_err(|e| Error::Device(format!("no window can be opened ({e})")))?;
+            adapters.retain(|a| a.is_surface_supported(&surface));
+            if let Some(adapter) = adapters.into_iter().next() {
+                return Ok((Self::open(&adapter)?, adapter, surface));
+            }
+        }
+        Err(Error::Device(
+            "no Vulkan, Metal or DX12 adapter can draw in a window here; install a driver \
+             (mesa-vulkan-drivers has one for machines without a GPU)"
+                .to_owned(),
+        ))
+    }
+
+    fn open(adapter: &wgpu::Adapter) -> Result<Self> {
+        let info = adapter.get_info();
+        let offered = adapter.limits();
+        let software = info.device_type == wgpu::DeviceType::Cpu;
+        let rows = ROWS[usize::from(software)];
+        // Only where it was measured to pay.
+        let threads = TILE * TILE / 4 / rows;
+        let subgroups = software
+            && adapter.features().contains(wgpu::Features::SUBGROUP)
+            && (info.subgroup_min_size, info.subgroup_max_size) == (threads, threads);
+        // Defaults everywhere but for the sizes, where scenes profit from what the adapter has.
+        let required_limits = wgpu::Limits {
+            max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
+            max_buffer_size: offered.max_buffer_size,
+            ..wgpu::Limits::default()
+        };
+        let binding_limit = required_limits.max_storage_buffer_binding_size;
+        let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
+            label: Some("splat_render"),
+            required_limits,
+            // Who draws frames wants to know what they cost.
+            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY
+                | if subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
+            memory_hints: wgpu::MemoryHints::Performance,
+            ..Default::default()
+        }))
+        .map_err(|e| {
+            Error::Device(format!(
+                "backend gpu: {} does not open ({e}); update its driver or use backend cpu",
+                info.name
+            ))
+        })?;
+        let failure = Arc::new(Mutex::new(None));
+        let seen = Arc::clone(&failure);
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            note(
+                &seen,
+                match error {
+                    wgpu::Error::OutOfMemory { .. } => "is out of memory".to_owned(),
+                    error => format!("failed ({error})"),
+                },
+            );
+        }));
+        let seen = Arc::clone(&failure);
+        let lost = Arc::new(AtomicBool::new(false));
+        let is_lost = Arc::clone(&lost);
+        device.set_device_lost_callback(move |reason, message| {
+            if reason != wgpu::DeviceLostReason::Destroyed {
+                is_lost.store(true, Ordering::Relaxed);
+                note(&seen, format!("was lost ({message})"));
+            }
+        });
+        let layouts = SOURCES.iter().map(|source| bind_group_layout(&device, source)).collect();
+        let gpu = Self {
+            device,
+            queue,
+            info,
+            pipelines: Kernel::ALL.iter().map(|_| OnceLock::new()).collect(),
+            layouts,
+            failure,
+            lost,
+            made: Default::default(),
+            binding_limit,
+            groups_max: GROUPS_MAX,
+            // A few segments per core keep a CPU busy; a GPU needs many workgroups.
+            segments: if software { 16 } else { 256 },
+            rows,
+            subgroups,
+            list_limit: list_limit(software, subgroups),
+        };
+        gpu.check()?;
+        Ok(gpu)
+    }
+}
+
+fn bind_group_layout(device: &wgpu::Device, source: &Source) -> wgpu::BindGroupLayout {
+    let entries: Vec<_> = source
+        .bindings
+        .iter()
+        .enumerate()
+        .map(|(i, access)| wgpu::BindGroupLayoutEntry {
+            binding: i as u32,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty: wgpu::BindingType::Buffer {
+                ty: match access {
+                    Access::Uniform => wgpu::BufferBindingType::Uniform,
+                    Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
+                    Access::Write => wgpu::BufferBindingType::Storage { read_only: false },
+                },
+                has_dynamic_offset: false,
+                min_binding_size: None,
+            },
+            count: None,
+        })
+        .collect();
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: Some(source.name),
+        entries: &entries,
+    })
+}

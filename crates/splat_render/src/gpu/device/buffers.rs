@@ -1,0 +1,164 @@
+//! Buffers: made, filled, and read back.
+
+use std::sync::Arc;
+
+use super::commands::Op;
+use super::{Gpu, note};
+use crate::error::Result;
+
+/// What new buffers hold in builds with debug assertions: 1.5e9 as a float, far out as an index. A
+/// NaN would not show in gradients, which are set to zero where they are not finite.
+#[cfg(debug_assertions)]
+const POISON: u32 = 0x4ead_beef;
+
+/// Smallest buffer: large enough for one element of any binding.
+const BUFFER_MIN: u64 = 256;
+
+impl Gpu {
+    /// A buffer of at least `bytes`, with nothing of use in it.
+    pub(in crate::gpu) fn buffer(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
+        let size = bytes.max(BUFFER_MIN).next_multiple_of(4);
+        if size > self.device.limits().max_buffer_size {
+            return Err(self.error(&format!("holds no buffer of {size} bytes for {label}")));
+        }
+        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(label),
+            size,
+            usage: wgpu::BufferUsages::STORAGE
+                | wgpu::BufferUsages::COPY_SRC
+                | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: cfg!(debug_assertions),
+        });
+        self.count(size);
+        // wgpu hands out zeros, which would hide a read of what no kernel has written.
+        #[cfg(debug_assertions)]
+        {
+            if let Ok(mut view) = buffer.get_mapped_range_mut(..) {
+                let words = vec![POISON; size as usize / 4];
+                view.copy_from_slice(bytemuck::cast_slice(&words));
+            }
+            buffer.unmap();
+        }
+        self.check()?;
+        Ok(buffer)
+    }
+
+    /// Checks that a buffer can be bound whole.
+    pub(in crate::gpu) fn bindable_bytes(&self, label: &str, bytes: u64) -> Result<()> {
+        if bytes > self.binding_limit {
+            return Err(self.error(&format!(
+                "binds at most {} bytes at once where {label} needs {bytes}",
+                self.binding_limit
+            )));
+        }
+        Ok(())
+    }
+
+    /// A buffer that must be bound whole.
+    pub(in crate::gpu) fn bindable(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
+        self.bindable_bytes(label, bytes)?;
+        self.buffer(label, bytes)
+    }
+
+    /// Room for what a pixel keeps between dispatches that walk a part of its tile's list each;
+    /// empty where one walks all.
+    pub(in crate::gpu) fn transmittances(&self, pixels: u64) -> Result<wgpu::Buffer> {
+        let floats = if self.list_limit == u32::MAX { 0 } else { pixels };
+        self.bindable("transmittances", 4 * floats)
+    }
+
+    /// A buffer with the given contents.
+    pub(in crate::gpu) fn upload<T: bytemuck::NoUninit>(
+        &self,
+        label: &str,
+        contents: &[T],
+    ) -> Result<wgpu::Buffer> {
+        let bytes: &[u8] = bytemuck::cast_slice(contents);
+        let buffer = self.buffer(label, bytes.len() as u64)?;
+        if !bytes.is_empty() {
+            self.queue.write_buffer(&buffer, 0, bytes);
+        }
+        self.check()?;
+        Ok(buffer)
+    }
+
+    /// A uniform buffer with the given contents.
+    pub(in crate::gpu) fn uniform<T: bytemuck::NoUninit>(&self, contents: &T) -> wgpu::Buffer {
+        let size = size_of::<T>().next_multiple_of(16) as u64;
+        self.count(size);
+        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("uniform"),
+            size,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        self.queue.write_buffer(&buffer, 0, bytemuck::bytes_of(contents));
+        buffer
+    }
+
+    /// Runs prepared commands and brings back the first `bytes` of each buffer.
+    pub(in crate::gpu) fn download(
+        &self,
+        ops: &[Op],
+        buffers: &[(&wgpu::Buffer, u64)],
+    ) -> Result<Vec<Vec<u8>>> {
+        let mut encoder = self.device.create_command_encoder(&Default::default());
+        Self::record(&mut encoder, ops);
+        let total: u64 = buffers.iter().map(|(_, bytes)| bytes).sum();
+        if total == 0 {
+            self.queue.submit([encoder.finish()]);
+            self.check()?;
+            return Ok(buffers.iter().map(|_| Vec::new()).collect());
+        }
+        let mut staging = Vec::new();
+        for &(buffer, bytes) in buffers {
+            let copy = self.readable(bytes);
+            if bytes > 0 {
+                encoder.copy_buffer_to_buffer(buffer, 0, &copy, 0, bytes);
+            }
+            staging.push((copy, bytes));
+        }
+        self.queue.submit([encoder.finish()]);
+        self.check()?;
+        let staging: Vec<_> = staging.iter().map(|(copy, bytes)| (copy, *bytes)).collect();
+        self.read(&staging)
+    }
+
+    /// A buffer that can be copied to and read by the host.
+    pub fn readable(&self, bytes: u64) -> wgpu::Buffer {
+        let size = bytes.max(4);
+        self.count(size);
+        self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("download"),
+            size,
+            usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ,
+            mapped_at_creation: false,
+        })
+    }
+
+    /// Waits for all work and brings back the first `bytes` of each [`Self::readable`] buffer.
+    pub fn read(&self, buffers: &[(&wgpu::Buffer, u64)]) -> Result<Vec<Vec<u8>>> {
+        for (buffer, _) in buffers {
+            let failure = Arc::clone(&self.failure);
+            buffer.slice(..).map_async(wgpu::MapMode::Read, move |result| {
+                if let Err(error) = result {
+                    note(&failure, format!("gave no results back ({error})"));
+                }
+            });
+        }
+        self.device
+            .poll(wgpu::PollType::wait_indefinitely())
+            .map_err(|e| self.error(&format!("did not finish ({e})")))?;
+        self.check()?;
+        let mut out = Vec::new();
+        for &(buffer, bytes) in buffers {
+            let view = buffer
+                .get_mapped_range(..)
+                .map_err(|e| self.error(&format!("gave no results back ({e})")))?;
+            out.push(view[..bytes as usize].to_vec());
+            drop(view);
+            buffer.unmap();
+        }
+        Ok(out)
+    }
+}

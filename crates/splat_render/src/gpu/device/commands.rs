@@ -1,0 +1,169 @@
+//! Kernels with their bindings, prepared, recorded and submitted.
+
+use std::num::NonZeroU64;
+use std::ops::Range;
+
+use super::Gpu;
+use crate::error::Result;
+use crate::gpu::layout::SPLATS_PER_GROUP;
+use crate::gpu::shaders::{Kernel, SOURCES, Source};
+
+/// A binding of a kernel.
+#[derive(Debug, Clone)]
+pub(in crate::gpu) struct Bound<'a> {
+    buffer: &'a wgpu::Buffer,
+    bytes: Option<Range<u64>>,
+}
+
+impl<'a> From<&'a wgpu::Buffer> for Bound<'a> {
+    fn from(buffer: &'a wgpu::Buffer) -> Self {
+        Self { buffer, bytes: None }
+    }
+}
+
+impl<'a> Bound<'a> {
+    /// A part of a buffer, bytes.
+    pub fn part(buffer: &'a wgpu::Buffer, bytes: Range<u64>) -> Self {
+        Self { buffer, bytes: Some(bytes) }
+    }
+}
+
+/// One prepared command.
+#[derive(Debug, Clone)]
+pub(in crate::gpu) enum Op {
+    /// Runs a kernel.
+    Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2] },
+    /// Fills a buffer with zeros.
+    Clear(wgpu::Buffer),
+    /// Copies so many bytes (the last) from the start of the first buffer to an offset in the second.
+    Copy(wgpu::Buffer, wgpu::Buffer, u64, u64),
+}
+
+impl Gpu {
+    fn pipeline(&self, kernel: Kernel) -> &wgpu::ComputePipeline {
+        self.pipelines[kernel as usize].get_or_init(|| {
+            let (file, entry) = kernel.entry();
+            let source = Source::named(file);
+            self.count(0);
+            let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(file),
+                source: wgpu::ShaderSource::Wgsl(source.text(self.rows, self.subgroups).into()),
+            });
+            let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+                label: Some(file),
+                bind_group_layouts: &[Some(self.layout(file))],
+                immediate_size: 0,
+            });
+            let segments = [("SEGMENTS", f64::from(self.segments))];
+            self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(entry),
+                layout: Some(&layout),
+                module: &module,
+                entry_point: Some(entry),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    constants: if source.segmented { &segments } else { &[] },
+                    ..Default::default()
+                },
+                cache: None,
+            })
+        })
+    }
+
+    fn layout(&self, file: &str) -> &wgpu::BindGroupLayout {
+        let index = SOURCES.iter().position(|source| source.name == file).unwrap_or(0);
+        &self.layouts[index]
+    }
+
+    /// Prepares a kernel on its bindings, in the order of their numbers.
+    pub(in crate::gpu) fn op(
+        &self,
+        kernel: Kernel,
+        bindings: &[Bound<'_>],
+        groups: [u32; 2],
+    ) -> Op {
+        let entries: Vec<_> = bindings
+            .iter()
+            .enumerate()
+            .map(|(i, bound)| wgpu::BindGroupEntry {
+                binding: i as u32,
+                resource: wgpu::BindingResource::Buffer(wgpu::BufferBinding {
+                    buffer: bound.buffer,
+                    offset: bound.bytes.as_ref().map_or(0, |b| b.start),
+                    size: bound.bytes.as_ref().and_then(|b| NonZeroU64::new(b.end - b.start)),
+                }),
+            })
+            .collect();
+        let pipeline = self.pipeline(kernel).clone();
+        self.count(0);
+        let bind_group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some(kernel.entry().1),
+            layout: self.layout(kernel.entry().0),
+            entries: &entries,
+        });
+        Op::Dispatch { pipeline, bind_group, groups }
+    }
+
+    /// Workgroups for `count` invocations or tiles, spilling into y past the limit of x.
+    pub(in crate::gpu) fn groups(&self, count: u32, per_group: u32) -> [u32; 2] {
+        let groups = count.div_ceil(per_group).max(1);
+        let x = groups.min(self.groups_max);
+        [x, groups.div_ceil(x)]
+    }
+
+    /// Splats `begin..end` of each dispatch, so that `bytes_per_splat` times their number can be
+    /// bound at once.
+    pub(in crate::gpu) fn windows(&self, splats: u32, bytes_per_splat: u64) -> Vec<Range<u32>> {
+        let fit =
+            (self.binding_limit / bytes_per_splat).min(u64::from(self.groups_max) * 64) as u32;
+        let step = (fit / SPLATS_PER_GROUP).max(1) * SPLATS_PER_GROUP;
+        (0..splats).step_by(step as usize).map(|b| b..(b + step).min(splats)).collect()
+    }
+
+    /// Records prepared commands in order.
+    pub(in crate::gpu) fn record(encoder: &mut wgpu::CommandEncoder, ops: &[Op]) {
+        let mut rest = ops;
+        while let Some(first) = rest.first() {
+            match first {
+                Op::Dispatch { .. } => {}
+                Op::Clear(buffer) => encoder.clear_buffer(buffer, 0, None),
+                Op::Copy(from, to, offset, bytes) => {
+                    encoder.copy_buffer_to_buffer(from, 0, to, *offset, *bytes);
+                }
+            }
+            let run = rest.iter().take_while(|op| matches!(op, Op::Dispatch { .. })).count();
+            if run == 0 {
+                rest = &rest[1..];
+                continue;
+            }
+            Self::record_pass(encoder, &rest[..run], None);
+            rest = &rest[run..];
+        }
+    }
+
+    /// Records the dispatches among prepared commands as one pass.
+    pub(in crate::gpu) fn record_pass(
+        encoder: &mut wgpu::CommandEncoder,
+        ops: &[Op],
+        timestamp_writes: Option<wgpu::ComputePassTimestampWrites<'_>>,
+    ) {
+        let mut pass = encoder
+            .begin_compute_pass(&wgpu::ComputePassDescriptor { label: None, timestamp_writes });
+        for op in ops {
+            if let Op::Dispatch { pipeline, bind_group, groups } = op {
+                pass.set_pipeline(pipeline);
+                pass.set_bind_group(0, bind_group, &[]);
+                pass.dispatch_workgroups(groups[0], groups[1], 1);
+            }
+        }
+    }
+
+    /// Runs lists of prepared commands, without waiting for them.
+    pub(in crate::gpu) fn submit(&self, lists: &[&[Op]]) -> Result<()> {
+        let mut encoder = self.device.create_command_encoder(&Default::default());
+        for ops in lists {
+            Self::record(&mut encoder, ops);
+        }
+        self.queue.submit([encoder.finish()]);
+        self.check()
+    }
+}

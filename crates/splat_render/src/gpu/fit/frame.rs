@@ -1,0 +1,103 @@
+//! What a fit keeps on the device for pictures of one size, and the commands of a step.
+
+use std::ops::Range;
+
+use super::scene::Scene;
+use crate::error::Result;
+use crate::gpu::adam::AdamInput;
+use crate::gpu::bin::{TileChunk, tile_count};
+use crate::gpu::device::{Gpu, Op};
+use crate::gpu::layout::Chunk;
+use crate::gpu::loss::LossBuffers;
+use crate::gpu::project::{Projection, project_ops};
+use crate::gpu::project_backward::project_backward_ops;
+use crate::gpu::rasterize::{PictureBuffers, rasterize_ops};
+use crate::gpu::rasterize_backward::{BackwardBuffers, rasterize_backward_ops};
+
+/// Buffers for pictures of one size, and the commands of a step with them.
+#[derive(Debug)]
+pub(super) struct Frame {
+    pub width: u32,
+    pub height: u32,
+    pub picture: PictureBuffers,
+    pub transmittances: wgpu::Buffer,
+    pub loss: LossBuffers,
+    /// Tiles of each chunk; more than one only where the pairs of all do not fit one binding.
+    pub chunks: Vec<Range<u32>>,
+    /// Empty until needed, and again whenever a buffer was replaced.
+    pub ops: Vec<Op>,
+}
+
+impl Frame {
+    pub fn new(gpu: &Gpu, width: u32, height: u32) -> Result<Self> {
+        let pixels = u64::from(width) * u64::from(height);
+        Ok(Self {
+            width,
+            height,
+            picture: PictureBuffers::new(gpu, pixels)?,
+            transmittances: gpu.transmittances(pixels)?,
+            loss: LossBuffers::new(gpu, width, height)?,
+            chunks: std::iter::once(0..tile_count(width, height)).collect(),
+            ops: Vec::new(),
+        })
+    }
+
+    /// The commands of a whole step.
+    pub fn step_ops(
+        &self,
+        gpu: &Gpu,
+        view: &wgpu::Buffer,
+        step: &wgpu::Buffer,
+        scene: &Scene,
+    ) -> Vec<Op> {
+        let n = scene.len();
+        let whole = Chunk::whole(tile_count(self.width, self.height), n, scene.capacity);
+        let parts = whole.parts(&self.chunks).zip(0..);
+        let chunks: Vec<TileChunk> =
+            parts.map(|(part, index)| TileChunk::new(gpu, Chunk { index, ..part })).collect();
+        let (bins, pairs) = (&scene.bins, &scene.pairs);
+        let drawn = Projection { view, splats2d: &scene.splats2d };
+        let bin = |ops: &mut Vec<Op>, chunk: &TileChunk| {
+            ops.extend(bins.count_ops(gpu, drawn, chunk));
+            ops.extend(bins.pair_ops(gpu, drawn, chunk, pairs));
+        };
+        let backward = BackwardBuffers {
+            v_picture: self.loss.v_picture.clone(),
+            totals: self.loss.totals.clone(),
+            transmittances: self.transmittances.clone(),
+            slots: scene.slots.clone(),
+            v_splats2d: scene.v_splats2d.clone(),
+        };
+        let mut ops = project_ops(gpu, drawn, &scene.adam.splats);
+        ops.extend(bins.depth_ops(gpu, drawn, &chunks[0]));
+        for chunk in &chunks {
+            bin(&mut ops, chunk);
+            ops.extend(rasterize_ops(gpu, drawn, chunk, pairs, &self.picture));
+        }
+        ops.extend(self.loss.ops(gpu, view, step, &self.picture.picture));
+        for chunk in &chunks {
+            // Chunks share the pair buffers, so that the lists of all but one are gone by now.
+            if chunks.len() > 1 {
+                bin(&mut ops, chunk);
+            }
+            let lists = (bins, pairs);
+            ops.extend(rasterize_backward_ops(gpu, drawn, chunk, lists, &backward, false));
+        }
+        ops.extend(project_backward_ops(
+            gpu,
+            drawn,
+            &scene.adam.splats,
+            &scene.v_splats2d,
+            &scene.gradients,
+        ));
+        let moved = AdamInput {
+            drawn,
+            step,
+            status: &bins.status,
+            gradients: &scene.gradients,
+            v_splats2d: &scene.v_splats2d,
+        };
+        ops.extend(scene.adam.ops(gpu, &moved));
+        ops
+    }
+}

@@ -1,0 +1,320 @@
+//! The GPU as a fitting device: parameters, Adam's moments, photos and everything between stay in
+//! its memory; a step is one submission of prepared commands.
+//!
+//! Buffers for (splat, tile) pairs have a capacity. A step that needs more finds out on the device
+//! and leaves the state as it was, as do the steps after it; the host looks at that flag now and
+//! then, makes room and repeats those steps, so that no step waits for a read-back.
+//!
+//! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P, their
+//! gradient and two moments make 4 P, statistics, 2D splats, their gradients and the depth order 120
+//! bytes. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
+//! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
+//! slopes of SSIM; a photo 4 per pixel, and 4 more for weights. A test holds the sum per splat.
+
+mod frame;
+mod scene;
+
+use std::sync::Arc;
+
+use super::bin::{SplatBins, pair_limit, tile_count};
+use super::device::{Gpu, Op};
+use super::layout::{ChunkCount, GRADIENT, StatusHead, Step, View};
+use super::loss::{LossBuffers, rgba};
+use super::project_backward::camera_sum;
+use crate::error::{Error, Result};
+use crate::fit_device::{CameraGradient, FitDevice, FitState, StepInput, dropout_threshold};
+use crate::sh;
+use crate::stages::ProjectOptions;
+use crate::target::{Target, Weight};
+use frame::Frame;
+use scene::{Scene, pair_buffers};
+
+/// Steps that may be under way before the host looks whether all pairs fitted.
+const STEPS_AHEAD: usize = 16;
+
+/// Fits on the GPU.
+#[derive(Debug)]
+pub struct GpuFit {
+    gpu: Arc<Gpu>,
+    photos: Vec<Photo>,
+    frames: Vec<Frame>,
+    /// Most tiles that a photo has.
+    tiles: u32,
+    view: wgpu::Buffer,
+    step: wgpu::Buffer,
+    scene: Option<Scene>,
+    /// Steps not known to have been done.
+    pending: Vec<StepInput>,
+    camera_gradients: Vec<CameraGradient>,
+    /// The last step: its photo and SSIM weight.
+    last: Option<(usize, f32)>,
+}
+
+/// A photo on the device.
+#[derive(Debug)]
+struct Photo {
+    frame: usize,
+    rgba: wgpu::Buffer,
+    weights: Option<wgpu::Buffer>,
+    weight: Weight,
+}
+
+impl GpuFit {
+    /// A fitting device without photos or splats yet.
+    pub fn new(gpu: Arc<Gpu>) -> Self {
+        Self {
+            view: gpu.uniform(&View::of_picture(1, 1, [0.0; 3])),
+            step: gpu.uniform(&<Step as bytemuck::Zeroable>::zeroed()),
+            gpu,
+            photos: Vec::new(),
+            frames: Vec::new(),
+            tiles: 1,
+            scene: None,
+            pending: Vec::new(),
+            camera_gradients: Vec::new(),
+            last: None,
+        }
+    }
+
+    fn scene(&self) -> Result<&Scene> {
+        self.scene
+            .as_ref()
+            .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))
+    }
+
+    /// Submits one step without waiting for it, as number `at` of those pending.
+    fn enqueue(&mut self, input: &StepInput, at: usize) -> Result<()> {
+        let scene = self
+            .scene
+            .as_mut()
+            .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))?;
+        let photo = &self.photos[input.view];
+        let frame = &mut self.frames[photo.frame];
+        if frame.ops.is_empty() {
+            frame.ops = frame.step_ops(&self.gpu, &self.view, &self.step, scene);
+        }
+        let view = View {
+            sh_degree: input.sh_degree.min(scene.sh_degree),
+            sh_stride: sh::coeffs(scene.sh_degree) as u32,
+            raw: 1,
+            dropout_threshold: dropout_threshold(input.dropout),
+            dropout_seed: input.noise_seed,
+            compensation: 1.0 / (1.0 - input.dropout),
+            ..View::of_view(&input.camera, &ProjectOptions::default(), input.background)
+        };
+        let step = Step::of_adam(&input.adam(), scene.len()).with_loss(
+            input.ssim_weight,
+            photo.weight,
+            photo.weights.is_some(),
+        );
+        let queue = &self.gpu.queue;
+        queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view));
+        queue.write_buffer(&self.step, 0, bytemuck::bytes_of(&step));
+        let step_at = std::mem::offset_of!(StatusHead, step) as u64;
+        queue.write_buffer(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
+        let bytes = u64::from(frame.width) * u64::from(frame.height) * 4;
+        let mut copies = vec![Op::Copy(photo.rgba.clone(), frame.loss.photo.clone(), 0, bytes)];
+        if let Some(weights) = &photo.weights {
+            copies.push(Op::Copy(weights.clone(), frame.loss.weights.clone(), 0, bytes));
+        }
+        let mut cameras = Vec::new();
+        if input.camera_gradient {
+            let bytes = scene.camera_bytes();
+            let log = match &scene.pending_cameras {
+                Some(log) => log,
+                None => {
+                    let log = self.gpu.readable(STEPS_AHEAD as u64 * bytes);
+                    scene.pending_cameras.insert(log)
+                }
+            };
+            let (from, to) = (scene.gradients.camera.clone(), log.clone());
+            cameras.push(Op::Copy(from, to, at as u64 * bytes, bytes));
+        }
+        self.last = Some((input.view, input.ssim_weight));
+        self.gpu.submit(&[&copies, &frame.ops, &cameras])
+    }
+
+    /// Takes in the camera sums of these steps, which have been done.
+    fn read_cameras(&mut self, steps: &[StepInput]) -> Result<()> {
+        if !steps.iter().any(|input| input.camera_gradient) {
+            return Ok(());
+        }
+        let scene = self.scene()?;
+        let Some(log) = &scene.pending_cameras else { return Ok(()) };
+        let bytes = scene.camera_bytes();
+        let data = self.gpu.read(&[(log, steps.len() as u64 * bytes)])?;
+        for (input, sums) in steps.iter().zip(data[0].chunks_exact(bytes as usize)) {
+            if input.camera_gradient {
+                let (v_viewmat, v_intrinsics) = camera_sum(sums);
+                self.camera_gradients.push(CameraGradient {
+                    view: input.view,
+                    v_viewmat,
+                    v_intrinsics,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads the flag and the counts of the last step.
+    fn status(&self) -> Result<(StatusHead, Vec<ChunkCount>)> {
+        let scene = self.scene()?;
+        let bytes = SplatBins::status_bytes(scene.chunks);
+        let copy = Op::Copy(scene.bins.status.clone(), scene.status_copy.clone(), 0, bytes);
+        self.gpu.submit(&[&[copy]])?;
+        let data = self.gpu.read(&[(&scene.status_copy, bytes)])?;
+        let (head, counts) = data[0].split_at(size_of::<StatusHead>());
+        Ok((bytemuck::pod_read_unaligned(head), bytemuck::pod_collect_to_vec(counts)))
+    }
+
+    /// Makes sure that all steps so far have been done.
+    fn settle(&mut self) -> Result<()> {
+        if self.pending.is_empty() {
+            return Ok(());
+        }
+        let (head, _) = self.status()?;
+        let pending = std::mem::take(&mut self.pending);
+        if head.overflow == 0 {
+            return self.read_cameras(&pending);
+        }
+        let first = pending.iter().position(|p| p.step == head.overflow).unwrap_or(0);
+        // One at a time, so that the counts read are those of the step that needs the room.
+        for (at, input) in pending.iter().enumerate().skip(first) {
+            loop {
+                let clear = std::mem::offset_of!(StatusHead, overflow) as u64;
+                let status = &self.scene()?.bins.status;
+                self.gpu.queue.write_buffer(status, clear, bytemuck::bytes_of(&0u32));
+                self.enqueue(input, at)?;
+                let (head, counts) = self.status()?;
+                if head.overflow == 0 {
+                    break;
+                }
+                self.grow(self.photos[input.view].frame, &counts)?;
+            }
+        }
+        self.read_cameras(&pending)
+    }
+
+    /// Makes room for the pairs that a step needs.
+    fn grow(&mut self, frame: usize, counts: &[ChunkCount]) -> Result<()> {
+        let gpu = Arc::clone(&self.gpu);
+        let limit = pair_limit(&gpu, GRADIENT);
+        let mut chunks = Vec::new();
+        let mut need = 0;
+        for (range, count) in self.frames[frame].chunks.iter().zip(counts) {
+            if count.total <= limit {
+                need = need.max(count.total);
+                chunks.push(range.clone());
+            } else if range.len() > 1 {
+                let middle = range.start + range.len() as u32 / 2;
+                chunks.extend([range.start..middle, middle..range.end]);
+            } else {
+                return Err(Error::argument(
+                    "splats",
+                    format!(
+                        "{} lie in one 16x16 tile, the device takes {limit}; lower max_splats or \
+                         use backend cpu",
+                        count.total
+                    ),
+                ));
+            }
+        }
+        let tiles = self.tiles;
+        let scene = self
+            .scene
+            .as_mut()
+            .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))?;
+        if need > scene.capacity {
+            scene.capacity = need.saturating_add(need / 4).min(limit);
+            (scene.pairs, scene.slots) = pair_buffers(&gpu, scene.capacity, tiles)?;
+        }
+        if chunks.len() as u32 > scene.chunks {
+            scene.chunks = chunks.len() as u32;
+            scene.bins = SplatBins::new(&gpu, scene.len(), scene.chunks)?;
+            scene.status_copy = gpu.readable(SplatBins::status_bytes(scene.chunks));
+        }
+        self.frames[frame].chunks = chunks;
+        for frame in &mut self.frames {
+            frame.ops.clear();
+        }
+        Ok(())
+    }
+}
+
+impl FitDevice for GpuFit {
+    fn set_targets(&mut self, targets: Vec<Target>) -> Result<()> {
+        self.settle()?;
+        for (k, target) in targets.iter().enumerate() {
+            target.validate(k)?;
+        }
+        self.photos.clear();
+        self.frames.clear();
+        self.last = None;
+        self.tiles = 1;
+        for target in targets {
+            let (width, height) = (target.width, target.height);
+            let known = self.frames.iter().position(|f| (f.width, f.height) == (width, height));
+            let frame = match known {
+                Some(frame) => frame,
+                None => {
+                    self.frames.push(Frame::new(&self.gpu, width, height)?);
+                    self.frames.len() - 1
+                }
+            };
+            let weight = target.weight();
+            let weights =
+                target.weights.as_ref().map(|w| self.gpu.upload("weights", w)).transpose()?;
+            self.tiles = self.tiles.max(tile_count(width, height));
+            let rgba = self.gpu.upload("photo", &rgba(&target))?;
+            self.photos.push(Photo { frame, rgba, weights, weight });
+        }
+        // Pair buffers are laid out for the largest photo.
+        if self.scene.is_some() {
+            let state = self.download()?;
+            self.upload(state)?;
+        }
+        Ok(())
+    }
+
+    fn upload(&mut self, state: FitState) -> Result<()> {
+        state.validate()?;
+        self.pending.clear();
+        // What the last scene has grown to is likely to be needed again.
+        let (capacity, chunks) = self.scene.take().map_or((0, 1), |s| (s.capacity, s.chunks));
+        for frame in &mut self.frames {
+            frame.ops.clear();
+        }
+        self.scene = Some(Scene::new(&self.gpu, &state, self.tiles, capacity, chunks)?);
+        Ok(())
+    }
+
+    fn download(&mut self) -> Result<FitState> {
+        self.settle()?;
+        self.scene()?.download(&self.gpu)
+    }
+
+    fn step(&mut self, input: &StepInput) -> Result<()> {
+        input.validate(self.photos.iter().map(|photo| {
+            let frame = &self.frames[photo.frame];
+            (frame.width, frame.height)
+        }))?;
+        self.enqueue(input, self.pending.len())?;
+        self.pending.push(*input);
+        if self.pending.len() >= STEPS_AHEAD { self.settle() } else { Ok(()) }
+    }
+
+    fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>> {
+        self.settle()?;
+        Ok(std::mem::take(&mut self.camera_gradients))
+    }
+
+    fn loss(&mut self) -> Result<f32> {
+        self.settle()?;
+        let Some((view, ssim_weight)) = self.last else { return Ok(0.0) };
+        let photo = &self.photos[view];
+        let loss = &self.frames[photo.frame].loss;
+        let data = self.gpu.download(&[], &[(&loss.sums, loss.sum_bytes())])?;
+        let [ssim, l1] = LossBuffers::total(&data[0]);
+        Ok(photo.weight.loss(f64::from(ssim_weight), l1, ssim) as f32)
+    }
+}

@@ -1,0 +1,122 @@
+//! What a fit keeps on the device that depends on the number of splats or pairs.
+
+use crate::error::Result;
+use crate::fit_device::{DensityStats, FitState};
+use crate::gpu::adam::{AdamBuffers, arrays_from_bytes};
+use crate::gpu::bin::{PairBins, SplatBins, pair_limit};
+use crate::gpu::device::Gpu;
+use crate::gpu::layout::{CAMERA, GEOMETRY, GRADIENT, STATS};
+use crate::gpu::project::SPLAT_2D;
+use crate::gpu::project_backward::{GradientBuffers, camera_sums};
+
+/// Pairs per splat that buffers have room for at first; they grow by what a step needs.
+const PAIRS_PER_SPLAT: u32 = 4;
+
+/// Buffers that depend on the number of splats or pairs.
+#[derive(Debug)]
+pub(super) struct Scene {
+    pub adam: AdamBuffers,
+    pub sh_degree: u32,
+    pub splats2d: wgpu::Buffer,
+    pub v_splats2d: wgpu::Buffer,
+    pub gradients: GradientBuffers,
+    /// The camera sums of each pending step; None until a step is to have them.
+    pub pending_cameras: Option<wgpu::Buffer>,
+    pub bins: SplatBins,
+    /// What the host reads of `bins.status`.
+    pub status_copy: wgpu::Buffer,
+    /// Chunks that `bins` has counts for.
+    pub chunks: u32,
+    pub pairs: PairBins,
+    pub slots: wgpu::Buffer,
+    pub capacity: u32,
+}
+
+fn stats_rows(stats: &DensityStats) -> Vec<[f32; STATS]> {
+    stats.grad_sum.iter().zip(&stats.seen).map(|(&sum, &seen)| [sum, seen]).collect()
+}
+
+/// The pair buffers and their gradient slots.
+pub(super) fn pair_buffers(
+    gpu: &Gpu,
+    capacity: u32,
+    tiles: u32,
+) -> Result<(PairBins, wgpu::Buffer)> {
+    let bytes = u64::from(capacity) * GRADIENT as u64 * 4;
+    Ok((PairBins::new(gpu, capacity, tiles)?, gpu.bindable("gradient slots", bytes)?))
+}
+
+impl Scene {
+    pub fn new(
+        gpu: &Gpu,
+        state: &FitState,
+        tiles: u32,
+        capacity: u32,
+        chunks: u32,
+    ) -> Result<Self> {
+        let adam = AdamBuffers::upload(
+            gpu,
+            [&state.splats, &state.first, &state.second].map(|a| a.params(a.sh_degree)),
+            &stats_rows(&state.stats),
+        )?;
+        let n = adam.splats.splats;
+        let first_guess = n.saturating_mul(PAIRS_PER_SPLAT).max(4096);
+        let capacity = capacity.max(first_guess).min(pair_limit(gpu, GRADIENT));
+        let (pairs, slots) = pair_buffers(gpu, capacity, tiles)?;
+        let row = |floats: usize| u64::from(n) * floats as u64 * 4;
+        Ok(Self {
+            sh_degree: state.splats.sh_degree,
+            splats2d: gpu.bindable("splats2d", row(SPLAT_2D))?,
+            v_splats2d: gpu.bindable("v_splats2d", row(GRADIENT))?,
+            gradients: GradientBuffers::new(gpu, &adam.splats)?,
+            pending_cameras: None,
+            bins: SplatBins::new(gpu, n, chunks)?,
+            status_copy: gpu.readable(SplatBins::status_bytes(chunks)),
+            chunks,
+            pairs,
+            slots,
+            capacity,
+            adam,
+        })
+    }
+
+    /// Number of splats.
+    pub fn len(&self) -> u32 {
+        self.adam.splats.splats
+    }
+
+    /// Size of one step's camera sums.
+    pub fn camera_bytes(&self) -> u64 {
+        u64::from(camera_sums(self.len())) * CAMERA as u64 * 4
+    }
+
+    /// The state as it is now; all steps must be done.
+    pub fn download(&self, gpu: &Gpu) -> Result<FitState> {
+        let n = u64::from(self.len());
+        let sizes = [n * GEOMETRY as u64 * 4, n * self.adam.splats.color_floats * 4];
+        let AdamBuffers { splats, first, second, stats } = &self.adam;
+        let data = gpu.download(
+            &[],
+            &[
+                (&splats.geometry, sizes[0]),
+                (&splats.colors, sizes[1]),
+                (&first.geometry, sizes[0]),
+                (&first.colors, sizes[1]),
+                (&second.geometry, sizes[0]),
+                (&second.colors, sizes[1]),
+                (stats, n * STATS as u64 * 4),
+            ],
+        )?;
+        let arrays = |k: usize| arrays_from_bytes(&data[2 * k], &data[2 * k + 1], self.sh_degree);
+        let stats: Vec<[f32; STATS]> = bytemuck::pod_collect_to_vec(&data[6]);
+        Ok(FitState {
+            splats: arrays(0),
+            first: arrays(1),
+            second: arrays(2),
+            stats: DensityStats {
+                grad_sum: stats.iter().map(|s| s[0]).collect(),
+                seen: stats.iter().map(|s| s[1]).collect(),
+            },
+        })
+    }
+}

@@ -1,0 +1,129 @@
+// rasterize: every tile's splats, front to back, to colours, depth and final transmittance. A
+// thread owns four neighbouring pixels of each of ROWS rows, so that a splat is read once for all of
+// them. Follows shared.wgsl and tile_memory.wgsl or tile_subgroup.wgsl.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> chunk: Chunk;
+@group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
+@group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
+@group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
+// Colour over the background and final transmittance, row-major. Where a tile's list goes on in the
+// next dispatch: colour so far and transmittance, negative where the pixel has stopped.
+@group(0) @binding(5) var<storage, read_write> picture: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> depths: array<f32>;
+
+// In one row: llvmpipe fills its vectors along x alone.
+const THREADS = 64u / ROWS;
+
+// Four neighbouring pixels.
+struct Quad {
+    live: vec4<bool>,
+    transmittance: vec4<f32>,
+    red: vec4<f32>,
+    green: vec4<f32>,
+    blue: vec4<f32>,
+    depth: vec4<f32>,
+}
+
+fn start(x: u32, y: u32) -> Quad {
+    let exists = vec4(x, x + 1u, x + 2u, x + 3u) < vec4(view.width);
+    var quad: Quad;
+    quad.live = exists & vec4(y < view.height);
+    quad.transmittance = vec4(1.0);
+    if chunk.list_begin > 0u {
+        for (var k = 0u; k < 4u; k++) {
+            if x + k < view.width && y < view.height {
+                let pixel = y * view.width + x + k;
+                let last = picture[pixel];
+                quad.red[k] = last.x;
+                quad.green[k] = last.y;
+                quad.blue[k] = last.z;
+                quad.transmittance[k] = abs(last.w);
+                quad.live[k] = last.w > 0.0;
+                quad.depth[k] = depths[pixel];
+            }
+        }
+    }
+    return quad;
+}
+
+fn blend(quad: Quad, splat: Splat2d, p_dx: vec4<f32>, center_y: f32) -> Quad {
+    let dy = center_y - splat.mean.y;
+    let u = p_dx + splat.pq.y * dy;
+    let v = splat.r * dy;
+    let exponent = max(-0.5 * (u * u + v * v), vec4(-80.0));
+    let alpha = min(splat.opacity * exp_accurate4(exponent), vec4(ALPHA_MAX));
+    let next = quad.transmittance * (1.0 - alpha);
+    let hit = quad.live & (alpha >= vec4(ALPHA_MIN));
+    let stops = hit & (next < vec4(TRANSMITTANCE_MIN));
+    let live = quad.live & !stops;
+    let adds = hit & live;
+    let weight = select(vec4(0.0), quad.transmittance * alpha, adds);
+    return Quad(
+        live,
+        select(quad.transmittance, next, adds),
+        quad.red + weight * splat.color.x,
+        quad.green + weight * splat.color.y,
+        quad.blue + weight * splat.color.z,
+        quad.depth + weight * splat.depth,
+    );
+}
+
+fn finish(quad: Quad, x: u32, y: u32, goes_on: bool) {
+    let behind = select(quad.transmittance, vec4(0.0), goes_on);
+    let red = quad.red + behind * view.background.x;
+    let green = quad.green + behind * view.background.y;
+    let blue = quad.blue + behind * view.background.z;
+    let stopped = vec4(goes_on) & !quad.live;
+    let transmittance = select(quad.transmittance, -quad.transmittance, stopped);
+    for (var k = 0u; k < 4u; k++) {
+        if x + k < view.width && y < view.height {
+            let pixel = y * view.width + x + k;
+            picture[pixel] = vec4(red[k], green[k], blue[k], transmittance[k]);
+            depths[pixel] = quad.depth[k];
+        }
+    }
+}
+
+@compute @workgroup_size(THREADS)
+fn rasterize(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let relative = workgroup.y * groups.x + workgroup.x;
+    let tile = chunk.tile_begin + relative;
+    if tile >= chunk.tile_end {
+        return;
+    }
+    let list = tile_begin[relative];
+    let length = tile_begin[relative + 1u] - list;
+    if chunk.list_begin > 0u && chunk.list_begin >= length {
+        return;
+    }
+    let end = list + min(chunk.list_end, length);
+    let goes_on = length > chunk.list_end;
+    let x = (tile % view.tiles_x) * TILE + 4u * (thread % 4u);
+    let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
+    let center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
+    let center_y = f32(y) + 0.5;
+    // A line with {row} stands once for each of the thread's rows: shaders.rs repeats it. A loop over
+    // an array of rows is not unrolled by every driver, and then lives in memory.
+    var quad{row} = start(x, y + {row}u);
+    var walking = true;
+    for (var batch = list + chunk.list_begin; walking && batch < end; batch += AHEAD) {
+        let ahead = read_ahead(batch, end, thread);
+        for (var k = 0u; k < AHEAD && batch + k < end; k++) {
+            let splat = splat_of(ahead, k);
+            let p_dx = splat.pq.x * (center_x - splat.mean.x);
+            var live = vec4(false);
+            quad{row} = blend(quad{row}, splat, p_dx, center_y + {row}.0);
+            live = live | quad{row}.live;
+            walking = walks_on(any(live));
+            if !walking {
+                break;
+            }
+        }
+    }
+    finish(quad{row}, x, y + {row}u, goes_on);
+}

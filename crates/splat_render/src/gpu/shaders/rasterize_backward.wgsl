@@ -1,0 +1,199 @@
+// rasterize_backward: gradients of the picture to a gradient per (splat, tile) pair, each in its
+// own slot. Walks front to back like rasterize, so that both round and stop alike; what lies
+// behind the current splat is what is left of the pixel's total. Follows shared.wgsl and
+// tile_memory.wgsl with tile_sums_memory.wgsl, or their twins for subgroups.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> chunk: Chunk;
+@group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
+@group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
+@group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
+@group(0) @binding(5) var<storage, read> slot_from_pair: array<u32>;
+// Gradients of colour (xyz) and accumulated depth (w).
+@group(0) @binding(6) var<storage, read> v_picture: array<vec4<f32>>;
+// Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included; less
+// what has been walked where a tile's list goes on in the next dispatch.
+@group(0) @binding(7) var<storage, read_write> totals: array<f32>;
+// SUMS floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma, then
+// depth, colour 3, opacity, and where asked for the absolute gradients of the mean: |g u| (times p
+// that of x) and that of y.
+@group(0) @binding(8) var<storage, read_write> slots: array<f32>;
+// Between such dispatches: transmittance, negative where the pixel has stopped.
+@group(0) @binding(9) var<storage, read_write> transmittances: array<f32>;
+
+// In one row: llvmpipe fills its vectors along x alone.
+const THREADS = 64u / ROWS;
+
+// Four neighbouring pixels.
+struct Quad {
+    center_x: vec4<f32>,
+    center_y: f32,
+    live: vec4<bool>,
+    transmittance: vec4<f32>,
+    // Sum over what is still to come, of weight times value times gradient.
+    remaining: vec4<f32>,
+    v_red: vec4<f32>,
+    v_green: vec4<f32>,
+    v_blue: vec4<f32>,
+    v_depth: vec4<f32>,
+}
+
+struct Sums {
+    u: vec4<f32>,
+    v: vec4<f32>,
+    uu: vec4<f32>,
+    uv: vec4<f32>,
+    vv: vec4<f32>,
+    depth: vec4<f32>,
+    red: vec4<f32>,
+    green: vec4<f32>,
+    blue: vec4<f32>,
+    opacity: vec4<f32>,
+    absolute_x: vec4<f32>,
+    absolute_y: vec4<f32>,
+}
+
+fn load_quad(x: u32, y: u32) -> Quad {
+    var quad: Quad;
+    quad.center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
+    quad.center_y = f32(y) + 0.5;
+    quad.transmittance = vec4(1.0);
+    for (var k = 0u; k < 4u; k++) {
+        if x + k < view.width && y < view.height {
+            let pixel = y * view.width + x + k;
+            let gradient = v_picture[pixel];
+            quad.live[k] = true;
+            quad.remaining[k] = totals[pixel];
+            quad.v_red[k] = gradient.x;
+            quad.v_green[k] = gradient.y;
+            quad.v_blue[k] = gradient.z;
+            quad.v_depth[k] = gradient.w;
+            if chunk.list_begin > 0u {
+                quad.transmittance[k] = abs(transmittances[pixel]);
+                quad.live[k] = transmittances[pixel] > 0.0;
+            }
+        }
+    }
+    return quad;
+}
+
+fn accumulate(quad: ptr<function, Quad>, splat: Splat2d, sums: ptr<function, Sums>) {
+    let dy = (*quad).center_y - splat.mean.y;
+    let u = splat.pq.x * ((*quad).center_x - splat.mean.x) + splat.pq.y * dy;
+    let v = splat.r * dy;
+    let exponent = max(-0.5 * (u * u + v * v), vec4(-80.0));
+    let gaussian = exp_accurate4(exponent);
+    let uncapped = splat.opacity * gaussian;
+    let alpha = min(uncapped, vec4(ALPHA_MAX));
+    let transmittance = (*quad).transmittance;
+    let next = transmittance * (1.0 - alpha);
+    let hit = (*quad).live & (alpha >= vec4(ALPHA_MIN));
+    let stops = hit & (next < vec4(TRANSMITTANCE_MIN));
+    let live = (*quad).live & !stops;
+    let adds = hit & live;
+    let weight = select(vec4(0.0), transmittance * alpha, adds);
+    let own = splat.color.x * (*quad).v_red + splat.color.y * (*quad).v_green
+        + splat.color.z * (*quad).v_blue + splat.depth * (*quad).v_depth;
+    let remaining = (*quad).remaining - weight * own;
+    // The cap has no slope.
+    let differs = adds & (uncapped <= vec4(ALPHA_MAX));
+    let v_alpha = select(
+        vec4(0.0),
+        transmittance * own - remaining / (1.0 - alpha),
+        differs,
+    );
+    let g = -alpha * v_alpha;
+    let gu = g * u;
+    let gv = g * v;
+    (*sums).u += gu;
+    (*sums).v += gv;
+    (*sums).uu += gu * u;
+    (*sums).uv += gu * v;
+    (*sums).vv += gv * v;
+    (*sums).depth += weight * (*quad).v_depth;
+    (*sums).red += weight * (*quad).v_red;
+    (*sums).green += weight * (*quad).v_green;
+    (*sums).blue += weight * (*quad).v_blue;
+    (*sums).opacity += gaussian * v_alpha;
+    if SUMS == GRADIENT_ABSOLUTE {
+        (*sums).absolute_x += abs(gu);
+        (*sums).absolute_y += abs(splat.pq.y * gu + splat.r * gv);
+    }
+    (*quad).live = live;
+    (*quad).remaining = remaining;
+    (*quad).transmittance = select(transmittance, next, adds);
+}
+
+// For the dispatch that goes on with the list.
+fn keep(quad: Quad, x: u32, y: u32) {
+    for (var k = 0u; k < 4u; k++) {
+        if x + k < view.width && y < view.height {
+            let pixel = y * view.width + x + k;
+            totals[pixel] = quad.remaining[k];
+            transmittances[pixel] =
+                select(-quad.transmittance[k], quad.transmittance[k], quad.live[k]);
+        }
+    }
+}
+
+fn total(x: vec4<f32>) -> f32 {
+    return (x.x + x.y) + (x.z + x.w);
+}
+
+@compute @workgroup_size(THREADS)
+fn rasterize_backward(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let relative = workgroup.y * groups.x + workgroup.x;
+    let tile = chunk.tile_begin + relative;
+    if tile >= chunk.tile_end {
+        return;
+    }
+    let list = tile_begin[relative];
+    let length = tile_begin[relative + 1u] - list;
+    if chunk.list_begin > 0u && chunk.list_begin >= length {
+        return;
+    }
+    let begin = list + chunk.list_begin;
+    let end = list + min(chunk.list_end, length);
+    let x = (tile % view.tiles_x) * TILE + 4u * (thread % 4u);
+    let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
+    // A line with {row} stands once for each of the thread's rows, as in rasterize.
+    var quad{row} = load_quad(x, y + {row}u);
+    for (var batch = begin; batch < end; batch += BATCH) {
+        let count = min(BATCH, end - batch);
+        var ahead = read_ahead(batch, end, thread);
+        for (var b = 0u; b < count; b++) {
+            if AHEAD == 1u {
+                ahead = read_ahead(batch + b, end, thread);
+            }
+            let splat = splat_of(ahead, b);
+            var sums = Sums();
+            accumulate(&quad{row}, splat, &sums);
+            keep_sum(b, 0u, total(sums.u), thread);
+            keep_sum(b, 1u, total(sums.v), thread);
+            keep_sum(b, 2u, total(sums.uu), thread);
+            keep_sum(b, 3u, total(sums.uv), thread);
+            keep_sum(b, 4u, total(sums.vv), thread);
+            keep_sum(b, 5u, total(sums.depth), thread);
+            keep_sum(b, 6u, total(sums.red), thread);
+            keep_sum(b, 7u, total(sums.green), thread);
+            keep_sum(b, 8u, total(sums.blue), thread);
+            keep_sum(b, 9u, total(sums.opacity), thread);
+            if SUMS == GRADIENT_ABSOLUTE {
+                keep_sum(b, 10u, total(sums.absolute_x), thread);
+                keep_sum(b, 11u, total(sums.absolute_y), thread);
+            }
+        }
+        var live = vec4(false);
+        live = live | quad{row}.live;
+        if !write_sums(batch, count, any(live), thread) {
+            break;
+        }
+    }
+    if length > chunk.list_end {
+        keep(quad{row}, x, y + {row}u);
+    }
+}

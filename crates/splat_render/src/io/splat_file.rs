@@ -1,0 +1,26 @@
+//! What files of splats hold.
+
+use super::format::Format;
+use crate::splats::SplatArrays;
+
+/// Splats with the f64 point that their means are relative to.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SplatFile {
+    /// Parameters as fitted: log-scales, opacity logits, SH.
+    pub splats: SplatArrays,
+    /// World position = origin + mean.
+    pub origin: [f64; 3],
+    /// Whether they were trained with, and want, antialiased opacities.
+    pub antialiased: bool,
+}
+
+/// A file that was read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Loaded {
+    /// What it holds.
+    pub file: SplatFile,
+    /// What it was written in.
+    pub format: Format,
+    /// One sentence for each thing in it that was passed over.
+    pub notes: Vec<String>,
+}

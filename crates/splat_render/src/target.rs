@@ -1,0 +1,118 @@
+//! Photos to fit to.
+
+use rayon::prelude::*;
+
+use crate::error::{Error, Result};
+
+/// One photo to fit to.
+#[derive(Debug, Clone)]
+pub struct Target {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// 3 (RGB) or 4 (RGB and straight alpha).
+    pub channels: u32,
+    /// `[H * W * channels]`, row-major.
+    pub pixels: Vec<u8>,
+    /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere. The loss is a mean over
+    /// the pixels whose weight is not 0: a photo of small weights counts less than others.
+    pub weights: Option<Vec<f32>>,
+    /// RGB in 0..=1 that stood behind what an image without alpha shows, where that is known: it is
+    /// compared to renders over it.
+    pub background: Option<[f32; 3]>,
+    /// How many steps of a round are of it, at least 1.
+    pub turns: u32,
+    /// The first step that is not of it any more, where there is one.
+    pub until: Option<u32>,
+}
+
+/// What a photo's pixels weigh.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Weight {
+    /// Sum of the weights.
+    pub sum: f64,
+    /// How many are not 0.
+    pub count: f64,
+}
+
+impl Weight {
+    /// Of a list of weights.
+    pub fn of(weights: &[f32]) -> Self {
+        Self {
+            sum: weights.iter().map(|&w| f64::from(w)).sum(),
+            count: weights.iter().filter(|w| **w > 0.0).count() as f64,
+        }
+    }
+
+    /// What one channel of a pixel of weight 1 counts in the loss, a mean; 0 where the photo is
+    /// masked out everywhere and asks for nothing.
+    pub(crate) fn scale(&self) -> f64 {
+        if self.count > 0.0 { 1.0 / (3.0 * self.count) } else { 0.0 }
+    }
+
+    /// The loss from the weighted sums of |x - y| and SSIM over all channels.
+    pub(crate) fn loss(&self, ssim_weight: f64, l1: f64, ssim: f64) -> f64 {
+        let scale = self.scale();
+        (1.0 - ssim_weight) * l1 * scale + ssim_weight * (3.0 * self.sum - ssim) * scale
+    }
+}
+
+impl Target {
+    /// Checks sizes; `index` names the photo in the error.
+    pub fn validate(&self, index: usize) -> Result<()> {
+        let pixels = self.width as usize * self.height as usize;
+        let bad = |reason: String| Err(Error::argument(format!("images[{index}]"), reason));
+        if pixels == 0 {
+            return bad("has no pixels".into());
+        }
+        if !matches!(self.channels, 3 | 4) {
+            return bad(format!("has {} channels; give RGB or RGBA", self.channels));
+        }
+        if self.pixels.len() != pixels * self.channels as usize {
+            return bad("does not hold width x height pixels".into());
+        }
+        if self.background.is_some_and(|color| color.iter().any(|c| !(0.0..=1.0).contains(c))) {
+            return bad("stood before a background that does not lie in 0..=1".into());
+        }
+        if self.turns == 0 {
+            return bad("has no turn; give at least one".into());
+        }
+        if let Some(weights) = &self.weights {
+            if weights.len() != pixels {
+                return bad("its weights do not have the image's size".into());
+            }
+            if !weights.iter().all(|w| w.is_finite() && *w >= 0.0) {
+                return bad("has a weight that is negative or not finite".into());
+            }
+        }
+        Ok(())
+    }
+
+    /// Sum of the weights, and the number of pixels whose weight is not 0.
+    pub fn weight(&self) -> Weight {
+        let pixels = f64::from(self.width) * f64::from(self.height);
+        self.weights.as_deref().map_or(Weight { sum: pixels, count: pixels }, Weight::of)
+    }
+
+    /// The photo over `background` as three planes in 0..1.
+    pub fn composite(&self, background: [f32; 3], planes: &mut [Vec<f32>; 3]) {
+        let pixels = self.width as usize * self.height as usize;
+        for plane in planes.iter_mut() {
+            plane.resize(pixels, 0.0);
+        }
+        let unit = 1.0 / 255.0;
+        planes.par_iter_mut().enumerate().for_each(|(c, plane)| {
+            if self.channels == 3 {
+                for (out, pixel) in plane.iter_mut().zip(self.pixels.chunks_exact(3)) {
+                    *out = f32::from(pixel[c]) * unit;
+                }
+            } else {
+                for (out, pixel) in plane.iter_mut().zip(self.pixels.chunks_exact(4)) {
+                    let alpha = f32::from(pixel[3]) * unit;
+                    *out = f32::from(pixel[c]) * unit * alpha + background[c] * (1.0 - alpha);
+                }
+            }
+        });
+    }
+}

@@ -1,0 +1,207 @@
+//! What loss and adam must show against the f64 reference. Each check prints its figures.
+
+use rand::Rng;
+use splat_render::fit::{Rates, Target};
+use splat_render::reference::Reference;
+use splat_render::splats::SplatArrays;
+use splat_render::stages::{AdamState, AdamStep, Image};
+use splat_render::{SplatGradients, Stages};
+
+use super::*;
+
+/// Largest difference of a loss, and of its gradient as a part of the largest.
+const LOSS: (f64, f64) = (2e-6, 1e-4);
+/// Largest difference of parameters and moments, as a part of the largest of their kind.
+const ADAM: f64 = 5e-6;
+
+/// A photo of random pixels, with or without alpha and weights.
+pub fn random_target(
+    rng: &mut Pcg64,
+    width: u32,
+    height: u32,
+    alpha: bool,
+    weighted: bool,
+) -> Target {
+    let pixels = (width * height) as usize;
+    let channels = if alpha { 4 } else { 3 };
+    let weight = |rng: &mut Pcg64| {
+        let w = rng.random::<f32>();
+        if w < 0.3 { 0.0 } else { w }
+    };
+    Target {
+        width,
+        height,
+        channels,
+        pixels: (0..pixels * channels as usize).map(|_| rng.random()).collect(),
+        weights: weighted.then(|| (0..pixels).map(|_| weight(rng)).collect()),
+        background: None,
+        turns: 1,
+        until: None,
+    }
+}
+
+/// A picture of random colours in 0..1.
+pub fn random_picture(rng: &mut Pcg64, width: u32, height: u32) -> Image<f32> {
+    let pixels = (width * height) as usize;
+    Image {
+        width,
+        height,
+        color: (0..pixels).map(|_| std::array::from_fn(|_| rng.random())).collect(),
+        alpha: vec![1.0; pixels],
+        depth: vec![0.0; pixels],
+        transmittance: vec![0.0; pixels],
+    }
+}
+
+/// Losses and gradients of pictures whose sides are and are not multiples of a tile.
+pub fn loss_matches_the_reference(stages: &dyn Stages<f32>) {
+    let mut rng = rng(60);
+    let background = [0.1f32, 0.6, 0.9];
+    let sizes = [(23, 37), (40, 9), (3, 2), (1, 1), (64, 48), (130, 7)];
+    for (k, (width, height)) in sizes.into_iter().enumerate() {
+        for ssim_weight in [0.0f32, 0.2, 1.0] {
+            let target = random_target(&mut rng, width, height, k % 2 == 0, k % 3 == 1);
+            let image = random_picture(&mut rng, width, height);
+            let what = format!("{width}x{height}, SSIM {ssim_weight}");
+            let got = stages.loss(&image, &target, background, ssim_weight).unwrap();
+            let wide = background.map(f64::from);
+            let expected =
+                Reference.loss(&widen_image(&image), &target, wide, ssim_weight).unwrap();
+            let off = (f64::from(got.value) - expected.value).abs();
+            let gradient = difference(&got.v_color, &expected.v_color, &[]).relative();
+            println!("{what}: loss off by {off:.1e}, gradient by {gradient:.1e} of the largest");
+            assert!(off <= LOSS.0, "{what}: {} where {} is right", got.value, expected.value);
+            assert!(gradient <= LOSS.1, "{what}: the gradient is {gradient:.1e} off");
+        }
+    }
+    let masked =
+        Target { weights: Some(vec![0.0; 12]), ..random_target(&mut rng, 4, 3, false, false) };
+    let loss = stages.loss(&random_picture(&mut rng, 4, 3), &masked, [0.0; 3], 0.2).unwrap();
+    assert_eq!(loss.value, 0.0, "a photo masked out everywhere asks for nothing");
+    assert!(loss.v_color.as_flattened().iter().all(|&v| v == 0.0));
+}
+
+/// Splats under optimisation, with moments of earlier steps, and gradients.
+pub fn random_adam(
+    rng: &mut Pcg64,
+    n: usize,
+    sh_degree: u32,
+) -> (AdamState<f32>, SplatGradients<f32>) {
+    let scene = random_scene(rng, n, Some(sh_degree));
+    let splats = SplatArrays {
+        means: scene.means,
+        quats: scene.quats,
+        scales: scene.scales,
+        opacities: scene.opacities,
+        sh: scene.colors,
+        sh_degree,
+    };
+    let mut like = |scale: f64, square: bool| {
+        let mut value = || {
+            let v = scale * normal(rng);
+            (if square { v * v } else { v }) as f32
+        };
+        SplatArrays {
+            means: (0..n).map(|_| std::array::from_fn(|_| value())).collect(),
+            quats: (0..n).map(|_| std::array::from_fn(|_| value())).collect(),
+            scales: (0..n).map(|_| std::array::from_fn(|_| value())).collect(),
+            opacities: (0..n).map(|_| value()).collect(),
+            sh: (0..splats.sh.len()).map(|_| std::array::from_fn(|_| value())).collect(),
+            sh_degree,
+        }
+    };
+    let (first, second, v) = (like(0.1, false), like(0.1, true), like(1.0, false));
+    let gradients = SplatGradients {
+        v_means: v.means,
+        v_quats: v.quats,
+        v_scales: v.scales,
+        v_opacities: v.opacities,
+        v_colors: v.sh,
+        ..SplatGradients::default()
+    };
+    (AdamState { splats, first, second }, gradients)
+}
+
+/// A step with every part of it in use.
+pub fn full_step(sh_degree: u32) -> AdamStep {
+    AdamStep {
+        number: 7,
+        rates: Rates {
+            means: 1e-3,
+            quats: 2e-3,
+            scales: 5e-3,
+            opacities: 5e-2,
+            sh0: 4e-3,
+            sh_rest: 2e-4,
+        },
+        sh_degree,
+        opacity_regularizer: 0.1,
+        scale_regularizer: 0.1,
+        noise: 5.0,
+        noise_seed: 1234,
+    }
+}
+
+fn differences(got: &SplatArrays, expected: &SplatArrays<f64>) -> [Difference; 5] {
+    [
+        difference(&got.means, &expected.means, &[]),
+        difference(&got.quats, &expected.quats, &[]),
+        difference(&got.scales, &expected.scales, &[]),
+        difference1(&got.opacities, &expected.opacities, &[]),
+        difference(&got.sh, &expected.sh, &[]),
+    ]
+}
+
+/// Parameters and moments after a step, with every SH degree in use and stored.
+pub fn adam_matches_the_reference(stages: &dyn Stages<f32>) {
+    for (n, stored, used) in [(1, 0, 0), (300, 1, 1), (65, 3, 3), (200, 3, 1), (64, 4, 0)] {
+        let (mut state, gradients) = random_adam(&mut rng(70 + n as u64), n, stored);
+        for opacity in state.splats.opacities.iter_mut().step_by(3) {
+            // Faint enough to explore.
+            *opacity = -7.0;
+        }
+        state.splats.quats[n / 2] = [0.0; 4];
+        let (before, mut expected) = (state.clone(), widen_adam_state(&state));
+        let wide = widen_splat_gradients(&gradients);
+        let step = full_step(used);
+        stages.adam(&mut state, &gradients, &step).unwrap();
+        Reference.adam(&mut expected, &wide, &step).unwrap();
+        let moved =
+            |a: &SplatArrays, b: &SplatArrays| a.means.iter().zip(&b.means).all(|(a, b)| a != b);
+        assert!(moved(&state.splats, &before.splats), "every splat moves");
+        for (what, got, expected) in [
+            ("parameters", &state.splats, &expected.splats),
+            ("first moments", &state.first, &expected.first),
+            ("second moments", &state.second, &expected.second),
+        ] {
+            for (kind, off) in ["means", "quats", "scales", "opacities", "sh"]
+                .iter()
+                .zip(differences(got, expected))
+            {
+                let off = off.relative();
+                println!("{n} splats, SH {used} of {stored}: {what}, {kind} {off:.1e}");
+                assert!(off <= ADAM, "{n} splats, SH {used} of {stored}: {what}, {kind} {off:.1e}");
+            }
+        }
+        // What is not in use rests, moments included.
+        let stride = splat_render::sh::coeffs(stored);
+        let rests = |a: &SplatArrays, b: &SplatArrays| {
+            (0..n).all(|i| {
+                let rest = i * stride + splat_render::sh::coeffs(used)..(i + 1) * stride;
+                a.sh[rest.clone()] == b.sh[rest]
+            })
+        };
+        assert!(rests(&state.splats, &before.splats) && rests(&state.first, &before.first));
+        assert!(rests(&state.second, &before.second));
+    }
+}
+
+/// With all rates 0, neither parameters nor moments move, and there is no noise.
+pub fn frozen_splats_keep_their_moments(stages: &dyn Stages<f32>) {
+    let (mut state, gradients) = random_adam(&mut rng(80), 130, 2);
+    state.splats.opacities.fill(-7.0);
+    let before = state.clone();
+    let step = AdamStep { rates: Rates::ZERO, ..full_step(2) };
+    stages.adam(&mut state, &gradients, &step).unwrap();
+    assert!(state == before, "a frozen step changed something");
+}

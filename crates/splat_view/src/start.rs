@@ -1,0 +1,38 @@
+//! What the command line names, read before a window opens: errors are printed where it was typed.
+
+use std::path::PathBuf;
+
+use splat_render::Result;
+
+use crate::arguments::Arguments;
+use crate::model::Model;
+use crate::sources::{Source, find_sources};
+
+/// What is shown first.
+pub struct Start {
+    /// The models that can be chosen.
+    pub sources: Vec<Source>,
+    /// The first folder that was named; it is watched.
+    pub folder: Option<PathBuf>,
+    /// The models on the left and on the right side.
+    pub models: Vec<(Source, Model)>,
+}
+
+impl Start {
+    /// Reads the scenes of a command line.
+    pub fn read(arguments: &Arguments) -> Result<Self> {
+        let mut out = Self { sources: Vec::new(), folder: None, models: Vec::new() };
+        for scene in &arguments.scenes {
+            let found = find_sources(scene)?;
+            if scene.is_dir() {
+                out.folder.get_or_insert_with(|| scene.clone());
+            }
+            if out.models.len() < 2 {
+                let model = Model::read(&found[0].path)?;
+                out.models.push((found[0].clone(), model));
+            }
+            out.sources.extend(found);
+        }
+        Ok(out)
+    }
+}

@@ -1,0 +1,63 @@
+"""A group of commands whose modules are imported only when a command runs."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, MutableMapping
+from typing import Any, ClassVar, NamedTuple
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+
+class LazyCommand(NamedTuple):
+    """Where a command is defined, and its line in the group's help.
+
+    Attributes:
+        module: the module that holds it.
+        name: the command's function, or a ``typer.Typer`` with commands of its own.
+        help: one line.
+        context_settings: of the command, as ``typer.Typer.command`` takes them.
+    """
+
+    module: str
+    name: str
+    help: str
+    context_settings: dict[str, Any] | None = None
+
+
+class LazyGroup(TyperGroup):
+    """A group that lists its commands from a table and imports the one that runs.
+
+    A subclass sets ``table``. The group's help shows stand-ins made from the table; the command
+    itself is imported when it is invoked, asked for its help, or completed by a shell.
+    """
+
+    table: ClassVar[Mapping[str, LazyCommand]] = {}
+
+    def __init__(self, **attrs: Any) -> None:
+        """Make the stand-ins."""
+        super().__init__(**attrs)
+        stand_ins: MutableMapping[str, Any] = {
+            name: TyperCommand(name, help=entry.help) for name, entry in self.table.items()
+        }
+        self.commands = stand_ins
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command that ``args`` names and import it; see ``TyperGroup``."""
+        name, command, rest = super().resolve_command(ctx, args)
+        if name is not None:
+            command = load_command(name, self.table[name])
+        return name, command, rest
+
+
+def load_command(name: str, entry: LazyCommand) -> Any:
+    """Import a command's module and make the command under its name in the group."""
+    found = getattr(importlib.import_module(entry.module), entry.name)
+    app = typer.Typer(add_completion=False)
+    if isinstance(found, typer.Typer):
+        app.add_typer(found, name=name)
+        group: Any = typer.main.get_command(app)
+        return group.commands[name]
+    app.command(name, context_settings=entry.context_settings)(found)
+    return typer.main.get_command(app)

@@ -1,0 +1,77 @@
+"""How to train. Free of torch, so that the command line can make its options from the settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from igsr._internal.settings import about, validate
+from igsr.denoiser.architecture import MULTIPLE
+from igsr.errors import IgsrError
+
+#: The default and the paper's three, "gan" and those with "lpips"; ``Loss`` says what they are.
+LossName = Literal["default", "charbonnier", "gan", "gan+lpips", "lpips"]
+LOSSES: tuple[str, ...] = get_args(LossName)
+#: torch's generators take seeds of 64 bits; those of the steps are a million apart.
+MOST_SEED = 2**43
+
+
+def _crop(name: str, value: Any) -> int:
+    if type(value) is not int or value < 1 or value % MULTIPLE:
+        raise IgsrError(f"{name} must be a multiple of {MULTIPLE}, not {value!r}.")
+    return value
+
+
+@dataclass(frozen=True)
+class Training:
+    """Settings of a training; stored with the weights that come out.
+
+    Raises:
+        IgsrError: a setting cannot be used; the message names it.
+    """
+
+    steps: int = field(default=20_000, metadata=about("Training steps.", limits=(1, 10**9)))
+    batch: int = field(
+        default=8,
+        metadata=about("Crops per step, of all processes together.", limits=(1, 2**20)),
+    )
+    crop: int = field(
+        default=128,
+        metadata=about(
+            f"Side of a crop, pixels, a multiple of {MULTIPLE}; smaller pictures are taken whole.",
+            read=_crop,
+        ),
+    )
+    rate: float = field(
+        default=1e-3,
+        metadata=about(
+            "Adam's highest learning rate. It warms up over the first hundredth of the steps and "
+            "falls as a cosine.",
+            limits=(1e-12, 1e3),
+        ),
+    )
+    weight_decay: float = field(
+        default=1e-4,
+        metadata=about("Decoupled, as in AdamW, in units of the rate.", limits=(0.0, 0.9999)),
+    )
+    dropout: float = field(
+        default=0.0,
+        metadata=about("Part of the deepest features that is left out.", limits=(0.0, 0.9999)),
+    )
+    augment: bool = field(
+        default=True, metadata=about("Mirror crops, swap colour channels, change exposure.")
+    )
+    loss: LossName = field(
+        default="default", metadata=about("gan, gan+lpips and lpips are the paper's.")
+    )
+    a: float = field(
+        default=0.9, metadata=about("Weight of LPIPS in loss gan+lpips.", limits=(0.0, 1.0))
+    )
+    seed: int = field(
+        default=0,
+        metadata=about("Training is deterministic for a given seed.", limits=(0, MOST_SEED)),
+    )
+
+    def __post_init__(self) -> None:
+        """Check every setting."""
+        validate(self)

@@ -1,0 +1,100 @@
+"""Cross-validation of rounds: each fold is scored on photos that are held out of its fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from igsr.capture import View
+from igsr.capture.downscaling import halved
+from igsr.refinement.stages import VALIDATED, Reconstruction, Stages
+
+#: Fewest photos: each fold needs two to fit.
+FEWEST_PHOTOS = 3
+#: Each of two folds holds out one photo in eight. Where more are held out the folds' fits are worse
+#: than the whole one, and denoised views help them where they do not help it.
+FOLDS, HOLD_OUT_EVERY = 2, 8
+#: Folds fit photos of half the size, unless their shorter side then has fewer pixels than this.
+#: Fewer steps on whole photos would be as fast, but are no model of a whole fit.
+LEAST_FOLD_SIDE = 64
+
+
+@dataclass(eq=False)
+class Fold:
+    """A reconstruction of some of the photos, the photos held out of it, and their scores by it."""
+
+    reconstruction: Reconstruction
+    held_out: list[View]
+    scores: list[dict[str, float]]
+
+
+class CrossValidation:
+    """Folds that do each round themselves, and are scored on their held-out photos.
+
+    The folds are fitted when the first round is validated. They keep the views that a round adds:
+    the next round is validated from there.
+    """
+
+    def __init__(self, stages: Stages, photos: Sequence[View]) -> None:
+        """Halve the photos, with as many splats per pixel."""
+        self._stages = stages
+        self._photos, self._share = _fold_photos(photos)
+        self._folds: list[Fold] = []
+
+    @property
+    def work(self) -> float:
+        """What fitting all folds takes, in units of a fit to all photos."""
+        return self._share * FOLDS
+
+    def validate(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Mean scores of the held-out photos, before each fold's own round and after it."""
+        self._folds = self._folds or self._fitted()
+        before: list[dict[str, float]] = []
+        after: list[dict[str, float]] = []
+        for fold in self._folds:
+            before += fold.scores
+            views = self._stages.render_and_denoise(fold.reconstruction)
+            selected, _ = self._stages.select(views)
+            self._stages.refit(fold.reconstruction, selected, views.added_before, "cross_validate")
+            fold.scores = self._scores(fold.reconstruction, fold.held_out)
+            after += fold.scores
+        return _means(before), _means(after)
+
+    def _fitted(self) -> list[Fold]:
+        """Fit the folds: no photo is held out of two, and at least one of each."""
+        every = min(HOLD_OUT_EVERY, len(self._photos))
+        folds = []
+        for number in range(FOLDS):
+            held_out = self._photos[number * every // FOLDS :: every]
+            kept = [photo for photo in self._photos if not any(photo is one for one in held_out)]
+            fitted = self._stages.fit(f"fold{number}", kept, self._share)
+            folds.append(Fold(fitted, held_out, self._scores(fitted, held_out)))
+        return folds
+
+    def _scores(self, fitted: Reconstruction, held_out: list[View]) -> list[dict[str, float]]:
+        return self._stages.validation_scores(fitted.splats, held_out)
+
+
+def combined_error(scores: dict[str, float]) -> float:
+    """Geometric mean of root squared error, 1 - SSIM and FLIP, of which lower is better.
+
+    With few photos a single score may get worse by chance.
+    """
+    errors = (10.0 ** (-scores["psnr"] / 20.0), 1.0 - scores["ssim"], scores["flip"])
+    return float(np.cbrt(np.prod(errors)))
+
+
+def _means(scores: Sequence[dict[str, float]]) -> dict[str, float]:
+    return {name: float(np.mean([one[name] for one in scores])) for name in VALIDATED}
+
+
+def _fold_photos(photos: Sequence[View]) -> tuple[list[View], float]:
+    """Photos as folds fit them, and their pixels as a part of the photos' own."""
+    shortest = min(min(photo.camera.width, photo.camera.height) for photo in photos)
+    if shortest < 2 * LEAST_FOLD_SIDE:
+        return list(photos), 1.0
+    small = [halved(photo) for photo in photos]
+    pixels = (sum(v.camera.width * v.camera.height for v in some) for some in (small, photos))
+    return small, next(pixels) / next(pixels)

@@ -1,0 +1,163 @@
+"""A refinement that runs: its folder, its progress and the time that each stage took."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from igsr._internal.atomic_write import remove_unfinished
+from igsr._internal.deprecation import RenamedKeys
+from igsr.capture import Capture, load_capture
+from igsr.capture.load import holds_cameras
+from igsr.capture.write_colmap import write_colmap
+from igsr.errors import IgsrError
+from igsr.pose import estimate_poses, found_before, kept_cameras, photos_note
+from igsr.refinement.report import seconds_so_far, write_refinement
+from igsr.refinement.results import OLD_STAGES, Refined, RefineProgress, Stage
+from igsr.refinement.settings import RefineSettings
+
+#: The error message of a run that ``progress`` ended.
+STOPPED = "the refinement was stopped; go on with resume."
+
+
+class RefineRun:
+    """Files, progress and time of one call of ``igsr.refine``.
+
+    Attributes:
+        round: number of the current round; 0 is the fit to the photos alone.
+    """
+
+    def __init__(
+        self,
+        settings: RefineSettings,
+        out: str | os.PathLike[str] | None,
+        resume: bool,
+        progress: Callable[[RefineProgress], bool | None] | None,
+    ) -> None:
+        """Begin to count time; no file is touched yet.
+
+        Raises:
+            IgsrError: ``resume`` without ``out``.
+        """
+        if resume and out is None:
+            raise IgsrError("resume needs out, the folder to go on from.")
+        self.round = 0
+        self._settings, self._resume, self._progress = settings, resume, progress
+        self._out = None if out is None else Path(out)
+        self._started = self._last = time.monotonic()
+        self._seconds: dict[Stage, float] = {}
+        # In units of a fit to all photos.
+        self._work, self._work_done = 1.0, 0.0
+        # A resumed run that has done nothing new leaves the files as they are.
+        self._has_news = not resume
+
+    def find_cameras(self, photos: str | os.PathLike[str]) -> Capture:
+        """The capture of a folder of photos; cameras that had to be found are kept in the folder.
+
+        Raises:
+            IgsrError: as ``igsr.estimate_poses`` and ``igsr.load_capture``, photos lie where the
+                cameras would be kept, or ``progress`` ended the run.
+        """
+
+        def tell(step: str, done: int, total: int) -> None:
+            if not self._goes_on("pose", 0.0):
+                raise IgsrError(STOPPED)
+
+        # A run that is resumed must fit the very cameras that it began with.
+        if self._out is None or holds_cameras(photos):
+            return estimate_poses(photos, seed=self._settings.seed, progress=tell)
+        kept = kept_cameras(Path(photos), self._out)
+        if not (self._resume and found_before(Path(photos), kept)):
+            found = estimate_poses(photos, seed=self._settings.seed, progress=tell)
+            write_colmap(found, kept, replace=True, notes=photos_note(Path(photos)))
+        return load_capture(kept)
+
+    def prepare(self, work: float) -> None:
+        """Clear the folder of what an earlier run left unfinished, or read what it took to resume.
+
+        Args:
+            work: all that there may be to do, in units of a fit to all photos.
+        """
+        self._work, self._last = work, time.monotonic()
+        self._seconds = {}
+        if self._out is None:
+            return
+        for folder in (self._out, self._checkpoints, *self._out.glob("rounds/[0-9]*")):
+            remove_unfinished(folder)
+        if self._resume:
+            self._seconds = seconds_so_far(self._out)
+        else:
+            self._remove_checkpoints()
+
+    def checkpoint(self, name: str) -> tuple[Path | None, bool]:
+        """Where a fit is saved to, and whether it resumes from there."""
+        if self._out is None:
+            return None, False
+        path = self._checkpoints / f"{name}.npz"
+        return path, self._resume and path.is_file()
+
+    def fitting(self, stage: Stage, part: float) -> bool:
+        """Tell that a fit is under way, and has done ``part`` of a whole fit's work.
+
+        Returns:
+            False where it is to be saved and ended.
+        """
+        self._has_news = True
+        return self._goes_on(stage, part)
+
+    def tell(self, stage: Stage) -> None:
+        """Tell the progress and count the time since the last call to a stage.
+
+        Raises:
+            IgsrError: ``progress`` ended the run.
+        """
+        if not self._goes_on(stage, 0.0):
+            raise IgsrError(STOPPED)
+
+    def work_done(self, work: float) -> None:
+        """Count finished work, in units of a fit to all photos."""
+        self._work_done += work
+
+    def write(self, refined: Refined) -> Refined:
+        """Write the result so far, unless the folder already holds as much.
+
+        Returns:
+            The result, with the time that each stage has taken.
+
+        Raises:
+            IgsrError: a file cannot be written.
+        """
+        refined = replace(refined, seconds=RenamedKeys(dict(self._seconds.items()), OLD_STAGES))
+        if self._out is not None and (self._has_news or refined.stop is not None):
+            write_refinement(self._out, refined, self._settings)
+        return refined
+
+    @property
+    def _checkpoints(self) -> Path:
+        assert self._out is not None
+        return self._out / "checkpoints"
+
+    def _goes_on(self, stage: Stage, part: float) -> bool:
+        now = time.monotonic()
+        if stage != "pose":
+            self._seconds[stage] = self._seconds.get(stage, 0.0) + now - self._last
+        self._last = now
+        if self._progress is None:
+            return True
+        done = min(1.0, (self._work_done + part) / self._work)
+        seconds = now - self._started
+        return self._progress(RefineProgress(self.round, stage, done, seconds)) is not False
+
+    def _remove_checkpoints(self) -> None:
+        """Remove fits of an earlier run and its report: a later resume must not use them."""
+        assert self._out is not None
+        with contextlib.suppress(OSError):
+            (self._out / "report.json").unlink()
+        for fit in ("whole", "fold[0-9]"):
+            for name in (f"{fit}.npz", f"{fit}-round[0-9]*.npz"):
+                for path in self._checkpoints.glob(name):
+                    path.unlink(missing_ok=True)

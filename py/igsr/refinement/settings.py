@@ -1,0 +1,80 @@
+"""The settings of a refinement: one frozen dataclass, checked when it is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from igsr._internal.settings import about, validate
+from igsr.errors import IgsrError
+
+#: As many rounds as help, but at most ``MOST_ROUNDS``.
+AUTO = "auto"
+MOST_ROUNDS = 4
+
+
+def _read_rounds(name: str, value: Any) -> int | str:
+    """A number of rounds, or "auto"; on the command line both are text."""
+    if isinstance(value, str):
+        if value == AUTO:
+            return AUTO
+        if value.removeprefix("-").isdecimal():
+            value = int(value)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise IgsrError(f'{name} must be a whole number or "auto", not {value!r}.')
+    if value < 0:
+        raise IgsrError(f"{name} must not be negative, not {value}.")
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineSettings:
+    """What a refinement depends on, beside the photos and the denoiser.
+
+    Attributes:
+        rounds: most rounds, or "auto", which is 4. A round that is rolled back is the last one.
+        steps: of each fit; None is the default preset's.
+        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
+        seed: of everything random. The result is deterministic for a given seed on one backend,
+            instruction set and number of threads.
+        cross_validate: whether a round is kept only if it improves the scores of held-out photos.
+
+    Raises:
+        IgsrError: a setting cannot be used.
+    """
+
+    rounds: str | int = field(
+        default=AUTO,
+        metadata=about(
+            f"Most rounds, or auto: until one does not help, at most {MOST_ROUNDS}.",
+            read=_read_rounds,
+        ),
+    )
+    steps: int | None = field(
+        default=None,
+        metadata=about(
+            "Optimizer steps of each fit. Default: the default preset's.", limits=(1, 10_000_000)
+        ),
+    )
+    backend: Literal["auto", "cpu", "gpu"] = field(
+        default="auto", metadata=about("auto: the GPU if there is a real one, else the CPU.")
+    )
+    seed: int = field(
+        default=0,
+        metadata=about(
+            "Of everything random; the result is deterministic for a given seed.",
+            limits=(0, 2**63 - 1),
+        ),
+    )
+    cross_validate: bool = field(
+        default=True,
+        metadata=about("Keep a round only if it improves the scores of held-out photos."),
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+    @property
+    def most_rounds(self) -> int:
+        """Most rounds, as a number."""
+        return MOST_ROUNDS if isinstance(self.rounds, str) else self.rounds

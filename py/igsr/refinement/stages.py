@@ -1,0 +1,201 @@
+"""The stages of a round, the same for all photos and for the photos of a cross-validation fold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from igsr.capture import Camera, Capture, View
+from igsr.denoiser import Denoiser, photo_sources, photo_support, render_buffers
+from igsr.errors import IgsrError
+from igsr.evaluation.scores import (
+    METRICS,
+    default_background,
+    evaluate,
+    known_background,
+    score_views,
+)
+from igsr.fitting.presets import preset_settings
+from igsr.fitting.run import Progress, fit
+from igsr.refinement.novel_views import NovelView
+from igsr.refinement.results import Scores, Stage
+from igsr.refinement.run import STOPPED, RefineRun
+from igsr.refinement.selection import Candidate, Rejected, denoised_candidate, rejected
+from igsr.refinement.settings import RefineSettings
+from igsr.splats import Splats
+
+#: Novel views rendered in a round, and how many of them are added at most.
+CANDIDATES, SELECTED = 24, 16
+#: Rendering and denoising novel views takes about this part of the time of a fit.
+NOVEL_VIEWS_WORK = 0.1
+#: Scores that cross-validation compares.
+VALIDATED = ("psnr", "ssim", "flip")
+#: Proposes novel views from the splats, the known cameras, the most views and the backend.
+Propose = Callable[[Splats, Sequence[Camera], int, str], Sequence[NovelView]]
+#: Selects the candidates to add, at most a number of them.
+Select = Callable[[Sequence[Candidate], int], list[Candidate]]
+
+
+@dataclass(eq=False)
+class Reconstruction:
+    """Splats fitted to some photos and to the novel views that rounds have added.
+
+    Attributes:
+        name: "whole" or "fold0", "fold1" ...; checkpoints are named after it.
+        photos: that are fitted.
+        share: the photos' pixels as a part of all; time and number of splats go by it.
+        splats: after the last fit.
+        added: novel views that the rounds so far have added.
+    """
+
+    name: str
+    photos: list[View]
+    share: float
+    splats: Splats
+    added: list[NovelView] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class DenoisedViews:
+    """Views of a round, rendered from a reconstruction and denoised.
+
+    Attributes:
+        candidates: novel views.
+        added_before: the views that earlier rounds added, rendered and denoised again.
+    """
+
+    candidates: list[Candidate]
+    added_before: list[Candidate]
+
+
+class Stages:
+    """What the stages share: the capture, settings, denoiser, and the run that they report to."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        settings: RefineSettings,
+        run: RefineRun,
+        denoiser: Denoiser,
+        propose: Propose,
+        select: Select,
+    ) -> None:
+        """Keep what is given.
+
+        Raises:
+            IgsrError: a setting cannot be used by fits.
+        """
+        self._capture, self._settings, self._run = capture, settings, run
+        self._denoiser, self._propose, self._select = denoiser, propose, select
+        self._background = default_background(capture)
+        self._background_of_views = known_background(capture.views)
+        # Folds have fewer photos, but are fitted with the settings for all of them.
+        preset = preset_settings("default", len(capture.train_views), steps=settings.steps)
+        self._fit_settings = {
+            name: preset[name] for name in ("steps", "sh_degree", "density", "dropout")
+        }
+        self._max_splats = int(preset["max_splats"])
+
+    def fit(self, name: str, photos: list[View], share: float = 1.0) -> Reconstruction:
+        """Fit photos alone."""
+        return Reconstruction(name, photos, share, self._fit(name, "fit", photos, share))
+
+    def render_and_denoise(self, reconstruction: Reconstruction) -> DenoisedViews:
+        """Render novel views, and again those that were added before, and denoise them."""
+        photos, splats, added = reconstruction.photos, reconstruction.splats, reconstruction.added
+        backend = self._settings.backend
+        self._run.tell("novel_views")
+        known = [photo.camera for photo in photos] + [view.camera for view in added]
+        novel = self._propose(splats, known, CANDIDATES, backend)
+        support = photo_support(splats, photos, backend)
+        sources = photo_sources(splats, photos, self._background, backend)
+        denoised = []
+        for view in (*novel, *added):
+            buffers = render_buffers(
+                splats, view.camera, support, self._background_of_views, backend
+            )
+            denoised.append(denoised_candidate(view, buffers, sources, self._denoiser))
+            self._run.tell("novel_views")
+        self._run.work_done(NOVEL_VIEWS_WORK * reconstruction.share)
+        return DenoisedViews(denoised[: len(novel)], denoised[len(novel) :])
+
+    def select(self, views: DenoisedViews) -> tuple[list[Candidate], list[Rejected]]:
+        """The candidates to add, and the others."""
+        selected = self._select(views.candidates, SELECTED)
+        others = [
+            candidate
+            for candidate in views.candidates
+            if not any(candidate is one for one in selected)
+        ]
+        return selected, [rejected(candidate) for candidate in others]
+
+    def refit(
+        self,
+        reconstruction: Reconstruction,
+        selected: Sequence[Candidate],
+        added_before: Sequence[Candidate],
+        stage: Stage,
+    ) -> None:
+        """Fit photos and novel views from the initialization that the photos alone had.
+
+        A fit that went on from the splats so far would keep what these made up where no photo
+        showed better.
+        """
+        name = f"{reconstruction.name}-round{self._run.round}"
+        views = [
+            View(
+                f"{name}-{number}.png",
+                candidate.view.camera,
+                "train",
+                candidate.denoised,
+                mask=None,
+                weights=candidate.confidence,
+                background=self._background_of_views,
+            )
+            for number, candidate in enumerate((*selected, *added_before))
+        ]
+        pictures = [*reconstruction.photos, *views]
+        reconstruction.splats = self._fit(name, stage, pictures, reconstruction.share)
+        reconstruction.added += [candidate.view for candidate in selected]
+
+    def validation_scores(self, splats: Splats, photos: list[View]) -> list[dict[str, float]]:
+        """Scores of each held-out photo."""
+        scores = [
+            {name: float(one.scores[name] or 0.0) for name in VALIDATED}
+            for one in score_views(splats, photos, self._background, self._settings.backend)
+        ]
+        self._run.tell("cross_validate")
+        return scores
+
+    def test_scores(self, splats: Splats | None) -> Scores | None:
+        """Mean scores of the test views, if there are any."""
+        if splats is None or not self._capture.test_views:
+            return None
+        backend = self._settings.backend
+        scores = evaluate(splats, self._capture, "test", self._background, backend)
+        self._run.tell("test")
+        return {metric: scores[metric] for metric in METRICS}
+
+    def _fit(self, name: str, stage: Stage, views: list[View], share: float) -> Splats:
+        goes_on = True
+
+        def progress(now: Progress) -> bool:
+            nonlocal goes_on
+            goes_on = self._run.fitting(stage, share * now.step / now.steps)
+            return goes_on
+
+        checkpoint, resume = self._run.checkpoint(name)
+        splats = fit(
+            Capture(self._capture.path, views, self._capture.points),
+            progress=progress,
+            backend=self._settings.backend,
+            seed=self._settings.seed,
+            max_splats=max(1, round(share * self._max_splats)),
+            checkpoint=checkpoint,
+            resume=resume,
+            **self._fit_settings,
+        )
+        if not goes_on:  # not raised in the callback, so that the fit saves its checkpoint
+            raise IgsrError(STOPPED)
+        self._run.work_done(share)
+        return splats
