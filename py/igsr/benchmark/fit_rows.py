@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from igsr import _core
+from igsr._internal.choices import Backend
 from igsr.benchmark import oracle
 from igsr.benchmark.comparison import (
     BOUND_3D,
@@ -304,7 +305,9 @@ def fit_gradients(shot: Shot, backend: str, mask: npt.NDArray[np.bool_]) -> Arra
 class OwnLoop:
     """A fit by ``igsr.rasterization``, torch's Adam and a Charbonnier loss."""
 
-    def __init__(self, shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) -> None:
+    def __init__(
+        self, shot: Shot, backend: Backend, mask: npt.NDArray[np.bool_] | None = None
+    ) -> None:
         """Parameters as leaves, at fixed rates.
 
         They are the fit's, but for the centres', which here is a tenth of the fit's first and knows
@@ -363,7 +366,7 @@ class OwnLoop:
         return {f"v_{n}": grad.numpy() for n, grad in found.items() if grad is not None}
 
 
-def own_loop_ms(shot: Shot, backend: str, seconds: float) -> list[float]:
+def own_loop_ms(shot: Shot, backend: Backend, seconds: float) -> list[float]:
     """Milliseconds per step of the loop of one's own, each nearly from the scene as given."""
     times: list[float] = []
     started = time.perf_counter()
@@ -435,7 +438,7 @@ def step_rows(
     return rows
 
 
-def _own_gradients(shot: Shot, backend: str, mask: npt.NDArray[np.bool_]) -> Arrays:
+def _own_gradients(shot: Shot, backend: Backend, mask: npt.NDArray[np.bool_]) -> Arrays:
     loop = OwnLoop(shot, backend, mask)
     loop.backward()
     return loop.gradients()

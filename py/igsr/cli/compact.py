@@ -17,9 +17,9 @@ from igsr._internal.atomic_write import check_writable
 from igsr._internal.json_file import write_json
 from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
-    BackendChoice,
-    BackendOption,
     BackgroundOption,
+    FitBackendChoice,
+    FitBackendOption,
     HoldoutOption,
     JsonOption,
     SceneArgument,
@@ -83,7 +83,7 @@ def compact_command(
     ] = DEFAULT_STEPS,
     seed: SeedOption = 0,
     background: BackgroundOption = None,
-    backend: BackendOption = BackendChoice.auto,
+    backend: FitBackendOption = FitBackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
     """Make SCENE smaller: the fewest splats that lose at most --max-loss of PSNR."""

@@ -16,6 +16,8 @@ from igsr.cli.settings_options import settings_options
 from igsr.cli.shared import (
     BackendChoice,
     BackendOption,
+    FitBackendChoice,
+    FitBackendOption,
     JobsOption,
     JsonOption,
     RayOption,
@@ -82,7 +84,7 @@ def pairs_command(
     ] = 0,
     jobs: JobsOption = 1,
     ray: RayOption = False,
-    backend: BackendOption = BackendChoice.auto,
+    backend: FitBackendOption = FitBackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
     """Make training pairs: degraded fits' renders of novel views beside the true photos.

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, overload
 
 import typer
 
@@ -121,6 +121,10 @@ SceneArgument = Annotated[
 ]
 
 
+@overload
+def resolved(backend: FitBackendChoice) -> Literal["cpu", "gpu"]: ...
+@overload
+def resolved(backend: BackendChoice) -> ResolvedBackend: ...
 def resolved(backend: BackendChoice | FitBackendChoice) -> ResolvedBackend:
     """The name of the backend that runs: "cpu", "gpu" or "reference".
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
+from igsr._internal.choices import Backend, FitBackend
 from igsr.capture import Capture
 from igsr.compaction.contribution import contribution
 from igsr.compaction.finetuning import (
@@ -89,7 +90,7 @@ def compact(
     steps: int = DEFAULT_STEPS,
     seed: int = 0,
     background: Sequence[float] | None = None,
-    backend: str = "auto",
+    backend: FitBackend = "auto",
     progress: Callable[[CompactProgress], None] | None = None,
 ) -> Compaction:
     """Find the smallest model that loses at most ``max_loss`` dB against ``splats``.
@@ -128,7 +129,7 @@ def compact(
     info = check_fits(backend)
     if splats.antialiased:
         raise IgsrError("Antialiased splats cannot be compacted: fits render without antialiasing.")
-    name = info["backend"]
+    name = _core.resolve_backend(backend)
     finite = subset(fresh_state(splats), np.flatnonzero(splats.finite))
     whole = splats_of(finite, splats.origin)
     if len(whole) == 0:
@@ -178,7 +179,7 @@ class _Search:
         sh_degree: int | None,
         steps: int,
         seed: int,
-        backend: str,
+        backend: Backend,
         progress: Callable[[CompactProgress], None] | None,
     ) -> None:
         self.validation = validation

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from igsr._internal.choices import Backend
 from igsr.capture import Camera, Capture, View
 from igsr.errors import IgsrError
 from igsr.evaluation import metrics
@@ -65,7 +66,7 @@ class Validation:
     against_photos: bool
     protocol: dict[str, Any] = field(repr=False)
 
-    def score(self, splats: Splats, backend: str) -> ValidationScore:
+    def score(self, splats: Splats, backend: Backend) -> ValidationScore:
         """Score ``splats`` on the validation views: 8-bit pictures, masked pixels do not count."""
         pairs = [
             (render(splats, view.camera, self.background, backend).to_uint8(), view)
@@ -96,7 +97,7 @@ def loss_of_change(psnr: float, model_psnr: float) -> float:
 
 
 def photo_validation(
-    splats: Splats, capture: Capture, background: Sequence[float] | None, backend: str
+    splats: Splats, capture: Capture, background: Sequence[float] | None, backend: Backend
 ) -> Validation:
     """Validation on photos: the test views, or held-out train views where there are none.
 
@@ -131,7 +132,7 @@ def photo_validation(
 
 
 def self_validation(
-    splats: Splats, background: Sequence[float] | None, psnr: float | None, backend: str
+    splats: Splats, background: Sequence[float] | None, psnr: float | None, backend: Backend
 ) -> Validation:
     """Validation on renders of the original model, from cameras all around it.
 
@@ -188,7 +189,7 @@ def _triple(color: Sequence[float]) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _picture_with_alpha(splats: Splats, camera: Camera, backend: str) -> Any:
+def _picture_with_alpha(splats: Splats, camera: Camera, backend: Backend) -> Any:
     """uint8 [H, W, 4], straight alpha, so that fine-tuning sees where the model is transparent."""
     picture = render(splats, camera, (0.0, 0.0, 0.0), backend)
     coverage = np.clip(picture.alpha, 1e-6, 1.0)[..., None]

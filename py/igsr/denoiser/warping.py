@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from igsr._internal.choices import Backend
 from igsr.capture import Camera, View
 from igsr.evaluation.scores import over_background
 from igsr.rendering.renders import render
@@ -64,7 +65,7 @@ class Warped:
 
 
 def photo_sources(
-    splats: Splats, views: Sequence[View], background: Sequence[float], backend: str = "auto"
+    splats: Splats, views: Sequence[View], background: Sequence[float], backend: Backend = "auto"
 ) -> list[Source]:
     """The photos of ``views``, with the depth that ``splats`` have in them.
 

@@ -10,7 +10,7 @@ from igsr.errors import IgsrError
 from igsr.fitting.settings import FitSettings
 
 Preset: TypeAlias = Literal["default", "3dgs", "instantsplat"]
-PRESETS: tuple[str, ...] = get_args(Preset)
+PRESETS: tuple[Preset, ...] = get_args(Preset)
 
 #: With so few photos or fewer, most novel views are barely constrained: fits overfit without help.
 FEW_PHOTOS = 20

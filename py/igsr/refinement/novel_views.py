@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.choices import Backend
 from igsr._internal.deprecation import renamed_names
 from igsr.capture import Camera
 from igsr.rendering.renders import render
@@ -56,7 +57,7 @@ class NovelView:
 
 
 def novel_views(
-    splats: Splats, known: Sequence[Camera], count: int, backend: str = "auto"
+    splats: Splats, known: Sequence[Camera], count: int, backend: Backend = "auto"
 ) -> list[NovelView]:
     """Cameras near known ones but not at them, spread out, and never inside the scene.
 
@@ -98,7 +99,7 @@ def _add_farthest(
     count: int,
     centres: Float64,
     splats: Splats,
-    backend: str,
+    backend: Backend,
 ) -> None:
     """Append views of a group, farthest from known cameras and chosen views first.
 
@@ -210,14 +211,14 @@ def _small(camera: Camera) -> Camera:
     return replace(camera, K=K, width=width, height=height)
 
 
-def _viewing_distance(splats: Splats, camera: Camera, backend: str) -> float | None:
+def _viewing_distance(splats: Splats, camera: Camera, backend: Backend) -> float | None:
     """Median depth of what a camera sees; None where it sees nothing."""
     seen = render(splats, _small(camera), backend=backend)
     depths = seen.expected_depth[seen.alpha > SURFACE_ALPHA]
     return float(np.median(depths)) if len(depths) else None
 
 
-def _is_outside(splats: Splats, camera: Camera, distance: float, backend: str) -> bool:
+def _is_outside(splats: Splats, camera: Camera, distance: float, backend: Backend) -> bool:
     """Whether a camera stands in front of the scene: few pixels are close, some show a surface."""
     seen = render(splats, _small(camera), backend=backend)
     near = (seen.alpha > SURFACE_ALPHA) & (seen.expected_depth < CLOSE * distance)

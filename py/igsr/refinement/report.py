@@ -15,6 +15,7 @@ from PIL import Image
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.choices import Backend
 from igsr._internal.json_file import write_json
 from igsr._internal.settings import checked_given
 from igsr.capture.write_cameras import write_cameras
@@ -152,7 +153,7 @@ def _view_rows(views: Sequence[Candidate | Rejected]) -> list[dict[str, Any]]:
     ]
 
 
-def _write_views(path: Path, refined: Refined, backend: str) -> None:
+def _write_views(path: Path, refined: Refined, backend: Backend) -> None:
     """Test views before the first round and after the last that was accepted."""
     shown = sheet_names([view.name for view in refined.capture.test_views])
     views = [view for view in refined.capture.test_views if view.name in shown]

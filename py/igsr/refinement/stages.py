@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from igsr._internal.choices import FitBackend
 from igsr.capture import Camera, Capture, View
 from igsr.denoiser import Denoiser, photo_sources, photo_support, render_buffers
 from igsr.errors import IgsrError
@@ -31,7 +32,7 @@ NOVEL_VIEWS_WORK = 0.1
 #: Scores that cross-validation compares.
 VALIDATED = ("psnr", "ssim", "flip")
 #: Proposes novel views from the splats, the known cameras, the most views and the backend.
-Propose = Callable[[Splats, Sequence[Camera], int, str], Sequence[NovelView]]
+Propose = Callable[[Splats, Sequence[Camera], int, FitBackend], Sequence[NovelView]]
 #: Selects the candidates to add, at most a number of them.
 Select = Callable[[Sequence[Candidate], int], list[Candidate]]
 

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from igsr._internal.choices import FitBackend
 from igsr.capture import Capture, load_capture
 from igsr.errors import IgsrError
-from igsr.fitting.presets import PRESETS
+from igsr.fitting.presets import PRESETS, Preset
 from igsr.study.scored_fits import Fit, fitted
 from igsr.study.splits import with_train_views
 from igsr.study.summary import write_study
@@ -34,9 +35,9 @@ def blender8(
     *,
     scenes: tuple[str, ...] = SCENES,
     views: tuple[str, ...] = tuple(VIEW_IDS),
-    presets: tuple[str, ...] = PRESETS,
+    presets: tuple[Preset, ...] = PRESETS,
     seeds: int = 3,
-    backend: str = "cpu",
+    backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
     ray: bool = False,

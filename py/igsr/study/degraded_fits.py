@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run
 from igsr.capture import Capture, View, load_capture
 from igsr.capture.load import holds_cameras
@@ -51,7 +52,7 @@ class DegradedFit:
     scene: str
     kind: str
     seed: int
-    backend: str
+    backend: FitBackend
 
     @property
     def name(self) -> str:

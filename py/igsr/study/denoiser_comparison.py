@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run, file_hash, finished_runs
 from igsr.denoiser.cleaning import DOUBT, SMALLEST_CHANGE, NetworkDenoiser
 from igsr.denoiser.training.pair_files import read_pairs
@@ -63,7 +64,7 @@ class ComparisonSettings:
     scenes: tuple[str, ...]
     kinds: tuple[str, ...]
     seeds: int
-    backend: str
+    backend: FitBackend
     denoisers: Mapping[str, Path] = field(default_factory=dict)
     features: Path | None = None
     pairs: Path | None = None
@@ -127,7 +128,7 @@ def denoiser_table(
     features: str | os.PathLike[str] | None = None,
     pairs: str | os.PathLike[str] | None = None,
     seeds: int = 1,
-    backend: str = "cpu",
+    backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
     ray: bool = False,

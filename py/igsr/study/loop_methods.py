@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.choices import FitBackend
 from igsr.capture import Camera, Capture, View
 from igsr.denoiser import Buffers, Denoiser, Source
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance, picture_distance
@@ -125,13 +126,15 @@ def _first(views: int, candidates: Sequence[Candidate], count: int) -> list[Cand
     return list(candidates[:views])
 
 
-def _between(splats: Splats, known: Sequence[Camera], count: int, backend: str) -> list[NovelView]:
+def _between(
+    splats: Splats, known: Sequence[Camera], count: int, backend: FitBackend
+) -> list[NovelView]:
     """Novel views between known cameras only."""
     return [view for view in novel_views(splats, known, count, backend) if view.between]
 
 
 def _given_views(
-    given: Sequence[View], splats: Splats, known: Sequence[Camera], count: int, backend: str
+    given: Sequence[View], splats: Splats, known: Sequence[Camera], count: int, backend: FitBackend
 ) -> list[NovelView]:
     """The given cameras that were not added yet."""
     return [

@@ -12,6 +12,7 @@ from typing import Any
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.capture import load_capture
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance
@@ -55,7 +56,7 @@ class _Options:
     features: PathLike | None
     steps: int | None
     seeds: int
-    backend: str
+    backend: FitBackend
     jobs: int
     on_run: OnRun | None
     ray: bool
@@ -71,7 +72,7 @@ def table2(
     features: PathLike | None = None,
     steps: int | None = None,
     seeds: int = 3,
-    backend: str = "cpu",
+    backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: OnRun | None = None,
     ray: bool = False,
@@ -122,7 +123,7 @@ def table3(
     features: PathLike | None = None,
     steps: int | None = None,
     seeds: int = 3,
-    backend: str = "cpu",
+    backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: OnRun | None = None,
     ray: bool = False,
@@ -148,7 +149,7 @@ def sweep(
     features: PathLike | None = None,
     steps: int | None = None,
     seeds: int = 1,
-    backend: str = "cpu",
+    backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: OnRun | None = None,
     ray: bool = False,
@@ -176,7 +177,7 @@ def refinement_ablation(
     features: PathLike | None = None,
     steps: int | None = None,
     seeds: int = 1,
-    backend: str = "cpu",
+    backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: OnRun | None = None,
     ray: bool = False,

@@ -19,6 +19,7 @@ from PIL import Image
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import file_hash
 from igsr.capture import Camera, Capture, View, load_capture
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance, picture_distance
@@ -64,7 +65,7 @@ class RunSpec:
     layout: str
     photos: int
     seed: int
-    backend: str
+    backend: FitBackend
 
     @property
     def name(self) -> str:
@@ -215,7 +216,7 @@ class _Scorer:
         self,
         held_out: list[View],
         photos: Capture,
-        backend: str,
+        backend: FitBackend,
         distance: SqueezeNetDistance | None,
     ) -> None:
         self._held_out, self._backend, self._distance = held_out, backend, distance

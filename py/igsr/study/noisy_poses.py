@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.capture import Capture, load_capture
 from igsr.errors import IgsrError
@@ -25,6 +26,7 @@ from igsr.evaluation.scores import WHITE, evaluate
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.presets import preset_settings
 from igsr.fitting.run import fit_with_cameras
+from igsr.fitting.settings import Poses
 from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
@@ -36,7 +38,7 @@ Float64 = npt.NDArray[np.float64]
 VIEW_IDS = tuple(range(0, 100, 5))
 SCORES = ("psnr", "ssim", "flip")
 WAYS = ("raw", "aligned", "refined")
-POSES = ("fixed", "joint")
+POSES: tuple[Poses, ...] = ("fixed", "joint")
 
 
 CLEAN = Noise("clean", 0.0)
@@ -48,9 +50,9 @@ class PoseFit:
 
     scene: str
     noise: Noise
-    poses: str
+    poses: Poses
     seed: int
-    backend: str
+    backend: FitBackend
 
 
 def run_fit(data: str, one: PoseFit) -> dict[str, Any]:
@@ -110,7 +112,7 @@ def pose_noise(
     turns: tuple[float, ...] = (0.5, 2.0),
     raw_affine: bool = False,
     seeds: int = 3,
-    backend: str = "cpu",
+    backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
     ray: bool = False,
@@ -154,7 +156,7 @@ def pose_noise(
         for seed in range(seeds)
         for kind in (CLEAN, *kinds)
         for scene in scenes
-        for poses in (("fixed",) if kind == CLEAN else POSES)
+        for poses in (POSES[:1] if kind == CLEAN else POSES)
     ]
     tasks = [
         Run(
@@ -194,7 +196,7 @@ def compared(rows: list[dict[str, Any]], noise: str, scene: str) -> dict[str, An
     back; "short_of_clean" the dB between clean and joint, both scored refined.
     """
     mine = [row for row in rows if scene in ("mean", row["scene"])]
-    sets = {
+    sets: dict[str, list[dict[str, Any]]] = {
         "clean": [row for row in mine if row["noise"] == str(CLEAN)],
         **{
             poses: [row for row in mine if (row["noise"], row["poses"]) == (noise, poses)]

@@ -9,12 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.capture import Capture
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background, evaluate
 from igsr.fitting.pose_refinement import refine_cameras
-from igsr.fitting.presets import preset_settings
+from igsr.fitting.presets import Preset, preset_settings
 from igsr.fitting.run import fit_with_cameras
 from igsr.geometry.similarity import similarity_between
 from igsr.splats import Splats
@@ -36,9 +37,9 @@ class Fit:
 
     scene: str
     views: str
-    preset: str
+    preset: Preset
     seed: int
-    backend: str
+    backend: FitBackend
 
 
 #: The capture of a fit, with the protocol's train and test views, from the folder of the scenes. A
@@ -76,7 +77,7 @@ def run_fit(load: Load, data: str, one: Fit, refined: bool = False) -> dict[str,
     }
 
 
-def _refined_psnr(splats: Splats, given: Capture, moved: Capture, backend: str) -> float:
+def _refined_psnr(splats: Splats, given: Capture, moved: Capture, backend: FitBackend) -> float:
     to_fitted = similarity_between(
         [view.camera for view in given.train_views], [view.camera for view in moved.train_views]
     )
@@ -92,9 +93,9 @@ def fitted(
     out: str | os.PathLike[str],
     load: Load,
     photos: dict[tuple[str, str], int],
-    presets: tuple[str, ...],
+    presets: tuple[Preset, ...],
     seeds: int,
-    backend: str,
+    backend: FitBackend,
     jobs: int,
     on_run: Callable[[int, int, dict[str, Any]], None] | None,
     ray: bool,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from igsr._internal.choices import FitBackend
 from igsr.capture import View
 from igsr.denoiser.buffers import photo_support, render_buffers
 from igsr.denoiser.inputs import PHOTOS, network_inputs
@@ -34,7 +35,7 @@ def rendered_pairs(
     photos: Sequence[View],
     views: Sequence[View],
     background: Sequence[float] | None,
-    backend: str,
+    backend: FitBackend,
 ) -> Pairs:
     """What the network sees of each view, and the true pictures.
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.capture import Capture, View, load_capture
 from igsr.denoiser.inputs import CHANNELS, COLOR
@@ -62,7 +63,7 @@ class PairFit:
     views: int
     steps: int | None
     seed: int
-    backend: str
+    backend: FitBackend
     all_views: bool
 
     @property
@@ -119,7 +120,7 @@ def make_pairs(
     steps: int | None = None,
     all_views: bool = False,
     seed: int = 0,
-    backend: str = "cpu",
+    backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
     ray: bool = False,
