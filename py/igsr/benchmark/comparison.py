@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from igsr.benchmark.scenes import Arrays
 
-#: Error beyond which a pixel of the band is left out (docs/how-it-works/numerics.md has the bounds):
+#: Error beyond which a pixel of the band (docs/how-it-works/numerics.md) is left out:
 #: for 2D splats handed over as they are, and for pictures from splats.
 BOUND_2D = {"reference": 0.0, "cpu": 2e-6, "gpu": 2e-5}
 BOUND_3D = {"reference": 0.0, "cpu": 1e-4, "gpu": 1e-4}
