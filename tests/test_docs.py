@@ -42,6 +42,7 @@ NOT_RUN = {
     "docs/getting-started.md": 3,
     "docs/guides/cameras.md": 1,
     "docs/guides/denoising.md": 2,
+    "docs/guides/smaller-scenes.md": 1,
     "docs/guides/synthetic-captures.md": 1,
     "docs/guides/viewing.md": 3,
 }
