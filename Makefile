@@ -54,7 +54,8 @@ accuracy: build vulkan
 # Stops at any warning: a link without a target, a page that no menu leads to.
 docs: build $(VENV)/.dev-ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
-	@echo "The documentation is in out/docs: open out/docs/index.html"
+	@printf '%s\n' '' 'The documentation is in out/docs: open out/docs/index.html or, to search it, run' \
+		'  python3 -m http.server --directory out/docs'
 
 # The hottest functions of W1 or, with CAPTURE=DIR, of W3's fit steps (once its models are fitted).
 profile: build

@@ -22,8 +22,8 @@ OLD_NAMES = {
     "igsr.compaction.plot": "write_plot",
     "igsr.compaction.refinement": "chosen fresh_state refined splats_of with_sh_degree",
     "igsr.denoiser.losses": "Discriminator Loss Prediction charbonnier error_likelihood "
-    "perceptual perceptual_ratio "
-    "regret squared_ratio structure_ratio",
+    "perceptual perceptual_ratio regret squared_ratio "
+    "structure_ratio",
     "igsr.denoiser.pair_files": "Pairs packed read_pairs write_pairs",
     "igsr.denoiser.pair_renders": "check_one_size rendered_pairs",
     "igsr.denoiser.pairs": "PairFit capture_of_pairs make_pairs",
@@ -50,8 +50,8 @@ OLD_NAMES = {
     "igsr.rasterization_arguments": "check_arguments",
     "igsr.refinement_page": "write_page",
     "igsr.refinement_report": "seconds_so_far write_refinement",
-    "igsr.report": "contact_sheet error_picture rounds_sheet save_sheet sheet_names write_cameras "
-    "write_report",
+    "igsr.report": "contact_sheet error_picture rounds_sheet save_sheet "
+    "sheet_names write_cameras write_report",
     "igsr.selection": "Candidate Passed candidate passed select trust_of",
     "igsr.sift_points": "sift_points",
     "igsr.study.fits": "Fit fitted run_fit",

@@ -32,7 +32,7 @@ def walk() -> Iterator[tuple[str, Any]]:
 
 
 def _section(name: str, command: Any) -> list[str]:
-    lines = ["#" * (1 + len(name.split())) + f" {name}", ""]
+    lines = ["#" * len(name.split()) + f" {name}", ""]
     lines += [_text(command.help or ""), ""]
     if getattr(command, "commands", None):
         return lines
@@ -69,7 +69,7 @@ def _value(option: Any) -> str:
     if option.metavar:
         return f"`{option.metavar}`"
     if isinstance(kind, type) and issubclass(kind, enum.Enum):
-        return "`" + " | ".join(str(choice.value) for choice in kind) + "`"
+        return ", ".join(f"`{choice.value}`" for choice in kind)
     return f"`{_NAMES.get(kind, 'TEXT')}`"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from dataclasses import dataclass, field, fields
@@ -18,6 +19,8 @@ from igsr.errors import IgsrError
 
 if TYPE_CHECKING:
     import torch
+
+logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -50,7 +53,7 @@ class Splats(ArrayEquality, NotebookPicture):
         IgsrError: an array has the wrong shape or dtype; the message names it.
     """
 
-    pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:splats_pictures"
+    _pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:splats_pictures"
 
     means: FloatArray
     quats: FloatArray
@@ -218,4 +221,6 @@ class Splats(ArrayEquality, NotebookPicture):
             raise IgsrError(f"{error}.") from error
         for note in read["notes"]:
             warnings.warn(f"{path}: {note}", stacklevel=2)
-        return Splats(**{part.name: read[part.name] for part in fields(Splats)})
+        splats = Splats(**{part.name: read[part.name] for part in fields(Splats)})
+        logger.info("%s: %r", path, splats)
+        return splats

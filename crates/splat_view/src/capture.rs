@@ -94,8 +94,11 @@ impl Frame {
 /// is returned is valid.
 pub fn read_cameras(path: &Path) -> Result<Vec<CaptureCamera>> {
     let Some(file) = find_cameras(path) else {
-        let reason = if path.is_dir() { "holds no cameras.json" } else { "is no file or folder" };
-        return Err(Error::file(path, format!("{reason}; {OTHERS}")));
+        let reason = match path.is_dir() {
+            true => format!("holds no {NAME}; {OTHERS}"),
+            false => format!("does not exist; give a {NAME} of igsr, or a folder with one"),
+        };
+        return Err(Error::file(path, reason));
     };
     let unreadable = |e: std::io::Error| Error::file(&file, format!("cannot be read ({e})"));
     let mut bytes = Vec::new();

@@ -10,7 +10,7 @@ use splat_render::{Camera, Error, Result};
 use crate::blending::{Blending, Drawable};
 use crate::composing::{Canvases, Composing, Look};
 use crate::display::{Display, Drawing, Settings};
-use crate::rasterizing::{Rasterizing, PictureBuffers};
+use crate::rasterizing::{PictureBuffers, Rasterizing};
 use crate::stage_times::{
     BIN, BLEND, CANVAS, COMPOSE, PANEL, PROJECT, RASTERIZE, SECOND, SORT, STAGES, StageTimes,
     Stamps, Written,
@@ -230,9 +230,9 @@ impl Painter {
                 None => false,
                 Some(buffers) => {
                     let (camera, settings) = (&shot.camera, shot.settings);
-                    let drawn = self
-                        .rasterizing
-                        .draw(&self.gpu, model, buffers, camera, settings, canvas, columns, &stamps);
+                    let drawn = self.rasterizing.draw(
+                        &self.gpu, model, buffers, camera, settings, canvas, columns, &stamps,
+                    );
                     match drawn {
                         Err(error) if settings.drawing == Drawing::Rasterizer => return Err(error),
                         // Too many splats in a tile: the blending unit draws them.

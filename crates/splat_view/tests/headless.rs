@@ -409,7 +409,7 @@ fn other_cameras_are_refused_and_say_what_reads_them() {
         &model.join("cameras.bin"),
         &[&["cameras.bin", "not a cameras.json"], &others[..]].concat(),
     );
-    refuse(&folder.join("nothing"), &["nothing", "is no file or folder"]);
+    refuse(&folder.join("nothing"), &["nothing", "does not exist"]);
 
     let file = folder.join("cameras.json");
     let good = common::cameras_json(&[camera()]);

@@ -24,19 +24,16 @@ LONGEST_SIDE = 240
 
 
 class NotebookPicture:
-    """Gives a class a ``_repr_html_``: its ``repr`` above its pictures, in one strip.
+    """Gives a class a ``_repr_html_``: its ``repr`` above its pictures, in one strip."""
 
-    Attributes:
-        pictures_by: "module:function" of the function that takes the object and returns its
-            pictures, a list of uint8 [H, W, 3] or [H, W, 4].
-    """
-
-    pictures_by: ClassVar[str]
+    #: "module:function" of the function that takes the object and returns its pictures, a list of
+    #: uint8 [H, W, 3] or [H, W, 4].
+    _pictures_by: ClassVar[str]
 
     def _repr_html_(self) -> str:
         """HTML for notebooks; without pictures where they cannot be made."""
         try:
-            pictures = pkgutil.resolve_name(self.pictures_by)(self)
+            pictures = pkgutil.resolve_name(self._pictures_by)(self)
         except (RuntimeError, ValueError, OSError):  # what cannot be drawn is still shown as text
             pictures = []
         return html_of(repr(self), pictures)

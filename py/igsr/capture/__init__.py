@@ -1,7 +1,7 @@
-"""Captures: photos, masks, cameras and points, from the formats that carry them.
+"""Captures: read and write photos, masks, cameras and points.
 
-One call, ``load_capture``, reads them all. Whatever the format, what comes out is the same: pinhole
-cameras in OpenCV axes, photos with lens distortion undone, masks of the pixels that may be used.
+``load_capture`` reads all formats and returns the same for each: pinhole cameras in OpenCV axes,
+undistorted photos, and masks of the pixels that may be used.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Views at half their size."""
+"""Downscale views to half their size."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from igsr.capture import View
 
 
 def halved(view: View) -> View:
-    """The view with each 2 x 2 pixels averaged into one; an odd last row or column is left out.
+    """Average each 2 x 2 pixels of a view into one; an odd last row or column is dropped.
 
-    Colours are weighted by alpha where there is alpha, and by the mask where there is one: masked
-    pixels have no part in them. A pixel of the result is masked where all four were; weights are
-    averaged.
+    Colors are weighted by alpha and by the mask, if the view has them: masked pixels do not count.
+    A pixel of the result is masked if all four were. Weights are averaged. The camera's focal
+    lengths and principal point are halved.
     """
     camera = view.camera
     height, width = camera.height // 2, camera.width // 2

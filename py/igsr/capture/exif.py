@@ -1,9 +1,9 @@
-"""What a camera wrote into a photo about itself: which way is up, its focal length, its name.
+"""EXIF of a photo: orientation, focal length and camera.
 
-EXIF is untrusted and often wrong or damaged: what cannot be read is taken as not written.
+EXIF is untrusted and often wrong or damaged: a field that cannot be read counts as missing.
 
-Sources: Exif 2.32 (CIPA DC-008); 35 mm equivalents are by the diagonal of the picture, 43.27 mm on
-film (CIPA DCG-001).
+Sources: Exif 2.32 (CIPA DC-008); 35 mm equivalents refer to the diagonal of the picture, 43.27 mm
+on film (CIPA DCG-001).
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
 _PIXEL_WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA20E, 0xA210
 _MM_FROM_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_DIAGONAL = math.hypot(36.0, 24.0)
-# Fisheyes and telescopes lie within; what is outside is no focal length but a wrong field.
+# In units of the longer side. Fisheyes and telescopes are within; other numbers are wrong fields.
 _FOCAL_RANGE = (0.2, 50.0)
 
 
 @dataclass(frozen=True)
 class Exif:
-    """What a photo's EXIF says.
+    """The fields of a photo's EXIF that are used.
 
     Attributes:
-        orientation: 1 to 8, as EXIF numbers them; 1 is upright.
+        orientation: 1 to 8, as in EXIF; 1 is upright.
         focal: focal length in pixels of the photo as stored, or None.
         device: make, model and lens of the camera, or None.
     """
@@ -40,7 +40,7 @@ class Exif:
 
 
 def read_exif(image: Image.Image) -> Exif:
-    """Read the EXIF of an image that is open; pixels need not be decoded."""
+    """Read the EXIF of an open image; its pixels need not be decoded."""
     try:
         fields = dict(image.getexif())
         fields.update(image.getexif().get_ifd(_SUB_FOLDER))
@@ -62,7 +62,7 @@ def _focal(fields: dict[int, Any], width: int, height: int) -> float | None:
     if length is None or resolution is None:
         return None
     unit = _MM_FROM_UNIT.get(fields.get(_PLANE_UNIT, 2), 25.4)
-    # The plane's resolution is that of the photo as it was taken, before it was reduced.
+    # The resolution refers to the photo as it was taken, before it was downscaled.
     taken = _number(fields.get(_PIXEL_WIDTH)) or float(width)
     reduced = max(width, height) / taken if taken >= max(width, height) else 1.0
     return _plausible(length * resolution / unit * reduced, width, height)
@@ -88,7 +88,7 @@ def _text(value: Any) -> str:
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Pixels [H, W, ...] turned and mirrored as an EXIF orientation says, so that up is up."""
+    """Turn and mirror pixels [H, W, ...] by an EXIF orientation, so that the photo is upright."""
     if orientation in (5, 6, 7, 8):
         pixels = np.swapaxes(pixels, 0, 1)
     if orientation in (2, 3, 6, 7):

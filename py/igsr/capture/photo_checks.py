@@ -1,4 +1,4 @@
-"""What a set of photos cannot tell, said before a fit spends minutes on it."""
+"""Checks of photos before a fit: warnings of what they cannot determine."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 from igsr.capture import View
 from igsr.errors import IgsrError
 
-#: Cameras nearer than this part of the largest distance between two stand at one place.
+#: Cameras nearer to each other than this part of the largest distance are at the same place.
 SAME_PLACE = 1e-6
 #: Rays of a photo, per side, and depths tried along them in units of the distance between cameras.
 RAYS, DEPTHS = 7, np.geomspace(0.05, 1000.0, 24)
 
 
 def check_photos(views: list[View]) -> None:
-    """Warn of what the photos cannot tell; refuse what no scene can be fitted to.
+    """Warn of what the photos cannot determine; refuse photos that no scene can be fitted to.
 
     Args:
         views: the photos to fit; at least one.
 
     Raises:
-        IgsrError: every photo is black or wholly transparent, or a mask leaves none of a photo.
+        IgsrError: every photo is black or fully transparent, or a mask leaves no pixel of a photo.
         UserWarning: a single photo, cameras at one place, a camera given twice, photos of which no
-            two see anything in common, a photo that is black or wholly transparent.
+            two see anything in common, a photo that is black or fully transparent.
     """
     for view in views:
         if view.mask is not None and not view.mask.any():

@@ -1,12 +1,12 @@
-"""Photos without cameras: folders, files and videos as people have them, decoded and upright.
+"""Photos without cameras: load folders, files and videos, upright.
 
-Unlike the photos of a capture, whose cameras were found for the pixels as stored, these are turned
-as their EXIF orientation says.
+These photos are turned by their EXIF orientation. Those of a capture are not: its cameras belong to
+the pixels as stored.
 
-Masks lie in a folder ``masks`` in the folder of photos or, where that is named ``images``, beside
-it: ``masks/NAME.png`` with the photo's whole name, as COLMAP has them (``masks/a/1.jpg.png``), or
-with ``.png`` in place of its suffix (``masks/a/1.png``). White pixels may be used, black ones not;
-they are of the upright photo.
+Masks are in a folder ``masks`` in the folder of photos or, if that is named ``images``, beside it:
+``masks/NAME.png`` with the photo's whole name, as in COLMAP (``masks/a/1.jpg.png``), or with
+``.png`` in place of its suffix (``masks/a/1.png``). White pixels may be used, black ones may not. A
+mask has the size of the upright photo.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from igsr.capture.photos import SUFFIXES, is_file, load_pixels, mask_of, open_im
 from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames
 from igsr.errors import IgsrError
 
-#: Frames taken of each video.
+#: Frames taken from each video.
 FRAMES = 40
-#: Photos that cameras can be found from.
+#: The fewest photos that cameras can be found from.
 FEWEST = 2
-#: What is named of a long list.
+#: Names shown of a long list.
 _NAMED = 3
 
 
@@ -40,10 +40,10 @@ class Photo:
     Attributes:
         name: posix path relative to the folder, unique among the photos.
         image: uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha; upright.
-        mask: bool [H, W], True where the pixel may be used, or None where all may.
-        focal: focal length in pixels of ``image``, from EXIF, or None where it is not known.
+        mask: bool [H, W], True where a pixel may be used, or None if all may.
+        focal: focal length in pixels of ``image``, from EXIF, or None if it is not known.
         device: make, model and lens of the camera, or the video's name; photos of one device, size
-            and focal length share their intrinsics. None where it is not known.
+            and focal length share their intrinsics. None if it is not known.
     """
 
     name: str
@@ -59,18 +59,18 @@ def load_photos(
     """Load photos whose cameras are not known.
 
     Args:
-        path: a folder (its sub-folders are read too; files that are no photos are passed over; of
-            a folder that holds ``images/`` and no photos itself, those), a video, or a list of
-            photos and videos.
-        frames: how many frames are taken of each video, the sharpest of as many equal spans.
+        path: a folder, a video, or a list of photos and videos. Sub-folders are read too, and files
+            that are not photos are ignored. If a folder has no photos itself but ``images/``, the
+            photos in that are taken.
+        frames: number of frames taken from each video: the sharpest of as many equal spans.
 
     Returns:
-        The photos, sorted by name from a folder and otherwise in the order given. A photo that
-        cannot be read is left out with a warning that names it.
+        The photos, sorted by name if from a folder, else in the order given. A photo that cannot be
+        read is left out; a warning names it.
 
     Raises:
-        IgsrError: there are no photos, fewer than two can be read, two have one name, or they need
-            more memory than there is.
+        IgsrError: there are no photos, fewer than two can be read, a file is given twice, they need
+            more memory than there is, or ``frames`` is not a whole number of at least 1.
     """
     if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
         raise IgsrError(
@@ -92,7 +92,7 @@ def load_photos(
             return error
 
     with warnings.catch_warnings(), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        # Of damaged EXIF and the like, which matters to nobody where the pixels can be read.
+        # Pillow warns of damaged EXIF and the like even where the pixels can be read.
         warnings.filterwarnings("ignore", module="PIL")
         _refuse_large(files)
         loaded = list(pool.map(load, files, names))
@@ -106,7 +106,7 @@ def load_photos(
 
 
 def photo_root(folder: Path) -> Path:
-    """Where the photos of a folder are: in ``images`` where only that holds any, else in itself."""
+    """The folder that holds the photos: ``images`` if only that has any, else the folder itself."""
     inner = folder / "images"
     if inner.is_dir() and not any(_is_photo(entry) for entry in folder.iterdir()):
         return inner
@@ -124,7 +124,7 @@ def has_photos(path: Path) -> bool:
 
 
 def photo_sizes(path: Path) -> dict[str, int]:
-    """Bytes of each photo and video of a path that ``load_photos`` takes, by its name, sorted.
+    """The size in bytes of each photo and video that ``load_photos`` would load, by name, sorted.
 
     Raises:
         IgsrError: there are none.
@@ -142,7 +142,7 @@ def _is_photo(path: Path) -> bool:
 
 
 def _walk(root: Path) -> Iterator[Path]:
-    """The photos and videos under a folder; hidden folders and that of the masks are left out."""
+    """The photos and videos under a folder, without hidden folders and the masks."""
     for place, folders, names in os.walk(root):
         kept = [name for name in folders if not name.startswith(".")]
         folders[:] = [name for name in kept if Path(place) != root or name != "masks"]
@@ -184,10 +184,10 @@ def _files(files: list[Path]) -> tuple[Path, list[Path], Path]:
 
 
 def _refuse_large(files: list[Path]) -> None:
-    """Refuse what would not fit into memory, before anything is decoded."""
+    """Refuse photos that do not fit into memory, before any is decoded."""
     try:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not every system tells
+    except (AttributeError, ValueError, OSError):  # not every system has these
         return
     needed = 0
     for file in files:
@@ -196,8 +196,8 @@ def _refuse_large(files: list[Path]) -> None:
                 with open_image(file) as image:
                     needed += 3 * image.width * image.height
             except IgsrError:
-                continue  # it is named when it is loaded
-    # Undistorted photos lie beside the ones that they are made from, and a fit copies them.
+                continue  # loading it names it
+    # Photos are held as decoded and as undistorted, and a fit copies them.
     if 3 * needed > memory:
         raise IgsrError(
             f"The {len(files)} photos need {3 * needed / 2**30:.1f} GiB of memory and this machine "
@@ -225,7 +225,7 @@ def _from_file(file: Path, name: str, masks: Path) -> Photo:
 
 
 def mask_paths(masks: Path, name: str) -> list[Path]:
-    """Where the mask of a photo may be, the first that exists; see the module."""
+    """Paths of a photo's mask, of which the first that exists counts; see the module."""
     return [masks / f"{name}.png", masks / PurePosixPath(name).with_suffix(".png")]
 
 

@@ -1,4 +1,4 @@
-"""Photos and masks decoded, checked against their cameras, and undistorted."""
+"""Decode photos and masks, check them against their cameras, and undistort them."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ SUFFIXES = (
     *_HEIF_SUFFIXES,
 )
 
-# Pillow knows more, but some of those (EPS) hand the file to another program.
+# Pillow reads more formats, but for some of them (EPS) it runs another program.
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "GIF")
 
-# No photo is packed tighter; a file that claims more is a decompression bomb or a torn header.
+# No photo is packed tighter; a file that claims more is a decompression bomb or damaged.
 _MOST_PIXELS_PER_BYTE = 10_000
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A photo to load: what a reader found out about one view.
+    """A photo to load, as a reader of captures describes it.
 
     Attributes:
         name: the view's name.
@@ -40,7 +40,7 @@ class Shot:
         camera: its pinhole camera; ``K`` and the size are the distorted photo's too.
         lens: its distortion.
         split: "train" or "test".
-        mask_path: or None.
+        mask_path: the mask's file, or None.
         source: the file that describes the camera, for error messages.
     """
 
@@ -62,10 +62,11 @@ def is_file(path: Path) -> bool:
 
 
 def open_image(path: Path) -> Image.Image:
-    """The image behind a path, its pixels not yet decoded.
+    """Open an image without decoding its pixels.
 
     Raises:
-        IgsrError: missing, of no format that is read, or claiming more pixels than its bytes hold.
+        IgsrError: the file is missing, has no format that is read, or claims more pixels than its
+            bytes can hold.
     """
     formats: tuple[str, ...] = _FORMATS
     if path.suffix.lower() in _HEIF_SUFFIXES:
@@ -98,7 +99,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels as stored (EXIF orientation not applied), from the header alone.
 
     Raises:
-        IgsrError: the file is missing or no image.
+        IgsrError: the file is missing or not an image.
     """
     with open_image(path) as image:
         return image.size
@@ -121,10 +122,10 @@ def _decode(path: Path, width: int, height: int, source: Path, what: str) -> Ima
 
 
 def load_pixels(image: Image.Image, path: Path) -> None:
-    """Decode the pixels of an image that ``open_image`` gave.
+    """Decode the pixels of an image from ``open_image``.
 
     Raises:
-        IgsrError: they are truncated or damaged.
+        IgsrError: the file is truncated or damaged.
     """
     try:
         image.load()
@@ -133,7 +134,7 @@ def load_pixels(image: Image.Image, path: Path) -> None:
 
 
 def _eight_bit(image: Image.Image, path: Path) -> Image.Image:
-    """16-bit greys as 8-bit greys; any other image as it is."""
+    """A 16-bit grey image in 8 bits; any other image as it is."""
     if image.mode.startswith("I"):
         grey = np.asarray(image)
         if grey.min() < 0 or grey.max() > 65535:
@@ -145,7 +146,7 @@ def _eight_bit(image: Image.Image, path: Path) -> Image.Image:
 
 
 def read_image(path: Path, width: int, height: int, source: Path) -> np.ndarray:
-    """A photo's pixels as stored: its EXIF orientation is not applied.
+    """Read a photo's pixels as stored, without applying its EXIF orientation.
 
     Palettes, greys, 16 bits, CMYK and the like are converted.
 
@@ -155,19 +156,19 @@ def read_image(path: Path, width: int, height: int, source: Path) -> np.ndarray:
         source: the file that gave the camera, for error messages.
 
     Returns:
-        uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha where the file has transparency.
+        uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha if the file has transparency.
 
     Raises:
-        IgsrError: missing, unreadable, truncated, or of another size.
+        IgsrError: the file is missing, unreadable, truncated, or has another size.
     """
     return pixels_of(_decode(path, width, height, source, "image"), path)
 
 
 def pixels_of(image: Image.Image, path: Path) -> np.ndarray:
-    """A decoded image as uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha where it has any.
+    """A decoded image as uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha if it has alpha.
 
     Raises:
-        IgsrError: its pixels are of a kind that is no photo's.
+        IgsrError: the kind of its pixels is not supported.
     """
     image = _eight_bit(image, path)
     transparent = "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
@@ -183,9 +184,9 @@ def pixels_of(image: Image.Image, path: Path) -> np.ndarray:
 
 
 def read_mask(path: Path, width: int, height: int, source: Path) -> np.ndarray:
-    """A mask's pixels: bool [H, W], True where brighter than half of its brightest pixel.
+    """Read a mask: bool [H, W], True where it is brighter than half of its brightest pixel.
 
-    So masks of 0 and 1 and of 0 and 255 mean the same; black pixels are left out.
+    So masks of 0 and 1 mean the same as masks of 0 and 255.
 
     Raises:
         IgsrError: as ``read_image``.
@@ -197,7 +198,7 @@ def mask_of(image: Image.Image, path: Path) -> np.ndarray:
     """A decoded image as a mask, bool [H, W]; see ``read_mask``.
 
     Raises:
-        IgsrError: its pixels are of a kind that is no mask's.
+        IgsrError: the kind of its pixels is not supported.
     """
     image = _eight_bit(image, path)
     try:
@@ -209,7 +210,7 @@ def mask_of(image: Image.Image, path: Path) -> np.ndarray:
 
 
 class _Undistorters:
-    """One resampling map per distinct camera, freed after its last photo: maps outweigh photos."""
+    """One resampling map per distinct camera, freed after its last photo: a map is larger."""
 
     def __init__(self, shots: list[Shot]) -> None:
         self._maps: dict[object, Undistorter] = {}
@@ -250,10 +251,10 @@ def _refuse_duplicates(shots: list[Shot]) -> None:
 
 
 def load_views(shots: list[Shot]) -> list[View]:
-    """All photos of a capture, decoded on all cores, in the order given.
+    """Load all photos of a capture on all cores, in the order given.
 
     Raises:
-        IgsrError: about the first photo, in that order, that cannot be used.
+        IgsrError: a photo cannot be used; of several, the message is about the first.
     """
     _refuse_duplicates(shots)
     undistorters = _Undistorters([shot for shot in shots if not shot.lens.is_pinhole])

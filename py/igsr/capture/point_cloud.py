@@ -19,13 +19,19 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
 def read_point_cloud(path: Path) -> Points | None:
-    """Read positions, colours and confidences; other properties and elements are passed over.
+    """Read positions, colors and confidences; other properties and elements are ignored.
 
-    Points without colours come out grey. Confidences count where all are positive.
+    Points without colors become grey. Confidences are ignored unless all are positive.
+
+    Args:
+        path: the ``.ply`` file, ASCII or binary.
+
+    Returns:
+        The points, or None if there are none.
 
     Raises:
-        IgsrError: the file is missing, is no .ply of points, is truncated, or has a point that is
-            not finite.
+        IgsrError: the file is missing, is not a .ply of points, is truncated, or has a point that
+            is not finite.
     """
     try:
         data = path.read_bytes()
@@ -46,7 +52,7 @@ def read_point_cloud(path: Path) -> Points | None:
         if words[:1] == ["format"] and len(words) == 3 and words[1] in _ORDERS:
             order = words[1]
         elif words[:1] == ["element"]:
-            # What follows the points need not be understood to read them.
+            # Elements after the points are not read.
             if count >= 0:
                 break
             if len(words) != 3 or words[1] != "vertex" or not words[2].isdecimal():
@@ -95,7 +101,7 @@ def read_point_cloud(path: Path) -> Points | None:
 
 
 def write_point_cloud(path: Path, points: Points) -> None:
-    """Write positions in float64, colours and, where there are any, confidences; binary."""
+    """Write a binary .ply: positions in float64, colors and, if known, confidences."""
     layout = [*((name, "<f8") for name in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))]
     if points.confidence is not None:
         layout.append(("confidence", "<f8"))

@@ -1,12 +1,13 @@
-"""Captures that COLMAP made: a sparse model, text or binary, beside a folder of photos.
+"""Read captures of COLMAP: a sparse model, text or binary, beside a folder of photos.
 
-The three files that say all a capture needs (cameras, images, points3D) are parsed here and not by
-pycolmap, which reads a truncated file as zeros without a word and ends the whole process on others;
-the tests hold this reader against models that pycolmap wrote. Models of COLMAP 3.12 and later have
-rigs and frames too, but their images file still gives each image's own pose.
+The files cameras, images and points3D are parsed here and not by pycolmap, which reads a truncated
+file as zeros without an error and on other damage ends the whole process. The tests compare this
+reader with models that pycolmap wrote. Models of COLMAP 3.12 and later also have rigs and frames,
+but their images file still has the pose of each image.
 
-A point that photos see has its confidence from their number and its error. Points without a track
-are not COLMAP's own: their error, where positive, is 1 / confidence, as ``write_colmap`` has it.
+The confidence of a point with a track follows from the track's length and the point's error. COLMAP
+itself writes no points without a track: their error, if positive, is 1 / confidence, as
+``write_colmap`` writes it.
 
 Source of the formats and camera models: https://colmap.github.io/format.html and cameras.html.
 """
@@ -29,7 +30,7 @@ from igsr.capture.types import Camera, Capture, Points, Tracks, intrinsic_matrix
 from igsr.capture.undistort import Lens
 from igsr.errors import IgsrError
 
-# COLMAP's model numbers, so that what is refused has a name.
+# Camera models by COLMAP's number, to name a model that is refused.
 _NAMES = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -50,7 +51,7 @@ _NAMES = (
     "EUCM",
     "EQUIRECTANGULAR",
 )
-# How many parameters each supported model has.
+# Number of parameters of each supported model.
 _PARAMETER_COUNTS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -90,7 +91,7 @@ class _ColmapImage:
 
 
 class _ColmapPoints:
-    """The points of a model, as they are read."""
+    """The points of a model while they are read."""
 
     def __init__(self) -> None:
         self.ids: list[int] = []
@@ -118,7 +119,7 @@ class _ColmapPoints:
         if not np.isfinite(xyz).all():
             raise IgsrError(f"{path} has a point that is not finite; remove it")
         error, length = np.array(self.errors), np.array(self.lengths, dtype=np.float64)
-        # Beyond these, 1 / error is no finite number.
+        # Outside these limits, 1 / error is not finite.
         told = (error > 1e-300) & (error < 1e300)
         with np.errstate(divide="ignore"):
             confidence = np.where(length > 0, track_confidence(length, error), 1.0 / error)
@@ -139,8 +140,8 @@ def load_colmap(path: Path, model: Path) -> Capture:
     """Load a COLMAP capture; all its views are for training.
 
     Args:
-        path: the capture; its photos are in ``images/`` or, where that is missing, in itself, and
-            a photo's mask, where it has one, in ``masks/`` under its whole name and ``.png``.
+        path: the capture. Its photos are in ``images/`` or, if that is missing, in the capture
+            itself. The mask of a photo, if any, is ``masks/`` + its whole name + ``.png``.
         model: the folder with cameras, images and points3D, all ``.bin`` or all ``.txt``.
 
     Raises:
@@ -200,13 +201,13 @@ def _tracks(
     ids: list[int],
     xyz: np.ndarray,
 ) -> Tracks | None:
-    """Where the images see the points, whose COLMAP ids are ``ids``; None where none is seen."""
+    """Where the images see the points with these COLMAP ids; None if no point is seen."""
     number = np.array(ids, dtype=np.uint64).astype(np.int64)  # as those of the features wrap
     order = np.argsort(number, kind="stable")
     views, points, places = [], [], []
     for index, image in enumerate(sorted(images, key=lambda image: image.name)):
         at = order[np.searchsorted(number[order], image.point_ids).clip(0, len(ids) - 1)]
-        # Ids without a point are of features without one, or points that were taken out.
+        # An id without a point belongs to a feature without a point, or to a removed point.
         seen = (number[at] == image.point_ids) & (image.point_ids != -1)
         if not np.isfinite(image.places[seen]).all():
             raise IgsrError(
@@ -268,7 +269,7 @@ def _parameter_count(path: Path, camera_id: int, model: str) -> int:
 
 
 class _Bytes:
-    """A little-endian file read front to back; every read is checked against what is there."""
+    """A little-endian file read front to back; every read is checked against its length."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -449,7 +450,7 @@ def _text_points(path: Path) -> _ColmapPoints:
             continue
         try:
             identity, x, y, z, r, g, b, *rest = line.split()
-            # What other programs write may end here: the error is not known then.
+            # Files of other programs may end here; the error is then not known.
             error, track = float(rest[0]) if rest else math.nan, rest[1:]
             xyz, rgb = (float(x), float(y), float(z)), (int(r), int(g), int(b))
             if not (all(0 <= value <= 255 for value in rgb) and 0 <= int(identity) < 1 << 64):

@@ -1,9 +1,9 @@
-"""Captures described by ``transforms.json``: NeRF Synthetic, nerfstudio and instant-ngp.
+"""Read captures with a ``transforms.json``: NeRF Synthetic, nerfstudio and instant-ngp.
 
-The three share one layout, a list of frames with a camera-to-world matrix each, and differ in which
-fields they use; every camera field may stand in the frame or, for all frames, beside the list.
+The three share one layout: a list of frames with a camera-to-world matrix each. They differ in the
+fields they use. Every camera field may be in the frame or, for all frames, beside the list.
 
-This is the one place where OpenGL cameras (x right, y up, z back) become OpenCV cameras.
+Only this reader turns OpenGL cameras (x right, y up, z back) into OpenCV cameras.
 
 Sources: https://docs.nerf.studio/quickstart/data_conventions.html, the NeRF Synthetic data, and
 instant-ngp's ``docs/nerf_dataset_tips.md``.
@@ -26,11 +26,11 @@ from igsr.capture.types import Camera, Capture, intrinsic_matrix, nearest_rigid
 from igsr.capture.undistort import Lens
 from igsr.errors import IgsrError
 
-# nerfstudio draws no line between these: the coefficients say what the lens does.
+# nerfstudio does not distinguish these: the coefficients determine the lens.
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE",)
 
-# NeRF Synthetic leaves the suffix away.
+# NeRF Synthetic omits the suffix.
 _OMITTED_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -108,7 +108,7 @@ def _text(fields: dict[str, Any], key: str, where: str) -> str:
 
 
 def _is_unicode(text: str) -> bool:
-    # JSON can spell half a surrogate pair, which no file name and no terminal takes.
+    # JSON can hold half a surrogate pair, which no file name and no terminal can.
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -137,7 +137,7 @@ def _number(fields: dict[str, Any], key: str, where: str, default: float | None 
 
 
 def _frame_name(frame: dict[str, Any], path: Path, index: int) -> str:
-    """``file_path`` in one spelling, so that "./a.png" and "a.png" are the same frame."""
+    """``file_path``, normalized: "./a.png" and "a.png" are the same frame."""
     return posixpath.normpath(_text(frame, "file_path", f"{path}, frame {index}"))
 
 
@@ -225,7 +225,7 @@ def _lens(fields: dict[str, Any], where: str) -> Lens:
     k1, k2, k3, k4, p1, p2 = (
         _number(fields, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
     )
-    # A coefficient that is left out silently would bend the scene, so each must have a meaning.
+    # Ignoring a coefficient would bend the scene, so each must have a meaning.
     unused = {key: _number(fields, key, where, 0.0) for key in ("k5", "k6")}
     unused.update({"p1": p1, "p2": p2} if fisheye else {"k4": k4})
     for key, value in unused.items():
@@ -269,10 +269,10 @@ def _viewmat(matrix: Any, where: str) -> np.ndarray:
 def _named_splits(
     document: dict[str, Any], path: Path, frames: list[dict[str, Any]]
 ) -> dict[str, Split] | None:
-    """nerfstudio's lists as {frame name: split}, or None where the file has no such lists.
+    """nerfstudio's lists as {frame name: split}, or None if the file has no such lists.
 
-    Frames that ``val_filenames`` alone names are left out, as a ``transforms_val.json`` is. Frames
-    that no list names are for training if there is no ``train_filenames``, and left out otherwise.
+    Frames that only ``val_filenames`` names are ignored, as a ``transforms_val.json`` is. Frames
+    that no list names are for training if there is no ``train_filenames``, else ignored.
     """
     split_from_name: dict[str, Split] = {}
     if "train_filenames" not in document and "test_filenames" not in document:

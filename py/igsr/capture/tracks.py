@@ -1,4 +1,4 @@
-"""What points are worth by their tracks, and tracks of photos whose lens bends."""
+"""Confidence of points from their tracks, and tracks in undistorted photos."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from igsr.capture.undistort import Lens
 
 
 def track_confidence(length: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Confidence of points that many photos see in nearly one place.
+    """Confidence of points: length / (1 + error), high for points that many photos see precisely.
 
     Args:
-        length: number of photos that see each point.
-        error: its mean reprojection error, pixels.
+        length: [P], number of photos that see each point.
+        error: [P], its mean reprojection error in pixels.
+
+    Returns:
+        float64 [P].
     """
     return np.asarray(length / (1.0 + error))
 
@@ -21,20 +24,20 @@ def track_confidence(length: np.ndarray, error: np.ndarray) -> np.ndarray:
 def straightened(
     tracks: Tracks, xyz: np.ndarray, cameras: list[Camera], lenses: list[Lens | None]
 ) -> Tracks:
-    """Observations in pixels of the photos with lens distortion undone.
+    """Move observations from the photos as taken to the undistorted photos.
 
-    Lens models are explicit from the ray to the pixel alone. So each observation is moved by what
-    the lens does to its point: what it is off by, which is all that counts, stays as it was to
-    first order.
+    Lens models are explicit only from the ray to the pixel. So each observation is moved by the
+    distortion at its point's projection. Its reprojection error, which is all that counts, stays
+    the same to first order.
 
     Args:
-        tracks: in pixels of the photos as they were taken.
-        xyz: [P, 3], the points.
+        tracks: in pixels of the photos as taken.
+        xyz: float64 [P, 3], the points, world frame.
         cameras: pinhole, one for each of ``tracks.names``.
-        lenses: theirs; None bends nothing.
+        lenses: their lenses; None has no distortion.
 
     Returns:
-        Tracks without the observations of points behind their camera or beyond what its lens sees.
+        The tracks, without observations of points behind the camera or outside the lens's view.
     """
     xy = tracks.xy.copy()
     keep = np.ones(len(xy), dtype=bool)

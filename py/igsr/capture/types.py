@@ -98,7 +98,7 @@ class View(ArrayEquality, NotebookPicture):
             given for an image with alpha.
     """
 
-    pictures_by: ClassVar[str] = "igsr.capture.thumbnails:view_pictures"
+    _pictures_by: ClassVar[str] = "igsr.capture.thumbnails:view_pictures"
 
     name: str
     camera: Camera
@@ -262,7 +262,7 @@ class Capture(ArrayEquality, NotebookPicture):
         points: the point cloud, or None.
     """
 
-    pictures_by: ClassVar[str] = "igsr.capture.thumbnails:capture_pictures"
+    _pictures_by: ClassVar[str] = "igsr.capture.thumbnails:capture_pictures"
 
     path: Path
     views: list[View]

@@ -1,11 +1,11 @@
-"""Lens distortion undone at load: a distorted photo becomes a pinhole photo and a validity mask.
+"""Undistort photos: a distorted photo becomes a pinhole photo and a mask of its valid pixels.
 
-The pinhole camera keeps the distorted camera's own focal lengths, principal point and size. So the
-picture's middle keeps its resolution and no crop has to be chosen; what the lens saw outside this
-frame is dropped, and pixels of the frame that the lens did not see are masked.
+The pinhole camera keeps the focal lengths, principal point and size of the distorted camera. So the
+middle of the picture keeps its resolution, and no crop has to be chosen. What the lens saw outside
+this frame is dropped; pixels of the frame that the lens did not see are masked.
 
-Each pixel of the pinhole picture is sent through the lens model, which is explicit in this
-direction, and the photo is sampled there: no iteration, so no failure to converge.
+Each pixel of the pinhole picture goes through the lens model, which is explicit in this direction,
+and the photo is sampled there. Nothing is iterated, so nothing can fail to converge.
 
 Sources of the models: OpenCV ``calib3d`` (Brown-Conrady, rational and equidistant fisheye) and
 COLMAP's camera models, which agree with it.
@@ -20,13 +20,13 @@ import numpy as np
 
 from igsr.errors import IgsrError
 
-# Rows mapped at a time: bounds the float64 temporaries at a few MB whatever the photo's size.
+# Pixels mapped at a time: limits the float64 temporaries to a few MB for photos of any size.
 _BAND_PIXELS = 1 << 17
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The distortion of a lens, acting on normalised coordinates x / z, y / z.
+    """The distortion of a lens, which acts on normalized coordinates x / z, y / z.
 
     Perspective: radial factor (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), with
     ``radial`` = (k1, k2, k3), ``denominator`` = (k4, k5, k6), plus the tangential p1, p2.
@@ -41,20 +41,20 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """True where the lens bends nothing."""
+        """Whether the lens has no distortion."""
         return not self.fisheye and not any(self.radial + self.denominator + self.tangential)
 
-    @np.errstate(all="ignore")  # absurd coefficients overflow; what comes of it is not valid
+    @np.errstate(all="ignore")  # absurd coefficients overflow, and the result is not valid
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the lens puts a ray.
+        """Distort rays, given as normalized pinhole coordinates.
 
         Args:
-            x, y: float64 arrays of one shape, normalised pinhole coordinates.
+            x, y: float64 arrays of one shape, normalized pinhole coordinates.
 
         Returns:
-            x, y: float64, distorted normalised coordinates.
+            x, y: float64, distorted normalized coordinates.
             valid: bool, False beyond the radius where the model folds back on itself. There two
-                rays share a pixel and the polynomial says nothing of the real lens.
+                rays share a pixel, and the polynomial does not describe the real lens.
         """
         s = x * x + y * y
         numerator = np.polynomial.Polynomial((1.0, *self.radial))
@@ -165,9 +165,9 @@ class Undistorter:
         yield index + step_down + step_right, right * down
 
     def image(self, image: np.ndarray) -> np.ndarray:
-        """The pinhole picture of uint8 [H, W, 3 or 4]; 0 where it is not valid."""
+        """Undistort a photo, uint8 [H, W, 3 or 4]; pixels that are not valid become 0."""
         height, width, channels = image.shape
-        # A pixel fetched as one 32-bit word comes three times as fast as byte by byte.
+        # Fetching a pixel as one 32-bit word is three times as fast as byte by byte.
         padded = np.zeros((height, width, 4), dtype=np.uint8)
         padded[..., :channels] = image
         words = padded.view(np.uint32).ravel()
@@ -177,7 +177,7 @@ class Undistorter:
             for index, weight in self._taps(band):
                 pixels = words[index].view(np.uint8).reshape(*index.shape, 4)
                 if channels == 4:
-                    # Straight colours of transparent pixels mean nothing: weigh by alpha.
+                    # The colors of transparent pixels have no meaning: weight them by alpha.
                     weight = weight * pixels[..., 3]
                     mixed[..., 3] += weight
                 mixed[..., :3] += weight[..., None] * pixels[..., :3]
@@ -188,7 +188,7 @@ class Undistorter:
         return out
 
     def mask(self, mask: np.ndarray) -> np.ndarray:
-        """bool [H, W]: True where valid and no pixel that is masked out has part in the sample."""
+        """Undistort a mask, bool [H, W]: True where valid and sampled from unmasked pixels only."""
         flat = mask.ravel()
         out = self.valid.copy()
         for band in self._bands():

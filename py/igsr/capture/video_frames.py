@@ -14,20 +14,21 @@ from igsr.errors import IgsrError
 UInt8 = npt.NDArray[np.uint8]
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
-#: Pixels of a frame's longer side at which sharpness is judged: noise and codec blocks, which are
-#: finer, say nothing of it.
+#: Longer side, in pixels, of the reduced frame whose sharpness is measured: noise and codec blocks
+#: are finer than its pixels.
 _JUDGED = 480
 
 
 def sharpest_frames(path: Path, count: int) -> list[tuple[int, UInt8]]:
-    """Frames of a video: of as many equal spans of it, the sharpest from each one's middle half.
+    """The sharpest frame of each of ``count`` equal spans of a video.
 
-    So two frames are never nearer than half a span. Sharpness is the variance of the Laplacian
-    (Pech-Pacheco et al., ICPR 2000), which motion blur and defocus lower.
+    Only the middle half of a span counts, so two frames are at least half a span apart. Sharpness
+    is the variance of the Laplacian (Pech-Pacheco et al., ICPR 2000), which motion blur and
+    defocus lower.
 
     Args:
         path: the video.
-        count: how many, at least 1; a video of fewer frames gives all. A video that is damaged
+        count: number of frames, at least 1; a video with fewer frames gives all. A damaged video
             gives those of its readable part.
 
     Returns:
@@ -44,7 +45,7 @@ def sharpest_frames(path: Path, count: int) -> list[tuple[int, UInt8]]:
     for index, frame in enumerate(_decoded(path)):
         place = (index + 0.5) * spans / length
         span = int(place)
-        # Where spans are of a frame or two, their middle half may hold none.
+        # The middle half of a span of a frame or two may hold no frame.
         if span >= spans or (length >= 4 * spans and abs(place - span - 0.5) > 0.25):
             continue
         if span != in_span and best is not None:
@@ -62,7 +63,7 @@ def sharpest_frames(path: Path, count: int) -> list[tuple[int, UInt8]]:
 
 
 def _frame_count(path: Path) -> int:
-    """Frames as the file lists them; nothing is decoded."""
+    """The number of frames that the file lists, without decoding any."""
     import av
 
     try:
@@ -76,7 +77,7 @@ def _frame_count(path: Path) -> int:
 
 
 def _decoded(path: Path) -> Iterator[Any]:
-    """The frames in order, up to where the file is damaged."""
+    """The frames in order, up to the first damaged one."""
     import av
 
     try:

@@ -12,7 +12,7 @@ from igsr.capture.types import View
 
 
 def write_cameras(path: Path, views: Sequence[View]) -> None:
-    """Write the cameras of photos as nerfstudio's ``transforms.json`` has them.
+    """Write the cameras of photos in the format of nerfstudio's ``transforms.json``.
 
     One frame per photo: ``file_path`` (its name in the capture), ``w``, ``h``, ``fl_x``, ``fl_y``,
     ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes.

@@ -1,10 +1,10 @@
-"""Captures written as COLMAP writes them: ``sparse/0``, ``images/`` and ``masks/``.
+"""Write captures for COLMAP: ``sparse/0``, ``images/`` and ``masks/``.
 
-Cameras are PINHOLE. Of an image's features, only those of points are kept. A point with a track has
-the error that its confidence was made from (see ``track_confidence``; -1, as in COLMAP, where none
-is known); one without has its confidence as an error, 1 / confidence (0 where none is known).
+Cameras are PINHOLE. Of an image's features, only those of points are written. A point with a track
+gets the error that its confidence was made from (see ``track_confidence``; -1, as in COLMAP, if it
+is not known). A point without a track gets 1 / confidence as its error (0 if it is not known).
 ``load_capture`` reads both back. A mask has the photo's whole name and ``.png``, as COLMAP's
-feature extraction expects it.
+feature extraction expects.
 
 Source of the formats: https://colmap.github.io/format.html.
 """
@@ -37,20 +37,19 @@ def write_colmap(
     further_masks: Mapping[str, Sequence[np.ndarray | None]] | None = None,
     notes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a capture as a folder that COLMAP and all that read its models take.
+    """Write a capture as a folder for COLMAP and programs that read its models.
 
     Args:
-        capture: what to write. Which views are for training is not part of the format.
-        out: the folder; it must not be there or be empty.
+        capture: the capture to write. The format has no split into train and test views.
+        out: the folder; it must be new or empty.
         text: write ``.txt`` files instead of ``.bin``.
-        replace: a folder that is there is replaced once the new one is whole.
-        further_masks: by the name of a folder for them: per view bool [h, w] of any size, which is
-            brought to the photo's, or None. They are for other programs; ``load_capture`` reads
-            ``masks`` alone.
-        notes: further text files, by name.
+        replace: replace an existing folder, once the new one is complete.
+        further_masks: more masks, by the name of their folder: per view bool [h, w] of any size,
+            which is resized to the photo's, or None. ``load_capture`` does not read them.
+        notes: texts of further files, by file name.
 
     Raises:
-        IgsrError: the folder is there and holds something, or cannot be written.
+        IgsrError: the folder is not empty, or cannot be written.
     """
     names = png_names(capture.views)
     with atomic_folder(out, replace=replace) as folder:

@@ -1,4 +1,4 @@
-"""The photos and masks of a capture as files, whatever the format that describes their cameras."""
+"""Write the photos and masks of a capture; every format of cameras shares this."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from igsr.capture.types import View
 
 
 def relative_name(name: str) -> PurePosixPath:
-    """A view's name as a relative path that cannot leave the folder it is joined to.
+    """A view's name as a relative path that stays inside the folder it is joined to.
 
-    What cannot be printed, such as line breaks, which text formats end a name with, becomes "_".
+    Characters that cannot be printed become "_": a line break would end a name in text formats.
     """
     name = "".join(letter if letter.isprintable() else "_" for letter in name)
     parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..", ".")]
@@ -24,7 +24,7 @@ def relative_name(name: str) -> PurePosixPath:
 
 
 def png_names(views: list[View]) -> list[str]:
-    """A ``.png`` name for each view, all different; a leading ``images/`` is left away."""
+    """A unique ``.png`` name for each view, without a leading ``images/``."""
     names: list[str] = []
     for view in views:
         path = relative_name(view.name)
@@ -42,12 +42,12 @@ def png_names(views: list[View]) -> list[str]:
 def write_pictures(
     folder: Path, views: list[View], names: list[str], mask_name: Callable[[str], str]
 ) -> None:
-    """Write ``images/`` and, where views have them, ``masks/`` into a folder; all are PNG.
+    """Write ``images/`` and, if views have masks, ``masks/`` into a folder, all as PNG.
 
     Args:
-        folder: the capture's.
-        views: what to write.
-        names: of ``png_names``.
+        folder: folder of the capture.
+        views: the views to write.
+        names: their file names, from ``png_names``.
         mask_name: gives the mask's name in ``masks/``, from the photo's in ``images/``.
     """
 
@@ -61,7 +61,7 @@ def write_pictures(
 
 
 def save_png(path: Path, pixels: np.ndarray) -> None:
-    """Write uint8 [H, W], [H, W, 3] or [H, W, 4]; its folder is made."""
+    """Write uint8 [H, W], [H, W, 3] or [H, W, 4]; the folder is made if it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Photos compress hardly better at the highest level, and take ten times as long.
+    # The highest level takes ten times as long and makes photos hardly smaller.
     Image.fromarray(pixels).save(path, compress_level=3)

@@ -1,4 +1,4 @@
-"""Captures written as nerfstudio has them: ``transforms.json`` with cameras in OpenGL axes."""
+"""Write captures for nerfstudio: ``transforms.json`` with cameras in OpenGL axes."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def write_transforms(
     """Write ``transforms.json``, ``images/``, ``masks/`` and ``points.ply`` into a folder.
 
     Args:
-        capture: what to write; which views are for training is kept where any is for testing.
-        out: the folder; it must not be there or be empty.
-        replace: a folder that is there is replaced once the new one is whole.
+        capture: the capture to write. The split is written if any view is for testing.
+        out: the folder; it must be new or empty.
+        replace: replace an existing folder, once the new one is complete.
 
     Raises:
-        IgsrError: the folder is there and holds something, or cannot be written.
+        IgsrError: the folder is not empty, or cannot be written.
     """
     names = png_names(capture.views)
     frames = []

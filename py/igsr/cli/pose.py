@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ from igsr.cli.shared import (
 from igsr.errors import IgsrError
 from igsr.pose import AUTO, capture_of, estimate, found_before, kept_cameras, photos_note, photos_of
 from igsr.pose.registry import ESTIMATORS
+
+logger = logging.getLogger(__name__)
 
 FramesOption = Annotated[
     int, typer.Option("--frames", help="Number of frames taken from each video.")
@@ -196,6 +199,7 @@ def _posed(
     from igsr.pose.plot_poses import plot_poses
 
     loaded = photos_of(photos, finder.frames)
+    logger.info("finding the cameras of %d photos with estimator %s", len(loaded), finder.estimator)
     with _pose_bar(shown) as show:
         name, found = estimate(
             loaded, finder.estimator, seed=finder.seed, progress=show, **finder.options

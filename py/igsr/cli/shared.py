@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import logging
 import sys
 import time
 from collections.abc import Iterator
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from igsr.capture import Capture
     from igsr.evaluation import ScoredView, Scores
     from igsr.splats import Splats
+
+logger = logging.getLogger(__name__)
 
 # The names that these had before.
 one_sentence = error_messages
@@ -133,7 +136,9 @@ def resolved(backend: BackendChoice | FitBackendChoice) -> ResolvedBackend:
     """
     from igsr import _core
 
-    return _core.resolve_backend(backend.value)
+    name = _core.resolve_backend(backend.value)
+    logger.info("backend %s: %s", name, _core.backend_info(name)["device"])
+    return name
 
 
 def background_color(text: str | None) -> tuple[float, float, float] | None:

@@ -1,4 +1,4 @@
-"""Scores of splats on the photos of a capture: metrics, held-out scores, contact sheets."""
+"""Evaluation: score splats on held-out photos; metrics and contact sheets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit leaves beside its splats: ``report.json``, ``cameras.json``, ``views.png``."""
+"""Contact sheets: photos, renders and errors of a few views in one picture."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from PIL import Image, ImageDraw, ImageFont
 from igsr._internal.atomic_write import atomic_write
 from igsr.evaluation.scores import ScoredView
 
-#: Views on a contact sheet: enough to judge a scene, few enough to look at.
+#: Most views on a contact sheet.
 MAX_SHEET_VIEWS = 8
-#: An absolute error of this size (of 1) is drawn white; small errors are what is looked for.
+#: An absolute error of this size (of 1) is drawn white, so that small errors show.
 ERROR_WHITE = 0.25
 #: Longest side of one picture on the sheet, pixels.
 PANEL_SIDE = 360

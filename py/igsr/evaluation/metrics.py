@@ -1,9 +1,9 @@
 """Image metrics: PSNR, SSIM, MS-SSIM and FLIP between a render and its photo.
 
-Every function takes two uint8 pictures [H, W, 3], sRGB-encoded, as a user would see them: scores
-are of the 8-bit image, not of the renderer's floats. ``mask`` ([H, W] bool, True = counts) limits
-the score to a part of the picture; both pictures are set to black outside it first, so that
-windows reaching over its edge see the same there.
+Every function takes two uint8 pictures [H, W, 3], sRGB-encoded: the 8-bit picture is scored, not
+the renderer's floats. ``mask`` (bool [H, W], True for pixels that count) limits the score to a
+part of the picture. Both pictures are set to black outside it first, so that windows over its edge
+see the same in both.
 """
 
 from __future__ import annotations

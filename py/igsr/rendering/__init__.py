@@ -1,4 +1,4 @@
-"""Splats to pictures: ``render`` for numpy, ``rasterization`` for torch, videos."""
+"""Rendering: ``render`` for numpy, ``rasterization`` for torch, normals, videos."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The normal of each splat: its shortest axis, turned to face the camera."""
+"""Normals of splats: the shortest axis of each, turned to face the camera."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from torch import Tensor
 def facing_normals(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, drawn: Tensor
 ) -> Tensor:
-    """Unit normals [N, 3] in the world frame, zero where ``drawn`` [N] (bool) is False.
+    """The normal of each splat.
+
+    The gradient reaches ``quats``. The choice of the axis and of its sign has no gradient.
 
     Args:
         means: [N, 3] centres, world frame.
@@ -17,9 +19,10 @@ def facing_normals(
         scales: [N, 3] standard deviations along the splat's axes; of equal ones the first counts
             as the shortest.
         viewmat: [4, 4] world-to-camera.
-        drawn: what is not drawn may hold any value, NaN too, and takes part in nothing.
+        drawn: bool [N]; splats that are not drawn may have any values, NaN too.
 
-    The gradient reaches ``quats``; which axis is shortest and which way it faces are decisions.
+    Returns:
+        [N, 3] unit normals in the world frame, zero for splats that are not drawn.
     """
     # Before anything is computed: 0 x NaN in a backward pass would be NaN.
     upright = quats.new_tensor([1.0, 0.0, 0.0, 0.0])

@@ -33,7 +33,7 @@ class Render(ArrayEquality, NotebookPicture):
             multiplied up, which is more precise than 1 - alpha.
     """
 
-    pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:render_pictures"
+    _pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:render_pictures"
 
     color: FloatArray
     alpha: FloatArray
