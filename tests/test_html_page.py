@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,10 @@ import scenes
 from PIL import Image
 
 import igsr
+from igsr.refinement.html_page import write_page
+from igsr.refinement.report import report_of
+from igsr.refinement.results import Refined, Stop, StopReason
+from igsr.refinement.settings import RefineSettings
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: As the page's script draws photos' cameras and those of added views.
@@ -47,9 +53,28 @@ def near(pixels, color):
 
 def test_a_browser_shows_it(report, tmp_path):
     pixels = shown(report, tmp_path / "page.png")
-    assert near(pixels, PHOTOS) > 100
-    assert near(pixels, ADDED) > 100
     broken = tmp_path / "broken.html"
     broken.write_text(report.read_text().replace("function draw()", "function other()"))
-    pixels = shown(broken, tmp_path / "broken.png")
-    assert near(pixels, PHOTOS) < 100, "else the test would pass without the script"
+    without = shown(broken, tmp_path / "broken.png")
+    for color in (PHOTOS, ADDED):  # the legend has them too
+        assert near(pixels, color) > near(without, color) + 100
+
+
+def test_text_is_escaped(tmp_path):
+    name = '"><script>alert("photo")</script>\udcff.png'
+    made = scenes.capture(views=4, size=16)
+    views = [replace(view, name=f"{k}{name}") for k, view in enumerate(made.views)]
+    capture = igsr.Capture(Path("a<b>&c"), views)
+    splats = scenes.splats()
+    stop = Stop(StopReason.NO_NOVEL_VIEW)
+    refined = Refined(splats, splats, None, capture, [], stop, [], {"fit": 1.0})
+    report = report_of(refined, RefineSettings(backend="cpu"))
+    report["not_registered"] = ["<i>lost</i>.png"]
+    write_page(tmp_path / "report.html", refined, report)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "alert(" in page
+    for unsafe in ('"photo"', "a<b>", "<i>", "<script>alert"):
+        assert unsafe not in page
+    assert "a&lt;b&gt;&amp;c" in page
+    assert "&lt;i&gt;lost&lt;/i&gt;.png" in page
+    assert "there is no novel view near the photos" in page

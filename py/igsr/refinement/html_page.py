@@ -116,7 +116,7 @@ def _score_rows(refined: Refined) -> list[dict[str, Any]]:
         else:
             rows.append(_score_row(f"{number}, not cross-validated", {}, splats))
         if done.test:
-            rows.append(_score_row(f"{number}, test views (decide nothing)", done.test, splats))
+            rows.append(_score_row(f"{number}, test views", done.test, splats))
     return rows
 
 
@@ -151,8 +151,8 @@ def _rejected(views: Sequence[Rejected]) -> list[dict[str, Any]]:
 
 
 def _place(view: NovelView) -> str:
-    where = "between" if view.between else "beyond"
-    return f"{view.angle:.0f}° from the nearest known camera, {where} known cameras"
+    where = "between two" if view.between else "outward"
+    return f"{view.angle:.0f}° from the nearest known camera, {where}"
 
 
 def _cameras(refined: Refined) -> list[tuple[int, list[list[float]]]]:
