@@ -257,7 +257,9 @@ fn photo_and_picture(seed: u64) -> (Target, Image<f64>) {
         height,
         channels,
         pixels: (0..pixels * channels as usize).map(|_| rng.random()).collect(),
-        weights: (seed % 3 == 0).then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect()),
+        weights: seed
+            .is_multiple_of(3)
+            .then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect()),
         background: None,
         turns: 1,
         until: None,
