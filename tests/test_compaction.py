@@ -321,7 +321,6 @@ def test_command_writes_scene_curve_and_plot(igsr_here, tmp_path):
         (["--out", "smaller.json"], ["--out", ".ply"]),
         (["--holdout", "8"], ["--holdout", "--capture"]),
         (["--steps", "0"], ["steps"]),
-        (["--backend", "reference"], ["reference", "cpu"]),
     ],
 )
 def test_command_refuses_in_one_sentence(igsr_here, tmp_path, options, words):

@@ -225,8 +225,10 @@ def test_code_blocks_run(page: str, world: Path, capsys: pytest.CaptureFixture[s
     for block in documentation.blocks(page):
         if block.not_run or block.language == "text":
             continue
-        assert block.language in {"sh", "python"}, f"{block.place}: say which language this is"
-        if block.language == "python":
+        assert block.language in {"sh", "python", "json"}, f"{block.place}: name its language"
+        if block.language == "json":
+            json.loads(block.code)
+        elif block.language == "python":
             exec(compile(block.code, block.place, "exec"), names)
         else:
             for words in documentation.commands(block.code):

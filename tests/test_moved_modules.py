@@ -21,6 +21,7 @@ OLD_NAMES = {
     "igsr.checkpoint": "load_checkpoint save_checkpoint",
     "igsr.compaction.plot": "write_plot",
     "igsr.compaction.refinement": "chosen fresh_state refined splats_of with_sh_degree",
+    "igsr.compaction.yardstick": "Verdict Yardstick loss_of_change own_yardstick photo_yardstick",
     "igsr.denoiser.losses": "Discriminator Loss Prediction charbonnier error_likelihood "
     "perceptual perceptual_ratio regret squared_ratio "
     "structure_ratio",
@@ -60,7 +61,7 @@ OLD_NAMES = {
     "run_cleaning run_fit scenes_in",
     "igsr.study.refinement_protocols": "refinement_ablation sweep table2 table3",
     "igsr.study.refinement_tables": "plot_rounds summarized write_table",
-    "igsr.study.refinements": "Given Refinement Rounds run_refinement split studied",
+    "igsr.study.refinements": "Given Refinement Rounds run_refinement split",
     "igsr.study.runs": "Run file_hash finished_runs folder_hash",
     "igsr.study.views": "dtu_views llff_views localized scattered spread_out with_train_views",
     "igsr.video": "write_video",

@@ -11,6 +11,7 @@ from typing import Any, get_args
 from typer.main import get_command
 
 from igsr.cli import app
+from igsr.cli.lazy_group import LazyGroup
 
 
 def commands_markdown() -> str:
@@ -24,7 +25,8 @@ def walk() -> Iterator[tuple[str, Any]]:
     def below(name: str, command: Any) -> Iterator[tuple[str, Any]]:
         if name != "igsr":
             yield name, command
-        for member, inner in getattr(command, "commands", {}).items():
+        members = command.loaded() if isinstance(command, LazyGroup) else None
+        for member, inner in (members or getattr(command, "commands", {})).items():
             if not inner.hidden:
                 yield from below(f"{name} {member}", inner)
 

@@ -25,6 +25,7 @@ MOVED: dict[str, tuple[str, ...]] = {
     "igsr.checkpoint": ("igsr.fitting.checkpoint",),
     "igsr.compaction.plot": ("igsr.compaction.plot_curve",),
     "igsr.compaction.refinement": ("igsr.compaction.finetuning",),
+    "igsr.compaction.yardstick": ("igsr.compaction.validation",),
     "igsr.denoiser.losses": ("igsr.denoiser.training.losses",),
     "igsr.denoiser.pair_files": ("igsr.denoiser.training.pair_files",),
     "igsr.denoiser.pair_renders": ("igsr.denoiser.training.pair_renders",),
@@ -76,7 +77,7 @@ MOVED: dict[str, tuple[str, ...]] = {
     ),
     "igsr.study.refinement_protocols": ("igsr.study.loop_protocols",),
     "igsr.study.refinement_tables": ("igsr.study.loop_tables",),
-    "igsr.study.refinements": ("igsr.study.loop_runs",),
+    "igsr.study.refinements": ("igsr.study.loop_runs", "igsr.study.loop_methods"),
     "igsr.study.runs": ("igsr._internal.resumable_jobs",),
     "igsr.study.views": ("igsr.study.splits",),
     "igsr.video": ("igsr.rendering.video",),
@@ -85,6 +86,16 @@ MOVED: dict[str, tuple[str, ...]] = {
 }
 #: Functions that have another name now, by module and old name.
 RENAMED = {
+    ("igsr.camera_holds", "CameraHolds"): "PosePriors",
+    ("igsr.camera_holds", "camera_holds"): "pose_priors",
+    ("igsr.compaction.refinement", "chosen"): "subset",
+    ("igsr.compaction.yardstick", "Verdict"): "ValidationScore",
+    ("igsr.compaction.yardstick", "Yardstick"): "Validation",
+    ("igsr.compaction.yardstick", "own_yardstick"): "self_validation",
+    ("igsr.compaction.yardstick", "photo_yardstick"): "photo_validation",
+    ("igsr.study.refinements", "Given"): "StudySpec",
+    ("igsr.study.refinements", "Refinement"): "RunSpec",
+    ("igsr.study.refinements", "Rounds"): "Method",
     ("igsr.initialization", "looked_at"): "focus_point",
     ("igsr.report", "write_report"): "write_json",
     ("igsr.study.poor_fits", "PoorFit"): "DegradedFit",

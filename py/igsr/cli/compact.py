@@ -146,7 +146,7 @@ def _decibels(option: str, text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 < value < 100.0:
-        raise IgsrError(f"{option} must be from 0 to 100 dB, such as 0.1dB, not {text!r}.")
+        raise IgsrError(f"{option} must be above 0 and below 100 dB, such as 0.1dB, not {text!r}.")
     return value
 
 

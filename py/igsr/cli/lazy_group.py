@@ -43,6 +43,10 @@ class LazyGroup(TyperGroup):
         }
         self.commands = stand_ins
 
+    def loaded(self) -> dict[str, Any]:
+        """Import all commands; by name, in the order of the table."""
+        return {name: load_command(name, entry) for name, entry in self.table.items()}
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that ``args`` names and import it; see ``TyperGroup``."""
         name, command, rest = super().resolve_command(ctx, args)

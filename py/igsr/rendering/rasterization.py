@@ -298,9 +298,10 @@ def rasterization(
             cost a whole pass over the 2D splats.
         viewmats: [C, 4, 4] rigid world-to-camera matrices, OpenCV axes.
         Ks: [C, 3, 3] pinhole matrices in pixels without skew; pixel centres at +0.5.
-        width, height: picture size in pixels.
-        near_plane, far_plane: world units; splats whose centre has a camera-space z outside are
-            not drawn. far_plane may be inf.
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+        near_plane: world units; splats whose centre has a camera-space z below it are not drawn.
+        far_plane: likewise above it; may be inf.
         radius_clip: splats whose ``radii`` are both at most this many pixels are not drawn.
         eps2d: variance in square pixels added to every projected Gaussian.
         sh_degree: spherical-harmonics degree to evaluate, 0-4, or None for direct colors.
@@ -325,12 +326,31 @@ def rasterization(
             depth and normal are 0, and it passes no gradient to the splats and the camera. These
             are the tile masks of gsplat's ``rasterize_to_pixels``, per pixel; they save no time.
         render_normals: True adds ``meta["render_normals"]``.
-        tile_size, sparse_grad, distributed, camera_model, segmented, covars, with_ut, with_eval3d,
-            radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter,
-            viewmats_rs: gsplat 1.5's, accepted at their defaults only.
-        macro_tile, return_normals, global_z_order, rays, lidar_coeffs, external_distortion_coeffs,
-            ut_params, extra_signals, extra_signals_sh_degree, renderer_config, nht_params: of
-            gsplat's development branch, accepted at their defaults only.
+        tile_size: of gsplat 1.5; only its default is accepted.
+        sparse_grad: of gsplat 1.5; only its default is accepted.
+        distributed: of gsplat 1.5; only its default is accepted.
+        camera_model: of gsplat 1.5; only its default is accepted.
+        segmented: of gsplat 1.5; only its default is accepted.
+        covars: of gsplat 1.5; only its default is accepted.
+        with_ut: of gsplat 1.5; only its default is accepted.
+        with_eval3d: of gsplat 1.5; only its default is accepted.
+        radial_coeffs: of gsplat 1.5; only its default is accepted.
+        tangential_coeffs: of gsplat 1.5; only its default is accepted.
+        thin_prism_coeffs: of gsplat 1.5; only its default is accepted.
+        ftheta_coeffs: of gsplat 1.5; only its default is accepted.
+        rolling_shutter: of gsplat 1.5; only its default is accepted.
+        viewmats_rs: of gsplat 1.5; only its default is accepted.
+        macro_tile: of gsplat's development branch; only its default is accepted.
+        return_normals: of gsplat's development branch; only its default is accepted.
+        global_z_order: of gsplat's development branch; only its default is accepted.
+        rays: of gsplat's development branch; only its default is accepted.
+        lidar_coeffs: of gsplat's development branch; only its default is accepted.
+        external_distortion_coeffs: of gsplat's development branch; only its default is accepted.
+        ut_params: of gsplat's development branch; only its default is accepted.
+        extra_signals: of gsplat's development branch; only its default is accepted.
+        extra_signals_sh_degree: of gsplat's development branch; only its default is accepted.
+        renderer_config: of gsplat's development branch; only its default is accepted.
+        nht_params: of gsplat's development branch; only its default is accepted.
 
     Returns:
         ``render_colors`` [C, height, width, X] with X = D, 1 or D + 1 by ``render_mode``,
