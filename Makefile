@@ -1,5 +1,6 @@
 # make demo   sets everything up and makes a scene of eight photos of the example capture
-# make test   sets everything up and runs every check
+# make test   sets everything up and runs the checks: about ten minutes on two cores once built
+# make test-long   runs the tests that take longer
 # make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
 # make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
 # make docs   builds the documentation site into out/docs
@@ -14,11 +15,9 @@ EXAMPLE := examples/tea_table
 VENV := .venv
 BIN := $(VENV)/bin
 
-# One profile everywhere, so that each dependency is compiled once; our own crate's tests run with
-# its assertions and overflow checks on.
+# What Python loads is a release build. Rust tests have the profile of plain `cargo test`: optimised,
+# with assertions and overflow checks.
 PROFILE := --release
-CHECKED := --config profile.release.package.splat_render.debug-assertions=true \
-	--config profile.release.package.splat_render.overflow-checks=true
 # The interpreter that maturin builds against: with another one, pyo3 would be compiled twice.
 export PYO3_PYTHON := $(CURDIR)/$(BIN)/python
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -26,7 +25,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test fuzz bench accuracy docs profile build wheel check-rust check-python vulkan display browser \
+.PHONY: demo test test-long fuzz bench accuracy docs profile build wheel check-rust check-python vulkan display browser \
 	example-capture clean
 .DELETE_ON_ERROR:
 
@@ -89,16 +88,22 @@ example-capture: build
 
 test: check-rust check-python
 
+test-long: build vulkan browser $(VENV)/.dev-ready
+	$(PYTEST) -m long
+
+# A process of tests per core. Each has one torch thread: more of them wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
+
 check-rust: build vulkan display
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy $(PROFILE) --locked --workspace --all-targets -- -D warnings
-	$(CARGO) test $(PROFILE) $(CHECKED) --locked --workspace
+	$(CARGO) test
 
 # The same seeded changes as in make test, and more of them. cargo-fuzz would need a nightly compiler.
 CASES ?= 100000
 
 fuzz:
-	IGSR_FUZZ_CASES=$(CASES) $(CARGO) test $(PROFILE) $(CHECKED) --locked --package splat_render \
+	IGSR_FUZZ_CASES=$(CASES) $(CARGO) test --locked --package splat_render \
 		--test formats mutations -- --nocapture
 
 check-python: build vulkan browser $(VENV)/.dev-ready
@@ -106,7 +111,7 @@ check-python: build vulkan browser $(VENV)/.dev-ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 # The GPU kernels are tested on whatever device answers; where none does, on Mesa's software one.
 VULKAN_ANSWERS := $(BIN)/python -c 'from igsr import _core; print("GPU tests run on", _core.backend_info("gpu")["device"])'
