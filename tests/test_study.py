@@ -234,7 +234,7 @@ def test_presets_that_move_cameras_are_scored_refined_too(real, monkeypatch):
 def test_what_a_mask_hides_in_a_scored_photo_changes_no_score(real, monkeypatch):
     from igsr.fitting import presets
 
-    monkeypatch.setattr(presets, "_3DGS", SHORT)
+    monkeypatch.setattr(presets, "_3DGS_FEW", SHORT)
     mask = np.zeros((16, 16), dtype=bool)
     mask[3:13, 4:14] = True
 
