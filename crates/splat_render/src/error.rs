@@ -1,6 +1,6 @@
-//! The one error type: each variant is one sentence that names the culprit and the mend.
+//! The one error type: each message names the argument, device or file, and how to mend it.
 
-/// What can go wrong, in one sentence each.
+/// What can go wrong; each displays as one message.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// An argument has a wrong shape, size or value.

@@ -1,9 +1,24 @@
-//! Differentiable Gaussian splatting: one set of stages, three implementations.
+//! A differentiable renderer of Gaussian splats and a fitter of them to photos.
 //!
-//! `project -> bin -> rasterize -> rasterize_backward -> project_backward` exist as
-//! [`reference`] (f64, plain, the oracle), [`cpu`] (f32, SIMD, threads) and [`gpu`] (WGSL through
-//! wgpu). A stage has the same name and file name in each. [`fit`] optimises splats to photos with
-//! either of the last two.
+//! Every stage exists three times, under one name and in files of one name: in [`reference`] (f64,
+//! plain, what the others are tested against), [`cpu`] (f32, SIMD, threads) and [`gpu`] (WGSL compute
+//! kernels through wgpu). They share the trait [`Stages`]:
+//!
+//! | stage | from | to |
+//! |---|---|---|
+//! | project | splats ([`SplatParams`]), [`Camera`] | 2D splats ([`Projected`]) |
+//! | bin | 2D splats | lists of splats per tile, inside the two rasterize stages |
+//! | rasterize | 2D splats, background | [`Image`]: colour, alpha, depth |
+//! | loss | image, photo ([`target::Target`]) | L1 and D-SSIM, and the image's gradient |
+//! | rasterize_backward | the image's gradient | gradients of the 2D splats |
+//! | project_backward | gradients of the 2D splats | gradients of splats and camera |
+//! | adam | gradients of the splats | splats after one optimiser step |
+//!
+//! [`fit`] runs them in a loop on a [`fit::FitDevice`], which keeps splats and photos where its kernels
+//! run. [`io`] reads and writes files of splats and pictures.
+//!
+//! Frames: the world is the scene's own, less an f64 origin that its files keep; cameras are OpenCV's
+//! (x right, y down, z forward), pixel centres at +0.5. Errors are [`Error`].
 
 pub mod camera;
 pub mod constants;

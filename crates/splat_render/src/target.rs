@@ -1,10 +1,10 @@
-//! Photos to fit to.
+//! Photos to fit to, with what each counts in the loss.
 
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 
-/// One photo to fit to.
+/// One photo to fit to: 8-bit pixels, optional alpha and weights, and when the fit uses it.
 #[derive(Debug, Clone)]
 pub struct Target {
     /// Width in pixels.
@@ -18,8 +18,8 @@ pub struct Target {
     /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere. The loss is a mean over
     /// the pixels whose weight is not 0: a photo of small weights counts less than others.
     pub weights: Option<Vec<f32>>,
-    /// RGB in 0..=1 that stood behind what an image without alpha shows, where that is known: it is
-    /// compared to renders over it.
+    /// RGB in 0..=1 of the background in a photo without alpha, where it is known: renders are
+    /// compared over it.
     pub background: Option<[f32; 3]>,
     /// How many steps of a round are of it, at least 1.
     pub turns: u32,
@@ -59,7 +59,10 @@ impl Weight {
 }
 
 impl Target {
-    /// Checks sizes; `index` names the photo in the error.
+    /// Checks sizes and values; `index` names the photo in the error.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] that names `images[index]`.
     pub fn validate(&self, index: usize) -> Result<()> {
         let pixels = self.width as usize * self.height as usize;
         let bad = |reason: String| Err(Error::argument(format!("images[{index}]"), reason));
@@ -73,7 +76,7 @@ impl Target {
             return bad("does not hold width x height pixels".into());
         }
         if self.background.is_some_and(|color| color.iter().any(|c| !(0.0..=1.0).contains(c))) {
-            return bad("stood before a background that does not lie in 0..=1".into());
+            return bad("has a background that does not lie in 0..=1".into());
         }
         if self.turns == 0 {
             return bad("has no turn; give at least one".into());

@@ -315,3 +315,13 @@ fn bad_arguments_are_named() {
     let degree = FitConfig { sh_degree: 2, ..good };
     assert!(build(targets, cameras, &state, degree).contains("SH degree"));
 }
+
+#[test]
+fn frozen_steps_keep_the_moments() {
+    common::agreement::frozen_steps_keep_the_moments(&mut CpuFit::default());
+}
+
+#[test]
+fn senseless_steps_are_refused() {
+    common::agreement::senseless_steps_are_refused(&mut CpuFit::default());
+}

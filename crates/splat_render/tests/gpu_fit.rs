@@ -338,3 +338,13 @@ fn steps_allocate_nothing_and_memory_grows_as_stated() {
     println!("{per_splat:.1} bytes per splat, stated {stated}");
     assert!(per_splat <= stated + 2.0, "{per_splat} bytes per splat, stated {stated}");
 }
+
+#[test]
+fn frozen_steps_keep_the_moments() {
+    common::agreement::frozen_steps_keep_the_moments(&mut GpuFit::new(shared()));
+}
+
+#[test]
+fn senseless_steps_are_refused() {
+    common::agreement::senseless_steps_are_refused(&mut GpuFit::new(shared()));
+}

@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use common::conformance::{Bounds, OPTIONS, end_to_end, project_stages, rasterize_stages};
 use common::*;
 use rand::Rng;
-use splat_render::gpu::{Gpu, ResidentPicture, ResidentSplats};
+use splat_render::gpu::{Gpu, ResidentPicture, ResidentSplats, ResidentView};
 use splat_render::reference::Reference;
 use splat_render::stages::{ImageGradients, Projected};
 use splat_render::{Camera, ProjectOptions, Stages};
@@ -155,7 +155,8 @@ fn resident_picture(
     let mut encoder = gpu.device().create_command_encoder(&Default::default());
     let bytes = 16 * u64::from(columns.end - columns.start) * u64::from(camera.height);
     let (options, none) = (ProjectOptions::default(), [const { None }; 4]);
-    picture.record(gpu, &mut encoder, splats, camera, &options, 2, columns, none)?;
+    let view = ResidentView { camera, options: &options, sh_degree: 2 };
+    picture.record(gpu, &mut encoder, splats, &view, columns, none)?;
     let readable = gpu.readable(bytes);
     encoder.copy_buffer_to_buffer(picture.picture(), 0, &readable, 0, bytes);
     gpu.queue().submit([encoder.finish()]);
@@ -199,6 +200,9 @@ fn resident_pictures_are_those_of_the_stages() {
             let error = draw(&large, columns).unwrap_err().to_string();
             assert!(error.starts_with("columns: "), "{error}");
         }
+        let nowhere = Camera { fx: f64::NAN, ..large };
+        let error = draw(&nowhere, 0..5).unwrap_err().to_string();
+        assert!(error.starts_with("K: "), "{error}");
     }
 }
 

@@ -2,7 +2,7 @@
 //! quad, back to front.
 
 use bytemuck::{Pod, Zeroable};
-use splat_render::gpu::{Gpu, ResidentSplats, shared_wgsl};
+use splat_render::gpu::{Gpu, ResidentSplats, ResidentView, shared_wgsl};
 use splat_render::io::SplatFile;
 use splat_render::{Camera, ProjectOptions, Result};
 
@@ -112,12 +112,12 @@ impl Blending {
         stamps: &Stamps<'_>,
     ) -> Result<()> {
         let (camera, options) = model.seen_from(camera, settings);
+        let seen =
+            ResidentView { camera: &camera, options: &options, sh_degree: settings.sh_degree };
         model.resident.record(
             gpu,
             encoder,
-            &camera,
-            &options,
-            settings.sh_degree,
+            &seen,
             [stamps.compute(PROJECT), stamps.compute(SORT)],
         )?;
         let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);

@@ -1,7 +1,7 @@
 //! Draws splats onto a canvas with the renderer's rasterizer. The picture stays on the device.
 
 use bytemuck::{Pod, Zeroable};
-use splat_render::gpu::{Gpu, ResidentPicture};
+use splat_render::gpu::{Gpu, ResidentPicture, ResidentView};
 use splat_render::{Camera, Result};
 
 use crate::blending::{CANVAS, Drawable};
@@ -70,13 +70,13 @@ impl Rasterizing {
     ) -> Result<()> {
         let (camera, options) = model.seen_from(camera, settings);
         let mut encoder = gpu.device().create_command_encoder(&Default::default());
+        let seen =
+            ResidentView { camera: &camera, options: &options, sh_degree: settings.sh_degree };
         buffers.picture.record(
             gpu,
             &mut encoder,
             model.splats(),
-            &camera,
-            &options,
-            settings.sh_degree,
+            &seen,
             begin..end,
             [PROJECT, SORT, BIN, RASTERIZE].map(|stage| stamps.compute(stage)),
         )?;

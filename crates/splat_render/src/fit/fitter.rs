@@ -45,7 +45,7 @@ pub struct Fitter {
     /// The cameras, where they are fitted; `cameras` follows them.
     moving: Option<Cameras>,
     has_alpha: Vec<bool>,
-    /// What stood behind each picture, where that is known.
+    /// Each photo's own background, where that is known.
     behind: Vec<Option<[f32; 3]>>,
     hull: Option<Hull>,
     extent: f32,
@@ -186,12 +186,20 @@ impl Fitter {
         }))
     }
 
-    /// Holds cameras that are fitted by what else is known of them; before anything else.
+    /// [`Fitter::set_pose_priors`] under its first name.
     pub fn hold_cameras(&mut self, holds: Vec<PosePrior>) -> Result<()> {
+        self.set_pose_priors(holds)
+    }
+
+    /// Sets the pose priors of the cameras that are fitted, one for each; before anything else.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] if cameras are not fitted, or the priors are not one per camera.
+    pub fn set_pose_priors(&mut self, priors: Vec<PosePrior>) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("holds", "are of cameras that are not fitted"));
         };
-        cameras.hold(holds)
+        cameras.set_pose_priors(priors)
     }
 
     /// Goes on with cameras where another fit's had come to.

@@ -119,7 +119,7 @@ mod tests {
         splats.means = vec![[-0.5, 0.0, 1.0], [0.5, 0.0, 1.0], [f32::NAN; 3]];
         assert_eq!(hull.inside(&splats, &[camera]), [1, 2]);
         splats.means = vec![[-0.5, 0.0, 1.0]; 3];
-        assert_eq!(hull.inside(&splats, &[camera]), [0, 1, 2], "an empty scene helps nobody");
+        assert_eq!(hull.inside(&splats, &[camera]), [0, 1, 2], "a scene is never emptied");
         let masked = Target { weights: Some(vec![0.0; 200]), ..target.clone() };
         assert!(Hull::new(&[masked]).contains([-0.5, 0.0, 1.0], &[camera]));
         let opaque = Target { channels: 3, pixels: vec![0; 600], ..target };

@@ -43,7 +43,7 @@ pub(super) struct AdamInput<'a> {
 }
 
 /// Parameters or moments from what their buffers hold.
-pub(super) fn arrays_from_bytes(geometry: &[u8], colors: &[u8], sh_degree: u32) -> SplatArrays {
+fn arrays_from_bytes(geometry: &[u8], colors: &[u8], sh_degree: u32) -> SplatArrays {
     let mut out = SplatArrays {
         sh: bytemuck::pod_collect_to_vec(colors),
         sh_degree,
@@ -72,6 +72,26 @@ impl AdamBuffers {
             second: SplatBuffers::upload(gpu, &second)?,
             stats: gpu.upload("stats", stats)?,
         })
+    }
+
+    /// Runs commands and brings back parameters, first and second moments, and statistics.
+    pub fn download(
+        &self,
+        gpu: &Gpu,
+        ops: &[Op],
+        sh_degree: u32,
+    ) -> Result<([SplatArrays; 3], Vec<[f32; STATS]>)> {
+        let n = u64::from(self.splats.splats);
+        let floats = [GEOMETRY as u64, self.splats.color_floats];
+        let mut wanted = Vec::new();
+        for arrays in [&self.splats, &self.first, &self.second] {
+            wanted.push((&arrays.geometry, 4 * n * floats[0]));
+            wanted.push((&arrays.colors, 4 * n * floats[1]));
+        }
+        wanted.push((&self.stats, 4 * n * STATS as u64));
+        let data = gpu.download(ops, &wanted)?;
+        let arrays = [0, 2, 4].map(|k| arrays_from_bytes(&data[k], &data[k + 1], sh_degree));
+        Ok((arrays, bytemuck::pod_collect_to_vec(&data[6])))
     }
 
     /// The commands of a step.
@@ -151,20 +171,7 @@ pub(super) fn adam(
             v_splats2d: &v_splats2d,
         },
     );
-    let sizes = [(n * GEOMETRY * 4) as u64, n as u64 * buffers.splats.color_floats * 4];
-    let AdamBuffers { splats, first, second, .. } = &buffers;
-    let data = gpu.download(
-        &ops,
-        &[
-            (&splats.geometry, sizes[0]),
-            (&splats.colors, sizes[1]),
-            (&first.geometry, sizes[0]),
-            (&first.colors, sizes[1]),
-            (&second.geometry, sizes[0]),
-            (&second.colors, sizes[1]),
-        ],
-    )?;
-    let arrays = |k: usize| arrays_from_bytes(&data[2 * k], &data[2 * k + 1], degree);
-    *state = AdamState { splats: arrays(0), first: arrays(1), second: arrays(2) };
+    let ([splats, first, second], _) = buffers.download(gpu, &ops, degree)?;
+    *state = AdamState { splats, first, second };
     Ok(())
 }

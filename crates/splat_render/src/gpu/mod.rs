@@ -22,7 +22,7 @@ mod shaders;
 
 pub use device::Gpu;
 pub use fit::GpuFit;
-pub use resident::ResidentSplats;
+pub use resident::{ResidentSplats, ResidentView};
 pub use resident_picture::ResidentPicture;
 pub use shaders::shared_wgsl;
 

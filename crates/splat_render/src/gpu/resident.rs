@@ -1,5 +1,5 @@
-//! Splats that stay on the device and are projected and sorted for one camera after another, for
-//! who draws them with a graphics pipeline or to a [`ResidentPicture`](super::ResidentPicture).
+//! Splats that stay on the device and are projected and sorted for one camera after another, to be
+//! drawn by the caller's graphics pipeline or to a `ResidentPicture`.
 
 use super::bin::{SplatBins, TileChunk};
 use super::device::{Gpu, Op};
@@ -8,6 +8,24 @@ use super::project::{Projection, SplatBuffers, project_ops};
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{Colors, ProjectOptions, SplatParams};
+
+/// A camera and how it sees resident splats.
+#[derive(Debug, Clone, Copy)]
+pub struct ResidentView<'a> {
+    /// The camera.
+    pub camera: &'a Camera,
+    /// Settings of the project stage.
+    pub options: &'a ProjectOptions,
+    /// Highest SH degree that is evaluated; at most what was given is.
+    pub sh_degree: u32,
+}
+
+impl ResidentView<'_> {
+    pub(super) fn validate(&self) -> Result<()> {
+        self.camera.validate()?;
+        self.options.validate()
+    }
+}
 
 /// Splats on the device, with the commands that project and sort them.
 #[derive(Debug)]
@@ -61,21 +79,20 @@ impl ResidentSplats {
         self.len() == 0
     }
 
-    /// Records the project stage, with SH up to `sh_degree` or what was given, and the sort by depth,
-    /// each a pass with its timestamps. One camera per submission: the last one given counts for all
-    /// of it.
+    /// Records the project stage and the sort by depth, each a pass with its timestamps. One view per
+    /// submission: the last one given counts for all of it.
+    ///
+    /// # Errors
+    /// [`crate::Error::Argument`] if camera or options cannot be used.
     pub fn record(
         &self,
         gpu: &Gpu,
         encoder: &mut wgpu::CommandEncoder,
-        camera: &Camera,
-        options: &ProjectOptions,
-        sh_degree: u32,
+        view: &ResidentView<'_>,
         [project, sort]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 2],
     ) -> Result<()> {
-        camera.validate()?;
-        options.validate()?;
-        self.record_view(gpu, encoder, &self.view(camera, options, sh_degree), [project, sort]);
+        view.validate()?;
+        self.record_view(gpu, encoder, &self.view(view), [project, sort]);
         Ok(())
     }
 
@@ -84,13 +101,13 @@ impl ResidentSplats {
         Projection { view: &self.view, splats2d: &self.splats2d }
     }
 
-    /// What the kernels are told of a camera.
-    pub(super) fn view(&self, camera: &Camera, options: &ProjectOptions, sh_degree: u32) -> View {
+    /// What the kernels are told of a view.
+    pub(super) fn view(&self, view: &ResidentView<'_>) -> View {
         View {
-            sh_degree: sh_degree.min(self.sh_degree),
+            sh_degree: view.sh_degree.min(self.sh_degree),
             sh_stride: self.sh_stride,
             raw: u32::from(self.raw),
-            ..View::of_view(camera, options, [0.0; 3])
+            ..View::of_view(view.camera, view.options, [0.0; 3])
         }
     }
 

@@ -8,11 +8,9 @@ use super::bin::{PairBins, TileChunk, pair_limit, tile_count};
 use super::device::Gpu;
 use super::layout::{Chunk, ChunkCount, StatusHead, View};
 use super::rasterize::{PictureBuffers, rasterize_ops};
-use super::resident::ResidentSplats;
-use crate::camera::Camera;
+use super::resident::{ResidentSplats, ResidentView};
 use crate::constants::TILE;
 use crate::error::{Error, Result};
-use crate::stages::ProjectOptions;
 
 /// A picture on the device, with room for what lies between it and the splats.
 #[derive(Debug)]
@@ -54,14 +52,12 @@ impl ResidentPicture {
         gpu: &Gpu,
         encoder: &mut wgpu::CommandEncoder,
         splats: &ResidentSplats,
-        camera: &Camera,
-        options: &ProjectOptions,
-        sh_degree: u32,
+        view: &ResidentView<'_>,
         columns: Range<u32>,
         [project, sort, mut bin, mut rasterize]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 4],
     ) -> Result<()> {
-        camera.validate()?;
-        options.validate()?;
+        view.validate()?;
+        let camera = view.camera;
         let width = columns.end.saturating_sub(columns.start);
         let fits = tile_count(width, camera.height) <= tile_count(self.width, self.height)
             && u64::from(width) * u64::from(camera.height)
@@ -76,8 +72,8 @@ impl ResidentPicture {
                 ),
             ));
         }
-        let all = splats.view(camera, options, sh_degree);
-        let view = View {
+        let all = splats.view(view);
+        let part = View {
             principal: [all.principal[0] - columns.start as f32, all.principal[1]],
             width,
             tiles_x: width.div_ceil(TILE),
@@ -88,7 +84,7 @@ impl ResidentPicture {
         let whole = Chunk::whole(tiles, splats.len(), u32::MAX);
         let count = bins.count_ops(gpu, drawn, &TileChunk::new(gpu, whole));
         let mut first = gpu.device.create_command_encoder(&Default::default());
-        splats.record_view(gpu, &mut first, &view, [project, sort]);
+        splats.record_view(gpu, &mut first, &part, [project, sort]);
         Gpu::record_pass(&mut first, &count, None);
         let bytes = size_of::<ChunkCount>() as u64;
         let head = size_of::<StatusHead>() as u64;

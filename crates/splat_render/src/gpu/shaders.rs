@@ -51,8 +51,8 @@ const TILE_SUMS: [&str; 2] = [
         include_str!("shaders/tile_sums_subgroup.wgsl")
     ),
 ];
-// The backward kernels once without and once with sums of absolute gradients, so that who does not
-// ask for those does not pay for them.
+// The backward kernels once without and once with sums of absolute gradients, so that callers that
+// do not ask for those do not pay for them.
 const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
@@ -290,8 +290,8 @@ fn constants(rows: u32) -> String {
     out
 }
 
-/// The structs, constants and functions that all shaders share, for who draws with what the kernels
-/// leave: `Splat2d` above all.
+/// The structs, constants and functions that all shaders share, for callers that draw from the
+/// kernels' buffers: `Splat2d` above all.
 pub fn shared_wgsl() -> String {
     constants(1) + SHARED
 }

@@ -1,8 +1,9 @@
-//! Splat files: read whatever people have, write whatever they need; `docs/guides/formats.md` says what
-//! each format holds.
+//! Files of splats, and of pictures ([`write_exr`]); `docs/guides/formats.md` says what
+//! each format of splats holds.
 //!
-//! Files are untrusted. Every size that a file claims is held against the bytes that are there
-//! before memory is taken for it, and what is wrong is said in one sentence.
+//! Files are untrusted: every size that a file claims is checked against the bytes that are there
+//! before memory is allocated for it, and each error is one message. Files are written whole or not
+//! at all.
 
 mod atomic;
 mod bytes;
@@ -37,8 +38,12 @@ use crate::error::Result;
 use bytes::Named;
 use ply_header::Header;
 
-/// Reads a file of any format in [`Format`], told by its content, or by its ending where the
-/// content has no mark.
+/// Reads a file of any format in [`Format`]. The format is detected from the content or, where that
+/// has no signature, from the ending.
+///
+/// # Errors
+/// [`crate::Error::File`] that names the file: it cannot be opened or read, is damaged, truncated or
+/// of an unknown format.
 pub fn read_splats(path: &Path) -> Result<Loaded> {
     let named = Named(path);
     let file = File::open(path).map_err(|e| named.bad(format!("cannot be opened ({e})")))?;
@@ -55,8 +60,11 @@ pub fn read_splats(path: &Path) -> Result<Loaded> {
     parse(&bytes, format, &named)
 }
 
-/// Reads what is in memory as [`read_splats`] reads a file; `path` is what errors call it, what
-/// tells formats without a mark, and where a `.gltf`'s other files are.
+/// Reads a file that is in memory, as [`read_splats`] does. `path` is its name in errors, detects
+/// formats without a signature, and locates a `.gltf`'s other files.
+///
+/// # Errors
+/// Those of [`read_splats`].
 pub fn parse_splats(bytes: &[u8], path: &Path) -> Result<Loaded> {
     let named = Named(path);
     parse(bytes, Format::of(bytes, &named)?, &named)
@@ -86,8 +94,12 @@ fn parse(mut bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
     }
 }
 
-/// Writes splats, whole or not at all, in the format of the ending. Returns one sentence for each
-/// thing that the format cannot hold.
+/// Writes splats, whole or not at all, in the format of the ending. Returns one message for each
+/// thing that the format cannot hold and that was left out or rounded.
+///
+/// # Errors
+/// [`crate::Error::File`] if the ending names no writable format or the file cannot be written;
+/// [`crate::Error::Argument`] if the splats' arrays differ in length or the format cannot hold them.
 pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
     let format = Format::to_write(path)?;
     file.splats.validate()?;
@@ -108,7 +120,10 @@ pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
     Ok(notes)
 }
 
-/// Reads a `.ply`, INRIA's or compressed, whatever it is called.
+/// Reads a `.ply`, INRIA's or compressed, whatever its ending.
+///
+/// # Errors
+/// Those of [`read_splats`].
 pub fn read_ply(path: &Path) -> Result<SplatFile> {
     let named = Named(path);
     let file = File::open(path).map_err(|e| named.bad(format!("cannot be opened ({e})")))?;
@@ -116,7 +131,10 @@ pub fn read_ply(path: &Path) -> Result<SplatFile> {
     Ok(read_any_ply(&mut BufReader::new(file), size, &named)?.file)
 }
 
-/// Writes INRIA's `.ply`, whatever the path is called.
+/// Writes INRIA's `.ply`, whatever the path's ending.
+///
+/// # Errors
+/// Those of [`write_splats`].
 pub fn write_ply(path: &Path, file: &SplatFile) -> Result<()> {
     file.splats.validate()?;
     write_atomically(path, |out| ply::write(out, file))

@@ -1,4 +1,4 @@
-//! What of a scene goes into a format, and the sentences about what does not.
+//! What of a scene a format can hold, and the notes about what it cannot.
 
 use std::borrow::Cow;
 
@@ -10,7 +10,7 @@ use crate::splats::SplatArrays;
 
 /// What a format has room for.
 pub struct Room {
-    /// Its name in sentences.
+    /// Its name in messages.
     pub name: &'static str,
     /// Highest SH degree.
     pub sh_degree: u32,

@@ -10,7 +10,7 @@ pub struct SplatFile {
     pub splats: SplatArrays,
     /// World position = origin + mean.
     pub origin: [f64; 3],
-    /// Whether they were trained with, and want, antialiased opacities.
+    /// Whether they were fitted with antialiased opacities and must be rendered so.
     pub antialiased: bool,
 }
 
@@ -19,8 +19,8 @@ pub struct SplatFile {
 pub struct Loaded {
     /// What it holds.
     pub file: SplatFile,
-    /// What it was written in.
+    /// The format it was in.
     pub format: Format,
-    /// One sentence for each thing in it that was passed over.
+    /// One message for each thing in it that was skipped.
     pub notes: Vec<String>,
 }

@@ -2,7 +2,7 @@
 //! options that make no sense.
 
 use splat_render::constants::{BLUR, FAR, NEAR};
-use splat_render::fit::Target;
+use splat_render::fit::{DensityStats, FitDevice, FitState, Rates, StepInput, Target};
 use splat_render::stages::{AdamStep, ImageGradients, Projected};
 use splat_render::{Error, ProjectOptions, Stages};
 
@@ -112,4 +112,77 @@ pub fn senseless_options_are_refused(stages: &dyn Stages<f32>) {
     assert_eq!(named(stages.adam(&mut state, &short, &step)), "v_quats");
     state.second.opacities.pop();
     assert_eq!(named(stages.adam(&mut state, &gradients, &step)), "opacities");
+}
+
+/// A device with one photo and a few splats that have moments, and a step on it.
+fn fitted(device: &mut dyn FitDevice) -> (FitState, StepInput) {
+    let mut rng = rng(94);
+    let (state, _) = random_adam(&mut rng, 130, 2);
+    let camera = random_camera(&mut rng, 40, 30);
+    let stats = DensityStats::zeros(130);
+    let state = FitState { splats: state.splats, first: state.first, second: state.second, stats };
+    device.set_targets(vec![random_target(&mut rng, 40, 30, false, false)]).unwrap();
+    device.upload(state.clone()).unwrap();
+    let input = StepInput {
+        view: 0,
+        camera,
+        background: [0.2; 3],
+        sh_degree: 1,
+        rates: full_step(1).rates,
+        step: 3,
+        ssim_weight: 0.2,
+        opacity_regularizer: 0.01,
+        scale_regularizer: 0.01,
+        noise: 1.0,
+        dropout: 0.1,
+        noise_seed: 9,
+        camera_gradient: true,
+    };
+    (state, input)
+}
+
+/// With all rates 0 a step moves no parameter and no moment; its loss, its statistics and its camera's
+/// gradient are those of a step that moves. Coefficients that are not in use rest in any step.
+pub fn frozen_steps_keep_the_moments(device: &mut dyn FitDevice) {
+    let (before, input) = fitted(device);
+    device.step(&StepInput { rates: Rates::ZERO, ..input }).unwrap();
+    let frozen = device.download().unwrap();
+    assert!(frozen.splats == before.splats, "splats moved");
+    assert!(frozen.first == before.first && frozen.second == before.second, "moments moved");
+    assert!(frozen.stats.seen.iter().any(|&seen| seen > 0.0), "nothing was seen");
+    let loss = device.loss().unwrap();
+    let gradients = device.camera_gradients().unwrap();
+
+    device.upload(before.clone()).unwrap();
+    device.step(&input).unwrap();
+    let moved = device.download().unwrap();
+    assert!(moved.splats != before.splats && moved.first != before.first);
+    assert_eq!(moved.stats, frozen.stats);
+    assert_eq!(device.loss().unwrap(), loss);
+    assert_eq!(device.camera_gradients().unwrap(), gradients);
+    for (a, b) in [(&moved.splats, &before.splats), (&moved.first, &before.first)] {
+        let rests = (0..a.len()).all(|i| a.sh[9 * i + 4..9 * i + 9] == b.sh[9 * i + 4..9 * i + 9]);
+        assert!(rests, "a coefficient that is not in use moved");
+    }
+}
+
+/// Steps that make no sense are refused by every device, and change nothing.
+pub fn senseless_steps_are_refused(device: &mut dyn FitDevice) {
+    let (before, input) = fitted(device);
+    let turned = Camera { width: 30, height: 40, ..input.camera };
+    let nowhere = Camera { fx: f64::NAN, ..input.camera };
+    for (name, step) in [
+        ("view", StepInput { view: 1, ..input }),
+        ("camera", StepInput { camera: turned, ..input }),
+        ("K", StepInput { camera: nowhere, ..input }),
+        ("dropout", StepInput { dropout: 1.0, ..input }),
+        ("dropout", StepInput { dropout: f32::NAN, ..input }),
+        ("ssim_weight", StepInput { ssim_weight: 1.5, ..input }),
+        ("step", StepInput { step: 0, ..input }),
+        ("noise", StepInput { noise: f32::NAN, ..input }),
+        ("rates", StepInput { rates: Rates { means: -1.0, ..input.rates }, ..input }),
+    ] {
+        assert_eq!(named(device.step(&step)), name);
+    }
+    assert!(device.download().unwrap() == before, "a refused step changed something");
 }

@@ -61,8 +61,8 @@ pub struct Cameras {
     now: Vec<Camera>,
     /// From steps in pixels to turns and moves.
     scales: Vec<PoseMatrix>,
-    /// What else is known of each camera; empty where nothing is.
-    holds: Vec<PosePrior>,
+    /// One per camera; empty where nothing is known.
+    priors: Vec<PosePrior>,
     /// Pixels by which the picture moves where the logarithm of the focal length grows by 1.
     focal_pixels: Vec<f64>,
     config: CameraConfig,
@@ -82,7 +82,7 @@ impl Cameras {
         };
         Self {
             scales: all_scales(initial, &distances, &[]),
-            holds: Vec::new(),
+            priors: Vec::new(),
             focal_pixels: initial.iter().map(focal_pixels).collect(),
             initial: initial.to_vec(),
             now: initial.to_vec(),
@@ -91,20 +91,23 @@ impl Cameras {
         }
     }
 
-    /// Holds the cameras, one entry for each, from before their first step or [`Cameras::resume`].
-    pub fn hold(&mut self, holds: Vec<PosePrior>) -> Result<()> {
-        if holds.len() != self.initial.len() {
+    /// Sets the pose priors, one for each camera, before the first step or [`Cameras::resume`].
+    ///
+    /// # Errors
+    /// [`Error::Argument`] if they are not one per camera or one of them cannot be used.
+    pub fn set_pose_priors(&mut self, priors: Vec<PosePrior>) -> Result<()> {
+        if priors.len() != self.initial.len() {
             let count = self.initial.len();
             return Err(Error::argument(
                 "holds",
                 format!("must have one entry for {count} cameras"),
             ));
         }
-        for (k, hold) in holds.iter().enumerate() {
-            hold.validate(k)?;
+        for (k, prior) in priors.iter().enumerate() {
+            prior.validate(k)?;
         }
-        self.scales = all_scales(&self.initial, &self.state.distances, &holds);
-        self.holds = holds;
+        self.scales = all_scales(&self.initial, &self.state.distances, &priors);
+        self.priors = priors;
         Ok(())
     }
 
@@ -135,7 +138,7 @@ impl Cameras {
         if !state.distances.iter().all(|d| d.is_finite() && *d > 0.0) {
             return Err(Error::argument("cameras", "has a distance that is not positive"));
         }
-        self.scales = all_scales(&self.initial, &state.distances, &self.holds);
+        self.scales = all_scales(&self.initial, &state.distances, &self.priors);
         self.state = state;
         Ok(())
     }
@@ -192,9 +195,9 @@ impl Cameras {
                 Focal::Shared => mean_pixels,
                 _ => self.focal_pixels[k],
             };
-            let hold = self.holds.get(k).copied();
+            let prior = self.priors.get(k).copied();
             // A step is as long as the shorter of a pixel and what is known already.
-            let pixels = hold.map_or(pixels, |hold| pixels.hypot(hold.log_focal.sqrt()));
+            let pixels = prior.map_or(pixels, |prior| pixels.hypot(prior.log_focal.sqrt()));
             let mut in_pixels = [0.0; POSE + 1];
             for (line, v) in scale.iter().zip(row) {
                 for (out, s) in in_pixels.iter_mut().zip(line) {
@@ -210,15 +213,15 @@ impl Cameras {
             let camera = &mut self.now[k];
             if self.config.poses {
                 move_by(camera, pose);
-                if let Some(hold) = hold {
-                    hold.pull_pose(camera, &scale, rate);
+                if let Some(prior) = prior {
+                    prior.pull_pose(camera, &scale, rate);
                 }
             }
             if self.config.focal != Focal::Fixed {
                 let factor = (moved[POSE] / pixels).exp();
                 (camera.fx, camera.fy) = (camera.fx * factor, camera.fy * factor);
-                if let Some(hold) = hold {
-                    hold.pull_focal(camera, pixels * pixels, rate);
+                if let Some(prior) = prior {
+                    prior.pull_focal(camera, pixels * pixels, rate);
                 }
             }
         }

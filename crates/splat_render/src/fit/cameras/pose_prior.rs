@@ -1,8 +1,8 @@
-//! What else than the photos' colours says of a camera: where it stood, and how surely.
+//! Pose priors: what is known of a camera besides the photos' colours.
 //!
-//! Points that were recognised in several photos tell a camera to hundredths of a pixel, which the
-//! colours of a fit do not. A held camera takes steps that are small along what is known and as large
-//! as ever along what is not, and is drawn back towards where it was told to stand: so far that a
+//! Points that were matched in several photos tell a camera's pose to hundredths of a pixel, which
+//! the colours of a fit do not. A camera with a prior takes small steps along what is known and steps
+//! as large as ever along what is not. It is also drawn back towards the prior's mean: so far that a
 //! steady push ends one standard deviation away.
 
 use glam::DMat4;
@@ -12,15 +12,15 @@ use super::motion::{POSE, PoseMatrix, between, move_by};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 
-/// Where a camera is told to stand, and the information about it.
+/// A Gaussian prior of one camera: its mean and its information (the covariance's inverse).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PosePrior {
-    /// World to camera.
+    /// Mean of the world-to-camera matrix.
     pub viewmat: DMat4,
-    /// Focal lengths, pixels.
+    /// Means of the focal lengths, pixels.
     pub focal: [f64; 2],
-    /// Inverse of the covariance of turn (radians) about and move (world units) along x, y, z of the
-    /// camera, as [`move_by`] takes them; symmetric, zero where nothing is known.
+    /// Inverse of the covariance of the rotation (radians) about and the translation (world units)
+    /// along x, y, z of the camera; symmetric, zero where nothing is known.
     pub pose: PoseMatrix,
     /// Inverse of the variance of the focal length's logarithm; zero where nothing is known.
     pub log_focal: f64,
@@ -28,6 +28,9 @@ pub struct PosePrior {
 
 impl PosePrior {
     /// Checks that every entry can be used; `k` is the camera's number.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] that names `holds[k]`.
     pub fn validate(&self, k: usize) -> Result<()> {
         let information = self.pose.as_flattened().iter().chain([&self.log_focal]);
         let diagonal = (0..POSE).map(|i| self.pose[i][i]).chain([self.log_focal]);
@@ -46,7 +49,7 @@ impl PosePrior {
 
     /// Draws a camera back by what balances a push of `rate` one standard deviation away.
     ///
-    /// `scale` takes steps of length 1 to poses; they are made with this hold's information, so that
+    /// `scale` takes steps of length 1 to poses; they are made with this prior's information, so that
     /// none goes further than a standard deviation.
     pub fn pull_pose(&self, camera: &mut Camera, scale: &PoseMatrix, rate: f64) {
         if self.pose == [[0.0; POSE]; POSE] {

@@ -37,10 +37,10 @@ fn grid(camera: &Camera) -> Vec<(f64, f64)> {
 pub(super) fn all_scales(
     cameras: &[Camera],
     distances: &[f64],
-    holds: &[PosePrior],
+    priors: &[PosePrior],
 ) -> Vec<PoseMatrix> {
     let each = cameras.iter().zip(distances).enumerate();
-    each.map(|(k, (camera, &d))| pixels_to_pose(camera, d, holds.get(k))).collect()
+    each.map(|(k, (camera, &d))| pixels_to_pose(camera, d, priors.get(k))).collect()
 }
 
 /// Median depth of the points that a camera has in its picture; of all before it, where it has none
@@ -69,8 +69,8 @@ pub fn scene_distance(camera: &Camera, means: &[[f32; 3]]) -> f64 {
 
 /// A matrix from steps in pixels to poses: what it makes of a unit step moves points of the picture by
 /// one pixel in root mean square. A move comes with the turn that keeps the picture in place. Along
-/// what a hold knows to less than a pixel, it is that.
-fn pixels_to_pose(camera: &Camera, distance: f64, hold: Option<&PosePrior>) -> PoseMatrix {
+/// what a prior knows to less than a pixel, it moves them by that.
+fn pixels_to_pose(camera: &Camera, distance: f64, prior: Option<&PosePrior>) -> PoseMatrix {
     let mut sum = [[0.0; POSE]; POSE];
     let points = grid(camera);
     let count = (points.len() * DEPTHS.len()) as f64;
@@ -96,8 +96,8 @@ fn pixels_to_pose(camera: &Camera, distance: f64, hold: Option<&PosePrior>) -> P
     for (i, line) in scaled.iter_mut().enumerate() {
         for (j, v) in line.iter_mut().enumerate() {
             *v = *v / (unit[i] * unit[j]) + if i == j { DAMPING } else { 0.0 };
-            if let Some(hold) = hold {
-                *v += hold.pose[i][j] / (unit[i] * unit[j]);
+            if let Some(prior) = prior {
+                *v += prior.pose[i][j] / (unit[i] * unit[j]);
             }
         }
     }

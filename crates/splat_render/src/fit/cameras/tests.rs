@@ -187,7 +187,7 @@ fn cameras_at_one_place_keep_the_scale_of_their_moves() {
 }
 
 #[test]
-fn held_cameras_stay_within_what_is_known_and_move_along_what_is_not() {
+fn cameras_with_priors_stay_within_what_is_known_and_move_along_what_is_not() {
     let truth = ring(4);
     let off = CameraConfig { anchored: false, focal: Focal::PerCamera, ..config() };
     let mut told = truth.clone();
@@ -198,7 +198,7 @@ fn held_cameras_stay_within_what_is_known_and_move_along_what_is_not() {
     // A hundredth of a pixel: the points pull by several, hard enough at any distance.
     let surely: Vec<PosePrior> = told.iter().map(|camera| known(camera, 0.01)).collect();
     let mut cameras = Cameras::new(&told, vec![4.0; 4], off);
-    cameras.hold(surely.clone()).unwrap();
+    cameras.set_pose_priors(surely.clone()).unwrap();
     fitted(&mut cameras, &truth, 400);
     for (now, told) in cameras.now().iter().zip(&told) {
         let turned = worst_angle(&[*now], &[*told]) * told.fx;
@@ -210,26 +210,26 @@ fn held_cameras_stay_within_what_is_known_and_move_along_what_is_not() {
     let mut turned = truth.clone();
     turned.iter_mut().for_each(|camera| move_by(camera, [0.01, -0.008, 0.006, 0.0, 0.0, 0.0]));
     let mut partly: Vec<PosePrior> = turned.iter().map(|camera| known(camera, 0.01)).collect();
-    for hold in &mut partly {
-        (0..3).for_each(|i| hold.pose[i][i] = 0.0);
-        hold.log_focal = 0.0;
+    for prior in &mut partly {
+        (0..3).for_each(|i| prior.pose[i][i] = 0.0);
+        prior.log_focal = 0.0;
     }
     let before = worst_angle(&turned, &truth);
     let mut cameras = Cameras::new(&turned, vec![4.0; 4], off);
-    cameras.hold(partly).unwrap();
+    cameras.set_pose_priors(partly).unwrap();
     fitted(&mut cameras, &truth, 1000);
     let after = worst_angle(cameras.now(), &truth);
     assert!(after < 0.02 * before, "turns were {before:.2e} off and are {after:.2e}");
-    // Cameras that were brought elsewhere first come back to where they were told to be.
+    // Cameras that start elsewhere come back to the mean of their prior.
     let mut cameras = Cameras::new(&truth, vec![4.0; 4], off);
-    cameras.hold(surely).unwrap();
+    cameras.set_pose_priors(surely).unwrap();
     (0..400).for_each(|_| cameras.step(0.0));
     assert!(worst_angle(cameras.now(), &told) * 500.0 < 0.02);
     assert!(cameras.now().iter().zip(&told).all(|(a, b)| (a.fx / b.fx - 1.0).abs() < 1e-4));
 }
 
 #[test]
-fn holds_that_know_nothing_change_no_bit_and_wrong_ones_are_refused() {
+fn priors_that_know_nothing_change_no_bit_and_wrong_ones_are_refused() {
     let truth = ring(3);
     let mut noisy = truth.clone();
     move_by(&mut noisy[1], [0.01; 6]);
@@ -237,14 +237,14 @@ fn holds_that_know_nothing_change_no_bit_and_wrong_ones_are_refused() {
     let mut free = Cameras::new(&noisy, vec![4.0; 3], off);
     let mut held = Cameras::new(&noisy, vec![4.0; 3], off);
     let nothing = PosePrior { pose: [[0.0; POSE]; POSE], log_focal: 0.0, ..known(&truth[0], 1.0) };
-    held.hold(vec![nothing; 3]).unwrap();
+    held.set_pose_priors(vec![nothing; 3]).unwrap();
     fitted(&mut free, &truth, 7);
     fitted(&mut held, &truth, 7);
     assert_eq!(free.state(), held.state());
-    assert!(held.hold(vec![nothing; 2]).is_err());
-    assert!(held.hold(vec![PosePrior { log_focal: f64::NAN, ..nothing }; 3]).is_err());
-    assert!(held.hold(vec![PosePrior { log_focal: -1.0, ..nothing }; 3]).is_err());
-    assert!(held.hold(vec![PosePrior { focal: [0.0, 1.0], ..nothing }; 3]).is_err());
+    assert!(held.set_pose_priors(vec![nothing; 2]).is_err());
+    assert!(held.set_pose_priors(vec![PosePrior { log_focal: f64::NAN, ..nothing }; 3]).is_err());
+    assert!(held.set_pose_priors(vec![PosePrior { log_focal: -1.0, ..nothing }; 3]).is_err());
+    assert!(held.set_pose_priors(vec![PosePrior { focal: [0.0, 1.0], ..nothing }; 3]).is_err());
 }
 
 #[test]

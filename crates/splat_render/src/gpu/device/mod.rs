@@ -102,12 +102,12 @@ impl Gpu {
         self.lost.load(Ordering::Relaxed)
     }
 
-    /// The device, for who draws with what the kernels leave.
+    /// The wgpu device, for callers that draw from the kernels' buffers.
     pub fn device(&self) -> &wgpu::Device {
         &self.device
     }
 
-    /// Where the kernels are submitted.
+    /// The queue that kernels are submitted to.
     pub fn queue(&self) -> &wgpu::Queue {
         &self.queue
     }

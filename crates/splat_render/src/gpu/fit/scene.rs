@@ -2,10 +2,10 @@
 
 use crate::error::Result;
 use crate::fit_device::{DensityStats, FitState};
-use crate::gpu::adam::{AdamBuffers, arrays_from_bytes};
+use crate::gpu::adam::AdamBuffers;
 use crate::gpu::bin::{PairBins, SplatBins, pair_limit};
 use crate::gpu::device::Gpu;
-use crate::gpu::layout::{CAMERA, GEOMETRY, GRADIENT, STATS};
+use crate::gpu::layout::{CAMERA, GRADIENT, STATS};
 use crate::gpu::project::SPLAT_2D;
 use crate::gpu::project_backward::{GradientBuffers, camera_sums};
 
@@ -92,27 +92,11 @@ impl Scene {
 
     /// The state as it is now; all steps must be done.
     pub fn download(&self, gpu: &Gpu) -> Result<FitState> {
-        let n = u64::from(self.len());
-        let sizes = [n * GEOMETRY as u64 * 4, n * self.adam.splats.color_floats * 4];
-        let AdamBuffers { splats, first, second, stats } = &self.adam;
-        let data = gpu.download(
-            &[],
-            &[
-                (&splats.geometry, sizes[0]),
-                (&splats.colors, sizes[1]),
-                (&first.geometry, sizes[0]),
-                (&first.colors, sizes[1]),
-                (&second.geometry, sizes[0]),
-                (&second.colors, sizes[1]),
-                (stats, n * STATS as u64 * 4),
-            ],
-        )?;
-        let arrays = |k: usize| arrays_from_bytes(&data[2 * k], &data[2 * k + 1], self.sh_degree);
-        let stats: Vec<[f32; STATS]> = bytemuck::pod_collect_to_vec(&data[6]);
+        let ([splats, first, second], stats) = self.adam.download(gpu, &[], self.sh_degree)?;
         Ok(FitState {
-            splats: arrays(0),
-            first: arrays(1),
-            second: arrays(2),
+            splats,
+            first,
+            second,
             stats: DensityStats {
                 grad_sum: stats.iter().map(|s| s[0]).collect(),
                 seen: stats.iter().map(|s| s[1]).collect(),
