@@ -337,3 +337,15 @@ def test_command_without_its_scene(igsr_here, tmp_path):
     result = igsr_here("compact", tmp_path / "none.ply")
     assert result.returncode == 1
     assert "none.ply" in result.stderr
+
+
+def test_progress_may_end_it():
+    seen = []
+
+    def stop(now):
+        seen.append(now)
+        return False
+
+    with pytest.raises(igsr.IgsrError, match="was stopped"):
+        igsr.compact(wall(60), steps=20, backend="cpu", progress=stop)
+    assert [now.step for now in seen] == [0]

@@ -120,6 +120,7 @@ def test_parity_tiny(tiny, height, width):
     assert worst(maps, PUBLISHED[f"tiny {height}x{width}"]) <= 1e-5
 
 
+@pytest.mark.long
 def test_parity_full_size():
     maps = outputs(hashed_network(DPT_512), 48, 64)
     assert worst(maps, PUBLISHED["full 48x64"]) <= 1e-5

@@ -196,6 +196,7 @@ def test_the_papers_choice_is_by_the_true_picture(data, monkeypatch):
     assert one[0].view.camera is not other[0].view.camera
 
 
+@pytest.mark.long
 def test_the_sweep_and_the_ablation(data):
     swept = study.sweep(data / "data", data / "sweep", views=("4",), **given(data))
     rounds = swept["scenes"]["ball"]["scattered 4"]

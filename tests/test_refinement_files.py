@@ -85,11 +85,16 @@ def test_everything_it_did_is_in_its_folder(helped):
     "moment",
     [
         (0, "fit"),
-        (1, "novel_views"),
-        (1, "fit"),
-        (1, "cross_validate"),
+        *(
+            pytest.param(moment, marks=pytest.mark.long)
+            for moment in (
+                (1, "novel_views"),
+                (1, "fit"),
+                (1, "cross_validate"),
+                (2, "novel_views"),
+            )
+        ),
         (1, "refit"),
-        (2, "novel_views"),
         (2, "refit"),
     ],
 )
@@ -105,7 +110,10 @@ def test_stopped_at_any_moment_and_resumed_it_ends_the_same(capture, helped, tmp
         assert done.validation_after == wanted.validation_after
 
 
-@pytest.mark.parametrize("renames", [2, 12, 40])
+@pytest.mark.parametrize(
+    "renames",
+    [pytest.param(2, marks=pytest.mark.long), 12, pytest.param(40, marks=pytest.mark.long)],
+)
 def test_killed_between_two_files_and_resumed_it_ends_the_same(
     capture, helped, tmp_path, renames, monkeypatch
 ):
@@ -326,3 +334,11 @@ def test_a_folder_of_igsr_0_1_is_resumed_to_the_same_end(capture, helped, tmp_pa
     assert set(report["seconds"]) == set(refined.seconds)
     files = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
     assert files == {p.relative_to(helped[1]) for p in helped[1].rglob("*") if p.is_file()}
+
+
+def test_what_it_returns_shows_itself_in_a_notebook(helped):
+    refined = helped[0]
+    assert repr(refined).startswith("Refined(2 of 2 rounds accepted, ")
+    assert "<img" in refined._repr_html_()
+    assert refined == refined
+    assert (refined == "a scene") is False

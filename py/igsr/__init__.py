@@ -11,10 +11,10 @@ Names are imported when they are first used (PEP 562): ``import igsr`` alone imp
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from igsr._internal import moved_modules
+from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from igsr._core import __version__
@@ -56,34 +56,23 @@ __all__ = [
     "render",
 ]
 
-#: Where each public name is defined.
-_HOMES = {
-    "igsr._core": ("__version__",),
-    "igsr.capture": ("Camera", "Capture", "Points", "View", "load_capture"),
-    "igsr.compaction": ("Compaction", "compact"),
-    "igsr.denoiser": ("denoise",),
-    "igsr.errors": ("IgsrError",),
-    "igsr.evaluation": ("Scores", "evaluate"),
-    "igsr.fitting": ("Progress", "fit", "fit_with_cameras", "refine_cameras"),
-    "igsr.pose": ("estimate_poses",),
-    "igsr.refinement": ("Refined", "refine"),
-    "igsr.rendering": ("Render", "render"),
-    "igsr.rendering.rasterization": ("rasterization",),
-    "igsr.splats": ("Splats",),
-}
-_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
-        raise AttributeError(f"module 'igsr' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME_OF[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "igsr._core": ("__version__",),
+            "igsr.capture": ("Camera", "Capture", "Points", "View", "load_capture"),
+            "igsr.compaction": ("Compaction", "compact"),
+            "igsr.denoiser": ("denoise",),
+            "igsr.errors": ("IgsrError",),
+            "igsr.evaluation": ("Scores", "evaluate"),
+            "igsr.fitting": ("Progress", "fit", "fit_with_cameras", "refine_cameras"),
+            "igsr.pose": ("estimate_poses",),
+            "igsr.refinement": ("Refined", "refine"),
+            "igsr.rendering": ("Render", "render"),
+            "igsr.rendering.rasterization": ("rasterization",),
+            "igsr.splats": ("Splats",),
+        },
+    )
 
 moved_modules.install()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
@@ -139,32 +139,6 @@ class _Finder:
             DeprecationWarning,
             stacklevel=2,
         )
-
-
-def moved_names(package: str, homes: dict[str, tuple[str, ...]]) -> Callable[[str], Any]:
-    """A module's ``__getattr__`` for names that were in it and are now in one of its modules.
-
-    Args:
-        package: the package's ``__name__``.
-        homes: names by the module that has them now.
-
-    Returns:
-        A function that finds a name where it is now, with a ``DeprecationWarning``.
-    """
-    home_of = {name: home for home, names in homes.items() for name in names}
-
-    def find(name: str) -> Any:
-        if name not in home_of:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        warnings.warn(
-            f"{package}.{name} is now {home_of[name]}.{name}; the old name goes with the next "
-            "release.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return getattr(importlib.import_module(home_of[name]), name)
-
-    return find
 
 
 def install() -> None:

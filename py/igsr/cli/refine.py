@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from igsr._internal.progress_bar import progress_bar
 from igsr.capture.photo_folder import FRAMES
 from igsr.cli.error_messages import error_messages, warning_messages
 from igsr.cli.pose import (
@@ -23,10 +22,8 @@ from igsr.cli.settings_options import settings_options
 from igsr.cli.shared import (
     HoldoutOption,
     JsonOption,
-    error_console,
     output_console,
     print_json,
-    stopped,
 )
 from igsr.errors import IgsrError
 from igsr.refinement.settings import AUTO, RefineSettings
@@ -34,16 +31,7 @@ from igsr.refinement.settings import AUTO, RefineSettings
 # What imports torch is imported by the command, so that --help answers at once.
 if TYPE_CHECKING:
     from igsr.capture import Capture
-    from igsr.refinement.results import Refined, RefineProgress
-
-#: Stages as the progress bar calls them.
-_STAGES = {
-    "fit": "fit photos",
-    "novel_views": "render and denoise novel views",
-    "cross_validate": "cross-validate",
-    "refit": "refit with novel views",
-    "test": "score test views",
-}
+    from igsr.refinement.results import Refined
 
 
 @settings_options(RefineSettings)
@@ -94,6 +82,7 @@ def refine_command(
 
         from igsr._core import resolve_backend
         from igsr.refinement.loop import refine, round_denoiser
+        from igsr.refinement.run import bar_state
 
         resolve_backend(settings.backend)  # a missing GPU is found before cameras are looked for
         denoiser = round_denoiser(weights)
@@ -108,9 +97,14 @@ def refine_command(
             )
         if photo_count is not None:
             capture = _some_photos(capture, photo_count)
-        with _bar(shown=not as_json) as show, warning_messages():
+        with progress_bar("refine", shown=not as_json) as show, warning_messages():
             refined = refine(
-                capture, progress=show, denoiser=denoiser, out=out, resume=resume, **vars(settings)
+                capture,
+                progress=lambda now: show(bar_state(now)),
+                denoiser=denoiser,
+                out=out,
+                resume=resume,
+                **vars(settings),
             )
     if as_json:
         print_json(_summary(refined, out))
@@ -199,26 +193,3 @@ def _print_summary(refined: Refined, out: Path) -> None:
         console.print(f"PSNR of the test views by round: {by_round} dB")
     names = ("scene.ply", "report.html", "report.json")
     console.print("  ".join(str(out / file) for file in names), style="dim", markup=False)
-
-
-@contextlib.contextmanager
-def _bar(shown: bool) -> Iterator[Callable[[RefineProgress], None]]:
-    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as ProgressBar
-
-    bar = ProgressBar(
-        TextColumn("round {task.fields[round]}"),
-        BarColumn(bar_width=30),
-        TextColumn("{task.fields[stage]}"),
-        TimeRemainingColumn(compact=True),
-        console=error_console(),
-        disable=not shown,
-    )
-    task = bar.add_task("refine", total=1.0, round=0, stage="")
-    with stopped(bar):
-
-        def show(now: RefineProgress) -> None:
-            bar.start()
-            bar.update(task, completed=now.done, round=now.round, stage=_STAGES[now.stage])
-
-        yield show

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.choices import Backend, FitBackend
+from igsr._internal.progress_bar import BarState, progress_or_bar
 from igsr.capture import Capture
 from igsr.compaction.contribution import contribution
 from igsr.compaction.finetuning import (
@@ -64,6 +65,12 @@ class CompactProgress:
     steps: int
 
 
+def _bar_state(now: CompactProgress) -> BarState:
+    return BarState(
+        now.step, now.steps, f"size {now.trial}: {now.splats} splats, SH {now.sh_degree}"
+    )
+
+
 @dataclass(frozen=True)
 class Compaction:
     """The smallest model found, and the curve of all sizes tried.
@@ -91,7 +98,7 @@ def compact(
     seed: int = 0,
     background: Sequence[float] | None = None,
     backend: FitBackend = "auto",
-    progress: Callable[[CompactProgress], None] | None = None,
+    progress: Callable[[CompactProgress], bool | None] | None = None,
 ) -> Compaction:
     """Find the smallest model that loses at most ``max_loss`` dB against ``splats``.
 
@@ -119,7 +126,8 @@ def compact(
         background: RGB in [0, 1] behind validation renders; None is white where photos have
             alpha, black where they have none, grey without a capture.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
-        progress: called every few fine-tuning steps.
+        progress: called every few fine-tuning steps; returning False ends it with an ``IgsrError``.
+            In an interactive session, None shows a progress bar.
 
     Raises:
         IgsrError: an argument cannot be used; the message names it.
@@ -138,8 +146,9 @@ def compact(
         validation = self_validation(whole, background, psnr, name)
     else:
         validation = photo_validation(whole, capture, background, name)
-    search = _Search(validation, whole.origin, max_loss, sh_degree, steps, seed, name, progress)
-    best = search.run(whole)
+    with progress_or_bar(progress, "compact", _bar_state) as report:
+        search = _Search(validation, whole.origin, max_loss, sh_degree, steps, seed, name, report)
+        best = search.run(whole)
     return Compaction(
         splats_of(best.state, whole.origin),
         {
@@ -180,7 +189,7 @@ class _Search:
         steps: int,
         seed: int,
         backend: Backend,
-        progress: Callable[[CompactProgress], None] | None,
+        progress: Callable[[CompactProgress], bool | None] | None,
     ) -> None:
         self.validation = validation
         self.origin = origin
@@ -266,8 +275,10 @@ class _Search:
         degree = round(start.state["sh"].shape[1] ** 0.5) - 1
 
         def on_steps(step: int) -> None:
-            if self.progress is not None:
-                self.progress(CompactProgress(number, count, degree, step, steps))
+            if self.progress is None:
+                return
+            if self.progress(CompactProgress(number, count, degree, step, steps)) is False:
+                raise IgsrError("The compaction was stopped.")
 
         on_steps(0)
         state = start.state

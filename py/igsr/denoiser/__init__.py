@@ -9,8 +9,9 @@ Names are imported when they are first used (PEP 562), so that command lines loa
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from igsr.denoiser.buffers import Buffers, photo_support, render_buffers
@@ -33,23 +34,13 @@ __all__ = [
     "warp_photos",
 ]
 
-#: Where each public name is defined.
-_HOMES = {
-    "buffers": ("Buffers", "photo_support", "render_buffers"),
-    "cleaning": ("Denoiser", "NetworkDenoiser", "denoise"),
-    "warping": ("Source", "Warped", "photo_sources", "warp_photos"),
-    "weights": ("load_network", "save_network"),
-}
-_HOME_OF = {name: f"igsr.denoiser.{home}" for home, names in _HOMES.items() for name in names}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
-        raise AttributeError(f"module 'igsr.denoiser' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME_OF[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "igsr.denoiser.buffers": ("Buffers", "photo_support", "render_buffers"),
+            "igsr.denoiser.cleaning": ("Denoiser", "NetworkDenoiser", "denoise"),
+            "igsr.denoiser.warping": ("Source", "Warped", "photo_sources", "warp_photos"),
+            "igsr.denoiser.weights": ("load_network", "save_network"),
+        },
+    )

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from igsr._internal import moved_modules
+from typing import TYPE_CHECKING
+
+from igsr._internal.lazy_exports import lazy_exports
 from igsr.evaluation.scores import METRICS, ScoredView, Scores, evaluate, score_views
 
 __all__ = ["METRICS", "ScoredView", "Scores", "evaluate", "score_views"]
 
-__getattr__ = moved_modules.moved_names(
-    __name__,
-    {
-        "igsr.evaluation.scores": (
-            *("BLACK", "WHITE", "check_masks", "default_background", "default_split"),
-            *("known_background", "over_background", "views_of_split"),
-        )
-    },
-)
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {},
+        moved={
+            "igsr.evaluation.scores": (
+                *("BLACK", "WHITE", "check_masks", "default_background", "default_split"),
+                *("known_background", "over_background", "views_of_split"),
+            )
+        },
+    )

@@ -6,8 +6,9 @@ without loading what fits.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from igsr.fitting.optimization import Progress
@@ -27,22 +28,18 @@ __all__ = [
     "settings_for",
 ]
 
-#: Where each public name is defined.
-_HOME_OF = {
-    "FitSettings": "settings",
-    "PRESETS": "presets",
-    "Progress": "optimization",
-    "fit": "run",
-    "fit_with_cameras": "run",
-    "preset_settings": "presets",
-    "refine_cameras": "pose_refinement",
-    "settings_for": "presets",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
-        raise AttributeError(f"module 'igsr.fitting' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"igsr.fitting.{_HOME_OF[name]}"), name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "igsr.fitting.optimization": ("Progress",),
+            "igsr.fitting.pose_refinement": ("refine_cameras",),
+            "igsr.fitting.presets": ("PRESETS", "preset_settings", "settings_for"),
+            "igsr.fitting.run": ("fit", "fit_with_cameras"),
+            "igsr.fitting.settings": ("FitSettings",),
+        },
+        moved={
+            "igsr.fitting.fitter": ("check_fits",),
+            "igsr.fitting.settings": ("check_whole_number",),
+        },
+    )

@@ -5,8 +5,9 @@ Names are imported when they are first used: the settings alone load neither tor
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from igsr.refinement.loop import refine, round_denoiser
@@ -24,15 +25,14 @@ __all__ = [
     "round_denoiser",
 ]
 
-_MODULES = {
-    "igsr.refinement.loop": ("refine", "round_denoiser"),
-    "igsr.refinement.results": ("RefineProgress", "Refined", "Round", "Stop", "StopReason"),
-    "igsr.refinement.settings": ("RefineSettings",),
-}
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'igsr.refinement' has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULE_OF[name]), name)
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "igsr.refinement.loop": ("refine", "round_denoiser"),
+            "igsr.refinement.results": (
+                *("RefineProgress", "Refined", "Round", "Stop", "StopReason"),
+            ),
+            "igsr.refinement.settings": ("RefineSettings",),
+        },
+    )

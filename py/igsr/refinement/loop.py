@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from igsr import _core
 from igsr._internal.deprecation import renamed_keywords, renamed_names
+from igsr._internal.progress_bar import progress_or_bar
 from igsr.capture import Capture
 from igsr.capture.photo_checks import check_photos
 from igsr.denoiser import Denoiser, NetworkDenoiser, load_network
@@ -23,7 +24,7 @@ from igsr.evaluation.scores import check_masks
 from igsr.refinement.cross_validation import FEWEST_PHOTOS, CrossValidation, combined_error
 from igsr.refinement.novel_views import novel_views
 from igsr.refinement.results import Refined, RefineProgress, Round, Stop, StopReason
-from igsr.refinement.run import RefineRun
+from igsr.refinement.run import RefineRun, bar_state
 from igsr.refinement.selection import select_views
 from igsr.refinement.settings import AUTO, RefineSettings
 from igsr.refinement.stages import NOVEL_VIEWS_WORK, Propose, Reconstruction, Select, Stages
@@ -51,7 +52,8 @@ def refine(
         photos: a capture, or a folder of photos, whose cameras are found if it has none.
         rounds: most rounds, or "auto": until one does not help, and at most four.
         progress: called about five times a second; returning False ends the refinement with an
-            ``IgsrError``, and what is done so far stays in ``out``.
+            ``IgsrError``, and what is done so far stays in ``out``. In an interactive session, None
+            shows a progress bar.
         steps: of each fit; None is the default preset's.
         backend: "auto", "cpu" or "gpu".
         seed: of everything random; the result is deterministic for a given seed.
@@ -79,22 +81,23 @@ def refine(
         cross_validate=cross_validate,
     )
     _core.resolve_backend(settings.backend)  # a missing GPU is found here
-    run = RefineRun(settings, out, resume, progress)
-    capture = photos if isinstance(photos, Capture) else run.find_cameras(photos)
-    _check_views(capture)
-    stages = Stages(capture, settings, run, denoiser or round_denoiser(), propose, select)
-    validation = CrossValidation(stages, capture.train_views) if cross_validate else None
-    fits = 1.0 + (validation.work if validation else 0.0)
-    run.prepare(work=fits * (1.0 + settings.most_rounds * (NOVEL_VIEWS_WORK + 1.0)))
+    with progress_or_bar(progress, "refine", bar_state) as report:
+        run = RefineRun(settings, out, resume, report)
+        capture = photos if isinstance(photos, Capture) else run.find_cameras(photos)
+        _check_views(capture)
+        stages = Stages(capture, settings, run, denoiser or round_denoiser(), propose, select)
+        validation = CrossValidation(stages, capture.train_views) if cross_validate else None
+        fits = 1.0 + (validation.work if validation else 0.0)
+        run.prepare(work=fits * (1.0 + settings.most_rounds * (NOVEL_VIEWS_WORK + 1.0)))
 
-    whole = stages.fit("whole", capture.train_views)
-    test = stages.test_scores(whole.splats)
-    refined = Refined(whole.splats, whole.splats, test, capture, [], None, [], {})
-    while refined.stop is None:
-        refined = run.write(refined)
-        run.round += 1
-        refined = _round(run.round, refined, whole, stages, validation, settings.most_rounds)
-    return run.write(refined)
+        whole = stages.fit("whole", capture.train_views)
+        test = stages.test_scores(whole.splats)
+        refined = Refined(whole.splats, whole.splats, test, capture, [], None, [], {})
+        while refined.stop is None:
+            refined = run.write(refined)
+            run.round += 1
+            refined = _round(run.round, refined, whole, stages, validation, settings.most_rounds)
+        return run.write(refined)
 
 
 def _round(

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
+from igsr._internal.array_equality import ArrayEquality
 from igsr._internal.deprecation import renamed_attributes
+from igsr._internal.notebook import NotebookPicture
 from igsr.capture import Capture
 from igsr.refinement.selection import Candidate, Rejected
 from igsr.splats import Splats
@@ -117,8 +119,8 @@ def _old_message(stop: Stop | None) -> str:
 
 
 @renamed_attributes(stopped=("stop", _old_message), passed="rejected")
-@dataclass(frozen=True, eq=False)
-class Refined:
+@dataclass(frozen=True, eq=False, repr=False)
+class Refined(ArrayEquality, NotebookPicture):
     """What ``refine`` returns.
 
     Attributes:
@@ -141,3 +143,14 @@ class Refined:
     stop: Stop | None
     rejected: list[Rejected]
     seconds: dict[str, float]
+
+    _pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:refined_pictures"
+
+    def __repr__(self) -> str:
+        """The rounds, the scene and why it stopped, in one line."""
+        accepted = sum(one.accepted for one in self.rounds)
+        stopped = "unfinished" if self.stop is None else str(self.stop)
+        return (
+            f"Refined({accepted} of {len(self.rounds)} rounds accepted, {len(self.splats)} splats; "
+            f"{stopped})"
+        )

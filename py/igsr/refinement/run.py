@@ -11,6 +11,7 @@ from pathlib import Path
 
 from igsr._internal.atomic_write import remove_unfinished
 from igsr._internal.deprecation import RenamedKeys
+from igsr._internal.progress_bar import BarState
 from igsr.capture import Capture, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.write_colmap import write_colmap
@@ -22,6 +23,22 @@ from igsr.refinement.settings import RefineSettings
 
 #: The error message of a run that ``progress`` ended.
 STOPPED = "the refinement was stopped; go on with resume."
+
+
+#: Stages as progress bars call them.
+_STAGES: dict[Stage, str] = {
+    "pose": "find cameras",
+    "fit": "fit photos",
+    "novel_views": "render and denoise novel views",
+    "cross_validate": "cross-validate",
+    "refit": "refit with novel views",
+    "test": "score test views",
+}
+
+
+def bar_state(now: RefineProgress) -> BarState:
+    """What a progress bar shows of a refinement."""
+    return BarState(now.done, 1.0, f"round {now.round}: {_STAGES[now.stage]}")
 
 
 class RefineRun:

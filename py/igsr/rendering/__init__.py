@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from igsr._internal import moved_modules
+from typing import TYPE_CHECKING
+
+from igsr._internal.lazy_exports import lazy_exports
 from igsr.rendering.renders import Render, render
 
 __all__ = ["Render", "render"]
 
-__getattr__ = moved_modules.moved_names(
-    __name__, {"igsr.rendering.renders": ("intrinsics_of", "project", "viewmat_about")}
-)
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {},
+        moved={"igsr.rendering.renders": ("intrinsics_of", "project", "viewmat_about")},
+    )

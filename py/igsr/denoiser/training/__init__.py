@@ -7,8 +7,9 @@ they are first used (PEP 562), so that command lines load no torch.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from igsr.denoiser.training.pairs import make_pairs
@@ -18,22 +19,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Training", "TrainingProgress", "make_pairs", "train"]
 
-#: Where each public name is defined.
-_HOME_OF = {
-    "Training": "igsr.denoiser.training.training_settings",
-    "TrainingProgress": "igsr.denoiser.training.training_run",
-    "make_pairs": "igsr.denoiser.training.pairs",
-    "train": "igsr.denoiser.training.train_network",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
-        raise AttributeError(f"module 'igsr.denoiser.training' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME_OF[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "igsr.denoiser.training.pairs": ("make_pairs",),
+            "igsr.denoiser.training.train_network": ("train",),
+            "igsr.denoiser.training.training_run": ("TrainingProgress",),
+            "igsr.denoiser.training.training_settings": ("Training",),
+        },
+        moved={
+            "igsr.denoiser.training.distributed": ("is_first_process",),
+            "igsr.denoiser.training.training_run": ("LOG", "WEIGHTS"),
+        },
+    )
