@@ -12,6 +12,7 @@ import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
+from igsr.cli.error_messages import error_messages
 from igsr.cli.settings_options import settings_options
 from igsr.cli.shared import (
     BackendChoice,
@@ -25,7 +26,6 @@ from igsr.cli.shared import (
     TimeLeft,
     error_console,
     load,
-    one_sentence,
     output_console,
     picture_name,
     print_json,
@@ -93,7 +93,7 @@ def pairs_command(
     """
     from igsr.denoiser.training.pairs import DEFAULT_RECIPES, make_pairs
 
-    with one_sentence(
+    with error_messages(
         lambda: "Interrupted; finished fits are kept, the same command goes on from there."
     ):
         time_left = TimeLeft()
@@ -186,7 +186,7 @@ def train_command(
     from igsr.denoiser.training.train_network import train
     from igsr.denoiser.training.training_run import LOG, WEIGHTS, TrainingProgress
 
-    with one_sentence(
+    with error_messages(
         lambda: f"Interrupted; go on from the last checkpoint in {out} with --resume."
     ):
         if features is not None and lpips is not None:
@@ -298,7 +298,7 @@ def apply_command(
     )
     from igsr.splats import Splats
 
-    with one_sentence():
+    with error_messages():
         denoiser = NetworkDenoiser(load_network(weights))
         splats = Splats.load(scene)
         capture = load(capture_path, holdout)

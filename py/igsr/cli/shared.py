@@ -14,12 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, overload
 import typer
 
 from igsr._internal.choices import Backend, ResolvedBackend, Split
-from igsr.cli.error_messages import (
-    INTERRUPTED,
-    error_messages,
-    print_message,
-    warning_messages,
-)
 from igsr.errors import IgsrError
 
 # ``igsr info`` and ``igsr convert`` import this module: what takes long to import and only some
@@ -33,13 +27,6 @@ if TYPE_CHECKING:
     from igsr.splats import Splats
 
 logger = logging.getLogger(__name__)
-
-# The names that these had before.
-one_sentence = error_messages
-warnings_as_sentences = warning_messages
-complain = print_message
-
-__all__ = ["INTERRUPTED", "complain", "one_sentence", "warnings_as_sentences"]
 
 NAMED_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
 

@@ -23,7 +23,7 @@ from igsr.capture import Capture, View, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.write_cameras import write_cameras
 from igsr.capture.write_files import png_names
-from igsr.cli.shared import INTERRUPTED, one_sentence
+from igsr.cli.error_messages import INTERRUPTED, error_messages
 from igsr.errors import IgsrError
 
 #: The viewer.
@@ -55,7 +55,7 @@ def view_command(
     ] = None,
 ) -> None:
     """Show splats in a window, or two scenes side by side. Needs the program splat-view."""
-    with one_sentence():
+    with error_messages():
         program = shutil.which(PROGRAM)
         if program is None:
             raise IgsrError(

@@ -142,7 +142,7 @@ def _guarded(seed: int) -> Iterator[None]:
 
 
 def _file(index: int) -> str:
-    """The name of a photo in COLMAP's database: users' names are not trusted to it."""
+    """The name of a photo in COLMAP's database: COLMAP is never given the users' file names."""
     return f"{index:06d}.png"
 
 

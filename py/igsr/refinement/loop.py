@@ -137,7 +137,7 @@ def _round(
 def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDenoiser:
     """A denoiser for the rounds of ``refine``; None is the one that comes with igsr.
 
-    It makes all its changes, uncertain ones too: confidence weights say how much each counts.
+    It applies uncertain changes too: confidence weights say how much each counts.
 
     Raises:
         IgsrError: as ``igsr.denoiser.load_network``.
