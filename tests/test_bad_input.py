@@ -289,3 +289,22 @@ def test_core_names_arrays_of_the_wrong_kind():
     ):
         with pytest.raises(ValueError, match=name):
             _core.project(**{**good, name: wrong})
+
+
+def test_a_fit_says_what_it_takes(tmp_path):
+    with pytest.raises(igsr.IgsrError, match=r"capture must be a Capture, not str; igsr\.load"):
+        igsr.fit("photos")
+    capture = scenes.capture(views=2, size=24)
+    with pytest.raises(igsr.IgsrError, match="backend must be auto, cpu or gpu, not 'tpu'"):
+        igsr.fit(capture, steps=1, backend="tpu")
+
+
+@pytest.mark.parametrize("command", ["fit", "refine"])
+def test_an_out_that_is_a_file_is_told_first(command, tmp_path, igsr_here):
+    file = tmp_path / "scene.ply"
+    file.write_text("mine")
+    for out in (file, file / "below"):
+        refused = igsr_here(command, tmp_path / "nowhere", "--out", out)
+        assert refused.returncode == 1
+        assert refused.stderr == f"--out {out}: {file} is a file; name a folder.\n"
+    assert file.read_text() == "mine"

@@ -93,6 +93,13 @@ class CameraFinder:
         return {name: value for name, value in given.items() if value is not None}
 
 
+def _check_out(out: Path) -> None:
+    """Find an --out that cannot be a folder, before anything slow."""
+    existing = next((path for path in (out, *out.parents) if path.exists()), None)
+    if existing is not None and not existing.is_dir():
+        raise IgsrError(f"--out {out}: {existing} is a file; name a folder.")
+
+
 def capture_to_fit(
     path: Path,
     out: Path,
@@ -121,6 +128,7 @@ def capture_to_fit(
         IgsrError: the capture cannot be loaded, its cameras cannot be found, or options that find
             cameras were given for a capture that has them.
     """
+    _check_out(out)
     if holds_cameras(path) or not has_photos(path):
         if finder.options or finder.estimator != AUTO:
             raise IgsrError(

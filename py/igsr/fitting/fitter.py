@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
+from igsr._internal.choices import FitBackend
 from igsr.capture import Camera, Capture, View
 from igsr.capture.types import intrinsic_matrix
 from igsr.errors import IgsrError
@@ -73,10 +74,9 @@ def check_fits(backend: str) -> dict[str, str]:
     """
     if backend == "reference":
         raise IgsrError("backend reference renders but does not fit; use auto, cpu or gpu.")
-    try:
-        return _core.backend_info(_core.resolve_backend(backend))
-    except ValueError as error:
-        raise IgsrError(f"{error}.") from error
+    if backend not in get_args(FitBackend):
+        raise IgsrError(f"backend must be auto, cpu or gpu, not {backend!r}.")
+    return _core.backend_info(_core.resolve_backend(backend))
 
 
 def initial_state(

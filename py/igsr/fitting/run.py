@@ -176,6 +176,7 @@ def _fitted(
 ) -> tuple[Splats, Capture]:
     """What ``fit`` and ``fit_with_cameras`` do; ``given`` are fields of ``FitSettings``."""
     # Check what was asked for, before any work. Warnings point to the caller of our caller.
+    _check_capture(capture)
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
@@ -243,6 +244,14 @@ def _fitted(
     if settings.moves_cameras:
         capture = with_train_cameras(capture, fitted_cameras(views, fitter, origin))
     return splats, capture
+
+
+def _check_capture(capture: object) -> None:
+    if not isinstance(capture, Capture):
+        raise IgsrError(
+            f"capture must be a Capture, not {type(capture).__name__}; igsr.load_capture(path) "
+            "makes one."
+        )
 
 
 def _settings_from_splats(

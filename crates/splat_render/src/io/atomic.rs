@@ -28,6 +28,6 @@ pub fn write_atomically(
     };
     run().map_err(|error| {
         let _ = std::fs::remove_file(&temporary);
-        Error::file(path, format!("cannot be written ({error}); what stood there is unchanged"))
+        Error::file(path, format!("cannot be written ({error}); the existing file is unchanged"))
     })
 }

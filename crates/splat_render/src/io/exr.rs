@@ -30,7 +30,7 @@ pub struct ExrPicture<'a> {
 ///
 /// # Errors
 /// [`Error::Argument`] if an array has not `width * height` entries or there is no pixel;
-/// [`Error::File`] if the file cannot be written: what stood there is unchanged.
+/// [`Error::File`] if the file cannot be written: the existing file is unchanged.
 pub fn write_exr(path: &Path, picture: &ExrPicture<'_>) -> Result<()> {
     let ExrPicture { width, height, color, alpha, depth } = *picture;
     let pixels = width.checked_mul(height).filter(|&pixels| pixels > 0).ok_or_else(|| {
