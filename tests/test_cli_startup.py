@@ -57,7 +57,11 @@ def places(tmp_path_factory):
 def test_importing_igsr_imports_neither_numpy_nor_torch():
     modules, rooms = imported("import igsr")
     assert not modules & {*SLOW, "numpy", "rich", "typer", "PIL"}
-    assert rooms == {"igsr._internal", "igsr._internal.moved_modules"}
+    assert rooms == {
+        "igsr._internal",
+        "igsr._internal.lazy_exports",
+        "igsr._internal.moved_modules",
+    }
 
 
 @pytest.mark.parametrize(
