@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
+import enum
 import importlib
 import inspect
 import re
@@ -11,9 +13,14 @@ import textwrap
 import pytest
 
 import igsr
+from igsr._internal.settings import settings_of
 
 #: Packages whose ``__all__`` is public.
-ROOMS = ("igsr", "igsr.capture", "igsr.evaluation", "igsr.rendering")
+ROOMS = (
+    *("igsr", "igsr.capture", "igsr.geometry", "igsr.rendering", "igsr.evaluation", "igsr.pose"),
+    *("igsr.fitting", "igsr.denoiser", "igsr.denoiser.training", "igsr.refinement"),
+    *("igsr.compaction", "igsr.benchmark"),
+)
 SECTIONS = ("Args", "Attributes", "Raises", "Returns", "Yields")
 
 
@@ -69,7 +76,14 @@ def described(text):
 
 
 def wanted_names(thing):
-    """Parameters of a function, or of the class's constructor."""
+    """Parameters of a function, or of the class's constructor.
+
+    Not of enums, which are not constructed, and not settings, which carry their own help.
+    """
+    if inspect.isclass(thing) and issubclass(thing, enum.Enum):
+        return set()
+    settings = settings_of(thing) if dataclasses.is_dataclass(thing) else {}
+    assert all(setting.help for setting in settings.values())
     try:
         parameters = inspect.signature(thing).parameters.values()
     except ValueError:  # the constructor of a builtin
@@ -77,7 +91,8 @@ def wanted_names(thing):
     return {
         parameter.name
         for parameter in parameters
-        if parameter.name not in ("self", "args", "kwargs") and not parameter.name.startswith("_")
+        if parameter.name not in ("self", "args", "kwargs", *settings)
+        and not parameter.name.startswith("_")
     }
 
 

@@ -124,7 +124,15 @@ def measure_accuracy(
     on_row: Callable[[str], object] = lambda doing: None,
     scene: Scene | None = None,
 ) -> dict[str, Any]:
-    """``{"machine": ..., "rows": [...]}``; each row names its setting."""
+    """``{"machine": ..., "rows": [...]}``; each row names its setting.
+
+    Args:
+        backends: names as ``resolved_backends`` returns them.
+        seed: of the scene.
+        seconds: spent on each time.
+        on_row: called with each row when it is measured.
+        scene: to measure on; None is the default scene of ``seed``.
+    """
     scene = ball(seed, COUNT, WIDTH, HEIGHT, MAX_SH_DEGREE, SIZE) if scene is None else scene
     machine = describe_machine(list(backends), seed)
     on_row("what the settings leave out")
@@ -140,6 +148,10 @@ def measure_accuracy(
 
 def write_accuracy(path: Path, report: dict[str, Any]) -> None:
     """Write the page, and its plot beside it.
+
+    Args:
+        path: of the Markdown page.
+        report: of ``measure_accuracy``.
 
     Raises:
         IgsrError: a file cannot be written.

@@ -19,6 +19,10 @@ LEAST_ERROR = 1e-16
 def plot_speed_vs_error(path: Path, report: dict[str, Any]) -> None:
     """Write a PNG of (time, largest error) of each row, and of W4's growth where there is any.
 
+    Args:
+        path: of the PNG.
+        report: of ``run_benchmark`` or ``measure_accuracy``.
+
     Raises:
         IgsrError: the file cannot be written.
     """

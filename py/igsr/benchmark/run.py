@@ -142,5 +142,9 @@ def _capture_work(
 
 
 def resolved_backends(names: list[str]) -> tuple[str, ...]:
-    """Backends by the names that run, each once."""
+    """Backends by the names that run, each once.
+
+    Args:
+        names: "auto", "cpu", "gpu" or "reference", in any number.
+    """
     return tuple(dict.fromkeys(_core.resolve_backend(name) for name in names))

@@ -80,7 +80,12 @@ def machine_line(machine: dict[str, Any]) -> str:
 
 
 def print_report(console: Console, report: dict[str, Any]) -> None:
-    """The table, what did not run and why, and how to read it."""
+    """The table, what did not run and why, and how to read it.
+
+    Args:
+        console: where to print.
+        report: of ``run_benchmark``.
+    """
     table = rows_table(report["rows"])
     # A terminal breaks long lines by itself; cells that end in an ellipsis say nothing.
     wide = console.options.update(max_width=1000)

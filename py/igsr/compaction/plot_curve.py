@@ -14,6 +14,10 @@ WITHIN, BEYOND, CHOSEN = "#0072b2", "#d55e00", "#009e73"
 def write_plot(path: Path, report: dict[str, Any]) -> None:
     """Write a PNG of the curve of ``Compaction.report``: loss against splats and against bytes.
 
+    Args:
+        path: of the PNG.
+        report: ``Compaction.report``.
+
     Raises:
         IgsrError: the file cannot be written.
     """

@@ -73,7 +73,11 @@ class NetworkDenoiser:
         return picture, np.where(broken, np.float32(0.0), confidence)
 
     def clean(self, inputs: Float32) -> tuple[Float32, Float32]:
-        """Clean what ``network_inputs`` gave, [``CHANNELS``, H, W]; returns as ``denoise``."""
+        """Clean what ``network_inputs`` gave, [``CHANNELS``, H, W]; returns as ``denoise``.
+
+        Args:
+            inputs: float32 [``CHANNELS``, H, W].
+        """
         image, log_error = self._in_tiles(torch.from_numpy(inputs)[None])
         render = torch.from_numpy(inputs[:COLOR])
         expected = log_error[0, 0].exp()

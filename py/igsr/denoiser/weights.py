@@ -46,6 +46,9 @@ def save_network(
 def load_network(path: str | os.PathLike[str] | None = None) -> DenoiserNetwork:
     """Read a network; None is the one that comes with igsr.
 
+    Args:
+        path: of a ``.safetensors`` file; None is the network that comes with igsr.
+
     Raises:
         IgsrError: the file is missing, no denoiser of igsr's, truncated, or lacks a weight.
     """

@@ -40,6 +40,10 @@ class FitSettings:
     Each field says in its metadata what it means (``igsr._internal.settings``). Presets have values
     for all that have no default here.
 
+    Attributes:
+        first_step: steps of the schedule that count as done: a fit that goes on from splats enters
+            it late.
+
     Raises:
         IgsrError: a setting cannot be used; the message names it.
     """
@@ -100,7 +104,6 @@ class FitSettings:
             read=_color,
         ),
     )
-    #: Steps of the schedule that count as done: a fit that goes on from splats enters it late.
     first_step: int = 0
 
     def __post_init__(self) -> None:

@@ -26,6 +26,11 @@ def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
     median distance and height, with their up direction, and with the first camera's lens. Without
     one it goes around the middle of the splats, z up.
 
+    Args:
+        splats: the scene.
+        capture: whose cameras the circle is fitted to, or None.
+        frames: number of cameras, at least 1.
+
     Raises:
         IgsrError: ``frames`` is under 1, or there are no finite splats to look at.
     """
@@ -67,6 +72,11 @@ def cameras_around(splats: Splats, count: int, side: int) -> list[Camera]:
 
     Neighbours in the list stand far from each other, so every so many of them are spread as well.
     Pictures are ``side`` pixels wide and high.
+
+    Args:
+        splats: the scene.
+        count: number of cameras.
+        side: width and height of the pictures, pixels.
 
     Raises:
         IgsrError: there are no finite splats to look at.

@@ -114,6 +114,10 @@ def _direction_angle(a: Float64, b: Float64) -> float:
 def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> dict[str, float]:
     """How far cameras are from the true ones once the true ones have been aligned to them.
 
+    Args:
+        cameras: the estimated cameras.
+        true_cameras: as many true ones, in the same order.
+
     Returns:
         "rotation": mean angle in degrees; "centre": mean distance in units of the true world.
 
@@ -130,7 +134,11 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> di
 
 
 def rotation_angle(rotation: Float64) -> float:
-    """Degrees that a rotation matrix turns by; accurate for small ones too."""
+    """Degrees that a rotation matrix turns by; accurate for small ones too.
+
+    Args:
+        rotation: float64 [3, 3], a rotation matrix.
+    """
     sine = 0.5 * np.linalg.norm(
         [
             rotation[2, 1] - rotation[1, 2],

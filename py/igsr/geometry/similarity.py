@@ -118,7 +118,11 @@ class Similarity:
     translation: Float64
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera that sees the mapped world as ``camera`` sees its own."""
+        """The camera that sees the mapped world as ``camera`` sees its own.
+
+        Args:
+            camera: in the world that is mapped from.
+        """
         viewmat = np.eye(4)
         viewmat[:3, :3] = camera.viewmat[:3, :3] @ self.rotation.T
         centre = self.scale * self.rotation @ camera.centre + self.translation
@@ -132,6 +136,10 @@ def similarity_between(cameras: Sequence[Camera], others: Sequence[Camera]) -> S
     The rotation is the one that turns both the viewing axes and the centres' offsets from their
     mean best (Procrustes); scale and translation are those of the centres. One camera alone, or
     cameras at one place, keep their scale.
+
+    Args:
+        cameras: at least one.
+        others: as many, in the same order.
 
     Raises:
         IgsrError: there are no cameras, or not as many of one as of the other.

@@ -104,6 +104,13 @@ def estimate(
 ) -> tuple[str, Estimate]:
     """The name of the estimator that ran, and all that it found; see ``estimate_poses``.
 
+    Args:
+        photos: at least two, upright.
+        estimator: its name, or "auto".
+        seed: random seed.
+        progress: called with a stage, how much of it is done, and how much there is.
+        options: of the estimator.
+
     Raises:
         IgsrError: as ``estimate_poses``.
     """
@@ -131,6 +138,11 @@ def estimate(
 
 def capture_of(path: Path, photos: Sequence[Photo], found: Estimate) -> Capture:
     """The registered photos of an estimate as a capture, with lens distortion undone.
+
+    Args:
+        path: that the capture has.
+        photos: those that cameras were estimated for.
+        found: the estimate, of as many photos.
 
     Raises:
         IgsrError: a lens bends so much that nothing of its photo is left.

@@ -18,6 +18,10 @@ GIVEN = "photos.json"
 def kept_cameras(photos: Path, out: Path) -> Path:
     """The folder that caches the estimated cameras of ``photos`` for the output folder ``out``.
 
+    Args:
+        photos: folder or file of photos.
+        out: output folder of the fit.
+
     Raises:
         IgsrError: the photos themselves lie there, or other files that would be replaced.
     """
@@ -29,12 +33,20 @@ def kept_cameras(photos: Path, out: Path) -> Path:
 
 
 def photos_note(photos: Path) -> dict[str, str]:
-    """The note in the cache that says which photos the cameras were estimated for."""
+    """The note in the cache that says which photos the cameras were estimated for.
+
+    Args:
+        photos: folder or file of photos.
+    """
     return {GIVEN: json.dumps(photo_sizes(photos), indent=1)}
 
 
 def found_before(photos: Path, kept: Path) -> bool:
     """Whether the cache ``kept`` holds cameras of ``photos``.
+
+    Args:
+        photos: folder or file of photos.
+        kept: the cache, of ``kept_cameras``.
 
     Raises:
         IgsrError: it holds cameras of other photos.
@@ -53,6 +65,9 @@ def not_placed(capture: Capture) -> list[str]:
     """Names of the photos that are not registered, if the cameras were estimated.
 
     They come from the cache, since a capture may hold fewer views than were registered.
+
+    Args:
+        capture: the photos that were fitted.
     """
     given = _given(capture.path) or {}
     photos = capture.path / "images"

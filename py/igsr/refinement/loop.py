@@ -139,6 +139,9 @@ def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDeno
 
     It applies uncertain changes too: confidence weights say how much each counts.
 
+    Args:
+        weights: a ``.safetensors`` file; None is the denoiser that comes with igsr.
+
     Raises:
         IgsrError: as ``igsr.denoiser.load_network``.
     """
