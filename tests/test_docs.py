@@ -52,6 +52,8 @@ SHORT = {"--steps": "4", "--rounds": "0", "--orbit": "2", "--max-splats": "600"}
 ADDED = ("--steps", "--rounds", "--max-splats")
 #: Where `igsr refine` makes a round, which takes longer than all else.
 WITH_A_ROUND = "README.md"
+#: Options of ``igsr`` itself, before the command, and how many values follow each.
+PROCESS_OPTIONS = {"--threads": 1, "-v": 0, "-vv": 0, "--debug": 0, "--version": 0}
 #: Options in the text that are other programs'.
 OF_OTHERS = {"--locked", "--path", "--release", "--nocapture", "--grid", "--window"}
 #: Pages that tell of splat-view's options, and of options as they were.
@@ -127,9 +129,18 @@ def _commands_by_name() -> dict[str, Any]:
     return dict(module.walk())
 
 
+def _without_process_options(words: list[str]) -> list[str]:
+    """The words without what stands between "igsr" and the command: "--threads 1", "-v" ..."""
+    rest = words[1:]
+    while rest and rest[0] in PROCESS_OPTIONS:
+        rest = rest[1 + PROCESS_OPTIONS[rest[0]] :]
+    return [words[0], *rest]
+
+
 def _named_command(words: list[str]) -> tuple[str, Any]:
     """The command that words such as "igsr study table2 DATA" name, and its name."""
     known = _commands_by_name()
+    words = _without_process_options(words)
     name = " ".join(words[:2])
     while len(words) > len(name.split()) and f"{name} {words[len(name.split())]}" in known:
         name += " " + words[len(name.split())]
@@ -147,6 +158,7 @@ def _unknown_options(words: list[str]) -> list[str]:
     name, command = _named_command(words)
     if name == "igsr view":
         return []  # the rest is splat-view's
+    words = _without_process_options(words)
     given = [word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)]
     return [option for option in given if option not in _options(command)]
 
@@ -190,7 +202,9 @@ def test_commands_and_options_exist(page: str) -> None:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in OTHER_OPTIONS])
 def test_options_in_the_text_exist(page: str) -> None:
-    known = OF_OTHERS.union(*(_options(command) for command in _commands_by_name().values()))
+    known = OF_OTHERS.union(
+        _options(get_command(app)), *(_options(command) for command in _commands_by_name().values())
+    )
     spans = [span for span in documentation.inline_code(page) if span.startswith("--")]
     named = [word for span in spans for word in re.findall(r"(?<!\S)--[a-z][\w-]*", span)]
     assert [option for option in named if option not in known] == []
