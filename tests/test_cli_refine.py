@@ -75,7 +75,7 @@ def test_what_cannot_be_used_is_told_before_anything_slow(tmp_path, igsr_here, m
         path.parent.mkdir(exist_ok=True)
         Image.fromarray(view.image).save(path)
     old = tmp_path / "report.json"
-    old.write_text('{"rounds": [], "stopped": "2 rounds are done"}')
+    old.write_text('{"rounds": [], "stopped": "2 rounds are done", "version": "0.1.0"}')
     wrong = tmp_path / "wrong.json"
     wrong.write_text('{"settings": {"rounds": 2, "steps": 0}}')
     missing = tmp_path / "none.json"
@@ -86,8 +86,8 @@ def test_what_cannot_be_used_is_told_before_anything_slow(tmp_path, igsr_here, m
         (["--rounds", "some"], "rounds must be a whole number or \"auto\", not 'some'."),
         (["--rounds", "-1"], "rounds must not be negative, not -1."),
         (["--steps", "0"], "steps must be from 1 to 10000000, not 0."),
-        (["--config", missing], f"{missing} cannot be read: "),
-        (["--config", old], f"{old} has no settings of a refinement"),
+        (["--config", missing], f"Cannot read {missing}: No such file or directory."),
+        (["--config", old], f"{old} has no settings: it is a report of an older version of igsr."),
         (["--config", wrong], f"{wrong}: steps must be from 1 to 10000000, not 0."),
     ):
         bad = igsr_here(*command, *options)

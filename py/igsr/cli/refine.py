@@ -18,7 +18,7 @@ from igsr.cli.pose import (
     GraphOption,
     capture_to_fit,
 )
-from igsr.cli.settings_options import settings_options
+from igsr.cli.settings_options import ConfigOption, settings_options
 from igsr.cli.shared import (
     HoldoutOption,
     JsonOption,
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 @settings_options(RefineSettings)
 def refine_command(
-    context: typer.Context,
     photos: Annotated[
         Path, typer.Argument(metavar="PHOTOS", help="A folder of photos, or a capture.")
     ],
@@ -58,15 +57,7 @@ def refine_command(
     network: CheckpointOption = None,
     graph: GraphOption = None,
     frames: FramesOption = FRAMES,
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            "--config",
-            metavar="FILE",
-            help="The report.json of an earlier run, for rounds, steps, backend, seed and "
-            "cross-validation. Options that are given here win.",
-        ),
-    ] = None,
+    config: ConfigOption = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the checkpoints in --out.")
     ] = False,
@@ -76,7 +67,7 @@ def refine_command(
     with error_messages(
         lambda: f"Interrupted; what is done is in {out}, the same command with --resume goes on."
     ):
-        settings = RefineSettings(**_given(context, given, config))
+        settings = RefineSettings(**given)
         if photo_count is not None:
             _check_photo_count(photos, holdout, photo_count)
 
@@ -110,24 +101,6 @@ def refine_command(
         print_json(_summary(refined, out))
     else:
         _print_summary(refined, out)
-
-
-def _given(context: typer.Context, given: dict[str, Any], config: Path | None) -> dict[str, Any]:
-    """The settings of the command line, on top of those of an earlier run's report.
-
-    Raises:
-        IgsrError: the report cannot be read or has no settings.
-    """
-    if config is None:
-        return given
-    from igsr.refinement.report import settings_of
-
-    explicit = {
-        name: value
-        for name, value in given.items()
-        if getattr(context.get_parameter_source(name), "name", "") != "DEFAULT"
-    }
-    return settings_of(config) | explicit
 
 
 def _check_photo_count(photos: Path, holdout: int | None, count: int) -> None:

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 
 import typer
 
-from igsr._internal.settings import Setting, settings_of
+from igsr._internal.settings import Setting, checked, settings_of
 from igsr.cli.error_messages import error_messages
 from igsr.errors import IgsrError
 
@@ -68,6 +68,7 @@ def settings_options(
 
         wrapped.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         wrapped.__annotations__ = {one.name: one.annotation for one in parameters}
+        wrapped.settings = {one.name: one for one in settings}  # type: ignore[attr-defined]
         return wrapped
 
     return with_options
@@ -91,9 +92,11 @@ def options_in(path: Path, command: Any) -> dict[str, Any]:
 
     Raises:
         IgsrError: the file cannot be read, is no such file, or names what is no option; a value is
-            of another type than the option's. The message names file and option.
+            of another type than the option's, or out of a setting's range. The message names file
+            and option.
     """
     kinds = inspect.signature(command.callback, eval_str=True).parameters
+    settings: dict[str, Setting] = getattr(command.callback, "settings", {})
     known = {
         name.lstrip("-").replace("-", "_"): one.name
         for one in command.params
@@ -107,9 +110,16 @@ def options_in(path: Path, command: Any) -> dict[str, Any]:
             raise IgsrError(f"{path}: there is no option {name!r} here; leave it out.")
         if value is None:
             continue
-        types, words = _JSON_TYPES.get(_kind(kinds[parameter].annotation), ((str,), "a text"))
-        if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
-            raise IgsrError(f"{path}: {name} must be {words}, not {json.dumps(value)}.")
+        setting = settings.get(parameter)
+        if setting is None or setting.read is None:
+            types, words = _JSON_TYPES.get(_kind(kinds[parameter].annotation), ((str,), "a text"))
+            if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
+                raise IgsrError(f"{path}: {name} must be {words}, not {json.dumps(value)}.")
+        if setting is not None:
+            try:
+                checked(setting, value)
+            except IgsrError as error:
+                raise IgsrError(f"{path}: {error}") from error
         found[parameter] = value
     return found
 
@@ -124,6 +134,8 @@ def _json_object(path: Path) -> dict[str, Any]:
         raise IgsrError(f"{path} is no JSON file of options ({error}).") from error
     if isinstance(values, dict) and isinstance(values.get("settings"), dict):
         values = values["settings"]
+    elif isinstance(values, dict) and "version" in values:
+        raise IgsrError(f"{path} has no settings: it is a report of an older version of igsr.")
     if not isinstance(values, dict):
         raise IgsrError(f"{path} is no JSON file of options: it holds no object.")
     return values

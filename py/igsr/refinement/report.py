@@ -17,9 +17,7 @@ from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import Backend
 from igsr._internal.json_file import write_json
-from igsr._internal.settings import checked_given
 from igsr.capture.write_cameras import write_cameras
-from igsr.errors import IgsrError
 from igsr.evaluation.contact_sheet import rounds_sheet, save_sheet, sheet_names
 from igsr.evaluation.scores import default_background, score_views
 from igsr.pose import not_placed
@@ -105,28 +103,6 @@ def seconds_so_far(out: Path) -> dict[Stage, float]:
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return {}
     return {stage: value for stage, value in seconds.items() if 0.0 <= value < math.inf}
-
-
-def settings_of(report: Path) -> dict[str, Any]:
-    """The settings of ``RefineSettings`` that a ``report.json`` has.
-
-    Raises:
-        IgsrError: the file cannot be read, has no settings, or one of them cannot be used.
-    """
-    try:
-        found = json.loads(report.read_text(encoding="utf-8"))["settings"]
-    except OSError as error:
-        raise IgsrError(f"{report} cannot be read: {error.strerror or error}.") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise IgsrError(
-            f"{report} has no settings of a refinement; reports of older versions have none."
-        ) from error
-    if not isinstance(found, dict):
-        raise IgsrError(f"{report}: settings must be an object.")
-    try:
-        return checked_given(RefineSettings, found)
-    except IgsrError as error:
-        raise IgsrError(f"{report}: {error}") from error
 
 
 def _round_row(done: Round) -> dict[str, Any]:
