@@ -1,7 +1,5 @@
 //! Renders as OpenEXR files in 32-bit float.
 
-use std::path::Path;
-
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use splat_render::io::{self, ExrPicture};
@@ -32,5 +30,7 @@ pub fn write_exr(
     let depth = elements("depth", &depth, &size)?;
     let alpha = elements("alpha", &alpha, &size)?;
     let picture = ExrPicture { width, height, color, alpha, depth };
-    py.detach(|| io::write_exr(Path::new(path), &picture)).map_err(to_python)
+    let bytes = py.detach(|| io::encode_exr(&picture)).map_err(to_python)?;
+    // To the name as it is given: callers in Python rename it in the end.
+    Ok(py.detach(|| std::fs::write(path, bytes))?)
 }

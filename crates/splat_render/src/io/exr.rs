@@ -29,9 +29,18 @@ pub struct ExrPicture<'a> {
 /// Writes a picture as an EXR file of one layer with the channels A, B, G, R, Z, whole or not at all.
 ///
 /// # Errors
-/// [`Error::Argument`] if an array has not `width * height` entries or there is no pixel;
-/// [`Error::File`] if the file cannot be written: the existing file is unchanged.
+/// Those of [`encode_exr`]; [`Error::File`] if the file cannot be written: the existing file is
+/// unchanged.
 pub fn write_exr(path: &Path, picture: &ExrPicture<'_>) -> Result<()> {
+    let bytes = encode_exr(picture)?;
+    write_atomically(path, |out| out.write_all(&bytes))
+}
+
+/// The bytes of that file, for callers that write it themselves.
+///
+/// # Errors
+/// [`Error::Argument`] if an array has not `width * height` entries or there is no pixel.
+pub fn encode_exr(picture: &ExrPicture<'_>) -> Result<Vec<u8>> {
     let ExrPicture { width, height, color, alpha, depth } = *picture;
     let pixels = width.checked_mul(height).filter(|&pixels| pixels > 0).ok_or_else(|| {
         Error::argument("width, height", format!("must be positive, got {width} x {height}"))
@@ -66,6 +75,6 @@ pub fn write_exr(path: &Path, picture: &ExrPicture<'_>) -> Result<()> {
     Image::from_layer(layer)
         .write()
         .to_buffered(&mut bytes)
-        .map_err(|e| Error::file(path, format!("cannot be written as EXR ({e})")))?;
-    write_atomically(path, |out| out.write_all(bytes.get_ref()))
+        .map_err(|e| Error::argument("picture", format!("cannot be written as EXR ({e})")))?;
+    Ok(bytes.into_inner())
 }

@@ -26,7 +26,7 @@ mod splat_file;
 mod spz;
 
 pub use atomic::write_atomically;
-pub use exr::{ExrPicture, write_exr};
+pub use exr::{ExrPicture, encode_exr, write_exr};
 pub use format::Format;
 pub use splat_file::{Loaded, SplatFile};
 
