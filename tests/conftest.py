@@ -5,6 +5,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+import refinements
 
 from igsr import cli
 
@@ -17,6 +18,31 @@ hypothesis.settings.load_profile("igsr")
 def example_path() -> Path:
     """The capture that is committed as an example."""
     return Path(__file__).parent.parent / "examples" / "tea_table"
+
+
+@pytest.fixture
+def small_fits():
+    """Fits within a refinement are short; see ``refinements.small_fits``."""
+    with refinements.small_fits():
+        yield
+
+
+@pytest.fixture(scope="session")
+def ball_photos():
+    """The capture that refinements are tested on."""
+    return refinements.capture()
+
+
+@pytest.fixture(scope="session")
+def helped(ball_photos, tmp_path_factory):
+    """A refinement of two rounds that help: what it returns, its folder, its progress."""
+    out = tmp_path_factory.mktemp("helped")
+    seen = []
+    with refinements.small_fits():
+        refined = refinements.refine(
+            ball_photos, 2, refinements.truthful, out=out, progress=seen.append
+        )
+    return refined, out, seen
 
 
 @pytest.fixture

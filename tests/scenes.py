@@ -107,3 +107,26 @@ def write_capture(folder, made):
         )
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
     return folder
+
+
+def project_call():
+    """Arguments of ``_core.project`` that draw the small scene."""
+    scene, camera = splats(), ring_camera(0.0)
+    return {
+        "means": scene.means,
+        "quats": scene.quats,
+        "scales": scene.scales,
+        "opacities": scene.opacities,
+        "colors": scene.sh,
+        "sh_degree": 1,
+        "raw_parameters": True,
+        "viewmat": camera.viewmat,
+        "intrinsics": np.array([72.0, 72.0, 24.0, 24.0]),
+        "width": 48,
+        "height": 48,
+        "near": 0.01,
+        "far": 100.0,
+        "eps2d": 0.3,
+        "antialiased": False,
+        "backend": "cpu",
+    }

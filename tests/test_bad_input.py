@@ -256,26 +256,8 @@ def test_render_names_what_the_renderer_refuses():
 
 
 def test_core_names_arrays_of_the_wrong_kind():
-    splats = scenes.splats()
-    camera = scenes.ring_camera(0.0)
-    good = {
-        "means": splats.means,
-        "quats": splats.quats,
-        "scales": splats.scales,
-        "opacities": splats.opacities,
-        "colors": splats.sh,
-        "sh_degree": 1,
-        "raw_parameters": True,
-        "viewmat": camera.viewmat,
-        "intrinsics": np.array([72.0, 72.0, 24.0, 24.0]),
-        "width": 48,
-        "height": 48,
-        "near": 0.01,
-        "far": 100.0,
-        "eps2d": 0.3,
-        "antialiased": False,
-        "backend": "cpu",
-    }
+    splats, camera = scenes.splats(), scenes.ring_camera(0.0)
+    good = scenes.project_call()
     assert len(_core.project(**good)["means2d"]) == len(splats)
     for name, wrong in (
         ("means", splats.means.astype(np.float64)),

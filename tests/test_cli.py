@@ -313,7 +313,8 @@ def test_full_disk_is_a_sentence_and_keeps_the_old_files(fitted, capture_path, t
         "render", out / "scene.ply", "--cameras", capture_path, "--exr", "--out", tmp_path / "exr",
         "--backend", "cpu", preexec_fn=small_files_only,
     )  # fmt: skip
-    refused(result, "00.exr")
+    refused(result, "00.exr: File too large")
+    assert "unfinished" not in result.stderr, "a temporary name is nobody's business"
     assert not (tmp_path / "orbit.mp4").exists()
     assert not any(path.is_file() for path in (tmp_path / "exr").rglob("*"))
 

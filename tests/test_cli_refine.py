@@ -14,23 +14,14 @@ from PIL import Image
 import igsr
 from igsr.pose import registry
 
-
-@pytest.fixture(scope="module", autouse=True)
-def small():
-    with refinements.small_fits():
-        yield
+pytestmark = pytest.mark.usefixtures("small_fits")
 
 
-@pytest.fixture(scope="module")
-def capture():
-    return refinements.capture()
-
-
-def test_the_command(capture, tmp_path, igsr_here, monkeypatch):
+def test_the_command(ball_photos, tmp_path, igsr_here, monkeypatch):
     from igsr.denoiser import save_network
     from igsr.denoiser.network import Architecture, DenoiserNetwork
 
-    scenes.write_capture(tmp_path / "ball", capture)
+    scenes.write_capture(tmp_path / "ball", ball_photos)
     save_network(DenoiserNetwork(Architecture(4, (0, 0, 0))), tmp_path / "a.safetensors", {})
     command = ["refine", tmp_path / "ball", "--out", tmp_path / "out", "--steps", "60"]
     command += ["--weights", tmp_path / "a.safetensors", "--backend", "cpu", "--rounds", "1"]
@@ -98,8 +89,8 @@ def test_what_cannot_be_used_is_told_before_anything_slow(tmp_path, igsr_here, m
     assert not (tmp_path / "out").exists()
 
 
-def test_the_settings_of_a_report_run_again(capture, tmp_path, igsr_here):
-    scenes.write_capture(tmp_path / "ball", capture)
+def test_the_settings_of_a_report_run_again(ball_photos, tmp_path, igsr_here):
+    scenes.write_capture(tmp_path / "ball", ball_photos)
     command = ["refine", tmp_path / "ball", "--photos", "3"]
     settings = ["--steps", "30", "--rounds", "0", "--seed", "7", "--backend", "cpu"]
     settings += ["--no-cross-validate"]

@@ -207,7 +207,7 @@ def test_same_seed_same_bits(photos):
 
 
 def test_what_nobody_sees_goes_without_harm():
-    """Steps of fitting would only hurt a model that is judged by its own pictures."""
+    """Steps of fitting would only hurt a model that is validated on its own renders."""
     seen = scenes.splats(count=30, degree=1)
     inside = replace(scenes.splats(count=30, degree=1), opacities=np.full(30, -9.0, np.float32))
     model = igsr.Splats(

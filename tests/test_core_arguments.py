@@ -14,31 +14,9 @@ from igsr import _core
 ODD = (None, True, -1, 0, 2**32 - 1, 2**70, 1e308, float("nan"), "", "a\0b", [], {}, b"x", object())
 
 
-def project_call():
-    splats, camera = scenes.splats(), scenes.ring_camera(0.0)
-    return {
-        "means": splats.means,
-        "quats": splats.quats,
-        "scales": splats.scales,
-        "opacities": splats.opacities,
-        "colors": splats.sh,
-        "sh_degree": 1,
-        "raw_parameters": True,
-        "viewmat": camera.viewmat,
-        "intrinsics": np.array([72.0, 72.0, 24.0, 24.0]),
-        "width": 48,
-        "height": 48,
-        "near": 0.01,
-        "far": 100.0,
-        "eps2d": 0.3,
-        "antialiased": False,
-        "backend": "cpu",
-    }
-
-
 def calls():
     """Every function of many arguments with good ones."""
-    project = project_call()
+    project = scenes.project_call()
     projected = _core.project(**project)
     size = {"width": 48, "height": 48}
     background = np.zeros(3, np.float32)

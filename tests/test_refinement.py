@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import refinements
 from refinements import contented, lying, refine, same, truthful, unsure
 
 import igsr
@@ -21,23 +20,7 @@ from igsr.refinement.selection import select_views
 SHIPPED_PHOTO_STEPS = fitter.PHOTO_STEPS
 
 
-@pytest.fixture(scope="module", autouse=True)
-def small():
-    with refinements.small_fits():
-        yield
-
-
-@pytest.fixture(scope="module")
-def capture():
-    return refinements.capture()
-
-
-@pytest.fixture(scope="module")
-def helped(capture, tmp_path_factory):
-    out = tmp_path_factory.mktemp("helped")
-    seen = []
-    refined = refine(capture, 2, truthful, out=out, progress=seen.append)
-    return refined, out, seen
+pytestmark = pytest.mark.usefixtures("small_fits")
 
 
 def test_rounds_that_help_are_accepted_and_make_views_better(helped):
@@ -56,9 +39,9 @@ def test_rounds_that_help_are_accepted_and_make_views_better(helped):
     assert {now.stage for now in seen} == {"fit", "novel_views", "cross_validate", "refit", "test"}
 
 
-def test_a_round_helps_with_as_many_steps_on_photos_as_igsr_has(capture, helped, monkeypatch):
+def test_a_round_helps_with_as_many_steps_on_photos_as_igsr_has(ball_photos, helped, monkeypatch):
     monkeypatch.setattr(fitter, "PHOTO_STEPS", SHIPPED_PHOTO_STEPS)
-    refined = refine(capture, 1, truthful)
+    refined = refine(ball_photos, 1, truthful)
     assert same(refined.first, helped[0].first)
     (one,) = refined.rounds
     assert one.accepted
@@ -66,8 +49,8 @@ def test_a_round_helps_with_as_many_steps_on_photos_as_igsr_has(capture, helped,
     assert one.test["psnr"] > refined.first_test["psnr"] + 0.1
 
 
-def test_a_round_that_does_not_help_is_rolled_back(capture, helped, tmp_path):
-    refined = refine(capture, "auto", lying, out=tmp_path)
+def test_a_round_that_does_not_help_is_rolled_back(ball_photos, helped, tmp_path):
+    refined = refine(ball_photos, "auto", lying, out=tmp_path)
     assert [one.accepted for one in refined.rounds] == [False]
     assert refined.stop == Stop(StopReason.NOT_ACCEPTED, 1)
     assert refined.splats is refined.first
@@ -80,29 +63,29 @@ def test_a_round_that_does_not_help_is_rolled_back(capture, helped, tmp_path):
     assert (kinds.count(0), kinds.count(1), kinds.count(2)) == (9, 0, looked_at)
 
 
-def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(capture, helped):
-    refined = refine(capture, "auto", unsure)
+def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(ball_photos, helped):
+    refined = refine(ball_photos, "auto", unsure)
     assert not refined.rounds
     assert refined.stop == Stop(StopReason.NONE_SELECTED, len(refined.rejected))
     assert "cross_validate" not in refined.seconds
     assert same(refined.splats, helped[0].first)
-    content = refine(capture, "auto", contented)
+    content = refine(ball_photos, "auto", contented)
     assert not content.rounds
     assert content.stop.reason is StopReason.NONE_SELECTED
     assert len(content.rejected) > 5
     assert all(one.gain == 0.0 for one in content.rejected)
     assert "cross_validate" not in content.seconds
-    none = refine(capture, 0, truthful)
+    none = refine(ball_photos, 0, truthful)
     assert none.stop == Stop(StopReason.ROUNDS_DONE, 0)
     assert same(none.splats, helped[0].first)
-    two = igsr.Capture(capture.path, capture.train_views[:2])
+    two = igsr.Capture(ball_photos.path, ball_photos.train_views[:2])
     assert refine(two, 1, truthful).stop == Stop(StopReason.TOO_FEW_PHOTOS, 3)
 
 
-def test_folds_are_fitted_as_all_photos_are(capture, monkeypatch):
+def test_folds_are_fitted_as_all_photos_are(ball_photos, monkeypatch):
     """One photo more than few: the folds have few, but are fitted with the settings for many."""
     monkeypatch.setattr(presets, "FEW_PHOTOS", 8)
-    assert len(capture.train_views) == 9
+    assert len(ball_photos.train_views) == 9
     settings = []
     real = stages.fit
 
@@ -111,16 +94,16 @@ def test_folds_are_fitted_as_all_photos_are(capture, monkeypatch):
         return real(made, **given)
 
     monkeypatch.setattr(stages, "fit", watched)
-    refine(capture, 1, lying, steps=40)
+    refine(ball_photos, 1, lying, steps=40)
     assert [photos for photos, *_ in settings][:3] == [9, 7, 8]
     assert {tuple(some) for _, *some in settings} == {("original", 2, 0.0)}
 
 
-def test_what_masks_hide_has_no_weight(capture):
+def test_what_masks_hide_has_no_weight(ball_photos):
     """Photos of one half alone: what only the other half would have shown has no weight."""
     half = np.zeros((40, 40), np.bool_)
     half[:, :20] = True
-    views = [replace(view, mask=half) for view in capture.train_views]
+    views = [replace(view, mask=half) for view in ball_photos.train_views]
     confidences = []
     real = select_views
 
@@ -132,8 +115,8 @@ def test_what_masks_hide_has_no_weight(capture):
         return truthful(buffers, photos)[0], np.full(buffers.color.shape[:2], 1.0, np.float32)
 
     given = {"cross_validate": False, "select": select}
-    refine(igsr.Capture(capture.path, views), 1, sure, **given)
-    refine(igsr.Capture(capture.path, capture.train_views), 1, sure, **given)
+    refine(igsr.Capture(ball_photos.path, views), 1, sure, **given)
+    refine(igsr.Capture(ball_photos.path, ball_photos.train_views), 1, sure, **given)
     masked, whole = (np.stack(some) for some in confidences)
     assert (whole == whole.max()).all(), "without masks what the denoiser says counts"
     assert masked.min() == 0.0
@@ -155,13 +138,13 @@ def test_what_masks_hide_has_no_weight(capture):
         (1, {"seed": -1}, "seed must be from 0 to"),
     ],
 )
-def test_bad_arguments(capture, rounds, options, message, monkeypatch, tmp_path):
+def test_bad_arguments(ball_photos, rounds, options, message, monkeypatch, tmp_path):
     earlier = tmp_path / "checkpoints/whole.npz"
     earlier.parent.mkdir()
     earlier.write_bytes(b"of an earlier run")
     given = options if "resume" in options else {**options, "out": tmp_path}
     with pytest.raises(igsr.IgsrError, match=message):
-        refine(capture, rounds, truthful, **given)
+        refine(ball_photos, rounds, truthful, **given)
     assert earlier.is_file()
     searched = lambda *_: pytest.fail("cameras are looked for")  # noqa: E731
     monkeypatch.setattr(RefineRun, "find_cameras", searched)
@@ -170,7 +153,7 @@ def test_bad_arguments(capture, rounds, options, message, monkeypatch, tmp_path)
 
 
 def test_photos_that_cannot_be_fitted_or_scored_are_told_before_anything_is_done(
-    capture, monkeypatch, tmp_path
+    ball_photos, monkeypatch, tmp_path
 ):
     monkeypatch.setattr(stages, "fit", lambda *_, **__: pytest.fail("it is fitted"))
     earlier = tmp_path / "checkpoints/whole.npz"
@@ -178,15 +161,15 @@ def test_photos_that_cannot_be_fitted_or_scored_are_told_before_anything_is_done
     earlier.write_bytes(b"of an earlier run")
     nothing = np.zeros((40, 40), np.bool_)
     for split, message in (("train", "no pixel to fit"), ("test", "no pixel to score")):
-        views = [replace(v, mask=nothing) if v.split == split else v for v in capture.views]
+        views = [replace(v, mask=nothing) if v.split == split else v for v in ball_photos.views]
         with pytest.raises(igsr.IgsrError, match=message):
-            refine(igsr.Capture(capture.path, views), 1, truthful, out=tmp_path)
+            refine(igsr.Capture(ball_photos.path, views), 1, truthful, out=tmp_path)
     assert earlier.is_file()
 
 
 @pytest.mark.parametrize("count", [3, 4, 6, 9])
-def test_each_fold_holds_out_photos_that_no_other_does(capture, count, monkeypatch):
-    fewer = igsr.Capture(capture.path, capture.train_views[:count])
+def test_each_fold_holds_out_photos_that_no_other_does(ball_photos, count, monkeypatch):
+    fewer = igsr.Capture(ball_photos.path, ball_photos.train_views[:count])
     held_out = []
     real = CrossValidation._fitted
 
@@ -204,7 +187,7 @@ def test_each_fold_holds_out_photos_that_no_other_does(capture, count, monkeypat
     assert not set(held_out[0]) & set(held_out[1])
 
 
-def test_folds_of_halved_photos_have_as_many_splats_per_pixel(capture, monkeypatch):
+def test_folds_of_halved_photos_have_as_many_splats_per_pixel(ball_photos, monkeypatch):
     monkeypatch.setattr(cross_validation, "LEAST_FOLD_SIDE", 16)
     counts = []
     real = CrossValidation._fitted
@@ -215,7 +198,7 @@ def test_folds_of_halved_photos_have_as_many_splats_per_pixel(capture, monkeypat
         return folds
 
     monkeypatch.setattr(CrossValidation, "_fitted", watched)
-    whole, folds = len(refine(capture, 1, lying, steps=400).first), counts
+    whole, folds = len(refine(ball_photos, 1, lying, steps=400).first), counts
     assert len(folds) == 2
     assert 250 < whole <= 1000
     assert all(0 < fold <= 250 for fold in folds)

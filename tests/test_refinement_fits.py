@@ -6,38 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import refinements
 import scenes
-from refinements import BALL, STEPS, WHITE, refine, same, truthful
+from refinements import BALL, STEPS, WHITE, same
 
 import igsr
 from igsr.fitting import fitter, presets
 from igsr.rendering.renders import render
 
-
-@pytest.fixture(scope="module", autouse=True)
-def small():
-    with refinements.small_fits():
-        yield
+pytestmark = pytest.mark.usefixtures("small_fits")
 
 
-@pytest.fixture(scope="module")
-def capture():
-    return refinements.capture()
-
-
-@pytest.fixture(scope="module")
-def helped(capture, tmp_path_factory):
-    out = tmp_path_factory.mktemp("helped")
-    seen = []
-    refined = refine(capture, 2, truthful, out=out, progress=seen.append)
-    return refined, out, seen
-
-
-def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(capture):
+def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(ball_photos):
     def fitted(**fields):
-        views = [replace(view, **fields) for view in capture.train_views]
-        made = igsr.Capture(capture.path, views)
+        views = [replace(view, **fields) for view in ball_photos.train_views]
+        made = igsr.Capture(ball_photos.path, views)
         # From given splats: masks also have a say in the first ones of a fit.
         return igsr.fit(made, steps=20, backend="cpu", start=BALL)
 
@@ -48,15 +30,15 @@ def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(capture):
     assert same(fitted(mask=left > 0), fitted(weights=left))
     assert not same(fitted(), fitted(weights=left))
     with pytest.raises(igsr.IgsrError, match="weights must be finite and not negative"):
-        replace(capture.views[0], weights=-left)
+        replace(ball_photos.views[0], weights=-left)
     with pytest.raises(igsr.IgsrError, match="weights"):
-        replace(capture.views[0], weights=left[1:])
+        replace(ball_photos.views[0], weights=left[1:])
 
 
 @pytest.mark.filterwarnings("ignore:.*one and the same camera", "ignore:.*black or wholly")
-def test_a_picture_of_small_weights_counts_less_than_a_photo(capture):
+def test_a_picture_of_small_weights_counts_less_than_a_photo(ball_photos):
     """Two pictures of one camera that disagree: the splats side with the heavier."""
-    view = capture.train_views[0]
+    view = ball_photos.train_views[0]
     white = replace(view, name="white.png", image=np.full((40, 40, 3), 255, np.uint8))
     black = replace(view, name="black.png", image=np.zeros((40, 40, 3), np.uint8))
     side = scenes.ring_camera(1.0, 40)
@@ -67,7 +49,7 @@ def test_a_picture_of_small_weights_counts_less_than_a_photo(capture):
         pair = [black, weighed, replace(black, name="side.png", camera=side)]
         pair = [view if view.weights is not None else replace(view, weights=ones) for view in pair]
         splats = igsr.fit(
-            igsr.Capture(capture.path, pair),
+            igsr.Capture(ball_photos.path, pair),
             steps=200,
             backend="cpu",
             start=BALL,
@@ -78,28 +60,28 @@ def test_a_picture_of_small_weights_counts_less_than_a_photo(capture):
     assert means[0] < 0.5 * means[1]
 
 
-def test_a_warm_start_goes_on_from_splats(capture):
-    first = igsr.fit(capture, steps=100, backend="cpu")
-    on = igsr.fit(capture, steps=50, backend="cpu", start=first)
-    before, after = (igsr.evaluate(s, capture, "train")["psnr"] for s in (first, on))
+def test_a_warm_start_goes_on_from_splats(ball_photos):
+    first = igsr.fit(ball_photos, steps=100, backend="cpu")
+    on = igsr.fit(ball_photos, steps=50, backend="cpu", start=first)
+    before, after = (igsr.evaluate(s, ball_photos, "train")["psnr"] for s in (first, on))
     assert after > before
     assert len(on) >= len(first)
     with pytest.raises(igsr.IgsrError, match="sh_degree must be the same, not 3"):
-        igsr.fit(capture, steps=5, backend="cpu", start=first, sh_degree=3)
+        igsr.fit(ball_photos, steps=5, backend="cpu", start=first, sh_degree=3)
     with pytest.raises(igsr.IgsrError, match="give at least one, and no more than max_splats"):
-        igsr.fit(capture, steps=5, backend="cpu", start=first, max_splats=2)
+        igsr.fit(ball_photos, steps=5, backend="cpu", start=first, max_splats=2)
     with pytest.raises(igsr.IgsrError, match="antialiased"):
-        igsr.fit(capture, steps=5, backend="cpu", start=replace(first, antialiased=True))
+        igsr.fit(ball_photos, steps=5, backend="cpu", start=replace(first, antialiased=True))
 
 
 @pytest.mark.filterwarnings("ignore:.*one and the same camera")
-def test_novel_views_change_neither_settings_nor_initialization(capture):
-    photos = capture.train_views[:3]
+def test_novel_views_change_neither_settings_nor_initialization(ball_photos):
+    photos = ball_photos.train_views[:3]
     weights = np.ones((40, 40), np.float32)
     views = [
         replace(view, name=f"{k}-{view.name}", weights=weights)
         for k in range(3)
-        for view in capture.train_views
+        for view in ball_photos.train_views
     ]
 
     def begun(some):
@@ -109,7 +91,7 @@ def test_novel_views_change_neither_settings_nor_initialization(capture):
             seen.append(now)
             return False
 
-        igsr.fit(igsr.Capture(capture.path, some), backend="cpu", progress=stop)
+        igsr.fit(igsr.Capture(ball_photos.path, some), backend="cpu", progress=stop)
         return seen[0].steps, seen[0].started
 
     assert len(views) > presets.FEW_PHOTOS
@@ -117,7 +99,7 @@ def test_novel_views_change_neither_settings_nor_initialization(capture):
     assert begun(views) != begun(photos)
 
 
-def test_a_round_fits_photos_and_novel_views_from_the_initialization(capture, helped):
+def test_a_round_fits_photos_and_novel_views_from_the_initialization(ball_photos, helped):
     refined = helped[0]
     views = list(refined.capture.train_views)
     for k, one in enumerate(refined.rounds[0].selected):
@@ -126,12 +108,12 @@ def test_a_round_fits_photos_and_novel_views_from_the_initialization(capture, he
             igsr.View(f"whole-round1-{k}.png", camera, "train", picture, None, one.confidence)
         )
     given = [*views[:9], *(replace(view, background=WHITE) for view in views[9:])]
-    fitted = igsr.fit(igsr.Capture(capture.path, given), STEPS, backend="cpu")
+    fitted = igsr.fit(igsr.Capture(ball_photos.path, given), STEPS, backend="cpu")
     assert same(fitted, refined.rounds[0].splats)
 
 
-def test_novel_views_are_sampled_less_often_and_not_at_the_end(capture, monkeypatch):
-    photos = capture.train_views[:2]
+def test_novel_views_are_sampled_less_often_and_not_at_the_end(ball_photos, monkeypatch):
+    photos = ball_photos.train_views[:2]
     views = [replace(view, weights=np.ones((40, 40), np.float32)) for view in photos]
     monkeypatch.setattr(fitter, "PHOTO_STEPS", 5)
     monkeypatch.setattr(fitter, "PHOTOS_LAST", 0.2)
@@ -146,13 +128,13 @@ def test_novel_views_are_sampled_less_often_and_not_at_the_end(capture, monkeypa
     assert schedule(*photos, views[0], first=900)[-1] == (1, 980)
 
 
-def test_a_short_fit_that_goes_on_samples_novel_views(capture):
-    photos = capture.train_views[:2]
-    view = replace(capture.train_views[2], weights=np.ones((40, 40), np.float32))
-    start = igsr.fit(igsr.Capture(capture.path, photos), 20, backend="cpu")
+def test_a_short_fit_that_goes_on_samples_novel_views(ball_photos):
+    photos = ball_photos.train_views[:2]
+    view = replace(ball_photos.train_views[2], weights=np.ones((40, 40), np.float32))
+    start = igsr.fit(igsr.Capture(ball_photos.path, photos), 20, backend="cpu")
 
     def gone_on(view):
-        given = igsr.Capture(capture.path, [*photos, view])
+        given = igsr.Capture(ball_photos.path, [*photos, view])
         return igsr.fit(given, 20, backend="cpu", start=start)
 
     assert not same(gone_on(view), gone_on(replace(view, image=255 - view.image)))

@@ -7,6 +7,7 @@ attribute up where it lives now.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import sys
 import warnings
@@ -111,9 +112,8 @@ class _Moved(ModuleType):
         # Import machinery asks for dunder names that no module has.
         if not (name.startswith("__") and name.endswith("__")):
             for home in MOVED[self.__name__]:
-                module = importlib.import_module(home)
-                if hasattr(module, wanted):
-                    return getattr(module, wanted)
+                with contextlib.suppress(AttributeError):
+                    return getattr(importlib.import_module(home), wanted)
         raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:

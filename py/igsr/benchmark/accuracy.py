@@ -7,6 +7,7 @@ the setting itself, the f64 reference at that setting against the f64 reference 
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +33,8 @@ COUNT, WIDTH, HEIGHT, SIZE = 2000, 128, 96, 0.4
 SECONDS = 1.0
 #: Samples per pixel along each axis of the picture that nothing is left out of.
 SAMPLES = 8
+#: Longest line of the page's text, characters.
+LONGEST_LINE = 100
 PLOT_NAME = "speed_vs_error.png"
 
 Table = list[list[str]]
@@ -194,7 +197,7 @@ def accuracy_page(report: dict[str, Any]) -> str:
     }
     headings = ["setting", "implementation", "forward, ms", "backward, ms", "picture: max", "mean"]
     headings += ["gradients: max", "mean", "band pixels", "left out"]
-    return "\n".join(
+    return _wrapped(
         [
             "# Accuracy",
             "",
@@ -211,7 +214,8 @@ def accuracy_page(report: dict[str, Any]) -> str:
             "",
             "Each implementation against the f64 reference at the same setting, on the same f32 "
             "splats. The reference's own line compares its walk over all splats with the culled "
-            "one that judges the others: culling leaves out only pairs that contribute nothing. "
+            "one that the others are compared with: culling leaves out only pairs that contribute "
+            "nothing. "
             "Gradients are in parts of the largest of their kind, for the worst kind. A pixel of "
             "the [band](numerics.md#bounds-and-what-is-measured) is left out only where it differs "
             f"by more than the bound, {max(BOUND_3D.values()):g}, or its transmittance by more "
@@ -245,6 +249,26 @@ def accuracy_page(report: dict[str, Any]) -> str:
             "",
         ]
     )
+
+
+def _wrapped(lines: list[str]) -> str:
+    """The lines with paragraphs wrapped to fit a screen; tables stay as they are."""
+    wrapped = []
+    for line in lines:
+        indent = "  " if line.startswith("* ") else ""
+        wrap = len(line) > LONGEST_LINE and not line.startswith("|")
+        wrapped += (
+            textwrap.wrap(
+                line,
+                LONGEST_LINE,
+                subsequent_indent=indent,
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+            if wrap
+            else [line]
+        )
+    return "\n".join(wrapped)
 
 
 def _scientific(value: float) -> str:

@@ -122,7 +122,7 @@ def measure_apart(
     """``measure`` in a child process.
 
     Raises:
-        IgsrError: the child failed, for example for want of memory.
+        IgsrError: the child failed, for example because it ran out of memory.
     """
     arguments = json.dumps([seed, count, side, backend, seconds])
     done = subprocess.run(

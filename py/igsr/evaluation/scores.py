@@ -66,8 +66,8 @@ class Protocol(TypedDict, total=False):
     """How views were scored, for reports.
 
     ``split`` is "test" or "train", ``views`` their number, ``background`` RGB in [0, 1];
-    ``pixels``, ``ssim`` and ``flip`` are in words. Commands add ``holdout``: every how many views
-    one was held out.
+    ``pixels``, ``ssim`` and ``flip`` are in words. Commands add ``holdout``: every
+    ``holdout``-th view is held out for testing.
     """
 
     split: str
