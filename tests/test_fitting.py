@@ -22,7 +22,7 @@ import igsr
 from igsr import _core
 from igsr.evaluation import metrics
 from igsr.fitting import checkpoint as checkpoints
-from igsr.fitting import optimization as fitting
+from igsr.fitting import run as fitting
 from igsr.fitting.checkpoint import load_checkpoint, save_checkpoint
 from igsr.fitting.fingerprint import fingerprint
 from igsr.fitting.settings import FitSettings
@@ -193,8 +193,8 @@ FIT_FOREVER = """
 import sys
 sys.path[:0] = {path!r}
 import igsr, scenes
-from igsr.fitting import optimization
-optimization.CHECKPOINT_STEPS = 20
+from igsr.fitting import run
+run.CHECKPOINT_STEPS = 20
 capture = scenes.capture(views=4, size=40)
 igsr.fit(capture, steps=1_000_000, backend="cpu", max_splats=400, sh_degree=1,
          checkpoint=sys.argv[1], progress=lambda now: print(now.step, flush=True))

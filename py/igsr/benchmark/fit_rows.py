@@ -34,7 +34,7 @@ from igsr.benchmark.scenes import PARAMETERS, Arrays, Scene
 from igsr.benchmark.stage_rows import MIN_REPEATS, SECONDS, timing_row
 from igsr.capture import Capture, View
 from igsr.errors import IgsrError
-from igsr.fitting.run import fingerprint, fit
+from igsr.fitting.fit_capture import fingerprint, fit
 from igsr.rendering.rasterization import rasterization
 from igsr.rendering.renders import intrinsics_of, viewmat_about
 from igsr.splats import Splats

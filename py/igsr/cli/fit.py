@@ -163,7 +163,7 @@ def _fitted(
 ) -> tuple[Splats, Capture]:
     """Fit with a progress bar; ``last`` holds the last progress in the end, if there was any."""
     from igsr.fitting import fit_with_cameras
-    from igsr.fitting.optimization import bar_state
+    from igsr.fitting.run import bar_state
 
     with progress_bar("fit", shown=shown) as show:
 

@@ -34,7 +34,7 @@ from igsr.compaction.validation import (
     self_validation,
 )
 from igsr.errors import IgsrError
-from igsr.fitting.run import check_fits
+from igsr.fitting.fit_capture import check_fits
 from igsr.splats import MAX_SH_DEGREE, Splats
 
 #: Fraction of the splats that a pruning round keeps. Many small rounds lose less than one large.

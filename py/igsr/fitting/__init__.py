@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
-    from igsr.fitting.optimization import Progress
+    from igsr.fitting.fit_capture import fit, fit_with_cameras
     from igsr.fitting.pose_refinement import refine_cameras
     from igsr.fitting.presets import PRESETS, preset_settings, settings_for
-    from igsr.fitting.run import fit, fit_with_cameras
+    from igsr.fitting.run import Progress
     from igsr.fitting.settings import FitSettings
 
 __all__ = [
@@ -32,10 +32,10 @@ if not TYPE_CHECKING:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "igsr.fitting.optimization": ("Progress",),
+            "igsr.fitting.run": ("Progress",),
             "igsr.fitting.pose_refinement": ("refine_cameras",),
             "igsr.fitting.presets": ("PRESETS", "preset_settings", "settings_for"),
-            "igsr.fitting.run": ("fit", "fit_with_cameras"),
+            "igsr.fitting.fit_capture": ("fit", "fit_with_cameras"),
             "igsr.fitting.settings": ("FitSettings",),
         },
         moved={

@@ -12,8 +12,8 @@ from igsr.capture import Capture
 from igsr.capture.downscaling import halved
 from igsr.errors import IgsrError
 from igsr.fitting.fitter import fitted_cameras, fitter_of, initial_state, with_train_cameras
-from igsr.fitting.optimization import FitRun, Progress, Report
 from igsr.fitting.pose_priors import PosePriors
+from igsr.fitting.run import FitRun, Progress, Report
 from igsr.fitting.settings import FitSettings
 
 #: Fractions of the fit's steps and splats that the rough fit has.

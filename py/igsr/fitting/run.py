@@ -1,281 +1,155 @@
-"""``fit``: splats from the photos of a capture, from the check of what was asked to the result."""
+"""A fit in progress: steps in chunks, with progress, time and checkpoints."""
 
 from __future__ import annotations
 
-import inspect
-import os
 import time
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from igsr._internal.choices import FitBackend
-from igsr._internal.progress_bar import progress_or_bar
-from igsr.capture import Capture
-from igsr.capture.photo_checks import check_photos
+from igsr import _core
+from igsr._internal.progress_bar import BarState
 from igsr.errors import IgsrError
-from igsr.fitting.checkpoint import CheckpointFile, recorded_settings
-from igsr.fitting.fingerprint import fingerprint, hash_of
-from igsr.fitting.fitter import (
-    camera_rows,
-    check_fits,
-    fitted_cameras,
-    fitter_of,
-    initial_state,
-    photos_among,
-    splat_arrays,
-    with_camera_rows,
-    with_train_cameras,
-)
-from igsr.fitting.optimization import FitRun, Progress, Report, bar_state
-from igsr.fitting.pose_priors import pose_priors
-from igsr.fitting.presets import Preset, settings_for
-from igsr.fitting.rough_cameras import with_rough_cameras
-from igsr.fitting.settings import (
-    Density,
-    FitSettings,
-    Focal,
-    Initialization,
-    Poses,
-    check_whole_number,
-)
-from igsr.splats import Splats
+from igsr.fitting.checkpoint import CheckpointFile
+from igsr.fitting.settings import FitSettings
 
-__all__ = [
-    "Progress",
-    "check_fits",
-    "check_whole_number",
-    "fingerprint",
-    "fit",
-    "fit_with_cameras",
-]
-
-#: What checkpoints call the cameras that a joint fit begins with.
-ROUGH = "rough_cameras"
-
-P = ParamSpec("P")
-T = TypeVar("T")
+#: A killed run loses at most this much work.
+CHECKPOINT_STEPS = 500
+CHECKPOINT_SECONDS = 20.0
+#: How long the Rust side runs before Python may look at Ctrl-C and the progress callback.
+CHUNK_SECONDS = 0.2
 
 
-def fit(
-    capture: Capture,
-    steps: int | None = None,
-    progress: Callable[[Progress], bool | None] | None = None,
-    backend: FitBackend = "auto",
-    seed: int = 0,
-    *,
-    preset: Preset = "default",
-    max_splats: int | None = None,
-    sh_degree: int | None = None,
-    density: Density | None = None,
-    dropout: float | None = None,
-    hull: bool | None = None,
-    start: Initialization | Splats | None = None,
-    poses: Poses | None = None,
-    focal: Focal | None = None,
-    background: tuple[float, float, float] | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
-    resume: bool = False,
-) -> Splats:
-    """Fit splats to the train views of ``capture``.
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit stands.
 
-    Where cameras are optimized too, ``fit_with_cameras`` also returns them.
-
-    A fit is deterministic: the same capture, settings and seed give the same splats, bit for bit,
-    on one backend and instruction set. A resumed fit ends with the same bits as one that was never
-    interrupted.
-
-    Args:
-        capture: photos and cameras; masked pixels do not count. Pseudo-views (views with weights)
-            are sampled less often: at least five steps are on photos for one on a pseudo-view, and
-            so are the last fifth of all steps.
-        steps: optimizer steps, each on one photo; None, here and below, is the preset's value.
-        progress: called about five times a second, with step 0 while cameras are found roughly.
-            Returning False ends the fit early, with the splats as they are then. In an interactive
-            session, None shows a progress bar.
-        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu".
-        seed: of everything random.
-        preset: "default" (other settings for up to 20 photos than for more; pseudo-views do not
-            count), "3dgs" or "instantsplat"; see ``igsr.fitting.presets``.
-        max_splats: most splats there may be.
-        sh_degree: degree of the spherical harmonics of colors, 0-4.
-        density: how splats are added and removed: "mcmc" (relocation and growth up to the maximum,
-            Kheradmand et al. 2024), "original" (clone, split, prune, Kerbl et al. 2023), "fixed".
-        dropout: fraction of the splats that a step leaves out at random, growing from 0 in the
-            first step to this in the last, while the others' opacities are raised to make up for it
-            (DropGaussian, Park et al. 2025); 0 to 0.9. Against overfitting few photos.
-        hull: whether splats are removed whose center a photo with alpha shows empty.
-        start: the initialization: "auto", "points", "hull", "sift", "rays" or "random"; see
-            ``igsr.fitting.initialization``. Or splats that a fit to some of the photos ended with:
-            learning rates and dropout then are those of the last ``steps`` of a fit of the preset.
-        poses: "fixed", or "joint": each camera is rotated and moved with the splats. On average
-            they stay where the given ones were: the scene keeps its place and size. Where the
-            capture has tracks, these give each camera a pose prior.
-        focal: "fixed", "shared" (one factor for all cameras' focal lengths is optimized) or
-            "per-camera".
-        background: RGB in [0, 1] behind splats and photos with alpha; None is a new random color in
-            every step for photos with alpha and black for photos without.
-        checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
-            Ctrl-C (KeyboardInterrupt, which is raised again); where cameras are optimized, from
-            when they have been found roughly.
-        resume: continue the fit that ``checkpoint`` holds.
-
-    Raises:
-        IgsrError: an argument cannot be used, the checkpoint cannot be written or belongs to
-            another capture or other settings.
-        UserWarning: the photos leave something open (see ``igsr.capture.photo_checks``); the last
-            checkpoint cannot be written; the splats are returned all the same.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    Attributes:
+        step: steps done, of ``steps``.
+        steps: steps in all.
+        loss: 0.8 L1 + 0.2 D-SSIM of the last step's photo, before that step.
+        splats: number of splats now.
+        started: what the splats were initialized from ("points", "hull" ...) and their number.
+        seconds: time spent fitting, earlier runs that were resumed included.
+        steps_per_second: of the last chunk of steps.
+        backend: what runs: "backend", "device" and "instruction_set".
     """
-    splats, _ = _fitted(**locals())  # the arguments, each by its name
-    return splats
+
+    step: int
+    steps: int
+    loss: float
+    splats: int
+    started: tuple[str, int]
+    seconds: float
+    steps_per_second: float
+    backend: dict[str, str]
 
 
-def _with_arguments_of(
-    model: Callable[P, Any],
-) -> Callable[[Callable[..., T]], Callable[P, T]]:
-    """A decorator: the function's arguments are ``model``'s, for help texts and type checkers."""
-
-    def decorate(function: Callable[..., T]) -> Callable[P, T]:
-        result = function.__annotations__["return"]
-        signature = inspect.signature(model).replace(return_annotation=result)
-        function.__signature__ = signature  # type: ignore[attr-defined]
-        return function
-
-    return decorate
+def bar_state(now: Progress) -> BarState:
+    """What a progress bar shows of a fit."""
+    return BarState(
+        now.step,
+        now.steps,
+        f"loss {now.loss:.4f}  {now.splats} splats  {now.steps_per_second:.0f} steps/s",
+    )
 
 
-@_with_arguments_of(fit)
-def fit_with_cameras(*args: Any, **kwargs: Any) -> tuple[Splats, Capture]:
-    """As ``fit``, with the same arguments; also returns the cameras.
+#: What is called with the progress of a fit; False ends the fit early.
+Report: TypeAlias = Callable[[Progress], bool | None]
 
-    Returns:
-        The splats, and the capture with its train cameras as they were optimized; the capture
-        itself where poses and focal lengths are fixed.
 
-    Raises:
-        IgsrError, UserWarning, RuntimeError: as ``fit``.
+@dataclass
+class FitRun:
+    """One fit in progress; it keeps progress, time and the checkpoint file.
+
+    Attributes:
+        fitter: the renderer's fitter.
+        settings: the fit's.
+        started: what the splats were initialized from, and their number.
+        backend: what runs; see ``Progress``.
+        report: what is called after each chunk of steps.
+        checkpoint: the file to save to.
+        kept: arrays that checkpoints hold beside the fitter's.
+        seconds_before: time spent before this run.
     """
-    given = inspect.signature(fit).bind(*args, **kwargs)
-    given.apply_defaults()
-    return _fitted(**given.arguments)
 
+    fitter: _core.Fitter
+    settings: FitSettings
+    started: tuple[str, int]
+    backend: dict[str, str]
+    report: Report | None = None
+    checkpoint: CheckpointFile | None = None
+    kept: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
+    seconds_before: float = 0.0
 
-def _fitted(
-    capture: Capture,
-    preset: str,
-    start: str | Splats | None,
-    backend: str,
-    progress: Report | None,
-    checkpoint: str | os.PathLike[str] | None,
-    resume: bool,
-    **given: Any,
-) -> tuple[Splats, Capture]:
-    """What ``fit`` and ``fit_with_cameras`` do; ``given`` are fields of ``FitSettings``."""
-    # Check what was asked for, before any work. Warnings point to the caller of our caller.
-    _check_capture(capture)
-    views = capture.train_views
-    if not views:
-        raise IgsrError(f"{capture.path} has no train views to fit.")
-    initial = start if isinstance(start, Splats) else None
-    if initial is None:
-        settings = settings_for(preset, len(photos_among(views)), start=start, **given)
-    else:
-        settings = _settings_from_splats(preset, len(photos_among(views)), initial, given)
-    if resume and checkpoint is None:
-        raise IgsrError("resume needs checkpoint, the file to continue from.")
-    check_photos(views)
-    device = check_fits(backend)
-    tracks = None
-    if settings.moves_cameras and capture.points is not None:
-        tracks = capture.points.tracks
-    priors = None
-    if tracks is not None:
-        # By the cameras as they were given, also where the fit goes on from others.
-        poses = settings.poses != "fixed"
-        priors = pose_priors(views, capture.points, poses=poses, focal=settings.focal)
-    file = None
-    if checkpoint is not None:
-        splats_hash = None if initial is None else hash_of(splat_arrays(initial).values())
-        recorded = recorded_settings(settings, device, fingerprint(views, tracks), splats_hash)
-        file = CheckpointFile(Path(checkpoint), recorded)
+    def __post_init__(self) -> None:
+        """Start the clock."""
+        self._began = self._saved_at = time.perf_counter()
+        self._step = self._saved_step = int(self.fitter.steps_done)
 
-    with progress_or_bar(progress, "fit", bar_state) as report:
-        # Go on from the checkpoint, or initialize the splats; joint fits find the cameras first.
-        seconds, rough, stopped = 0.0, False, False
-        if resume and file is not None:
-            state, started, seconds = file.load()
-        if file is not None:
-            file.check_writable()
-        if not resume:
-            if settings.moves_cameras and initial is None:
-                rough, began = True, time.perf_counter()
-                capture, stopped = with_rough_cameras(capture, settings, device, priors, report)
-                seconds = time.perf_counter() - began
-            state, started = initial_state(capture, settings, initial)
+    def save(self) -> None:
+        """Save a checkpoint, if there is a file for it.
 
-        # Make the fitter of views, splats and settings.
-        origin = state.pop("origin", np.zeros(0))
+        Raises:
+            IgsrError: it cannot be written.
+        """
+        if self.checkpoint is not None:
+            seconds = self.seconds_before + time.perf_counter() - self._began
+            self.checkpoint.save({**self.fitter.state(), **self.kept}, self.started, seconds)
+        self._saved_step, self._saved_at = self._step, time.perf_counter()
+
+    def optimize(self) -> None:
+        """Step until done or told to stop. Save on the way, at the end and on Ctrl-C.
+
+        Raises:
+            IgsrError: a step fails, or a checkpoint cannot be written.
+            UserWarning: the last checkpoint cannot be written.
+            KeyboardInterrupt: on Ctrl-C, after a checkpoint.
+        """
+        chunk = 1
         try:
-            views = with_camera_rows(capture.train_views, state.pop(ROUGH, None))
-            if origin.shape != (3,) or not np.isfinite(origin).all():
-                raise ValueError("origin: must be three finite numbers")
-            values = {**settings.plain(), "first_step": settings.first_step}
-            fitter = fitter_of(views, origin, state, values, device["backend"], priors)
+            while self._step < self.settings.steps:
+                now = self._stepped(chunk)
+                # A step's time follows the number of splats: follow it, a factor two at a time.
+                chunk = max(1, min(2 * chunk, int(now.steps_per_second * CHUNK_SECONDS)))
+                if self.report is not None and self.report(now) is False:
+                    break
+                if self._is_save_due():
+                    self.save()
+            if self._step > self._saved_step:
+                try:
+                    self.save()
+                except IgsrError as error:
+                    # The splats are finished: losing them to a full disk would be the greater harm.
+                    warnings.warn(str(error), stacklevel=4)
+        except KeyboardInterrupt:
+            self.save()
+            raise
+
+    def _stepped(self, count: int) -> Progress:
+        """Take ``count`` steps, or as many as are left, and say where the fit stands."""
+        began = time.perf_counter()
+        try:
+            done: dict[str, Any] = self.fitter.step(min(count, self.settings.steps - self._step))
         except ValueError as error:
-            if resume:
-                raise IgsrError(f"The checkpoint {checkpoint} cannot be used: {error}.") from error
             raise IgsrError(f"{error}.") from error
-
-        # Take the steps, with checkpoints.
-        kept = {"origin": origin}
-        if settings.moves_cameras:
-            kept[ROUGH] = camera_rows(views)
-        run = FitRun(fitter, settings, started, device, report, file, kept, seconds)
-        if rough:
-            run.save()  # the cameras that took so long to find are kept from here on
-        if not stopped:
-            run.optimize()
-
-    splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
-    if settings.moves_cameras:
-        capture = with_train_cameras(capture, fitted_cameras(views, fitter, origin))
-    return splats, capture
-
-
-def _check_capture(capture: object) -> None:
-    if not isinstance(capture, Capture):
-        raise IgsrError(
-            f"capture must be a Capture, not {type(capture).__name__}; igsr.load_capture(path) "
-            "makes one."
+        now = time.perf_counter()
+        advanced, self._step = done["step"] - self._step, done["step"]
+        return Progress(
+            step=self._step,
+            steps=self.settings.steps,
+            loss=done["loss"],
+            splats=done["splats"],
+            started=self.started,
+            seconds=self.seconds_before + now - self._began,
+            steps_per_second=advanced / max(now - began, 1e-9),
+            backend=self.backend,
         )
 
-
-def _settings_from_splats(
-    preset: str, photos: int, splats: Splats, given: dict[str, Any]
-) -> FitSettings:
-    """The settings of a fit that goes on from splats: the last steps of the preset's schedule.
-
-    Raises:
-        IgsrError: the splats and the settings do not go together.
-    """
-    if given["sh_degree"] is None:
-        given = given | {"sh_degree": splats.sh_degree}
-    settings = settings_for(preset, photos, **given)
-    if splats.sh_degree != settings.sh_degree:
-        raise IgsrError(
-            f"start has splats of SH degree {splats.sh_degree}; sh_degree must be the same, not "
-            f"{settings.sh_degree}."
-        )
-    if not 1 <= len(splats) <= settings.max_splats:
-        raise IgsrError(
-            f"start has {len(splats)} splats; give at least one, and no more than max_splats, "
-            f"{settings.max_splats}."
-        )
-    if splats.antialiased:
-        raise IgsrError("start has antialiased splats, which igsr does not fit; give others.")
-    whole = max(settings.steps, settings_for(preset, photos).steps)
-    return replace(settings, steps=whole, first_step=whole - settings.steps)
+    def _is_save_due(self) -> bool:
+        steps, seconds = self._step - self._saved_step, time.perf_counter() - self._saved_at
+        return steps >= CHECKPOINT_STEPS or seconds >= CHECKPOINT_SECONDS

@@ -16,8 +16,8 @@ from igsr.evaluation.scores import (
     known_background,
     score_views,
 )
+from igsr.fitting.fit_capture import Progress, fit
 from igsr.fitting.presets import preset_settings
-from igsr.fitting.run import Progress, fit
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.results import Scores, Stage
 from igsr.refinement.run import STOPPED, RefineRun

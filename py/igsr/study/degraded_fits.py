@@ -21,8 +21,8 @@ from igsr.denoiser.training.pair_files import write_pairs
 from igsr.denoiser.training.pair_renders import check_one_size, rendered_pairs
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import known_background
+from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.presets import PAPER_STEPS, preset_settings
-from igsr.fitting.run import fit_with_cameras
 from igsr.geometry.camera_noise import AFFINE, MATRIX, Noise, noise_unit, noisy_view
 from igsr.study.real_captures import is_dtu
 from igsr.study.splits import HOLDOUT, dtu_views, llff_views, spread_out

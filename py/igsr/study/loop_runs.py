@@ -26,7 +26,7 @@ from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance, pictu
 from igsr.denoiser.weights import SHIPPED
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background, over_background, score_views
-from igsr.fitting.run import fingerprint
+from igsr.fitting.fit_capture import fingerprint
 from igsr.refinement.loop import refine, round_denoiser
 from igsr.refinement.results import Refined, Round
 from igsr.splats import Splats

@@ -23,9 +23,9 @@ from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.capture import Capture, load_capture
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import WHITE, evaluate
+from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.presets import preset_settings
-from igsr.fitting.run import fit_with_cameras
 from igsr.fitting.settings import Poses
 from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
 from igsr.geometry.pose_errors import pose_errors

@@ -14,9 +14,9 @@ from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.capture import Capture
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background, evaluate
+from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.presets import Preset, preset_settings
-from igsr.fitting.run import fit_with_cameras
 from igsr.geometry.similarity import similarity_between
 from igsr.splats import Splats
 

@@ -21,8 +21,8 @@ from igsr.denoiser.training.pair_renders import check_one_size, rendered_pairs
 from igsr.errors import IgsrError
 from igsr.evaluation.metrics import psnr
 from igsr.evaluation.scores import WHITE
+from igsr.fitting.fit_capture import fingerprint, fit_with_cameras
 from igsr.fitting.presets import PAPER_STEPS, preset_settings
-from igsr.fitting.run import fingerprint, fit_with_cameras
 from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
 
 #: How fits are degraded. "sparse" has 3 to 16 photos; "underfit" stops early; "noise" has noise on
