@@ -27,6 +27,7 @@ from igsr.cli.shared import (
     FitBackendOption,
     HoldoutOption,
     JsonOption,
+    MaxSizeOption,
     PresetChoice,
     background_color,
     output_console,
@@ -58,6 +59,7 @@ def fit_command(
     ],
     *,
     holdout: HoldoutOption = None,
+    max_size: MaxSizeOption = None,
     preset: Annotated[
         PresetChoice,
         typer.Option(
@@ -103,7 +105,7 @@ def fit_command(
         name = resolved(backend)
         finder = CameraFinder(estimator, network, graph, frames, given["seed"])
         loaded, found = capture_to_fit(
-            capture, out, holdout, finder, resume=resume, shown=not as_json
+            capture, out, holdout, finder, max_size=max_size, resume=resume, shown=not as_json
         )
         color = _background(background, loaded)
         # Photos with alpha are fitted over random colors, so that no background is learned.
@@ -121,6 +123,7 @@ def fit_command(
         asked = {
             "capture": str(capture),
             "holdout": holdout,
+            "max_size": max_size,
             "preset": preset.value,
             **settings.plain(),
             "backend": name,

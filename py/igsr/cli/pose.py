@@ -17,6 +17,7 @@ from rich.progress import Progress as ProgressBar
 from igsr import _core
 from igsr._internal.atomic_write import check_folder
 from igsr.capture import Capture
+from igsr.capture.downscaling import check_max_size
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import FRAMES, has_photos
 from igsr.capture.write_colmap import write_colmap
@@ -106,6 +107,7 @@ def capture_to_fit(
     holdout: int | None,
     finder: CameraFinder,
     *,
+    max_size: int | None,
     resume: bool,
     shown: bool,
 ) -> tuple[Capture, bool]:
@@ -118,6 +120,7 @@ def capture_to_fit(
         out: the folder of the fit.
         holdout: hold out every ``holdout``-th view for testing, or None.
         finder: how to find the cameras.
+        max_size: longest side, in pixels, of photos as loaded, or None.
         resume: use cameras that an earlier run found.
         shown: whether progress is shown.
 
@@ -129,12 +132,13 @@ def capture_to_fit(
             cameras were given for a capture that has them.
     """
     _check_out(out)
+    check_max_size(max_size)
     if holds_cameras(path) or not has_photos(path):
         if finder.options or finder.estimator != AUTO:
             raise IgsrError(
                 f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
             )
-        return load(path, holdout), False
+        return load(path, holdout, max_size), False
     kept = kept_cameras(path, out)
     if resume and found_before(path, kept):
         print_message(f"The cameras found before are used, from {kept}")
@@ -144,7 +148,7 @@ def capture_to_fit(
             f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
             f"{report['estimator']} and are kept in {kept}"
         )
-    return load(kept, holdout), True
+    return load(kept, holdout, max_size), True
 
 
 def pose_command(

@@ -22,6 +22,7 @@ from igsr.cli.settings_options import ConfigOption, settings_options
 from igsr.cli.shared import (
     HoldoutOption,
     JsonOption,
+    MaxSizeOption,
     output_console,
     print_json,
 )
@@ -45,6 +46,7 @@ def refine_command(
     ],
     given: dict[str, Any],
     holdout: HoldoutOption = None,
+    max_size: MaxSizeOption = None,
     photo_count: Annotated[
         int | None,
         typer.Option("--photos", metavar="N", help="Fit N of the train photos, evenly spaced."),
@@ -83,6 +85,7 @@ def refine_command(
                 out,
                 holdout,
                 CameraFinder(estimator, network, graph, frames, settings.seed),
+                max_size=max_size,
                 resume=resume,
                 shown=not as_json,
             )

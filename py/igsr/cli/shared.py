@@ -92,6 +92,15 @@ HoldoutOption = Annotated[
         help="Hold out every Nth photo for testing, such as 8.",
     ),
 ]
+MaxSizeOption = Annotated[
+    int | None,
+    typer.Option(
+        "--max-size",
+        metavar="N",
+        help="Load photos whose longest side has more than N pixels reduced to that. Default: as "
+        "they are.",
+    ),
+]
 SeedOption = Annotated[
     int, typer.Option("--seed", help="Random seed. Results are deterministic for a given seed.")
 ]
@@ -150,15 +159,17 @@ def background_color(text: str | None) -> tuple[float, float, float] | None:
     )
 
 
-def load(path: Path, holdout: int | None) -> Capture:
+def load(path: Path, holdout: int | None, max_size: int | None = None) -> Capture:
     """Load a capture; hold out every ``holdout``-th view if that is given.
+
+    Photos are reduced to ``max_size`` pixels of their longest side, if that is given.
 
     Raises:
         IgsrError: as ``load_capture`` and ``Capture.with_holdout``.
     """
     from igsr.capture import load_capture
 
-    capture = load_capture(path)
+    capture = load_capture(path, max_size)
     return capture if holdout is None else capture.with_holdout(holdout)
 
 
