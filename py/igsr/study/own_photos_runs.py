@@ -14,7 +14,8 @@ import numpy as np
 from igsr._internal.atomic_write import atomic_folder
 from igsr._internal.choices import FitBackend
 from igsr._internal.part_usage import Parts
-from igsr.capture import Capture, View, load_capture
+from igsr.capture import Camera, Capture, View, load_capture
+from igsr.capture.downscaling import resized_camera
 from igsr.capture.write_colmap import write_colmap
 from igsr.denoiser.training.perceptual_distance import (
     SMALLEST_SIDE,
@@ -32,7 +33,6 @@ from igsr.fitting.presets import Preset
 from igsr.geometry.similarity import similarity_between
 from igsr.pose import capture_of, estimate, photos_of
 from igsr.splats import Splats
-from igsr.study.view_sizes import at_most
 
 #: Pictures on a sheet have at most so many pixels on their longest side: fog must be seen.
 SHEET_SIDE = 640
@@ -127,13 +127,7 @@ def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
     """
     parts = Parts()
     with parts.measured("decode"):
-        whole = load_capture(Path(data) / one.scene if one.capture is None else one.capture)
-        if one.capture is not None or not whole.test_views:
-            whole = whole.with_holdout(one.holdout)
-        capture = at_most(whole, one.max_size)
-        test = at_most(Capture(whole.path, whole.test_views), one.score_size).views
-        train = at_most(Capture(whole.path, train_photos(whole)), one.score_size).views
-        del whole
+        capture = _loaded(data, one, one.max_size)
     background = default_background(capture)
     with parts.measured("fit"):
         splats, moved = fit_with_cameras(
@@ -148,21 +142,21 @@ def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
         "train_photos": len(capture.train_views),
         "splats": len(splats),
         "fit_size": _largest(capture.views),
-        "score_size": _largest(test),
     }
-    if moved is not capture:
-        train = _with_cameras_of(train, moved)
-        to_fitted = similarity_between(
-            [view.camera for view in capture.train_views],
-            [view.camera for view in moved.train_views],
-        )
-        aligned = [replace(view, camera=to_fitted.camera(view.camera)) for view in test]
-    else:
-        aligned = test
+    was, are = ([view.camera for view in of.train_views] for of in (capture, moved))
+    cameras = {view.name: view.camera for view in moved.train_views}
     del capture, moved
     with parts.measured("score"):
+        scored = _loaded(data, one, one.score_size)
+        test, train = scored.test_views, train_photos(scored)
+        del scored
+        row["score_size"] = _largest(test)
         row |= _held_out_scores(splats, test, background, one)
-        refined = refine_cameras(splats, aligned, background, backend=one.backend)
+        if was != are:
+            train = [_with_camera(view, cameras[view.name]) for view in train]
+            to_fitted = similarity_between(was, are)
+            test = [replace(view, camera=to_fitted.camera(view.camera)) for view in test]
+        refined = refine_cameras(splats, test, background, backend=one.backend)
         again = psnr_and_ssim(splats, refined, background, one.backend)
         for view, (psnr, ssim) in zip(row["views"], again, strict=True):
             view |= {"psnr_refined": psnr, "ssim_refined": ssim}
@@ -171,6 +165,12 @@ def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
         row["train_psnr"], row["train_ssim"] = _means(of_train)
     row["limit"] = limit_of(row["train_psnr"], row["psnr"], row["psnr_refined"]).plain()
     return {**row, "parts": parts.plain()}
+
+
+def _loaded(data: str, one: OwnFit, max_size: int | None) -> Capture:
+    capture = load_capture(Path(data) / one.scene if one.capture is None else one.capture, max_size)
+    own_split = one.capture is None and bool(capture.test_views)
+    return capture if own_split else capture.with_holdout(one.holdout)
 
 
 def _held_out_scores(
@@ -213,17 +213,9 @@ def _largest(views: list[View]) -> list[int]:
     return [camera.width, camera.height]
 
 
-def _with_cameras_of(views: list[View], capture: Capture) -> list[View]:
-    """The views with the poses and focal lengths of a capture of another size."""
-    cameras = {view.name: view.camera for view in capture.views}
-    moved = []
-    for view in views:
-        camera, size = cameras[view.name], view.camera
-        K = camera.K.copy()
-        K[0] *= size.width / camera.width
-        K[1] *= size.height / camera.height
-        moved.append(replace(view, camera=replace(size, viewmat=camera.viewmat, K=K)))
-    return moved
+def _with_camera(view: View, camera: Camera) -> View:
+    """The view with a camera of its photo at another size."""
+    return replace(view, camera=resized_camera(camera, view.camera.width, view.camera.height))
 
 
 @contextlib.contextmanager
