@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -45,6 +46,38 @@ class Usage:
             "cpu_seconds": round(self.cpu_seconds, 3),
         }
 
+    @staticmethod
+    def of(found: Mapping[str, Any]) -> Usage:
+        """What ``plain`` gave, read again.
+
+        Raises:
+            KeyError, TypeError, ValueError, OverflowError: it is nothing such.
+        """
+        numbers = float(found["seconds"]), float(found["cpu_seconds"])
+        peak = None if found["peak_memory_bytes"] is None else int(found["peak_memory_bytes"])
+        if not all(0.0 <= number < math.inf for number in (*numbers, peak or 0)):
+            raise ValueError("a number is negative or not finite")
+        return Usage(*numbers, peak)
+
+
+class Meter:
+    """What is used from one moment to the next."""
+
+    def __init__(self) -> None:
+        """Begin now."""
+        self._begin()
+
+    def lap(self) -> Usage:
+        """What was used since the last call, or since the beginning."""
+        now, cpu, peak = time.monotonic(), cpu_seconds(), peak_bytes()
+        usage = Usage(now - self._began, cpu - self._cpu, peak)
+        self._begin()
+        return usage
+
+    def _begin(self) -> None:
+        forget_peak()
+        self._began, self._cpu = time.monotonic(), cpu_seconds()
+
 
 class Parts:
     """The usage of parts, by name, in the order in which they were first begun."""
@@ -56,12 +89,11 @@ class Parts:
     @contextlib.contextmanager
     def measured(self, name: str) -> Iterator[None]:
         """Count what happens inside to a part; one that is named again is added up."""
-        forget_peak()
-        began, cpu = time.monotonic(), cpu_seconds()
+        meter = Meter()
         try:
             yield
         finally:
-            self.add(name, Usage(time.monotonic() - began, cpu_seconds() - cpu, peak_bytes()))
+            self.add(name, meter.lap())
 
     def add(self, name: str, usage: Usage) -> None:
         """Count a usage to a part."""
@@ -81,7 +113,7 @@ def total(parts: Mapping[str, Mapping[str, Any]]) -> Usage:
     """
     whole = Usage(0.0, 0.0, None)
     for part in parts.values():
-        whole += Usage(part["seconds"], part["cpu_seconds"], part["peak_memory_bytes"])
+        whole += Usage.of(part)
     return whole
 
 

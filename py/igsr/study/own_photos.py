@@ -17,7 +17,7 @@ from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import photo_sizes
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance
 from igsr.errors import IgsrError
-from igsr.evaluation.train_scores import MOST_TRAIN
+from igsr.evaluation.quick_scores import MOST_TRAIN
 from igsr.fitting.presets import Preset, preset_settings
 from igsr.study.own_photos_runs import (
     SCENE_NOTE,

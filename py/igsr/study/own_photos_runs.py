@@ -25,8 +25,8 @@ from igsr.denoiser.training.perceptual_distance import (
 from igsr.errors import IgsrError
 from igsr.evaluation.contact_sheet import flip_sheet, save_sheet, sheet_names
 from igsr.evaluation.limits import limit_of
+from igsr.evaluation.quick_scores import psnr_and_ssim, train_photos
 from igsr.evaluation.scores import METRICS, ScoredView, default_background, score_views
-from igsr.evaluation.train_scores import psnr_and_ssim, train_photos
 from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.presets import Preset

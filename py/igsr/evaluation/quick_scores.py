@@ -1,8 +1,8 @@
-"""Scores of photos that were fitted: how well a fit reproduces what it was given."""
+"""The two scores that cost least, and those of fitted photos: how well a fit reproduces them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from igsr._internal.choices import Backend
 from igsr.capture import Capture, View
 from igsr.evaluation import metrics
-from igsr.evaluation.scores import check_masks, over_background
+from igsr.evaluation.scores import ScoredView, check_masks, over_background
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
@@ -50,14 +50,22 @@ def train_scores(
     Raises:
         IgsrError: a mask leaves no pixel to score.
     """
-    views = train_photos(capture)
-    each = psnr_and_ssim(splats, views, background, backend)
-    psnr, ssim = np.mean(each, axis=0)
+    scored = quick_views(splats, train_photos(capture), background, backend)
+    return mean_of(list(scored), len(capture.train_views))
+
+
+def mean_of(scored: Sequence[ScoredView], count: int) -> dict[str, Any]:
+    """What ``train_scores`` returns, of views that are scored already.
+
+    Args:
+        scored: with "psnr" and "ssim".
+        count: of photos that were fitted.
+    """
     return {
-        "psnr": float(psnr),
-        "ssim": float(ssim),
-        "views": len(views),
-        "of": len(capture.train_views),
+        "psnr": float(np.mean([one.scores["psnr"] for one in scored])),
+        "ssim": float(np.mean([one.scores["ssim"] for one in scored])),
+        "views": len(scored),
+        "of": count,
     }
 
 
@@ -67,7 +75,18 @@ def psnr_and_ssim(
     background: Sequence[float],
     backend: Backend = "auto",
 ) -> list[tuple[float, float]]:
-    """PSNR in dB and SSIM of each view: the two scores that cost least.
+    """PSNR in dB and SSIM of each view; see ``quick_views``."""
+    scored = quick_views(splats, views, background, backend)
+    return [(float(one.scores["psnr"] or 0.0), float(one.scores["ssim"] or 0.0)) for one in scored]
+
+
+def quick_views(
+    splats: Splats,
+    views: Sequence[View],
+    background: Sequence[float],
+    backend: Backend = "auto",
+) -> Iterator[ScoredView]:
+    """Render views and score PSNR and SSIM, which cost least, and no other metric.
 
     Args:
         splats: the scene.
@@ -75,14 +94,18 @@ def psnr_and_ssim(
         background: RGB in [0, 1], behind renders and behind photos with alpha.
         backend: "auto", "cpu", "gpu" or "reference".
 
+    Yields:
+        Each view with "psnr" in dB and "ssim".
+
     Raises:
         IgsrError: a mask leaves no pixel to score.
     """
     check_masks(views)
-    scores = []
     for view in views:
         photo = over_background(view.image, background)
         picture = render(splats, view.camera, background, backend).to_uint8()
-        psnr = metrics.psnr(picture, photo, view.mask)
-        scores.append((psnr, metrics.ssim(picture, photo, view.mask)))
-    return scores
+        scores: dict[str, float | None] = {
+            "psnr": metrics.psnr(picture, photo, view.mask),
+            "ssim": metrics.ssim(picture, photo, view.mask),
+        }
+        yield ScoredView(view.name, photo, picture, view.mask, scores)
