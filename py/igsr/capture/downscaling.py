@@ -1,45 +1,220 @@
-"""Downscale views to half their size."""
+"""Make photos and views smaller, with an area filter.
+
+A pixel of the smaller photo is the mean of the area that it covers, parts of pixels included. The
+photo covers the same field of view: focal lengths and principal point scale by the two sizes' ratio
+per axis, exactly, since pixel centres are at +0.5.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
-from igsr.capture import View
+from igsr.capture.types import Camera, View
+from igsr.errors import IgsrError
+
+Float64 = npt.NDArray[np.float64]
+
+#: Rows of the smaller photo computed at a time are so many that this many numbers are held.
+_BAND_NUMBERS = 1 << 20
+
+
+def check_max_size(max_size: int | None) -> None:
+    """Find a size that no photo can have.
+
+    Raises:
+        IgsrError: it is neither None nor a whole number of at least 1.
+    """
+    if max_size is None:
+        return
+    whole = isinstance(max_size, (int, np.integer)) and not isinstance(max_size, bool)
+    if not whole or max_size < 1:
+        raise IgsrError(
+            f"max_size is {max_size!r}; give the longest side in pixels, at least 1, such as 1600"
+        )
+
+
+def reduced_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
+    """Width and height of a photo whose longest side may have ``max_size`` pixels.
+
+    Args:
+        width, height: of the photo, pixels.
+        max_size: the most pixels of its longest side; None, or more than it has, keeps it.
+    """
+    longest = max(width, height)
+    if max_size is None or longest <= max_size:
+        return width, height
+    # Halves go up; whole numbers, so that no rounding of a quotient can decide.
+    shorter = max(1, (2 * min(width, height) * int(max_size) + longest) // (2 * longest))
+    return (int(max_size), shorter) if width >= height else (shorter, int(max_size))
+
+
+def resized_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of the same photo at another size.
+
+    Args:
+        camera: pinhole, in pixels of the photo as it is.
+        width, height: the photo's new size, pixels.
+    """
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    K = camera.K.copy()
+    K[0] *= width / camera.width
+    K[1] *= height / camera.height
+    return replace(camera, K=K, width=width, height=height)
+
+
+def area_means(
+    pixels: np.ndarray,
+    width: int,
+    height: int,
+    mask: np.ndarray | None = None,
+    box: tuple[float, float] | None = None,
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_] | None]:
+    """Reduce a photo by an area filter.
+
+    Colors are weighted by alpha and by the mask, where there are such: transparent and masked
+    pixels lend no color. Alpha is weighted by the mask.
+
+    Args:
+        pixels: uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha.
+        width, height: the smaller size in pixels, at most the larger.
+        mask: bool [H, W], True where a pixel counts, or None if all do.
+        box: width and height, in pixels, of the part of ``pixels`` that is the photo, from the
+            upper left corner; None is all.
+
+    Returns:
+        The photo, uint8 [height, width, 3 or 4], and its mask, None without ``mask``: a pixel of it
+        is False where none of the pixels under it counts.
+    """
+    alpha = pixels.shape[2] == 4
+
+    def planes(rows: slice) -> np.ndarray:
+        """What is summed: the weighted color, and what it is divided by."""
+        band = pixels[rows]
+        if mask is None and not alpha:
+            return band
+        used = np.ones((*band.shape[:2], 1)) if mask is None else mask[rows, :, None] * 1.0
+        if not alpha:
+            return np.concatenate([band * used, used], axis=2)
+        opacity = band[..., 3:] * used
+        return np.concatenate([band[..., :3] * opacity, opacity, used], axis=2)
+
+    sums = _area_sums(planes, pixels.shape[:2], (height, width), box)
+    if mask is None and not alpha:
+        return _rounded(sums / _area(pixels.shape[:2], (height, width), box)), None
+    # The sums of weights are 0 only where the color has no meaning.
+    colors = sums[..., :3] / np.maximum(sums[..., 3:4], 1e-9)
+    if alpha:
+        colors = np.concatenate([colors, sums[..., 3:4] / np.maximum(sums[..., 4:], 1e-9)], axis=2)
+    return _rounded(colors), None if mask is None else sums[..., -1] > 1e-9
+
+
+def plane_area_means(plane: np.ndarray, width: int, height: int) -> Float64:
+    """Reduce one number per pixel, [H, W], by an area filter; see ``area_means``."""
+    sums = _area_sums(lambda rows: plane[rows, :, None], plane.shape, (height, width), None)
+    return sums[..., 0] / _area(plane.shape, (height, width), None)
+
+
+def reduced_view(view: View, width: int, height: int) -> View:
+    """A view with a smaller photo; its camera, mask and weights go with it.
+
+    A pixel is masked if all under it were. Weights are averaged.
+
+    Args:
+        view: the view.
+        width, height: the smaller size in pixels, at most the larger.
+    """
+    if (width, height) == (view.camera.width, view.camera.height):
+        return view
+    image, mask = area_means(view.image, width, height, view.mask)
+    weights = None
+    if view.weights is not None:
+        weights = plane_area_means(view.weights, width, height).astype(np.float32)
+    camera = resized_camera(view.camera, width, height)
+    return replace(view, camera=camera, image=image, mask=mask, weights=weights)
 
 
 def halved(view: View) -> View:
     """Average each 2 x 2 pixels of a view into one; an odd last row or column is dropped.
 
-    Colors are weighted by alpha and by the mask, if the view has them: masked pixels do not count.
-    A pixel of the result is masked if all four were. Weights are averaged. The camera's focal
-    lengths and principal point are halved.
+    See ``reduced_view``; focal lengths and principal point are halved.
     """
-    camera = view.camera
-    height, width = camera.height // 2, camera.width // 2
-    pixels = view.image[: 2 * height, : 2 * width].astype(np.float64)
-    weight = np.ones((2 * height, 2 * width, 1))
-    if view.mask is not None:
-        weight = view.mask[: 2 * height, : 2 * width, None].astype(np.float64)
-
-    def pooled(values: np.ndarray) -> np.ndarray:
-        return np.asarray(values.reshape(height, 2, width, 2, -1).mean(axis=(1, 3)))
-
-    used = pooled(weight)
-    of_color = weight * pixels[..., 3:] if pixels.shape[2] == 4 else weight
-    planes = [pooled(pixels[..., :3] * of_color) / np.maximum(pooled(of_color), 1e-9)]
-    if pixels.shape[2] == 4:
-        planes.append(pooled(pixels[..., 3:] * weight) / np.maximum(used, 1e-9))
-    weights = None
-    if view.weights is not None:
-        weights = pooled(view.weights[: 2 * height, : 2 * width])[..., 0].astype(np.float32)
-    K = camera.K.copy()
-    K[:2] /= 2.0
-    return replace(
+    width, height = view.camera.width // 2, view.camera.height // 2
+    even = (slice(2 * height), slice(2 * width))
+    whole = replace(
         view,
-        camera=replace(camera, K=K, width=width, height=height),
-        image=np.floor(np.concatenate(planes, axis=2) + 0.5).astype(np.uint8),
-        mask=None if view.mask is None else used[..., 0] > 0.0,
-        weights=weights,
+        camera=replace(view.camera, width=2 * width, height=2 * height),
+        image=view.image[even],
+        mask=None if view.mask is None else view.mask[even],
+        weights=None if view.weights is None else view.weights[even],
     )
+    return reduced_view(whole, width, height)
+
+
+def _rounded(values: Float64) -> npt.NDArray[np.uint8]:
+    return np.floor(values + 0.5).astype(np.uint8)
+
+
+def _area(shape: tuple[int, ...], size: tuple[int, int], box: tuple[float, float] | None) -> float:
+    """How many pixels one of the smaller photo covers."""
+    width, height = (shape[1], shape[0]) if box is None else box
+    return width / size[1] * (height / size[0])
+
+
+def _bounds(covered: float, count: int) -> tuple[npt.NDArray[np.int64], Float64]:
+    """Where each of ``count`` equal parts of ``covered`` pixels begins, and the last ends.
+
+    Returns:
+        The pixel, int64 [count + 1], and how much of it lies before, in [0, 1).
+    """
+    ends = np.arange(count + 1) * covered / count
+    whole = ends.astype(np.int64)
+    return whole, ends - whole
+
+
+def _area_sums(
+    planes: Callable[[slice], np.ndarray],
+    shape: tuple[int, ...],
+    size: tuple[int, int],
+    box: tuple[float, float] | None,
+) -> Float64:
+    """Sums over the areas that the smaller pixels cover, float64 [h, w, C].
+
+    Whole numbers are summed exactly where pixels are covered whole.
+
+    Args:
+        planes: gives rows of what is summed, [rows, W, C].
+        shape: H and W.
+        size: h and w.
+        box: as ``area_means``.
+    """
+    (full_height, full_width), (height, width) = shape[:2], size
+    covered = (full_width, full_height) if box is None else box
+    rows, row_parts = _bounds(covered[1], height)
+    columns, column_parts = _bounds(covered[0], width)
+    at_once = max(1, _BAND_NUMBERS * height // (full_height * full_width * 4))
+    parts = []
+    for top in range(0, height, at_once):
+        bottom = min(top + at_once, height)
+        first = int(rows[top])
+        band = planes(slice(first, int(rows[bottom]) + 1))
+        summed = np.empty((bottom - top, *band.shape[1:]))
+        for row in range(top, bottom):
+            start, end = int(rows[row]) - first, int(rows[row + 1]) - first
+            out = summed[row - top]
+            np.sum(band[start:end], axis=0, dtype=np.float64, out=out)
+            if row_parts[row + 1]:
+                out += row_parts[row + 1] * band[end]
+            if row_parts[row]:
+                out -= row_parts[row] * band[start]
+        sums = np.add.reduceat(summed[:, : columns[-1]], columns[:-1], axis=1)
+        if column_parts.any():
+            # What lies in the first part of the pixel where an area ends, and the next begins.
+            edge = summed[:, np.minimum(columns, full_width - 1)] * column_parts[:, None]
+            sums += np.diff(edge, axis=1)
+        parts.append(sums)
+    return np.concatenate(parts)

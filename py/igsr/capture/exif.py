@@ -19,6 +19,8 @@ _ORIENTATION, _MAKE, _MODEL, _SUB_FOLDER = 0x0112, 0x010F, 0x0110, 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
 _PIXEL_WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA20E, 0xA210
 _MM_FROM_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+#: Orientations that exchange width and height.
+TURNED = (5, 6, 7, 8)
 _FILM_DIAGONAL = math.hypot(36.0, 24.0)
 # In units of the longer side. Fisheyes and telescopes are within; other numbers are wrong fields.
 _FOCAL_RANGE = (0.2, 50.0)
@@ -89,10 +91,21 @@ def _text(value: Any) -> str:
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Turn and mirror pixels [H, W, ...] by an EXIF orientation, so that the photo is upright."""
-    if orientation in (5, 6, 7, 8):
+    if orientation in TURNED:
         pixels = np.swapaxes(pixels, 0, 1)
     if orientation in (2, 3, 6, 7):
         pixels = pixels[:, ::-1]
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]
+    return np.ascontiguousarray(pixels)
+
+
+def turned_back(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Undo ``upright``."""
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    if orientation in TURNED:
+        pixels = np.swapaxes(pixels, 0, 1)
     return np.ascontiguousarray(pixels)

@@ -15,13 +15,24 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from igsr.capture.exif import read_exif, upright
-from igsr.capture.photos import SUFFIXES, is_file, load_pixels, mask_of, open_image, pixels_of
+from igsr.capture.downscaling import area_means, check_max_size, reduced_size
+from igsr.capture.exif import TURNED, read_exif, turned_back, upright
+from igsr.capture.memory_check import check_memory, decoding_threads
+from igsr.capture.photos import (
+    SUFFIXES,
+    PhotoHeader,
+    decoded,
+    is_file,
+    load_pixels,
+    mask_of,
+    open_image,
+    photo_header,
+)
 from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames
 from igsr.errors import IgsrError
 
@@ -44,6 +55,8 @@ class Photo:
         focal: focal length in pixels of ``image``, from EXIF, or None if it is not known.
         device: make, model and lens of the camera, or the video's name; photos of one device, size
             and focal length share their intrinsics. None if it is not known.
+        taken: width and height in pixels of the upright photo before it was reduced to ``image``;
+            None if it was not.
     """
 
     name: str
@@ -51,10 +64,18 @@ class Photo:
     mask: np.ndarray | None = None
     focal: float | None = None
     device: str | None = None
+    taken: tuple[int, int] | None = None
+
+    @property
+    def full_size(self) -> tuple[int, int]:
+        """Width and height in pixels of the upright photo as it was taken."""
+        return self.taken or (self.image.shape[1], self.image.shape[0])
 
 
 def load_photos(
-    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], frames: int = FRAMES
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    frames: int = FRAMES,
+    max_size: int | None = None,
 ) -> list[Photo]:
     """Load photos whose cameras are not known.
 
@@ -63,6 +84,8 @@ def load_photos(
             that are not photos are ignored. If a folder has no photos itself but ``images/``, the
             photos in that are taken.
         frames: number of frames taken from each video: the sharpest of as many equal spans.
+        max_size: longest side, in pixels, of photos as loaded. Larger ones are reduced with an area
+            filter as they are decoded; none is enlarged. None keeps all as they are.
 
     Returns:
         The photos, sorted by name if from a folder, else in the order given. A photo that cannot be
@@ -76,26 +99,27 @@ def load_photos(
         raise IgsrError(
             f"frames is {frames!r}; give a whole number of at least 1, such as {FRAMES}"
         )
-    if isinstance(path, (str, os.PathLike)):
-        given = Path(path)
-        root, files, masks = _folder(given) if not is_file(given) else _files([given])
-    else:
-        root, files, masks = _files([Path(file) for file in path])
+    check_max_size(max_size)
+    root, files, masks = _found(path)
     names = [file.relative_to(root).as_posix() for file in files]
 
     def load(file: Path, name: str) -> list[Photo] | IgsrError:
         try:
             if file.suffix.lower() in VIDEO_SUFFIXES:
-                return _from_video(file, name, frames)
-            return [_from_file(file, name, masks)]
+                return _from_video(file, name, frames, max_size)
+            return [_from_file(file, name, masks, max_size)]
         except IgsrError as error:
             return error
 
-    with warnings.catch_warnings(), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+    with warnings.catch_warnings():
         # Pillow warns of damaged EXIF and the like even where the pixels can be read.
         warnings.filterwarnings("ignore", module="PIL")
-        _refuse_large(files)
-        loaded = list(pool.map(load, files, names))
+        headers = [header for header in map(_header, files) if header is not None]
+        sizes = [header.size for header in headers]
+        check_memory(sizes, max_size, channels=max((one.channels for one in headers), default=3))
+        largest = max((width * height for width, height in sizes), default=1)
+        with ThreadPoolExecutor(max_workers=decoding_threads(largest)) as pool:
+            loaded = list(pool.map(load, files, names))
     photos = [photo for found in loaded if isinstance(found, list) for photo in found]
     broken = [found for found in loaded if isinstance(found, IgsrError)]
     if broken:
@@ -129,7 +153,7 @@ def photo_sizes(path: Path) -> dict[str, int]:
     Raises:
         IgsrError: there are none.
     """
-    root, files, _ = _files([path]) if is_file(path) else _folder(path)
+    root, files, _ = _found(path)
     return {file.relative_to(root).as_posix(): file.stat().st_size for file in files}
 
 
@@ -147,6 +171,16 @@ def _walk(root: Path) -> Iterator[Path]:
         kept = [name for name in folders if not name.startswith(".")]
         folders[:] = [name for name in kept if Path(place) != root or name != "masks"]
         yield from (file for name in names if _is_photo(file := Path(place, name)))
+
+
+def _found(
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+) -> tuple[Path, list[Path], Path]:
+    """The root of the names, the photos and videos, and the folder of masks."""
+    if not isinstance(path, (str, os.PathLike)):
+        return _files([Path(file) for file in path])
+    given = Path(path)
+    return _files([given]) if is_file(given) else _folder(given)
 
 
 def _folder(path: Path) -> tuple[Path, list[Path], Path]:
@@ -183,45 +217,51 @@ def _files(files: list[Path]) -> tuple[Path, list[Path], Path]:
     return root, files, root / "masks"
 
 
-def _refuse_large(files: list[Path]) -> None:
-    """Refuse photos that do not fit into memory, before any is decoded."""
+def _header(file: Path) -> PhotoHeader | None:
+    """The header of a photo; None of a video, and of a photo that loading will name as broken."""
+    if file.suffix.lower() in VIDEO_SUFFIXES:
+        return None
     try:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not every system has these
-        return
-    needed = 0
-    for file in files:
-        if file.suffix.lower() in SUFFIXES:
-            try:
-                with open_image(file) as image:
-                    needed += 3 * image.width * image.height
-            except IgsrError:
-                continue  # loading it names it
-    # Photos are held as decoded and as undistorted, and a fit copies them.
-    if 3 * needed > memory:
-        raise IgsrError(
-            f"The {len(files)} photos need {3 * needed / 2**30:.1f} GiB of memory and this machine "
-            f"has {memory / 2**30:.1f}; give fewer or smaller ones."
-        )
+        return photo_header(file)
+    except IgsrError:
+        return None
 
 
-def _from_file(file: Path, name: str, masks: Path) -> Photo:
-    with open_image(file) as image:
-        exif = read_exif(image)
-        load_pixels(image, file)
-        pixels = upright(pixels_of(image, file), exif.orientation)
-    mask = None
+def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> Photo:
     mask_path = next(filter(is_file, mask_paths(masks, name)), None)
-    if mask_path is not None:
-        with open_image(mask_path) as image:
-            load_pixels(image, mask_path)
-            mask = mask_of(image, mask_path)
-        if mask.shape != pixels.shape[:2]:
-            raise IgsrError(
-                f"{mask_path} is {mask.shape[1]}x{mask.shape[0]} pixels but its photo {name} is, "
-                f"upright, {pixels.shape[1]}x{pixels.shape[0]}; resize the mask"
-            )
-    return Photo(name, pixels, mask, exif.focal, exif.device)
+    with open_image(file) as image:
+        full, exif = image.size, read_exif(image)
+        mask = None
+        if mask_path is not None:
+            mask = _mask_as_stored(mask_path, name, full, exif.orientation)
+        size = reduced_size(*full, max_size)
+        pixels, mask = decoded(image, file, size, mask)
+    pixels = upright(pixels, exif.orientation)
+    if mask is not None:
+        mask = upright(mask, exif.orientation)
+    focal, taken = exif.focal, None
+    if size != full:
+        taken = full[::-1] if exif.orientation in TURNED else full
+        focal = None if focal is None else focal * max(size) / max(full)
+    return Photo(name, pixels, mask, focal, exif.device, taken)
+
+
+def _mask_as_stored(path: Path, name: str, size: tuple[int, int], orientation: int) -> np.ndarray:
+    """The mask of an upright photo, turned as the photo is stored.
+
+    Raises:
+        IgsrError: it cannot be read, or has another size than the upright photo.
+    """
+    with open_image(path) as image:
+        load_pixels(image, path)
+        mask = mask_of(image, path)
+    width, height = size[::-1] if orientation in TURNED else size
+    if mask.shape != (height, width):
+        raise IgsrError(
+            f"{path} is {mask.shape[1]}x{mask.shape[0]} pixels but its photo {name} is, "
+            f"upright, {width}x{height}; resize the mask"
+        )
+    return turned_back(mask, orientation)
 
 
 def mask_paths(masks: Path, name: str) -> list[Path]:
@@ -229,11 +269,23 @@ def mask_paths(masks: Path, name: str) -> list[Path]:
     return [masks / f"{name}.png", masks / PurePosixPath(name).with_suffix(".png")]
 
 
-def _from_video(file: Path, name: str, frames: int) -> list[Photo]:
-    return [
-        Photo(f"{name}/{index:06d}.png", pixels, device=f"video {name}")
-        for index, pixels in sharpest_frames(file, frames)
-    ]
+def _from_video(file: Path, name: str, frames: int, max_size: int | None) -> list[Photo]:
+    photos = []
+    for index, pixels in sharpest_frames(file, frames):
+        photo = Photo(f"{name}/{index:06d}.png", pixels, device=f"video {name}")
+        photos.append(reduced_photo(photo, max_size))
+    return photos
+
+
+def reduced_photo(photo: Photo, max_size: int | None) -> Photo:
+    """A photo whose longest side has at most ``max_size`` pixels; None keeps it as it is."""
+    height, width = photo.image.shape[:2]
+    size = reduced_size(width, height, max_size)
+    if size == (width, height):
+        return photo
+    image, mask = area_means(photo.image, *size, photo.mask)
+    focal = None if photo.focal is None else photo.focal * max(size) / max(width, height)
+    return replace(photo, image=image, mask=mask, focal=focal, taken=photo.full_size)
 
 
 def _left_out(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +12,13 @@ import numpy as np
 from PIL import Image
 
 from igsr._internal.choices import Split
+from igsr.capture.downscaling import (
+    area_means,
+    plane_area_means,
+    reduced_size,
+    resized_camera,
+)
+from igsr.capture.memory_check import decoding_threads
 from igsr.capture.types import Camera, View
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
@@ -42,6 +48,7 @@ class Shot:
         split: "train" or "test".
         mask_path: the mask's file, or None.
         source: the file that describes the camera, for error messages.
+        factor: by which the photo is smaller than its camera says, within a pixel.
     """
 
     name: str
@@ -51,6 +58,7 @@ class Shot:
     split: Split
     mask_path: Path | None
     source: Path
+    factor: int = 1
 
 
 def is_file(path: Path) -> bool:
@@ -105,22 +113,6 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def _decode(path: Path, width: int, height: int, source: Path, what: str) -> Image.Image:
-    with open_image(path) as image:
-        if image.size != (width, height):
-            turned = (
-                " (an EXIF orientation is never applied)"
-                if what == "image" and image.size == (height, width)
-                else ""
-            )
-            raise IgsrError(
-                f"{path} is {image.width}x{image.height} pixels but its camera in {source.name} "
-                f"is {width}x{height}{turned}; resize the {what} or correct the camera"
-            )
-        load_pixels(image, path)
-        return image
-
-
 def load_pixels(image: Image.Image, path: Path) -> None:
     """Decode the pixels of an image from ``open_image``.
 
@@ -145,23 +137,46 @@ def _eight_bit(image: Image.Image, path: Path) -> Image.Image:
     return image
 
 
-def read_image(path: Path, width: int, height: int, source: Path) -> np.ndarray:
-    """Read a photo's pixels as stored, without applying its EXIF orientation.
+def decoded(
+    image: Image.Image,
+    path: Path,
+    size: tuple[int, int] | None = None,
+    mask: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Decode an image from ``open_image``, as stored: its EXIF orientation is not applied.
 
-    Palettes, greys, 16 bits, CMYK and the like are converted.
+    Palettes, greys, 16 bits, CMYK and the like are converted. A JPEG that is to become much smaller
+    is decoded at a half, a quarter or an eighth of its size, as long as that is at least twice the
+    wanted one, and an area filter does the rest.
 
     Args:
-        path: the photo.
-        width, height: its camera's size, pixels.
-        source: the file that gave the camera, for error messages.
+        image: whose pixels are not decoded yet.
+        path: of its file, for error messages.
+        size: width and height to reduce it to, or None.
+        mask: bool [H, W] of its pixels: masked ones lend no color to the smaller photo.
 
     Returns:
-        uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha if the file has transparency.
+        uint8 [h, w, 3] RGB, or [h, w, 4] with straight alpha if the file has transparency, and the
+        mask at that size.
 
     Raises:
-        IgsrError: the file is missing, unreadable, truncated, or has another size.
+        IgsrError: the file is truncated or damaged, or has pixels of an unsupported kind.
     """
-    return pixels_of(_decode(path, width, height, source, "image"), path)
+    box = None
+    if size is not None and size != image.size and mask is None:
+        full = image.size
+        drafted = image.draft(None, (2 * size[0], 2 * size[1]))
+        if drafted is not None and image.size != full:
+            box = drafted[1][2], drafted[1][3]  # its last row and column may lie partly beyond
+    load_pixels(image, path)
+    pixels = pixels_of(image, path)
+    if size is None or size == (pixels.shape[1], pixels.shape[0]):
+        return pixels, mask
+    return area_means(pixels, *size, mask, box)
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
 
 
 def pixels_of(image: Image.Image, path: Path) -> np.ndarray:
@@ -171,8 +186,7 @@ def pixels_of(image: Image.Image, path: Path) -> np.ndarray:
         IgsrError: the kind of its pixels is not supported.
     """
     image = _eight_bit(image, path)
-    transparent = "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
-    mode = "RGBA" if transparent else "RGB"
+    mode = "RGBA" if _has_alpha(image) else "RGB"
     if image.mode == "La":
         image = image.convert("LA")
     try:
@@ -183,19 +197,10 @@ def pixels_of(image: Image.Image, path: Path) -> np.ndarray:
         ) from error
 
 
-def read_mask(path: Path, width: int, height: int, source: Path) -> np.ndarray:
-    """Read a mask: bool [H, W], True where it is brighter than half of its brightest pixel.
+def mask_of(image: Image.Image, path: Path) -> np.ndarray:
+    """A decoded image as a mask, bool [H, W], True where it is brighter than half of its brightest.
 
     So masks of 0 and 1 mean the same as masks of 0 and 255.
-
-    Raises:
-        IgsrError: as ``read_image``.
-    """
-    return mask_of(_decode(path, width, height, source, "mask"), path)
-
-
-def mask_of(image: Image.Image, path: Path) -> np.ndarray:
-    """A decoded image as a mask, bool [H, W]; see ``read_mask``.
 
     Raises:
         IgsrError: the kind of its pixels is not supported.
@@ -212,21 +217,23 @@ def mask_of(image: Image.Image, path: Path) -> np.ndarray:
 class _Undistorters:
     """One resampling map per distinct camera, freed after its last photo: a map is larger."""
 
-    def __init__(self, shots: list[Shot]) -> None:
+    def __init__(self, shots: list[Shot], cameras: list[Camera]) -> None:
         self._maps: dict[object, Undistorter] = {}
-        self._uses = Counter(self._key(shot) for shot in shots)
+        pairs = zip(shots, cameras, strict=True)
+        self._uses = Counter(
+            self._key(shot, camera) for shot, camera in pairs if not shot.lens.is_pinhole
+        )
         # A lock for each camera, so that different cameras are mapped side by side.
         self._locks = {key: threading.Lock() for key in self._uses}
 
     @staticmethod
-    def _key(shot: Shot) -> object:
-        return shot.lens, shot.camera.K.tobytes(), shot.camera.width, shot.camera.height
+    def _key(shot: Shot, camera: Camera) -> object:
+        return shot.lens, camera.K.tobytes(), camera.width, camera.height
 
-    def take(self, shot: Shot) -> Undistorter:
-        key = self._key(shot)
+    def take(self, shot: Shot, camera: Camera) -> Undistorter:
+        key = self._key(shot, camera)
         with self._locks[key]:
             if key not in self._maps:
-                camera = shot.camera
                 try:
                     self._maps[key] = Undistorter(shot.lens, camera.K, camera.width, camera.height)
                 except IgsrError as error:
@@ -250,31 +257,122 @@ def _refuse_duplicates(shots: list[Shot]) -> None:
         source_from_name[shot.name] = shot.source
 
 
-def load_views(shots: list[Shot]) -> list[View]:
+@dataclass(frozen=True)
+class PhotoHeader:
+    """What the file of a photo says before it is decoded.
+
+    Attributes:
+        size: width and height, pixels, as stored.
+        channels: 3, or 4 with alpha.
+    """
+
+    size: tuple[int, int]
+    channels: int
+
+
+def photo_header(path: Path) -> PhotoHeader:
+    """Read the header of a photo.
+
+    Raises:
+        IgsrError: as ``open_image``.
+    """
+    with open_image(path) as image:
+        return PhotoHeader(image.size, 4 if _has_alpha(image) else 3)
+
+
+def checked_headers(shots: list[Shot]) -> list[PhotoHeader]:
+    """Read the headers of all photos of a capture, and check their sizes against their cameras.
+
+    Raises:
+        IgsrError: two photos have one name, one cannot be read, or has another size.
+    """
+    _refuse_duplicates(shots)
+    headers = []
+    for shot in shots:
+        header = photo_header(shot.path)
+        _check_size(shot.path, header.size, shot, "image")
+        headers.append(header)
+    return headers
+
+
+def _check_size(path: Path, size: tuple[int, int], shot: Shot, what: str) -> None:
+    """Check a photo's or mask's size against its camera."""
+    camera = shot.camera
+    wanted = camera.width, camera.height
+    if size == wanted and (shot.factor == 1 or what == "mask"):
+        return
+    # Programs round the size of a reduced photo up, down or to the nearest.
+    near = all(abs(one - full / shot.factor) <= 1.0 for one, full in zip(size, wanted, strict=True))
+    if shot.factor > 1 and near:
+        return
+    is_turned = what == "image" and shot.factor == 1 and size == wanted[::-1]
+    turned = " (an EXIF orientation is never applied)" if is_turned else ""
+    reduced = "" if shot.factor == 1 else f", and {path.parent.name} says 1/{shot.factor} of it"
+    raise IgsrError(
+        f"{path} is {size[0]}x{size[1]} pixels but its camera in {shot.source.name} "
+        f"is {wanted[0]}x{wanted[1]}{reduced}{turned}; resize the {what} or correct the camera"
+    )
+
+
+def load_views(
+    shots: list[Shot], headers: list[PhotoHeader], max_size: int | None = None
+) -> list[View]:
     """Load all photos of a capture on all cores, in the order given.
+
+    Args:
+        shots: the photos.
+        headers: of their files, from ``checked_headers``.
+        max_size: longest side in pixels of photos as loaded; larger ones are reduced. None keeps
+            all as they are.
 
     Raises:
         IgsrError: a photo cannot be used; of several, the message is about the first.
     """
-    _refuse_duplicates(shots)
-    undistorters = _Undistorters([shot for shot in shots if not shot.lens.is_pinhole])
+    cameras = [
+        resized_camera(shot.camera, *reduced_size(*header.size, max_size))
+        for shot, header in zip(shots, headers, strict=True)
+    ]
+    undistorters = _Undistorters(shots, cameras)
 
-    def load(shot: Shot) -> View:
-        size = (shot.camera.width, shot.camera.height, shot.source)
-        image = read_image(shot.path, *size)
-        mask = read_mask(shot.mask_path, *size) if shot.mask_path is not None else None
+    def load(shot: Shot, header: PhotoHeader, camera: Camera) -> View:
+        size = camera.width, camera.height
+        with open_image(shot.path) as opened:
+            if opened.size != header.size:
+                raise IgsrError(f"{shot.path} was changed while it was read; try again")
+            mask = _mask(shot, header.size)
+            image, mask = decoded(opened, shot.path, size, mask)
         if not shot.lens.is_pinhole:
-            undistorter = undistorters.take(shot)
+            undistorter = undistorters.take(shot, camera)
             image = undistorter.image(image)
             mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
             if mask.all():
                 mask = None
-        return View(shot.name, shot.camera, shot.split, image, mask)
+        return View(shot.name, camera, shot.split, image, mask)
 
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        futures = [pool.submit(load, shot) for shot in shots]
+    largest = max((header.size[0] * header.size[1] for header in headers), default=1)
+    with ThreadPoolExecutor(max_workers=decoding_threads(largest)) as pool:
+        futures = [pool.submit(load, *each) for each in zip(shots, headers, cameras, strict=True)]
         try:
             return [future.result() for future in futures]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def _mask(shot: Shot, size: tuple[int, int]) -> np.ndarray | None:
+    """The mask of a photo in the photo's pixels; one of the camera's size is brought to them."""
+    if shot.mask_path is None:
+        return None
+    with open_image(shot.mask_path) as opened:
+        _check_size(shot.mask_path, opened.size, shot, "mask")
+        load_pixels(opened, shot.mask_path)
+        mask = mask_of(opened, shot.mask_path)
+    if (mask.shape[1], mask.shape[0]) == size:
+        return mask
+    if mask.shape[1] < size[0] or mask.shape[0] < size[1]:
+        raise IgsrError(
+            f"{shot.mask_path} is {mask.shape[1]}x{mask.shape[0]} pixels but its photo is "
+            f"{size[0]}x{size[1]}; resize the mask"
+        )
+    # The smaller photo mixes what the mask tells apart: a pixel counts if all under it do.
+    return plane_area_means(mask, *size) > 1.0 - 1e-6

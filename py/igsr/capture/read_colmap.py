@@ -24,7 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from igsr.capture.photos import Shot, is_file, load_views
+from igsr.capture.described import DescribedCapture
+from igsr.capture.image_folders import find_images
+from igsr.capture.photos import Shot, is_file
 from igsr.capture.tracks import straightened, track_confidence
 from igsr.capture.types import Camera, Capture, Points, Tracks, intrinsic_matrix
 from igsr.capture.undistort import Lens
@@ -136,13 +138,23 @@ def find_model(path: Path) -> Path | None:
     return None
 
 
-def load_colmap(path: Path, model: Path) -> Capture:
-    """Load a COLMAP capture; all its views are for training.
+def load_colmap(path: Path, model: Path, max_size: int | None = None) -> Capture:
+    """Load a COLMAP capture; see ``described_colmap``."""
+    return described_colmap(path, model, max_size).loaded(max_size)
+
+
+def described_colmap(
+    path: Path, model: Path, max_size: int | None = None, folder: str | None = None
+) -> DescribedCapture:
+    """Read a COLMAP capture, but not its photos; all its views are for training.
 
     Args:
-        path: the capture. Its photos are in ``images/`` or, if that is missing, in the capture
-            itself. The mask of a photo, if any, is ``masks/`` + its whole name + ``.png``.
+        path: the capture. Its photos are in ``images/``, or reduced in ``images_K/`` (see
+            ``igsr.capture.image_folders``) or, if there is none of these, in the capture itself.
+            The mask of a photo, if any, is ``masks/`` + its whole name + ``.png``.
         model: the folder with cameras, images and points3D, all ``.bin`` or all ``.txt``.
+        max_size: longest side in pixels of photos as they will be loaded, or None.
+        folder: the name of the folder of photos to take, or None.
 
     Raises:
         IgsrError: a file is missing, corrupt, or has a camera model that is not supported.
@@ -160,20 +172,21 @@ def load_colmap(path: Path, model: Path) -> Capture:
     images = (_binary_images if binary else _text_images)(images_path)
     if not images:
         raise IgsrError(f"{images_path} lists no images; give a model with registered images")
-    images_folder = path / "images" if (path / "images").is_dir() else path
-    shots = []
-    for image in sorted(images, key=lambda image: image.name):
+    images = sorted(images, key=lambda image: image.name)
+    sizes = []
+    for image in images:
         if image.camera_id not in cameras:
             raise IgsrError(
                 f"{images_path}: {image.name} refers to camera {image.camera_id}, which "
                 f"{cameras_path.name} does not have; export the model again"
             )
-        photo = images_folder / image.name
-        if not is_file(photo):
-            raise IgsrError(
-                f"{images_path} has a camera for {image.name} but {photo} is missing; put the "
-                "photo there"
-            )
+        sizes.append((cameras[image.camera_id].width, cameras[image.camera_id].height))
+    names = [image.name for image in images]
+    found = find_images(path, names, sizes, max_size, folder, images_path)
+    # Photos keep their names at every size.
+    prefix = "images" if found.factor > 1 or (path / "images").is_dir() else ""
+    shots = []
+    for image, photo in zip(images, found.files, strict=True):
         viewmat = _viewmat(image, images_path)
         colmap_camera = cameras[image.camera_id]
         try:
@@ -181,17 +194,22 @@ def load_colmap(path: Path, model: Path) -> Capture:
             camera = Camera(viewmat, K, colmap_camera.width, colmap_camera.height)
         except IgsrError as error:
             raise IgsrError(f"{cameras_path}, camera {image.camera_id}: {error}") from error
-        name = posixpath.normpath((images_folder.relative_to(path) / image.name).as_posix())
-        mask = path / "masks" / f"{image.name}.png"
+        name = posixpath.normpath(posixpath.join(prefix, image.name))
+        mask = found.masks / f"{image.name}.png"
         mask_path = mask if is_file(mask) else None
-        shots.append(Shot(name, photo, camera, lens, "train", mask_path, images_path))
-    points = None
-    if is_file(points_path):
+        shots.append(Shot(name, photo, camera, lens, "train", mask_path, images_path, found.factor))
+
+    def points() -> Points | None:
+        if not is_file(points_path):
+            return None
         listed = (_binary_points if binary else _text_points)(points_path)
-        if listed.ids:
-            points = listed.points(points_path)
-            points.tracks = _tracks(images_path, images, shots, listed.ids, points.xyz)
-    return Capture(path, load_views(shots), points)
+        if not listed.ids:
+            return None
+        points = listed.points(points_path)
+        points.tracks = _tracks(images_path, images, shots, listed.ids, points.xyz)
+        return points
+
+    return DescribedCapture(path, shots, points)
 
 
 def _tracks(
@@ -205,7 +223,7 @@ def _tracks(
     number = np.array(ids, dtype=np.uint64).astype(np.int64)  # as those of the features wrap
     order = np.argsort(number, kind="stable")
     views, points, places = [], [], []
-    for index, image in enumerate(sorted(images, key=lambda image: image.name)):
+    for index, image in enumerate(images):
         at = order[np.searchsorted(number[order], image.point_ids).clip(0, len(ids) - 1)]
         # An id without a point belongs to a feature without a point, or to a removed point.
         seen = (number[at] == image.point_ids) & (image.point_ids != -1)

@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 
 from igsr._internal.choices import SPLITS, Split
-from igsr.capture.photos import Shot, image_size, is_file, load_views
+from igsr.capture.described import DescribedCapture
+from igsr.capture.photos import Shot, image_size, is_file
 from igsr.capture.point_cloud import read_point_cloud
-from igsr.capture.types import Camera, Capture, intrinsic_matrix, nearest_rigid
+from igsr.capture.types import Camera, Capture, Points, intrinsic_matrix, nearest_rigid
 from igsr.capture.undistort import Lens
 from igsr.errors import IgsrError
 
@@ -34,8 +35,18 @@ _FISHEYE = ("OPENCV_FISHEYE",)
 _OMITTED_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
-def load_transforms(path: Path) -> Capture:
-    """Load a ``transforms.json``; paths in it are relative to its folder.
+def load_transforms(path: Path, max_size: int | None = None) -> Capture:
+    """Load a ``transforms.json``; see ``described_transforms``."""
+    return described_transforms(path).loaded(max_size)
+
+
+def load_split_transforms(folder: Path, max_size: int | None = None) -> Capture:
+    """Load a NeRF Synthetic capture; see ``described_split_transforms``."""
+    return described_split_transforms(folder).loaded(max_size)
+
+
+def described_transforms(path: Path) -> DescribedCapture:
+    """Read a ``transforms.json``; paths in it are relative to its folder.
 
     Raises:
         IgsrError: a field is missing, malformed or out of range, or a file it names is unusable.
@@ -49,18 +60,20 @@ def load_transforms(path: Path) -> Capture:
         split: Split | None = "train" if split_from_name is None else split_from_name.get(name)
         if split is not None:
             shots.append(_shot(document, frame, path, index, split))
-    points = None
-    if "ply_file_path" in document:
-        name = _text(document, "ply_file_path", str(path))
-        points = read_point_cloud(path.parent / name)
-    return Capture(path.parent, load_views(shots), points)
+
+    def points() -> Points | None:
+        if "ply_file_path" not in document:
+            return None
+        return read_point_cloud(path.parent / _text(document, "ply_file_path", str(path)))
+
+    return DescribedCapture(path.parent, shots, points)
 
 
-def load_split_transforms(folder: Path) -> Capture:
-    """Load ``transforms_train.json`` and, where it exists, ``transforms_test.json`` of a folder.
+def described_split_transforms(folder: Path) -> DescribedCapture:
+    """Read ``transforms_train.json`` and, where it exists, ``transforms_test.json`` of a folder.
 
     Raises:
-        IgsrError: as ``load_transforms``.
+        IgsrError: as ``described_transforms``.
     """
     shots = []
     for split in SPLITS:
@@ -69,7 +82,7 @@ def load_split_transforms(folder: Path) -> Capture:
             document = _read_json(path)
             for index, frame in enumerate(_frames(document, path)):
                 shots.append(_shot(document, frame, path, index, split))
-    return Capture(folder, load_views(shots))
+    return DescribedCapture(folder, shots, lambda: None)
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 
-from igsr.capture.types import Camera, Tracks
+from igsr.capture.types import Camera, Points, Tracks
 from igsr.capture.undistort import Lens
 
 
@@ -53,3 +56,26 @@ def straightened(
         xy[mine] -= np.stack([bent_x - x, bent_y - y], axis=1) * focal
         keep[mine] = before & valid & np.isfinite(xy[mine]).all(axis=1)
     return Tracks(tracks.names, tracks.view[keep], tracks.point[keep], xy[keep])
+
+
+def resized(
+    points: Points | None, before: Mapping[str, Camera], after: Mapping[str, Camera]
+) -> Points | None:
+    """Points whose tracks are in pixels of photos at another size.
+
+    Args:
+        points: with tracks in pixels of the photos as they were, or None.
+        before, after: the cameras of the photos by name; only their sizes count. Photos that are
+            not in both stay as they are.
+    """
+    if points is None or points.tracks is None:
+        return points
+    tracks = points.tracks
+    scale = np.ones((len(tracks.names), 2))
+    for index, name in enumerate(tracks.names):
+        if name in before and name in after:
+            old, new = before[name], after[name]
+            scale[index] = new.width / old.width, new.height / old.height
+    if (scale == 1.0).all():
+        return points
+    return replace(points, tracks=replace(tracks, xy=tracks.xy * scale[tracks.view]))

@@ -16,6 +16,7 @@ from igsr.cli.shared import (
     CaptureArgument,
     HoldoutOption,
     JsonOption,
+    MaxSizeOption,
     SceneArgument,
     SplitChoice,
     background_color,
@@ -35,6 +36,7 @@ def eval_command(
     scene: SceneArgument,
     capture_path: CaptureArgument,
     holdout: HoldoutOption = None,
+    max_size: MaxSizeOption = None,
     split: Annotated[
         SplitChoice | None,
         typer.Option("--split", help="Views to score. Default: test if there are any, else train."),
@@ -47,7 +49,7 @@ def eval_command(
     with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)
-        capture = load(capture_path, holdout)
+        capture = load(capture_path, holdout, max_size)
         color = background_color(background) or default_background(capture)
         chosen = split.value if split is not None else default_split(capture)
         scores, _ = scored(splats, capture, chosen, color, name, shown=not as_json)

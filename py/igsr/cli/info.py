@@ -11,7 +11,7 @@ import typer
 
 from igsr import _core
 from igsr.cli.error_messages import error_messages
-from igsr.cli.shared import JsonOption, output_console, print_json
+from igsr.cli.shared import JsonOption, MaxSizeOption, output_console, print_json
 from igsr.splats import SPLAT_ENDINGS, Splats
 
 
@@ -19,11 +19,16 @@ def info_command(
     path: Annotated[
         Path, typer.Argument(metavar="SCENE|CAPTURE", help="A splat file, or a capture.")
     ],
+    max_size: MaxSizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Describe a scene or a capture, and this machine's backends."""
     with error_messages():
-        report = _scene_info(path) if path.suffix.lower() in SPLAT_ENDINGS else _capture_info(path)
+        report = (
+            _scene_info(path)
+            if path.suffix.lower() in SPLAT_ENDINGS
+            else _capture_info(path, max_size)
+        )
         report["backends"] = _backends()
     if as_json:
         print_json(report)
@@ -70,10 +75,10 @@ def _known(number: float) -> float | None:
     return float(number) if math.isfinite(number) else None
 
 
-def _capture_info(path: Path) -> dict[str, Any]:
+def _capture_info(path: Path, max_size: int | None) -> dict[str, Any]:
     from igsr.capture import load_capture
 
-    capture = load_capture(path)
+    capture = load_capture(path, max_size)
     sizes = sorted({f"{view.camera.width}x{view.camera.height}" for view in capture.views})
     points = None if capture.points is None else len(capture.points.xyz)
     return {

@@ -16,7 +16,9 @@ from rich.progress import Progress as ProgressBar
 
 from igsr import _core
 from igsr._internal.atomic_write import check_folder
+from igsr._internal.part_usage import Parts
 from igsr.capture import Capture
+from igsr.capture.downscaling import check_max_size
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import FRAMES, has_photos
 from igsr.capture.write_colmap import write_colmap
@@ -32,6 +34,7 @@ from igsr.cli.shared import (
 )
 from igsr.errors import IgsrError
 from igsr.pose import AUTO, capture_of, estimate, found_before, kept_cameras, photos_note, photos_of
+from igsr.pose.cache import read_usage, write_usage
 from igsr.pose.registry import ESTIMATORS
 
 logger = logging.getLogger(__name__)
@@ -106,8 +109,10 @@ def capture_to_fit(
     holdout: int | None,
     finder: CameraFinder,
     *,
+    max_size: int | None,
     resume: bool,
     shown: bool,
+    parts: Parts | None = None,
 ) -> tuple[Capture, bool]:
     """Load the capture at a path; find the cameras first if it has none.
 
@@ -118,8 +123,10 @@ def capture_to_fit(
         out: the folder of the fit.
         holdout: hold out every ``holdout``-th view for testing, or None.
         finder: how to find the cameras.
+        max_size: longest side, in pixels, of photos as loaded, or None.
         resume: use cameras that an earlier run found.
         shown: whether progress is shown.
+        parts: count what "cameras" and "load" take, or None.
 
     Returns:
         The capture, and whether its cameras were found here (or by the run that is resumed).
@@ -129,22 +136,31 @@ def capture_to_fit(
             cameras were given for a capture that has them.
     """
     _check_out(out)
+    check_max_size(max_size)
+    parts = Parts() if parts is None else parts
     if holds_cameras(path) or not has_photos(path):
         if finder.options or finder.estimator != AUTO:
             raise IgsrError(
                 f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
             )
-        return load(path, holdout), False
+        with parts.measured("load"):
+            return load(path, holdout, max_size), False
     kept = kept_cameras(path, out)
     if resume and found_before(path, kept):
         print_message(f"The cameras found before are used, from {kept}")
+        usage = read_usage(kept)
+        if usage is not None:
+            parts.add("cameras", usage)
     else:
-        report = _posed(path, kept, finder, plot=False, shown=shown, notes=photos_note(path))
+        with parts.measured("cameras"):
+            report = _posed(path, kept, finder, plot=False, shown=shown, notes=photos_note(path))
+        write_usage(kept, parts.used["cameras"])
         print_message(
             f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
             f"{report['estimator']} and are kept in {kept}"
         )
-    return load(kept, holdout), True
+    with parts.measured("load"):
+        return load(kept, holdout, max_size), True
 
 
 def pose_command(

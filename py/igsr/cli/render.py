@@ -18,6 +18,7 @@ from igsr.cli.shared import (
     BackendOption,
     BackgroundOption,
     JsonOption,
+    MaxSizeOption,
     SceneArgument,
     background_color,
     output_console,
@@ -57,6 +58,7 @@ def render_command(
         ),
     ] = False,
     background: BackgroundOption = None,
+    max_size: MaxSizeOption = None,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
@@ -64,7 +66,7 @@ def render_command(
     with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)
-        capture = None if cameras is None else load_capture(cameras)
+        capture = None if cameras is None else load_capture(cameras, max_size)
         color = background_color(background) or (
             NAMED_COLORS["black"] if capture is None else default_background(capture)
         )

@@ -6,6 +6,8 @@ import json
 from pathlib import Path, PurePosixPath
 
 from igsr._internal.atomic_write import check_folder
+from igsr._internal.json_file import write_json
+from igsr._internal.part_usage import Usage
 from igsr.capture import Capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import VIDEO_SUFFIXES, photo_sizes
@@ -13,6 +15,8 @@ from igsr.errors import IgsrError
 
 #: File in the cache: names and sizes in bytes of the photos that cameras were estimated for.
 GIVEN = "photos.json"
+#: File in the cache: what finding the cameras took.
+USAGE = "usage.json"
 
 
 def kept_cameras(photos: Path, out: Path) -> Path:
@@ -95,3 +99,29 @@ def _given(kept: Path) -> dict[str, int] | None:
     except (OSError, ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def write_usage(kept: Path, usage: Usage) -> None:
+    """Write into the cache what finding its cameras took, for reports, also of resumed runs.
+
+    Args:
+        kept: the cache, with cameras.
+        usage: what finding them took.
+
+    Raises:
+        IgsrError: it cannot be written.
+    """
+    write_json(kept / USAGE, usage.plain())
+
+
+def read_usage(kept: Path) -> Usage | None:
+    """What finding the cameras in the cache took; None where that is not known.
+
+    Args:
+        kept: the cache, or another capture.
+    """
+    try:
+        found = json.loads((kept / USAGE).read_text(encoding="utf-8"))
+        return Usage.of(found)
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return None
