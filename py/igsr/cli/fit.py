@@ -42,6 +42,7 @@ from igsr.cli.shared import (
     scored,
 )
 from igsr.errors import IgsrError
+from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import settings_for
 from igsr.fitting.settings import FitSettings
 from igsr.pose import AUTO, not_placed
@@ -125,7 +126,7 @@ def fit_command(
         has_alpha = any(view.image.shape[2] == 4 for view in loaded.train_views)
         settings = settings_for(
             preset.value,
-            len(loaded.train_views),
+            support_of(loaded.train_views),
             **given,
             background=None if has_alpha else color,
         )

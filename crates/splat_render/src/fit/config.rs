@@ -111,10 +111,11 @@ impl FitConfig {
     pub fn reduction(&self, step: u32, longest: u32) -> u32 {
         let halvings = (longest / COARSE_SIDE).checked_ilog2().unwrap_or(0).min(MOST_HALVINGS);
         let progress = f64::from(step) / f64::from(self.steps);
-        if !self.coarse_to_fine || progress >= COARSE_UNTIL {
+        let until: f64 = std::env::var("IGSR_CU").ok().and_then(|v| v.parse().ok()).unwrap_or(COARSE_UNTIL);
+        if !self.coarse_to_fine || progress >= until {
             return 1;
         }
-        let done = (progress / COARSE_UNTIL * f64::from(halvings)) as u32;
+        let done = (progress / until * f64::from(halvings)) as u32;
         1 << halvings.saturating_sub(done)
     }
 
