@@ -12,6 +12,7 @@ from igsr._internal.settings import checked_given, settings_of
 from igsr.capture.photo_folder import FRAMES
 from igsr.cli.error_messages import error_messages, warning_messages
 from igsr.cli.pose import (
+    AllowMissingOption,
     CameraFinder,
     CheckpointOption,
     EstimatorOption,
@@ -74,6 +75,7 @@ def fit_command(
     network: CheckpointOption = None,
     graph: GraphOption = None,
     frames: FramesOption = FRAMES,
+    allow_missing: AllowMissingOption = False,
     background: BackgroundOption = None,
     config: ConfigOption = None,
     resume: Annotated[
@@ -105,7 +107,14 @@ def fit_command(
         name = resolved(backend)
         finder = CameraFinder(estimator, network, graph, frames, given["seed"])
         loaded, found = capture_to_fit(
-            capture, out, holdout, finder, max_size=max_size, resume=resume, shown=not as_json
+            capture,
+            out,
+            holdout,
+            finder,
+            max_size=max_size,
+            allow_missing=allow_missing,
+            resume=resume,
+            shown=not as_json,
         )
         color = _background(background, loaded)
         # Photos with alpha are fitted over random colors, so that no background is learned.
@@ -131,6 +140,7 @@ def fit_command(
             "network": None if network is None else str(network),
             "graph": graph,
             "frames": frames,
+            "allow_missing": allow_missing,
             "background": background,
         }
         report = _written(splats, fitted, settings, asked, color, out, last, shown=not as_json)
