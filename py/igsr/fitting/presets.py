@@ -37,6 +37,10 @@ PAPER_STEPS = 5000
 #: Most splats of 3DGS, which has no such limit: as many as 8 GB of memory hold.
 UNLIMITED_SPLATS = 4_000_000
 
+#: Longest side of photos that fits have where none is asked for, pixels: what two cores do in
+#: minutes, and what other tools have on GPUs (nerfstudio: 1600).
+MAX_SIZES = {"cpu": 1000, "gpu": 1600}
+
 _DEFAULT = FitSettings(
     steps=MOST_STEPS,
     max_splats=30_000,
@@ -74,6 +78,17 @@ _INSTANTSPLAT = replace(
 )
 #: What a preset says nothing of.
 _NOT_OF_PRESETS = ("seed", "background")
+
+
+def default_max_size(backend: str) -> int:
+    """Longest side in pixels of the photos that a backend fits where nothing else is asked for.
+
+    By the backend alone, so that the same command gives the same result on every machine.
+
+    Args:
+        backend: "cpu" or "gpu".
+    """
+    return MAX_SIZES[backend]
 
 
 def settings_for(preset: str, photos: PhotoSupport | int, **given: Any) -> FitSettings:

@@ -18,7 +18,7 @@ from igsr.capture.photo_folder import photo_sizes
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance
 from igsr.errors import IgsrError
 from igsr.evaluation.quick_scores import MOST_TRAIN
-from igsr.fitting.presets import Preset, preset_settings
+from igsr.fitting.presets import Preset, default_max_size, preset_settings
 from igsr.study.own_photos_runs import (
     SCENE_NOTE,
     CameraRun,
@@ -69,7 +69,8 @@ def own_photos(
         seeds: how many seeds, from 0.
         holdout: every so many photos one is held out, counted in the order of their names.
         steps: of each fit; None is the preset's number.
-        max_size: longest side of the photos that are fitted, pixels; None leaves it to the preset.
+        max_size: longest side of the photos that are fitted, pixels; None is ``default_max_size`` of the
+            backend.
         score_size: longest side of the photos that are scored, pixels, the same for all presets;
             None is ``max_size``, or 1600 where that is None.
         known_cameras: use cameras that lie beside the photos, where there are some.
@@ -109,7 +110,11 @@ def own_photos(
 
     # Cameras first: a scene's are the same for all of its fits.
     own = {name for name in names if known_cameras and holds_cameras(root / name)}
-    tasks = [_camera_task(folder, name) for name in names if name not in own]
+    score_size = score_size or max_size or SCORE_SIZE
+    if max_size is None:
+        max_size = default_max_size(backend)
+    largest = max(score_size, max_size)
+    tasks = [_camera_task(folder, name, largest) for name in names if name not in own]
     work = partial(in_a_process, find_cameras)
     cameras = {
         row["scene"]: row
@@ -125,7 +130,7 @@ def own_photos(
             holdout,
             steps,
             max_size,
-            score_size or max_size or SCORE_SIZE,
+            score_size,
             None if features is None else str(features),
             None if name in own else str(_capture(folder, name)),
             str(folder / "splats" / f"{_run_name(name, one, seed, backend)}.ply"),
@@ -151,7 +156,7 @@ def own_photos(
         "seeds": seeds,
         "steps": steps,
         "max_size": max_size,
-        "score_size": score_size or max_size or SCORE_SIZE,
+        "score_size": score_size,
         "cameras": "known where there are some, else found" if known_cameras else "found",
         "train": f"at most {MOST_TRAIN} fitted photos of each scene, evenly spaced",
         "refined": "held-out cameras aligned to the fitted ones where those moved, then each "
@@ -171,12 +176,12 @@ def _run_name(scene: str, preset: str, seed: int, backend: str) -> str:
     return f"{file_name(scene)}-{preset}-seed{seed}-{backend}"
 
 
-def _camera_task(out: Path, scene: str) -> Run:
+def _camera_task(out: Path, scene: str, max_size: int) -> Run:
     capture = _capture(out, scene)
     return Run(
         file_name(scene),
-        CameraRun(scene, str(capture), ESTIMATOR),
-        {"estimator": ESTIMATOR},
+        CameraRun(scene, str(capture), ESTIMATOR, max_size),
+        {"estimator": ESTIMATOR, "max_size": max_size},
         leaves=capture / SCENE_NOTE,
         scene=scene,
     )

@@ -16,6 +16,7 @@ from igsr._internal.choices import FitBackend
 from igsr._internal.part_usage import Parts
 from igsr.capture import Camera, Capture, View, load_capture
 from igsr.capture.downscaling import resized_camera
+from igsr.capture.photo_folder import FRAMES
 from igsr.capture.write_colmap import write_colmap
 from igsr.denoiser.training.perceptual_distance import (
     SMALLEST_SIDE,
@@ -31,7 +32,8 @@ from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.presets import Preset
 from igsr.geometry.similarity import similarity_between
-from igsr.pose import capture_of, estimate, photos_of
+from igsr.pose import find_cameras as find_found_cameras
+from igsr.pose import photos_at
 from igsr.splats import Splats
 
 #: Pictures on a sheet have at most so many pixels on their longest side: fog must be seen.
@@ -48,11 +50,13 @@ class CameraRun:
         scene: folder of photos in the data.
         out: folder for the capture: photos, cameras and points.
         estimator: a name of ``igsr.pose.registry``, or "auto".
+        max_size: longest side of the capture's photos, pixels.
     """
 
     scene: str
     out: str
     estimator: str
+    max_size: int
 
 
 @dataclass(frozen=True)
@@ -98,22 +102,22 @@ def find_cameras(data: str, one: CameraRun) -> dict[str, Any]:
     row: dict[str, Any] = {"scene": one.scene, "failed": None}
     try:
         with parts.measured("cameras"), _warnings() as said:
-            photos = photos_of(folder)
-            row["photos"] = len(photos)
-            row["estimator"], found = estimate(photos, one.estimator)
-            capture = capture_of(folder, photos, found)
+            found, held = find_found_cameras(folder, one.estimator, max_size=one.max_size)
+            capture = found.capture(folder, photos_at(folder, FRAMES, one.max_size, held))
             write_colmap(capture, one.out, replace=True, notes={SCENE_NOTE: f"{one.scene}\n"})
     except IgsrError as error:
         # The note stays, so that it is not tried again.
         with atomic_folder(one.out, replace=True) as new:
             (new / SCENE_NOTE).write_text(f"{one.scene}\n", encoding="utf-8")
         return {**row, "failed": str(error), "parts": parts.plain()}
-    row["placed"] = len(capture.views)
-    row["not_placed"] = [
-        photo.name for photo, camera in zip(photos, found.cameras, strict=True) if camera is None
-    ]
-    row["points"] = 0 if capture.points is None else len(capture.points.xyz)
-    row["warnings"] = [*said, *found.warnings]
+    row |= {
+        "photos": len(found.names),
+        "estimator": found.made_by["estimator"],
+        "placed": len(capture.views),
+        "not_placed": found.not_placed,
+        "points": 0 if capture.points is None else len(capture.points.xyz),
+        "warnings": [*said, *found.estimate.warnings],
+    }
     return {**row, "parts": parts.plain()}
 
 
