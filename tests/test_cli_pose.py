@@ -153,11 +153,136 @@ def test_fit_finds_cameras_once_and_keeps_them(photos, calls, tmp_path, igsr_her
     assert "The cameras found before are used" in resumed.stderr
     assert len(calls) == 1
     assert (out / "scene.ply").read_bytes() == scene
-    assert igsr_here(*fit).returncode == 0  # anew, over what was there
-    assert len(calls) == 2
+    again = igsr_here(*fit)  # a new fit, over what was there
+    assert again.returncode == 0
+    assert f"are used, from {out / 'capture'}; delete it to find them anew" in again.stderr
+    assert len(calls) == 1
     assert (out / "scene.ply").read_bytes() == scene
     scored = igsr_here("eval", out / "scene.ply", out / "capture", "--holdout", "4", "--json")
     assert json.loads(scored.stdout)["psnr"] == report["psnr"]
+
+
+def test_found_cameras_serve_any_size(photos, calls, tmp_path, igsr_here):
+    out = tmp_path / "fitted"
+    fit = ["fit", photos, "--out", out, "--steps", "1", *FIT[2:]]
+    sizes = []
+    for size in ([], ["--max-size", "30"], ["--max-size", "20"], ["--max-size", "99"]):
+        result = igsr_here(*fit, *size)
+        assert result.returncode == 0, result.stderr
+        assert json.loads(result.stdout)["settings"]["max_size"] == (int(size[1]) if size else None)
+        capture = igsr.load_capture(out / "capture")
+        sizes.append(capture.views[0].camera.width)
+        for view, i in zip(capture.views, (0, 1, 3, 4, 5), strict=True):
+            true = MADE.views[i].camera
+            scale = view.camera.width / true.width
+            np.testing.assert_allclose(view.camera.K[:2], scale * true.K[:2], rtol=1e-15)
+            np.testing.assert_allclose(view.camera.viewmat, true.viewmat, atol=1e-9)
+        np.testing.assert_array_equal(capture.points.confidence, [1.0, 2.0, 3.0])
+    assert sizes == [40, 30, 20, 40]
+    np.testing.assert_array_equal(capture.views[0].image, MADE.views[0].image)
+    assert len(calls) == 1, "cameras are found once"
+
+
+def test_other_photos_and_options_are_looked_at_anew(photos, calls, tmp_path, igsr_here):
+    out = tmp_path / "fitted"
+    fit = ["fit", photos, "--out", out, "--steps", "1", *FIT[2:]]
+    assert igsr_here(*fit).returncode == 0
+    assert igsr_here(*fit, "--seed", "1").returncode == 0
+    assert len(calls) == 2, "another seed may find other cameras"
+    damaged = out / "capture/found.npz"
+    damaged.write_bytes(damaged.read_bytes()[:200])
+    refused(igsr_here(*fit, "--seed", "1", "--resume"), damaged, "cannot be read", "delete")
+    assert igsr_here(*fit, "--seed", "1").returncode == 0
+    assert len(calls) == 3
+    Image.new("RGB", (40, 40)).save(photos / "01.png")
+    refused(igsr_here(*fit, "--seed", "1", "--resume"), "cameras of other photos")
+    assert igsr_here(*fit, "--seed", "1").returncode == 0
+    assert len(calls) == 4
+    assert not igsr.load_capture(out / "capture").views[1].image.any()
+
+
+@pytest.mark.parametrize("command", ["fit", "refine"])
+def test_few_placed_photos_stop_with_advice(photos, tmp_path, igsr_here, monkeypatch, command):
+    calls = []
+
+    def make():
+        def run(photos, *, seed=0, progress=None):
+            calls.append(len(photos))
+            cameras = [MADE.views[0].camera, MADE.views[1].camera, *[None] * (len(photos) - 2)]
+            nothing = [None] * len(photos)
+            return Estimate(cameras, None, nothing, nothing, ["2 of 6 photos are registered."])
+
+        return run
+
+    monkeypatch.setitem(registry.ESTIMATORS, "dust3r", registry.Entry(make, lambda options: False))
+    monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
+    out = tmp_path / "out"
+    arguments = [command, photos, "--out", out, "--steps", "1", "--backend", "cpu"]
+    arguments += ["--rounds", "0"] if command == "refine" else []
+    for attempt in range(2):
+        stopped = igsr_here(*arguments)
+        assert stopped.returncode == 1
+        last = stopped.stderr.splitlines()[-1]
+        assert last.startswith("Only 2 of 6 photos could be placed, not 02.png, 03.png, 04.png, 05")
+        assert "--allow-missing" in last
+        assert "dust3r" not in last, "there is no checkpoint"
+        assert not (out / "scene.ply").exists(), attempt
+    assert igsr_here(*arguments, "--allow-missing").returncode == 0
+    assert (out / "scene.ply").exists()
+    assert calls == [6], "going on costs no search"
+    with pytest.raises(igsr.IgsrError, match="allow_missing=True"):
+        igsr.refine(photos, 0, steps=1, backend="cpu")
+    posed = igsr_here("pose", photos, "--out", tmp_path / "posed")
+    assert posed.returncode == 0
+    assert len(igsr.load_capture(tmp_path / "posed").views) == 2
+
+
+def test_photos_are_checked_before_cameras_are_looked_for(photos, calls, tmp_path, igsr_here):
+    out = ["--out", tmp_path / "out"]
+    given = scenes.write_capture(tmp_path / "given", MADE)
+    for path in (photos, given):
+        for command in ("fit", "refine"):
+            refused(igsr_here(command, path, *out, "--max-size", "0"), "max_size is 0")
+            refused(igsr_here(command, path, *out, "--max-size", "-5"), "max_size is -5")
+            refused(igsr_here(command, path, *out, "--holdout", "1"), "holdout is 1")
+        refused(igsr_here("refine", path, *out, "--photos", "99"), "from 1 to 6", path)
+        refused(igsr_here("refine", path, *out, "--photos", "5", "--holdout", "3"), "from 1 to 4")
+        typo = igsr_here("fit", path, *out, "--max-size", "big")
+        assert (typo.returncode, "--max-size" in typo.stderr) == (2, True)
+    refused(igsr_here("info", given, "--max-size", "0"), "max_size is 0")
+    info = json.loads(igsr_here("info", given, "--max-size", "20", "--json").stdout)
+    assert info["sizes"] == ["20x20"]
+    for name in range(1, 6):
+        (photos / f"0{name}.png").unlink()
+    refused(igsr_here("fit", photos, *out, "--holdout", "2"), "one photo only")
+    assert calls == []
+
+
+def test_a_video_has_no_more_photos_than_frames(calls, tmp_path, igsr_here):
+    from test_photo_folder import film, write_video
+
+    write_video(tmp_path / "clip.mp4", film(30, set()))
+    command = ["refine", tmp_path / "clip.mp4", "--out", tmp_path / "out", "--frames", "10"]
+    refused(igsr_here(*command, "--photos", "11"), "--photos must be from 1 to 10")
+    assert calls == []
+
+
+@pytest.mark.parametrize("command", ["fit", "refine"])
+def test_little_memory_is_told_before_any_work(
+    photos, calls, tmp_path, igsr_here, monkeypatch, command
+):
+    from igsr.capture import memory_check
+
+    given = scenes.write_capture(tmp_path / "given", MADE)
+    monkeypatch.setattr(memory_check, "LIBRARIES", 0)
+    monkeypatch.setattr(memory_check, "OF_A_SPLAT", 0)
+    monkeypatch.setattr(memory_check, "STEP", 10)
+    monkeypatch.setattr(memory_check, "available_memory", lambda: 400_000)
+    for path in (photos, given):
+        result = igsr_here(command, path, "--out", tmp_path / "out")
+        refused(result, "The 6 photos of 40x40 would need", "are free: give --max-size 20")
+    assert calls == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_mistakes_of_fit_without_cameras(photos, calls, tmp_path, igsr_here):

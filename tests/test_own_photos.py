@@ -80,7 +80,7 @@ def test_folders_of_photos_end_to_end(here, data, tmp_path):
     before, after = report["runs"]
     assert (before["preset"], after["preset"]) == ("3dgs", "default")
     assert (after["photos"], after["placed"], after["train_photos"]) == (8, 7, 5)
-    assert [row["name"] for row in after["views"]] == ["images/00.png", "images/04.png"]
+    assert [row["name"] for row in after["views"]] == ["00.png", "04.png"]
     for name in ("psnr", "ssim", "flip", "perceptual", "psnr_refined", "train_psnr", "train_ssim"):
         assert np.isfinite(after[name])
     assert after["psnr"] == pytest.approx(np.mean([row["psnr"] for row in after["views"]]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -67,8 +68,21 @@ def resized_camera(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, K=K, width=width, height=height)
 
 
+class PixelRows(Protocol):
+    """Pixels [H, W, C] of which rows can be asked for: an array, or a photo that is not one yet."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """H, W, C."""
+        ...
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """The rows, [rows, W, C]; a slice may end beyond the last."""
+        ...
+
+
 def area_means(
-    pixels: np.ndarray,
+    pixels: PixelRows,
     width: int,
     height: int,
     mask: np.ndarray | None = None,

@@ -25,7 +25,6 @@ from igsr.capture.exif import TURNED, read_exif, turned_back, upright
 from igsr.capture.memory_check import check_memory, decoding_threads
 from igsr.capture.photos import (
     SUFFIXES,
-    PhotoHeader,
     decoded,
     is_file,
     load_pixels,
@@ -33,7 +32,7 @@ from igsr.capture.photos import (
     open_image,
     photo_header,
 )
-from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames
+from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames, video_size
 from igsr.errors import IgsrError
 
 #: Frames taken from each video.
@@ -114,9 +113,8 @@ def load_photos(
     with warnings.catch_warnings():
         # Pillow warns of damaged EXIF and the like even where the pixels can be read.
         warnings.filterwarnings("ignore", module="PIL")
-        headers = [header for header in map(_header, files) if header is not None]
-        sizes = [header.size for header in headers]
-        check_memory(sizes, max_size, channels=max((one.channels for one in headers), default=3))
+        sizes, channels, _ = _headers(files, frames)
+        check_memory(sizes, max_size, channels=channels, masked=masks.is_dir())
         largest = max((width * height for width, height in sizes), default=1)
         with ThreadPoolExecutor(max_workers=decoding_threads(largest)) as pool:
             loaded = list(pool.map(load, files, names))
@@ -217,14 +215,40 @@ def _files(files: list[Path]) -> tuple[Path, list[Path], Path]:
     return root, files, root / "masks"
 
 
-def _header(file: Path) -> PhotoHeader | None:
-    """The header of a photo; None of a video, and of a photo that loading will name as broken."""
-    if file.suffix.lower() in VIDEO_SUFFIXES:
-        return None
-    try:
-        return photo_header(file)
-    except IgsrError:
-        return None
+def photo_headers(
+    path: str | os.PathLike[str], frames: int = FRAMES
+) -> tuple[list[tuple[int, int]], int, bool]:
+    """The sizes of the photos that ``load_photos`` would load, without decoding any.
+
+    Args:
+        path, frames: as ``load_photos``.
+
+    Returns:
+        Width and height in pixels of each as stored, and as often as frames may be taken of each
+        video; the most channels of one; whether there are just as many photos.
+
+    Raises:
+        IgsrError: there are none.
+    """
+    return _headers(_found(path)[1], frames)
+
+
+def _headers(files: list[Path], frames: int) -> tuple[list[tuple[int, int]], int, bool]:
+    """See ``photo_headers``; files that loading will name as broken are passed over."""
+    sizes, channels, exact = [], 3, True
+    for file in files:
+        try:
+            if file.suffix.lower() in VIDEO_SUFFIXES:
+                size, count = video_size(file)
+                sizes += [size] * (min(frames, count) if count else frames)
+                exact = False
+            else:
+                header = photo_header(file)
+                sizes.append(header.size)
+                channels = max(channels, header.channels)
+        except IgsrError:
+            continue
+    return sizes, channels, exact
 
 
 def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> Photo:

@@ -169,10 +169,21 @@ def decoded(
         if drafted is not None and image.size != full:
             box = drafted[1][2], drafted[1][3]  # its last row and column may lie partly beyond
     load_pixels(image, path)
-    pixels = pixels_of(image, path)
-    if size is None or size == (pixels.shape[1], pixels.shape[0]):
-        return pixels, mask
-    return area_means(pixels, *size, mask, box)
+    if size is None or size == image.size:
+        return pixels_of(image, path), mask
+    return area_means(_ImageRows(image, path), *size, mask, box)
+
+
+class _ImageRows:
+    """Pixels of a decoded image, made an array a few rows at a time: it is never held twice."""
+
+    def __init__(self, image: Image.Image, path: Path) -> None:
+        self._image, self._path = image, path
+        self.shape = (image.height, image.width, 4 if _has_alpha(image) else 3)
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        box = (0, rows.start, self._image.width, min(rows.stop, self._image.height))
+        return pixels_of(self._image.crop(box), self._path)
 
 
 def _has_alpha(image: Image.Image) -> bool:

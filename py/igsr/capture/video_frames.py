@@ -62,6 +62,24 @@ def sharpest_frames(path: Path, count: int) -> list[tuple[int, UInt8]]:
     return frames
 
 
+def video_size(path: Path) -> tuple[tuple[int, int], int]:
+    """Width and height of a video's frames in pixels, and their number, by its header alone.
+
+    The number is 0 where the header does not say.
+
+    Raises:
+        IgsrError: the file cannot be read as a video.
+    """
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            return (int(stream.width), int(stream.height)), max(0, int(stream.frames))
+    except (av.FFmpegError, IndexError, ValueError) as error:
+        raise IgsrError(f"{path} cannot be read as a video; save it as MP4 again") from error
+
+
 def _frame_count(path: Path) -> int:
     """The number of frames that the file lists, without decoding any."""
     import av

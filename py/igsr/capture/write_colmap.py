@@ -35,7 +35,7 @@ def write_colmap(
     text: bool = False,
     replace: bool = False,
     further_masks: Mapping[str, Sequence[np.ndarray | None]] | None = None,
-    notes: Mapping[str, str] | None = None,
+    notes: Mapping[str, str | bytes] | None = None,
 ) -> None:
     """Write a capture as a folder for COLMAP and programs that read its models.
 
@@ -46,7 +46,7 @@ def write_colmap(
         replace: replace an existing folder, once the new one is complete.
         further_masks: more masks, by the name of their folder: per view bool [h, w] of any size,
             which is resized to the photo's, or None. ``load_capture`` does not read them.
-        notes: texts of further files, by file name.
+        notes: contents of further files, by file name.
 
     Raises:
         IgsrError: the folder is not empty, or cannot be written.
@@ -58,8 +58,8 @@ def write_colmap(
             for view, name, mask in zip(capture.views, names, masks, strict=True):
                 if mask is not None:
                     save_png(folder / kind / f"{name}.png", _at_size(mask, view.camera))
-        for note, text_of_note in (notes or {}).items():
-            (folder / note).write_text(text_of_note, encoding="utf-8")
+        for note, content in (notes or {}).items():
+            (folder / note).write_bytes(content.encode() if isinstance(content, str) else content)
         model = folder / "sparse" / "0"
         model.mkdir(parents=True)
         cameras = [view.camera for view in capture.views]

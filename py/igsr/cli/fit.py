@@ -14,6 +14,7 @@ from igsr._internal.settings import checked_given, settings_of
 from igsr.capture.photo_folder import FRAMES
 from igsr.cli.error_messages import error_messages, warning_messages
 from igsr.cli.pose import (
+    AllowMissingOption,
     CameraFinder,
     CheckpointOption,
     EstimatorOption,
@@ -79,6 +80,7 @@ def fit_command(
     network: CheckpointOption = None,
     graph: GraphOption = None,
     frames: FramesOption = FRAMES,
+    allow_missing: AllowMissingOption = False,
     background: BackgroundOption = None,
     config: ConfigOption = None,
     resume: Annotated[
@@ -116,6 +118,7 @@ def fit_command(
             holdout,
             finder,
             max_size=max_size,
+            allow_missing=allow_missing,
             resume=resume,
             shown=not as_json,
             parts=parts,
@@ -147,6 +150,7 @@ def fit_command(
             "network": None if network is None else str(network),
             "graph": graph,
             "frames": frames,
+            "allow_missing": allow_missing,
             "background": background,
         }
         write_scene(out, splats, fitted)

@@ -20,11 +20,13 @@ from igsr._internal.part_usage import Parts
 from igsr.capture import Capture
 from igsr.capture.downscaling import check_max_size
 from igsr.capture.load import holds_cameras
-from igsr.capture.photo_folder import FRAMES, has_photos
+from igsr.capture.overview import look_at
+from igsr.capture.photo_folder import FRAMES
 from igsr.capture.write_colmap import write_colmap
 from igsr.cli.error_messages import error_messages, print_message, warning_messages
 from igsr.cli.shared import (
     JsonOption,
+    MaxSizeOption,
     SeedOption,
     error_console,
     load,
@@ -33,8 +35,7 @@ from igsr.cli.shared import (
     stopped,
 )
 from igsr.errors import IgsrError
-from igsr.pose import AUTO, capture_of, estimate, found_before, kept_cameras, photos_note, photos_of
-from igsr.pose.cache import read_usage, write_usage
+from igsr.pose import AUTO, find_cameras, kept_cameras, kept_capture, photos_at
 from igsr.pose.registry import ESTIMATORS
 
 logger = logging.getLogger(__name__)
@@ -67,6 +68,15 @@ GraphOption = Annotated[
         "--graph",
         metavar="KIND",
         help="For dust3r: which pairs of photos it sees: complete, swin-K, logwin-K or oneref-K.",
+    ),
+]
+
+
+AllowMissingOption = Annotated[
+    bool,
+    typer.Option(
+        "--allow-missing",
+        help="Go on where the cameras of fewer than half of the photos are found.",
     ),
 ]
 
@@ -110,8 +120,10 @@ def capture_to_fit(
     finder: CameraFinder,
     *,
     max_size: int | None,
+    allow_missing: bool,
     resume: bool,
     shown: bool,
+    splats: int = 0,
     parts: Parts | None = None,
 ) -> tuple[Capture, bool]:
     """Load the capture at a path; find the cameras first if it has none.
@@ -124,8 +136,10 @@ def capture_to_fit(
         holdout: hold out every ``holdout``-th view for testing, or None.
         finder: how to find the cameras.
         max_size: longest side, in pixels, of photos as loaded, or None.
+        allow_missing: whether to go on with fewer than half of the photos.
         resume: use cameras that an earlier run found.
         shown: whether progress is shown.
+        splats: most splats of the fit, for the memory that it needs.
         parts: count what "cameras" and "load" take, or None.
 
     Returns:
@@ -138,29 +152,35 @@ def capture_to_fit(
     _check_out(out)
     check_max_size(max_size)
     parts = Parts() if parts is None else parts
-    if holds_cameras(path) or not has_photos(path):
+    seen = look_at(path, finder.frames, max_size)
+    seen.train_photos(holdout)
+    if seen.has_cameras:
         if finder.options or finder.estimator != AUTO:
             raise IgsrError(
                 f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
             )
+        seen.check_memory(max_size, splats)
         with parts.measured("load"):
             return load(path, holdout, max_size), False
-    kept = kept_cameras(path, out)
-    if resume and found_before(path, kept):
-        print_message(f"The cameras found before are used, from {kept}")
-        usage = read_usage(kept)
-        if usage is not None:
-            parts.add("cameras", usage)
-    else:
-        with parts.measured("cameras"):
-            report = _posed(path, kept, finder, plot=False, shown=shown, notes=photos_note(path))
-        write_usage(kept, parts.used["cameras"])
-        print_message(
-            f"Cameras of {len(report['cameras'])} of {report['photos']} photos were found by "
-            f"{report['estimator']} and are kept in {kept}"
+    kept_cameras(path, out)
+    seen.check_memory(max_size, splats)
+    with _pose_bar(shown) as show:
+        capture = kept_capture(
+            path,
+            out,
+            estimator=finder.estimator,
+            seed=finder.seed,
+            frames=finder.frames,
+            options=finder.options,
+            max_size=max_size,
+            resume=resume,
+            allow_missing=allow_missing,
+            progress=show,
+            say=print_message,
+            warn=print_message,
+            parts=parts,
         )
-    with parts.measured("load"):
-        return load(kept, holdout, max_size), True
+    return (capture if holdout is None else capture.with_holdout(holdout)), True
 
 
 def pose_command(
@@ -174,6 +194,7 @@ def pose_command(
     estimator: EstimatorOption = AUTO,
     checkpoint: CheckpointOption = None,
     graph: GraphOption = None,
+    max_size: MaxSizeOption = None,
     plot: Annotated[
         bool, typer.Option("--plot", help="Draw cameras and points to --out/poses.png.")
     ] = False,
@@ -184,6 +205,7 @@ def pose_command(
     """Find the cameras of PHOTOS and write photos and cameras as a COLMAP capture."""
     with error_messages(lambda: "Interrupted; nothing is written."), warning_messages():
         check_folder(out)
+        check_max_size(max_size)
         started = time.monotonic()
         given = photos[0] if len(photos) == 1 else photos
         if estimator == AUTO and isinstance(given, Path) and holds_cameras(given):
@@ -192,7 +214,7 @@ def pose_command(
                 "them again"
             )
         finder = CameraFinder(estimator, checkpoint, graph, frames, seed)
-        report = _posed(given, out, finder, plot=plot, shown=not as_json)
+        report = _posed(given, out, finder, max_size=max_size, plot=plot, shown=not as_json)
         report["seconds"] = round(time.monotonic() - started, 3)
     if as_json:
         print_json(report)
@@ -211,39 +233,36 @@ def _posed(
     out: Path,
     finder: CameraFinder,
     *,
+    max_size: int | None,
     plot: bool,
     shown: bool,
-    notes: dict[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Find cameras, write the capture, and return the report of ``igsr pose``.
-
-    ``notes`` are text files to write beside the capture, by name. With them, a folder that is
-    there is replaced.
-    """
+    """Find cameras, write the capture, and return the report of ``igsr pose``."""
     from igsr.pose.plot_poses import plot_poses
 
-    loaded = photos_of(photos, finder.frames)
-    logger.info("finding the cameras of %d photos with estimator %s", len(loaded), finder.estimator)
+    logger.info("finding the cameras of %s with estimator %s", photos, finder.estimator)
     with _pose_bar(shown) as show:
-        name, found = estimate(
-            loaded, finder.estimator, seed=finder.seed, progress=show, **finder.options
+        found, held = find_cameras(
+            photos,
+            finder.estimator,
+            seed=finder.seed,
+            frames=finder.frames,
+            max_size=max_size,
+            progress=show,
+            **finder.options,
         )
-    for sentence in found.warnings:
+    for sentence in found.estimate.warnings:
         print_message(sentence)
-    capture = capture_of(photos if isinstance(photos, Path) else Path("photos"), loaded, found)
-    trusted = [
-        mask
-        for mask, camera in zip(found.trusted, found.cameras, strict=True)
-        if camera is not None
-    ]
-    write_colmap(
-        capture, out, replace=notes is not None, further_masks={"trusted": trusted}, notes=notes
+    capture = found.capture(
+        photos if isinstance(photos, Path) else Path("photos"),
+        photos_at(photos, finder.frames, max_size, held),
     )
+    write_colmap(capture, out, further_masks={"trusted": found.trusted})
     if plot:
         plot_poses(out / "poses.png", capture)
     return {
-        "estimator": name,
-        "photos": len(loaded),
+        "estimator": found.made_by["estimator"],
+        "photos": len(found.names),
         "cameras": [
             {
                 "name": view.name,
@@ -252,13 +271,9 @@ def _posed(
             }
             for view in capture.views
         ],
-        "not_placed": [
-            photo.name
-            for photo, camera in zip(loaded, found.cameras, strict=True)
-            if camera is None
-        ],
+        "not_placed": found.not_placed,
         "points": 0 if capture.points is None else len(capture.points.xyz),
-        "warnings": found.warnings,
+        "warnings": found.estimate.warnings,
         "seed": finder.seed,
         "version": _core.__version__,
         "out": str(out),

@@ -12,6 +12,7 @@ from igsr._internal.progress_bar import progress_bar
 from igsr.capture.photo_folder import FRAMES
 from igsr.cli.error_messages import error_messages, warning_messages
 from igsr.cli.pose import (
+    AllowMissingOption,
     CameraFinder,
     CheckpointOption,
     EstimatorOption,
@@ -62,6 +63,7 @@ def refine_command(
     network: CheckpointOption = None,
     graph: GraphOption = None,
     frames: FramesOption = FRAMES,
+    allow_missing: AllowMissingOption = False,
     config: ConfigOption = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the checkpoints in --out.")
@@ -74,7 +76,7 @@ def refine_command(
     ):
         settings = RefineSettings(**given)
         if photo_count is not None:
-            _check_photo_count(photos, holdout, photo_count)
+            _check_photo_count(photos, holdout, frames, photo_count)
 
         from igsr._core import resolve_backend
         from igsr.refinement.loop import refine, round_denoiser
@@ -89,6 +91,7 @@ def refine_command(
                 holdout,
                 CameraFinder(estimator, network, graph, frames, settings.seed),
                 max_size=max_size,
+                allow_missing=allow_missing,
                 resume=resume,
                 shown=not as_json,
             )
@@ -109,20 +112,15 @@ def refine_command(
         _print_summary(refined, out)
 
 
-def _check_photo_count(photos: Path, holdout: int | None, count: int) -> None:
-    """Find a --photos that a folder of photos without cameras cannot have.
+def _check_photo_count(photos: Path, holdout: int | None, frames: int, count: int) -> None:
+    """Find a --photos that a path cannot have, before photos are decoded or cameras looked for.
 
     Raises:
         IgsrError: there are fewer train photos, even if the cameras of all are found.
     """
-    from igsr.capture.load import holds_cameras
-    from igsr.capture.photo_folder import VIDEO_SUFFIXES, has_photos, photo_sizes
+    from igsr.capture.overview import look_at
 
-    names = [] if holds_cameras(photos) or not has_photos(photos) else list(photo_sizes(photos))
-    if not names or any(name.lower().endswith(VIDEO_SUFFIXES) for name in names):
-        return  # captures are loaded at once, and the frames of videos are chosen later
-    held_out = len(names[::holdout]) if holdout is not None and holdout > 1 else 0
-    _check_count(count, len(names) - held_out, photos)
+    _check_count(count, look_at(photos, frames).train_photos(holdout), photos)
 
 
 def _some_photos(capture: Capture, count: int) -> Capture:

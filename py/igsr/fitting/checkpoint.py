@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,7 +18,7 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write, check_writable
-from igsr._internal.untrusted_npz import DAMAGE
+from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
 from igsr.errors import IgsrError
 from igsr.fitting.settings import FitSettings
 
@@ -137,11 +136,7 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
     if not path.is_file():
         raise IgsrError(f"There is no checkpoint {path} to resume; leave --resume out.")
     try:
-        with zipfile.ZipFile(path) as archive:
-            state = {
-                member.filename.removesuffix(".npy"): _read_member(archive, member)
-                for member in archive.infolist()
-            }
+        state = stored_arrays(path)
         settings = json.loads(state.pop(SETTINGS).tobytes())
         if not isinstance(settings, dict) or settings.pop("format", None) != FORMAT:
             raise ValueError(f"it is not of format {FORMAT}")
@@ -156,28 +151,3 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
             f"The checkpoint {path} cannot be read ({error}); leave --resume out to start anew."
         ) from error
     return state, settings
-
-
-def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
-    if member.compress_type != zipfile.ZIP_STORED or not member.filename.endswith(".npy"):
-        raise ValueError(f"{member.filename} is not a stored array")
-    with archive.open(member) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"{member.filename} is of an unknown array version")
-        read_header = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
-        shape, fortran, dtype = read_header(file)
-        if dtype.hasobject or fortran or dtype.kind not in "biuf":
-            raise ValueError(f"{member.filename} is not a plain array of numbers")
-        count = 1
-        for size in shape:  # Python integers: a hostile shape cannot overflow
-            count *= size
-        # One byte more than promised, so that a longer member shows as well as a shorter one.
-        data = file.read(min(member.file_size, count * dtype.itemsize) + 1)
-        if len(data) != count * dtype.itemsize:
-            raise ValueError(f"{member.filename} has another size than its header says")
-    return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)

@@ -45,6 +45,8 @@ def refine(
     propose: Propose = novel_views,
     select: Select = select_views,
     cross_validate: bool = True,
+    max_size: int | None = None,
+    allow_missing: bool = False,
 ) -> Refined:
     """Fit photos, and improve the fit with denoised novel views.
 
@@ -67,6 +69,10 @@ def refine(
         propose: what proposes the cameras of novel views.
         select: which of the denoised views to add.
         cross_validate: whether a round is kept only if it improves the scores of held-out photos.
+        max_size: longest side, in pixels, of photos as loaded; larger ones are reduced. None keeps
+            all as they are. A ``Capture`` has its size.
+        allow_missing: go on where the cameras of fewer than half of the photos are found; without,
+            that ends with advice.
 
     Raises:
         IgsrError: an argument cannot be used, photos lie in ``out/capture``, or as ``igsr.fit`` and
@@ -83,7 +89,10 @@ def refine(
     _core.resolve_backend(settings.backend)  # a missing GPU is found here
     with progress_or_bar(progress, "refine", bar_state) as report:
         run = RefineRun(settings, out, resume, report)
-        capture = photos if isinstance(photos, Capture) else run.find_cameras(photos)
+        if isinstance(photos, Capture):
+            capture = photos
+        else:
+            capture = run.find_cameras(photos, max_size, allow_missing)
         _check_views(capture)
         stages = Stages(capture, settings, run, denoiser or round_denoiser(), propose, select)
         validation = CrossValidation(stages, capture.train_views) if cross_validate else None

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,13 +17,15 @@ from igsr._internal.part_usage import Meter, Parts
 from igsr._internal.progress_bar import BarState
 from igsr.capture import Capture, load_capture
 from igsr.capture.load import holds_cameras
-from igsr.capture.write_colmap import write_colmap
+from igsr.capture.photo_folder import FRAMES
 from igsr.errors import IgsrError
-from igsr.pose import estimate_poses, found_before, kept_cameras, photos_note
-from igsr.pose.cache import read_usage, write_usage
+from igsr.pose import check_enough_placed, find_cameras, kept_capture, photos_at
+from igsr.pose.cache import read_usage
 from igsr.refinement.report import parts_so_far, write_refinement
 from igsr.refinement.results import OLD_STAGES, Refined, RefineProgress, Stage
 from igsr.refinement.settings import RefineSettings
+
+logger = logging.getLogger(__name__)
 
 #: The error message of a run that ``progress`` ended.
 STOPPED = "the refinement was stopped; go on with resume."
@@ -74,28 +78,46 @@ class RefineRun:
         # A resumed run that has done nothing new leaves the files as they are.
         self._has_news = not resume
 
-    def find_cameras(self, photos: str | os.PathLike[str]) -> Capture:
+    def find_cameras(
+        self, photos: str | os.PathLike[str], max_size: int | None, allow_missing: bool
+    ) -> Capture:
         """The capture of a folder of photos; cameras that had to be found are kept in the folder.
 
+        Args:
+            photos: a capture, or a folder of photos.
+            max_size: longest side in pixels of photos as loaded, or None.
+            allow_missing: whether fewer than half of the photos may be registered.
+
         Raises:
-            IgsrError: as ``igsr.estimate_poses`` and ``igsr.load_capture``, photos lie where the
-                cameras would be kept, or ``progress`` ended the run.
+            IgsrError: as ``igsr.estimate_poses`` and ``igsr.load_capture``, too few photos are
+                registered, photos lie where the cameras would be kept, or ``progress`` ended the
+                run.
         """
 
         def tell(step: str, done: int, total: int) -> None:
             if not self._goes_on("pose", 0.0):
                 raise IgsrError(STOPPED)
 
-        # A run that is resumed must fit the very cameras that it began with.
-        if self._out is None or holds_cameras(photos):
-            return estimate_poses(photos, seed=self._settings.seed, progress=tell)
-        kept = kept_cameras(Path(photos), self._out)
-        if not (self._resume and found_before(Path(photos), kept)):
-            self._meter.lap()
-            found = estimate_poses(photos, seed=self._settings.seed, progress=tell)
-            write_colmap(found, kept, replace=True, notes=photos_note(Path(photos)))
-            write_usage(kept, self._meter.lap())
-        return load_capture(kept)
+        if holds_cameras(photos):
+            return load_capture(photos, max_size)
+        seed = self._settings.seed
+        if self._out is not None:
+            return kept_capture(
+                Path(photos),
+                self._out,
+                seed=seed,
+                max_size=max_size,
+                # A run that is resumed must fit the very cameras that it began with.
+                resume=self._resume,
+                allow_missing=allow_missing,
+                progress=tell,
+                say=logger.info,
+            )
+        found, held = find_cameras(photos, seed=seed, max_size=max_size, progress=tell)
+        for sentence in found.estimate.warnings:
+            warnings.warn(sentence, stacklevel=3)
+        check_enough_placed(found, {}, allow_missing)
+        return found.capture(Path(photos), photos_at(photos, FRAMES, max_size, held))
 
     def prepare(self, work: float) -> None:
         """Clear the folder of what an earlier run left unfinished, or read what it took to resume.
