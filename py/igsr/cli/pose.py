@@ -139,8 +139,8 @@ def capture_to_fit(
         allow_missing: whether to go on with fewer than half of the photos.
         resume: use cameras that an earlier run found.
         shown: whether progress is shown.
-        parts: count what "cameras" and "load" take, or None.
         splats: most splats of the fit, for the memory that it needs.
+        parts: count what "cameras" and "load" take, or None.
 
     Returns:
         The capture, and whether its cameras were found here (or by the run that is resumed).

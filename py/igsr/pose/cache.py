@@ -13,7 +13,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from igsr._internal.atomic_write import check_folder
-from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Parts, Usage
 from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
@@ -29,10 +28,10 @@ from igsr.pose.registry import ESTIMATORS
 
 #: File in the cache: names and sizes in bytes of the photos that cameras were estimated for.
 GIVEN = "photos.json"
-#: File in the cache: what finding the cameras took.
-USAGE = "usage.json"
 #: File in the cache: the cameras, see ``igsr.pose.found_cameras``.
 FOUND = "found.npz"
+#: File in the cache: what finding the cameras took.
+USAGE = "usage.json"
 #: Fewer registered photos than this part of all end a fit that does not allow it.
 ENOUGH = 0.5
 #: Names shown of a long list.
@@ -69,7 +68,8 @@ def kept_capture(
         allow_missing: whether fewer than half of the photos may be registered.
         say: takes sentences about what is done.
         warn: takes warnings.
-        parts: counts what "cameras" (also of the run that found them) and "load" take, or None.
+        parts: count what "cameras" and "load" take, or None. Cameras that were found before count
+            with what finding them took.
 
     Raises:
         IgsrError: as ``igsr.estimate_poses``; too few photos are registered (the cameras are kept);
@@ -92,10 +92,12 @@ def kept_capture(
                 progress=progress,
                 **options,
             )
+        usage = parts.used["cameras"]
         for sentence in found.estimate.warnings:
             warn(sentence)
-        capture = found.capture(kept, photos_at(photos, frames, max_size, held))
-        _write(kept, photos, found, capture, parts.used["cameras"])
+        with parts.measured("load"):
+            capture = found.capture(kept, photos_at(photos, frames, max_size, held))
+            _write(kept, photos, found, capture, usage)
         say(
             f"Cameras of {len(found.placed)} of {len(found.names)} photos were found by {name} "
             f"and are kept in {kept}"
@@ -104,13 +106,14 @@ def kept_capture(
     else:
         say(f"The cameras found before are used, from {kept}; delete it to find them anew")
         check_enough_placed(found, options, allow_missing)
-        usage = read_usage(kept)
-        if usage is not None:
-            parts.add("cameras", usage)
+        before = read_usage(kept)
+        if before is not None:
+            parts.add("cameras", before)
         if not _is_at(kept, found, max_size):
             look_at(photos, frames).check_memory(max_size)
-            capture = found.capture(kept, photos_at(photos, frames, max_size))
-            _write(kept, photos, found, capture, usage)
+            with parts.measured("load"):
+                capture = found.capture(kept, photos_at(photos, frames, max_size))
+                _write(kept, photos, found, capture, before)
     with parts.measured("load"):
         return load_capture(kept)
 
@@ -159,15 +162,14 @@ def _before(photos: Path, kept: Path, made_by: dict[str, Any], resume: bool) -> 
 def _write(
     kept: Path, photos: Path, found: FoundCameras, capture: Capture, usage: Usage | None
 ) -> None:
+    used = {} if usage is None else {USAGE: json.dumps(usage.plain())}
     write_colmap(
         capture,
         kept,
         replace=True,
         further_masks={"trusted": found.trusted},
-        notes={**photos_note(photos), FOUND: found.to_bytes()},
+        notes={**photos_note(photos), **used, FOUND: found.to_bytes()},
     )
-    if usage is not None:
-        write_usage(kept, usage)
 
 
 def _is_at(kept: Path, found: FoundCameras, max_size: int | None) -> bool:
@@ -266,21 +268,10 @@ def _given(kept: Path) -> dict[str, int] | None:
     return found if isinstance(found, dict) else None
 
 
-def write_usage(kept: Path, usage: Usage) -> None:
-    """Write into the cache what finding its cameras took, for reports, also of resumed runs.
-
-    Args:
-        kept: the cache, with cameras.
-        usage: what finding them took.
-
-    Raises:
-        IgsrError: it cannot be written.
-    """
-    write_json(kept / USAGE, usage.plain())
-
-
 def read_usage(kept: Path) -> Usage | None:
     """What finding the cameras in the cache took; None where that is not known.
+
+    It is there for reports, also of runs that find the cameras kept.
 
     Args:
         kept: the cache, or another capture.

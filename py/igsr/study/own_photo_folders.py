@@ -11,7 +11,7 @@ from typing import Any
 from igsr import _core
 from igsr._internal.choices import FitBackend
 from igsr._internal.part_usage import total
-from igsr._internal.resumable_jobs import Run, file_hash, finished_runs, folder_hash
+from igsr._internal.resumable_jobs import Run, file_hash, finished_runs
 from igsr._internal.worker_processes import in_a_process
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import photo_sizes
@@ -20,10 +20,9 @@ from igsr.errors import IgsrError
 from igsr.evaluation.quick_scores import MOST_TRAIN
 from igsr.fitting.presets import Preset, default_max_size, preset_settings
 from igsr.study.own_photos_runs import (
-    SCENE_NOTE,
     CameraRun,
     OwnFit,
-    find_cameras,
+    find_scene_cameras,
     fit_and_score,
 )
 from igsr.study.own_photos_tables import write_report
@@ -69,8 +68,8 @@ def own_photos(
         seeds: how many seeds, from 0.
         holdout: every so many photos one is held out, counted in the order of their names.
         steps: of each fit; None is the preset's number.
-        max_size: longest side of the photos that are fitted, pixels; None is ``default_max_size`` of the
-            backend.
+        max_size: longest side of the photos that are fitted, pixels; None is what
+            ``default_max_size`` says of the backend.
         score_size: longest side of the photos that are scored, pixels, the same for all presets;
             None is ``max_size``, or 1600 where that is None.
         known_cameras: use cameras that lie beside the photos, where there are some.
@@ -113,9 +112,9 @@ def own_photos(
     score_size = score_size or max_size or SCORE_SIZE
     if max_size is None:
         max_size = default_max_size(backend)
-    largest = max(score_size, max_size)
-    tasks = [_camera_task(folder, name, largest) for name in names if name not in own]
-    work = partial(in_a_process, find_cameras)
+    most = max(score_size, max_size)
+    tasks = [_camera_task(folder, name, most) for name in names if name not in own]
+    work = partial(in_a_process, find_scene_cameras)
     cameras = {
         row["scene"]: row
         for row in finished_runs(folder / "cameras", tasks, work, str(root), jobs, on_run)
@@ -132,7 +131,7 @@ def own_photos(
             max_size,
             score_size,
             None if features is None else str(features),
-            None if name in own else str(_capture(folder, name)),
+            None if name in own else str(_cameras(folder, name)),
             str(folder / "splats" / f"{_run_name(name, one, seed, backend)}.ply"),
             str(folder / "sheets" / f"{file_name(name)}-{one}.png") if seed == 0 else None,
         )
@@ -168,8 +167,8 @@ def own_photos(
     )
 
 
-def _capture(out: Path, scene: str) -> Path:
-    return out / "cameras" / file_name(scene)
+def _cameras(out: Path, scene: str) -> Path:
+    return out / "cameras" / f"{file_name(scene)}.npz"
 
 
 def _run_name(scene: str, preset: str, seed: int, backend: str) -> str:
@@ -177,12 +176,12 @@ def _run_name(scene: str, preset: str, seed: int, backend: str) -> str:
 
 
 def _camera_task(out: Path, scene: str, max_size: int) -> Run:
-    capture = _capture(out, scene)
+    cameras = _cameras(out, scene)
     return Run(
         file_name(scene),
-        CameraRun(scene, str(capture), ESTIMATOR, max_size),
-        {"estimator": ESTIMATOR, "max_size": max_size},
-        leaves=capture / SCENE_NOTE,
+        CameraRun(scene, str(cameras), ESTIMATOR, max_size),
+        {"estimator": ESTIMATOR},
+        leaves=cameras,
         scene=scene,
     )
 
@@ -197,7 +196,7 @@ def _fit_task(root: Path, one: OwnFit, cameras: dict[str, Any] | None, features:
         "max_size": one.max_size,
         "scored_at": one.score_size,
         "perceptual": features,
-        "cameras": None if one.capture is None else folder_hash(Path(one.capture) / "sparse"),
+        "cameras": None if one.cameras is None else file_hash(Path(one.cameras)),
     }
     name = _run_name(one.scene, one.preset, one.seed, one.backend)
     leaves = None if one.sheet is None else Path(one.sheet)
