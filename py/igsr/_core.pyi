@@ -203,6 +203,12 @@ def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict
     opacities (logits of 0.1) and sh, as ``SplatArrays`` has them.
     """
 
+def reduction(steps: int, coarse_to_fine: bool, step: int, longest: int) -> int:
+    """What both sides of photos are divided by in a step, from 0, of a fit from coarse to fine.
+
+    ``longest`` is the longest side of all photos, in pixels.
+    """
+
 def plane_sweep(
     greys: list[Float32],
     usable: list[npt.NDArray[np.uint8] | None],

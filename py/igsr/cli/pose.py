@@ -20,7 +20,7 @@ from igsr._internal.part_usage import Parts
 from igsr.capture import Capture
 from igsr.capture.downscaling import check_max_size
 from igsr.capture.load import holds_cameras
-from igsr.capture.overview import look_at
+from igsr.capture.overview import Overview, look_at
 from igsr.capture.photo_folder import FRAMES
 from igsr.capture.write_colmap import write_colmap
 from igsr.cli.error_messages import error_messages, print_message, warning_messages
@@ -35,7 +35,7 @@ from igsr.cli.shared import (
     stopped,
 )
 from igsr.errors import IgsrError
-from igsr.pose import AUTO, find_cameras, kept_cameras, kept_capture, photos_at
+from igsr.pose import AUTO, find_cameras, has_found, kept_cameras, kept_capture, photos_at
 from igsr.pose.registry import ESTIMATORS
 
 logger = logging.getLogger(__name__)
@@ -125,6 +125,7 @@ def capture_to_fit(
     shown: bool,
     splats: int = 0,
     parts: Parts | None = None,
+    announced: Callable[[Overview, bool], None] | None = None,
 ) -> tuple[Capture, bool]:
     """Load the capture at a path; find the cameras first if it has none.
 
@@ -141,6 +142,7 @@ def capture_to_fit(
         shown: whether progress is shown.
         splats: most splats of the fit, for the memory that it needs.
         parts: count what "cameras" and "load" take, or None.
+        announced: called before anything slow, with what there is and whether cameras are known.
 
     Returns:
         The capture, and whether its cameras were found here (or by the run that is resumed).
@@ -154,6 +156,8 @@ def capture_to_fit(
     parts = Parts() if parts is None else parts
     seen = look_at(path, finder.frames, max_size)
     seen.train_photos(holdout)
+    if announced is not None:
+        announced(seen, seen.has_cameras or has_found(path, out))
     if seen.has_cameras:
         if finder.options or finder.estimator != AUTO:
             raise IgsrError(

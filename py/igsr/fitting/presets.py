@@ -12,6 +12,13 @@ from igsr.fitting.settings import FitSettings
 
 Preset: TypeAlias = Literal["default", "3dgs", "instantsplat"]
 PRESETS: tuple[Preset, ...] = get_args(Preset)
+Quality: TypeAlias = Literal["draft", "normal", "high"]
+#: What qualities multiply the sides of photos, the steps and the most splats by.
+QUALITIES: dict[Quality, tuple[float, float, float]] = {
+    "draft": (0.6, 0.4, 0.4),
+    "normal": (1.0, 1.0, 1.0),
+    "high": (1.6, 2.0, 2.5),
+}
 
 #: Fits to few photos overfit without help: dropout is this over the number of photos that see the
 #: same place, at most ``MOST_DROPOUT``, and none where that is less than ``LEAST_DROPOUT``.
@@ -26,9 +33,9 @@ SH2_PHOTOS = 12.0
 #: Steps of any fit, and more for each photo, up to a most; but for few photos only so many each.
 STEPS, STEPS_MORE, MOST_STEPS = 2500, 25, 5000
 STEPS_PER_PHOTO = 500
-#: Most splats per pixel of one photo, times the square root of the photos over ``FEW``: more photos
+#: Most splats per pixel of one photo, times the fourth root of the photos over ``FEW``: more photos
 #: show more of a scene, but not as many times more.
-SPLATS_PER_PIXEL = 0.2
+SPLATS_PER_PIXEL = 0.14
 FEW = 8.0
 MOST_SPLATS = 1_000_000
 #: Steps of the paper's fits to photos whose cameras have noise.
@@ -80,18 +87,31 @@ _INSTANTSPLAT = replace(
 _NOT_OF_PRESETS = ("seed", "background")
 
 
-def default_max_size(backend: str) -> int:
+def default_max_size(backend: str, quality: Quality = "normal") -> int:
     """Longest side in pixels of the photos that a backend fits where nothing else is asked for.
 
     By the backend alone, so that the same command gives the same result on every machine.
 
     Args:
         backend: "cpu" or "gpu".
+        quality: "draft", "normal" or "high".
+
+    Raises:
+        IgsrError: there is no such quality.
     """
-    return MAX_SIZES[backend]
+    return round(MAX_SIZES[backend] * _quality(quality)[0])
 
 
-def settings_for(preset: str, photos: PhotoSupport | int, **given: Any) -> FitSettings:
+def _quality(quality: str) -> tuple[float, float, float]:
+    for name, factors in QUALITIES.items():
+        if name == quality:
+            return factors
+    raise IgsrError(f"quality must be one of {', '.join(QUALITIES)}, not {quality!r}.")
+
+
+def settings_for(
+    preset: str, photos: PhotoSupport | int, quality: Quality = "normal", **given: Any
+) -> FitSettings:
     """The settings of a fit: those given, and the preset's where none or None is given.
 
     Args:
@@ -100,26 +120,31 @@ def settings_for(preset: str, photos: PhotoSupport | int, **given: Any) -> FitSe
             for few photos) or "instantsplat" (dense initialization, fixed number of splats, joint
             poses, shared focal length).
         photos: what the photos to fit tell, or their number, for small ones all round an object.
+        quality: "draft", "normal" or "high": fewer or more steps and splats. Only the default
+            preset has qualities.
         **given: fields of ``FitSettings``.
 
     Raises:
-        IgsrError: there is no such preset or setting, or a setting cannot be used.
+        IgsrError: there is no such preset, quality or setting, or a setting cannot be used.
     """
     if preset not in PRESETS:
         raise IgsrError(f"preset must be one of {', '.join(PRESETS)}, not {preset!r}.")
     support = photos if isinstance(photos, PhotoSupport) else PhotoSupport.of_number(photos)
-    base = {"default": _default(support), "3dgs": _3DGS, "instantsplat": _INSTANTSPLAT}[preset]
+    base = {"default": _default(support, quality), "3dgs": _3DGS, "instantsplat": _INSTANTSPLAT}[
+        preset
+    ]
     return replace(base, **checked_given(FitSettings, given))
 
 
-def _default(support: PhotoSupport) -> FitSettings:
+def _default(support: PhotoSupport, quality: Quality) -> FitSettings:
     """The default for these photos: one rule from few of them to many."""
     dropout = min(MOST_DROPOUT, DROPOUT_PHOTOS / support.seen_by)
-    steps = min(MOST_STEPS, STEPS + STEPS_MORE * support.photos)
-    splats = SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** 0.5
+    _, more_steps, more_splats = _quality(quality)
+    steps = more_steps * min(MOST_STEPS, STEPS + STEPS_MORE * support.photos)
+    splats = more_splats * SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** 0.25
     return replace(
         _DEFAULT,
-        steps=min(steps, STEPS_PER_PHOTO * support.photos),
+        steps=round(min(steps, more_steps * STEPS_PER_PHOTO * support.photos)),
         max_splats=max(1000, min(MOST_SPLATS, round(splats))),
         sh_degree=2 if support.seen_by >= SH2_PHOTOS else 1,
         density="mcmc" if support.apart > WIDE_APART else "original",
@@ -127,13 +152,15 @@ def _default(support: PhotoSupport) -> FitSettings:
     )
 
 
-def preset_settings(name: str, photos: PhotoSupport | int, **given: Any) -> dict[str, Any]:
+def preset_settings(
+    name: str, photos: PhotoSupport | int, quality: Quality = "normal", **given: Any
+) -> dict[str, Any]:
     """As ``settings_for``, but as keywords of ``igsr.fit``, without seed and background.
 
     Raises:
         IgsrError: as ``settings_for``.
     """
-    return preset_keywords(settings_for(name, photos, **given))
+    return preset_keywords(settings_for(name, photos, quality, **given))
 
 
 def preset_keywords(settings: FitSettings) -> dict[str, Any]:

@@ -94,8 +94,8 @@ class FitSettings:
     )
     coarse_to_fine: bool = field(
         metadata=about(
-            "Begin with photos of an eighth to half of their size; the last two fifths of the "
-            "steps have their whole size."
+            "Begin with photos of an eighth to half of their size; the last seven tenths of "
+            "the steps have their whole size."
         )
     )
     poses: Poses = field(metadata=about("joint: optimize the cameras' poses with the splats."))

@@ -212,6 +212,17 @@ def photos_note(photos: Path) -> dict[str, str]:
     return {GIVEN: json.dumps(photo_sizes(photos), indent=1)}
 
 
+def has_found(photos: Path, out: Path) -> bool:
+    """Whether the output folder ``out`` holds cameras of ``photos``; files are not read whole.
+
+    Args:
+        photos: folder or file of photos.
+        out: output folder of the fit.
+    """
+    kept = out / "capture"
+    return (kept / FOUND).is_file() and _given(kept) == photo_sizes(photos)
+
+
 def found_before(photos: Path, kept: Path) -> bool:
     """Whether the cache ``kept`` holds cameras of ``photos``.
 

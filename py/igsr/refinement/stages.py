@@ -92,7 +92,12 @@ class Stages:
         self._background = default_background(capture)
         self._background_of_views = known_background(capture.views)
         # Folds have fewer photos, but are fitted with the settings for all of them.
-        preset = preset_settings("default", support_of(capture.train_views), steps=settings.steps)
+        preset = preset_settings(
+            "default",
+            support_of(capture.train_views),
+            settings.quality,
+            steps=settings.steps,
+        )
         self._fit_settings = {
             name: preset[name]
             for name in ("steps", "sh_degree", "density", "dropout", "coarse_to_fine")

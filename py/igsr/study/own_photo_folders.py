@@ -189,9 +189,8 @@ def _camera_task(out: Path, scene: str, max_size: int) -> Run:
 def _fit_task(root: Path, one: OwnFit, cameras: dict[str, Any] | None, features: str | None) -> Run:
     placed = len(photo_sizes(root / one.scene)) if cameras is None else cameras["placed"]
     photos = placed - len(range(0, placed, one.holdout))
-    given = {} if one.steps is None else {"steps": one.steps}
     settings = {
-        **preset_settings(one.preset, photos, **given),
+        **preset_settings(one.preset, photos, steps=one.steps),
         "holdout": one.holdout,
         "max_size": one.max_size,
         "scored_at": one.score_size,

@@ -98,11 +98,11 @@ const COARSE_SIDE: u32 = 96;
 /// Photos are halved at most so often.
 const MOST_HALVINGS: u32 = 3;
 /// Part of the steps after which photos have their whole size.
-const COARSE_UNTIL: f64 = 0.6;
+const COARSE_UNTIL: f64 = 0.3;
 
 impl FitConfig {
-    /// What both sides of photos are divided by in a step, from 0: a power of two, and 1 in the last
-    /// two fifths of the steps. Each size has as many steps as the next.
+    /// What both sides of photos are divided by in a step, from 0: a power of two, each for as many
+    /// steps as the next, and 1 in the last seven tenths of all steps.
     ///
     /// A step costs what its pixels and splats cost, and while there are few splats, they show no
     /// detail of the photos (Chen et al., "DashGaussian", 2025, section 3.2).
@@ -111,11 +111,10 @@ impl FitConfig {
     pub fn reduction(&self, step: u32, longest: u32) -> u32 {
         let halvings = (longest / COARSE_SIDE).checked_ilog2().unwrap_or(0).min(MOST_HALVINGS);
         let progress = f64::from(step) / f64::from(self.steps);
-        let until: f64 = std::env::var("IGSR_CU").ok().and_then(|v| v.parse().ok()).unwrap_or(COARSE_UNTIL);
-        if !self.coarse_to_fine || progress >= until {
+        if !self.coarse_to_fine || progress >= COARSE_UNTIL {
             return 1;
         }
-        let done = (progress / until * f64::from(halvings)) as u32;
+        let done = (progress / COARSE_UNTIL * f64::from(halvings)) as u32;
         1 << halvings.saturating_sub(done)
     }
 

@@ -356,7 +356,7 @@ impl Fitter {
         let (start, every) = REFINE;
         let stop = match config.density {
             DensityControl::Mcmc => REFINE_STOP.0,
-            DensityControl::Original => std::env::var("IGSR_RS").ok().and_then(|v| v.parse().ok()).unwrap_or(REFINE_STOP.1),
+            DensityControl::Original => REFINE_STOP.1,
             DensityControl::Fixed => 0.0,
         };
         let active = f64::from(step) < stop * f64::from(config.steps);
