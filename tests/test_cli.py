@@ -92,6 +92,22 @@ def test_fit_writes_scene_report_views_and_checkpoint(fitted):
     assert (report["start"], report["start_splats"]) == ("hull", 300)
     assert "initialization: hull, 300 points" in result.stdout
     assert "over white" in result.stdout
+    assert report["train"]["views"] == report["train"]["of"] == 6
+    assert report["train"]["psnr"] > 10.0
+    assert f"fitted photos: PSNR {report['train']['psnr']:.2f} dB" in result.stdout
+    assert report["limit"]["sentence"] in result.stdout.replace("\n", " ")
+    assert list(report["parts"]) == ["load", "fit", "score"]
+    assert all(part["peak_memory_bytes"] > 2**20 for part in report["parts"].values())
+    assert report["peak_memory_bytes"] == max(
+        part["peak_memory_bytes"] for part in report["parts"].values()
+    )
+    assert report["photos"] == {
+        "given": 8, "placed": 8, "train": 6, "test": 2, "not_placed": [],
+    }  # fmt: skip
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 3 * 2
+    assert report["limit"]["sentence"] in page
+    assert "http" not in page
     sheet = Image.open(out / "views.png")
     assert sheet.width > 3 * 40
     assert sheet.height > 2 * 40

@@ -39,7 +39,14 @@ def test_everything_it_did_is_in_its_folder(helped):
     assert report["rounds"][2]["cross_validation"]["after"] == refined.rounds[1].validation_after
     assert report["rounds"][2]["test"]["psnr"] == refined.rounds[1].test["psnr"]
     assert set(report["seconds"]) == {"fit", "novel_views", "cross_validate", "refit", "test"}
+    assert set(report["parts"]) == set(report["seconds"])
+    assert report["peak_memory_bytes"] == max(
+        part["peak_memory_bytes"] for part in report["parts"].values()
+    )
+    assert report["train"]["views"] == report["train"]["of"] == 9
+    assert report["test"] == report["rounds"][2]["test"]
     page = (out / "report.html").read_text()
+    assert report["limit"]["sentence"] in page
     assert f"Why it ended:</b> {refined.stop}." in page
     assert "Round 2: accepted" in page
     beside = 3 * len(refined.capture.test_views)
@@ -161,6 +168,23 @@ def test_without_resume_nothing_of_an_earlier_run_is_in_the_way(ball_photos, tmp
     assert others.read_bytes() == b"mine"
     resumed = refine(ball_photos, 1, truthful, out=out, steps=60, cross_validate=False, resume=True)
     assert len(resumed.rounds) == 1
+
+
+def test_pictures_are_there_where_no_round_was_accepted(ball_photos, tmp_path):
+    alone = igsr.Capture(ball_photos.path, ball_photos.train_views)
+    for name, photos in (("held", ball_photos), ("all", alone)):
+        out = tmp_path / name
+        refined = refine(photos, 1, unsure, out=out, steps=20, cross_validate=False)
+        assert not refined.rounds
+        report = json.loads((out / "report.json").read_text())
+        assert report["limit"]["sentence"] in (out / "report.html").read_text()
+        assert (report["limit"]["held_out_gap"] is None) == (name == "all")
+        shown = 3 * len(photos.test_views or photos.train_views[:8])
+        photos_of_page = len(photos.train_views)
+        page = (out / "report.html").read_text()
+        assert page.count("data:image/jpeg;base64,") == shown + photos_of_page
+        sheet = np.asarray(Image.open(out / "views.png"))
+        assert sheet.shape[0] > 40
 
 
 def test_a_fit_that_is_stopped_is_saved(ball_photos, tmp_path):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +15,15 @@ from PIL import Image
 import igsr
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.json_file import write_json
-from igsr.evaluation import metrics
+from igsr._internal.part_usage import Parts, Usage
+from igsr.capture import Capture
+from igsr.evaluation import evaluate, metrics, score_views
 from igsr.evaluation.contact_sheet import contact_sheet, error_picture, sheet_names
-from igsr.evaluation.scores import ScoredView, over_background
+from igsr.evaluation.quick_scores import MOST_TRAIN, train_photos, train_scores
+from igsr.evaluation.scores import BLACK, ScoredView, over_background
+from igsr.fitting.fit_page import write_fit_page
+from igsr.fitting.fit_report import FinishedFit, FitScores, fit_report
+from igsr.fitting.presets import settings_for
 
 
 def test_the_true_scene_scores_perfectly_and_another_does_not():
@@ -133,3 +141,48 @@ def test_atomic_write_keeps_the_old_file_on_any_failure(tmp_path):
         assert path.read_bytes() == b"old"
     assert Image.open(path).size == (2, 2)
     assert [entry.name for entry in tmp_path.iterdir()] == ["picture.png"]
+
+
+def test_fitted_photos_are_scored_at_most_ten_evenly_spaced():
+    splats = scenes.splats(10)
+    made = scenes.capture(views=25, size=16, scene=splats)
+    views = [replace(view, split="train") for view in made.views]
+    capture = Capture(made.path, views)
+    names = [view.name for view in train_photos(capture)]
+    assert len(names) == MOST_TRAIN == 10
+    assert (names[0], names[-1]) == (views[0].name, views[-1].name)
+    scores = train_scores(splats, capture, BLACK, "reference")
+    assert (scores["views"], scores["of"]) == (10, 25)
+    assert scores["psnr"] > 45.0
+    few = Capture(made.path, views[:4])
+    whole = evaluate(splats, few, "train", BLACK, "cpu")
+    quick = train_scores(splats, few, BLACK, "cpu")
+    for name in ("psnr", "ssim"):
+        assert quick[name] == pytest.approx(whole[name], abs=1e-12)
+
+
+def test_a_fits_page_escapes_what_it_shows(tmp_path):
+    name = '"><script>alert("photo")</script>\udcff.png'
+    made = scenes.capture(views=5, size=16)
+    views = [replace(view, name=f"{k}{name}") for k, view in enumerate(made.views)]
+    capture = Capture(Path("a<b>&c"), views)
+    splats = scenes.splats(5)
+    sheet = list(score_views(splats, capture.test_views, BLACK, "cpu"))
+    scores = evaluate(splats, capture, "test", BLACK, "cpu")
+    train = train_scores(splats, capture, BLACK, "cpu")
+    asked = {"capture": "a<b>&c", "preset": "<i>", "backend": "cpu"}
+    fit = FinishedFit(splats, capture, settings_for("default", 3), asked, ("rays", 5), 1.0,
+                      ["<i>lost</i>.png"])  # fmt: skip
+    parts = Parts()
+    parts.add("<fit>", Usage(1.0, 2.0, None))
+    scored = FitScores(scores, sheet, train, {"psnr": 20.0, "ssim": 0.5, "flip": 0.1})
+    report = fit_report(fit, scored, parts)
+    assert report["limit"]["camera_gain"] is not None
+    write_fit_page(tmp_path / "report.html", report, capture, sheet)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "alert(" in page
+    for unsafe in ('"photo"', "a<b>", "<i>", "<script>alert", "<fit>"):
+        assert unsafe not in page
+    assert "a&lt;b&gt;&amp;c" in page
+    assert "&lt;i&gt;lost&lt;/i&gt;.png" in page
+    assert "the same with refined cameras" in page
