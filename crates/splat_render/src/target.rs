@@ -173,3 +173,39 @@ impl Target {
         });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn photo(channels: u32, pixels: Vec<u8>, weights: Option<Vec<f32>>) -> Target {
+        Target {
+            width: 3,
+            height: 2,
+            channels,
+            pixels,
+            weights,
+            background: None,
+            turns: 2,
+            until: Some(7),
+        }
+    }
+
+    #[test]
+    fn a_reduced_photo_has_the_mean_of_what_counts() {
+        let plain = photo(3, (0..18).map(|i| 10 * i as u8).collect(), None).reduced(2);
+        assert_eq!((plain.width, plain.height, plain.turns, plain.until), (1, 1, 2, Some(7)));
+        // Pixels 0, 1, 3 and 4; the last column is left over.
+        assert_eq!(plain.pixels, [60, 70, 80]);
+        let mut pixels = vec![200u8; 24];
+        pixels[..4].copy_from_slice(&[0, 100, 50, 255]);
+        pixels[4..8].copy_from_slice(&[255, 255, 255, 0]);
+        pixels[12..16].copy_from_slice(&[40, 100, 50, 255]);
+        let weights = vec![1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
+        let clear = photo(4, pixels, Some(weights)).reduced(2);
+        // Neither the transparent pixel's colour counts nor that of the one of weight 0.
+        assert_eq!(clear.pixels, [20, 100, 50, 170]);
+        assert_eq!(clear.weights, Some(vec![0.75]));
+        clear.validate(0).unwrap();
+    }
+}

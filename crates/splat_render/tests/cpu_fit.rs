@@ -129,6 +129,62 @@ fn a_resumed_fit_ends_with_the_same_bits() {
 }
 
 #[test]
+fn a_fit_from_coarse_to_fine_resumes_with_the_same_bits_and_moves_cameras_as_a_whole_one_does() {
+    // Photos of noise that is smooth enough for half the size to show it.
+    let (small, cameras) = photos();
+    let targets: Vec<Target> = small
+        .iter()
+        .map(|target| {
+            let (width, height) = (6 * target.width, 6 * target.height);
+            let pixels = (0..width * height).flat_map(|i| {
+                let from = (i / width / 6 * target.width + i % width / 6) as usize * 4;
+                target.pixels[from..from + 4].to_vec()
+            });
+            Target { width, height, pixels: pixels.collect(), ..target.clone() }
+        })
+        .collect();
+    let cameras: Vec<Camera> = cameras
+        .iter()
+        .map(|c| Camera {
+            fx: 6.0 * c.fx,
+            fy: 6.0 * c.fy,
+            cx: 6.0 * c.cx,
+            cy: 6.0 * c.cy,
+            width: 6 * c.width,
+            height: 6 * c.height,
+            ..*c
+        })
+        .collect();
+    let steps = 100;
+    let coarse = |state: FitState, step| {
+        let config = FitConfig {
+            steps,
+            coarse_to_fine: true,
+            hull: false,
+            ..config(DensityControl::Original)
+        };
+        let device = Box::new(CpuFit::default());
+        Fitter::new(device, targets.clone(), cameras.clone(), state, step, config).unwrap()
+    };
+    let mut whole = coarse(start(1), 0);
+    run(&mut whole, 31);
+    let first = whole.loss().unwrap();
+    let end = run(&mut whole, steps);
+    assert!(whole.loss().unwrap() < first, "at the whole size the loss falls on");
+    let moved = whole.cameras()[0];
+    assert_eq!((moved.width, moved.height), (240, 180));
+    assert!((moved.fx / cameras[0].fx - 1.0).abs() < 0.2, "the focal length is of the whole size");
+    // In the reduced photos, at the change and after it; between the ends of rounds.
+    for cut in [3, 29, 30, 31, 52] {
+        let mut half = coarse(start(1), 0);
+        let state = run(&mut half, cut);
+        let mut resumed = coarse(state, cut);
+        resumed.resume_cameras(half.camera_state().unwrap().unwrap()).unwrap();
+        assert!(run(&mut resumed, steps) == end, "resumed at step {cut} it ends otherwise");
+    }
+}
+
+#[test]
 fn a_photo_of_two_turns_is_fitted_as_often_as_two_photos() {
     let (targets, cameras) = photos();
     let fitted = |turns: &[(usize, u32)]| {

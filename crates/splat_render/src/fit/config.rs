@@ -163,3 +163,25 @@ impl FitConfig {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn photos_grow_to_their_whole_size() {
+        let config = FitConfig { steps: 1000, coarse_to_fine: true, ..FitConfig::default() };
+        let sizes = |longest| -> Vec<u32> {
+            [0, 99, 100, 149, 150, 200, 299, 300, 999]
+                .iter()
+                .map(|&step| config.reduction(step, longest))
+                .collect()
+        };
+        assert_eq!(sizes(4000), [8, 8, 4, 4, 4, 2, 2, 1, 1]);
+        assert_eq!(sizes(400), [4, 4, 4, 4, 2, 2, 2, 1, 1]);
+        assert_eq!(sizes(200), [2, 2, 2, 2, 2, 2, 2, 1, 1]);
+        assert_eq!(sizes(1), [1; 9]);
+        let whole = FitConfig { coarse_to_fine: false, ..config };
+        assert_eq!(whole.reduction(0, 4000), 1);
+    }
+}

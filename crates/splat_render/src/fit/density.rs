@@ -80,7 +80,6 @@ fn share(o: f32, copies: usize) -> (f32, f32) {
 /// The paper's 5 % a run gets nowhere from few points: 24 runs make three splats of one.
 pub(super) fn mcmc(state: &mut FitState, max_splats: usize, runs_left: u32, rng: &mut Pcg64) {
     let n = state.splats.len();
-
     let opacities: Vec<f32> = state.splats.opacities.iter().map(|&o| sigmoid(o)).collect();
     let dead: Vec<usize> = (0..n)
         .filter(|&i| {
@@ -271,6 +270,19 @@ mod tests {
         state.validate().unwrap();
         assert!(sigmoid(state.splats.opacities[7]) >= OPACITY_DEAD * 0.99);
         assert!((0..103).all(|i| finite(&state.splats, i)));
+    }
+
+    #[test]
+    fn mcmc_reaches_the_cap_from_few_splats() {
+        let mut state = some(100);
+        let mut counts = Vec::new();
+        for left in (0..8).rev() {
+            mcmc(&mut state, 20_000, left, &mut Pcg64::seed_from_u64(2));
+            counts.push(state.splats.len());
+        }
+        assert_eq!(counts[6..], [20_000, 20_000]);
+        let rates = counts[..7].windows(2).map(|pair| pair[1] as f64 / pair[0] as f64);
+        assert!(rates.clone().all(|rate| (rate - 200f64.powf(1.0 / 7.0)).abs() < 0.02));
     }
 
     #[test]
