@@ -433,7 +433,7 @@ mod tests {
         for map in [&away, &masked, &alone] {
             assert!(map.score.iter().all(|&score| score == -1.0));
         }
-        assert!(flat.score.iter().all(|score| score.abs() < 0.01));
+        assert!(flat.score.iter().all(|&score| score < 0.01));
         for map in [away, flat, masked, alone] {
             assert!(map.inverse_depth.iter().all(|v| v.is_finite() && *v > 0.0));
         }
