@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from igsr.pose.estimate import Progress
 
 #: Pixels of a photo's longer side at which features are found; bounds time.
 LONGEST = 1600
-#: Photos done between two calls of progress, or as many as there are cores; Ctrl-C is heard then.
+#: Photos done between two calls of progress; Ctrl-C is heard then. Each may take 0.5 GB.
 FEATURES_AT_ONCE = 4
 
 
@@ -32,10 +31,9 @@ def find_features(photos: Sequence[Photo], workspace: Path, database: Path, show
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = LONGEST
     extraction.use_gpu = False
-    at_once = max(FEATURES_AT_ONCE, os.cpu_count() or 1)
-    for start in range(0, len(photos), at_once):
+    for start in range(0, len(photos), FEATURES_AT_ONCE):
         show("features", start, len(photos))
-        chunk = range(start, min(start + at_once, len(photos)))
+        chunk = range(start, min(start + FEATURES_AT_ONCE, len(photos)))
         for index in chunk:
             mask_path = masks / f"{photo_file(index)}.png" if masked else None
             _write(photos[index], images / photo_file(index), mask_path)
