@@ -17,8 +17,10 @@ from igsr.capture import Camera, Capture, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.write_transforms import write_transforms
 from igsr.geometry.pose_errors import pose_accuracy
-from igsr.pose import colmap, registry
-from igsr.pose.colmap import Colmap
+from igsr.pose import registry
+from igsr.pose.colmap import Colmap, estimator, pairs
+from igsr.pose.colmap.database import list_photos
+from igsr.pose.colmap.features import find_features
 from igsr.pose.estimate import Estimate
 
 CAMERAS = [rooms.camera(angle) for angle in np.linspace(-0.5, 0.5, 6)]
@@ -159,18 +161,21 @@ def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -
     places /= np.linalg.norm(places, axis=2, keepdims=True)
     glances = [places[i % 180 : i % 180 + 4].reshape(-1, 128) for i in range(200)]
     glances[77] = np.zeros((0, 128), dtype=np.float32)  # a photo without features
-    monkeypatch.setattr(colmap, "_largest_features", lambda count, database: glances)
-    pairs = colmap._pairs(200, Path("database"))
-    assert len(pairs) < 200 * (colmap.FOLLOWING + colmap.MOST_SIMILAR) < 200 * 199 // 2
-    assert {(i, i + 180) for i in range(20)} <= set(pairs)
-    assert {(i, i + 1) for i in range(199)} <= set(pairs)
-    assert len(colmap._pairs(colmap.EXHAUSTIVE, Path("database"))) == 60 * 59 // 2
+    monkeypatch.setattr(pairs, "largest_features", lambda count, database: glances)
+    chosen = pairs.pairs_to_match(200, Path("database"))
+    assert len(chosen) < 200 * (pairs.FOLLOWING + pairs.MOST_SIMILAR) < 200 * 199 // 2
+    assert {(i, i + 180) for i in range(20)} <= set(chosen)
+    assert {(i, i + 1) for i in range(199)} <= set(chosen)
+    assert len(pairs.pairs_to_match(pairs.EXHAUSTIVE, Path("database"))) == 60 * 59 // 2
+    tiles = pairs.in_tiles(chosen)
+    assert sorted(pair for tile in tiles for pair in tile) == chosen
+    assert max(len({photo for pair in tile for photo in pair}) for tile in tiles) <= 2 * pairs.TILE
 
 
 def test_of_many_photos_the_time_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    for step in ("_list_photos", "_find_features"):
-        monkeypatch.setattr(colmap, step, lambda *arguments: None)
-    monkeypatch.setattr(colmap, "_mapped", lambda *arguments: (None, 0))
+    for step in ("list_photos", "find_features"):
+        monkeypatch.setattr(estimator, step, lambda *arguments: None)
+    monkeypatch.setattr(estimator, "mapped", lambda *arguments: (None, []))
     tiny = [Photo(f"{i}.png", np.zeros((2, 2, 3), dtype=np.uint8)) for i in range(500)]
     with (
         pytest.warns(UserWarning, match=r"COLMAP needs about \d+ minutes for 500 photos"),
@@ -183,12 +188,12 @@ def test_photos_that_look_alike_are_found_in_the_database(photos: list[Photo], t
     stranger = rooms.photos([CAMERAS[2]], seed=7)
     both = [*photos[:3], *stranger]
     database = tmp_path / "database.db"
-    colmap._list_photos(both, database)
-    colmap._find_features(both, tmp_path, database, lambda *arguments: None)
-    counts = colmap._similarity(colmap._largest_features(4, database))
+    list_photos(both, database)
+    find_features(both, tmp_path, database, lambda *arguments: None)
+    counts = pairs.similarity(pairs.largest_features(4, database))
     assert (counts == counts.T).all()
-    assert min(counts[0, 1], counts[1, 2]) >= 2 * colmap.LEAST_SIMILAR
-    assert counts[:3, 3].max() < colmap.LEAST_SIMILAR
+    assert min(counts[0, 1], counts[1, 2]) >= 2 * pairs.LEAST_SIMILAR
+    assert counts[:3, 3].max() < pairs.LEAST_SIMILAR
 
 
 def make_estimator(calls: list[dict[str, object]], name: str) -> object:

@@ -1,0 +1,72 @@
+"""The estimator ``colmap``: features, matches, mapping, and again for photos that are missing."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from igsr.capture.photo_folder import Photo
+from igsr.errors import IgsrError
+from igsr.pose.colmap.attempts import mapped
+from igsr.pose.colmap.database import list_photos
+from igsr.pose.colmap.distortion import without_distortion
+from igsr.pose.colmap.features import find_features
+from igsr.pose.colmap.result import estimate_of
+from igsr.pose.estimate import Estimate, Progress
+
+#: Seconds of one core that a photo takes, and photos from which that is said; by our measurements.
+SECONDS_A_PHOTO = 8.0
+MANY = 200
+
+
+class Colmap:
+    """Finds cameras with pycolmap; see the package."""
+
+    name = "colmap"
+
+    def __call__(
+        self, photos: Sequence[Photo], *, seed: int = 0, progress: Progress | None = None
+    ) -> Estimate:
+        """Register as many photos as possible; see ``Estimator``.
+
+        The largest set of photos that hang together is kept. The same photos and seed give the same
+        bits on the same machine.
+        """
+        show = progress or (lambda stage, done, total: None)
+        if len(photos) > MANY:
+            minutes = SECONDS_A_PHOTO * len(photos) / 60.0
+            warnings.warn(
+                f"COLMAP needs about {minutes:.0f} minutes for {len(photos)} photos; every third "
+                "is mostly enough",
+                stacklevel=2,
+            )
+        with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, _guarded(seed):
+            workspace = Path(folder)
+            database = workspace / "database.db"
+            list_photos(photos, database)
+            find_features(photos, workspace, database, show)
+            model, doubtful = mapped(len(photos), database, seed, show)
+            if model is not None:
+                model = without_distortion(model)
+        return estimate_of(photos, model, doubtful)
+
+
+@contextlib.contextmanager
+def _guarded(seed: int) -> Iterator[None]:
+    """pycolmap without its log, with a fixed seed, and with failures as error messages."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    pycolmap.set_random_seed(seed)
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        raise IgsrError(
+            f"COLMAP failed ({error}); leave out unusual photos and try again"
+        ) from error
+    finally:
+        pycolmap.logging.minloglevel = level

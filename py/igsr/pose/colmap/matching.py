@@ -1,0 +1,150 @@
+"""Matches between photos, in copies of COLMAP's database, with focal lengths by them.
+
+Photos that EXIF gives no focal length get one from the fundamental matrices of all pairs together
+(Sweeney et al., "Optimizing the Viewing Graph for Structure-from-Motion", ICCV 2015) before the
+first is registered: with few photos, a wrong initial focal length is the most common failure.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from igsr.pose.colmap.database import image_id, photo_file
+from igsr.pose.colmap.epipolar import Constraint, EpipolarLine, Plane
+from igsr.pose.colmap.guided_matching import Features, comparable, guided_matches
+from igsr.pose.colmap.pairs import in_tiles, pairs_to_match
+from igsr.pose.estimate import Progress
+
+#: Pairs that more matches are looked for in between two calls of progress.
+GUIDED_AT_ONCE = 8
+#: Pixels that a match may be off its epipolar line; COLMAP's.
+GUIDED_PIXELS = 4.0
+
+
+def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
+    """A copy of the database of features, with matches that agree with the geometry of a pair.
+
+    Args:
+        count: of photos.
+        features: the database.
+        seed: of the search for the geometry.
+        show: called with "matching", pairs done and all pairs.
+
+    Returns:
+        The new database, beside the other. Its focal lengths are those of ``features``.
+    """
+    import pycolmap
+
+    database = features.with_name("matched.db")
+    shutil.copyfile(features, database)
+    pairs = pairs_to_match(count, database)
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    listing = pycolmap.ImportedPairingOptions()
+    listing.match_list_path = database.with_name("pairs.txt")
+    done = 0
+    for tile in in_tiles(pairs):
+        show("matching", done, len(pairs))
+        listing.match_list_path.write_text(
+            "".join(f"{photo_file(a)} {photo_file(b)}\n" for a, b in tile)
+        )
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=matching,
+            pairing_options=listing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+        done += len(tile)
+    show("matching", done, len(pairs))
+    return database
+
+
+def with_focal_lengths(matches: Path, seed: int) -> Path:
+    """A copy of a database of matches, with focal lengths from all its pairs together."""
+    import pycolmap
+
+    database = matches.with_name(f"calibrated_{matches.name}")
+    shutil.copyfile(matches, database)
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    calibration.random_seed = seed
+    pycolmap.calibrate_view_graph(database, calibration)
+    return database
+
+
+def with_matches(matches: Path) -> set[int]:
+    """Indices of photos that have matches with any other; those without cannot be placed."""
+    import pycolmap
+
+    found: set[int] = set()
+    with pycolmap.Database.open(matches) as opened:
+        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            if len(geometry.inlier_matches):
+                found.update(image - image_id(0) for image in pycolmap.pair_id_to_image_pair(pair))
+    return found
+
+
+def matched_along_lines(matches: Path, missing: Collection[int], show: Progress) -> Path | None:
+    """A copy of a database of matches, with more of them where they can help missing photos.
+
+    Args:
+        matches: the database.
+        missing: indices of photos that are not placed. Pairs without one of them are left alone:
+            what is placed has matches enough.
+        show: called with "matching", pairs done and all pairs that are looked at.
+
+    Returns:
+        The new database, beside the other; None if no pair has gained a match.
+    """
+    import pycolmap
+
+    database = matches.with_name("guided.db")
+    shutil.copyfile(matches, database)
+    wanted = {image_id(index) for index in missing}
+    gained = False
+    with pycolmap.Database.open(database) as opened:
+        ids, geometries = opened.read_two_view_geometries()
+        pairs = []
+        for pair, geometry in sorted(zip(ids, geometries, strict=True), key=lambda one: one[0]):
+            a, b = pycolmap.pair_id_to_image_pair(pair)
+            constraint = _constraint(geometry)
+            if constraint is not None and (a in wanted or b in wanted):
+                pairs.append((a, b, geometry, constraint))
+        features: dict[int, Features] = {}
+        for done, (a, b, geometry, constraint) in enumerate(pairs):
+            if done % GUIDED_AT_ONCE == 0:
+                show("matching", done, len(pairs))
+            for image in {a, b} - features.keys():
+                features[image] = comparable(
+                    opened.read_keypoints(image)[:, :2], opened.read_descriptors(image).data
+                )
+            found = guided_matches(features[a], features[b], constraint)
+            if len(found) > len(geometry.inlier_matches):
+                geometry.inlier_matches = found
+                opened.update_two_view_geometry(a, b, geometry)
+                gained = True
+            # Pairs are in order of their first photo: of the others, few are needed again soon.
+            features = {image: kept for image, kept in features.items() if image == a}
+        show("matching", len(pairs), len(pairs))
+    return database if gained else None
+
+
+def _constraint(geometry: Any) -> Constraint | None:
+    """What guides further matches of a pair, or None if its geometry is not known."""
+    import pycolmap
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    lines = [int(kind) for kind in (kinds.CALIBRATED, kinds.UNCALIBRATED)]
+    planes = [int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)]
+    if geometry.config in lines and geometry.F is not None:
+        return EpipolarLine(np.array(geometry.F, dtype=np.float64), GUIDED_PIXELS)
+    if geometry.config in planes and geometry.H is not None:
+        return Plane(np.array(geometry.H, dtype=np.float64), GUIDED_PIXELS)
+    return None

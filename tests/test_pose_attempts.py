@@ -1,0 +1,182 @@
+"""Photos that are missing from a first model: what is looked for, and what becomes of the model."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rooms
+
+from igsr.geometry.pose_errors import pose_accuracy
+from igsr.pose.colmap import attempts
+from igsr.pose.colmap.attempts import mapped
+from igsr.pose.colmap.database import image_id, list_photos
+from igsr.pose.colmap.estimator import _guarded
+from igsr.pose.colmap.evidence import DOUBTFUL, STEPS
+from igsr.pose.colmap.features import find_features
+from igsr.pose.colmap.mapping import extend, map_photos
+from igsr.pose.colmap.matching import matched, matched_along_lines, with_focal_lengths, with_matches
+from igsr.pose.colmap.result import estimate_of
+
+CAMERAS = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 5)]
+
+
+def silent(*arguments: object) -> None:
+    pass
+
+
+class Model:
+    """Placed photos, as far as ``attempts`` asks a model for them."""
+
+    def __init__(self, *placed: int) -> None:
+        self.placed = set(placed)
+
+    def num_reg_images(self) -> int:
+        return len(self.placed)
+
+    def reg_image_ids(self) -> list[int]:
+        return [image_id(index) for index in self.placed]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[Any]]]:
+    """Runs ``mapped`` on six photos with models that the test makes up."""
+
+    def with_models(
+        anew: dict[int, Model | None],
+        further: dict[int, set[int]],
+        more: bool = True,
+        with_any: set[int] | None = None,
+    ) -> tuple[Any, Any, list[Any]]:
+        calls: list[Any] = []
+
+        def make(count: int, database: Path, evidence: Any, *_: object) -> Model | None:
+            step = STEPS.index(evidence)
+            calls.append(("anew", step, database.name))
+            return anew.get(step)
+
+        def add(model: Model, count: int, database: Path, evidence: Any, *_: object) -> None:
+            step = STEPS.index(evidence)
+            calls.append(("extend", step, database.name))
+            model.placed |= further.get(step, set())
+
+        def look(matches: Path, missing: set[int], show: object) -> Path | None:
+            calls.append(("guided", sorted(missing)))
+            return Path("guided.db") if more else None
+
+        monkeypatch.setattr(attempts, "matched", lambda *_: Path("matched.db"))
+        monkeypatch.setattr(attempts, "with_focal_lengths", lambda path, seed: path)
+        monkeypatch.setattr(attempts, "with_matches", lambda path: with_any or set(range(6)))
+        monkeypatch.setattr(attempts, "matched_along_lines", look)
+        monkeypatch.setattr(attempts, "map_photos", make)
+        monkeypatch.setattr(attempts, "extend", add)
+        model, doubtful = mapped(6, Path("features.db"), 0, silent)
+        return model, doubtful, calls
+
+    return with_models
+
+
+def test_what_is_placed_at_once_is_not_tried_again(run: Callable[..., Any]) -> None:
+    model, doubtful, calls = run({0: Model(*range(6))}, {})
+    assert calls == [("anew", 0, "matched.db")]
+    assert model.num_reg_images() == 6
+    assert doubtful == []
+
+
+def test_a_model_of_most_photos_is_extended(run: Callable[..., Any]) -> None:
+    model, doubtful, calls = run({0: Model(0, 1, 2, 3)}, {1: {4}, 3: {5}})
+    assert calls == [
+        ("anew", 0, "matched.db"),
+        ("extend", 1, "matched.db"),
+        ("guided", [5]),
+        ("extend", 2, "guided.db"),
+        ("extend", 3, "guided.db"),
+    ]
+    assert model.num_reg_images() == 6
+    assert doubtful == [5]
+    assert DOUBTFUL == 3
+
+
+def test_a_model_of_few_photos_is_made_anew(run: Callable[..., Any]) -> None:
+    model, doubtful, calls = run({0: Model(0, 1), 2: Model(0, 1), 3: Model(2, 3, 4)}, {})
+    assert [call[0] for call in calls] == ["anew", "anew", "guided", "anew", "anew", "anew"]
+    assert model.placed == {2, 3, 4}
+    assert doubtful == [2, 3, 4]
+
+
+def test_where_extending_ends_another_beginning_is_tried(run: Callable[..., Any]) -> None:
+    last = len(STEPS) - 1
+    model, doubtful, calls = run({0: Model(0, 1, 2, 3), last: Model(*range(6))}, {4: {4}})
+    assert calls[-2:] == [("extend", last, "guided.db"), ("anew", last, "guided.db")]
+    assert model.num_reg_images() == 6
+    assert doubtful == list(range(6))  # none of them is where the sure ones were placed
+    model, doubtful, _ = run({0: Model(0, 1, 2, 3), last: Model(0, 1, 2)}, {4: {4}})
+    assert model.placed == {0, 1, 2, 3, 4}
+    assert doubtful == [4]
+
+
+def test_nothing_is_done_for_photos_without_matches(run: Callable[..., Any]) -> None:
+    model, _, calls = run({0: Model(0, 1, 2, 3)}, {}, with_any={0, 1, 2, 3})
+    assert calls == [("anew", 0, "matched.db")]
+    assert model.num_reg_images() == 4
+
+
+def test_the_same_matches_are_not_mapped_twice(run: Callable[..., Any]) -> None:
+    _, _, calls = run({0: Model(0, 1, 2, 3)}, {}, more=False)
+    assert [call[1] for call in calls if call[0] == "extend"] == [1, 3, 4]
+
+
+def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
+    import pycolmap
+
+    photos = rooms.photos(CAMERAS)
+    features = tmp_path / "features.db"
+    with _guarded(0):
+        list_photos(photos, features)
+        find_features(photos, tmp_path, features, silent)
+        matches = matched(5, features, 0, silent)
+        assert with_matches(matches) == set(range(5))
+        database = with_focal_lengths(matches, 0)
+        fewer = Path(shutil.copyfile(matches, tmp_path / "fewer.db"))
+        with pycolmap.Database.open(fewer) as opened:
+            for other in range(4):
+                opened.delete_two_view_geometry(image_id(other), image_id(4))
+        assert with_matches(fewer) == set(range(4))
+        model = map_photos(5, with_focal_lengths(fewer, 0), STEPS[0], 0, silent)
+        assert model.num_reg_images() == 4
+        told: list[tuple[int, int]] = []
+        extend(model, 5, database, STEPS[0], 0, lambda stage, done, of: told.append((done, of)))
+    assert told == [(4, 5), (5, 5)]
+    found = estimate_of(photos, model, [4])
+    accuracy = pose_accuracy(found.cameras, CAMERAS)
+    assert accuracy["registered"] == 5
+    assert accuracy["RTA@5"] == 1.0
+    assert accuracy["rotation"] < 0.5
+    assert found.warnings[0].startswith("Few matches for: 4.png. ")
+
+    # With the geometry known, more features match; pairs without a missing photo keep theirs.
+    shown: list[tuple[int, int]] = []
+    more = matched_along_lines(database, [4], lambda stage, done, of: shown.append((done, of)))
+    before, after = inliers(database), inliers(more)
+    assert before.keys() == after.keys()
+    with_missing = {pair for pair in after if image_id(4) in pair}
+    assert all(after[pair] == before[pair] for pair in after.keys() - with_missing)
+    assert sum(after[p] for p in with_missing) > 1.05 * sum(before[p] for p in with_missing)
+    assert shown[-1] == (len(with_missing), len(with_missing))
+    assert matched_along_lines(database, [], silent) is None
+
+
+def inliers(database: Path) -> dict[tuple[int, int], int]:
+    """How many matches each pair has."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        ids, found = opened.read_two_view_geometries()
+    return {
+        tuple(pycolmap.pair_id_to_image_pair(pair)): len(geometry.inlier_matches)
+        for pair, geometry in zip(ids, found, strict=True)
+    }
