@@ -17,6 +17,7 @@ import torch
 from PIL import Image
 
 from igsr import _core, cli
+from igsr._internal import peak_memory
 from igsr.benchmark import accuracy, fit_rows, growth, machine, oracle, run, scenes, stage_rows
 from igsr.benchmark.comparison import FLIP, gradient_error, picture_error
 from igsr.benchmark.plots import plot_speed_vs_error
@@ -292,7 +293,8 @@ def test_rows_of_steps():
 
 
 @pytest.mark.skipif(
-    not os.access(growth.CLEAR_REFS, os.W_OK), reason="only Linux forgets a process's peak memory"
+    not os.access(peak_memory.CLEAR_REFS, os.W_OK),
+    reason="only Linux forgets a process's peak memory",
 )
 def test_a_fit_keeps_its_memory_contract():
     (row,) = growth.growth_rows("cpu", 0, [(100_000, 512)], 0.0)
@@ -307,7 +309,7 @@ def test_memory_that_cannot_be_told_is_left_out(monkeypatch, tmp_path, change):
     if change == "a device of its own":
         monkeypatch.setattr(growth, "runs_on_cores", lambda backend: False)
     else:
-        monkeypatch.setattr(growth, "CLEAR_REFS", tmp_path / "nowhere" / "clear_refs")
+        monkeypatch.setattr(peak_memory, "CLEAR_REFS", tmp_path / "nowhere" / "clear_refs")
     point = growth.measure(0, 200, 32, "cpu", 0.0)
     monkeypatch.setattr(growth, "measure_apart", lambda *arguments: point)
     (row,) = growth.growth_rows("cpu", 0, [(200, 32)], 0.0)

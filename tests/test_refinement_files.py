@@ -42,7 +42,8 @@ def test_everything_it_did_is_in_its_folder(helped):
     page = (out / "report.html").read_text()
     assert f"Why it ended:</b> {refined.stop}." in page
     assert "Round 2: accepted" in page
-    assert page.count("data:image/jpeg;base64,") == 9 + 3 * sum(
+    beside = 3 * len(refined.capture.test_views)
+    assert page.count("data:image/jpeg;base64,") == 9 + beside + 3 * sum(
         len(one.selected) for one in refined.rounds
     )
     assert "http" not in page, "the page needs nothing from elsewhere"

@@ -47,6 +47,7 @@ pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
         background,
         dropout: setting(config, "dropout")?.unwrap_or(default.dropout),
         hull: setting(config, "hull")?.unwrap_or(default.hull),
+        coarse_to_fine: setting(config, "coarse_to_fine")?.unwrap_or(default.coarse_to_fine),
         rates: if frozen { Rates::ZERO } else { default.rates },
         cameras,
         ..default

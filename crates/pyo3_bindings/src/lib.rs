@@ -15,6 +15,7 @@ mod fit_settings;
 mod fit_state;
 mod fitter;
 mod photos;
+mod plane_sweep;
 mod splat_arrays;
 mod splat_files;
 mod stages;
@@ -49,6 +50,8 @@ mod _core {
     use crate::exr_files::write_exr;
     #[pymodule_export]
     use crate::fitter::{Fitter, splats_from_points};
+    #[pymodule_export]
+    use crate::plane_sweep::plane_sweep;
     #[pymodule_export]
     use crate::splat_files::{read_splats, write_splats};
     #[pymodule_export]

@@ -98,6 +98,60 @@ impl Target {
         self.weights.as_deref().map_or(Weight { sum: pixels, count: pixels }, Weight::of)
     }
 
+    /// The photo with each `by` x `by` pixels averaged into one; rows and columns left over are dropped.
+    ///
+    /// Colours are weighted by alpha and by the weights, which are averaged themselves.
+    pub fn reduced(&self, by: u32) -> Self {
+        let (width, height) = (self.width / by, self.height / by);
+        let (side, channels) = (by as usize, self.channels as usize);
+        let (old, new) = (self.width as usize, width as usize);
+        let mut pixels = vec![0u8; new * height as usize * channels];
+        let mut weights = self.weights.as_ref().map(|_| vec![0.0f32; new * height as usize]);
+        let area = f64::from(by * by);
+        for at in 0..new * height as usize {
+            let (row, column) = (at / new * side, at % new * side);
+            let (mut color, mut of_color, mut alpha, mut weight) = ([0.0f64; 3], 0.0, 0.0, 0.0);
+            for i in
+                (row..row + side).flat_map(|y| (column..column + side).map(move |x| y * old + x))
+            {
+                let w = self.weights.as_ref().map_or(1.0, |weights| f64::from(weights[i]));
+                let pixel = &self.pixels[i * channels..(i + 1) * channels];
+                let a = if channels == 4 { f64::from(pixel[3]) } else { 1.0 };
+                for (sum, &value) in color.iter_mut().zip(pixel) {
+                    *sum += w * a * f64::from(value);
+                }
+                of_color += w * a;
+                alpha += w * a;
+                weight += w;
+            }
+            let out = &mut pixels[at * channels..(at + 1) * channels];
+            for (out, sum) in out.iter_mut().zip(color) {
+                *out = (sum / f64::max(of_color, 1e-9)).round() as u8;
+            }
+            if channels == 4 {
+                out[3] = (alpha / f64::max(weight, 1e-9)).round() as u8;
+            }
+            if let Some(weights) = &mut weights {
+                weights[at] = (weight / area) as f32;
+            }
+        }
+        Self { width, height, pixels, weights, ..self.clone_settings() }
+    }
+
+    /// Everything but the pixels and their weights.
+    fn clone_settings(&self) -> Self {
+        Self {
+            width: self.width,
+            height: self.height,
+            channels: self.channels,
+            pixels: Vec::new(),
+            weights: None,
+            background: self.background,
+            turns: self.turns,
+            until: self.until,
+        }
+    }
+
     /// The photo over `background` as three planes in 0..1.
     pub fn composite(&self, background: [f32; 3], planes: &mut [Vec<f32>; 3]) {
         let pixels = self.width as usize * self.height as usize;

@@ -5,7 +5,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, TypeVar
+
+from igsr.errors import IgsrError
+
+T = TypeVar("T")
 
 #: Environment variables that say how many threads to start.
 THREADS = ("RAYON_NUM_THREADS", "OMP_NUM_THREADS")
@@ -33,3 +40,19 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+def in_a_process(work: Callable[..., T], *arguments: Any) -> T:
+    """Call a function of a module in a process of its own, which ends with the call.
+
+    Raises:
+        IgsrError: the process was ended from outside, for example for want of memory.
+        Exception: what the function raises.
+    """
+    with worker_processes(1) as pool:
+        try:
+            return pool.submit(work, *arguments).result()
+        except BrokenProcessPool as error:
+            raise IgsrError(
+                "A process ended without a result; the machine may have run out of memory."
+            ) from error

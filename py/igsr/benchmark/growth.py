@@ -11,11 +11,11 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from igsr._internal.peak_memory import forget_peak, peak_bytes
 from igsr.benchmark.comparison import errors_row
 from igsr.benchmark.fit_rows import Shot, fit_step_ms, step_rows
 from igsr.benchmark.scenes import ball, upstream
@@ -35,8 +35,6 @@ EMPTY = 16
 STEP_SECONDS = 20.0
 #: Crops that are compared with the reference, evenly chosen.
 CROPS = 64
-#: Linux forgets a process's peak memory when 5 is written here.
-CLEAR_REFS = Path("/proc/self/clear_refs")
 #: How long one point is repeated.
 POINT_SECONDS = 1.0
 
@@ -65,22 +63,6 @@ def contract_bytes(count: int) -> int:
     return 5 * parameter_bytes(count)
 
 
-def _peak_bytes() -> int:
-    """Largest resident size of this process since ``_forget_peak``."""
-    status = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return 1024 * next(int(line.split()[1]) for line in status if line.startswith("VmHWM:"))
-
-
-def _forget_peak() -> bool:
-    """Let the peak start from what is resident now; False where the system cannot (Linux can)."""
-    gc.collect()
-    try:
-        CLEAR_REFS.write_text("5")
-    except OSError:
-        return False
-    return True
-
-
 def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> dict[str, Any]:
     """Time, memory where it can be told, and error of one point; for a process of its own."""
     shot = shot_of(seed, count, side)
@@ -89,10 +71,10 @@ def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> d
     # The process's size says nothing of the memory that a device has of its own, nor what is below
     # an earlier peak.
     memory: dict[str, int] = {}
-    if runs_on_cores(backend) and _forget_peak():
-        before = _peak_bytes()
+    gc.collect()
+    if runs_on_cores(backend) and forget_peak() and (before := peak_bytes()) is not None:
         times = fit_step_ms(shot, backend, seconds)
-        memory["peak_bytes"] = _peak_bytes() - before
+        memory["peak_bytes"] = (peak_bytes() or before) - before
     else:
         times = fit_step_ms(shot, backend, seconds)
     v_image = upstream(seed, side, side)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from igsr._internal.choices import FitBackend
+from igsr._internal.part_usage import Parts
 from igsr._internal.progress_bar import BarState, progress_bar
 from igsr._internal.settings import checked_given, settings_of
 from igsr.capture.photo_folder import FRAMES
@@ -31,7 +33,9 @@ from igsr.cli.shared import (
     MaxSizeOption,
     PresetChoice,
     background_color,
+    fitted_line,
     output_console,
+    parts_line,
     print_json,
     protocol_line,
     resolved,
@@ -39,14 +43,15 @@ from igsr.cli.shared import (
     scored,
 )
 from igsr.errors import IgsrError
-from igsr.fitting.presets import preset_keywords, settings_for
+from igsr.fitting.presets import settings_for
 from igsr.fitting.settings import FitSettings
-from igsr.pose import AUTO
+from igsr.pose import AUTO, not_placed
 
 # What computes takes long to import: the help of the command does without.
 if TYPE_CHECKING:
     from igsr.capture import Capture
     from igsr.fitting import Progress
+    from igsr.fitting.fit_report import FitScores
     from igsr.splats import Splats
 
 
@@ -56,7 +61,7 @@ def fit_command(
     capture: CaptureArgument,
     out: Annotated[
         Path,
-        typer.Option("--out", help="Folder for scene.ply, report.json, views.png, checkpoint.npz."),
+        typer.Option("--out", help="Folder for scene.ply, report.html, report.json, views.png."),
     ],
     *,
     holdout: HoldoutOption = None,
@@ -88,6 +93,7 @@ def fit_command(
     Where CAPTURE is a plain folder of photos, or a video, its cameras are found first.
     """
     last: list[Progress] = []
+    parts = Parts()
 
     def interrupted() -> str:
         if not last or last[-1].step == 0:
@@ -115,6 +121,7 @@ def fit_command(
             allow_missing=allow_missing,
             resume=resume,
             shown=not as_json,
+            parts=parts,
         )
         color = _background(background, loaded)
         # Photos with alpha are fitted over random colors, so that no background is learned.
@@ -126,7 +133,10 @@ def fit_command(
             background=None if has_alpha else color,
         )
 
-        splats, fitted = _fitted(loaded, settings, name, out, resume, last, shown=not as_json)
+        with parts.measured("fit"):
+            splats, fitted = _fitted(loaded, settings, name, out, resume, last, shown=not as_json)
+
+        from igsr.fitting.fit_report import FinishedFit, fit_report, write_fit_report, write_scene
 
         # Write the scene, its scores and everything that it takes to fit it again.
         asked = {
@@ -143,10 +153,18 @@ def fit_command(
             "allow_missing": allow_missing,
             "background": background,
         }
-        report = _written(splats, fitted, settings, asked, color, out, last, shown=not as_json)
-        moved = fitted is not loaded
-        if (moved or found) and report["protocol"]["split"] == "test":
-            _add_refined_scores(report, splats, fitted, color, out, shown=not as_json)
+        write_scene(out, splats, fitted)
+        with parts.measured("score"):
+            is_refined = bool(fitted.test_views) and (fitted is not loaded or found)
+            scores = _scored(splats, fitted, color, name, is_refined=is_refined, shown=not as_json)
+        scores.scores.protocol["holdout"] = holdout
+        if last:
+            seconds, started = last[-1].seconds, last[-1].started
+        else:
+            seconds, started = _finished_before(out)
+        done = FinishedFit(splats, fitted, settings, asked, started, seconds, not_placed(fitted))
+        report = fit_report(done, scores, parts)
+        write_fit_report(out, report, done, scores)
     if as_json:
         print_json(report)
     else:
@@ -194,82 +212,39 @@ def _fitted(
         )
 
 
-def _written(
-    splats: Splats,
-    capture: Capture,
-    settings: FitSettings,
-    asked: dict[str, Any],
-    color: tuple[float, float, float],
-    out: Path,
-    last: list[Progress],
-    *,
-    shown: bool,
-) -> dict[str, Any]:
-    """Write scene, cameras, contact sheet and report, which is returned."""
-    from igsr import _core
-    from igsr._internal.json_file import write_json
-    from igsr.capture.write_cameras import write_cameras
-    from igsr.evaluation.contact_sheet import contact_sheet, save_sheet
-    from igsr.evaluation.scores import METRICS, default_split
-
-    splats.save(out / "scene.ply")
-    split = default_split(capture)
-    scores, sheet = scored(splats, capture, split, color, asked["backend"], shown=shown)
-    scores["protocol"]["holdout"] = asked["holdout"]
-    write_cameras(out / "cameras.json", capture.train_views)
-    if last:
-        seconds, started = last[-1].seconds, last[-1].started
-    else:
-        seconds, started = _finished_before(out)
-    report = {
-        **{metric: scores[metric] for metric in METRICS},
-        "splats": len(splats),
-        "preset": asked["preset"],
-        **preset_keywords(settings),
-        "start": started[0],
-        "start_splats": started[1],
-        "seconds": round(seconds, 3),
-        **_core.backend_info(asked["backend"]),
-        "seed": settings.seed,
-        "version": _core.__version__,
-        "capture": asked["capture"],
-        "settings": asked,
-        "protocol": scores["protocol"],
-        "views": scores["views"],
-    }
-    save_sheet(out / "views.png", contact_sheet(sheet))
-    write_json(out / "report.json", report)
-    return report
-
-
-def _finished_before(out: Path) -> tuple[float, tuple[str, int]]:
-    """Seconds and initialization (see ``Progress``) of a fit that was already complete."""
-    from igsr.fitting.checkpoint import load_checkpoint
-
-    _, settings = load_checkpoint(out / "checkpoint.npz")
-    return settings["seconds"], tuple(settings["started"])
-
-
-def _add_refined_scores(
-    report: dict[str, Any],
+def _scored(
     splats: Splats,
     capture: Capture,
     color: tuple[float, float, float],
-    out: Path,
+    backend: FitBackend,
     *,
+    is_refined: bool,
     shown: bool,
-) -> None:
-    """Add the scores of the test views with cameras fitted to their photos to the report.
+) -> FitScores:
+    """Score held-out and fitted photos; with ``is_refined`` held-out ones also with other cameras.
 
     Held-out photos have the cameras that they were given, which may be as wrong as those that were
-    found or optimized; with these they score what the splats are worth.
+    found or optimized; with cameras fitted to them they score what the splats are worth.
     """
-    from igsr._internal.json_file import write_json
     from igsr.capture import Capture
-    from igsr.evaluation.scores import METRICS
+    from igsr.evaluation.quick_scores import train_photos, train_scores
+    from igsr.evaluation.scores import METRICS, default_split
     from igsr.fitting import refine_cameras
+    from igsr.fitting.fit_report import FitScores
 
-    backend = report["settings"]["backend"]
+    split = default_split(capture)
+    if split == "train":
+        some = Capture(capture.path, train_photos(capture))
+        scores, sheet = scored(splats, some, split, color, backend, shown=shown)
+        count = len(capture.train_views)
+        if len(some.views) < count:
+            scores.protocol["of"] = count
+        train = {"psnr": scores.psnr, "ssim": scores.ssim, "views": len(some.views), "of": count}
+        return FitScores(scores, sheet, train)
+    scores, sheet = scored(splats, capture, split, color, backend, shown=shown)
+    train = train_scores(splats, capture, color, backend)
+    if not is_refined:
+        return FitScores(scores, sheet, train)
     with progress_bar("refine cameras", shown=shown, transient=True) as show:
         views = refine_cameras(
             splats,
@@ -279,9 +254,16 @@ def _add_refined_scores(
             progress=lambda done, total: show(BarState(done, total)),
         )
     refined = Capture(capture.path, views, capture.points)
-    scores, _ = scored(splats, refined, "test", color, backend, shown)
-    report["refined"] = {metric: scores[metric] for metric in METRICS}
-    write_json(out / "report.json", report)
+    again, _ = scored(splats, refined, "test", color, backend, shown)
+    return FitScores(scores, sheet, train, {metric: again[metric] for metric in METRICS})
+
+
+def _finished_before(out: Path) -> tuple[float, tuple[str, int]]:
+    """Seconds and initialization (see ``Progress``) of a fit that was already complete."""
+    from igsr.fitting.checkpoint import load_checkpoint
+
+    _, settings = load_checkpoint(out / "checkpoint.npz")
+    return settings["seconds"], tuple(settings["started"])
 
 
 def _print_report(report: dict[str, Any], out: Path) -> None:
@@ -296,6 +278,10 @@ def _print_report(report: dict[str, Any], out: Path) -> None:
     console.print(score_line(report))
     if "refined" in report:
         console.print(f"with refined cameras: {score_line(report['refined'])}")
+    if report["protocol"]["split"] == "test":
+        console.print(fitted_line(report["train"]))
+    console.print(report["limit"]["sentence"])
     console.print(protocol_line(report["protocol"]), style="dim")
-    names = ["scene.ply", "report.json", "views.png", "cameras.json"]
+    console.print(parts_line(report["parts"]), style="dim")
+    names = ["scene.ply", "report.html", "report.json", "views.png", "cameras.json"]
     console.print("  ".join(str(out / name) for name in names), style="dim")

@@ -16,6 +16,7 @@ from rich.progress import Progress as ProgressBar
 
 from igsr import _core
 from igsr._internal.atomic_write import check_folder
+from igsr._internal.part_usage import Parts
 from igsr.capture import Capture
 from igsr.capture.downscaling import check_max_size
 from igsr.capture.load import holds_cameras
@@ -122,6 +123,7 @@ def capture_to_fit(
     allow_missing: bool,
     resume: bool,
     shown: bool,
+    parts: Parts | None = None,
     splats: int = 0,
 ) -> tuple[Capture, bool]:
     """Load the capture at a path; find the cameras first if it has none.
@@ -137,6 +139,7 @@ def capture_to_fit(
         allow_missing: whether to go on with fewer than half of the photos.
         resume: use cameras that an earlier run found.
         shown: whether progress is shown.
+        parts: count what "cameras" and "load" take, or None.
         splats: most splats of the fit, for the memory that it needs.
 
     Returns:
@@ -148,6 +151,7 @@ def capture_to_fit(
     """
     _check_out(out)
     check_max_size(max_size)
+    parts = Parts() if parts is None else parts
     seen = look_at(path, finder.frames, max_size)
     seen.train_photos(holdout)
     if seen.has_cameras:
@@ -156,7 +160,8 @@ def capture_to_fit(
                 f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
             )
         seen.check_memory(max_size, splats)
-        return load(path, holdout, max_size), False
+        with parts.measured("load"):
+            return load(path, holdout, max_size), False
     kept_cameras(path, out)
     seen.check_memory(max_size, splats)
     with _pose_bar(shown) as show:
@@ -171,6 +176,7 @@ def capture_to_fit(
             resume=resume,
             allow_missing=allow_missing,
             progress=show,
+            parts=parts,
             say=print_message,
             warn=print_message,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,7 +25,9 @@ from igsr.cli.shared import (
     HoldoutOption,
     JsonOption,
     MaxSizeOption,
+    fitted_line,
     output_console,
+    parts_line,
     print_json,
 )
 from igsr.errors import IgsrError
@@ -137,8 +140,15 @@ def _check_count(count: int, most: int, path: Path) -> None:
         )
 
 
+def _report(out: Path) -> dict[str, Any]:
+    """The report that the refinement has just written."""
+    report: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    return report
+
+
 def _summary(refined: Refined, out: Path) -> dict[str, Any]:
     """What --json prints."""
+    report = _report(out)
     assert refined.stop is not None
     accepted = [done for done in refined.rounds if done.accepted]
     tests = [refined.first_test, *(done.test for done in accepted)]
@@ -149,7 +159,11 @@ def _summary(refined: Refined, out: Path) -> dict[str, Any]:
         "stopped": str(refined.stop),
         "test": tests if refined.first_test else None,
         "splats": len(refined.splats),
+        "train": report["train"],
+        "limit": report["limit"],
         "seconds": {stage: round(seconds, 2) for stage, seconds in refined.seconds.items()},
+        "parts": report["parts"],
+        "peak_memory_bytes": report["peak_memory_bytes"],
         "out": str(out),
     }
 
@@ -165,5 +179,9 @@ def _print_summary(refined: Refined, out: Path) -> None:
         tests = [refined.first_test, *(done.test for done in accepted)]
         by_round = " -> ".join(f"{scores['psnr']:.2f}" for scores in tests if scores)
         console.print(f"PSNR of the test views by round: {by_round} dB")
-    names = ("scene.ply", "report.html", "report.json")
+    report = _report(out)
+    console.print(fitted_line(report["train"]))
+    console.print(report["limit"]["sentence"])
+    console.print(parts_line(report["parts"]), style="dim")
+    names = ("scene.ply", "report.html", "report.json", "views.png")
     console.print("  ".join(str(out / file) for file in names), style="dim", markup=False)

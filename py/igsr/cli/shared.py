@@ -224,13 +224,31 @@ def score_line(scores: dict[str, Any]) -> str:
     return "   ".join(parts)
 
 
+def fitted_line(train: dict[str, Any]) -> str:
+    """Scores of fitted photos in one line; ``train`` as reports have it."""
+    of = "" if train["views"] == train["of"] else f", {train['views']} of {train['of']}"
+    return f"fitted photos{of}: PSNR {train['psnr']:.2f} dB   SSIM {train['ssim']:.4f}"
+
+
+def parts_line(parts: dict[str, dict[str, Any]]) -> str:
+    """Seconds and peak memory of each part in one line; ``parts`` as reports have them."""
+
+    def written(name: str, part: dict[str, Any]) -> str:
+        peak = part["peak_memory_bytes"]
+        memory = "" if peak is None else f" {peak / 2**30:.1f} GiB"
+        return f"{name} {part['seconds']:.1f} s{memory}"
+
+    return ", ".join(written(name, part) for name, part in parts.items())
+
+
 def protocol_line(protocol: dict[str, Any]) -> str:
     """How views were scored, in one line; ``protocol`` as ``Scores.protocol``."""
     background = tuple(protocol["background"])
     names = {color: name for name, color in NAMED_COLORS.items()}
     behind = names.get(background) or ",".join(f"{channel:g}" for channel in background)
+    some = f" of {protocol['of']}" if "of" in protocol else ""
     return (
-        f"scored on {protocol['views']} {protocol['split']} view"
+        f"scored on {protocol['views']}{some} {protocol['split']} view"
         f"{'' if protocol['views'] == 1 else 's'} over {behind}, {protocol['pixels']}"
     )
 

@@ -184,6 +184,76 @@ def poses_command(
     )  # fmt: skip
 
 
+@app.command("own-photos")
+def own_photos_command(
+    data: Annotated[
+        Path,
+        typer.Argument(metavar="DATA", help="A folder of photos, or a folder of such folders."),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            help="Folder for study.json, study.md, study.png, sheets/, splats/, cameras/, runs/.",
+        ),
+    ],
+    scenes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scene",
+            metavar="NAME",
+            help="A folder of photos in DATA. Repeat it for several. Default: all.",
+        ),
+    ] = None,
+    preset: Annotated[
+        str, typer.Option("--preset", metavar="PRESET", help="Settings of the fits.")
+    ] = "default",
+    compare: Annotated[
+        str | None,
+        typer.Option(
+            "--compare",
+            metavar="PRESET",
+            help="Fit with these settings, too, and tell the differences to them.",
+        ),
+    ] = None,
+    seeds: SeedsOption = None,
+    holdout: Annotated[
+        int | None,
+        typer.Option("--holdout", metavar="N", help="Hold out every Nth photo. Default: 8."),
+    ] = None,
+    steps: StepsOption = None,
+    max_size: Annotated[
+        int | None,
+        typer.Option(
+            "--max-size", metavar="N", help="Longest side of the photos that are fitted, pixels."
+        ),
+    ] = None,
+    score_size: Annotated[
+        int | None,
+        typer.Option(
+            "--score-size",
+            metavar="N",
+            help="Longest side of the scored photos, pixels. Default: --max-size, or 1600.",
+        ),
+    ] = None,
+    known_cameras: Annotated[
+        bool,
+        typer.Option("--known-cameras", help="Use cameras that lie beside the photos."),
+    ] = False,
+    features: FeaturesOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Run folders of plain photos end to end: cameras, fit, held-out scores, seconds and memory."""
+    _run(
+        "own_photos", _own_photos_line, data, out, jobs, None, as_json,
+        scenes=scenes, preset=preset, compare=compare, seeds=seeds, holdout=holdout, steps=steps,
+        max_size=max_size, score_size=score_size, known_cameras=known_cameras, features=features,
+        backend=backend,
+    )  # fmt: skip
+
+
 @app.command("denoiser-table")
 def denoiser_table_command(
     data: DataArgument,
@@ -327,11 +397,14 @@ def _run(
     data: Path,
     out: Path,
     jobs: int,
-    ray: bool,
+    ray: bool | None,
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Run a function of ``igsr.study`` with the options that were given, and print its table."""
+    """Run a function of ``igsr.study`` with the options that were given, and print its table.
+
+    ``ray`` is None for one that measures time and memory, and so stays on this machine.
+    """
     from igsr import study
 
     with error_messages(
@@ -341,10 +414,18 @@ def _run(
         time_left = TimeLeft()
 
         def on_run(done: int, total: int, row: dict[str, Any]) -> None:
-            console.print(f"{done} of {total}: {line(row)}; {time_left(done, total)}")
+            nonlocal time_left
+            text = f"{done} of {total}: {line(row)}"
+            if "failed" in row:  # a scene's cameras, which say nothing of how long fits take
+                time_left = TimeLeft()
+            else:
+                text += f"; {time_left(done, total)}"
+            console.print(text, markup=False)
 
         given = {name: _plain(value) for name, value in options.items() if value is not None}
-        report = getattr(study, name)(data, out, **given, jobs=jobs, on_run=on_run, ray=ray)
+        if ray is not None:
+            given["ray"] = ray
+        report = getattr(study, name)(data, out, **given, jobs=jobs, on_run=on_run)
     if as_json:
         print_json(report)
         return
@@ -364,6 +445,18 @@ def _fit_line(row: dict[str, Any]) -> str:
     return (
         f"{row['scene']} views {row['views']} {row['preset']} seed {row['seed']}: "
         f"{row['psnr']:.2f} dB in {row['seconds']:.0f} s"
+    )
+
+
+def _own_photos_line(row: dict[str, Any]) -> str:
+    if "failed" in row:  # a scene's cameras
+        seconds = sum(part["seconds"] for part in row["parts"].values())
+        what = row["failed"] or f"{row['placed']} of {row['photos']} photos placed"
+        return f"{row['scene']}: {what} in {seconds:.0f} s"
+    seconds = sum(part["seconds"] for part in row["parts"].values())
+    return (
+        f"{row['scene']} {row['preset']} seed {row['seed']}: {row['psnr']:.2f} dB held out, "
+        f"{row['train_psnr']:.2f} dB fitted, {row['splats']} splats in {seconds:.0f} s"
     )
 
 

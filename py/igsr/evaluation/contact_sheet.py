@@ -11,6 +11,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from igsr._internal.atomic_write import atomic_write
+from igsr.evaluation.metrics import flip_map
 from igsr.evaluation.scores import ScoredView
 
 #: Most views on a contact sheet.
@@ -63,6 +64,42 @@ def contact_sheet(views: Sequence[ScoredView]) -> Image.Image:
     )
 
 
+def flip_picture(scored: ScoredView) -> npt.NDArray[np.uint8]:
+    """FLIP error of each pixel in false colour, uint8 [H, W, 3].
+
+    Black is no error, the lightest yellow 1 (matplotlib's "magma", as FLIP's authors show it);
+    pixels outside the mask, which do not count, are grey.
+    """
+    from matplotlib import colormaps
+
+    errors = flip_map(scored.render, scored.photo, scored.mask)
+    picture = np.asarray(colormaps["magma"](np.clip(errors, 0.0, 1.0), bytes=True))[..., :3].copy()
+    if scored.mask is not None:
+        picture[~scored.mask] = 96
+    return picture
+
+
+def flip_sheet(views: Sequence[ScoredView], side: int = PANEL_SIDE) -> Image.Image:
+    """Photo, render and FLIP error of each view side by side, a row for each.
+
+    Args:
+        views: at least one.
+        side: longest side of a picture on the sheet, pixels.
+    """
+    return _sheet(
+        [
+            [
+                (one.photo, one.name),
+                (one.render, f"render  {one.scores['psnr']:.2f} dB"),
+                (flip_picture(one), f"FLIP {one.scores['flip']:.4f}"),
+            ]
+            for one in views
+        ],
+        columns=1,
+        side=side,
+    )
+
+
 def rounds_sheet(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> Image.Image:
     """Photo, render of the first fit and render after the last round, of each view."""
     return _sheet(
@@ -77,13 +114,18 @@ def rounds_sheet(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> I
     )
 
 
-def _sheet(rows_of_panels: Sequence[Sequence[tuple[npt.NDArray[np.uint8], str]]]) -> Image.Image:
+def _sheet(
+    rows_of_panels: Sequence[Sequence[tuple[npt.NDArray[np.uint8], str]]],
+    columns: int | None = None,
+    side: int = PANEL_SIDE,
+) -> Image.Image:
     """Pictures of each view side by side, each under its label."""
     if not rows_of_panels:
         raise ValueError("views: a contact sheet needs at least one")
-    # One column of triples grows too tall to look at from about three views on.
-    columns = 1 if len(rows_of_panels) <= 3 else 2
-    blocks = [_block(panels) for panels in rows_of_panels]
+    if columns is None:
+        # One column of triples grows too tall to look at from about three views on.
+        columns = 1 if len(rows_of_panels) <= 3 else 2
+    blocks = [_block(panels, side) for panels in rows_of_panels]
     column_width = max(block.width for block in blocks)
     rows = [blocks[i : i + columns] for i in range(0, len(blocks), columns)]
     row_heights = [max(block.height for block in row) for row in rows]
@@ -107,10 +149,10 @@ def save_sheet(path: Path, sheet: Image.Image) -> None:
         sheet.save(temporary, format="PNG", optimize=True)
 
 
-def _block(panels: Sequence[tuple[npt.NDArray[np.uint8], str]]) -> Image.Image:
+def _block(panels: Sequence[tuple[npt.NDArray[np.uint8], str]], side: int) -> Image.Image:
     """The pictures of one view, of one size, with a line of text above each."""
     height, width = panels[0][0].shape[:2]
-    shrink = min(1.0, PANEL_SIDE / max(height, width))
+    shrink = min(1.0, side / max(height, width))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     font = ImageFont.load_default(size=14)
     # A thumbnail of 16 pixels still needs room for its label.

@@ -67,7 +67,8 @@ class Protocol(TypedDict, total=False):
 
     ``split`` is "test" or "train", ``views`` their number, ``background`` RGB in [0, 1];
     ``pixels``, ``ssim`` and ``flip`` are in words. Commands add ``holdout``: every
-    ``holdout``-th view is held out for testing.
+    ``holdout``-th view is held out for testing; and ``of``, where the views are evenly spaced ones
+    of as many.
     """
 
     split: str
@@ -77,6 +78,7 @@ class Protocol(TypedDict, total=False):
     ssim: str
     flip: str
     holdout: int | None
+    of: int
 
 
 class Scores(dict[str, Any]):

@@ -13,11 +13,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from igsr._internal.atomic_write import check_folder
+from igsr._internal.part_usage import Parts, Usage
 from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
 from igsr.capture.load import describe_capture, holds_cameras
 from igsr.capture.overview import look_at
-from igsr.capture.photo_folder import FRAMES, VIDEO_SUFFIXES, photo_sizes
+from igsr.capture.photo_folder import FRAMES, VIDEO_SUFFIXES, Photo, photo_sizes
 from igsr.capture.write_colmap import write_colmap
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Progress
@@ -29,6 +30,8 @@ from igsr.pose.registry import ESTIMATORS
 GIVEN = "photos.json"
 #: File in the cache: the cameras, see ``igsr.pose.found_cameras``.
 FOUND = "found.npz"
+#: File in the cache: what finding the cameras took.
+USAGE = "usage.json"
 #: Fewer registered photos than this part of all end a fit that does not allow it.
 ENOUGH = 0.5
 #: Names shown of a long list.
@@ -47,6 +50,7 @@ def kept_capture(
     resume: bool = False,
     allow_missing: bool = False,
     progress: Progress | None = None,
+    parts: Parts | None = None,
     say: Callable[[str], None] = lambda sentence: None,
     warn: Callable[[str], None] = warnings.warn,
 ) -> Capture:
@@ -62,6 +66,8 @@ def kept_capture(
         max_size: longest side in pixels of the capture's photos; None keeps them as they are.
         resume: whether a fit goes on that began with these cameras.
         allow_missing: whether fewer than half of the photos may be registered.
+        parts: count what "cameras" and "load" take, or None. Cameras that were found before count
+            with what they took then.
         say: takes sentences about what is done.
         warn: takes warnings.
 
@@ -74,31 +80,41 @@ def kept_capture(
     kept = kept_cameras(photos, out)
     name = chosen_estimator(estimator, options)
     found = _before(photos, kept, made_by_of(name, seed, frames, options), resume)
+    held: list[Photo] | None = None
+    parts = Parts() if parts is None else parts
     if found is None:
-        found, held = find_cameras(
-            photos,
-            name,
-            seed=seed,
-            frames=frames,
-            max_size=max_size,
-            progress=progress,
-            **options,
-        )
+        with parts.measured("cameras"):
+            found, held = find_cameras(
+                photos,
+                name,
+                seed=seed,
+                frames=frames,
+                max_size=max_size,
+                progress=progress,
+                **options,
+            )
+        usage: Usage | None = parts.used["cameras"]
         for sentence in found.estimate.warnings:
             warn(sentence)
-        _write(kept, photos, found, found.capture(kept, photos_at(photos, frames, max_size, held)))
-        say(
+        said = (
             f"Cameras of {len(found.placed)} of {len(found.names)} photos were found by {name} "
             f"and are kept in {kept}"
         )
-        check_enough_placed(found, options, allow_missing)
     else:
-        say(f"The cameras found before are used, from {kept}; delete it to find them anew")
+        usage = read_usage(kept)
+        if usage is not None:
+            parts.add("cameras", usage)
+        said = f"The cameras found before are used, from {kept}; delete it to find them anew"
         check_enough_placed(found, options, allow_missing)
-        if not _is_at(kept, found, max_size):
-            look_at(photos, frames).check_memory(max_size)
-            _write(kept, photos, found, found.capture(kept, photos_at(photos, frames, max_size)))
-    return load_capture(kept)
+        look_at(photos, frames).check_memory(max_size)
+    with parts.measured("load"):
+        if held is not None or not _is_at(kept, found, max_size):
+            capture = found.capture(kept, photos_at(photos, frames, max_size, held))
+            _write(kept, photos, found, usage, capture)
+            del capture
+        say(said)
+        check_enough_placed(found, options, allow_missing)
+        return load_capture(kept)
 
 
 def check_enough_placed(
@@ -142,13 +158,18 @@ def _before(photos: Path, kept: Path, made_by: dict[str, Any], resume: bool) -> 
     return found if found.made_by == made_by else None
 
 
-def _write(kept: Path, photos: Path, found: FoundCameras, capture: Capture) -> None:
+def _write(
+    kept: Path, photos: Path, found: FoundCameras, usage: Usage | None, capture: Capture
+) -> None:
+    notes: dict[str, str | bytes] = {**photos_note(photos), FOUND: found.to_bytes()}
+    if usage is not None:
+        notes[USAGE] = json.dumps(usage.plain(), indent=2)
     write_colmap(
         capture,
         kept,
         replace=True,
         further_masks={"trusted": found.trusted},
-        notes={**photos_note(photos), FOUND: found.to_bytes()},
+        notes=notes,
     )
 
 
@@ -246,3 +267,16 @@ def _given(kept: Path) -> dict[str, int] | None:
     except (OSError, ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def read_usage(kept: Path) -> Usage | None:
+    """What finding the cameras in the cache took; None where that is not known.
+
+    Args:
+        kept: the cache, or another capture.
+    """
+    try:
+        found = json.loads((kept / USAGE).read_text(encoding="utf-8"))
+        return Usage.of(found)
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return None

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -17,9 +16,13 @@ from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import Backend
 from igsr._internal.json_file import write_json
+from igsr._internal.part_usage import Usage, total
+from igsr.capture import View
 from igsr.capture.write_cameras import write_cameras
-from igsr.evaluation.contact_sheet import rounds_sheet, save_sheet, sheet_names
-from igsr.evaluation.scores import default_background, score_views
+from igsr.evaluation.contact_sheet import contact_sheet, rounds_sheet, save_sheet, sheet_names
+from igsr.evaluation.limits import limit_of
+from igsr.evaluation.quick_scores import mean_of, quick_views, train_photos, train_scores
+from igsr.evaluation.scores import ScoredView, default_background
 from igsr.pose import not_placed
 from igsr.refinement.html_page import write_page
 from igsr.refinement.results import OLD_STAGES, Refined, Round, Stage
@@ -39,7 +42,9 @@ ROUND_FILES = (
 )
 
 
-def write_refinement(out: Path, refined: Refined, settings: RefineSettings) -> None:
+def write_refinement(
+    out: Path, refined: Refined, settings: RefineSettings, parts: Mapping[str, Usage] | None = None
+) -> None:
     """Write a refinement as it stands.
 
     ``scene.ply`` is the last accepted model, ``cameras.json`` has the photos' cameras.
@@ -47,7 +52,11 @@ def write_refinement(out: Path, refined: Refined, settings: RefineSettings) -> N
     ``rounds/N/view-K.{before,after,confidence}.png`` are the novel views that it added: rendered,
     denoised, and their confidence weights, white for 1. Such files of an earlier run that this one
     does not write are removed. ``views.png`` has test views before the first round and after the
-    last accepted one.
+    last accepted one; photos, renders and errors where no round was accepted. Where there are no
+    test views, it has photos that were fitted.
+
+    What limits the scene, and the scores of fitted photos that say so, are found once the
+    refinement has ended.
 
     Raises:
         IgsrError: a file cannot be written.
@@ -62,14 +71,33 @@ def write_refinement(out: Path, refined: Refined, settings: RefineSettings) -> N
     _remove_others(out / "rounds", set(written))
     refined.splats.save(out / "scene.ply")
     write_cameras(out / "cameras.json", refined.capture.train_views)
-    report = report_of(refined, settings)
+    train, shown = _scored(refined, settings.backend)
+    report = report_of(refined, settings, parts, train)
     write_json(out / "report.json", report)
-    _write_views(out / "views.png", refined, settings.backend)
-    write_page(out / "report.html", refined, report)
+    _write_views(out / "views.png", refined, shown, settings.backend)
+    write_page(out / "report.html", refined, report, shown)
 
 
-def report_of(refined: Refined, settings: RefineSettings) -> dict[str, Any]:
-    """What ``report.json`` holds."""
+def report_of(
+    refined: Refined,
+    settings: RefineSettings,
+    parts: Mapping[str, Usage] | None = None,
+    train: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What ``report.json`` holds.
+
+    Args:
+        refined: the refinement.
+        settings: of it.
+        parts: what each stage took.
+        train: "psnr", "ssim", "views" and "of" of fitted photos, once they are scored.
+    """
+    accepted = [done.test for done in refined.rounds if done.accepted]
+    test = [refined.first_test, *accepted][-1]
+    limit = None
+    if train is not None:
+        limit = limit_of(train["psnr"], None if test is None else test["psnr"]).plain()
+    used = {} if parts is None else {name: usage.plain() for name, usage in parts.items()}
     first = {"splats": len(refined.first), "test": refined.first_test}
     return {
         "format": FORMAT,
@@ -78,7 +106,11 @@ def report_of(refined: Refined, settings: RefineSettings) -> dict[str, Any]:
         "stopped": "" if refined.stop is None else str(refined.stop),
         "rejected": _view_rows(refined.rejected),
         "seconds": {stage: round(seconds, 2) for stage, seconds in refined.seconds.items()},
-        "peak_memory_bytes": _peak_memory(),
+        "parts": used,
+        "peak_memory_bytes": total(used).peak_memory_bytes,
+        "test": test,
+        "train": train,
+        "limit": limit,
         "photos": [view.name for view in refined.capture.train_views],
         "not_registered": not_placed(refined.capture),
         "splats": len(refined.splats),
@@ -105,6 +137,17 @@ def seconds_so_far(out: Path) -> dict[Stage, float]:
     return {stage: value for stage, value in seconds.items() if 0.0 <= value < math.inf}
 
 
+def parts_so_far(out: Path) -> dict[str, Usage]:
+    """What each stage took by the report in ``out``; of older reports its seconds alone."""
+    seconds = seconds_so_far(out)
+    try:
+        found = json.loads((out / "report.json").read_text(encoding="utf-8"))["parts"]
+        parts = {stage: Usage.of(found[stage]) for stage in seconds if stage in found}
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        parts = {}
+    return {stage: parts.get(stage, Usage(value, 0.0, None)) for stage, value in seconds.items()}
+
+
 def _round_row(done: Round) -> dict[str, Any]:
     return {
         "splats": None if done.splats is None else len(done.splats),
@@ -129,19 +172,38 @@ def _view_rows(views: Sequence[Candidate | Rejected]) -> list[dict[str, Any]]:
     ]
 
 
-def _write_views(path: Path, refined: Refined, backend: Backend) -> None:
-    """Test views before the first round and after the last that was accepted."""
-    shown = sheet_names([view.name for view in refined.capture.test_views])
-    views = [view for view in refined.capture.test_views if view.name in shown]
-    if not views or not any(done.accepted for done in refined.rounds):
-        path.unlink(missing_ok=True)
+def _scored(refined: Refined, backend: Backend) -> tuple[dict[str, Any] | None, list[ScoredView]]:
+    """Scores of fitted photos, once the refinement has ended, and the views that are shown."""
+    capture = refined.capture
+    background = default_background(capture)
+
+    def quick(views: Sequence[View]) -> list[ScoredView]:
+        return list(quick_views(refined.splats, views, background, backend))
+
+    if capture.test_views:
+        names = sheet_names([view.name for view in capture.test_views])
+        shown = quick([view for view in capture.test_views if view.name in names])
+        if refined.stop is None:
+            return None, shown
+        return train_scores(refined.splats, capture, background, backend), shown
+    fitted = quick(train_photos(capture))
+    names = sheet_names([one.name for one in fitted])
+    shown = [one for one in fitted if one.name in names]
+    if refined.stop is None:
+        return None, shown
+    return mean_of(fitted, len(capture.train_views)), shown
+
+
+def _write_views(path: Path, refined: Refined, shown: list[ScoredView], backend: Backend) -> None:
+    """Views before the first round and after the last that was accepted, or with their errors."""
+    if not any(done.accepted for done in refined.rounds):
+        save_sheet(path, contact_sheet(shown))
         return
-    background = default_background(refined.capture)
-    before, after = (
-        list(score_views(splats, views, background, backend))
-        for splats in (refined.first, refined.splats)
-    )
-    save_sheet(path, rounds_sheet(before, after))
+    names = {one.name for one in shown}
+    capture = refined.capture
+    views = [v for v in capture.test_views or capture.train_views if v.name in names]
+    before = quick_views(refined.first, views, default_background(capture), backend)
+    save_sheet(path, rounds_sheet(list(before), shown))
 
 
 def _save(splats: Splats, path: Path) -> Path:
@@ -172,13 +234,3 @@ def _remove_others(rounds: Path, written: set[Path]) -> None:
     for folder in rounds.glob("[0-9]*"):
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
-
-
-def _peak_memory() -> int | None:
-    """Most bytes that this process has had in memory; None where the system does not say."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else 1024 * most

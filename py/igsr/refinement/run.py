@@ -13,13 +13,15 @@ from pathlib import Path
 
 from igsr._internal.atomic_write import remove_unfinished
 from igsr._internal.deprecation import RenamedKeys
+from igsr._internal.part_usage import Meter, Parts
 from igsr._internal.progress_bar import BarState
 from igsr.capture import Capture, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import FRAMES
 from igsr.errors import IgsrError
 from igsr.pose import check_enough_placed, find_cameras, kept_capture, photos_at
-from igsr.refinement.report import seconds_so_far, write_refinement
+from igsr.pose.cache import read_usage
+from igsr.refinement.report import parts_so_far, write_refinement
 from igsr.refinement.results import OLD_STAGES, Refined, RefineProgress, Stage
 from igsr.refinement.settings import RefineSettings
 
@@ -69,8 +71,8 @@ class RefineRun:
         self.round = 0
         self._settings, self._resume, self._progress = settings, resume, progress
         self._out = None if out is None else Path(out)
-        self._started = self._last = time.monotonic()
-        self._seconds: dict[Stage, float] = {}
+        self._started, self._meter = time.monotonic(), Meter()
+        self._parts = Parts()
         # In units of a fit to all photos.
         self._work, self._work_done = 1.0, 0.0
         # A resumed run that has done nothing new leaves the files as they are.
@@ -123,14 +125,14 @@ class RefineRun:
         Args:
             work: all that there may be to do, in units of a fit to all photos.
         """
-        self._work, self._last = work, time.monotonic()
-        self._seconds = {}
+        self._work, self._parts = work, Parts()
+        self._meter.lap()
         if self._out is None:
             return
         for folder in (self._out, self._checkpoints, *self._out.glob("rounds/[0-9]*")):
             remove_unfinished(folder)
         if self._resume:
-            self._seconds = seconds_so_far(self._out)
+            self._parts.used = parts_so_far(self._out)
         else:
             self._remove_checkpoints()
 
@@ -172,9 +174,12 @@ class RefineRun:
         Raises:
             IgsrError: a file cannot be written.
         """
-        refined = replace(refined, seconds=RenamedKeys(dict(self._seconds.items()), OLD_STAGES))
+        seconds = {name: usage.seconds for name, usage in self._parts.used.items()}
+        refined = replace(refined, seconds=RenamedKeys(seconds, OLD_STAGES))
         if self._out is not None and (self._has_news or refined.stop is not None):
-            write_refinement(self._out, refined, self._settings)
+            cameras = read_usage(refined.capture.path)
+            parts = {} if cameras is None else {"cameras": cameras}
+            write_refinement(self._out, refined, self._settings, parts | self._parts.used)
         return refined
 
     @property
@@ -183,14 +188,12 @@ class RefineRun:
         return self._out / "checkpoints"
 
     def _goes_on(self, stage: Stage, part: float) -> bool:
-        now = time.monotonic()
         if stage != "pose":
-            self._seconds[stage] = self._seconds.get(stage, 0.0) + now - self._last
-        self._last = now
+            self._parts.add(stage, self._meter.lap())
         if self._progress is None:
             return True
         done = min(1.0, (self._work_done + part) / self._work)
-        seconds = now - self._started
+        seconds = time.monotonic() - self._started
         return self._progress(RefineProgress(self.round, stage, done, seconds)) is not False
 
     def _remove_checkpoints(self) -> None:

@@ -57,6 +57,9 @@ pub struct FitConfig {
     pub hull: bool,
     /// How cameras are fitted, or None: they are taken as exact.
     pub cameras: Option<CameraConfig>,
+    /// Whether the first steps are on photos of a fraction of their size; see
+    /// [`FitConfig::reduction`].
+    pub coarse_to_fine: bool,
     /// What the centres' rate has decayed to at the end, as a part of the start's.
     pub means_decay: f32,
 }
@@ -84,12 +87,37 @@ impl Default for FitConfig {
             dropout: 0.0,
             hull: false,
             cameras: None,
+            coarse_to_fine: false,
             means_decay: 0.01,
         }
     }
 }
 
+/// Longest side in pixels that reduced photos have at least: smaller ones show too little.
+const COARSE_SIDE: u32 = 96;
+/// Photos are halved at most so often.
+const MOST_HALVINGS: u32 = 3;
+/// Part of the steps after which photos have their whole size.
+const COARSE_UNTIL: f64 = 0.6;
+
 impl FitConfig {
+    /// What both sides of photos are divided by in a step, from 0: a power of two, and 1 in the last
+    /// two fifths of the steps. Each size has as many steps as the next.
+    ///
+    /// A step costs what its pixels and splats cost, and while there are few splats, they show no
+    /// detail of the photos (Chen et al., "DashGaussian", 2025, section 3.2).
+    ///
+    /// `longest` is the longest side of all photos, in pixels.
+    pub fn reduction(&self, step: u32, longest: u32) -> u32 {
+        let halvings = (longest / COARSE_SIDE).checked_ilog2().unwrap_or(0).min(MOST_HALVINGS);
+        let progress = f64::from(step) / f64::from(self.steps);
+        if !self.coarse_to_fine || progress >= COARSE_UNTIL {
+            return 1;
+        }
+        let done = (progress / COARSE_UNTIL * f64::from(halvings)) as u32;
+        1 << halvings.saturating_sub(done)
+    }
+
     /// Checks every setting.
     pub fn validate(&self) -> Result<()> {
         if self.steps == 0 {

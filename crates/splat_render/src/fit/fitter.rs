@@ -8,6 +8,7 @@ use std::iter::repeat_n;
 use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
+use rayon::prelude::*;
 
 use super::cameras::{CameraState, Cameras, PosePrior, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
@@ -23,6 +24,8 @@ use crate::target::Target;
 const REFINE: (u32, u32) = (300, 100);
 /// Part of all steps after which it runs no more (MCMC; original).
 const REFINE_STOP: (f64, f64) = (0.85, 0.5);
+/// Part of all steps after which MCMC has as many splats as there may be.
+const MCMC_GROWN: f64 = 0.5;
 /// Steps between two opacity resets of the original control.
 const RESET_EVERY: u32 = 3000;
 /// MCMC's pull on opacities and scales and its noise in units of the centres' rate (the paper's).
@@ -41,6 +44,11 @@ enum Draw {
 pub struct Fitter {
     device: Box<dyn FitDevice>,
     config: FitConfig,
+    /// The photos at their whole size, until the device has them; what they are divided by there; and
+    /// their longest side.
+    photos: Vec<Target>,
+    reduction: u32,
+    longest: u32,
     cameras: Vec<Camera>,
     /// The cameras, where they are fitted; `cameras` follows them.
     moving: Option<Cameras>,
@@ -122,7 +130,7 @@ impl Fitter {
         }
         let schedule = targets.iter().map(|target| (target.turns, target.until)).collect();
         let hull = config.hull.then(|| Hull::new(&targets));
-        device.set_targets(targets)?;
+        let longest = targets.iter().map(|t| t.width.max(t.height)).max().unwrap_or(1);
         let splats = state.splats.len();
         let moving = config.cameras.map(|moving| {
             let means = &state.splats.means;
@@ -130,8 +138,11 @@ impl Fitter {
             Cameras::new(&cameras, distances, moving)
         });
         device.upload(state)?;
-        Ok(Self {
+        let mut fitter = Self {
             device,
+            photos: targets,
+            reduction: 0,
+            longest,
             extent: scene_extent(&cameras) as f32,
             moving,
             config,
@@ -145,7 +156,55 @@ impl Fitter {
             rounds_from: 0,
             splats,
             step,
+        };
+        fitter.set_reduction()?;
+        Ok(fitter)
+    }
+
+    /// Gives the device the photos at the size of the next step.
+    fn set_reduction(&mut self) -> Result<()> {
+        let reduction = self.config.reduction(self.step, self.longest);
+        // A photo that is narrower would have no pixel left.
+        let least = self.cameras.iter().map(|c| c.width.min(c.height)).min().unwrap_or(1);
+        let reduction = reduction.min(1 << least.checked_ilog2().unwrap_or(0));
+        if reduction == self.reduction {
+            return Ok(());
+        }
+        self.collect_gradients()?;
+        self.reduction = reduction;
+        self.device.set_targets(if reduction == 1 {
+            std::mem::take(&mut self.photos)
+        } else {
+            self.photos.par_iter().map(|photo| photo.reduced(reduction)).collect()
         })
+    }
+
+    /// Adds the gradients of the cameras of all steps until now.
+    fn collect_gradients(&mut self) -> Result<()> {
+        let Some(cameras) = self.moving.as_mut() else { return Ok(()) };
+        let mut gradients = self.device.camera_gradients()?;
+        for gradient in &mut gradients {
+            // Of pixels of the whole size.
+            gradient.v_intrinsics =
+                gradient.v_intrinsics.map(|v| v / f64::from(self.reduction.max(1)));
+        }
+        cameras.add(&gradients);
+        Ok(())
+    }
+
+    /// A photo's camera at the size of this step.
+    fn camera(&self, view: usize) -> Camera {
+        let (camera, by) = (self.cameras[view], self.reduction);
+        let scale = f64::from(by);
+        Camera {
+            fx: camera.fx / scale,
+            fy: camera.fy / scale,
+            cx: camera.cx / scale,
+            cy: camera.cy / scale,
+            width: camera.width / by,
+            height: camera.height / by,
+            ..camera
+        }
     }
 
     fn rng(&self, draw: Draw, number: u64) -> Pcg64 {
@@ -179,11 +238,8 @@ impl Fitter {
 
     /// What [`Fitter::resume_cameras`] needs, where cameras are fitted.
     pub fn camera_state(&mut self) -> Result<Option<CameraState>> {
-        let gradients = self.device.camera_gradients()?;
-        Ok(self.moving.as_mut().map(|cameras| {
-            cameras.add(&gradients);
-            cameras.state()
-        }))
+        self.collect_gradients()?;
+        Ok(self.moving.as_ref().map(Cameras::state))
     }
 
     /// [`Fitter::set_pose_priors`] under its first name.
@@ -236,6 +292,7 @@ impl Fitter {
 
     /// One step, density control included where it is due.
     pub fn step(&mut self) -> Result<()> {
+        self.set_reduction()?;
         let step = self.step;
         let view = self.view(step);
         let config = &self.config;
@@ -254,7 +311,7 @@ impl Fitter {
         let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();
         let input = StepInput {
             view,
-            camera: self.cameras[view],
+            camera: self.camera(view),
             background,
             sh_degree: if config.rates == Rates::ZERO {
                 config.sh_degree
@@ -279,11 +336,15 @@ impl Fitter {
 
     /// At the end of a round, when each camera has its gradient.
     fn move_cameras(&mut self, progress: f64) -> Result<()> {
-        let Some(cameras) = self.moving.as_mut().filter(|cameras| cameras.moving(progress)) else {
+        if !self.moving.as_ref().is_some_and(|cameras| cameras.moving(progress)) {
             return Ok(());
-        };
+        }
         if (self.step - self.rounds_from).is_multiple_of(self.round.len() as u32) {
-            cameras.add(&self.device.camera_gradients()?);
+            self.collect_gradients()?;
+        }
+        if let Some(cameras) = self.moving.as_mut()
+            && (self.step - self.rounds_from).is_multiple_of(self.round.len() as u32)
+        {
             cameras.step(progress);
             self.cameras = cameras.now().to_vec();
         }
@@ -319,7 +380,9 @@ impl Fitter {
                 }
             }
             if refine && config.density == DensityControl::Mcmc {
-                density::mcmc(state, config.max_splats, &mut rng);
+                let until = (MCMC_GROWN * f64::from(config.steps)) as u32;
+                let left = if step > until { 0 } else { (until - step) / every + 1 };
+                density::mcmc(state, config.max_splats, left, &mut rng);
             } else if refine {
                 let huge = step > RESET_EVERY;
                 density::original(state, config.max_splats, extent, huge, &mut rng);

@@ -7,11 +7,13 @@ mod density;
 mod fitter;
 mod hull;
 mod initial;
+mod plane_sweep;
 
 pub use cameras::{CameraConfig, CameraState, Cameras, Focal, PosePrior, scene_distance};
 pub use config::{Background, DensityControl, FitConfig};
 pub use fitter::{Fitter, scene_extent};
 pub use initial::splats_from_points;
+pub use plane_sweep::{DepthMap, GreyPhoto, Sweep, plane_sweep};
 
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
 pub use crate::fit_device::{

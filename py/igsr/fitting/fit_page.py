@@ -1,0 +1,96 @@
+"""``report.html`` of a fit: one page, with everything inside.
+
+The page itself is ``templates/fit.html.jinja``; this module says what is put into it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from igsr.capture import Capture
+from igsr.evaluation.report_page import (
+    ADDED,
+    PHOTO,
+    beside,
+    drawn_cameras,
+    number,
+    part_rows,
+    write_template,
+)
+from igsr.evaluation.scores import ScoredView
+
+#: Parts as the page calls them.
+PARTS = {
+    "cameras": "find cameras",
+    "load": "load photos",
+    "fit": "fit",
+    "score": "score",
+}
+
+
+def write_fit_page(
+    path: Path, report: dict[str, Any], capture: Capture, shown: Sequence[ScoredView]
+) -> None:
+    """Write the page, whole or not at all; it needs nothing but a browser.
+
+    Args:
+        path: where to.
+        report: of ``report.json``.
+        capture: the photos, with cameras.
+        shown: views that are shown beside their renders.
+
+    Raises:
+        IgsrError: the file cannot be written.
+    """
+    train = [view.camera for view in capture.train_views]
+    test = [view.camera for view in capture.test_views]
+    held_out = report["protocol"]["split"] == "test"
+    variables = {
+        "name": _title(report["capture"]),
+        "photos": report["photos"],
+        "splats": report["splats"],
+        "seconds": report["seconds"],
+        "start": report["start"],
+        "start_splats": report["start_splats"],
+        "limit": report["limit"]["sentence"],
+        "score_rows": _score_rows(report),
+        "beside_text": "Held-out photos." if held_out else "Fitted photos; none is held out.",
+        "beside_views": beside(shown),
+        "cameras": drawn_cameras([(PHOTO, train), (ADDED, test)], train),
+        "not_registered": report["photos"]["not_placed"],
+        "parts": part_rows(report["parts"], PARTS),
+        "peak_memory": report["peak_memory_bytes"],
+        "version": report["version"],
+        "backend": f"{report['backend']} ({report['instruction_set']})",
+        "seed": report["seed"],
+        "settings": report["settings"],
+    }
+    write_template(path, Path(__file__).with_name("templates"), "fit.html.jinja", variables)
+
+
+def _title(capture: str) -> str:
+    return Path(capture).resolve().name or "photos"
+
+
+def _score_rows(report: dict[str, Any]) -> list[dict[str, str]]:
+    rows = []
+    if report["protocol"]["split"] == "test":
+        rows.append(_row(f"{report['protocol']['views']} held out", report))
+        if "refined" in report:
+            rows.append(_row("the same with refined cameras", report["refined"]))
+        train: dict[str, Any] = report["train"]
+    else:
+        train = {**report, **report["train"]}
+    views, of = report["train"]["views"], report["train"]["of"]
+    label = f"{views} fitted" if views == of else f"{views} of {of} fitted"
+    return [*rows, _row(label, train)]
+
+
+def _row(label: str, scores: dict[str, Any]) -> dict[str, str]:
+    digits = {"psnr": 2, "ssim": 4, "ms_ssim": 4, "flip": 4}
+    return {
+        "label": label,
+        **{name: number(scores.get(name), places) for name, places in digits.items()},
+    }

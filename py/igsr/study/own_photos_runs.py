@@ -1,0 +1,226 @@
+"""What ``own_photos`` runs, each in a process of its own: cameras of a scene; one fit, scored."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from igsr import pose
+from igsr._internal.atomic_write import atomic_folder
+from igsr._internal.choices import FitBackend
+from igsr._internal.part_usage import Parts
+from igsr.capture import Camera, Capture, View, load_capture
+from igsr.capture.downscaling import resized_camera
+from igsr.capture.photo_folder import FRAMES
+from igsr.capture.write_colmap import write_colmap
+from igsr.denoiser.training.perceptual_distance import (
+    SMALLEST_SIDE,
+    SqueezeNetDistance,
+    picture_distance,
+)
+from igsr.errors import IgsrError
+from igsr.evaluation.contact_sheet import flip_sheet, save_sheet, sheet_names
+from igsr.evaluation.limits import limit_of
+from igsr.evaluation.quick_scores import psnr_and_ssim, train_photos
+from igsr.evaluation.scores import METRICS, ScoredView, default_background, score_views
+from igsr.fitting.fit_capture import fit_with_cameras
+from igsr.fitting.pose_refinement import refine_cameras
+from igsr.fitting.presets import Preset
+from igsr.geometry.similarity import similarity_between
+from igsr.splats import Splats
+
+#: Pictures on a sheet have at most so many pixels on their longest side: fog must be seen.
+SHEET_SIDE = 640
+#: File beside a scene's cameras; one that says which scene it was.
+SCENE_NOTE = "scene.txt"
+
+
+@dataclass(frozen=True)
+class CameraRun:
+    """The cameras of one scene.
+
+    Attributes:
+        scene: folder of photos in the data.
+        out: folder for the capture: photos, cameras and points.
+        estimator: a name of ``igsr.pose.registry``, or "auto".
+    """
+
+    scene: str
+    out: str
+    estimator: str
+
+
+@dataclass(frozen=True)
+class OwnFit:
+    """One fit of a scene; everything that its scores depend on.
+
+    Attributes:
+        scene: folder of photos in the data.
+        preset: a name of ``igsr.fitting.presets``.
+        seed: of the fit.
+        backend: what fits and renders.
+        holdout: every so many photos one is held out.
+        steps: of the fit; None is the preset's number.
+        max_size: longest side of the photos that are fitted, pixels; None leaves it as it is.
+        score_size: longest side of the photos that are scored, pixels.
+        features: SqueezeNet's arrays, for "perceptual"; None leaves that out.
+        capture: folder of the found cameras; None where the scene's own are used.
+        splats: file that the splats are written to.
+        sheet: file for the sheet of pictures, or None.
+    """
+
+    scene: str
+    preset: Preset
+    seed: int
+    backend: FitBackend
+    holdout: int
+    steps: int | None
+    max_size: int | None
+    score_size: int
+    features: str | None
+    capture: str | None
+    splats: str
+    sheet: str | None
+
+
+def find_cameras(data: str, one: CameraRun) -> dict[str, Any]:
+    """Find a scene's cameras and write the capture; for a process of its own.
+
+    A scene whose cameras cannot be found has the row's "failed" say why.
+    """
+    parts = Parts()
+    folder = Path(data) / one.scene
+    row: dict[str, Any] = {"scene": one.scene, "failed": None}
+    try:
+        with parts.measured("cameras"), _warnings() as said:
+            found, held = pose.find_cameras(folder, one.estimator)
+            row["photos"], row["estimator"] = len(found.names), found.made_by["estimator"]
+            capture = found.capture(folder, pose.photos_at(folder, FRAMES, None, held))
+            write_colmap(capture, one.out, replace=True, notes={SCENE_NOTE: f"{one.scene}\n"})
+    except IgsrError as error:
+        # The note stays, so that it is not tried again.
+        with atomic_folder(one.out, replace=True) as new:
+            (new / SCENE_NOTE).write_text(f"{one.scene}\n", encoding="utf-8")
+        return {**row, "failed": str(error), "parts": parts.plain()}
+    row["placed"] = len(capture.views)
+    row["not_placed"] = found.not_placed
+    row["points"] = 0 if capture.points is None else len(capture.points.xyz)
+    row["warnings"] = [*said, *found.estimate.warnings]
+    return {**row, "parts": parts.plain()}
+
+
+def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
+    """Load, fit and score as ``igsr fit`` does; for a process of its own.
+
+    Photos are scored at ``score_size``, whatever size was fitted: held-out photos with the cameras
+    that they were given, and ("psnr_refined") with cameras aligned to the fitted ones, where those
+    moved, and then fitted each to its photo; fitted photos with the cameras that the fit ended
+    with.
+    """
+    parts = Parts()
+    with parts.measured("decode"):
+        capture = _loaded(data, one, one.max_size)
+    background = default_background(capture)
+    with parts.measured("fit"):
+        splats, moved = fit_with_cameras(
+            capture, preset=one.preset, seed=one.seed, steps=one.steps, backend=one.backend
+        )
+        splats.save(one.splats)
+    row: dict[str, Any] = {
+        "scene": one.scene,
+        "preset": one.preset,
+        "seed": one.seed,
+        "backend": one.backend,
+        "train_photos": len(capture.train_views),
+        "splats": len(splats),
+        "fit_size": _largest(capture.views),
+    }
+    was, are = ([view.camera for view in of.train_views] for of in (capture, moved))
+    cameras = {view.name: view.camera for view in moved.train_views}
+    del capture, moved
+    with parts.measured("score"):
+        scored = _loaded(data, one, one.score_size)
+        test, train = scored.test_views, train_photos(scored)
+        del scored
+        row["score_size"] = _largest(test)
+        row |= _held_out_scores(splats, test, background, one)
+        if was != are:
+            train = [_with_camera(view, cameras[view.name]) for view in train]
+            to_fitted = similarity_between(was, are)
+            test = [replace(view, camera=to_fitted.camera(view.camera)) for view in test]
+        refined = refine_cameras(splats, test, background, backend=one.backend)
+        again = psnr_and_ssim(splats, refined, background, one.backend)
+        for view, (psnr, ssim) in zip(row["views"], again, strict=True):
+            view |= {"psnr_refined": psnr, "ssim_refined": ssim}
+        of_train = psnr_and_ssim(splats, train, background, one.backend)
+        row["psnr_refined"], row["ssim_refined"] = _means(again)
+        row["train_psnr"], row["train_ssim"] = _means(of_train)
+    row["limit"] = limit_of(row["train_psnr"], row["psnr"], row["psnr_refined"]).plain()
+    return {**row, "parts": parts.plain()}
+
+
+def _loaded(data: str, one: OwnFit, max_size: int | None) -> Capture:
+    capture = load_capture(Path(data) / one.scene if one.capture is None else one.capture, max_size)
+    own_split = one.capture is None and bool(capture.test_views)
+    return capture if own_split else capture.with_holdout(one.holdout)
+
+
+def _held_out_scores(
+    splats: Splats, views: list[View], background: tuple[float, float, float], one: OwnFit
+) -> dict[str, Any]:
+    """Mean scores and "views", the scores of each; writes the sheet."""
+    shown = sheet_names([view.name for view in views]) if one.sheet is not None else set()
+    distance = None if one.features is None else SqueezeNetDistance(one.features)
+    pictures: list[ScoredView] = []
+    rows: list[dict[str, Any]] = []
+    for scored in score_views(splats, views, background, one.backend):
+        scores = dict(scored.scores)
+        if distance is not None and min(scored.photo.shape[:2]) >= SMALLEST_SIDE:
+            shown_pixels = True if scored.mask is None else scored.mask[..., None]
+            scores["perceptual"] = picture_distance(
+                distance,
+                np.where(shown_pixels, scored.render, np.uint8(0)),
+                np.where(shown_pixels, scored.photo, np.uint8(0)),
+            )
+        rows.append({"name": scored.name, **scores})
+        if scored.name in shown:
+            pictures.append(scored)
+    if one.sheet is not None:
+        save_sheet(Path(one.sheet), flip_sheet(pictures, SHEET_SIDE))
+    means: dict[str, Any] = {}
+    for name in (*METRICS, "perceptual"):
+        known = [row[name] for row in rows if row.get(name) is not None]
+        means[name] = float(np.mean(known)) if known else None
+    return {**means, "views": rows}
+
+
+def _means(pairs: list[tuple[float, float]]) -> tuple[float, float]:
+    first, second = np.mean(pairs, axis=0)
+    return float(first), float(second)
+
+
+def _largest(views: list[View]) -> list[int]:
+    """Width and height of the view with the most pixels."""
+    camera = max((view.camera for view in views), key=lambda one: one.width * one.height)
+    return [camera.width, camera.height]
+
+
+def _with_camera(view: View, camera: Camera) -> View:
+    """The view with a camera of its photo at another size."""
+    return replace(view, camera=resized_camera(camera, view.camera.width, view.camera.height))
+
+
+@contextlib.contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """Collect the texts of warnings."""
+    texts: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield texts
+        texts += [str(one.message) for one in caught if issubclass(one.category, UserWarning)]
