@@ -203,6 +203,34 @@ def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict
     opacities (logits of 0.1) and sh, as ``SplatArrays`` has them.
     """
 
+def reduction(steps: int, coarse_to_fine: bool, step: int, longest: int) -> int:
+    """What both sides of photos are divided by in a step, from 0, of a fit from coarse to fine.
+
+    ``longest`` is the longest side of all photos, in pixels.
+    """
+
+def plane_sweep(
+    greys: list[Float32],
+    usable: list[npt.NDArray[np.uint8] | None],
+    viewmats: Float64,
+    intrinsics: Float64,
+    sweeps: Sequence[tuple[int, Sequence[int], tuple[float, float], int]],
+) -> list[dict[str, Float32]]:
+    """Depth maps by plane sweep, scored by the correlation of 7 x 7 patches.
+
+    Args:
+        greys: grey in 0..1 of V photos, [H, W] each.
+        usable: which of their pixels count, [H, W], not 0 where they do; or None for all.
+        viewmats: [V, 4, 4], world-to-camera.
+        intrinsics: [V, 4], fx, fy, cx, cy in pixels.
+        sweeps: (index of the photo, indices of those compared with, inverse depths of the first
+            and the last plane, number of planes), one for each map.
+
+    Returns:
+        For each sweep "inverse_depth" [H, W] and "score" [H, W], the correlation in -1..1: the mean
+        of the two photos that agree best, -1 where none sees the place.
+    """
+
 class Fitter:
     """A fit in progress; parameters and optimiser state stay on the device that computes."""
 
@@ -232,7 +260,8 @@ class Fitter:
             state: the initialization (``SplatArrays`` without origin), or what ``state()``
                 returned.
             config: steps, first_step (where in the schedule the fit begins), seed, sh_degree,
-                max_splats, density ("mcmc", "original", "fixed"), dropout, hull, background; poses
+                max_splats, density ("mcmc", "original", "fixed"), dropout, hull, background,
+                coarse_to_fine (the first steps are on photos of a fraction of their size); poses
                 ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate (pixels per
                 step), camera_decay, camera_warm_up (fraction of the steps), frozen (splats are not
                 changed). An absent or None entry takes the default.

@@ -6,6 +6,13 @@ use splat_render::fit::{Background, CameraConfig, DensityControl, FitConfig, Foc
 
 use crate::arguments::{choice, setting};
 
+/// What both sides of photos are divided by in a step; see [`FitConfig::reduction`].
+#[pyfunction]
+pub fn reduction(steps: u32, coarse_to_fine: bool, step: u32, longest: u32) -> u32 {
+    FitConfig { steps: steps.max(1), coarse_to_fine, ..FitConfig::default() }
+        .reduction(step, longest)
+}
+
 /// The settings of a fit; what is absent or None takes the default.
 pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
     let default = FitConfig::default();

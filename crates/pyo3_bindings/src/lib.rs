@@ -49,6 +49,8 @@ mod _core {
     #[pymodule_export]
     use crate::exr_files::write_exr;
     #[pymodule_export]
+    use crate::fit_settings::reduction;
+    #[pymodule_export]
     use crate::fitter::{Fitter, splats_from_points};
     #[pymodule_export]
     use crate::plane_sweep::plane_sweep;

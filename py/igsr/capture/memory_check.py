@@ -18,9 +18,11 @@ from igsr.errors import IgsrError
 DECODED = 18
 #: Bytes of a pixel of the largest photo while it is undistorted: the map, and the padded photo.
 UNDISTORTED = 24
-#: Bytes of a pixel of the largest photo while it is scored, which takes most: planes of float64 for
-#: SSIM, and the colors and edges that FLIP compares. A fit's step takes 110.
-RENDERED = 780
+#: Bytes of a pixel of the largest photo while it is fitted: render, photo, loss and gradients.
+FITTED = 110
+#: Bytes of a pixel of the largest photo while it is scored: planes of float64 for SSIM, and the
+#: colors and edges that FLIP compares.
+SCORED = 740
 #: Bytes of a splat at degree 3: parameters, two moments, gradients and statistics, its entries in
 #: tiles (1850 together), and the copies that checkpoints and results are.
 OF_A_SPLAT = 3500
@@ -80,8 +82,9 @@ def needed_memory(
     if splats is None:
         return loading
     copied = pixels * (channels + 4 * masked)  # a mask becomes float32 weights
-    fitting = held + copied + RENDERED * largest + OF_A_SPLAT * splats
-    return LIBRARIES + max(loading, fitting)
+    fitting = held + copied + FITTED * largest + OF_A_SPLAT * splats
+    scoring = held + SCORED * largest
+    return LIBRARIES + max(loading, fitting, scoring)
 
 
 def largest_size_that_fits(
@@ -140,7 +143,7 @@ def check_memory(
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     count = f"{len(sizes)} photos" if len(sizes) > 1 else "photo"
     up_to = "" if len(set(sizes)) == 1 else "up to "
-    at = "" if max_size is None else f" at --max-size {max_size}"
+    at = "" if max_size is None or max_size >= max(width, height) else f" at --max-size {max_size}"
     says = (
         f"The {count} of {up_to}{width}x{height}{at} would need {_gigabytes(needed_at(max_size))} "
         f"and {_gigabytes(available)} are free"

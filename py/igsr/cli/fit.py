@@ -28,10 +28,12 @@ from igsr.cli.shared import (
     CaptureArgument,
     FitBackendChoice,
     FitBackendOption,
+    FitSizeOption,
     HoldoutOption,
     JsonOption,
-    MaxSizeOption,
     PresetChoice,
+    QualityChoice,
+    QualityOption,
     background_color,
     fitted_line,
     output_console,
@@ -43,13 +45,15 @@ from igsr.cli.shared import (
     scored,
 )
 from igsr.errors import IgsrError
-from igsr.fitting.presets import settings_for
+from igsr.fitting.photo_support import support_of
+from igsr.fitting.presets import default_max_size, settings_for
 from igsr.fitting.settings import FitSettings
 from igsr.pose import AUTO, not_placed
 
 # What computes takes long to import: the help of the command does without.
 if TYPE_CHECKING:
     from igsr.capture import Capture
+    from igsr.capture.overview import Overview
     from igsr.fitting import Progress
     from igsr.fitting.fit_report import FitScores
     from igsr.splats import Splats
@@ -65,7 +69,8 @@ def fit_command(
     ],
     *,
     holdout: HoldoutOption = None,
-    max_size: MaxSizeOption = None,
+    max_size: FitSizeOption = None,
+    quality: QualityOption = QualityChoice.normal,
     preset: Annotated[
         PresetChoice,
         typer.Option(
@@ -111,6 +116,23 @@ def fit_command(
                 f"--preset changes nothing: {config} names every setting. Leave one of them out."
             )
         name = resolved(backend)
+        if max_size is None:
+            max_size = default_max_size(name, quality.value)
+
+        def announced(seen: Overview, kept: bool) -> None:
+            from igsr.cli.announcement import announce
+
+            announce(
+                seen,
+                holdout=holdout,
+                max_size=max_size,
+                preset=preset.value,
+                quality=quality.value,
+                given=given,
+                backend=name,
+                cameras_kept=kept,
+            )
+
         finder = CameraFinder(estimator, network, graph, frames, given["seed"])
         loaded, found = capture_to_fit(
             capture,
@@ -122,13 +144,15 @@ def fit_command(
             resume=resume,
             shown=not as_json,
             parts=parts,
+            announced=None if as_json else announced,
         )
         color = _background(background, loaded)
         # Photos with alpha are fitted over random colors, so that no background is learned.
         has_alpha = any(view.image.shape[2] == 4 for view in loaded.train_views)
         settings = settings_for(
             preset.value,
-            len(loaded.train_views),
+            support_of(loaded.train_views),
+            quality.value,
             **given,
             background=None if has_alpha else color,
         )
@@ -144,6 +168,7 @@ def fit_command(
             "holdout": holdout,
             "max_size": max_size,
             "preset": preset.value,
+            "quality": quality.value,
             **settings.plain(),
             "backend": name,
             "estimator": estimator,

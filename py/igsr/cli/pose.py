@@ -20,7 +20,7 @@ from igsr._internal.part_usage import Parts
 from igsr.capture import Capture
 from igsr.capture.downscaling import check_max_size
 from igsr.capture.load import holds_cameras
-from igsr.capture.overview import look_at
+from igsr.capture.overview import Overview, look_at
 from igsr.capture.photo_folder import FRAMES
 from igsr.capture.write_colmap import write_colmap
 from igsr.cli.error_messages import error_messages, print_message, warning_messages
@@ -35,7 +35,7 @@ from igsr.cli.shared import (
     stopped,
 )
 from igsr.errors import IgsrError
-from igsr.pose import AUTO, find_cameras, kept_cameras, kept_capture, photos_at
+from igsr.pose import AUTO, find_cameras, has_found, kept_cameras, kept_capture, photos_at
 from igsr.pose.registry import ESTIMATORS
 
 logger = logging.getLogger(__name__)
@@ -123,8 +123,9 @@ def capture_to_fit(
     allow_missing: bool,
     resume: bool,
     shown: bool,
-    parts: Parts | None = None,
     splats: int = 0,
+    parts: Parts | None = None,
+    announced: Callable[[Overview, bool], None] | None = None,
 ) -> tuple[Capture, bool]:
     """Load the capture at a path; find the cameras first if it has none.
 
@@ -139,8 +140,9 @@ def capture_to_fit(
         allow_missing: whether to go on with fewer than half of the photos.
         resume: use cameras that an earlier run found.
         shown: whether progress is shown.
-        parts: count what "cameras" and "load" take, or None.
         splats: most splats of the fit, for the memory that it needs.
+        parts: count what "cameras" and "load" take, or None.
+        announced: called before anything slow, with what there is and whether cameras are known.
 
     Returns:
         The capture, and whether its cameras were found here (or by the run that is resumed).
@@ -154,16 +156,18 @@ def capture_to_fit(
     parts = Parts() if parts is None else parts
     seen = look_at(path, finder.frames, max_size)
     seen.train_photos(holdout)
+    if seen.has_cameras and (finder.options or finder.estimator != AUTO):
+        raise IgsrError(
+            f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
+        )
+    if not seen.has_cameras:
+        kept_cameras(path, out)
+    seen.check_memory(max_size, splats)
+    if announced is not None:
+        announced(seen, seen.has_cameras or has_found(path, out))
     if seen.has_cameras:
-        if finder.options or finder.estimator != AUTO:
-            raise IgsrError(
-                f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
-            )
-        seen.check_memory(max_size, splats)
         with parts.measured("load"):
             return load(path, holdout, max_size), False
-    kept_cameras(path, out)
-    seen.check_memory(max_size, splats)
     with _pose_bar(shown) as show:
         capture = kept_capture(
             path,
@@ -176,9 +180,9 @@ def capture_to_fit(
             resume=resume,
             allow_missing=allow_missing,
             progress=show,
-            parts=parts,
             say=print_message,
             warn=print_message,
+            parts=parts,
         )
     return (capture if holdout is None else capture.with_holdout(holdout)), True
 

@@ -22,20 +22,22 @@ from igsr.cli.pose import (
 )
 from igsr.cli.settings_options import ConfigOption, settings_options
 from igsr.cli.shared import (
+    FitSizeOption,
     HoldoutOption,
     JsonOption,
-    MaxSizeOption,
     fitted_line,
     output_console,
     parts_line,
     print_json,
 )
 from igsr.errors import IgsrError
+from igsr.fitting.presets import default_max_size
 from igsr.refinement.settings import AUTO, RefineSettings
 
 # What imports torch is imported by the command, so that --help answers at once.
 if TYPE_CHECKING:
     from igsr.capture import Capture
+    from igsr.capture.overview import Overview
     from igsr.refinement.results import Refined
 
 
@@ -50,7 +52,7 @@ def refine_command(
     ],
     given: dict[str, Any],
     holdout: HoldoutOption = None,
-    max_size: MaxSizeOption = None,
+    max_size: FitSizeOption = None,
     photo_count: Annotated[
         int | None,
         typer.Option("--photos", metavar="N", help="Fit N of the train photos, evenly spaced."),
@@ -82,7 +84,27 @@ def refine_command(
         from igsr.refinement.loop import refine, round_denoiser
         from igsr.refinement.run import bar_state
 
-        resolve_backend(settings.backend)  # a missing GPU is found before cameras are looked for
+        # A missing GPU is found before cameras are looked for.
+        backend = resolve_backend(settings.backend)
+        if max_size is None:
+            max_size = default_max_size(backend, settings.quality)
+
+        def announced(seen: Overview, kept: bool) -> None:
+            from igsr.cli.announcement import announce
+
+            announce(
+                seen,
+                holdout=holdout,
+                photos=photo_count,
+                max_size=max_size,
+                preset="default",
+                quality=settings.quality,
+                given={"steps": settings.steps},
+                backend=backend,
+                cameras_kept=kept,
+                rounds=settings.most_rounds,
+            )
+
         denoiser = round_denoiser(weights)
         with warning_messages():
             capture, _ = capture_to_fit(
@@ -94,6 +116,7 @@ def refine_command(
                 allow_missing=allow_missing,
                 resume=resume,
                 shown=not as_json,
+                announced=None if as_json else announced,
             )
         if photo_count is not None:
             capture = _some_photos(capture, photo_count)

@@ -56,6 +56,14 @@ class PresetChoice(str, enum.Enum):
     instantsplat = "instantsplat"
 
 
+class QualityChoice(str, enum.Enum):
+    """How much time a fit is worth."""
+
+    draft = "draft"
+    normal = "normal"
+    high = "high"
+
+
 class SplitChoice(str, enum.Enum):
     """Train or test views of a capture."""
 
@@ -99,6 +107,21 @@ MaxSizeOption = Annotated[
         metavar="N",
         help="Load photos whose longest side has more than N pixels reduced to that. Default: as "
         "they are.",
+    ),
+]
+FitSizeOption = Annotated[
+    int | None,
+    typer.Option(
+        "--max-size",
+        metavar="N",
+        help="Fit photos whose longest side has more than N pixels reduced to that. Default: 1000 "
+        "on the CPU, 1600 on a GPU, times 0.6 for --quality draft and 1.6 for high.",
+    ),
+]
+QualityOption = Annotated[
+    QualityChoice,
+    typer.Option(
+        "--quality", help="Size of photos, steps and splats, where these options do not say."
     ),
 ]
 SeedOption = Annotated[

@@ -30,8 +30,9 @@ from igsr.fitting.fitter import (
     with_camera_rows,
     with_train_cameras,
 )
+from igsr.fitting.photo_support import PhotoSupport, support_of
 from igsr.fitting.pose_priors import pose_priors
-from igsr.fitting.presets import Preset, settings_for
+from igsr.fitting.presets import Preset, Quality, settings_for
 from igsr.fitting.rough_cameras import with_rough_cameras
 from igsr.fitting.run import FitRun, Progress, Report, bar_state
 from igsr.fitting.settings import (
@@ -68,10 +69,12 @@ def fit(
     seed: int = 0,
     *,
     preset: Preset = "default",
+    quality: Quality = "normal",
     max_splats: int | None = None,
     sh_degree: int | None = None,
     density: Density | None = None,
     dropout: float | None = None,
+    coarse_to_fine: bool | None = None,
     hull: bool | None = None,
     start: Initialization | Splats | None = None,
     poses: Poses | None = None,
@@ -98,8 +101,9 @@ def fit(
             session, None shows a progress bar.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu".
         seed: of everything random.
-        preset: "default" (other settings for up to 20 photos than for more; pseudo-views do not
-            count), "3dgs" or "instantsplat"; see ``igsr.fitting.presets``.
+        preset: "default" (by how many photos see the same place, from how far apart; pseudo-views
+            do not count), "3dgs" or "instantsplat"; see ``igsr.fitting.presets``.
+        quality: "draft", "normal" or "high": fewer or more steps and splats of the default preset.
         max_splats: most splats there may be.
         sh_degree: degree of the spherical harmonics of colors, 0-4.
         density: how splats are added and removed: "mcmc" (relocation and growth up to the maximum,
@@ -107,10 +111,14 @@ def fit(
         dropout: fraction of the splats that a step leaves out at random, growing from 0 in the
             first step to this in the last, while the others' opacities are raised to make up for it
             (DropGaussian, Park et al. 2025); 0 to 0.9. Against overfitting few photos.
+        coarse_to_fine: whether the first steps are on photos of an eighth to half of their size,
+            which costs less and loses nothing (Chen et al., "DashGaussian", 2025); the last seven
+            tenths of the steps have their whole size.
         hull: whether splats are removed whose center a photo with alpha shows empty.
-        start: the initialization: "auto", "points", "hull", "sift", "rays" or "random"; see
-            ``igsr.fitting.initialization``. Or splats that a fit to some of the photos ended with:
-            learning rates and dropout then are those of the last ``steps`` of a fit of the preset.
+        start: the initialization: "auto", "points", "depths", "hull", "sift", "rays", "random" or
+            "sfm"; see ``igsr.fitting.initialization``. Or splats that a fit to some of the photos
+            ended with: learning rates and dropout then are those of the last ``steps`` of a fit of
+            the preset.
         poses: "fixed", or "joint": each camera is rotated and moved with the splats. On average
             they stay where the given ones were: the scene keeps its place and size. Where the
             capture has tracks, these give each camera a pose prior.
@@ -167,6 +175,7 @@ def fit_with_cameras(*args: Any, **kwargs: Any) -> tuple[Splats, Capture]:
 def _fitted(
     capture: Capture,
     preset: str,
+    quality: Quality,
     start: str | Splats | None,
     backend: str,
     progress: Report | None,
@@ -182,9 +191,13 @@ def _fitted(
         raise IgsrError(f"{capture.path} has no train views to fit.")
     initial = start if isinstance(start, Splats) else None
     if initial is None:
-        settings = settings_for(preset, len(photos_among(views)), start=start, **given)
+        settings = settings_for(
+            preset, support_of(photos_among(views)), quality, start=start, **given
+        )
     else:
-        settings = _settings_from_splats(preset, len(photos_among(views)), initial, given)
+        settings = _settings_from_splats(
+            preset, support_of(photos_among(views)), quality, initial, given
+        )
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
     check_photos(views)
@@ -255,7 +268,7 @@ def _check_capture(capture: object) -> None:
 
 
 def _settings_from_splats(
-    preset: str, photos: int, splats: Splats, given: dict[str, Any]
+    preset: str, photos: PhotoSupport, quality: Quality, splats: Splats, given: dict[str, Any]
 ) -> FitSettings:
     """The settings of a fit that goes on from splats: the last steps of the preset's schedule.
 
@@ -264,7 +277,7 @@ def _settings_from_splats(
     """
     if given["sh_degree"] is None:
         given = given | {"sh_degree": splats.sh_degree}
-    settings = settings_for(preset, photos, **given)
+    settings = settings_for(preset, photos, quality, **given)
     if splats.sh_degree != settings.sh_degree:
         raise IgsrError(
             f"start has splats of SH degree {splats.sh_degree}; sh_degree must be the same, not "
@@ -277,5 +290,5 @@ def _settings_from_splats(
         )
     if splats.antialiased:
         raise IgsrError("start has antialiased splats, which igsr does not fit; give others.")
-    whole = max(settings.steps, settings_for(preset, photos).steps)
+    whole = max(settings.steps, settings_for(preset, photos, quality).steps)
     return replace(settings, steps=whole, first_step=whole - settings.steps)

@@ -71,7 +71,8 @@ def write_fit_page(
 
 
 def _title(capture: str) -> str:
-    return Path(capture).resolve().name or "photos"
+    path = Path(capture).resolve()
+    return (path.parent.name if path.name == "images" else path.name) or "photos"
 
 
 def _score_rows(report: dict[str, Any]) -> list[dict[str, str]]:

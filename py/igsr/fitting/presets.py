@@ -1,4 +1,4 @@
-"""Named settings of a fit: the default, by what the photos can support, and two baselines."""
+"""Named settings of a fit: the default, by what the photos tell, and two baselines."""
 
 from __future__ import annotations
 
@@ -7,43 +7,79 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from igsr._internal.settings import checked_given
 from igsr.errors import IgsrError
+from igsr.fitting.photo_support import PhotoSupport
 from igsr.fitting.settings import FitSettings
 
 Preset: TypeAlias = Literal["default", "3dgs", "instantsplat"]
 PRESETS: tuple[Preset, ...] = get_args(Preset)
+Quality: TypeAlias = Literal["draft", "normal", "high"]
+#: What qualities multiply the sides of photos, the steps and the most splats by.
+QUALITIES: dict[Quality, tuple[float, float, float]] = {
+    "draft": (0.6, 0.4, 0.4),
+    "normal": (1.0, 1.0, 1.0),
+    "high": (1.6, 2.0, 2.5),
+}
 
-#: With so few photos or fewer, most novel views are barely constrained: fits overfit without help.
-FEW_PHOTOS = 20
-#: Steps per photo after which fits to few photos gain no more, and later lose.
+#: Fits to few photos overfit without help: dropout is this over the number of photos that see the
+#: same place, at most ``MOST_DROPOUT``, and none where that is less than ``LEAST_DROPOUT``.
+DROPOUT_PHOTOS = 1.2
+MOST_DROPOUT, LEAST_DROPOUT = 0.3, 0.05
+#: Photos further apart than this (degrees, in the mean) leave so much open that splats are only
+#: added where opaque ones are, with a pull to small and faint ones (MCMC). Nearer ones show where
+#: splats are missing.
+WIDE_APART = 17.0
+#: From so many photos of the same place on, view-dependent color is more than a way to overfit.
+SH2_PHOTOS = 12.0
+#: Steps of any fit, and more for each photo, up to a most; but for few photos only so many each.
+STEPS, STEPS_MORE, MOST_STEPS = 2500, 25, 5000
 STEPS_PER_PHOTO = 500
+#: Most splats per pixel of one photo, times the fourth root of the photos over ``FEW``: more photos
+#: show more of a scene, but not as many times more.
+SPLATS_PER_PIXEL = 0.14
+FEW = 8.0
+MOST_SPLATS = 1_000_000
 #: Steps of the paper's fits to photos whose cameras have noise.
 PAPER_STEPS = 5000
 
-_MANY = FitSettings(
-    steps=5000,
+#: Most splats of 3DGS, which has no such limit: as many as 8 GB of memory hold.
+UNLIMITED_SPLATS = 4_000_000
+
+#: Longest side of photos that fits have where none is asked for, pixels: what two cores do in
+#: minutes, and what other tools have on GPUs (nerfstudio: 1600).
+MAX_SIZES = {"cpu": 1000, "gpu": 1600}
+
+_DEFAULT = FitSettings(
+    steps=MOST_STEPS,
     max_splats=30_000,
     sh_degree=2,
     density="original",
     dropout=0.0,
     hull=False,
     start="auto",
+    coarse_to_fine=True,
     poses="fixed",
     focal="fixed",
 )
-_FEW = replace(_MANY, steps=4000, sh_degree=1, density="mcmc", dropout=0.3)
-#: As Kerbl et al. 2023 fit synthetic scenes, at their shorter number of steps, but for our number
-#: of splats. From few photos it only overfits more with the steps, so there it has the default's.
-_3DGS = replace(_MANY, steps=7000, sh_degree=3, start="random")
-_3DGS_FEW = replace(_3DGS, steps=_MANY.steps)
+#: As Kerbl et al. 2023 fit, at their shorter number of steps: SfM points where there are some, and
+#: as many splats as their density control adds.
+_3DGS = replace(
+    _DEFAULT,
+    steps=7000,
+    max_splats=UNLIMITED_SPLATS,
+    sh_degree=3,
+    start="sfm",
+    coarse_to_fine=False,
+)
 #: As InstantSplat (Fan et al. 2024) fits: many splats from dense points, which stay as many, with
 #: cameras and one focal length optimized. Here the points are the capture's or made from its
 #: photos, and all have one learning rate.
 _INSTANTSPLAT = replace(
-    _MANY,
+    _DEFAULT,
     steps=1000,
     max_splats=60_000,
     sh_degree=1,
     density="fixed",
+    coarse_to_fine=False,
     poses="joint",
     focal="shared",
 )
@@ -51,39 +87,80 @@ _INSTANTSPLAT = replace(
 _NOT_OF_PRESETS = ("seed", "background")
 
 
-def settings_for(preset: str, photos: int, **given: Any) -> FitSettings:
+def default_max_size(backend: str, quality: Quality = "normal") -> int:
+    """Longest side in pixels of the photos that a backend fits where nothing else is asked for.
+
+    By the backend alone, so that the same command gives the same result on every machine.
+
+    Args:
+        backend: "cpu" or "gpu".
+        quality: "draft", "normal" or "high".
+
+    Raises:
+        IgsrError: there is no such quality.
+    """
+    return round(MAX_SIZES[backend] * _quality(quality)[0])
+
+
+def _quality(quality: str) -> tuple[float, float, float]:
+    for name, factors in QUALITIES.items():
+        if name == quality:
+            return factors
+    raise IgsrError(f"quality must be one of {', '.join(QUALITIES)}, not {quality!r}.")
+
+
+def settings_for(
+    preset: str, photos: PhotoSupport | int, quality: Quality = "normal", **given: Any
+) -> FitSettings:
     """The settings of a fit: those given, and the preset's where none or None is given.
 
     Args:
-        preset: "default" (measured to be best: one set for up to ``FEW_PHOTOS`` photos, another for
-            more), or a baseline: "3dgs" (3D Gaussian Splatting without help for few photos) or
-            "instantsplat" (dense initialization, fixed number of splats, joint poses, shared focal
-            length).
-        photos: number of photos to fit.
+        preset: "default" (measured to be best; how many photos see the same place, from how far
+            apart, and their size decide), or a baseline: "3dgs" (3D Gaussian Splatting without help
+            for few photos) or "instantsplat" (dense initialization, fixed number of splats, joint
+            poses, shared focal length).
+        photos: what the photos to fit tell, or their number, for small ones all round an object.
+        quality: "draft", "normal" or "high": fewer or more steps and splats. Only the default
+            preset has qualities.
         **given: fields of ``FitSettings``.
 
     Raises:
-        IgsrError: there is no such preset or setting, or a setting cannot be used.
+        IgsrError: there is no such preset, quality or setting, or a setting cannot be used.
     """
     if preset not in PRESETS:
         raise IgsrError(f"preset must be one of {', '.join(PRESETS)}, not {preset!r}.")
-    is_few = photos <= FEW_PHOTOS
-    few = replace(_FEW, steps=min(_FEW.steps, STEPS_PER_PHOTO * max(1, photos)))
-    base = {
-        "default": few if is_few else _MANY,
-        "3dgs": _3DGS_FEW if is_few else _3DGS,
-        "instantsplat": _INSTANTSPLAT,
-    }[preset]
+    support = photos if isinstance(photos, PhotoSupport) else PhotoSupport.of_number(photos)
+    base = {"default": _default(support, quality), "3dgs": _3DGS, "instantsplat": _INSTANTSPLAT}[
+        preset
+    ]
     return replace(base, **checked_given(FitSettings, given))
 
 
-def preset_settings(name: str, photos: int, **given: Any) -> dict[str, Any]:
+def _default(support: PhotoSupport, quality: Quality) -> FitSettings:
+    """The default for these photos: one rule from few of them to many."""
+    dropout = min(MOST_DROPOUT, DROPOUT_PHOTOS / support.seen_by)
+    _, more_steps, more_splats = _quality(quality)
+    steps = more_steps * min(MOST_STEPS, STEPS + STEPS_MORE * support.photos)
+    splats = more_splats * SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** 0.25
+    return replace(
+        _DEFAULT,
+        steps=round(min(steps, more_steps * STEPS_PER_PHOTO * support.photos)),
+        max_splats=max(1000, min(MOST_SPLATS, round(splats))),
+        sh_degree=2 if support.seen_by >= SH2_PHOTOS else 1,
+        density="mcmc" if support.apart > WIDE_APART else "original",
+        dropout=round(dropout, 2) if dropout >= LEAST_DROPOUT else 0.0,
+    )
+
+
+def preset_settings(
+    name: str, photos: PhotoSupport | int, quality: Quality = "normal", **given: Any
+) -> dict[str, Any]:
     """As ``settings_for``, but as keywords of ``igsr.fit``, without seed and background.
 
     Raises:
         IgsrError: as ``settings_for``.
     """
-    return preset_keywords(settings_for(name, photos, **given))
+    return preset_keywords(settings_for(name, photos, quality, **given))
 
 
 def preset_keywords(settings: FitSettings) -> dict[str, Any]:

@@ -14,7 +14,9 @@ from igsr._internal.settings import about, checked, settings_of, validate
 from igsr.errors import IgsrError
 
 Density: TypeAlias = Literal["mcmc", "original", "fixed"]
-Initialization: TypeAlias = Literal["auto", "points", "hull", "sift", "rays", "random"]
+Initialization: TypeAlias = Literal[
+    "auto", "points", "depths", "hull", "sift", "rays", "random", "sfm"
+]
 Poses: TypeAlias = Literal["fixed", "joint"]
 Focal: TypeAlias = Literal["fixed", "shared", "per-camera"]
 
@@ -83,10 +85,17 @@ class FitSettings:
     )
     start: Initialization = field(
         metadata=about(
-            "Initialization: points (of the capture), hull (visual hull of photos with alpha), "
-            "sift (triangulated features), rays (plane sweep), random, or auto (chosen by the "
-            "capture).",
+            "Initialization: points (of the capture), depths (these and points of the photos' "
+            "depth maps), hull (visual hull of photos with alpha), sift (triangulated features), "
+            "rays (pixels at the depth where photos agree), random, sfm (points, else random, "
+            "as 3DGS), or auto (chosen by the capture).",
             aliases=("init",),
+        )
+    )
+    coarse_to_fine: bool = field(
+        metadata=about(
+            "Begin with photos of an eighth to half of their size; the last seven tenths of "
+            "the steps have their whole size."
         )
     )
     poses: Poses = field(metadata=about("joint: optimize the cameras' poses with the splats."))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from igsr.pose.cache import (
     check_enough_placed,
     found_before,
+    has_found,
     kept_cameras,
     kept_capture,
     not_placed,
@@ -36,6 +37,7 @@ __all__ = [
     "estimate_poses",
     "find_cameras",
     "found_before",
+    "has_found",
     "kept_cameras",
     "kept_capture",
     "not_placed",

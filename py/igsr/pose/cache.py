@@ -18,7 +18,7 @@ from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
 from igsr.capture.load import describe_capture, holds_cameras
 from igsr.capture.overview import look_at
-from igsr.capture.photo_folder import FRAMES, VIDEO_SUFFIXES, Photo, photo_sizes
+from igsr.capture.photo_folder import FRAMES, VIDEO_SUFFIXES, photo_sizes
 from igsr.capture.write_colmap import write_colmap
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Progress
@@ -50,9 +50,9 @@ def kept_capture(
     resume: bool = False,
     allow_missing: bool = False,
     progress: Progress | None = None,
-    parts: Parts | None = None,
     say: Callable[[str], None] = lambda sentence: None,
     warn: Callable[[str], None] = warnings.warn,
+    parts: Parts | None = None,
 ) -> Capture:
     """The capture of photos without cameras, which are found only if the cache has none.
 
@@ -66,10 +66,10 @@ def kept_capture(
         max_size: longest side in pixels of the capture's photos; None keeps them as they are.
         resume: whether a fit goes on that began with these cameras.
         allow_missing: whether fewer than half of the photos may be registered.
-        parts: count what "cameras" and "load" take, or None. Cameras that were found before count
-            with what they took then.
         say: takes sentences about what is done.
         warn: takes warnings.
+        parts: count what "cameras" and "load" take, or None. Cameras that were found before count
+            with what finding them took.
 
     Raises:
         IgsrError: as ``igsr.estimate_poses``; too few photos are registered (the cameras are kept);
@@ -77,11 +77,10 @@ def kept_capture(
     """
     check_max_size(max_size)
     options = dict(options or {})
+    parts = Parts() if parts is None else parts
     kept = kept_cameras(photos, out)
     name = chosen_estimator(estimator, options)
     found = _before(photos, kept, made_by_of(name, seed, frames, options), resume)
-    held: list[Photo] | None = None
-    parts = Parts() if parts is None else parts
     if found is None:
         with parts.measured("cameras"):
             found, held = find_cameras(
@@ -93,27 +92,30 @@ def kept_capture(
                 progress=progress,
                 **options,
             )
-        usage: Usage | None = parts.used["cameras"]
+        usage = parts.used["cameras"]
         for sentence in found.estimate.warnings:
             warn(sentence)
-        said = (
+        with parts.measured("load"):
+            # The capture is let go of before it is loaded.
+            views = photos_at(photos, frames, max_size, held)
+            _write(kept, photos, found, found.capture(kept, views), usage)
+        say(
             f"Cameras of {len(found.placed)} of {len(found.names)} photos were found by {name} "
             f"and are kept in {kept}"
         )
+        check_enough_placed(found, options, allow_missing)
     else:
-        usage = read_usage(kept)
-        if usage is not None:
-            parts.add("cameras", usage)
-        said = f"The cameras found before are used, from {kept}; delete it to find them anew"
+        say(f"The cameras found before are used, from {kept}; delete it to find them anew")
         check_enough_placed(found, options, allow_missing)
-        look_at(photos, frames).check_memory(max_size)
+        before = read_usage(kept)
+        if before is not None:
+            parts.add("cameras", before)
+        if not _is_at(kept, found, max_size):
+            look_at(photos, frames).check_memory(max_size)
+            with parts.measured("load"):
+                views = photos_at(photos, frames, max_size)
+                _write(kept, photos, found, found.capture(kept, views), before)
     with parts.measured("load"):
-        if held is not None or not _is_at(kept, found, max_size):
-            capture = found.capture(kept, photos_at(photos, frames, max_size, held))
-            _write(kept, photos, found, usage, capture)
-            del capture
-        say(said)
-        check_enough_placed(found, options, allow_missing)
         return load_capture(kept)
 
 
@@ -159,17 +161,15 @@ def _before(photos: Path, kept: Path, made_by: dict[str, Any], resume: bool) -> 
 
 
 def _write(
-    kept: Path, photos: Path, found: FoundCameras, usage: Usage | None, capture: Capture
+    kept: Path, photos: Path, found: FoundCameras, capture: Capture, usage: Usage | None
 ) -> None:
-    notes: dict[str, str | bytes] = {**photos_note(photos), FOUND: found.to_bytes()}
-    if usage is not None:
-        notes[USAGE] = json.dumps(usage.plain(), indent=2)
+    used = {} if usage is None else {USAGE: json.dumps(usage.plain())}
     write_colmap(
         capture,
         kept,
         replace=True,
         further_masks={"trusted": found.trusted},
-        notes=notes,
+        notes={**photos_note(photos), **used, FOUND: found.to_bytes()},
     )
 
 
@@ -211,6 +211,17 @@ def photos_note(photos: Path) -> dict[str, str]:
         photos: folder or file of photos.
     """
     return {GIVEN: json.dumps(photo_sizes(photos), indent=1)}
+
+
+def has_found(photos: Path, out: Path) -> bool:
+    """Whether the output folder ``out`` holds cameras of ``photos``; files are not read whole.
+
+    Args:
+        photos: folder or file of photos.
+        out: output folder of the fit.
+    """
+    kept = out / "capture"
+    return (kept / FOUND).is_file() and _given(kept) == photo_sizes(photos)
 
 
 def found_before(photos: Path, kept: Path) -> bool:
@@ -271,6 +282,8 @@ def _given(kept: Path) -> dict[str, int] | None:
 
 def read_usage(kept: Path) -> Usage | None:
     """What finding the cameras in the cache took; None where that is not known.
+
+    It is there for reports, also of runs that find the cameras kept.
 
     Args:
         kept: the cache, or another capture.

@@ -21,6 +21,7 @@ from igsr.capture.photo_checks import check_photos
 from igsr.denoiser import Denoiser, NetworkDenoiser, load_network
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import check_masks
+from igsr.fitting.presets import Quality, default_max_size
 from igsr.refinement.cross_validation import FEWEST_PHOTOS, CrossValidation, combined_error
 from igsr.refinement.novel_views import novel_views
 from igsr.refinement.results import Refined, RefineProgress, Round, Stop, StopReason
@@ -45,6 +46,7 @@ def refine(
     propose: Propose = novel_views,
     select: Select = select_views,
     cross_validate: bool = True,
+    quality: Quality = "normal",
     max_size: int | None = None,
     allow_missing: bool = False,
 ) -> Refined:
@@ -69,8 +71,9 @@ def refine(
         propose: what proposes the cameras of novel views.
         select: which of the denoised views to add.
         cross_validate: whether a round is kept only if it improves the scores of held-out photos.
-        max_size: longest side, in pixels, of photos as loaded; larger ones are reduced. None keeps
-            all as they are. A ``Capture`` has its size.
+        quality: "draft", "normal" or "high": size of photos, steps and splats.
+        max_size: longest side, in pixels, of photos as loaded; larger ones are reduced. None is
+            ``igsr.fitting.presets.default_max_size``. A ``Capture`` has its size.
         allow_missing: go on where the cameras of fewer than half of the photos are found; without,
             that ends with advice.
 
@@ -85,8 +88,10 @@ def refine(
         backend=backend,  # type: ignore[arg-type]  # checked there
         seed=seed,
         cross_validate=cross_validate,
+        quality=quality,
     )
-    _core.resolve_backend(settings.backend)  # a missing GPU is found here
+    resolved = _core.resolve_backend(settings.backend)  # a missing GPU is found here
+    max_size = default_max_size(resolved, quality) if max_size is None else max_size
     with progress_or_bar(progress, "refine", bar_state) as report:
         run = RefineRun(settings, out, resume, report)
         if isinstance(photos, Capture):

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from igsr._internal.settings import about, validate
 from igsr.errors import IgsrError
+from igsr.fitting.presets import Quality
 
 #: As many rounds as help, but at most ``MOST_ROUNDS``.
 AUTO = "auto"
@@ -34,6 +35,7 @@ class RefineSettings:
     Attributes:
         rounds: most rounds, or "auto", which is 4. A round that is rolled back is the last one.
         steps: of each fit; None is the default preset's.
+        quality: "draft", "normal" or "high", of the default preset.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
         seed: of everything random. The result is deterministic for a given seed on one backend,
             instruction set and number of threads.
@@ -55,6 +57,10 @@ class RefineSettings:
         metadata=about(
             "Optimizer steps of each fit. Default: the default preset's.", limits=(1, 10_000_000)
         ),
+    )
+    quality: Quality = field(
+        default="normal",
+        metadata=about("Size of photos, steps and splats, where these options do not say."),
     )
     backend: Literal["auto", "cpu", "gpu"] = field(
         default="auto", metadata=about("auto: the GPU if there is a real one, else the CPU.")

@@ -17,6 +17,7 @@ from igsr.evaluation.scores import (
     score_views,
 )
 from igsr.fitting.fit_capture import Progress, fit
+from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import preset_settings
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.results import Scores, Stage
@@ -91,9 +92,15 @@ class Stages:
         self._background = default_background(capture)
         self._background_of_views = known_background(capture.views)
         # Folds have fewer photos, but are fitted with the settings for all of them.
-        preset = preset_settings("default", len(capture.train_views), steps=settings.steps)
+        preset = preset_settings(
+            "default",
+            support_of(capture.train_views),
+            settings.quality,
+            steps=settings.steps,
+        )
         self._fit_settings = {
-            name: preset[name] for name in ("steps", "sh_degree", "density", "dropout")
+            name: preset[name]
+            for name in ("steps", "sh_degree", "density", "dropout", "coarse_to_fine")
         }
         self._max_splats = int(preset["max_splats"])
 

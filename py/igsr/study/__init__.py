@@ -5,7 +5,7 @@ from igsr.study.denoiser_comparison import denoiser_table
 from igsr.study.estimated_poses import poses
 from igsr.study.loop_protocols import refinement_ablation, sweep, table2, table3
 from igsr.study.noisy_poses import pose_noise
-from igsr.study.own_photos import own_photos
+from igsr.study.own_photo_folders import own_photos
 from igsr.study.real_captures import few_photos
 
 __all__ = [

@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from igsr import pose
-from igsr._internal.atomic_write import atomic_folder
+from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import FitBackend
 from igsr._internal.part_usage import Parts
 from igsr.capture import Camera, Capture, View, load_capture
 from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import FRAMES
-from igsr.capture.write_colmap import write_colmap
 from igsr.denoiser.training.perceptual_distance import (
     SMALLEST_SIDE,
     SqueezeNetDistance,
@@ -33,12 +31,11 @@ from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.presets import Preset
 from igsr.geometry.similarity import similarity_between
+from igsr.pose import check_enough_placed, find_cameras, photos_at, read_found
 from igsr.splats import Splats
 
 #: Pictures on a sheet have at most so many pixels on their longest side: fog must be seen.
 SHEET_SIDE = 640
-#: File beside a scene's cameras; one that says which scene it was.
-SCENE_NOTE = "scene.txt"
 
 
 @dataclass(frozen=True)
@@ -47,13 +44,16 @@ class CameraRun:
 
     Attributes:
         scene: folder of photos in the data.
-        out: folder for the capture: photos, cameras and points.
+        out: file for the cameras.
         estimator: a name of ``igsr.pose.registry``, or "auto".
+        max_size: largest that photos will be loaded, for the check of memory; the cameras do not
+            depend on it.
     """
 
     scene: str
     out: str
     estimator: str
+    max_size: int
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class OwnFit:
         max_size: longest side of the photos that are fitted, pixels; None leaves it as it is.
         score_size: longest side of the photos that are scored, pixels.
         features: SqueezeNet's arrays, for "perceptual"; None leaves that out.
-        capture: folder of the found cameras; None where the scene's own are used.
+        cameras: file of the found cameras; None where the scene's own are used.
         splats: file that the splats are written to.
         sheet: file for the sheet of pictures, or None.
     """
@@ -84,34 +84,36 @@ class OwnFit:
     max_size: int | None
     score_size: int
     features: str | None
-    capture: str | None
+    cameras: str | None
     splats: str
     sheet: str | None
 
 
-def find_cameras(data: str, one: CameraRun) -> dict[str, Any]:
-    """Find a scene's cameras and write the capture; for a process of its own.
+def find_scene_cameras(data: str, one: CameraRun) -> dict[str, Any]:
+    """Find a scene's cameras and write them; for a process of its own.
 
-    A scene whose cameras cannot be found has the row's "failed" say why.
+    A scene whose cameras cannot be found, or of too few photos, has the row's "failed" say why.
     """
     parts = Parts()
     folder = Path(data) / one.scene
     row: dict[str, Any] = {"scene": one.scene, "failed": None}
+    written = b""
     try:
         with parts.measured("cameras"), _warnings() as said:
-            found, held = pose.find_cameras(folder, one.estimator)
-            row["photos"], row["estimator"] = len(found.names), found.made_by["estimator"]
-            capture = found.capture(folder, pose.photos_at(folder, FRAMES, None, held))
-            write_colmap(capture, one.out, replace=True, notes={SCENE_NOTE: f"{one.scene}\n"})
+            found, _ = find_cameras(folder, one.estimator, max_size=one.max_size)
+        row["photos"] = len(found.names)
+        row["estimator"] = found.made_by["estimator"]
+        row["placed"] = len(found.placed)
+        row["not_placed"] = found.not_placed
+        row["points"] = 0 if found.estimate.points is None else len(found.estimate.points.xyz)
+        row["warnings"] = [*said, *found.estimate.warnings]
+        check_enough_placed(found, {}, allow_missing=False)
+        written = found.to_bytes()
     except IgsrError as error:
-        # The note stays, so that it is not tried again.
-        with atomic_folder(one.out, replace=True) as new:
-            (new / SCENE_NOTE).write_text(f"{one.scene}\n", encoding="utf-8")
-        return {**row, "failed": str(error), "parts": parts.plain()}
-    row["placed"] = len(capture.views)
-    row["not_placed"] = found.not_placed
-    row["points"] = 0 if capture.points is None else len(capture.points.xyz)
-    row["warnings"] = [*said, *found.estimate.warnings]
+        row["failed"] = str(error)
+    # Where it failed the file is empty, so that it is not tried again.
+    with atomic_write(Path(one.out)) as temporary:
+        temporary.write_bytes(written)
     return {**row, "parts": parts.plain()}
 
 
@@ -166,9 +168,12 @@ def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
 
 
 def _loaded(data: str, one: OwnFit, max_size: int | None) -> Capture:
-    capture = load_capture(Path(data) / one.scene if one.capture is None else one.capture, max_size)
-    own_split = one.capture is None and bool(capture.test_views)
-    return capture if own_split else capture.with_holdout(one.holdout)
+    folder = Path(data) / one.scene
+    if one.cameras is None:
+        capture = load_capture(folder, max_size)
+        return capture if capture.test_views else capture.with_holdout(one.holdout)
+    found = read_found(Path(one.cameras))
+    return found.capture(folder, photos_at(folder, FRAMES, max_size)).with_holdout(one.holdout)
 
 
 def _held_out_scores(

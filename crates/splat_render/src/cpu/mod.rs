@@ -17,6 +17,7 @@ mod tile;
 
 pub use fit::CpuFit;
 pub use peak::peak_multiply_add;
+pub(crate) use simd::dispatch;
 pub use simd::instruction_set;
 
 use crate::camera::Camera;

@@ -8,7 +8,7 @@ use pulp::{Simd, WithSimd};
 
 /// Runs `operation` with the widest instruction set of this machine.
 #[inline]
-pub(super) fn dispatch<Operation: WithSimd>(operation: Operation) -> Operation::Output {
+pub(crate) fn dispatch<Operation: WithSimd>(operation: Operation) -> Operation::Output {
     #[cfg(test)]
     match tests::LANES.get() {
         1 => return pulp::Scalar.vectorize(operation),

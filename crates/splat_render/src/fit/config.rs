@@ -98,11 +98,11 @@ const COARSE_SIDE: u32 = 96;
 /// Photos are halved at most so often.
 const MOST_HALVINGS: u32 = 3;
 /// Part of the steps after which photos have their whole size.
-const COARSE_UNTIL: f64 = 0.6;
+const COARSE_UNTIL: f64 = 0.3;
 
 impl FitConfig {
-    /// What both sides of photos are divided by in a step, from 0: a power of two, and 1 in the last
-    /// two fifths of the steps. Each size has as many steps as the next.
+    /// What both sides of photos are divided by in a step, from 0: a power of two, each for as many
+    /// steps as the next, and 1 in the last seven tenths of all steps.
     ///
     /// A step costs what its pixels and splats cost, and while there are few splats, they show no
     /// detail of the photos (Chen et al., "DashGaussian", 2025, section 3.2).

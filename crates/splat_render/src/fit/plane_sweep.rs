@@ -2,9 +2,11 @@
 //! cross-correlation, which a photo's exposure does not change.
 
 use glam::{DMat3, DVec3};
+use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use crate::camera::Camera;
+use crate::cpu::dispatch;
 use crate::error::{Error, Result};
 
 /// Patches that are compared have a side of `2 * RADIUS + 1` pixels.
@@ -72,7 +74,46 @@ pub fn plane_sweep(photos: &[GreyPhoto], sweeps: &[Sweep]) -> Result<Vec<DepthMa
             return bad("needs two planes at least, at finite depths above 0");
         }
     }
-    Ok(sweeps.par_iter().map(|sweep| swept(photos, sweep)).collect())
+    Ok(sweeps.par_iter().map(|sweep| dispatch(Sweeping { photos, sweep })).collect())
+}
+
+/// Compiled for the widest instruction set there is: its loops are plain, for the compiler to turn into
+/// vectors.
+struct Sweeping<'a> {
+    photos: &'a [GreyPhoto],
+    sweep: &'a Sweep,
+}
+
+impl WithSimd for Sweeping<'_> {
+    type Output = DepthMap;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> DepthMap {
+        let Self { photos, sweep } = self;
+        let photo = &photos[sweep.photo];
+        let (width, height) = (photo.camera.width as usize, photo.camera.height as usize);
+        let pixels = width * height;
+        let mut boxes = Boxes::new(width, height);
+        let own = Patches::of(&photo.grey, &mut boxes);
+        let mut best = Best::new(pixels);
+        let [near, far] = sweep.range;
+        let gap = (far - near) / (sweep.planes - 1) as f32;
+        let mut warped = Warped { grey: vec![0.0; pixels], seen: vec![0.0; pixels] };
+        let mut top: [Vec<f32>; BEST] = std::array::from_fn(|_| vec![0.0; pixels]);
+        for plane in 0..sweep.planes {
+            top.iter_mut().for_each(|scores| scores.fill(-1.0));
+            for &other in &sweep.others {
+                let warp = Warp::new(&photo.camera, &photos[other]);
+                warp.run(near + gap * plane as f32, width, &mut warped);
+                own.correlate(&photo.grey, &warped, &mut boxes, &mut top);
+            }
+            best.take(plane as u32, &top);
+        }
+        let inverse_depth = (0..pixels)
+            .map(|pixel| near + gap * (best.plane[pixel] as f32 + best.between_planes(pixel)))
+            .collect();
+        DepthMap { inverse_depth, score: best.score }
+    }
 }
 
 /// The best depth so far of each pixel, and its neighbours' scores.
@@ -81,64 +122,40 @@ struct Best {
     plane: Vec<u32>,
     before: Vec<f32>,
     after: Vec<f32>,
-}
-
-fn swept(photos: &[GreyPhoto], sweep: &Sweep) -> DepthMap {
-    let photo = &photos[sweep.photo];
-    let (width, height) = (photo.camera.width as usize, photo.camera.height as usize);
-    let pixels = width * height;
-    let mut boxes = Boxes::new(width, height);
-    let own = Patches::of(&photo.grey, &mut boxes);
-    let warps: Vec<Warp<'_>> =
-        sweep.others.iter().map(|&other| Warp::new(&photo.camera, &photos[other])).collect();
-    let mut best = Best {
-        score: vec![-1.0; pixels],
-        plane: vec![0; pixels],
-        before: vec![-1.0; pixels],
-        after: vec![-1.0; pixels],
-    };
-    let [near, far] = sweep.range;
-    let gap = (far - near) / (sweep.planes - 1) as f32;
-    let (mut warped, mut seen) = (vec![0.0; pixels], vec![false; pixels]);
-    let mut top = vec![[-1.0f32; BEST]; pixels];
-    let mut last = vec![-1.0f32; pixels];
-    for plane in 0..sweep.planes {
-        top.fill([-1.0; BEST]);
-        for warp in &warps {
-            warp.run(near + gap * plane as f32, width, &mut warped, &mut seen);
-            own.correlate(&photo.grey, &warped, &mut boxes, |pixel, score| {
-                if seen[pixel] {
-                    let top = &mut top[pixel];
-                    if score > top[0] {
-                        *top = [score, top[0]];
-                    } else if score > top[1] {
-                        top[1] = score;
-                    }
-                }
-            });
-        }
-        for pixel in 0..pixels {
-            let [first, second] = top[pixel];
-            let score = if second > -1.0 { 0.5 * (first + second) } else { first };
-            if plane > 0 && best.plane[pixel] as usize == plane - 1 {
-                best.after[pixel] = score;
-            }
-            if score > best.score[pixel] {
-                best.score[pixel] = score;
-                best.plane[pixel] = plane as u32;
-                best.before[pixel] = last[pixel];
-                best.after[pixel] = -1.0;
-            }
-            last[pixel] = score;
-        }
-    }
-    let inverse_depth = (0..pixels)
-        .map(|pixel| near + gap * (best.plane[pixel] as f32 + best.between_planes(pixel)))
-        .collect();
-    DepthMap { inverse_depth, score: best.score }
+    last: Vec<f32>,
 }
 
 impl Best {
+    fn new(pixels: usize) -> Self {
+        let unseen = || vec![-1.0; pixels];
+        Self {
+            score: unseen(),
+            plane: vec![0; pixels],
+            before: unseen(),
+            after: unseen(),
+            last: unseen(),
+        }
+    }
+
+    /// Takes the scores of the next plane: the mean of the best photos'.
+    #[inline(always)]
+    fn take(&mut self, plane: u32, [first, second]: &[Vec<f32>; BEST]) {
+        for pixel in 0..self.score.len() {
+            let (first, second) = (first[pixel], second[pixel]);
+            let score = if second > -1.0 { 0.5 * (first + second) } else { first };
+            if plane > 0 && self.plane[pixel] == plane - 1 {
+                self.after[pixel] = score;
+            }
+            if score > self.score[pixel] {
+                self.score[pixel] = score;
+                self.plane[pixel] = plane;
+                self.before[pixel] = self.last[pixel];
+                self.after[pixel] = -1.0;
+            }
+            self.last[pixel] = score;
+        }
+    }
+
     /// Where the parabola through the best score and its neighbours has its top, in planes.
     fn between_planes(&self, pixel: usize) -> f32 {
         let (before, score, after) = (self.before[pixel], self.score[pixel], self.after[pixel]);
@@ -148,6 +165,13 @@ impl Best {
         }
         (0.5 * (before - after) / bend).clamp(-0.5, 0.5)
     }
+}
+
+/// Another photo as a photo's camera would see it.
+struct Warped {
+    grey: Vec<f32>,
+    /// 1 where the other photo sees the place, else 0.
+    seen: Vec<f32>,
 }
 
 /// How a photo's pixels at some depth fall on another photo.
@@ -173,38 +197,39 @@ impl<'a> Warp<'a> {
         }
     }
 
-    /// The other photo as seen at this inverse depth, and where it sees it.
-    fn run(&self, inverse_depth: f32, width: usize, warped: &mut [f32], seen: &mut [bool]) {
+    #[inline(always)]
+    fn run(&self, inverse_depth: f32, width: usize, warped: &mut Warped) {
         let (w, h) = (self.other.camera.width as usize, self.other.camera.height as usize);
+        let (grey, usable) = (self.other.grey.as_slice(), self.other.usable.as_deref());
         let along = self.infinite.x_axis.as_vec3();
         let (most_x, most_y) = (w as f32 - 1.0, h as f32 - 1.0);
-        for (row, (warped, seen)) in
-            warped.chunks_exact_mut(width).zip(seen.chunks_exact_mut(width)).enumerate()
-        {
+        let rows = warped.grey.chunks_exact_mut(width).zip(warped.seen.chunks_exact_mut(width));
+        for (row, (out, seen)) in rows.enumerate() {
             let start = self.infinite * DVec3::new(0.5, row as f64 + 0.5, 1.0)
                 + f64::from(inverse_depth) * self.epipole;
             let start = start.as_vec3();
             for column in 0..width {
-                let at = start + column as f32 * along;
-                let scale = 1.0 / at.z.max(1e-6);
+                let at = column as f32;
+                let z = start.z + at * along.z;
+                let scale = 1.0 / z.max(1e-6);
                 // Relative to the centre of pixel (0, 0).
-                let (x, y) = (at.x * scale - 0.5, at.y * scale - 0.5);
-                let inside = at.z > 1e-6 && x >= 0.0 && y >= 0.0 && x <= most_x && y <= most_y;
-                let (x, y) = (x.clamp(0.0, most_x), y.clamp(0.0, most_y));
-                let (left, top) = (x as usize, y as usize);
-                let (right, bottom) = ((left + 1).min(w - 1), (top + 1).min(h - 1));
-                let (fx, fy) = (x - left as f32, y - top as f32);
-                let grey = &self.other.grey;
-                let upper = grey[top * w + left] * (1.0 - fx) + grey[top * w + right] * fx;
-                let lower = grey[bottom * w + left] * (1.0 - fx) + grey[bottom * w + right] * fx;
-                warped[column] = upper * (1.0 - fy) + lower * fy;
-                seen[column] = inside
-                    && self.other.usable.as_ref().is_none_or(|usable| {
-                        usable[top * w + left]
-                            && usable[top * w + right]
-                            && usable[bottom * w + left]
-                            && usable[bottom * w + right]
-                    });
+                let x = (start.x + at * along.x) * scale - 0.5;
+                let y = (start.y + at * along.y) * scale - 0.5;
+                let inside = z > 1e-6 && x >= 0.0 && y >= 0.0 && x <= most_x && y <= most_y;
+                let (x, y) = (x.max(0.0).min(most_x), y.max(0.0).min(most_y));
+                let (left, upper) = (x as i32 as usize, y as i32 as usize);
+                let (right, lower) = ((left + 1).min(w - 1), (upper + 1).min(h - 1));
+                let (dx, dy) = (x - left as f32, y - upper as f32);
+                let corners =
+                    [upper * w + left, upper * w + right, lower * w + left, lower * w + right];
+                let above = grey[corners[0]] * (1.0 - dx) + grey[corners[1]] * dx;
+                let below = grey[corners[2]] * (1.0 - dx) + grey[corners[3]] * dx;
+                out[column] = above * (1.0 - dy) + below * dy;
+                let counts = match usable {
+                    Some(usable) => corners.iter().all(|&corner| usable[corner]),
+                    None => true,
+                };
+                seen[column] = if inside && counts { 1.0 } else { 0.0 };
             }
         }
     }
@@ -217,84 +242,136 @@ struct Patches {
 }
 
 impl Patches {
+    #[inline(always)]
     fn of(grey: &[f32], boxes: &mut Boxes) -> Self {
         let mut out = Self { mean: vec![0.0; grey.len()], variance: vec![0.0; grey.len()] };
-        boxes.run(
-            |i| [grey[i], grey[i] * grey[i], 0.0],
-            |i, [mean, square, _]| {
-                out.mean[i] = mean;
-                out.variance[i] = (square - mean * mean).max(0.0);
-            },
-        );
+        for row in 0..boxes.height + RADIUS {
+            if let Some((pixels, [mean, square, _])) = boxes.next_row(row, grey, grey) {
+                let (means, variances) = (&mut out.mean[pixels.clone()], &mut out.variance[pixels]);
+                for column in 0..mean.len() {
+                    means[column] = mean[column];
+                    variances[column] = (square[column] - mean[column] * mean[column]).max(0.0);
+                }
+            }
+        }
         out
     }
 
-    /// Calls `score` with each pixel's correlation of its patch and the warped photo's.
+    /// Puts the correlation of each pixel's patch and the warped photo's among the best.
+    #[inline(always)]
     fn correlate(
         &self,
         grey: &[f32],
-        warped: &[f32],
+        warped: &Warped,
         boxes: &mut Boxes,
-        mut score: impl FnMut(usize, f32),
+        [first, second]: &mut [Vec<f32>; BEST],
     ) {
-        boxes.run(
-            |i| [warped[i], warped[i] * warped[i], warped[i] * grey[i]],
-            |i, [mean, square, product]| {
-                let variance = (square - mean * mean).max(0.0);
-                let both = (self.variance[i] + NOISE) * (variance + NOISE);
-                score(i, (product - mean * self.mean[i]) / both.sqrt());
-            },
-        );
+        for row in 0..boxes.height + RADIUS {
+            let Some((pixels, [mean, square, product])) = boxes.next_row(row, &warped.grey, grey)
+            else {
+                continue;
+            };
+            let seen = &warped.seen[pixels.clone()];
+            let (own_mean, own_variance) =
+                (&self.mean[pixels.clone()], &self.variance[pixels.clone()]);
+            let (first, second) = (&mut first[pixels.clone()], &mut second[pixels]);
+            for column in 0..mean.len() {
+                let variance = (square[column] - mean[column] * mean[column]).max(0.0);
+                let both = (own_variance[column] + NOISE) * (variance + NOISE);
+                let score = (product[column] - mean[column] * own_mean[column]) / both.sqrt();
+                let score = if seen[column] > 0.0 { score } else { -1.0 };
+                second[column] = second[column].max(first[column].min(score));
+                first[column] = first[column].max(score);
+            }
+        }
     }
 }
 
-/// Means over the square about each pixel, of three values at once; squares end at the border.
+/// Means over the square about each pixel; squares end at the border.
 struct Boxes {
     width: usize,
     height: usize,
-    /// Sums along the row, for each row of the square in turn, and over all of them.
-    rows: Vec<[f32; 3]>,
-    sums: Vec<[f32; 3]>,
+    /// Sums along the row of a value, its square and its product with another, for each row of the
+    /// square in turn.
+    rows: [Vec<f32>; 3],
+    /// The values with zeros before and after.
+    padded: [Vec<f32>; 3],
+    means: [Vec<f32>; 3],
+    /// 1 / number of columns of each square.
+    columns: Vec<f32>,
 }
+
+const SIDE: usize = 2 * RADIUS + 1;
 
 impl Boxes {
     fn new(width: usize, height: usize) -> Self {
-        let rows = vec![[0.0; 3]; width * (2 * RADIUS + 1)];
-        Self { width, height, rows, sums: vec![[0.0; 3]; width] }
+        let columns = (0..width).map(|column| {
+            let count = (column + RADIUS + 1).min(width) - column.saturating_sub(RADIUS);
+            1.0 / count as f32
+        });
+        Self {
+            width,
+            height,
+            rows: std::array::from_fn(|_| vec![0.0; width * SIDE]),
+            padded: std::array::from_fn(|_| vec![0.0; width + 2 * RADIUS]),
+            means: std::array::from_fn(|_| vec![0.0; width]),
+            columns: columns.collect(),
+        }
     }
 
-    fn run(&mut self, value: impl Fn(usize) -> [f32; 3], mut mean: impl FnMut(usize, [f32; 3])) {
-        let (width, height, side) = (self.width, self.height, 2 * RADIUS + 1);
-        let mut line = vec![[0.0f32; 3]; width + 2 * RADIUS];
-        for row in 0..height + RADIUS {
-            if row < height {
-                let slot = &mut self.rows[row % side * width..][..width];
-                for (column, out) in line[RADIUS..RADIUS + width].iter_mut().enumerate() {
-                    *out = value(row * width + column);
-                }
-                for (column, out) in slot.iter_mut().enumerate() {
-                    let square = &line[column..column + side];
-                    *out = std::array::from_fn(|k| square.iter().map(|v| v[k]).sum());
+    /// Adds a row of `values` and of their products with `others`. Returns the means of the row that
+    /// this completes, `RADIUS` further up, and its pixels. Rows come in order, from 0 to the height
+    /// and `RADIUS` more.
+    #[inline(always)]
+    fn next_row(
+        &mut self,
+        row: usize,
+        values: &[f32],
+        others: &[f32],
+    ) -> Option<(std::ops::Range<usize>, [&[f32]; 3])> {
+        let width = self.width;
+        if row < self.height {
+            let (values, others) =
+                (&values[row * width..][..width], &others[row * width..][..width]);
+            let [plain, squares, products] = &mut self.padded;
+            let (plain, squares, products) = (
+                &mut plain[RADIUS..][..width],
+                &mut squares[RADIUS..][..width],
+                &mut products[RADIUS..][..width],
+            );
+            for column in 0..width {
+                plain[column] = values[column];
+                squares[column] = values[column] * values[column];
+                products[column] = values[column] * others[column];
+            }
+            for (rows, padded) in self.rows.iter_mut().zip(&self.padded) {
+                let out = &mut rows[row % SIDE * width..][..width];
+                out.copy_from_slice(&padded[..width]);
+                for shift in 1..SIDE {
+                    let shifted = &padded[shift..][..width];
+                    for column in 0..width {
+                        out[column] += shifted[column];
+                    }
                 }
             }
-            if row < RADIUS {
-                continue;
-            }
-            let centre = row - RADIUS;
-            let rows = centre.saturating_sub(RADIUS)..(centre + RADIUS + 1).min(height);
-            self.sums.fill([0.0; 3]);
-            for one in rows.clone() {
-                let slot = &self.rows[one % side * width..][..width];
-                for (sum, add) in self.sums.iter_mut().zip(slot) {
-                    *sum = std::array::from_fn(|k| sum[k] + add[k]);
+        }
+        let centre = row.checked_sub(RADIUS)?;
+        let square = centre.saturating_sub(RADIUS)..(centre + RADIUS + 1).min(self.height);
+        let scale = 1.0 / square.len() as f32;
+        for (means, rows) in self.means.iter_mut().zip(&self.rows) {
+            means.fill(0.0);
+            for one in square.clone() {
+                let sums = &rows[one % SIDE * width..][..width];
+                for column in 0..width {
+                    means[column] += sums[column];
                 }
             }
             for column in 0..width {
-                let columns = (column + RADIUS + 1).min(width) - column.saturating_sub(RADIUS);
-                let scale = 1.0 / (columns * rows.len()) as f32;
-                mean(centre * width + column, self.sums[column].map(|sum| sum * scale));
+                means[column] *= scale * self.columns[column];
             }
         }
+        let [mean, square, product] = &self.means;
+        Some((centre * width..(centre + 1) * width, [mean, square, product]))
     }
 }
 

@@ -3,14 +3,16 @@
 There is one splat for each of some points. These are
 
 * "points": the capture's own (COLMAP);
+* "depths": these, and points of the photos' depth maps that other photos confirm (``plane_sweep``);
 * "hull": inside the visual hull of photos with alpha (``visual_hull``);
-* "rays": on rays of photo pixels, at the depth where other photos agree best, by patches where
-  photos look from similar directions (``plane_sweep``), else by single pixels (``ray_depths``);
+* "rays": on rays of photo pixels, at the depth where other photos agree best (``ray_depths``);
 * "sift": triangulated features, and points between them (``sift_points``);
-* "random": anywhere in the box that the cameras look at.
+* "random": anywhere in the box that the cameras look at;
+* "sfm": points where the capture has some, else random, as 3DGS starts.
 
-"auto" is the first of points and hull that the capture has what it needs for; else rays where each
-photo has another from a similar direction; else sift, and rays where there are too few features.
+"auto" is points where the capture has as many as splats are wanted; hull where photos have alpha
+and there are no points; depths where most photos have another from a similar direction; else points
+where there are some, else sift, and rays where there are too few features.
 """
 
 from __future__ import annotations
@@ -21,10 +23,10 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
-from igsr.capture import Capture
+from igsr.capture import Capture, Points, View
 from igsr.errors import IgsrError
 from igsr.fitting.initialization.camera_coverage import looked_at_box
-from igsr.fitting.initialization.plane_sweep import can_sweep, swept_points
+from igsr.fitting.initialization.plane_sweep import sweepable, swept_points
 from igsr.fitting.initialization.ray_depths import ray_points
 from igsr.fitting.initialization.sift_points import sift_points, with_points_between
 from igsr.fitting.initialization.visual_hull import hull_points
@@ -38,6 +40,10 @@ Generator = np.random.Generator
 #: Splats where a capture has no points and density control adds more where they are needed. A fit
 #: that adds none starts with as many as it may have.
 MADE_UP_SPLATS = 20_000
+#: Part of the most splats that depth maps start a fit with.
+DEPTHS_PART = 0.5
+#: Part of the photos that need another from a similar direction for depth maps.
+SWEPT_PHOTOS = 0.5
 #: Fewer points of a capture than this say too little of a scene's surface.
 MIN_POINTS = 100
 #: Opacity of the least and most confident points, where points have a confidence; others have the
@@ -47,8 +53,6 @@ UNSURE_SIZE = 1.5
 
 #: The names of initializations.
 STARTS: tuple[str, ...] = get_args(Initialization)
-#: Degrees to the nearest other photo up to which plane sweeps are better than features.
-SWEEP_BEFORE_SIFT = 30.0
 #: Fewer triangulated features than this say nothing of a scene's shape.
 MIN_FEATURES = 30
 #: Splats per triangulated feature: itself and points between it and one of its nearest neighbours.
@@ -58,31 +62,42 @@ SPLATS_PER_FEATURE = 10
 RANDOM_SPLATS = 10_000
 
 
-def chosen_start(capture: Capture, start: str = "auto") -> str:
-    """The initialization that "auto" stands for with this capture, or ``start`` itself.
+def chosen_start(capture: Capture, start: str = "auto", wanted: int = MADE_UP_SPLATS) -> str:
+    """The initialization that "auto" or "sfm" stands for with this capture, or ``start`` itself.
 
-    Where "auto" stands for "sift", too few features may still turn it into "rays".
+    Where "auto" stands for "sift", too few features may still turn it into "rays"; where it stands
+    for "depths", too few points that photos confirm into what it were without.
+
+    Args:
+        capture: its train views are used.
+        start: a name of ``STARTS``.
+        wanted: number of splats that would do to start from.
 
     Raises:
         IgsrError: there is no such initialization, or the capture has not what it needs.
     """
     if start not in STARTS:
         raise IgsrError(f"start must be one of {', '.join(STARTS)}, not {start!r}.")
-    has_points = capture.points is not None and len(capture.points.xyz) >= MIN_POINTS
+    points = 0 if capture.points is None else len(capture.points.xyz)
     has_alpha = all(view.image.shape[2] == 4 for view in capture.train_views)
-    if start == "points" and not has_points:
+    if start == "points" and points < MIN_POINTS:
         raise IgsrError(
             f"{capture.path} has no {MIN_POINTS} points to start from; use another start."
         )
     if start == "hull" and not has_alpha:
         raise IgsrError(f"{capture.path} has photos without alpha; start hull needs it in all.")
+    if start == "sfm":
+        return "points" if points >= MIN_POINTS else "random"
     if start != "auto":
         return start
-    if has_points or has_alpha:
-        return "points" if has_points else "hull"
+    if points >= wanted:
+        return "points"
+    if has_alpha:
+        return "points" if points >= MIN_POINTS else "hull"
     views = capture.train_views
-    target = focus_point([view.camera for view in views])
-    return "rays" if can_sweep(views, target, SWEEP_BEFORE_SIFT) else "sift"
+    if np.mean(sweepable(views, focus_point([view.camera for view in views]))) >= SWEPT_PHOTOS:
+        return "depths"
+    return "points" if points >= MIN_POINTS else "sift"
 
 
 def initial_splats(
@@ -119,7 +134,7 @@ def initial_splats(
     if capture.points is not None:
         points = capture.points.seen_by(view.name for view in capture.train_views)
         capture = Capture(capture.path, capture.views, points)
-    if start == "auto" and not exact_poses and chosen_start(capture) == "sift":
+    if start == "auto" and not exact_poses and chosen_start(capture, start) == "sift":
         start = "rays"
     try:
         # What overflows is found by the check of the points; numpy's warnings would say less.
@@ -137,9 +152,20 @@ def initial_splats(
 def _placed_splats(
     capture: Capture, seed: int, max_splats: int, sh_degree: int, start: str, dense: bool
 ) -> tuple[Splats, str]:
-    asked, start = start, chosen_start(capture, start)
+    wanted = max_splats if dense else max(MIN_POINTS, round(DEPTHS_PART * max_splats))
+    asked, start = start, chosen_start(capture, start, wanted)
     random = np.random.default_rng([seed, 0x1617])
     points, views = capture.points, capture.train_views
+    if start == "depths":
+        xyz, colors = _with_depths(views, points, wanted, random)
+        if len(xyz) >= MIN_POINTS:
+            return _splats_at(xyz, colors, None, sh_degree), start
+        if asked != "auto":
+            raise IgsrError(
+                f"{capture.path}: the photos' depth maps agree in {len(xyz)} points only, too few "
+                "to start from; use start auto or random."
+            )
+        start = "points" if points is not None and len(points.xyz) >= MIN_POINTS else "sift"
     confidence = None
     features = sift_points(views) if start == "sift" else None
     if features is not None and len(features[0]) < MIN_FEATURES:
@@ -166,13 +192,27 @@ def _placed_splats(
         xyz, colors = random.uniform(low, high, size=(count, 3)), random.uniform(size=(count, 3))
     else:
         count = max_splats if dense else min(MADE_UP_SPLATS, max_splats)
-        target = focus_point([view.camera for view in views])
         if start == "hull":
             xyz, colors = hull_points(views, count, random)
-        elif can_sweep(views, target):
-            xyz, colors = swept_points(views, target, count, random)
         else:
             xyz, colors = ray_points(views, count, random)
+    return _splats_at(xyz, colors, confidence, sh_degree), start
+
+
+def _with_depths(
+    views: list[View], points: Points | None, wanted: int, random: Generator
+) -> tuple[Float64, Float64]:
+    """Points of depth maps and, where there are some, the capture's, ``wanted`` in all."""
+    known, rgb = np.zeros((0, 3)), np.zeros((0, 3))
+    if points is not None:
+        chosen = _at_most(wanted, len(points.xyz), random)
+        known, rgb = points.xyz[chosen], points.rgb[chosen] / 255.0
+    swept, colors = swept_points(views, known if len(known) else None, wanted - len(known), random)
+    return np.concatenate([known, swept]), np.concatenate([rgb, colors])
+
+
+def _splats_at(xyz: Float64, colors: Float64, confidence: Float64 | None, sh_degree: int) -> Splats:
+    """A splat at each point [P, 3], of its color [P, 3], by the points' confidence [P]."""
     # Relative to the middle, so that float32 is precise where the scene is.
     origin = np.median(xyz, axis=0)
     arrays = _core.splats_from_points(
@@ -180,7 +220,7 @@ def _placed_splats(
     )
     if confidence is not None:
         _follow_confidence(arrays, confidence)
-    return Splats(**arrays, origin=origin, antialiased=False), start
+    return Splats(**arrays, origin=origin, antialiased=False)
 
 
 def _at_most(most: int, count: int, random: Generator) -> npt.NDArray[np.int64]:

@@ -30,6 +30,8 @@ MIN_ANGLE = 2.0
 LONGEST = 320
 #: Depths tried per pixel, evenly spaced in inverse depth.
 DEPTHS = 96
+#: Photos that have depth maps, evenly spaced: of many photos, each shows what its neighbours do.
+MOST_SWEPT = 24
 #: Photos compared with, the nearest: more cost time and look from further apart.
 COMPARED = 4
 #: Range of depths, in units of the distance to what the cameras look at.
@@ -40,6 +42,8 @@ POINTS_NEAREST, POINTS_FARTHEST = 0.6, 4.0
 POINTS_SEEN = 20
 #: Correlation of patches that a point has at least.
 LEAST_SCORE = 0.5
+#: Depth maps of the nearest photos that may confirm a point.
+CONFIRMING = 8
 #: Depth maps agree where they differ by so many of the depths tried, or by this part of the depth.
 SAME_PLANES, SAME_DEPTH = 1.5, 0.01
 
@@ -49,20 +53,16 @@ class DepthMap:
     """Depths of a photo's pixels.
 
     Attributes:
-        photo: its index.
         view: the photo, reduced to at most ``LONGEST`` pixels.
         inverse_depth: float32 [H, W], 1 / z-depth in world units.
         score: float32 [H, W], correlation of patches in -1..1; -1 where no photo tells.
         gap: between two of the inverse depths tried.
-        compared: indices of the photos that were compared with.
     """
 
-    photo: int
     view: View
     inverse_depth: Float32
     score: Float32
     gap: float
-    compared: list[int]
 
     def points(self) -> Float64:
         """The world points [H * W, 3] of all pixels, row by row."""
@@ -94,7 +94,9 @@ def can_sweep(views: list[View], target: Float64, angle: float = MAX_ANGLE) -> b
 
 
 def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap]:
-    """The depth map of each photo that has another to compare with; nothing is random.
+    """Depth maps of at most ``MOST_SWEPT`` photos that have another to compare with.
+
+    Nothing is random.
 
     Args:
         views: the photos; masked and transparent pixels are not compared.
@@ -104,8 +106,9 @@ def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap
     target = focus_point([view.camera for view in views])
     angles = _angles(views, target)
     centres = np.stack([view.camera.centre for view in views])
-    sweeps = []
-    for k, view in enumerate(small):
+    sweeps: list[tuple[int, list[int], tuple[float, float], int]] = []
+    for k in np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_SWEPT)).round()):
+        k, view = int(k), small[int(k)]
         others = _compared(k, angles, np.linalg.norm(centres - centres[k], axis=1))
         nearest, farthest = _depth_range(view, target, known)
         sweeps.append((k, others, (1.0 / nearest, 1.0 / farthest), DEPTHS))
@@ -119,10 +122,10 @@ def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap
         sweeps,
     )
     maps = []
-    for (k, others, (near, far), _), arrays in zip(sweeps, found, strict=True):
+    for (k, _, (near, far), _), arrays in zip(sweeps, found, strict=True):
         score = np.where(usable[k], arrays["score"], np.float32(-1.0))
         gap = (near - far) / (DEPTHS - 1)
-        maps.append(DepthMap(k, small[k], arrays["inverse_depth"], score, gap, others))
+        maps.append(DepthMap(small[k], arrays["inverse_depth"], score, gap))
     return maps
 
 
@@ -142,9 +145,12 @@ def swept_points(
     """
     maps = depth_maps(views, known)
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for one in maps:
+    centres = np.stack([one.view.camera.centre for one in maps]) if maps else np.zeros((0, 3))
+    for k, one in enumerate(maps):
         world = one.points()
-        agreed = (one.score.reshape(-1) > LEAST_SCORE) & _is_confirmed(one, world, maps)
+        near = np.argsort(np.linalg.norm(centres - centres[k], axis=1), kind="stable")
+        others = [maps[int(i)] for i in near if i != k][:CONFIRMING]
+        agreed = (one.score.reshape(-1) > LEAST_SCORE) & _is_confirmed(world, others)
         points.append(world[agreed])
         colors.append(one.view.image[..., :3].reshape(-1, 3)[agreed] / 255.0)
     xyz, rgb = np.concatenate(points), np.concatenate(colors)
@@ -190,7 +196,7 @@ def _compared(k: int, angles: Float64, distances: Float64) -> list[int]:
 def _depth_range(view: View, target: Float64, known: Float64 | None) -> tuple[float, float]:
     """The nearest and farthest depth to try."""
     if known is not None:
-        row, column, depth, inside = _pixels(view, known)
+        _, _, depth, inside = _pixels(view, known)
         if inside.sum() >= POINTS_SEEN:
             low, high = np.percentile(depth[inside], [1.0, 99.0])
             return POINTS_NEAREST * float(low), POINTS_FARTHEST * float(high)
@@ -198,12 +204,10 @@ def _depth_range(view: View, target: Float64, known: Float64 | None) -> tuple[fl
     return NEAREST * reach, FARTHEST * reach
 
 
-def _is_confirmed(one: DepthMap, world: Float64, maps: list[DepthMap]) -> Bool:
-    """Which points [H * W, 3] of a depth map lie on the surface of another photo's."""
+def _is_confirmed(world: Float64, others: list[DepthMap]) -> Bool:
+    """Which world points [P, 3] lie on the surface of another depth map."""
     confirmed = np.zeros(len(world), dtype=np.bool_)
-    for other in maps:
-        if other.photo not in one.compared and one.photo not in other.compared:
-            continue
+    for other in others:
         row, column, depth, inside = _pixels(other.view, world)
         surface = 1.0 / other.inverse_depth[row, column].astype(np.float64)
         same = np.maximum(SAME_PLANES * other.gap * depth, SAME_DEPTH)

@@ -11,19 +11,18 @@ from typing import Any
 from igsr import _core
 from igsr._internal.choices import FitBackend
 from igsr._internal.part_usage import total
-from igsr._internal.resumable_jobs import Run, file_hash, finished_runs, folder_hash
+from igsr._internal.resumable_jobs import Run, file_hash, finished_runs
 from igsr._internal.worker_processes import in_a_process
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import photo_sizes
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance
 from igsr.errors import IgsrError
 from igsr.evaluation.quick_scores import MOST_TRAIN
-from igsr.fitting.presets import Preset, preset_settings
+from igsr.fitting.presets import Preset, default_max_size, preset_settings
 from igsr.study.own_photos_runs import (
-    SCENE_NOTE,
     CameraRun,
     OwnFit,
-    find_cameras,
+    find_scene_cameras,
     fit_and_score,
 )
 from igsr.study.own_photos_tables import write_report
@@ -69,7 +68,8 @@ def own_photos(
         seeds: how many seeds, from 0.
         holdout: every so many photos one is held out, counted in the order of their names.
         steps: of each fit; None is the preset's number.
-        max_size: longest side of the photos that are fitted, pixels; None leaves it to the preset.
+        max_size: longest side of the photos that are fitted, pixels; None is what
+            ``default_max_size`` says of the backend.
         score_size: longest side of the photos that are scored, pixels, the same for all presets;
             None is ``max_size``, or 1600 where that is None.
         known_cameras: use cameras that lie beside the photos, where there are some.
@@ -109,8 +109,12 @@ def own_photos(
 
     # Cameras first: a scene's are the same for all of its fits.
     own = {name for name in names if known_cameras and holds_cameras(root / name)}
-    tasks = [_camera_task(folder, name) for name in names if name not in own]
-    work = partial(in_a_process, find_cameras)
+    score_size = score_size or max_size or SCORE_SIZE
+    if max_size is None:
+        max_size = default_max_size(backend)
+    most = max(score_size, max_size)
+    tasks = [_camera_task(folder, name, most) for name in names if name not in own]
+    work = partial(in_a_process, find_scene_cameras)
     cameras = {
         row["scene"]: row
         for row in finished_runs(folder / "cameras", tasks, work, str(root), jobs, on_run)
@@ -125,9 +129,9 @@ def own_photos(
             holdout,
             steps,
             max_size,
-            score_size or max_size or SCORE_SIZE,
+            score_size,
             None if features is None else str(features),
-            None if name in own else str(_capture(folder, name)),
+            None if name in own else str(_cameras(folder, name)),
             str(folder / "splats" / f"{_run_name(name, one, seed, backend)}.ply"),
             str(folder / "sheets" / f"{file_name(name)}-{one}.png") if seed == 0 else None,
         )
@@ -151,7 +155,7 @@ def own_photos(
         "seeds": seeds,
         "steps": steps,
         "max_size": max_size,
-        "score_size": score_size or max_size or SCORE_SIZE,
+        "score_size": score_size,
         "cameras": "known where there are some, else found" if known_cameras else "found",
         "train": f"at most {MOST_TRAIN} fitted photos of each scene, evenly spaced",
         "refined": "held-out cameras aligned to the fitted ones where those moved, then each "
@@ -163,21 +167,21 @@ def own_photos(
     )
 
 
-def _capture(out: Path, scene: str) -> Path:
-    return out / "cameras" / file_name(scene)
+def _cameras(out: Path, scene: str) -> Path:
+    return out / "cameras" / f"{file_name(scene)}.npz"
 
 
 def _run_name(scene: str, preset: str, seed: int, backend: str) -> str:
     return f"{file_name(scene)}-{preset}-seed{seed}-{backend}"
 
 
-def _camera_task(out: Path, scene: str) -> Run:
-    capture = _capture(out, scene)
+def _camera_task(out: Path, scene: str, max_size: int) -> Run:
+    cameras = _cameras(out, scene)
     return Run(
         file_name(scene),
-        CameraRun(scene, str(capture), ESTIMATOR),
+        CameraRun(scene, str(cameras), ESTIMATOR, max_size),
         {"estimator": ESTIMATOR},
-        leaves=capture / SCENE_NOTE,
+        leaves=cameras,
         scene=scene,
     )
 
@@ -185,14 +189,13 @@ def _camera_task(out: Path, scene: str) -> Run:
 def _fit_task(root: Path, one: OwnFit, cameras: dict[str, Any] | None, features: str | None) -> Run:
     placed = len(photo_sizes(root / one.scene)) if cameras is None else cameras["placed"]
     photos = placed - len(range(0, placed, one.holdout))
-    given = {} if one.steps is None else {"steps": one.steps}
     settings = {
-        **preset_settings(one.preset, photos, **given),
+        **preset_settings(one.preset, photos, steps=one.steps),
         "holdout": one.holdout,
         "max_size": one.max_size,
         "scored_at": one.score_size,
         "perceptual": features,
-        "cameras": None if one.capture is None else folder_hash(Path(one.capture) / "sparse"),
+        "cameras": None if one.cameras is None else file_hash(Path(one.cameras)),
     }
     name = _run_name(one.scene, one.preset, one.seed, one.backend)
     leaves = None if one.sheet is None else Path(one.sheet)
