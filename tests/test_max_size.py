@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
 from capture_files import HEIGHT, WIDTH, photo, save, write_colmap, write_json, write_transforms
 from PIL import Image
 
-from igsr.capture import load_capture
-from igsr.capture.downscaling import area_means, plane_area_means, reduced_size
+import igsr
+from igsr.capture import Camera, View, load_capture
+from igsr.capture.downscaling import area_means, plane_area_means, reduced_size, reduced_view
 from igsr.capture.photo_folder import load_photos
 from igsr.errors import IgsrError
 
@@ -297,3 +300,25 @@ def test_masks_of_reduced_photos(tmp_path: Path) -> None:
     save(tmp_path / "masks_2/0.png.png", np.full((4, 4), 255, dtype=np.uint8))
     with pytest.raises(IgsrError, match=r"masks_2/0\.png\.png is 4x4 pixels"):
         load_capture(tmp_path, max_size=24)
+
+
+def test_a_fit_takes_odd_photos_among_good_ones() -> None:
+    capture = scenes.capture(views=4, size=24)
+    first = capture.views[0]
+    K = first.camera.K.copy()
+    K[:2] /= 24.0
+    pixel = np.full((1, 1, 3), 90, dtype=np.uint8)
+    odd = [
+        View("one-pixel.png", Camera(first.camera.viewmat, K, 1, 1), "train", pixel),
+        reduced_view(replace(first, name="wide.png"), 23, 24),
+        replace(capture.views[1], name="black.png", image=np.zeros_like(first.image)),
+    ]
+    with pytest.warns(UserWarning, match=r"black\.png: black or wholly transparent"):
+        splats = igsr.fit(
+            replace(capture, views=capture.views + odd),
+            steps=10,
+            max_splats=200,
+            backend="cpu",
+            start="random",
+        )
+    assert splats.finite.all()

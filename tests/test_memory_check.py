@@ -56,7 +56,7 @@ def test_more_needs_more() -> None:
     assert needed_memory(TWELVE, 1000) < base < needed_memory(TWELVE, 1100, 30_000)
     assert base < needed_memory(TWELVE, 1000, 30_000, channels=4)
     assert base < needed_memory(TWELVE, 1000, 30_000, masked=True)
-    assert base < needed_memory(TWELVE, 1000, 40_000)
+    assert needed_memory(TWELVE, 1000, 300_000) < needed_memory(TWELVE, 1000, 400_000)
     assert needed_memory(TWELVE, 4000) == needed_memory(TWELVE) == needed_memory(TWELVE, 9999)
     assert largest_size_that_fits(TWELVE, available=10**12) == 4000
     assert largest_size_that_fits(TWELVE, available=10**6) is None
@@ -128,7 +128,12 @@ def test_limits_of_control_groups(
 
 def test_few_large_photos_are_decoded_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory_check.os, "cpu_count", lambda: 64)
-    monkeypatch.setattr(memory_check, "available_memory", lambda: 2_000_000_000)
-    assert decoding_threads(12_000_000) == 5
-    assert decoding_threads(100_000_000) == 1
-    assert decoding_threads(1_000) == 16
+    for free in (2_000_000_000, 3_000_000_000):
+        monkeypatch.setattr(memory_check, "available_memory", lambda free=free: free)
+        threads = decoding_threads(TWELVE, 1000)
+        needed = needed_memory(TWELVE, 1000, masked=True)
+        one = memory_check.DECODED * 12_000_000
+        assert 1 < threads < 16
+        assert needed + (threads - 1) * one <= USABLE * free < needed + threads * one
+    assert decoding_threads(TWELVE) == 1, "one at a time, where there is hardly room"
+    assert decoding_threads([(48, 32)]) == 16

@@ -13,22 +13,23 @@ from pathlib import Path
 from igsr.capture.downscaling import reduced_size
 from igsr.errors import IgsrError
 
-#: Bytes of a photo's pixel while it is decoded: Pillow's four, and the copy as an array.
-DECODED = 8
+#: Bytes of a photo's pixel while it is decoded: Pillow's four, copies of it, and what the allocator
+#: keeps between photos (17 together, measured on JPEGs of 12 megapixels).
+DECODED = 18
 #: Bytes of a pixel of the largest photo while it is undistorted: the map, and the padded photo.
 UNDISTORTED = 24
-#: Bytes of a pixel of the largest photo while it is fitted and scored: render, photo, loss and
-#: gradients as float32, and the pictures that scores are computed from.
-RENDERED = 420
+#: Bytes of a pixel of the largest photo while it is fitted: render, photo, loss and gradients.
+FITTED = 110
+#: Bytes of a pixel of the largest photo while it is scored: planes of float64 for SSIM, and the
+#: colors and edges that FLIP compares.
+SCORED = 740
 #: Bytes of a splat at degree 3: parameters, two moments, gradients and statistics, its entries in
-#: tiles, and the copies that checkpoints and results are.
-OF_A_SPLAT = 4000
+#: tiles (1850 together), and the copies that checkpoints and results are.
+OF_A_SPLAT = 3500
 #: Bytes that a fit takes whatever its size: libraries, and threads' scratch.
-LIBRARIES = 500_000_000
+LIBRARIES = 650_000_000
 #: Photos may take this part of what is available: the rest is for what nobody counted.
 USABLE = 0.9
-#: Photos are decoded side by side while they take no more than this part of what is available.
-DECODING = 0.25
 #: Threads beyond these wait for the disk.
 MOST_THREADS = 16
 #: Sizes that are advised are multiples of this where they are larger, and none is below it.
@@ -81,8 +82,9 @@ def needed_memory(
     if splats is None:
         return loading
     copied = pixels * (channels + 4 * masked)  # a mask becomes float32 weights
-    fitting = held + copied + RENDERED * largest + OF_A_SPLAT * splats
-    return LIBRARIES + max(loading, fitting)
+    fitting = held + copied + FITTED * largest + OF_A_SPLAT * splats
+    scoring = held + SCORED * largest
+    return LIBRARIES + max(loading, fitting, scoring)
 
 
 def largest_size_that_fits(
@@ -141,7 +143,7 @@ def check_memory(
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     count = f"{len(sizes)} photos" if len(sizes) > 1 else "photo"
     up_to = "" if len(set(sizes)) == 1 else "up to "
-    at = "" if max_size is None else f" at --max-size {max_size}"
+    at = "" if max_size is None or max_size >= max(width, height) else f" at --max-size {max_size}"
     says = (
         f"The {count} of {up_to}{width}x{height}{at} would need {_gigabytes(needed_at(max_size))} "
         f"and {_gigabytes(available)} are free"
@@ -154,14 +156,19 @@ def check_memory(
     raise IgsrError(f"{says}: give --max-size {size} ({_gigabytes(needed_at(size))}).")
 
 
-def decoding_threads(largest: int) -> int:
-    """How many photos are decoded side by side.
+def decoding_threads(
+    sizes: Sequence[tuple[int, int]], max_size: int | None = None, *, channels: int = 3
+) -> int:
+    """How many photos are decoded side by side: as many as memory allows, at least one.
 
     Args:
-        largest: pixels of the largest photo as stored.
+        sizes, max_size, channels: as ``needed_memory``.
     """
-    fitting = DECODING * available_memory() / max(1, DECODED * largest)
-    return max(1, min(int(fitting), os.cpu_count() or 1, MOST_THREADS))
+    largest = max((width * height for width, height in sizes), default=1)
+    alone = needed_memory(sizes, max_size, channels=channels, masked=True)
+    left = USABLE * available_memory() - alone
+    more = int(max(0.0, left) / (DECODED * largest))
+    return min(1 + more, os.cpu_count() or 1, MOST_THREADS)
 
 
 def _gigabytes(count: float) -> str:

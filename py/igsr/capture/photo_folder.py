@@ -115,8 +115,8 @@ def load_photos(
         warnings.filterwarnings("ignore", module="PIL")
         sizes, channels, _ = _headers(files, frames)
         check_memory(sizes, max_size, channels=channels, masked=masks.is_dir())
-        largest = max((width * height for width, height in sizes), default=1)
-        with ThreadPoolExecutor(max_workers=decoding_threads(largest)) as pool:
+        threads = decoding_threads(sizes, max_size, channels=channels)
+        with ThreadPoolExecutor(max_workers=threads) as pool:
             loaded = list(pool.map(load, files, names))
     photos = [photo for found in loaded if isinstance(found, list) for photo in found]
     broken = [found for found in loaded if isinstance(found, IgsrError)]

@@ -360,8 +360,12 @@ def load_views(
                 mask = None
         return View(shot.name, camera, shot.split, image, mask)
 
-    largest = max((header.size[0] * header.size[1] for header in headers), default=1)
-    with ThreadPoolExecutor(max_workers=decoding_threads(largest)) as pool:
+    threads = decoding_threads(
+        [header.size for header in headers],
+        max_size,
+        channels=max((header.channels for header in headers), default=3),
+    )
+    with ThreadPoolExecutor(max_workers=threads) as pool:
         futures = [pool.submit(load, *each) for each in zip(shots, headers, cameras, strict=True)]
         try:
             return [future.result() for future in futures]

@@ -156,18 +156,18 @@ def capture_to_fit(
     parts = Parts() if parts is None else parts
     seen = look_at(path, finder.frames, max_size)
     seen.train_photos(holdout)
+    if seen.has_cameras and (finder.options or finder.estimator != AUTO):
+        raise IgsrError(
+            f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
+        )
+    if not seen.has_cameras:
+        kept_cameras(path, out)
+    seen.check_memory(max_size, splats)
     if announced is not None:
         announced(seen, seen.has_cameras or has_found(path, out))
     if seen.has_cameras:
-        if finder.options or finder.estimator != AUTO:
-            raise IgsrError(
-                f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
-            )
-        seen.check_memory(max_size, splats)
         with parts.measured("load"):
             return load(path, holdout, max_size), False
-    kept_cameras(path, out)
-    seen.check_memory(max_size, splats)
     with _pose_bar(shown) as show:
         capture = kept_capture(
             path,

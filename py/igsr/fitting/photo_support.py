@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
+# Presets are read by commands that must answer at once: what computes is imported where it does.
+if TYPE_CHECKING:
+    import numpy as np
 
-from igsr.capture import View
-from igsr.geometry.focus_point import focus_point
+    from igsr.capture import View
 
 #: A photo supports what another looks at if it sees that from within so many degrees of it: from
 #: further round, it sees other surfaces.
@@ -42,7 +45,7 @@ class PhotoSupport:
     def of_number(cls, photos: int) -> PhotoSupport:
         """A guess where nothing but the number is known: small photos all round an object."""
         # Each photo has its share of the half-sphere, a cap as wide as photos are apart.
-        apart = float(np.degrees(2.0 * np.arccos(1.0 - min(1.0, 1.0 / photos))))
+        apart = math.degrees(2.0 * math.acos(1.0 - min(1.0, 1.0 / photos)))
         return cls(photos, PIXELS, max(1.0, SUPPORTS_OF_ALL * photos), apart)
 
 
@@ -52,6 +55,10 @@ def support_of(views: Sequence[View]) -> PhotoSupport:
     Args:
         views: at least one.
     """
+    import numpy as np
+
+    from igsr.geometry.focus_point import focus_point
+
     target = focus_point([view.camera for view in views])
     centres = np.stack([view.camera.centre for view in views])
     forward = np.stack([view.camera.viewmat[2, :3] for view in views])

@@ -96,8 +96,9 @@ def kept_capture(
         for sentence in found.estimate.warnings:
             warn(sentence)
         with parts.measured("load"):
-            capture = found.capture(kept, photos_at(photos, frames, max_size, held))
-            _write(kept, photos, found, capture, usage)
+            # The capture is let go of before it is loaded.
+            views = photos_at(photos, frames, max_size, held)
+            _write(kept, photos, found, found.capture(kept, views), usage)
         say(
             f"Cameras of {len(found.placed)} of {len(found.names)} photos were found by {name} "
             f"and are kept in {kept}"
@@ -112,8 +113,8 @@ def kept_capture(
         if not _is_at(kept, found, max_size):
             look_at(photos, frames).check_memory(max_size)
             with parts.measured("load"):
-                capture = found.capture(kept, photos_at(photos, frames, max_size))
-                _write(kept, photos, found, capture, before)
+                views = photos_at(photos, frames, max_size)
+                _write(kept, photos, found, found.capture(kept, views), before)
     with parts.measured("load"):
         return load_capture(kept)
 

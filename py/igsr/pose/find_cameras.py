@@ -29,6 +29,9 @@ from igsr.pose.registry import ESTIMATORS
 #: The first of ``ESTIMATORS`` that can run here.
 AUTO = "auto"
 
+#: Longest side, in pixels, of photos that estimators are given: they look no closer.
+LONGEST = 1600
+
 #: What photos are given as.
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str] | Photo]
 
@@ -101,8 +104,6 @@ def find_cameras(
     Raises:
         IgsrError: as ``estimate_poses``.
     """
-    from igsr.pose.colmap import LONGEST
-
     chosen_estimator(estimator, options)
     if isinstance(photos, (str, os.PathLike)):
         # Before the long work, and not when the photos are loaded at that size.
