@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import scenes
 
 import igsr
-from igsr.fitting import fitter, presets
+from igsr.fitting import fitter
 from igsr.rendering.renders import render
 
 BALL = scenes.splats(60)
@@ -20,9 +19,8 @@ STEPS = 800
 
 @contextlib.contextmanager
 def small_fits():
-    """Few splats, and as many steps on novel views as on photos, since there are few steps."""
+    """As many steps on novel views as on photos, since there are few steps."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(presets, "_FEW", replace(presets._FEW, max_splats=1000))
         patch.setattr(fitter, "PHOTO_STEPS", 1)
         yield
 

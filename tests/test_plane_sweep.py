@@ -9,7 +9,15 @@ import pytest
 import scenes
 
 from igsr.capture import Camera, View
-from igsr.fitting.initialization.plane_sweep import DEPTHS, _most_alike, can_sweep, swept_points
+from igsr.fitting.initialization import plane_sweep
+from igsr.fitting.initialization.plane_sweep import (
+    FARTHEST,
+    MOST_SWEPT,
+    _depth_range,
+    can_sweep,
+    depth_maps,
+    swept_points,
+)
 
 SIZE, FOCAL, DEPTH = 64, 80.0, 4.0
 #: The wall moves by 8 pixels from photo to photo, and photos are compared at whole pixels.
@@ -34,8 +42,12 @@ def views(count=3, flat=lambda x: np.zeros(x.shape, dtype=bool), baseline=0.4):
     return made
 
 
+#: The photos' axes are parallel: what they look at is known from points.
+KNOWN = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)) + TARGET
+
+
 def points(photos, count=400, seed=0):
-    return swept_points(photos, TARGET, count, np.random.default_rng(seed))
+    return swept_points(photos, KNOWN, count, np.random.default_rng(seed))
 
 
 def test_points_lie_on_the_surface_with_its_colours():
@@ -87,20 +99,34 @@ def back_to_back():
 
 
 @pytest.mark.parametrize("photos", [views(1), back_to_back()])
-def test_photos_that_tell_nothing_still_give_points(photos):
-    xyz, _ = points(photos)
-    assert xyz.shape == (400, 3)
-    assert np.isfinite(xyz).all()
-    # At random depths, not all at one.
-    assert np.std(np.log(np.abs(xyz[:, 2]))) > 0.5
+def test_photos_that_tell_nothing_give_no_points(photos):
+    xyz, colors = points(photos)
+    assert xyz.shape == colors.shape == (0, 3)
 
 
-def test_one_good_match_is_surer_than_many():
-    difference = np.full((1, 3, DEPTHS), 0.3)
-    difference[0, 0, 20] = 0.01
-    difference[0, 1, [20, 60]] = 0.01
-    difference[0, 2] = np.inf
-    best, doubt = _most_alike(difference, np.random.default_rng(0))
-    assert best[0] == 20
-    assert best[1] in (20, 60)
-    assert doubt[0] < doubt[1] < doubt[2] == np.inf
+def test_known_points_tell_the_range_of_depths():
+    photo = views()[0]
+    nearest, farthest = _depth_range(photo, TARGET, KNOWN)
+    assert nearest < DEPTH - 1.0 < DEPTH + 1.0 < farthest
+    assert farthest / nearest < 0.5 * FARTHEST / plane_sweep.NEAREST
+    without = plane_sweep.NEAREST * DEPTH, FARTHEST * DEPTH
+    assert _depth_range(photo, np.array([photo.camera.centre[0], 0, DEPTH]), None) == without
+    assert _depth_range(photo, np.array([photo.camera.centre[0], 0, DEPTH]), KNOWN[:5]) == without
+
+
+def test_points_need_a_second_depth_map_that_agrees():
+    """Of a photo whose neighbour shows another scene, little is believed: what agrees by chance."""
+    photos = views()
+    noise = np.random.default_rng(5).integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8)
+    strange = [photos[0], replace(photos[1], image=noise)]
+    assert len(points(strange)[0]) < 0.05 * SIZE * SIZE
+    assert len(points(photos[:2], count=SIZE * SIZE)[0]) > 0.3 * SIZE * SIZE
+
+
+def test_of_many_photos_some_are_swept():
+    photos = views(MOST_SWEPT + 6, baseline=0.05)
+    maps = depth_maps(photos, KNOWN)
+    assert len(maps) == MOST_SWEPT
+    names = [one.view.name for one in maps]
+    assert names[0] == photos[0].name
+    assert names[-1] == photos[-1].name

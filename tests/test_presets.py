@@ -13,8 +13,10 @@ from made_up_tracks import tracked
 import igsr
 from igsr.capture import Points
 from igsr.capture.types import Tracks
+from igsr.fitting import presets
 from igsr.fitting.initialization.initial_splats import chosen_start, initial_splats
-from igsr.fitting.presets import FEW_PHOTOS, preset_settings
+from igsr.fitting.photo_support import PhotoSupport, support_of
+from igsr.fitting.presets import preset_settings, settings_for
 
 
 @pytest.fixture(scope="module")
@@ -27,17 +29,85 @@ def fit(capture, **options):
     return igsr.fit(capture, **arguments)
 
 
-def test_default_follows_the_number_of_photos_and_gives_way_to_the_caller():
-    few, many = preset_settings("default", FEW_PHOTOS), preset_settings("default", FEW_PHOTOS + 1)
-    assert few["dropout"] > 0.0
-    assert many["dropout"] == 0.0
-    assert (few["density"], many["density"]) == ("mcmc", "original")
-    assert preset_settings("default", 3)["steps"] < few["steps"]
-    assert preset_settings("default", 8)["steps"] == few["steps"]
-    plain = preset_settings("3dgs", FEW_PHOTOS)
-    assert preset_settings("3dgs", FEW_PHOTOS + 1) == plain | {"steps": 7000}
+def support(photos, seen_by=8.0, apart=10.0, pixels=100_000.0):
+    return PhotoSupport(photos, pixels, seen_by, apart)
+
+
+def test_default_follows_what_photos_tell_and_gives_way_to_the_caller():
+    few, many = settings_for("default", support(8)), settings_for("default", support(100, 50.0))
+    assert few.dropout == 0.15
+    assert many.dropout == 0.0
+    assert settings_for("default", support(3, 1.5)).dropout == presets.MOST_DROPOUT
+    assert (few.sh_degree, many.sh_degree) == (1, 2)
+    assert (few.density, settings_for("default", support(8, apart=30.0)).density) == (
+        "original",
+        "mcmc",
+    )
+    assert (few.max_splats, many.max_splats) == (14_000, 26_324)
+    assert settings_for("default", support(8, pixels=1e9)).max_splats == presets.MOST_SPLATS
     given = preset_settings("default", 8, dropout=0.0, hull=True, steps=None)
-    assert (given["dropout"], given["hull"], given["steps"]) == (0.0, True, few["steps"])
+    assert (given["dropout"], given["hull"]) == (0.0, True)
+    assert given["steps"] == settings_for("default", 8).steps
+
+
+def test_the_default_has_no_cliff():
+    """One photo more changes little, whatever their number."""
+    steps = splats = 0
+    dropout = presets.MOST_DROPOUT
+    for photos in range(1, 200):
+        now = settings_for("default", support(photos, max(1.0, 0.4 * photos)))
+        assert steps <= now.steps <= max(2 * presets.STEPS_PER_PHOTO, 1.5 * steps)
+        assert splats <= now.max_splats <= max(14_000, 1.2 * splats)
+        assert dropout - 0.1 <= now.dropout <= dropout
+        steps, splats, dropout = now.steps, now.max_splats, now.dropout
+    assert (steps, dropout) == (presets.MOST_STEPS, 0.0)
+
+
+def test_qualities_move_size_steps_and_splats_together():
+    by_quality = [settings_for("default", support(8), quality) for quality in presets.QUALITIES]
+    sizes = [presets.default_max_size("cpu", quality) for quality in presets.QUALITIES]
+    for values in (
+        sizes,
+        [one.steps for one in by_quality],
+        [one.max_splats for one in by_quality],
+    ):
+        assert values == sorted(set(values))
+    assert presets.default_max_size("gpu") > presets.default_max_size("cpu") == sizes[1]
+    for call in (
+        lambda: settings_for("default", 8, "best"),
+        lambda: presets.default_max_size("cpu", "best"),
+    ):
+        with pytest.raises(igsr.IgsrError, match="quality must be one of draft, normal, high"):
+            call()
+
+
+def test_the_baseline_is_3dgs(capture):
+    """SfM points where there are any, else random ones; no cap of ours; all photos' whole size."""
+    plain = settings_for("3dgs", 8)
+    assert plain == settings_for("3dgs", 100)
+    assert (plain.density, plain.sh_degree, plain.steps) == ("original", 3, 7000)
+    assert (plain.dropout, plain.coarse_to_fine) == (0.0, False)
+    assert plain.max_splats >= 1_000_000
+    assert initial_splats(capture, 0, 500, 1, plain.start)[1] == "random"
+    xyz = np.random.default_rng(0).normal(size=(200, 3))
+    points = Points(xyz, np.full((200, 3), 128, dtype=np.uint8))
+    with_points = igsr.Capture(capture.path, capture.views, points)
+    assert initial_splats(with_points, 0, 500, 1, plain.start)[1] == "points"
+
+
+def test_support_is_what_cameras_show():
+    ring = scenes.capture(views=12, size=40, alpha=True).views
+    all_round = support_of(ring)
+    assert all_round.photos == 12
+    assert all_round.pixels == 1600.0
+    # Within 60 degrees of each, itself included, on a ring of 30 degrees' steps.
+    assert 3.0 <= all_round.seen_by <= 5.0
+    half = support_of(ring[::2])
+    assert half.apart > all_round.apart
+    assert half.seen_by < all_round.seen_by
+    masked = [replace(view, mask=np.arange(1600).reshape(40, 40) < 400) for view in ring]
+    assert support_of(masked).pixels == 400.0
+    assert support_of(ring[:1]) == PhotoSupport(1, 1600.0, 1.0, 180.0)
 
 
 def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
@@ -45,7 +115,7 @@ def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
 
     igsr.fit(capture, steps=3, backend="cpu", checkpoint=tmp_path / "a.npz")
     _, settings = load_checkpoint(tmp_path / "a.npz")
-    expected = preset_settings("default", len(capture.train_views), steps=3)
+    expected = preset_settings("default", support_of(capture.train_views), steps=3)
     assert {name: settings[name] for name in expected} == expected
 
 
@@ -119,7 +189,7 @@ def test_splats_outside_the_hull_are_removed(capture):
 def test_starts(capture):
     assert chosen_start(capture) == "hull"
     assert chosen_start(scenes.capture(views=4, size=24)) == "sift"
-    assert chosen_start(scenes.capture(views=16, size=8)) == "rays"
+    assert chosen_start(scenes.capture(views=16, size=8)) == "depths"
     for start in ("hull", "rays", "random"):
         splats, made_from = initial_splats(capture, 0, 300, 1, start)
         assert made_from == start

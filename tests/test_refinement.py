@@ -11,6 +11,8 @@ from refinements import contented, lying, refine, same, truthful, unsure
 
 import igsr
 from igsr.fitting import fitter, presets
+from igsr.fitting.photo_support import support_of
+from igsr.fitting.presets import settings_for
 from igsr.refinement import cross_validation, stages
 from igsr.refinement.cross_validation import CrossValidation, combined_error
 from igsr.refinement.results import Stop, StopReason
@@ -83,9 +85,13 @@ def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(ball_photos, help
 
 
 def test_folds_are_fitted_as_all_photos_are(ball_photos, monkeypatch):
-    """One photo more than few: the folds have few, but are fitted with the settings for many."""
-    monkeypatch.setattr(presets, "FEW_PHOTOS", 8)
-    assert len(ball_photos.train_views) == 9
+    """The folds have fewer photos, further apart, but are fitted with the settings for all."""
+    photos = ball_photos.train_views
+    assert len(photos) == 9
+    monkeypatch.setattr(presets, "WIDE_APART", support_of(photos).apart + 0.1)
+    monkeypatch.setattr(presets, "SH2_PHOTOS", support_of(photos).seen_by)
+    dropout = settings_for("default", support_of(photos)).dropout
+    assert settings_for("default", support_of(photos[:7])).dropout != dropout
     settings = []
     real = stages.fit
 
@@ -96,7 +102,7 @@ def test_folds_are_fitted_as_all_photos_are(ball_photos, monkeypatch):
     monkeypatch.setattr(stages, "fit", watched)
     refine(ball_photos, 1, lying, steps=40)
     assert [photos for photos, *_ in settings][:3] == [9, 7, 8]
-    assert {tuple(some) for _, *some in settings} == {("original", 2, 0.0)}
+    assert {tuple(some) for _, *some in settings} == {("original", 2, dropout)}
 
 
 def test_what_masks_hide_has_no_weight(ball_photos):

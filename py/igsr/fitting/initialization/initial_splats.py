@@ -26,12 +26,11 @@ from igsr import _core
 from igsr.capture import Capture, Points, View
 from igsr.errors import IgsrError
 from igsr.fitting.initialization.camera_coverage import looked_at_box
-from igsr.fitting.initialization.plane_sweep import sweepable, swept_points
+from igsr.fitting.initialization.plane_sweep import looked_at, sweepable, swept_points
 from igsr.fitting.initialization.ray_depths import ray_points
 from igsr.fitting.initialization.sift_points import sift_points, with_points_between
 from igsr.fitting.initialization.visual_hull import hull_points
 from igsr.fitting.settings import Initialization
-from igsr.geometry.focus_point import focus_point
 from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
@@ -95,7 +94,8 @@ def chosen_start(capture: Capture, start: str = "auto", wanted: int = MADE_UP_SP
     if has_alpha:
         return "points" if points >= MIN_POINTS else "hull"
     views = capture.train_views
-    if np.mean(sweepable(views, focus_point([view.camera for view in views]))) >= SWEPT_PHOTOS:
+    target = looked_at(views, None if capture.points is None else capture.points.xyz)
+    if np.mean(sweepable(views, target)) >= SWEPT_PHOTOS:
         return "depths"
     return "points" if points >= MIN_POINTS else "sift"
 

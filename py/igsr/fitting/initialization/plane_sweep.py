@@ -88,6 +88,13 @@ def sweepable(views: list[View], target: Float64, angle: float = MAX_ANGLE) -> B
     return np.asarray(cosines.max(axis=1) > np.cos(np.radians(angle)))
 
 
+def looked_at(views: list[View], known: Float64 | None) -> Float64:
+    """The place [3] that photos look at: amid the known points [P, 3], or where the axes meet."""
+    if known is not None and len(known) >= POINTS_SEEN:
+        return np.asarray(np.median(known, axis=0))
+    return focus_point([view.camera for view in views])
+
+
 def can_sweep(views: list[View], target: Float64, angle: float = MAX_ANGLE) -> bool:
     """Whether every photo has another that sees the target [3] from within ``angle`` degrees."""
     return bool(sweepable(views, target, angle).all())
@@ -103,7 +110,7 @@ def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap
         known: [P, 3], points of the scene, which tell the range of depths, or None.
     """
     small = [_reduced(view) for view in views]
-    target = focus_point([view.camera for view in views])
+    target = looked_at(views, known)
     angles = _angles(views, target)
     centres = np.stack([view.camera.centre for view in views])
     sweeps: list[tuple[int, list[int], tuple[float, float], int]] = []
@@ -115,7 +122,7 @@ def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap
     sweeps = [sweep for sweep in sweeps if sweep[1]]
     usable = [_usable(view) for view in small]
     found = _core.plane_sweep(
-        [_grey(view) for view in small],
+        [_grey(view, mask) for view, mask in zip(small, usable, strict=True)],
         [None if mask.all() else mask.astype(np.uint8) for mask in usable],
         np.stack([view.camera.viewmat for view in small]),
         np.stack([view.camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for view in small]),
@@ -165,9 +172,10 @@ def _reduced(view: View) -> View:
     return reduced_view(view, *reduced_size(camera.width, camera.height, LONGEST))
 
 
-def _grey(view: View) -> Float32:
-    """Luma in 0..1 (BT.601)."""
+def _grey(view: View, usable: Bool) -> Float32:
+    """Luma in 0..1 (BT.601); what must not count is grey, whatever it shows."""
     grey = view.image[..., :3] @ np.array([0.299, 0.587, 0.114]) / 255.0
+    grey = np.where(usable, grey, 0.5)
     return np.ascontiguousarray(np.clip(grey, 0.0, 1.0), dtype=np.float32)
 
 
