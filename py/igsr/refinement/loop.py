@@ -21,6 +21,7 @@ from igsr.capture.photo_checks import check_photos
 from igsr.denoiser import Denoiser, NetworkDenoiser, load_network
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import check_masks
+from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import Quality, default_max_size
 from igsr.refinement.cross_validation import FEWEST_PHOTOS, CrossValidation, combined_error
 from igsr.refinement.novel_views import novel_views
@@ -29,6 +30,9 @@ from igsr.refinement.run import RefineRun, bar_state
 from igsr.refinement.selection import select_views
 from igsr.refinement.settings import AUTO, RefineSettings
 from igsr.refinement.stages import NOVEL_VIEWS_WORK, Propose, Reconstruction, Select, Stages
+
+#: Where so many photos see the same place, rounds gained nothing; "auto" does none.
+ENOUGH_PHOTOS = 30.0
 
 
 @renamed_keywords(look="propose", choose="select", judge="cross_validate")
@@ -54,7 +58,8 @@ def refine(
 
     Args:
         photos: a capture, or a folder of photos, whose cameras are found if it has none.
-        rounds: most rounds, or "auto": until one does not help, and at most four.
+        rounds: most rounds, or "auto": until one does not help, at most four, and none where so
+            many photos see the same place that they leave novel views nothing to add.
         progress: called about five times a second; returning False ends the refinement with an
             ``IgsrError``, and what is done so far stays in ``out``. In an interactive session, None
             shows a progress bar.
@@ -110,7 +115,7 @@ def refine(
         while refined.stop is None:
             refined = run.write(refined)
             run.round += 1
-            refined = _round(run.round, refined, whole, stages, validation, settings.most_rounds)
+            refined = _round(run.round, refined, whole, stages, validation, settings)
         return run.write(refined)
 
 
@@ -120,11 +125,15 @@ def _round(
     whole: Reconstruction,
     stages: Stages,
     validation: CrossValidation | None,
-    most_rounds: int,
+    settings: RefineSettings,
 ) -> Refined:
     """Do a round, or find out why there is none."""
-    if number > most_rounds:
-        return replace(refined, stop=Stop(StopReason.ROUNDS_DONE, most_rounds))
+    if number > settings.most_rounds:
+        return replace(refined, stop=Stop(StopReason.ROUNDS_DONE, settings.most_rounds))
+    seen_by = support_of(whole.photos).seen_by
+    if settings.rounds == AUTO and seen_by >= ENOUGH_PHOTOS:
+        # Known before the folds are fitted, which would cost as much as the fit itself.
+        return replace(refined, stop=Stop(StopReason.ENOUGH_PHOTOS, round(seen_by)))
     if validation and len(whole.photos) < FEWEST_PHOTOS:
         return replace(refined, stop=Stop(StopReason.TOO_FEW_PHOTOS, FEWEST_PHOTOS))
 

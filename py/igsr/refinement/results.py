@@ -27,6 +27,7 @@ class StopReason(enum.Enum):
 
     ROUNDS_DONE = "rounds_done"
     TOO_FEW_PHOTOS = "too_few_photos"
+    ENOUGH_PHOTOS = "enough_photos"
     NO_NOVEL_VIEW = "no_novel_view"
     NONE_SELECTED = "none_selected"
     NOT_ACCEPTED = "not_accepted"
@@ -39,7 +40,8 @@ class Stop:
     Attributes:
         reason: what ended it.
         count: what the reason counts. ``ROUNDS_DONE``: the rounds. ``TOO_FEW_PHOTOS``: the photos
-            that cross-validation needs. ``NONE_SELECTED``: the novel views that were rejected.
+            that cross-validation needs. ``ENOUGH_PHOTOS``: the photos that see the same place.
+            ``NONE_SELECTED``: the novel views that were rejected.
             ``NOT_ACCEPTED``: the number of the round that was rolled back. ``NO_NOVEL_VIEW``: 0.
     """
 
@@ -52,6 +54,8 @@ class Stop:
         return {
             StopReason.ROUNDS_DONE: f"{rounds} done",
             StopReason.TOO_FEW_PHOTOS: f"cross-validation needs at least {self.count} photos",
+            StopReason.ENOUGH_PHOTOS: f"{self.count} photos see the same place, in the mean, which "
+            "leaves novel views nothing to add",
             StopReason.NO_NOVEL_VIEW: "there is no novel view near the photos",
             StopReason.NONE_SELECTED: f"{views} had too little confidence or gain",
             StopReason.NOT_ACCEPTED: f"round {self.count} did not improve cross-validation scores",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from igsr._internal.choices import FitBackend
 from igsr.capture import Camera, Capture, View
-from igsr.denoiser import Denoiser, photo_sources, photo_support, render_buffers
+from igsr.denoiser import Denoiser, photo_support, render_buffers
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import (
     METRICS,
@@ -19,6 +19,7 @@ from igsr.evaluation.scores import (
 from igsr.fitting.fit_capture import Progress, fit
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import preset_settings
+from igsr.refinement.near_sources import NearSources
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.results import Scores, Stage
 from igsr.refinement.run import STOPPED, RefineRun
@@ -116,13 +117,14 @@ class Stages:
         known = [photo.camera for photo in photos] + [view.camera for view in added]
         novel = self._propose(splats, known, CANDIDATES, backend)
         support = photo_support(splats, photos, backend)
-        sources = photo_sources(splats, photos, self._background, backend)
+        sources = NearSources(splats, photos, self._background, backend)
         denoised = []
         for view in (*novel, *added):
             buffers = render_buffers(
                 splats, view.camera, support, self._background_of_views, backend
             )
-            denoised.append(denoised_candidate(view, buffers, sources, self._denoiser))
+            near = sources.of(view.camera)
+            denoised.append(denoised_candidate(view, buffers, near, self._denoiser))
             self._run.tell("novel_views")
         self._run.work_done(NOVEL_VIEWS_WORK * reconstruction.share)
         return DenoisedViews(denoised[: len(novel)], denoised[len(novel) :])

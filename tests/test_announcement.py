@@ -1,0 +1,94 @@
+"""What commands say at once: what was found, what follows, how long; and how that is estimated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from igsr.capture.overview import Overview
+from igsr.cli import announcement
+from igsr.cli.announcement import announce
+from igsr.fitting.presets import settings_for
+from igsr.fitting.time_estimate import StepTime, fit_seconds, timed_steps
+from igsr.pose.time_estimate import camera_seconds
+
+#: A step that takes a microsecond a pixel.
+BY_PIXELS = StepTime(0.0, 1e-6, 0.0)
+
+
+def test_a_fit_takes_what_its_steps_take():
+    settings = settings_for("3dgs", 8, steps=1000, max_splats=1000)
+    assert fit_seconds(settings, 400, 300, BY_PIXELS) == pytest.approx(120.0)
+    assert fit_seconds(settings, 400, 300, StepTime(0.01, 0.0, 0.0)) == pytest.approx(10.0)
+    # As many as there may be from half of the steps on, and half of them at first.
+    splats = fit_seconds(settings, 400, 300, StepTime(0.0, 0.0, 1e-3)) / 1000 / 1e-3
+    assert 0.8 * 1000 < splats < 0.95 * 1000
+    late = replace(settings, first_step=750)
+    assert fit_seconds(late, 400, 300, BY_PIXELS) == pytest.approx(30.0)
+    coarse = replace(settings, coarse_to_fine=True)
+    # Three tenths of the steps: half at a quarter, half at half of the sides.
+    expected = 120.0 * (0.7 + 0.15 / 4 + 0.15 / 16)
+    assert fit_seconds(coarse, 400, 300, BY_PIXELS) == pytest.approx(expected, rel=0.02)
+
+
+def test_steps_are_timed():
+    step = timed_steps("cpu")
+    assert step.per_pixel > 0.0
+    assert step.per_splat >= 0.0
+    assert 1e-5 < step.of(400 * 300, 10_000) < 10.0
+
+
+def test_cameras_take_longer_for_more_and_larger_photos():
+    small = camera_seconds([(400, 300)] * 10)
+    assert 0.0 < small < camera_seconds([(1600, 1200)] * 10) < camera_seconds([(1600, 1200)] * 40)
+    assert camera_seconds([(4000, 3000)] * 10) == camera_seconds([(1600, 1200)] * 10)
+
+
+def said(monkeypatch, seen, **options):
+    lines = []
+    monkeypatch.setattr(announcement, "print_message", lines.append)
+    monkeypatch.setattr(announcement, "timed_steps", lambda backend, degree: BY_PIXELS)
+    given = {
+        "holdout": None,
+        "max_size": 1000,
+        "preset": "default",
+        "quality": "normal",
+        "given": {"steps": 600},
+        "backend": "cpu",
+        "cameras_kept": False,
+        **options,
+    }
+    announce(seen, **given)
+    assert len(lines) == 3
+    return lines
+
+
+def test_three_lines_say_what_is_found_done_and_how_long_it_takes(monkeypatch):
+    sizes = [(1558, 1039)] * 24 + [(1039, 1558)]
+    seen = Overview(Path("photos"), False, sizes, 25, 3, True, True)
+    found, done, long = said(monkeypatch, seen, holdout=8)
+    assert (
+        found == "Found 25 photos of 1558x1039 to 1039x1558, 4 of them held out, without cameras."
+    )
+    assert done.startswith("Finds the cameras, then fits at 1000x667: up to ")
+    assert done.endswith(" splats, 600 steps.")
+    assert "of it for cameras" in long
+    found, done, long = said(monkeypatch, replace(seen, has_cameras=True), cameras_kept=True)
+    assert found.endswith("1039x1558.")
+    assert done.startswith("Fits at 1000x667")
+    assert "cameras" not in long
+    # 600 steps of 667 000 pixels, of which three tenths are on smaller photos.
+    assert "about 5 min" in long
+    *_, long = said(monkeypatch, replace(seen, has_cameras=True), cameras_kept=True, rounds=4)
+    assert "at most about" in long
+
+
+def test_few_of_many_photos_are_counted(monkeypatch):
+    seen = Overview(Path("photos"), True, [(300, 200)] * 100, 100, 3, False, True)
+    given = {"steps": None}
+    many = said(monkeypatch, seen, cameras_kept=True, given=given)[1]
+    few = said(monkeypatch, seen, cameras_kept=True, given=given, photos=8)[1]
+    assert many.endswith("5000 steps.")
+    assert few.endswith("2700 steps.")

@@ -1,0 +1,65 @@
+"""Refinements of many photos: bounded memory, and an early end where nothing is open."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from refinements import refine, truthful
+
+from igsr.refinement import loop, near_sources
+from igsr.refinement.near_sources import NearSources
+from igsr.refinement.results import Stop, StopReason
+
+
+def test_the_nearest_photos_are_held_and_no_more(ball_photos, helped, monkeypatch):
+    monkeypatch.setattr(near_sources, "NEAR", 3)
+    monkeypatch.setattr(near_sources, "HELD", 4)
+    made = []
+    real = near_sources.photo_sources
+
+    def watched(splats, views, *rest):
+        made.extend(view.name for view in views)
+        return real(splats, views, *rest)
+
+    monkeypatch.setattr(near_sources, "photo_sources", watched)
+    photos = ball_photos.train_views
+    sources = NearSources(helped[0].first, photos, (1.0, 1.0, 1.0), "cpu")
+    assert made == []
+    for photo in [*photos, photos[0]]:
+        near = sources.of(photo.camera)
+        assert len(near) == 3
+        assert any(one.camera is photo.camera for one in near)
+        distances = [np.linalg.norm(p.camera.centre - photo.camera.centre) for p in photos]
+        farthest = max(np.linalg.norm(one.camera.centre - photo.camera.centre) for one in near)
+        assert farthest <= np.sort(distances)[2] + 1e-9
+        assert len(sources._held) <= 4
+    assert len(made) > len(photos), "what was let go of is made again"
+    again = len(made)
+    sources.of(photos[0].camera)
+    assert len(made) == again, "what is held is not"
+
+
+def test_all_photos_are_near_where_there_are_few(ball_photos, helped):
+    photos = ball_photos.train_views
+    sources = NearSources(helped[0].first, photos, (1.0, 1.0, 1.0), "cpu")
+    near = sources.of(photos[4].camera)
+    assert [one.camera for one in near] == [photo.camera for photo in photos]
+
+
+def test_a_refinement_ends_where_photos_leave_nothing_open(ball_photos, monkeypatch):
+    monkeypatch.setattr(loop, "ENOUGH_PHOTOS", 2.0)
+    refined = refine(ball_photos, "auto", truthful, steps=20)
+    assert refined.stop.reason is StopReason.ENOUGH_PHOTOS
+    assert refined.rounds == []
+    assert "photos see the same place" in str(refined.stop)
+    assert "cross_validate" not in refined.seconds
+    # Rounds that were asked for are done.
+    asked = refine(ball_photos, 1, truthful, steps=20)
+    assert len(asked.rounds) == 1 or asked.stop != Stop(StopReason.ENOUGH_PHOTOS, 2)
+
+
+@pytest.mark.parametrize("count", [1, 9])
+def test_the_default_end_is_for_more_photos_than_a_ring_has(ball_photos, count):
+    from igsr.fitting.photo_support import support_of
+
+    assert support_of(ball_photos.train_views[:count]).seen_by < loop.ENOUGH_PHOTOS
