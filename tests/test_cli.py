@@ -285,7 +285,7 @@ def test_interrupt_saves_says_so_and_resumes(capture_path, tmp_path):
     assert not (tmp_path / "scene.ply").exists()
     resumed = igsr_command(
         "fit", capture_path, "--out", tmp_path, "--steps", 7, "--resume", "--max-splats", 300,
-        "--backend", "cpu",
+        "--backend", "cpu", "--json",
     )  # fmt: skip
     refused(resumed, "checkpoint.npz", "steps")
 

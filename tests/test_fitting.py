@@ -421,6 +421,7 @@ def test_a_checkpoint_of_format_1_goes_on(capture, tmp_path):
     """As files were written from the first release on, array by array."""
     path, count = tmp_path / "old.npz", 30
     options = {"steps": 20, "max_splats": count, "sh_degree": 0, "density": "fixed", "seed": 5}
+    since = {"dropout": 0.3, "coarse_to_fine": False}
     random = np.random.default_rng(0)
     shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3)}
     shapes |= {"opacities": (count,), "sh": (count, 1, 3)}
@@ -452,7 +453,8 @@ def test_a_checkpoint_of_format_1_goes_on(capture, tmp_path):
         text = json.dumps(settings | changed).encode()
         np.savez(path, **state, settings=np.frombuffer(text, dtype=np.uint8))
         last = []
-        keywords = options | {"background": (0.0, 0.0, 0.0), "checkpoint": path, "resume": True}
+        keywords = options | since | {"checkpoint": path, "resume": True}
+        keywords["background"] = (0.0, 0.0, 0.0)
         splats = small_fit(capture, progress=last.append, **keywords)
         return splats, last[-1]
 
@@ -462,7 +464,7 @@ def test_a_checkpoint_of_format_1_goes_on(capture, tmp_path):
     assert np.array_equal(splats.origin, np.zeros(3))
     # Eight steps away from what the file holds, and no other fit.
     assert 0 < np.abs(splats.means - state["means"]).max() < 0.2
-    assert load_checkpoint(path)[1].keys() == settings.keys() - {"format"}
+    assert load_checkpoint(path)[1].keys() == settings.keys() - {"format"} | {"coarse_to_fine"}
     with pytest.raises(igsr.IgsrError, match="it is not of format 1"):
         resumed(format=2)
     with pytest.raises(igsr.IgsrError, match=r"was made with igsr '0\.0\.9', not"):
@@ -474,7 +476,7 @@ def test_both_fits_have_the_same_arguments(capture):
     assert ours.parameters == theirs.parameters
     named = set(ours.parameters) - {"capture", "progress", "backend", "preset", "checkpoint"}
     fields = {one.name for one in dataclasses.fields(FitSettings)}
-    assert named - {"resume"} == fields - {"first_step"}
+    assert named - {"resume", "quality"} == fields - {"first_step"}
     with pytest.raises(TypeError, match="steps_"):
         igsr.fit_with_cameras(capture, steps_=3)
     alike = (capture, 5, None, "cpu", 4)

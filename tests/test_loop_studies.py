@@ -67,7 +67,8 @@ def test_views_of_a_run():
 
 @pytest.fixture
 def data(tmp_path, monkeypatch):
-    monkeypatch.setattr(presets, "_FEW", replace(presets._FEW, max_splats=200))
+    short = replace(presets.settings_for("default", 8), max_splats=200)
+    monkeypatch.setattr(presets, "_default", lambda support, quality: short)
     scenes.write_capture(tmp_path / "data/ball", ball(20))
     network = DenoiserNetwork(Architecture(4, (0, 0, 0)))
     with torch.no_grad():

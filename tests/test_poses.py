@@ -264,7 +264,7 @@ def test_the_command_writes_cameras_that_load_again(made, tmp_path):
     scenes.write_capture(tmp_path / "photos", wrong(made))
     out = tmp_path / "out"
     arguments = ["fit", str(tmp_path / "photos"), "--out", str(out), "--holdout", "4", "--json"]
-    options = ["--poses", "joint", "--steps", "60", "--max-splats", "300", "--backend", "cpu"]
+    options = ["--poses", "joint", "--steps", "150", "--max-splats", "300", "--backend", "cpu"]
     result = CliRunner().invoke(app, arguments + options)
     assert result.exit_code == 0, result.output
     report = json.loads((out / "report.json").read_text())
@@ -417,10 +417,11 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
         dropout=0.2,
         hull=True,
         start="auto",
+        coarse_to_fine=False,
         poses="fixed",
         focal="fixed",
     )
-    monkeypatch.setattr(presets, "_FEW", short)
+    monkeypatch.setattr(presets, "_default", lambda support, quality: short)
     row = run_fit(str(data), PoseFit("ball", Noise("turn", 1.0), "joint", 0, "cpu"))
     assert row["before"]["rotation"] == pytest.approx(1.0, abs=0.2)
     assert set(row["refined"]) == {"psnr", "ssim", "flip"}

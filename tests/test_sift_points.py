@@ -236,7 +236,7 @@ def test_too_few_features_are_one_sentence_or_rays():
     assert chosen_start(capture) == "sift"
     _, made_from = initial_splats(capture, 0, 200, 0)
     assert made_from == "rays"
-    wide = [photo(angle) for angle in (-0.27, 0.27)]
+    wide = [photo(angle) for angle in (-0.36, 0.36)]
     for exact, expected in ((True, "sift"), (False, "rays")):
         made = initial_splats(Capture(Path("wall"), wide), 0, 200, 0, exact_poses=exact)
         assert made[1] == expected

@@ -32,6 +32,7 @@ SHORT = FitSettings(
     dropout=0.0,
     hull=False,
     start="random",
+    coarse_to_fine=False,
     poses="fixed",
     focal="fixed",
 )
@@ -122,7 +123,7 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
     from igsr.fitting import presets
 
     short = replace(SHORT, steps=30, dropout=0.2, hull=True, start="auto")
-    monkeypatch.setattr(presets, "_FEW", short)
+    monkeypatch.setattr(presets, "_default", lambda support, quality: short)
     row = run_fit(blender.load_views, str(data), Fit("ball", "76", "default", 1, "cpu"))
     assert row["psnr"] > 10.0
     assert row["splats"] <= 300
@@ -234,7 +235,7 @@ def test_presets_that_move_cameras_are_scored_refined_too(real, monkeypatch):
 def test_what_a_mask_hides_in_a_scored_photo_changes_no_score(real, monkeypatch):
     from igsr.fitting import presets
 
-    monkeypatch.setattr(presets, "_3DGS_FEW", SHORT)
+    monkeypatch.setattr(presets, "_3DGS", SHORT)
     mask = np.zeros((16, 16), dtype=bool)
     mask[3:13, 4:14] = True
 

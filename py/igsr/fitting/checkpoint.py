@@ -140,6 +140,7 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         settings = json.loads(state.pop(SETTINGS).tobytes())
         if not isinstance(settings, dict) or settings.pop("format", None) != FORMAT:
             raise ValueError(f"it is not of format {FORMAT}")
+        settings.setdefault("coarse_to_fine", False)  # the first fits had no such setting
         seconds = settings.get("seconds")
         if not isinstance(seconds, float) or not math.isfinite(seconds):
             raise ValueError(f"its seconds are {seconds!r} where a finite number belongs")
