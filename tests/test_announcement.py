@@ -11,7 +11,7 @@ from igsr.capture.overview import Overview
 from igsr.cli import announcement
 from igsr.cli.announcement import announce
 from igsr.fitting.presets import settings_for
-from igsr.fitting.time_estimate import StepTime, fit_seconds, timed_steps
+from igsr.fitting.time_estimate import StepTime, fit_seconds, other_seconds, timed_steps
 from igsr.pose.time_estimate import camera_seconds
 
 #: A step that takes a microsecond a pixel.
@@ -38,6 +38,12 @@ def test_steps_are_timed():
     assert step.per_pixel > 0.0
     assert step.per_splat >= 0.0
     assert 1e-5 < step.of(400 * 300, 10_000) < 10.0
+
+
+def test_depth_maps_and_scores_count():
+    assert other_seconds(0, 0, 1e6) == 0.0
+    assert other_seconds(8, 0, 1e6) < other_seconds(24, 0, 1e6) == other_seconds(100, 0, 1e6)
+    assert other_seconds(0, 10, 2e6) == pytest.approx(2.0 * other_seconds(0, 10, 1e6))
 
 
 def test_cameras_take_longer_for_more_and_larger_photos():
@@ -79,7 +85,8 @@ def test_three_lines_say_what_is_found_done_and_how_long_it_takes(monkeypatch):
     assert found.endswith("1039x1558.")
     assert done.startswith("Fits at 1000x667")
     assert "cameras" not in long
-    # 600 steps of 667 000 pixels, of which three tenths are on smaller photos.
+    # 600 steps of 667 000 pixels, of which three tenths are on smaller photos; and depth maps
+    # and scores.
     assert "about 5 min" in long
     *_, long = said(monkeypatch, replace(seen, has_cameras=True), cameras_kept=True, rounds=4)
     assert "at most about" in long

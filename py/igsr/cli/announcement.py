@@ -10,9 +10,11 @@ from igsr.capture.overview import Overview
 from igsr.cli.error_messages import print_message
 from igsr.fitting.photo_support import PhotoSupport
 from igsr.fitting.presets import Quality, settings_for
-from igsr.fitting.time_estimate import fit_seconds, timed_steps
+from igsr.fitting.time_estimate import fit_seconds, other_seconds, timed_steps
 from igsr.pose.time_estimate import camera_seconds
 
+#: Fitted photos that are scored, at most.
+MOST_TRAIN = 10
 #: Photos as people take them stand this far apart, seen from what they show: degrees.
 USUALLY_APART = 10.0
 #: A round of a refinement takes this part of a fit's time, by its folds, novel views and refit.
@@ -57,6 +59,7 @@ def announce(
         settings, width, height, timed_steps(backend, settings.sh_degree)
     )
     held_out = len(seen.sizes) - train
+    fit += other_seconds(photos, held_out + min(photos, MOST_TRAIN), pixels)
     print_message(
         f"Found {len(seen.sizes)} photos of {_range_of(seen.sizes)}"
         + (f", {held_out} of them held out" if held_out else "")
