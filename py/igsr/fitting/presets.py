@@ -33,10 +33,10 @@ SH2_PHOTOS = 12.0
 #: Steps of any fit, and more for each photo, up to a most; but for few photos only so many each.
 STEPS, STEPS_MORE, MOST_STEPS = 2500, 25, 5000
 STEPS_PER_PHOTO = 500
-#: Most splats per pixel of one photo, times the fourth root of the photos over ``FEW``: more photos
-#: show more of a scene, but not as many times more.
-SPLATS_PER_PIXEL = 0.14
-FEW = 8.0
+#: Most splats per pixel of one photo, times this power of the photos over ``FEW``: more photos show
+#: more of a scene, but not as many times more. With more splats, few photos are only overfitted.
+SPLATS_PER_PIXEL = 0.11
+FEW, SPLATS_POWER = 8.0, 0.4
 MOST_SPLATS = 1_000_000
 #: Steps of the paper's fits to photos whose cameras have noise.
 PAPER_STEPS = 5000
@@ -141,7 +141,9 @@ def _default(support: PhotoSupport, quality: Quality) -> FitSettings:
     dropout = min(MOST_DROPOUT, DROPOUT_PHOTOS / support.seen_by)
     _, more_steps, more_splats = _quality(quality)
     steps = more_steps * min(MOST_STEPS, STEPS + STEPS_MORE * support.photos)
-    splats = more_splats * SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** 0.25
+    splats = (
+        more_splats * SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** SPLATS_POWER
+    )
     return replace(
         _DEFAULT,
         steps=round(min(steps, more_steps * STEPS_PER_PHOTO * support.photos)),
