@@ -481,3 +481,20 @@ def test_both_fits_have_the_same_arguments(capture):
         igsr.fit_with_cameras(capture, steps_=3)
     alike = (capture, 5, None, "cpu", 4)
     assert same(igsr.fit(*alike), igsr.fit_with_cameras(*alike)[0])
+
+
+def test_backends_agree_from_coarse_to_fine():
+    """Photos change their size in the middle of a fit, on each backend."""
+    photos = scenes.capture(views=6, size=200)
+    options = {"steps": 60, "max_splats": 300, "start": "random", "density": "fixed", "dropout": 0}
+    fits = {
+        backend: igsr.fit(photos, backend=backend, coarse_to_fine=True, **options)
+        for backend in ("cpu", "gpu")
+    }
+    scores = {
+        backend: igsr.evaluate(splats, photos, "train", backend="cpu").psnr
+        for backend, splats in fits.items()
+    }
+    assert scores["gpu"] == pytest.approx(scores["cpu"], abs=0.05)
+    whole = igsr.fit(photos, backend="cpu", coarse_to_fine=False, **options)
+    assert not np.array_equal(whole.means, fits["cpu"].means)
