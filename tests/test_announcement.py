@@ -5,13 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from igsr.capture.overview import Overview
 from igsr.cli import announcement
 from igsr.cli.announcement import announce
 from igsr.fitting.presets import settings_for
-from igsr.fitting.time_estimate import StepTime, fit_seconds, other_seconds, timed_steps
+from igsr.fitting.time_estimate import (
+    StepTime,
+    fit_seconds,
+    other_seconds,
+    timed_steps,
+    work_done,
+)
 from igsr.pose.time_estimate import camera_seconds
 
 #: A step that takes a microsecond a pixel.
@@ -31,6 +38,19 @@ def test_a_fit_takes_what_its_steps_take():
     # Three tenths of the steps: half at a quarter, half at half of the sides.
     expected = 120.0 * (0.7 + 0.15 / 4 + 0.15 / 16)
     assert fit_seconds(coarse, 400, 300, BY_PIXELS) == pytest.approx(expected, rel=0.02)
+
+
+def test_the_bar_goes_by_time_and_not_by_steps():
+    settings = settings_for("default", 100)
+    parts = [work_done(settings, 800, 600, step) for step in range(0, settings.steps + 1, 100)]
+    assert parts[0] == 0.0
+    assert parts[-1] == 1.0
+    assert (np.diff(parts) > 0.0).all()
+    # Reduced photos and few splats first: three tenths of the steps are a tenth of the work.
+    assert work_done(settings, 800, 600, round(0.3 * settings.steps)) < 0.2
+    late = replace(settings, first_step=settings.steps - 100)
+    assert work_done(late, 800, 600, settings.steps - 100) == 0.0
+    assert work_done(late, 800, 600, settings.steps - 50) == pytest.approx(0.5, abs=0.03)
 
 
 def test_steps_are_timed():

@@ -27,11 +27,14 @@ class BarState(NamedTuple):
         done: of ``total``.
         total: of any unit.
         text: behind the bar.
+        work: part of the work that is done, in [0, 1], by which the bar and the time left go; None
+            where each of ``total`` takes as long.
     """
 
     done: float
     total: float
     text: str = ""
+    work: float | None = None
 
 
 @contextlib.contextmanager
@@ -66,7 +69,8 @@ def progress_bar(
         bar.start()
         # Fractions are a unit of their own, which no count explains.
         counts = f"{state.done:.0f}/{state.total:.0f}" if state.total > 1 else ""
-        bar.update(task, completed=state.done, total=state.total, counts=counts, text=state.text)
+        done = state.done if state.work is None else state.work * state.total
+        bar.update(task, completed=done, total=state.total, counts=counts, text=state.text)
 
     try:
         yield show

@@ -247,7 +247,18 @@ def _fitted(
         kept = {"origin": origin}
         if settings.moves_cameras:
             kept[ROUGH] = camera_rows(views)
-        run = FitRun(fitter, settings, started, device, report, file, kept, seconds)
+        size = np.mean([(view.camera.width, view.camera.height) for view in views], axis=0)
+        run = FitRun(
+            fitter,
+            settings,
+            started,
+            device,
+            report,
+            file,
+            size=(float(size[0]), float(size[1])),
+            kept=kept,
+            seconds_before=seconds,
+        )
         if rough:
             run.save()  # the cameras that took so long to find are kept from here on
         if not stopped:

@@ -16,6 +16,7 @@ from igsr._internal.progress_bar import BarState
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import CheckpointFile
 from igsr.fitting.settings import FitSettings
+from igsr.fitting.time_estimate import work_done
 
 #: A killed run loses at most this much work.
 CHECKPOINT_STEPS = 500
@@ -37,6 +38,7 @@ class Progress:
         seconds: time spent fitting, earlier runs that were resumed included.
         steps_per_second: of the last chunk of steps.
         backend: what runs: "backend", "device" and "instruction_set".
+        work: part of the fit's time, in [0, 1], that the steps done take of all.
     """
 
     step: int
@@ -47,6 +49,7 @@ class Progress:
     seconds: float
     steps_per_second: float
     backend: dict[str, str]
+    work: float = 0.0
 
 
 def bar_state(now: Progress) -> BarState:
@@ -55,6 +58,7 @@ def bar_state(now: Progress) -> BarState:
         now.step,
         now.steps,
         f"loss {now.loss:.4f}  {now.splats} splats  {now.steps_per_second:.0f} steps/s",
+        now.work,
     )
 
 
@@ -73,6 +77,7 @@ class FitRun:
         backend: what runs; see ``Progress``.
         report: what is called after each chunk of steps.
         checkpoint: the file to save to.
+        size: width and height of the photos, pixels.
         kept: arrays that checkpoints hold beside the fitter's.
         seconds_before: time spent before this run.
     """
@@ -83,6 +88,7 @@ class FitRun:
     backend: dict[str, str]
     report: Report | None = None
     checkpoint: CheckpointFile | None = None
+    size: tuple[float, float] = (1.0, 1.0)
     kept: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
     seconds_before: float = 0.0
 
@@ -148,6 +154,7 @@ class FitRun:
             seconds=self.seconds_before + now - self._began,
             steps_per_second=advanced / max(now - began, 1e-9),
             backend=self.backend,
+            work=work_done(self.settings, *self.size, self._step),
         )
 
     def _is_save_due(self) -> bool:

@@ -47,6 +47,10 @@ class StepTime:
         return self.fixed + self.per_pixel * pixels + self.per_splat * splats
 
 
+#: What steps take on two cores; only how pixels and splats compare matters.
+USUAL = StepTime(1e-3, 7e-8, 4e-7)
+
+
 def timed_steps(backend: str, sh_degree: int = 1) -> StepTime:
     """Time a few steps on made-up photos and splats; takes about a second.
 
@@ -67,13 +71,16 @@ def timed_steps(backend: str, sh_degree: int = 1) -> StepTime:
     return StepTime(max(0.0, base - per_pixel * small - per_splat * few), per_pixel, per_splat)
 
 
-def fit_seconds(settings: FitSettings, width: float, height: float, step: StepTime) -> float:
+def fit_seconds(
+    settings: FitSettings, width: float, height: float, step: StepTime, until: int | None = None
+) -> float:
     """Seconds that the steps of a fit take.
 
     Args:
         settings: of the fit.
         width, height: of its photos, pixels.
         step: what steps take on this machine.
+        until: count the steps before this one; None counts all.
     """
     seconds, longest = 0.0, round(max(width, height))
     first = settings.first_step
@@ -83,8 +90,27 @@ def fit_seconds(settings: FitSettings, width: float, height: float, step: StepTi
         by = _core.reduction(settings.steps, settings.coarse_to_fine, at, longest)
         grown = 1.0 if settings.density == "fixed" else min(1.0, progress / GROWN)
         splats = settings.max_splats * (START_PART + (REACHED - START_PART) * grown)
-        seconds += (settings.steps - first) / PARTS * step.of(width * height / by**2, splats)
+        begins = first + part * (settings.steps - first) / PARTS
+        steps = (settings.steps - first) / PARTS
+        if until is not None:
+            steps = min(steps, max(0.0, until - begins))
+        seconds += steps * step.of(width * height / by**2, splats)
     return seconds
+
+
+def work_done(settings: FitSettings, width: float, height: float, step: int) -> float:
+    """Part of a fit's time, in [0, 1], that its first steps take: late ones have more splats.
+
+    Args:
+        settings: of the fit.
+        width, height: of its photos, pixels.
+        step: number of steps done.
+    """
+    whole = fit_seconds(settings, width, height, USUAL)
+    first = settings.first_step
+    if step >= settings.steps or whole <= 0.0:
+        return 1.0
+    return fit_seconds(settings, width, height, USUAL, until=max(first, step)) / whole
 
 
 def other_seconds(photos: int, scored: int, pixels: float) -> float:
