@@ -175,7 +175,7 @@ def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -
 def test_of_many_photos_the_time_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     for step in ("list_photos", "find_features"):
         monkeypatch.setattr(estimator, step, lambda *arguments: None)
-    monkeypatch.setattr(estimator, "mapped", lambda *arguments: (None, []))
+    monkeypatch.setattr(estimator, "mapped", lambda *arguments: (None, False))
     tiny = [Photo(f"{i}.png", np.zeros((2, 2, 3), dtype=np.uint8)) for i in range(500)]
     with (
         pytest.warns(UserWarning, match=r"COLMAP needs about \d+ minutes for 500 photos"),

@@ -1,14 +1,13 @@
 """Cameras of as many photos as possible: what is not placed is tried again with more and with less.
 
-A model of most photos is kept and extended: photos that are missing ask for more matches of their
-own and for lower thresholds, not for the same cameras once more. A smaller model may have begun at
-the wrong pair, and is made anew.
+Where COLMAP's own thresholds leave few photos out, these ask for more matches of their own, and the
+model is extended. Where they leave many out, all photos stand on little: every pair gets more
+matches, and the model is made anew.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,14 +25,11 @@ from igsr.pose.estimate import Progress
 
 #: Up to this many photos, unregistered ones are tried again.
 FEW = 60
-#: Steps, and whether a model is made anew where one could be extended. Where thresholds have fallen
-#: as far as they do and photos are still missing, another beginning may hold them too.
-ATTEMPTS = (*((step, False) for step in range(len(STEPS))), (len(STEPS) - 1, True))
+#: The largest part of the photos that counts as few.
+FEW_MISSING = 0.25
 
 
-def mapped(
-    count: int, features: Path, seed: int, show: Progress
-) -> tuple[Any | None, Collection[int]]:
+def mapped(count: int, features: Path, seed: int, show: Progress) -> tuple[Any | None, bool]:
     """Match and place photos.
 
     Args:
@@ -43,42 +39,41 @@ def mapped(
         show: called with "matching" and "mapping", how much is done, and how much there is.
 
     Returns:
-        The model with most photos, or None, and the indices of photos in it that are placed on so
-        little evidence that they may be wrong.
+        The model with most photos, or None, and whether it stands on so little evidence that it may
+        be wrong.
     """
     matches = matched(count, features, seed, show)
     hopeless = set(range(count)) - with_matches(matches)
     database = with_focal_lengths(matches, seed)
     best: Any | None = None
-    sure: set[int] = set()
-    looked = same = extended = False
-    for step, anew in ATTEMPTS:
-        evidence = STEPS[step]
-        if evidence.guided_matching and not looked:
-            looked = True
-            more = matched_along_lines(matches, _missing(best, count), show)
-            same = more is None
-            database = database if more is None else with_focal_lengths(more, seed)
-        if same and _differ_in_matches_alone(STEPS[step - 1], evidence):
-            continue
-        if anew and not extended:
-            break
-        extended = not anew and best is not None and 2 * best.num_reg_images() > count
-        if extended:
+    best_step = 0
+    looked_for: set[int] = set()
+    few = False
+    for step, evidence in enumerate(STEPS):
+        extending = few and step < DOUBTFUL
+        if evidence.guided_matching:
+            wanted = _missing(best, count) if extending else set(range(count))
+            if not wanted <= looked_for:
+                looked_for = wanted
+                more = matched_along_lines(matches, wanted, show)
+                if more is not None:
+                    database = with_focal_lengths(more, seed)
+                elif _differ_in_matches_alone(STEPS[step - 1], evidence):
+                    continue
+        if extending:
             model = copy.deepcopy(best)
             extend(model, count, database, evidence, seed, show)
         else:
             model = map_photos(count, database, evidence, seed, show)
         if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
-            best = model
-            if step < DOUBTFUL:
-                sure = set(range(count)) - _missing(best, count)
-            elif not extended:
-                sure = set()
-        if best is not None and (count > FEW or _missing(best, count) <= hopeless):
+            best, best_step = model, step
+        lost = _missing(best, count)
+        if best is not None and (count > FEW or lost <= hopeless):
             break
+        if step == 0:
+            few = len(lost) <= FEW_MISSING * count
     show("mapping", count, count)
-    return best, sorted(set(range(count)) - _missing(best, count) - sure)
+    return best, best_step >= DOUBTFUL
 
 
 def _missing(model: Any | None, count: int) -> set[int]:

@@ -91,13 +91,12 @@ def with_matches(matches: Path) -> set[int]:
     return found
 
 
-def matched_along_lines(matches: Path, missing: Collection[int], show: Progress) -> Path | None:
-    """A copy of a database of matches, with more of them where they can help missing photos.
+def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) -> Path | None:
+    """A copy of a database of matches, with more of them along the epipolar lines of pairs.
 
     Args:
         matches: the database.
-        missing: indices of photos that are not placed. Pairs without one of them are left alone:
-            what is placed has matches enough.
+        wanted: indices of photos that need more; pairs without any of them are left alone.
         show: called with "matching", pairs done and all pairs that are looked at.
 
     Returns:
@@ -107,7 +106,7 @@ def matched_along_lines(matches: Path, missing: Collection[int], show: Progress)
 
     database = matches.with_name("guided.db")
     shutil.copyfile(matches, database)
-    wanted = {image_id(index) for index in missing}
+    images = {image_id(index) for index in wanted}
     gained = False
     with pycolmap.Database.open(database) as opened:
         ids, geometries = opened.read_two_view_geometries()
@@ -115,7 +114,7 @@ def matched_along_lines(matches: Path, missing: Collection[int], show: Progress)
         for pair, geometry in sorted(zip(ids, geometries, strict=True), key=lambda one: one[0]):
             a, b = pycolmap.pair_id_to_image_pair(pair)
             constraint = _constraint(geometry)
-            if constraint is not None and (a in wanted or b in wanted):
+            if constraint is not None and (a in images or b in images):
                 pairs.append((a, b, geometry, constraint))
         features: dict[int, Features] = {}
         for done, (a, b, geometry, constraint) in enumerate(pairs):

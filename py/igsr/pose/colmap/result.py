@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,13 @@ from igsr.pose.estimate import Estimate
 Float64 = npt.NDArray[np.float64]
 
 
-def estimate_of(photos: Sequence[Photo], model: Any | None, doubtful: Collection[int]) -> Estimate:
+def estimate_of(photos: Sequence[Photo], model: Any | None, doubtful: bool) -> Estimate:
     """Cameras, points and warnings.
 
     Args:
         photos: all that were given.
         model: pycolmap's, or None if there is none.
-        doubtful: indices of photos whose cameras may be wrong.
+        doubtful: whether it may be wrong.
     """
     nothing: list[Any] = [None] * len(photos)
     if model is None:
@@ -50,13 +50,9 @@ def estimate_of(photos: Sequence[Photo], model: Any | None, doubtful: Collection
             f"matches for: {', '.join(lost)}."
         )
     if doubtful:
-        whose = "The photos have few matches, so cameras"
-        if len(doubtful) < len(photos) - len(lost):
-            names = ", ".join(photos[index].name for index in sorted(doubtful))
-            whose = f"Few matches for: {names}. Their cameras"
         sentences.append(
-            f"{whose} were found with lower thresholds and may be wrong; check the plot, or add "
-            "photos between those that you have."
+            "The photos have few matches, so cameras were found with lower thresholds and may be "
+            "wrong; check the plot, or add photos between those that you have."
         )
     points = _points(photos, model, index_of)
     if points is not None:
