@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 #: Seconds of one core for the features of a photo of a million pixels, for matching a pair of
 #: photos, and for adding a photo to the model; measured on one machine.
-FEATURES, PAIR, PLACED = 1.5, 0.35, 0.35
+FEATURES, PAIR, PLACED = 0.9, 0.15, 0.3
 #: Longest side at which features are found, and photos of which all pairs are matched.
-LONGEST, ALL_PAIRS = 1600, 25
+LONGEST, ALL_PAIRS = 1600, 60
 #: Photos that each of more photos is matched with.
 MATCHED = 24
 
