@@ -38,6 +38,8 @@ STEPS_PER_PHOTO = 500
 SPLATS_PER_PIXEL = 0.11
 FEW, SPLATS_POWER = 8.0, 0.4
 MOST_SPLATS = 1_000_000
+#: Small photos may have this many, or so many per pixel: they cost little there.
+SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL = 20_000, 0.3
 #: Steps of the paper's fits to photos whose cameras have noise.
 PAPER_STEPS = 5000
 
@@ -141,13 +143,12 @@ def _default(support: PhotoSupport, quality: Quality) -> FitSettings:
     dropout = min(MOST_DROPOUT, DROPOUT_PHOTOS / support.seen_by)
     _, more_steps, more_splats = _quality(quality)
     steps = more_steps * min(MOST_STEPS, STEPS + STEPS_MORE * support.photos)
-    splats = (
-        more_splats * SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** SPLATS_POWER
-    )
+    splats = SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** SPLATS_POWER
+    splats = max(splats, min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * support.pixels))
     return replace(
         _DEFAULT,
         steps=round(min(steps, more_steps * STEPS_PER_PHOTO * support.photos)),
-        max_splats=max(1000, min(MOST_SPLATS, round(splats))),
+        max_splats=max(1000, min(MOST_SPLATS, round(more_splats * splats))),
         sh_degree=2 if support.seen_by >= SH2_PHOTOS else 1,
         density="mcmc" if support.apart > WIDE_APART else "original",
         dropout=round(dropout, 2) if dropout >= LEAST_DROPOUT else 0.0,
