@@ -46,7 +46,7 @@ def in_a_process(work: Callable[..., T], *arguments: Any) -> T:
     """Call a function of a module in a process of its own, which ends with the call.
 
     Raises:
-        IgsrError: the process was ended from outside, for example for want of memory.
+        IgsrError: the process was ended from outside, for example because memory ran out.
         Exception: what the function raises.
     """
     with worker_processes(1) as pool:

@@ -8,13 +8,12 @@ from typing import Any
 from igsr.capture.downscaling import reduced_size
 from igsr.capture.overview import Overview
 from igsr.cli.error_messages import print_message
+from igsr.evaluation.quick_scores import MOST_TRAIN
 from igsr.fitting.photo_support import PhotoSupport
 from igsr.fitting.presets import Quality, settings_for
 from igsr.fitting.time_estimate import fit_seconds, other_seconds, timed_steps
-from igsr.pose.time_estimate import camera_seconds
+from igsr.pose.colmap.time_estimate import camera_seconds
 
-#: Fitted photos that are scored, at most.
-MOST_TRAIN = 10
 #: Photos as people take them stand this far apart, seen from what they show: degrees.
 USUALLY_APART = 10.0
 #: A round of a refinement takes this part of a fit's time, by its folds, novel views and refit.

@@ -104,11 +104,10 @@ def default_max_size(backend: str, quality: Quality = "normal") -> int:
     return round(MAX_SIZES[backend] * _quality(quality)[0])
 
 
-def _quality(quality: str) -> tuple[float, float, float]:
-    for name, factors in QUALITIES.items():
-        if name == quality:
-            return factors
-    raise IgsrError(f"quality must be one of {', '.join(QUALITIES)}, not {quality!r}.")
+def _quality(quality: Quality) -> tuple[float, float, float]:
+    if quality not in QUALITIES:
+        raise IgsrError(f"quality must be one of {', '.join(QUALITIES)}, not {quality!r}.")
+    return QUALITIES[quality]
 
 
 def settings_for(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from igsr import _core
+from igsr.fitting.initialization.plane_sweep import MOST_SWEPT
 from igsr.fitting.settings import FitSettings
 
 #: Sides in pixels of the two photos that steps are timed on, and numbers of splats before them.
@@ -21,9 +22,10 @@ COVER = 12.0
 #: Part of the most splats that fits start with, from which step on they have as many as they come
 #: to, and how many of the most that mostly is.
 START_PART, GROWN, REACHED = 0.5, 0.5, 0.95
+#: Splats per pixel that fits without a limit of their own come to, at most.
+UNLIMITED_PER_PIXEL = 0.5
 #: Seconds of a photo's depth map, and of a scored photo's pixel; measured on two cores.
-SWEPT, MOST_SWEPT = 0.4, 24
-SCORED = 3.5e-6
+SWEPT, SCORED = 0.4, 3.5e-6
 #: Parts that steps are counted in.
 PARTS = 50
 
@@ -83,13 +85,16 @@ def fit_seconds(
         until: count the steps before this one; None counts all.
     """
     seconds, longest = 0.0, round(max(width, height))
+    most = min(settings.max_splats, UNLIMITED_PER_PIXEL * width * height)
+    if settings.density == "fixed":
+        most = settings.max_splats
     first = settings.first_step
     for part in range(PARTS):
         progress = (part + 0.5) / PARTS
         at = first + int(progress * (settings.steps - first))
         by = _core.reduction(settings.steps, settings.coarse_to_fine, at, longest)
         grown = 1.0 if settings.density == "fixed" else min(1.0, progress / GROWN)
-        splats = settings.max_splats * (START_PART + (REACHED - START_PART) * grown)
+        splats = most * (START_PART + (REACHED - START_PART) * grown)
         begins = first + part * (settings.steps - first) / PARTS
         steps = (settings.steps - first) / PARTS
         if until is not None:

@@ -26,7 +26,7 @@ from igsr import _core
 from igsr.capture import Capture, Points, View
 from igsr.errors import IgsrError
 from igsr.fitting.initialization.camera_coverage import looked_at_box
-from igsr.fitting.initialization.plane_sweep import looked_at, sweepable, swept_points
+from igsr.fitting.initialization.plane_sweep import can_sweep, looked_at, swept_points
 from igsr.fitting.initialization.ray_depths import ray_points
 from igsr.fitting.initialization.sift_points import sift_points, with_points_between
 from igsr.fitting.initialization.visual_hull import hull_points
@@ -95,7 +95,7 @@ def chosen_start(capture: Capture, start: str = "auto", wanted: int = MADE_UP_SP
         return "points" if points >= MIN_POINTS else "hull"
     views = capture.train_views
     target = looked_at(views, None if capture.points is None else capture.points.xyz)
-    if np.mean(sweepable(views, target)) >= SWEPT_PHOTOS:
+    if can_sweep(views, target, part=SWEPT_PHOTOS):
         return "depths"
     return "points" if points >= MIN_POINTS else "sift"
 

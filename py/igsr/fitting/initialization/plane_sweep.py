@@ -81,13 +81,6 @@ class DepthMap:
         return world
 
 
-def sweepable(views: list[View], target: Float64, angle: float = MAX_ANGLE) -> Bool:
-    """Which photos [V] have another that sees the target [3] from within ``angle`` degrees."""
-    cosines = np.cos(np.radians(_angles(views, target)))
-    np.fill_diagonal(cosines, -1.0)
-    return np.asarray(cosines.max(axis=1) > np.cos(np.radians(angle)))
-
-
 def looked_at(views: list[View], known: Float64 | None) -> Float64:
     """The place [3] that photos look at: amid the known points [P, 3], or where the axes meet."""
     if known is not None and len(known) >= POINTS_SEEN:
@@ -95,9 +88,20 @@ def looked_at(views: list[View], known: Float64 | None) -> Float64:
     return focus_point([view.camera for view in views])
 
 
-def can_sweep(views: list[View], target: Float64, angle: float = MAX_ANGLE) -> bool:
-    """Whether every photo has another that sees the target [3] from within ``angle`` degrees."""
-    return bool(sweepable(views, target, angle).all())
+def can_sweep(
+    views: list[View], target: Float64, angle: float = MAX_ANGLE, part: float = 1.0
+) -> bool:
+    """Whether photos have another that sees the target [3] from within ``angle`` degrees.
+
+    Args:
+        views: the photos.
+        target: what they look at.
+        angle: degrees.
+        part: of all photos, that must have another.
+    """
+    angles = _angles(views, target)
+    np.fill_diagonal(angles, 180.0)
+    return bool(np.mean(angles.min(axis=1) < angle) >= part)
 
 
 def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap]:

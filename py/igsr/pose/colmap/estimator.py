@@ -15,10 +15,10 @@ from igsr.pose.colmap.database import list_photos
 from igsr.pose.colmap.distortion import without_distortion
 from igsr.pose.colmap.features import find_features
 from igsr.pose.colmap.result import estimate_of
+from igsr.pose.colmap.time_estimate import camera_seconds
 from igsr.pose.estimate import Estimate, Progress
 
-#: Seconds of one core that a photo takes, and photos from which that is said; by our measurements.
-SECONDS_A_PHOTO = 8.0
+#: Photos from which it is said how long they take.
 MANY = 200
 
 
@@ -37,7 +37,8 @@ class Colmap:
         """
         show = progress or (lambda stage, done, total: None)
         if len(photos) > MANY:
-            minutes = SECONDS_A_PHOTO * len(photos) / 60.0
+            sizes = [(photo.image.shape[1], photo.image.shape[0]) for photo in photos]
+            minutes = camera_seconds(sizes) / 60.0
             warnings.warn(
                 f"COLMAP needs about {minutes:.0f} minutes for {len(photos)} photos; every third "
                 "is mostly enough",

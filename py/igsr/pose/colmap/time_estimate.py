@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
+from igsr.pose.colmap.features import LONGEST
+from igsr.pose.colmap.pairs import EXHAUSTIVE, FOLLOWING, MOST_SIMILAR
+
 #: Seconds of one core for the features of a photo of a million pixels, for matching a pair of
 #: photos, and for adding a photo to the model; measured on one machine.
 FEATURES, PAIR, PLACED = 0.9, 0.15, 0.3
-#: Longest side at which features are found, and photos of which all pairs are matched.
-LONGEST, ALL_PAIRS = 1600, 60
-#: Photos that each of more photos is matched with.
-MATCHED = 24
 
 
 def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:
@@ -25,6 +24,6 @@ def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:
     for width, height in sizes:
         scale = min(1.0, LONGEST / max(width, height))
         pixels += width * height * scale * scale
-    pairs = count * (count - 1) / 2 if count <= ALL_PAIRS else count * MATCHED / 2
+    pairs = count * (count - 1) / 2 if count <= EXHAUSTIVE else count * (FOLLOWING + MOST_SIMILAR)
     parallel = FEATURES * pixels / 1e6 + PAIR * pairs
     return parallel / max(1, cores or 1) + PLACED * count
