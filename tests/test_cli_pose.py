@@ -248,6 +248,9 @@ def test_photos_are_checked_before_cameras_are_looked_for(photos, calls, tmp_pat
             refused(igsr_here(command, path, *out, "--holdout", "1"), "holdout is 1")
         refused(igsr_here("refine", path, *out, "--photos", "99"), "from 1 to 6", path)
         refused(igsr_here("refine", path, *out, "--photos", "5", "--holdout", "3"), "from 1 to 4")
+        hull = ["--start", "hull", "--steps", "1"]
+        for shown in ([], ["--json"]):
+            refused(igsr_here("fit", path, *out, *hull, *shown), "without alpha", "--start hull")
         typo = igsr_here("fit", path, *out, "--max-size", "big")
         assert (typo.returncode, "--max-size" in typo.stderr) == (2, True)
     refused(igsr_here("info", given, "--max-size", "0"), "max_size is 0")

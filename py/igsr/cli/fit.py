@@ -122,6 +122,10 @@ def fit_command(
         def announced(seen: Overview, kept: bool) -> None:
             from igsr.cli.announcement import announce
 
+            if given.get("start") == "hull" and seen.channels < 4:
+                raise IgsrError(f"{capture} has photos without alpha; --start hull needs it in all")
+            if as_json:
+                return
             announce(
                 seen,
                 holdout=holdout,
@@ -144,7 +148,7 @@ def fit_command(
             resume=resume,
             shown=not as_json,
             parts=parts,
-            announced=None if as_json else announced,
+            announced=announced,
         )
         color = _background(background, loaded)
         # Photos with alpha are fitted over random colors, so that no background is learned.
