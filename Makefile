@@ -3,6 +3,7 @@
 # make test-long   runs the tests that take longer
 # make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
 # make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
+# make bench-check  compares this build's speed with a commit's: [BASE=HEAD~1]; fails at 10 % slower
 # make docs   builds the documentation site into out/docs
 #
 # Needs a Python (3.10 or newer), a Rust toolchain, a C linker and a package manager. Everything
@@ -25,7 +26,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test test-long fuzz bench accuracy docs profile build wheel check-rust check-python vulkan display browser \
+.PHONY: demo test test-long fuzz bench bench-check accuracy docs profile build wheel check-rust check-python vulkan display browser \
 	example-capture clean
 .DELETE_ON_ERROR:
 
@@ -45,6 +46,10 @@ BENCH := $(BIN)/igsr bench $(if $(GARDEN),--garden '$(GARDEN)') $(if $(CAPTURE),
 
 bench: build
 	$(BENCH) $(BACKENDS:%=--backend %) --plot out/bench/speed_vs_error.png --json out/bench/rows.json
+
+BASE ?= HEAD~1
+bench-check: build
+	$(BIN)/python benches/bench_check.py '$(BASE)'
 
 # Writes the page of accuracy and its plot; on the software driver where there is no GPU.
 accuracy: build vulkan

@@ -18,7 +18,17 @@ from PIL import Image
 
 from igsr import _core, cli
 from igsr._internal import peak_memory
-from igsr.benchmark import accuracy, fit_rows, growth, machine, oracle, run, scenes, stage_rows
+from igsr.benchmark import (
+    accuracy,
+    build_pairs,
+    fit_rows,
+    growth,
+    machine,
+    oracle,
+    run,
+    scenes,
+    stage_rows,
+)
 from igsr.benchmark.comparison import FLIP, gradient_error, picture_error
 from igsr.benchmark.plots import plot_speed_vs_error
 from igsr.benchmark.table import not_run_lines
@@ -395,6 +405,66 @@ def test_the_page_names_every_setting(tmp_path):
     assert errors[5] < errors[4]
     with Image.open(tmp_path / accuracy.PLOT_NAME) as plot:
         assert plot.width > 500
+
+
+# ---- two builds ---------------------------------------------------------------------------------
+
+
+def test_two_builds_take_turns(tmp_path):
+    copy = shutil.copy(_core.__file__, tmp_path / "_core.abi3.so")
+    report = build_pairs.compare_builds(Path(copy), ("cpu",), ("W1",), 0, 0.0, rounds=2)
+    assert report["machine"]["protocol"] == build_pairs.PAIR_PROTOCOL
+    assert [row["pass"] for row in report["rows"]] == ["rasterize", "rasterize_backward"]
+    for row in report["rows"]:
+        # The same code: no more apart than a busy machine makes it.
+        assert 0.2 < row["ratio_least"] <= row["ratio"] <= row["ratio_most"] < 5.0
+        assert 0.0 < row["mean_error_old"] == row["mean_error_new"] < 1e-5
+        assert row["max_error_old"] == row["max_error_new"] < 1e-4
+
+
+def test_what_is_no_build_is_one_sentence(igsr_bench, tmp_path):
+    (tmp_path / "_core.abi3.so").write_bytes(b"not a module")
+    for file, words in (
+        (tmp_path / "_core.abi3.so", "could not be run"),
+        (tmp_path / "none.so", "no file"),
+    ):
+        status, out, err = igsr_bench("--backend", "cpu", "--workload", "W1", "--compare", file)
+        assert (status, out) == (1, "")
+        assert words in err
+        assert "--compare" in err
+
+
+def test_a_build_without_a_function_is_a_row_that_says_so(monkeypatch):
+    class Old:
+        def ask(self, name, seconds):
+            return {"failed": "AttributeError: no time_rasterize"}
+
+    rows = build_pairs._pair_rows({"workload": "W1"}, Old(), Old(), "W1 20000 400", 0.0, 2)
+    assert [row["not_run"] for row in rows] == ["AttributeError: no time_rasterize"]
+    assert build_pairs.slower_rows(rows, 10.0) == []
+
+
+def test_slower_builds_are_named():
+    size = {"splats": 5, "width": 8, "height": 8, "backend": "cpu", "workload": "W1"}
+    rows = [{**size, "pass": name, "ratio": ratio} for name, ratio in (("a", 0.92), ("b", 0.8))]
+    assert build_pairs.slower_rows(rows, 10.0) == [
+        "W1 b with 5 splats at 8 x 8 on cpu takes 25 % longer."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--fail-above", "10"], "--compare FILE"),
+        (["--compare", "a.so", "--fail-above", "-1"], "--fail-above"),
+        (["--compare", "a.so", "--workload", "W2"], "leave W2 and W3 out"),
+        (["--compare", "a.so", "--plot", "p.png"], "leave --plot out"),
+    ],
+)
+def test_options_that_do_not_go_together(igsr_bench, arguments, words):
+    status, out, err = igsr_bench("--backend", "cpu", *arguments)
+    assert (status, out) == (1, "")
+    assert words in err
 
 
 # ---- the command --------------------------------------------------------------------------------

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from igsr.benchmark.accuracy import measure_accuracy, write_accuracy
+from igsr.benchmark.build_pairs import compare_builds, slower_rows
 from igsr.benchmark.plots import plot_speed_vs_error
 from igsr.benchmark.run import WORKLOADS, Settings, resolved_backends, run_benchmark
-from igsr.benchmark.table import print_report
+from igsr.benchmark.table import print_pairs, print_report
 
 __all__ = [
     "WORKLOADS",
     "Settings",
+    "compare_builds",
     "measure_accuracy",
     "plot_speed_vs_error",
+    "print_pairs",
     "print_report",
     "resolved_backends",
     "run_benchmark",
+    "slower_rows",
     "write_accuracy",
 ]

@@ -78,7 +78,7 @@ def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> d
     else:
         times = fit_step_ms(shot, backend, seconds)
     v_image = upstream(seed, side, side)
-    comparison, _ = compare(shot.scene, backend, v_image, _evenly_chosen)
+    comparison, _ = compare(shot.scene, backend, v_image, evenly_chosen)
     return {
         "workload": "W4",
         "backend": backend,
@@ -92,7 +92,8 @@ def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> d
     }
 
 
-def _evenly_chosen(crops: list[Any]) -> list[Any]:
+def evenly_chosen(crops: list[Any]) -> list[Any]:
+    """``CROPS`` of the crops: enough to tell the error, in seconds."""
     if len(crops) <= CROPS:
         return crops
     return [crops[i] for i in np.linspace(0, len(crops) - 1, CROPS).round().astype(int)]

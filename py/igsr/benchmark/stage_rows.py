@@ -97,10 +97,14 @@ def masked(v_image: Arrays, left_out: npt.NDArray[np.bool_], known: npt.NDArray[
     }
 
 
-def rasterize_rows(
-    backend: str, seed: int, seconds: float = SECONDS, count: int = 20_000, side: int = 400
-) -> list[dict[str, Any]]:
-    """W1: rasterize and its backward on 2D splats; bin is part of both."""
+def w1_comparison(
+    backend: str, seed: int, count: int, side: int
+) -> tuple[Error, Error, Band, Arrays]:
+    """W1's picture and gradients beside the reference's.
+
+    Returns the picture's error, the gradients', the band of pixels that may differ and the
+    upstream gradients that count.
+    """
     projected = splats2d(seed, count, side, side)
     shape = (side, side)
     background = np.zeros(3)
@@ -111,18 +115,29 @@ def rasterize_rows(
     expected = oracle.picture(exact, crops, shape, background)
     in_band = oracle.band(exact, crops, shape, oracle.ALPHA_BAND_2D)
     options: dict[str, Any] = {"background": background.astype(dtype), "backend": backend}
-    size: dict[str, Any] = {"width": side, "height": side}
-    got = _core.rasterize(own, **size, **options)
+    got = _core.rasterize(own, width=side, height=side, **options)
     picture, band = picture_error(got, expected, in_band, BOUND_2D[backend])
     v_image = masked(upstream(seed, side, side), band.left_out, expected["alpha"])
     v_own = {name: v.astype(dtype) for name, v in v_image.items()}
     v_expected = oracle.gradients2d(exact, crops, expected, v_image, background)
     v_got = _core.rasterize_backward(own, got, **v_own, **options, absolute=False)
-    gradients = gradient_error(v_got, v_expected)
+    return picture, gradient_error(v_got, v_expected), band, v_own
 
+
+def rasterize_rows(
+    backend: str, seed: int, seconds: float = SECONDS, count: int = 20_000, side: int = 400
+) -> list[dict[str, Any]]:
+    """W1: rasterize and its backward on 2D splats; bin is part of both."""
+    picture, gradients, band, v_own = w1_comparison(backend, seed, count, side)
+    projected = splats2d(seed, count, side, side)
+    dtype = _core.working_dtype(backend)
+    own = {name: array.astype(dtype) for name, array in projected.items()}
+    size: dict[str, Any] = {"width": side, "height": side}
+    options: dict[str, Any] = {"background": np.zeros(3, dtype), "backend": backend}
     times = repeated(
         lambda n: _core.time_rasterize(own, **size, **v_own, **options, repeats=n), seconds
     )
+    exact = {name: array.astype(np.float64) for name, array in projected.items()}
     pairs = oracle.pair_counts(exact, side, side)
     common = {
         "workload": "W1",

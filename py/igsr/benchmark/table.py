@@ -66,6 +66,36 @@ def not_run_lines(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
+def pairs_table(rows: list[dict[str, Any]]) -> Table:
+    """One line per row of two builds that ran."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("workload", "pass", "backend"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("splats", "size", "ms old", "ms new", "old : new", "from", "to"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("max error old", "new", "mean error old", "new"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        if row["ratio"] is None:
+            continue
+        table.add_row(
+            row["workload"],
+            row["pass"],
+            row["backend"],
+            str(row["splats"]),
+            f"{row['width']}x{row['height']}",
+            milliseconds(row["ms_old"]),
+            milliseconds(row["ms_new"]),
+            *(f"{row[name]:.2f}" for name in ("ratio", "ratio_least", "ratio_most")),
+            *(
+                f"{row[f'{kind}_error_{build}']:.1e}"
+                for kind in ("max", "mean")
+                for build in ("old", "new")
+            ),
+        )
+    return table
+
+
 def machine_line(machine: dict[str, Any]) -> str:
     """One line on where and with what the figures were measured."""
     sets = ", ".join(
@@ -86,12 +116,27 @@ def print_report(console: Console, report: dict[str, Any]) -> None:
         console: where to print.
         report: of ``run_benchmark``.
     """
-    table = rows_table(report["rows"])
+    _print(console, report, rows_table(report["rows"]), not_run_lines(report["rows"]))
+
+
+def print_pairs(console: Console, report: dict[str, Any]) -> None:
+    """As ``print_report``, of ``compare_builds``."""
+    rows = report["rows"]
+    failed = [
+        f"{row['workload']} with {row['splats']} splats on {row['backend']} not compared: "
+        f"{row['not_run']}"
+        for row in rows
+        if row["ratio"] is None
+    ]
+    _print(console, report, pairs_table(rows), failed)
+
+
+def _print(console: Console, report: dict[str, Any], table: Table, lines: list[str]) -> None:
     # A terminal breaks long lines by itself; cells that end in an ellipsis say nothing.
     wide = console.options.update(max_width=1000)
     console.width = max(console.width, console.measure(table, options=wide).maximum)
     console.print(table)
-    for line in not_run_lines(report["rows"]):
+    for line in lines:
         console.print(line, markup=False)  # a reason may hold brackets
     console.print(machine_line(report["machine"]), style="dim")
     console.print(report["machine"]["protocol"], style="dim")

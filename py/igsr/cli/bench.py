@@ -73,6 +73,23 @@ def bench_command(
             "docs/how-it-works/accuracy.md, its plot beside it.",
         ),
     ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare",
+            metavar="FILE",
+            help="Time W1 and W4 in turns with another build: the compiled module "
+            "(igsr/_core*.so) of another checkout.",
+        ),
+    ] = None,
+    fail_above: Annotated[
+        float | None,
+        typer.Option(
+            "--fail-above",
+            metavar="PERCENT",
+            help="With --compare: end with status 1 where this build takes so much longer.",
+        ),
+    ] = None,
 ) -> None:
     """Measure speed, and error against the float64 reference, of the backends.
 
@@ -81,13 +98,31 @@ def bench_command(
     """
     from igsr import benchmark
 
+    given: dict[str, object]
     with error_messages():
         if seed < 0:
             raise IgsrError(f"--seed must be at least 0, not {seed}.")
         if not 0.0 <= seconds <= 3600.0:
             raise IgsrError(f"--seconds must be from 0 to 3600, not {seconds:g}.")
         names = benchmark.resolved_backends([b.value for b in backends or [BackendChoice.auto]])
-        if accuracy is not None:
+        if fail_above is not None and compare is None:
+            raise IgsrError("--fail-above compares two builds; give --compare FILE as well.")
+        if fail_above is not None and not 0.0 <= fail_above <= 1000.0:
+            raise IgsrError(f"--fail-above must be from 0 to 1000, not {fail_above:g}.")
+        if compare is not None:
+            given = {
+                "--accuracy": accuracy,
+                "--garden": garden,
+                "--capture": capture,
+                "--models": models,
+                "--plot": plot,
+            }
+            for name, value in given.items():
+                if value:
+                    raise IgsrError(f"--compare runs W1 and W4 only; leave {name} out.")
+            if {WorkloadChoice.W2, WorkloadChoice.W3} & set(workloads or ()):
+                raise IgsrError("--compare runs W1 and W4 only; leave W2 and W3 out.")
+        elif accuracy is not None:
             given = {
                 "--workload": workloads,
                 "--garden": garden,
@@ -101,9 +136,10 @@ def bench_command(
             if path is not None:
                 check_writable(path)
         console = error_console()
+        chosen = tuple(w.value for w in workloads or WorkloadChoice)
         settings = benchmark.Settings(
             backends=names,
-            workloads=tuple(w.value for w in workloads or WorkloadChoice),
+            workloads=chosen,
             garden=garden,
             capture=capture,
             models=models or benchmark.Settings.models,
@@ -111,7 +147,16 @@ def bench_command(
             seconds=seconds,
         )
         with console.status("starting") as status:
-            if accuracy is None:
+            if compare is not None:
+                report = benchmark.compare_builds(
+                    compare,
+                    names,
+                    tuple(name for name in chosen if name in ("W1", "W4")),
+                    seed,
+                    seconds,
+                    status.update,
+                )
+            elif accuracy is None:
                 report = benchmark.run_benchmark(settings, status.update)
             else:
                 implementations = ("reference", *(name for name in names if name != "reference"))
@@ -121,4 +166,12 @@ def bench_command(
             benchmark.plot_speed_vs_error(plot, report)
         if json_path is not None:
             write_json(json_path, report)
-    benchmark.print_report(output_console(), report)
+    if compare is None:
+        benchmark.print_report(output_console(), report)
+        return
+    benchmark.print_pairs(output_console(), report)
+    slower = [] if fail_above is None else benchmark.slower_rows(report["rows"], fail_above)
+    for line in slower:
+        console.print(line)
+    if slower:
+        raise typer.Exit(1)

@@ -1,0 +1,178 @@
+"""Two builds of the renderer in one run: ratio of their times with its spread, and their errors.
+
+Times of shared machines change by tens of percent from minute to minute. Here two processes, each
+with a build of its own, take turns within seconds, and only the ratio of neighbours counts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+
+from igsr.benchmark.machine import describe_machine
+from igsr.benchmark.timed_work import all_work
+from igsr.errors import IgsrError
+
+#: Turns of the two builds, of which each gives a ratio.
+ROUNDS = 7
+PAIR_PROTOCOL = (
+    "Two processes, each with one build, take turns, and the order changes from round to round. "
+    "ratio is old : new, each the least over its repeats of that round: the median over the "
+    "rounds, with the least and the most. Errors are against the f64 reference as everywhere."
+)
+
+
+class Build:
+    """A process with one build; closes with ``with``."""
+
+    def __init__(self, file: Path | None, settings: dict[str, Any]) -> None:
+        """Start it.
+
+        Args:
+            file: the build's compiled module; None is the one in use.
+            settings: keywords of ``all_work``.
+        """
+        self.name = "this build" if file is None else str(file)
+        self._process = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "igsr.benchmark.build_process",
+                "" if file is None else str(file),
+                json.dumps(settings),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+        )
+
+    def __enter__(self) -> Build:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def ask(self, name: str, seconds: float | None) -> dict[str, Any]:
+        """Times of one workload, or its errors where ``seconds`` is None.
+
+        Raises:
+            IgsrError: the process ended.
+        """
+        questions, answers, errors = (
+            cast(IO[str], stream)
+            for stream in (self._process.stdin, self._process.stdout, self._process.stderr)
+        )
+        try:
+            print(json.dumps([name, seconds]), file=questions, flush=True)
+            line = answers.readline()
+        except BrokenPipeError:
+            line = ""
+        if not line:
+            reason = (errors.read().strip().splitlines() or ["no reason given"])[-1]
+            raise IgsrError(f"{self.name} could not be run ({reason}); give --compare a build.")
+        found: dict[str, Any] = json.loads(line)
+        return found
+
+
+def compare_builds(
+    other: Path,
+    backends: tuple[str, ...],
+    workloads: tuple[str, ...],
+    seed: int,
+    seconds: float,
+    on_row: Callable[[str], object] = lambda doing: None,
+    rounds: int = ROUNDS,
+    most_splats: int = 1_000_000,
+) -> dict[str, Any]:
+    """Time another build and this one in turns; ``{"machine": ..., "rows": [...]}``.
+
+    Args:
+        other: the other build's compiled module (``igsr/_core*.so``), the "old" one of all ratios.
+        backends: resolved names.
+        workloads: some of "W1" and "W4".
+        seed: of all that is drawn.
+        seconds: how long a workload is repeated by each build.
+        on_row: told what is about to run.
+        rounds: turns.
+        most_splats: larger workloads are left out.
+
+    Raises:
+        IgsrError: there is no such file, or it is no build for this Python.
+    """
+    if not other.is_file():
+        raise IgsrError(f"There is no file {other}; give --compare a build's compiled module.")
+    machine = describe_machine(list(backends), seed) | {"protocol": PAIR_PROTOCOL}
+    rows = []
+    for backend in backends:
+        settings: dict[str, Any] = {
+            "workloads": list(workloads),
+            "backend": backend,
+            "seed": seed,
+            "most_splats": most_splats,
+        }
+        with Build(other.resolve(), settings) as old, Build(None, settings) as new:
+            for work in all_work(**settings):
+                common = {"workload": work.workload, "backend": backend, "splats": work.splats}
+                common |= {"width": work.side, "height": work.side}
+                on_row(f"{work.name.replace(' ', ', ')} on {backend}, two builds")
+                rows += _pair_rows(common, old, new, work.name, seconds / rounds, rounds)
+    return {"machine": machine, "rows": rows}
+
+
+def _pair_rows(
+    common: dict[str, Any], old: Build, new: Build, name: str, seconds: float, rounds: int
+) -> list[dict[str, Any]]:
+    fastest: dict[str, list[tuple[float, float]]] = {}
+    errors = old.ask(name, None), new.ask(name, None)
+    # The first turn wakes threads and devices, and does not count.
+    for turn in range(-1, rounds):
+        order = (old, new) if turn % 2 == 0 else (new, old)
+        found = {id(build): build.ask(name, seconds if turn >= 0 else 0.0) for build in order}
+        pair = found[id(old)], found[id(new)]
+        for answer in (*errors, *pair):
+            if "failed" in answer:
+                return [{**common, "pass": "", "ratio": None, "not_run": answer["failed"]}]
+        if turn >= 0:
+            for key in pair[0]:
+                fastest.setdefault(key, []).append((min(pair[0][key]), min(pair[1][key])))
+    rows = []
+    for key, times in fastest.items():
+        ms = np.array(times)
+        ratios = ms[:, 0] / ms[:, 1]
+        rows.append(
+            {
+                **common,
+                "pass": key,
+                "ms_old": float(ms[:, 0].min()),
+                "ms_new": float(ms[:, 1].min()),
+                "ratio": float(np.median(ratios)),
+                "ratio_least": float(ratios.min()),
+                "ratio_most": float(ratios.max()),
+                "rounds": rounds,
+                "max_error_old": errors[0][key][0],
+                "max_error_new": errors[1][key][0],
+                "mean_error_old": errors[0][key][1],
+                "mean_error_new": errors[1][key][1],
+            }
+        )
+    return rows
+
+
+def slower_rows(rows: list[dict[str, Any]], percent: float) -> list[str]:
+    """One sentence per row in which this build takes more than ``percent`` longer."""
+    return [
+        f"{row['workload']} {row['pass']} with {row['splats']} splats at {row['width']} x "
+        f"{row['height']} on {row['backend']} takes {100.0 / row['ratio'] - 100.0:.0f} % longer."
+        for row in rows
+        if row["ratio"] is not None and row["ratio"] < 1.0 / (1.0 + percent / 100.0)
+    ]
