@@ -29,7 +29,7 @@ def fit(capture, **options):
     return igsr.fit(capture, **arguments)
 
 
-def support(photos, seen_by=8.0, apart=10.0, pixels=100_000.0):
+def support(photos, seen_by=8.0, apart=5.0, pixels=100_000.0):
     return PhotoSupport(photos, pixels, seen_by, apart)
 
 

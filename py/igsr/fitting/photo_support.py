@@ -44,8 +44,8 @@ class PhotoSupport:
     @classmethod
     def of_number(cls, photos: int) -> PhotoSupport:
         """A guess where nothing but the number is known: small photos all round an object."""
-        # Each photo has its share of the half-sphere, a cap as wide as photos are apart.
-        apart = math.degrees(2.0 * math.acos(1.0 - min(1.0, 1.0 / photos)))
+        # The mean distance to the nearest of points that lie on a half-sphere at random.
+        apart = math.degrees(0.5 * math.sqrt(2.0 * math.pi / photos))
         return cls(photos, PIXELS, max(1.0, SUPPORTS_OF_ALL * photos), apart)
 
 
