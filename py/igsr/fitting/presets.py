@@ -27,7 +27,7 @@ MOST_DROPOUT, LEAST_DROPOUT = 0.3, 0.05
 #: Photos further apart than this (degrees, in the mean) leave so much open that splats are only
 #: added where opaque ones are, with a pull to small and faint ones (MCMC). Nearer ones show where
 #: splats are missing.
-WIDE_APART = 9.0
+WIDE_APART = 7.0
 #: From so many photos of the same place on, view-dependent color is more than a way to overfit.
 SH2_PHOTOS = 12.0
 #: Steps of any fit, and more for each photo, up to a most; but for few photos only so many each.
