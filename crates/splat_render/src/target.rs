@@ -1,7 +1,5 @@
 //! Photos to fit to, with what each counts in the loss.
 
-use rayon::prelude::*;
-
 use crate::error::{Error, Result};
 
 /// One photo to fit to: 8-bit pixels, optional alpha and weights, and when the fit uses it.
@@ -152,25 +150,23 @@ impl Target {
         }
     }
 
-    /// The photo over `background` as three planes in 0..1.
-    pub fn composite(&self, background: [f32; 3], planes: &mut [Vec<f32>; 3]) {
-        let pixels = self.width as usize * self.height as usize;
-        for plane in planes.iter_mut() {
-            plane.resize(pixels, 0.0);
-        }
+    /// A row of one channel of the photo over `background`, that channel's, in 0..1.
+    #[inline(always)]
+    pub fn row(&self, row: usize, channel: usize, background: f32, out: &mut [f32]) {
+        let width = self.width as usize;
         let unit = 1.0 / 255.0;
-        planes.par_iter_mut().enumerate().for_each(|(c, plane)| {
-            if self.channels == 3 {
-                for (out, pixel) in plane.iter_mut().zip(self.pixels.chunks_exact(3)) {
-                    *out = f32::from(pixel[c]) * unit;
-                }
-            } else {
-                for (out, pixel) in plane.iter_mut().zip(self.pixels.chunks_exact(4)) {
-                    let alpha = f32::from(pixel[3]) * unit;
-                    *out = f32::from(pixel[c]) * unit * alpha + background[c] * (1.0 - alpha);
-                }
+        if self.channels == 3 {
+            let pixels = self.pixels[3 * row * width..].chunks_exact(3);
+            for (out, pixel) in out[..width].iter_mut().zip(pixels) {
+                *out = f32::from(pixel[channel]) * unit;
             }
-        });
+        } else {
+            let pixels = self.pixels[4 * row * width..].chunks_exact(4);
+            for (out, pixel) in out[..width].iter_mut().zip(pixels) {
+                let alpha = f32::from(pixel[3]) * unit;
+                *out = f32::from(pixel[channel]) * unit * alpha + background * (1.0 - alpha);
+            }
+        }
     }
 }
 

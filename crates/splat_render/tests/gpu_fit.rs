@@ -177,12 +177,14 @@ fn psnr(capture: &Capture, state: &FitState) -> f64 {
         let projected =
             Reference.project(&wide.params(), camera, &ProjectOptions::default()).unwrap();
         let image = Reference.rasterize(&projected, [0.0; 3]).unwrap();
-        let mut photo: [Vec<f32>; 3] = Default::default();
-        target.composite([0.0; 3], &mut photo);
-        for (pixel, color) in image.color.iter().enumerate() {
+        let mut photo = vec![0.0; target.width as usize];
+        for (row, colors) in image.color.chunks(photo.len()).enumerate() {
             for c in 0..3 {
-                total += (color[c].clamp(0.0, 1.0) - f64::from(photo[c][pixel])).powi(2);
-                count += 1;
+                target.row(row, c, 0.0, &mut photo);
+                for (color, &photo) in colors.iter().zip(&photo) {
+                    total += (color[c].clamp(0.0, 1.0) - f64::from(photo)).powi(2);
+                    count += 1;
+                }
             }
         }
     }

@@ -31,7 +31,6 @@ pub struct CpuFit {
     splats: Vec<TileSplat>,
     bins: Bins,
     image: Planes,
-    photo: [Vec<f32>; 3],
     loss: Loss,
     sums: Vec<PairSums<COLOR_SUMS>>,
     /// The camera's gradient by block of splats, so that its sum does not depend on the threads.
@@ -102,16 +101,8 @@ impl FitDevice for CpuFit {
 
         self.image.resize(width, height);
         rasterize_tiles::<false>(&self.splats, &self.bins, input.background, &mut self.image);
-        target.composite(input.background, &mut self.photo);
         let [r, g, b, ..] = &self.image.planes;
-        let [photo_r, photo_g, photo_b] = &self.photo;
-        self.loss_value = self.loss.run(
-            [r, g, b],
-            [photo_r, photo_g, photo_b],
-            target.weights.as_deref(),
-            width as usize,
-            input.ssim_weight,
-        );
+        self.loss_value = self.loss.run([r, g, b], target, input.background, input.ssim_weight);
         rasterize_backward_tiles(
             &self.splats,
             &self.bins,

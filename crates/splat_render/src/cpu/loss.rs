@@ -1,294 +1,450 @@
 //! loss: L1 and D-SSIM of a picture against a photo, with the picture's gradient.
+//!
+//! One sweep over the rows: as soon as the window around a row is there, SSIM's slopes in it are
+//! computed, and as soon as there are slopes around a row, its gradient. Only the rows that windows
+//! still reach are kept, in rings that fit into the cache.
+
+use std::ops::Range;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::simd::dispatch;
-use super::ssim_window::{HALF, RUN, Rows};
+use super::ssim_window::{
+    Aligned, HALF, SLOTS, STEP, collect, fill_ends, filter, filter_step, many_registers, spread,
+    vectors_of_row, window,
+};
 use crate::constants::SSIM_C;
 use crate::stages::{self, Image};
-use crate::target::{Target, Weight};
+use crate::target::Target;
 
-/// Rows per task.
-const BAND: usize = 64;
+/// Rows that a task is to have, about: the 2 [`HALF`] rows that it reads on either side of its own
+/// cost a tenth of them, and there are some tasks for each of many threads.
+const BAND: usize = 96;
 
 /// The loss's gradient and scratch memory, kept from step to step.
-#[derive(Debug, Default, Clone)]
+#[derive(Debug, Default)]
 pub(super) struct Loss {
-    /// Derivatives of the weighted SSIM sum with respect to the filtered x, xx and xy, per channel.
-    slopes: [[Vec<f32>; 3]; 3],
     /// Gradient of the loss with respect to each channel of the picture.
     pub v_color: [Vec<f32>; 3],
+    /// What tasks left behind that are done.
+    scratch: Mutex<Vec<Aligned>>,
 }
 
-/// A band of rows of one channel: first pass, from pictures to slopes.
-struct Slopes<'a> {
+/// A band of rows of one channel.
+struct Band<'a> {
+    /// The picture's channel.
     x: &'a [f32],
-    y: &'a [f32],
-    weights: Option<&'a [f32]>,
-    width: usize,
-    rows: std::ops::Range<usize>,
-    out: [&'a mut [f32]; 3],
-}
-
-/// The picture's rows that the window meets around `rows`, each with its index in a [`Rows`].
-fn rows_around(
-    rows: &std::ops::Range<usize>,
-    height: usize,
-) -> impl Iterator<Item = (usize, usize)> + use<> {
-    let start = rows.start;
-    (start.saturating_sub(HALF)..(rows.end + HALF).min(height))
-        .map(move |row| (row + HALF - start, row))
-}
-
-impl WithSimd for Slopes<'_> {
-    /// Weighted sum of SSIM over the band.
-    type Output = f64;
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> f64 {
-        let width = self.width;
-        // x, y, xx + yy and xy: SSIM takes the two variances only as a sum.
-        let mut filtered = Rows::new(4, self.rows.len(), width);
-        let [mut x, mut y, mut squares, mut xy] = [(); 4].map(|()| filtered.padded());
-        for (index, row) in rows_around(&self.rows, self.x.len() / width) {
-            let at = row * width..(row + 1) * width;
-            let (from_x, from_y) = (&self.x[at.clone()], &self.y[at]);
-            x.row(width).copy_from_slice(from_x);
-            y.row(width).copy_from_slice(from_y);
-            let products = squares.row(width).iter_mut().zip(xy.row(width));
-            for ((squares, xy), (x, y)) in products.zip(from_x.iter().zip(from_y)) {
-                (*squares, *xy) = (x * x + y * y, x * y);
-            }
-            for (map, padded) in [&x, &y, &squares, &xy].into_iter().enumerate() {
-                filtered.filter_row(s, padded, map, index);
-            }
-        }
-        let (c1, c2) = (s.splat_f32s(SSIM_C.0), s.splat_f32s(SSIM_C.1));
-        let two = s.splat_f32s(2.0);
-        let mut lines = [(); 4].map(|()| filtered.line(s));
-        let mut total = 0.0f64;
-        let [out_mu, out_xx, out_xy] = self.out;
-        for row in self.rows.clone() {
-            for (map, line) in lines.iter_mut().enumerate() {
-                filtered.filter_column(s, map, row - self.rows.start, line);
-            }
-            // Each line's filtered map gives way to what becomes of it.
-            let [mu_line, xx_line, xy_line, ssim_line] = &mut lines;
-            let n = mu_line.len() * RUN;
-            let mu_line = &mut mu_line.as_flattened_mut()[..n];
-            let xx_line = &mut xx_line.as_flattened_mut()[..n];
-            let xy_line = &mut xy_line.as_flattened_mut()[..n];
-            let ssim_line = &mut ssim_line.as_flattened_mut()[..n];
-            for k in 0..n {
-                let (mu_x, mu_y) = (mu_line[k], xx_line[k]);
-                let (squares, xy) = (xy_line[k], ssim_line[k]);
-                let mu_xy = s.mul_f32s(mu_x, mu_y);
-                let (mu_xx, mu_yy) = (s.mul_f32s(mu_x, mu_x), s.mul_f32s(mu_y, mu_y));
-                let s_xy = s.sub_f32s(xy, mu_xy);
-                let s_sum = s.sub_f32s(squares, s.add_f32s(mu_xx, mu_yy));
-                let a1 = s.mul_add_e_f32s(two, mu_xy, c1);
-                let a2 = s.mul_add_e_f32s(two, s_xy, c2);
-                let b1 = s.add_f32s(s.add_f32s(mu_xx, mu_yy), c1);
-                let b2 = s.add_f32s(s_sum, c2);
-                let inverse = s.div_f32s(s.splat_f32s(1.0), s.mul_f32s(b1, b2));
-                let ssim = s.mul_f32s(s.mul_f32s(a1, a2), inverse);
-                let v_xx = s.neg_f32s(s.mul_f32s(s.mul_f32s(ssim, inverse), b1));
-                let v_xy = s.mul_f32s(two, s.mul_f32s(a1, inverse));
-                // d/d mu_x directly, and through s_xx = xx - mu_x^2 and s_xy = xy - mu_x mu_y.
-                let direct = s.sub_f32s(
-                    s.mul_f32s(s.mul_f32s(mu_y, a2), inverse),
-                    s.mul_f32s(mu_x, s.mul_f32s(s.mul_f32s(ssim, inverse), b2)),
-                );
-                let through = s.mul_add_e_f32s(s.mul_f32s(two, v_xx), mu_x, s.mul_f32s(v_xy, mu_y));
-                mu_line[k] = s.sub_f32s(s.mul_f32s(two, direct), through);
-                xx_line[k] = v_xx;
-                xy_line[k] = v_xy;
-                ssim_line[k] = ssim;
-            }
-            let to = (row - self.rows.start) * width;
-            let at = row * width;
-            let weights = self.weights.map(|w| &w[at..at + width]);
-            let line =
-                |k: usize| &bytemuck::cast_slice::<S::f32s, f32>(lines[k].as_flattened())[..width];
-            for (k, out) in [&mut *out_mu, &mut *out_xx, &mut *out_xy].into_iter().enumerate() {
-                let out = &mut out[to..to + width];
-                match weights {
-                    None => out.copy_from_slice(line(k)),
-                    Some(w) => {
-                        for ((out, v), w) in out.iter_mut().zip(line(k)).zip(w) {
-                            *out = v * w;
-                        }
-                    }
-                }
-            }
-            total += f64::from(weighted_sum(s, line(3), weights));
-        }
-        total
-    }
-}
-
-/// Sum of a row's values times their weights, 1 if there are none.
-#[inline(always)]
-fn weighted_sum<S: Simd>(s: S, values: &[f32], weights: Option<&[f32]>) -> f32 {
-    let (vectors, rest) = S::as_simd_f32s(values);
-    let mut sum = s.splat_f32s(0.0);
-    let mut rest_sum = 0.0;
-    match weights {
-        None => {
-            for &v in vectors {
-                sum = s.add_f32s(sum, v);
-            }
-            for v in rest {
-                rest_sum += v;
-            }
-        }
-        Some(weights) => {
-            let (weight_vectors, rest_weights) = S::as_simd_f32s(weights);
-            for (&v, &w) in vectors.iter().zip(weight_vectors) {
-                sum = s.mul_add_e_f32s(v, w, sum);
-            }
-            for (v, w) in rest.iter().zip(rest_weights) {
-                rest_sum += v * w;
-            }
-        }
-    }
-    s.reduce_sum_f32s(sum) + rest_sum
-}
-
-/// A band of rows of one channel: second pass, from slopes to the picture's gradient.
-struct Gradient<'a> {
-    x: &'a [f32],
-    y: &'a [f32],
-    weights: Option<&'a [f32]>,
-    slopes: &'a [Vec<f32>; 3],
-    width: usize,
-    rows: std::ops::Range<usize>,
+    photo: &'a Target,
+    channel: usize,
+    /// What a photo with alpha lies over.
+    background: f32,
+    rows: Range<usize>,
     /// What one unit of |x - y| and of SSIM weighs in the loss.
     l1: f32,
     ssim: f32,
+    scratch: &'a mut Aligned,
     out: &'a mut [f32],
 }
 
-impl WithSimd for Gradient<'_> {
-    /// Weighted sum of |x - y| over the band.
-    type Output = f64;
+/// Maps of a ring of pictures: the picture and the photo, zero beyond them.
+const PICTURES: usize = 2;
+/// Maps of a ring of slopes: by how much the loss falls with the filtered x, how it grows with half
+/// of the filtered xx, and how it falls with the filtered xy, through SSIM.
+const SLOPES: usize = 3;
+/// Filtered maps that SSIM is made of: x, y, xx + yy and xy. It takes the two variances only as a
+/// sum.
+const MEANS: usize = 4;
 
+/// A band's scratch memory. Rings have all rows of a vector side by side.
+struct Memory<'a, V> {
+    /// Vectors of a row.
+    vectors: usize,
+    /// [`PICTURES`] maps.
+    pictures: &'a mut [[V; SLOTS]],
+    /// [`SLOPES`] maps.
+    slopes: &'a mut [[V; SLOTS]],
+    /// [`STEP`] rows of each of [`MEANS`] maps, filtered along the columns, with [`HALF`] vectors
+    /// before and after each row.
+    filtered: &'a mut [V],
+    /// A row's gradient.
+    gradient: &'a mut [V],
+    /// A row as it lies in a picture, zero beyond its width.
+    row: &'a mut [V],
+    /// A row's weights, zero beyond its width.
+    weights: &'a mut [V],
+}
+
+impl<'a, V: bytemuck::Pod> Memory<'a, V> {
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> f64 {
-        let width = self.width;
-        let mut filtered = Rows::new(3, self.rows.len(), width);
-        let mut padded = filtered.padded();
-        for (map, slopes) in self.slopes.iter().enumerate() {
-            for (index, row) in rows_around(&self.rows, self.x.len() / width) {
-                padded.row(width).copy_from_slice(&slopes[row * width..(row + 1) * width]);
-                filtered.filter_row(s, &padded, map, index);
-            }
-        }
-        let mut lines = [(); 3].map(|()| filtered.line(s));
-        let mut distances = vec![0.0f32; width];
-        let mut total = 0.0f64;
-        for row in self.rows.clone() {
-            for (map, line) in lines.iter_mut().enumerate() {
-                filtered.filter_column(s, map, row - self.rows.start, line);
-            }
-            let at = row * width;
-            let (x, y) = (&self.x[at..at + width], &self.y[at..at + width]);
-            let line =
-                |k: usize| &bytemuck::cast_slice::<S::f32s, f32>(lines[k].as_flattened())[..width];
-            let (mu, xx, xy) = (line(0), line(1), line(2));
-            let out = &mut self.out[(row - self.rows.start) * width..][..width];
-            // Plain loops without a branch: the compiler makes vectors of them.
-            for k in 0..width {
-                let difference = x[k] - y[k];
-                distances[k] = difference.abs();
-                let sign = f32::from(difference > 0.0) - f32::from(difference < 0.0);
-                out[k] = self.l1 * sign;
-            }
-            let weights = self.weights.map(|w| &w[at..at + width]);
-            if let Some(weights) = weights {
-                for (out, weight) in out.iter_mut().zip(weights) {
-                    *out *= weight;
-                }
-            }
-            for k in 0..width {
-                out[k] -= self.ssim * (mu[k] + 2.0 * x[k] * xx[k] + y[k] * xy[k]);
-            }
-            total += f64::from(weighted_sum(s, &distances, weights));
-        }
-        total
+    fn new<S: Simd<f32s = V>>(s: S, scratch: &'a mut Aligned, width: usize) -> Self {
+        let vectors = vectors_of_row::<S>(width);
+        let padded = vectors + 2 * HALF;
+        let parts = [
+            vectors * PICTURES * SLOTS,
+            vectors * SLOPES * SLOTS,
+            padded * MEANS * STEP,
+            vectors,
+            vectors,
+            vectors,
+        ];
+        let all = scratch.vectors::<S>(parts.iter().sum());
+        let (pictures, all) = all.split_at_mut(parts[0]);
+        let (slopes, all) = all.split_at_mut(parts[1]);
+        let (filtered, all) = all.split_at_mut(parts[2]);
+        let (gradient, all) = all.split_at_mut(parts[3]);
+        let (row, weights) = all.split_at_mut(parts[4]);
+        row.fill(s.splat_f32s(0.0));
+        let mut memory = Self {
+            vectors,
+            pictures: pictures.as_chunks_mut().0,
+            slopes: slopes.as_chunks_mut().0,
+            filtered,
+            gradient,
+            row,
+            weights,
+        };
+        // Those of a photo that has none.
+        let values = memory.row();
+        values[..width].fill(1.0);
+        memory.put_weights::<S>();
+        memory.row()[..width].fill(0.0);
+        memory
+    }
+
+    /// The row as it lies in a picture.
+    #[inline(always)]
+    fn row(&mut self) -> &mut [f32] {
+        bytemuck::cast_slice_mut(self.row)
+    }
+
+    /// Row `row` of filtered map `map`, with the vectors before and after it.
+    #[inline(always)]
+    fn filtered(&mut self, map: usize, row: usize) -> &mut [V] {
+        let padded = self.vectors + 2 * HALF;
+        &mut self.filtered[(map * STEP + row) * padded..][..padded]
+    }
+
+    /// Puts `row` into a slot of the pictures' ring.
+    #[inline(always)]
+    fn put<S: Simd<f32s = V>>(&mut self, map: usize, slot: usize) {
+        let row = bytemuck::cast_slice::<V, f32>(self.row);
+        let ring = bytemuck::cast_slice_mut::<V, f32>(self.pictures.as_flattened_mut());
+        let at = (map * SLOTS + slot) * S::F32_LANES;
+        spread::<S>(row, &mut ring[at..], PICTURES * SLOTS * S::F32_LANES);
+    }
+
+    /// Makes `row` the weights.
+    #[inline(always)]
+    fn put_weights<S: Simd<f32s = V>>(&mut self) {
+        let row = bytemuck::cast_slice::<V, f32>(self.row);
+        spread::<S>(row, bytemuck::cast_slice_mut(self.weights), S::F32_LANES);
     }
 }
 
+impl WithSimd for Band<'_> {
+    /// Weighted sums of SSIM and of |x - y| over the band.
+    type Output = [f64; 2];
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, s: S) -> [f64; 2] {
+        let mut scratch = std::mem::take(self.scratch);
+        let mut memory = Memory::new(s, &mut scratch, self.photo.width as usize);
+        let mut sums = [0.0; 2];
+        for at in (0..self.rows.len() + 4 * HALF).step_by(STEP) {
+            self.take_in::<S>(&mut memory, at);
+            // The first steps only fill the rings.
+            if at + STEP > 2 * HALF + 1 {
+                sums[0] += self.slopes(s, &mut memory, at);
+            }
+            if at >= 4 * HALF {
+                sums[1] += self.gradient(s, &mut memory, at);
+            }
+        }
+        *self.scratch = scratch;
+        sums
+    }
+}
+
+/// The sweep. It counts rows from the first one that the band's windows reach, 2 [`HALF`] before
+/// it. The step at row `at` takes in rows from there on, has slopes of those HALF rows before them,
+/// and the gradient of those HALF rows before these.
+impl Band<'_> {
+    /// The picture's row that a sweep's row is, if there is one.
+    #[inline(always)]
+    fn row(&self, of_sweep: usize) -> Option<usize> {
+        (self.rows.start + of_sweep)
+            .checked_sub(2 * HALF)
+            .filter(|&row| row < self.photo.height as usize)
+    }
+
+    /// Takes the next rows into the pictures' ring.
+    #[inline(always)]
+    fn take_in<S: Simd>(&self, memory: &mut Memory<'_, S::f32s>, at: usize) {
+        let width = self.photo.width as usize;
+        for row_of_sweep in at..at + STEP {
+            let slot = row_of_sweep % SLOTS;
+            let Some(row) = self.row(row_of_sweep) else {
+                for ring in memory.pictures.iter_mut() {
+                    ring[slot] = bytemuck::Zeroable::zeroed();
+                }
+                continue;
+            };
+            memory.row()[..width].copy_from_slice(&self.x[row * width..][..width]);
+            memory.put::<S>(0, slot);
+            let values = &mut memory.row()[..width];
+            self.photo.row(row, self.channel, self.background, values);
+            memory.put::<S>(1, slot);
+        }
+    }
+
+    /// Takes in the weights of a row of the picture.
+    #[inline(always)]
+    fn weigh<S: Simd>(&self, memory: &mut Memory<'_, S::f32s>, row: usize) {
+        if let Some(weights) = &self.photo.weights {
+            let width = self.photo.width as usize;
+            memory.row()[..width].copy_from_slice(&weights[row * width..][..width]);
+            memory.put_weights::<S>();
+        }
+    }
+
+    /// Filters the pictures and puts the slopes of SSIM into their ring; returns the weighted sum of
+    /// SSIM over those rows that are the band's own.
+    #[inline(always)]
+    fn slopes<S: Simd>(&self, s: S, memory: &mut Memory<'_, S::f32s>, at: usize) -> f64 {
+        let vectors = memory.vectors;
+        for k in 0..vectors {
+            let rings = &memory.pictures[PICTURES * k..][..PICTURES];
+            let mut x = window::<S>(&rings[0], at + SLOTS - 2 * HALF);
+            let mut y = window::<S>(&rings[1], at + SLOTS - 2 * HALF);
+            let (mu_x, mu_y) = (filter_step(s, &x), filter_step(s, &y));
+            for j in 0..x.len() {
+                let squares = s.mul_add_e_f32s(x[j], x[j], s.mul_f32s(y[j], y[j]));
+                (x[j], y[j]) = (squares, s.mul_f32s(x[j], y[j]));
+            }
+            let (squares, xy) = (filter_step(s, &x), filter_step(s, &y));
+            for row in 0..STEP {
+                memory.filtered(0, row)[HALF + k] = mu_x[row];
+                memory.filtered(1, row)[HALF + k] = mu_y[row];
+                memory.filtered(2, row)[HALF + k] = squares[row];
+                memory.filtered(3, row)[HALF + k] = xy[row];
+            }
+        }
+        let mut total = 0.0;
+        for row in 0..STEP {
+            // The sweep's row, in the rings since SLOTS rows at most.
+            let of_sweep = at + row + SLOTS - HALF;
+            let slot = of_sweep % SLOTS;
+            let Some(own) = self.row(of_sweep - SLOTS) else {
+                for ring in memory.slopes.iter_mut() {
+                    ring[slot] = bytemuck::Zeroable::zeroed();
+                }
+                continue;
+            };
+            self.weigh::<S>(memory, own);
+            for map in 0..MEANS {
+                fill_ends(s, memory.filtered(map, row));
+            }
+            let mut sum = s.splat_f32s(0.0);
+            let mut k = 0;
+            while many_registers::<S>() && k + STEP <= vectors {
+                slopes_of::<S, STEP>(s, self.ssim, memory, row, slot, k, &mut sum);
+                k += STEP;
+            }
+            while k + 2 <= vectors {
+                slopes_of::<S, 2>(s, self.ssim, memory, row, slot, k, &mut sum);
+                k += 2;
+            }
+            if k < vectors {
+                slopes_of::<S, 1>(s, self.ssim, memory, row, slot, k, &mut sum);
+            }
+            if self.rows.contains(&own) {
+                total += f64::from(s.reduce_sum_f32s(sum));
+            }
+        }
+        total
+    }
+
+    /// Filters the slopes and writes the gradient of those rows that are the band's own; returns the
+    /// weighted sum of |x - y| over them.
+    #[inline(always)]
+    fn gradient<S: Simd>(&mut self, s: S, memory: &mut Memory<'_, S::f32s>, at: usize) -> f64 {
+        let (vectors, width) = (memory.vectors, self.photo.width as usize);
+        let first = at - 4 * HALF;
+        let rows = STEP.min(self.rows.len() - first);
+        for k in 0..vectors {
+            for map in 0..SLOPES {
+                let rows = window::<S>(&memory.slopes[SLOPES * k + map], at + SLOTS - 3 * HALF);
+                let rows = filter_step(s, &rows);
+                for row in 0..STEP {
+                    memory.filtered(map, row)[HALF + k] = rows[row];
+                }
+            }
+        }
+        let mut total = 0.0;
+        for row in 0..rows {
+            let slot = (at + row + SLOTS - 2 * HALF) % SLOTS;
+            self.weigh::<S>(memory, self.rows.start + first + row);
+            for map in 0..SLOPES {
+                fill_ends(s, memory.filtered(map, row));
+            }
+            let mut sum = s.splat_f32s(0.0);
+            let mut k = 0;
+            while many_registers::<S>() && k + STEP <= vectors {
+                self.gradient_of::<S, STEP>(s, memory, row, slot, k, &mut sum);
+                k += STEP;
+            }
+            while k + 2 <= vectors {
+                self.gradient_of::<S, 2>(s, memory, row, slot, k, &mut sum);
+                k += 2;
+            }
+            if k < vectors {
+                self.gradient_of::<S, 1>(s, memory, row, slot, k, &mut sum);
+            }
+            total += f64::from(s.reduce_sum_f32s(sum));
+            let values = bytemuck::cast_slice_mut::<S::f32s, f32>(memory.row);
+            collect::<S>(bytemuck::cast_slice(memory.gradient), values);
+            self.out[(first + row) * width..][..width].copy_from_slice(&values[..width]);
+            values[width..].fill(0.0);
+        }
+        total
+    }
+
+    /// `N` vectors of a row's gradient, from `k` on; adds w |x - y| to `sum`.
+    #[inline(always)]
+    fn gradient_of<S: Simd, const N: usize>(
+        &self,
+        s: S,
+        memory: &mut Memory<'_, S::f32s>,
+        row: usize,
+        slot: usize,
+        k: usize,
+        sum: &mut S::f32s,
+    ) {
+        let mu = filter::<S, N>(s, &memory.filtered(0, row)[k..]);
+        let xx = filter::<S, N>(s, &memory.filtered(1, row)[k..]);
+        let xy = filter::<S, N>(s, &memory.filtered(2, row)[k..]);
+        let (l1, minus_l1) = (s.splat_f32s(self.l1), s.splat_f32s(-self.l1));
+        let zero = s.splat_f32s(0.0);
+        let rings = &memory.pictures[PICTURES * k..][..PICTURES * N];
+        let weights = &memory.weights[k..][..N];
+        let out = &mut memory.gradient[k..][..N];
+        for j in 0..N {
+            let (x, y) = (rings[PICTURES * j][slot], rings[PICTURES * j + 1][slot]);
+            let weight = weights[j];
+            let difference = s.sub_f32s(x, y);
+            let distance = s.max_f32s(difference, s.sub_f32s(y, x));
+            *sum = s.mul_add_e_f32s(distance, weight, *sum);
+            // The distance has no slope where it is 0.
+            let below = s.less_than_f32s(difference, zero);
+            let sign = s.select_f32s(below, minus_l1, zero);
+            let sign = s.select_f32s(s.greater_than_f32s(difference, zero), l1, sign);
+            let v = s.mul_add_e_f32s(x, xx[j], s.mul_f32s(sign, weight));
+            out[j] = s.sub_f32s(s.negate_mul_add_e_f32s(y, xy[j], v), mu[j]);
+        }
+    }
+}
+
+/// `N` vectors of a row of slopes, from `k` on, where one of SSIM weighs `unit`; adds w SSIM to `sum`.
+#[inline(always)]
+fn slopes_of<S: Simd, const N: usize>(
+    s: S,
+    unit: f32,
+    memory: &mut Memory<'_, S::f32s>,
+    row: usize,
+    slot: usize,
+    k: usize,
+    sum: &mut S::f32s,
+) {
+    let mu_x = filter::<S, N>(s, &memory.filtered(0, row)[k..]);
+    let mu_y = filter::<S, N>(s, &memory.filtered(1, row)[k..]);
+    let squares = filter::<S, N>(s, &memory.filtered(2, row)[k..]);
+    let xy = filter::<S, N>(s, &memory.filtered(3, row)[k..]);
+    let (c1, c2) = (s.splat_f32s(SSIM_C.0), s.splat_f32s(SSIM_C.1));
+    let (one, two, twice) = (s.splat_f32s(1.0), s.splat_f32s(2.0), s.splat_f32s(2.0 * unit));
+    let weights = &memory.weights[k..][..N];
+    let slopes = &mut memory.slopes[SLOPES * k..][..SLOPES * N];
+    for j in 0..N {
+        let (mu_x, mu_y, weight) = (mu_x[j], mu_y[j], weights[j]);
+        let mu_xy = s.mul_f32s(mu_x, mu_y);
+        let mu_squares = s.mul_add_e_f32s(mu_x, mu_x, s.mul_f32s(mu_y, mu_y));
+        let s_xy = s.sub_f32s(xy[j], mu_xy);
+        let s_sum = s.sub_f32s(squares[j], mu_squares);
+        let a1 = s.mul_add_e_f32s(two, mu_xy, c1);
+        let a2 = s.mul_add_e_f32s(two, s_xy, c2);
+        let b1 = s.add_f32s(mu_squares, c1);
+        let b2 = s.add_f32s(s_sum, c2);
+        let inverse = s.div_f32s(one, s.mul_f32s(b1, b2));
+        let ssim = s.mul_f32s(s.mul_f32s(a1, a2), inverse);
+        *sum = s.mul_add_e_f32s(ssim, weight, *sum);
+        // d/d mu_x directly, 2 mu_y a2 - 2 mu_x b2 ssim, and through s_xx = xx - mu_x^2 and
+        // s_xy = xy - mu_x mu_y.
+        let scale = s.mul_f32s(s.mul_f32s(twice, weight), inverse);
+        let v_mu = s.mul_f32s(s.mul_f32s(mu_x, ssim), s.sub_f32s(b1, b2));
+        let v_mu = s.mul_add_e_f32s(mu_y, s.sub_f32s(a2, a1), v_mu);
+        let v_xx = s.mul_f32s(ssim, b1);
+        slopes[SLOPES * j][slot] = s.mul_f32s(v_mu, scale);
+        slopes[SLOPES * j + 1][slot] = s.mul_f32s(v_xx, scale);
+        slopes[SLOPES * j + 2][slot] = s.mul_f32s(a1, scale);
+    }
+}
+
+/// Rows of the bands of a picture of so many rows, from its size alone, so that no sum depends on
+/// the threads.
+fn rows_of_bands(height: usize) -> usize {
+    let bands = ((height + BAND / 2) / BAND).max(1);
+    height.div_ceil(bands).next_multiple_of(STEP)
+}
+
 impl Loss {
-    /// Loss of the picture `x` against the photo `y` (three planes each); its gradient is left in
-    /// `v_color`.
+    /// Loss of the picture `x`, three planes, against the photo; its gradient is left in `v_color`.
     pub fn run(
         &mut self,
         x: [&[f32]; 3],
-        y: [&[f32]; 3],
-        weights: Option<&[f32]>,
-        width: usize,
+        photo: &Target,
+        background: [f32; 3],
         ssim_weight: f32,
     ) -> f32 {
-        let pixels = x[0].len();
-        let all = Weight { sum: pixels as f64, count: pixels as f64 };
-        let weight = weights.map_or(all, Weight::of);
+        let width = photo.width as usize;
+        let weight = photo.weight();
         let scale = weight.scale();
-        let band = BAND * width;
-        let bands =
-            |band_index: usize| band_index * BAND..((band_index + 1) * BAND).min(pixels / width);
+        let (l1, ssim) = (1.0 - f64::from(ssim_weight), f64::from(ssim_weight));
+        let rows = rows_of_bands(photo.height as usize);
         for v in &mut self.v_color {
-            v.resize(pixels, 0.0);
+            v.resize(x[0].len(), 0.0);
         }
-        for slope in self.slopes.iter_mut().flatten() {
-            slope.resize(pixels, 0.0);
-        }
-        let ssim: f64 = (0..3)
-            .into_par_iter()
-            .zip(&mut self.slopes)
-            .flat_map(|(c, [mu, xx, xy])| {
-                (mu.par_chunks_mut(band), xx.par_chunks_mut(band), xy.par_chunks_mut(band))
-                    .into_par_iter()
-                    .enumerate()
-                    .map(move |(index, (mu, xx, xy))| {
-                        dispatch(Slopes {
-                            x: x[c],
-                            y: y[c],
-                            weights,
-                            width,
-                            rows: bands(index),
-                            out: [mu, xx, xy],
-                        })
-                    })
-            })
-            .collect::<Vec<f64>>()
-            .iter()
-            .sum();
-        let slopes = &self.slopes;
-        let l1: f64 = (0..3)
+        let pool = &self.scratch;
+        let sums: Vec<[f64; 2]> = (0..3)
             .into_par_iter()
             .zip(&mut self.v_color)
-            .flat_map(|(c, v)| {
-                v.par_chunks_mut(band).enumerate().map(move |(index, out)| {
-                    dispatch(Gradient {
-                        x: x[c],
-                        y: y[c],
-                        weights,
-                        slopes: &slopes[c],
-                        width,
-                        rows: bands(index),
-                        l1: ((1.0 - f64::from(ssim_weight)) * scale) as f32,
-                        ssim: (f64::from(ssim_weight) * scale) as f32,
+            .flat_map(|(channel, v)| {
+                v.par_chunks_mut(rows * width).enumerate().map(move |(band, out)| {
+                    let mut scratch = lock(pool).pop().unwrap_or_default();
+                    let sums = dispatch(Band {
+                        x: x[channel],
+                        photo,
+                        channel,
+                        background: background[channel],
+                        rows: band * rows..band * rows + out.len() / width,
+                        l1: (l1 * scale) as f32,
+                        ssim: (ssim * scale) as f32,
+                        scratch: &mut scratch,
                         out,
-                    })
+                    });
+                    lock(pool).push(scratch);
+                    sums
                 })
             })
-            .collect::<Vec<f64>>()
-            .iter()
-            .sum();
-        weight.loss(f64::from(ssim_weight), l1, ssim) as f32
+            .collect();
+        let [sum_ssim, sum_l1] = [0, 1].map(|k| sums.iter().map(|sums| sums[k]).sum::<f64>());
+        weight.loss(ssim, sum_l1, sum_ssim) as f32
     }
+}
+
+/// A task that failed leaves scratch memory that is as good as any.
+fn lock(pool: &Mutex<Vec<Aligned>>) -> MutexGuard<'_, Vec<Aligned>> {
+    pool.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 pub(super) fn loss(
@@ -299,16 +455,9 @@ pub(super) fn loss(
 ) -> stages::Loss<f32> {
     let picture: [Vec<f32>; 3] =
         std::array::from_fn(|c| image.color.iter().map(|color| color[c]).collect());
-    let mut photo: [Vec<f32>; 3] = Default::default();
-    target.composite(background, &mut photo);
     let mut loss = Loss::default();
-    let value = loss.run(
-        picture.each_ref().map(|plane| plane.as_slice()),
-        photo.each_ref().map(|plane| plane.as_slice()),
-        target.weights.as_deref(),
-        image.width as usize,
-        ssim_weight,
-    );
+    let planes = picture.each_ref().map(|plane| plane.as_slice());
+    let value = loss.run(planes, target, background, ssim_weight);
     let [r, g, b] = &loss.v_color;
     let v_color = (0..r.len()).map(|pixel| [r[pixel], g[pixel], b[pixel]]).collect();
     stages::Loss { value, v_color }
@@ -363,26 +512,41 @@ mod tests {
         sum / total
     }
 
+    fn photo(rng: &mut impl Rng, width: usize, height: usize, weighted: bool) -> Target {
+        let pixels = width * height;
+        let mut weight = || {
+            let w = rng.random::<f32>();
+            if w < 0.3 { 0.0 } else { w }
+        };
+        Target {
+            width: width as u32,
+            height: height as u32,
+            channels: 3,
+            weights: weighted.then(|| (0..pixels).map(|_| weight()).collect()),
+            pixels: (0..3 * pixels).map(|_| rng.random()).collect(),
+            background: None,
+            turns: 1,
+            until: None,
+        }
+    }
+
+    fn planes(photo: &Target) -> [Vec<f32>; 3] {
+        std::array::from_fn(|c| {
+            photo.pixels.chunks_exact(3).map(|pixel| f32::from(pixel[c]) / 255.0).collect()
+        })
+    }
+
     #[test]
     fn loss_and_gradient_match_the_definition() {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(3);
         for (width, height, weighted) in [(23, 37, false), (40, 9, true), (3, 2, false)] {
             let n = width * height;
-            let mut draw = || -> [Vec<f32>; 3] {
-                std::array::from_fn(|_| (0..n).map(|_| rng.random::<f32>()).collect())
-            };
-            let (x, y) = (draw(), draw());
-            let weights = weighted.then(|| {
-                draw()[0].iter().map(|&w| if w < 0.3 { 0.0 } else { w }).collect::<Vec<f32>>()
-            });
+            let x: [Vec<f32>; 3] =
+                std::array::from_fn(|_| (0..n).map(|_| rng.random::<f32>()).collect());
+            let photo = photo(&mut rng, width, height, weighted);
             let mut loss = Loss::default();
-            let value = loss.run(
-                [&x[0], &x[1], &x[2]],
-                [&y[0], &y[1], &y[2]],
-                weights.as_deref(),
-                width,
-                0.2,
-            );
+            let value = loss.run([&x[0], &x[1], &x[2]], &photo, [0.0; 3], 0.2);
+            let (y, weights) = (planes(&photo), photo.weights);
             let wide = x.clone().map(|p| p.into_iter().map(f64::from).collect::<Vec<f64>>());
             let expected = plain(&wide, &y, weights.as_deref(), width, 0.2);
             assert!((f64::from(value) - expected).abs() < 1e-6, "{value} vs {expected}");
@@ -409,9 +573,36 @@ mod tests {
     #[test]
     fn a_photo_masked_out_everywhere_asks_for_nothing() {
         let x = vec![0.3f32; 12];
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(4);
+        let photo = Target { weights: Some(vec![0.0; 12]), ..photo(&mut rng, 4, 3, false) };
         let mut loss = Loss::default();
-        let value = loss.run([&x; 3], [&x; 3], Some(&[0.0; 12]), 4, 0.2);
+        let value = loss.run([&x; 3], &photo, [0.0; 3], 0.2);
         assert_eq!(value, 0.0);
         assert!(loss.v_color.iter().flatten().all(|&v| v == 0.0));
+    }
+
+    /// Also with scratch memory that a picture of another size has left behind.
+    #[test]
+    fn threads_and_earlier_pictures_change_no_bit() {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(5);
+        let photos = [(70, 300, true), (7, 20, false), (333, 150, false)]
+            .map(|(width, height, weighted)| photo(&mut rng, width, height, weighted));
+        let x: Vec<f32> = (0..333 * 150).map(|_| rng.random()).collect();
+        let run = |threads: usize, kept: bool| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut loss = Loss::default();
+            photos.each_ref().map(|photo| {
+                if !kept {
+                    loss = Loss::default();
+                }
+                let x = &x[..photo.pixels.len() / 3];
+                let value = pool.install(|| loss.run([x; 3], photo, [0.0; 3], 0.2));
+                (value.to_bits(), loss.v_color.clone())
+            })
+        };
+        let expected = run(1, false);
+        for threads in 1..=8 {
+            assert!(run(threads, true) == expected, "{threads} threads give other bits");
+        }
     }
 }

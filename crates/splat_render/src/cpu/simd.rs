@@ -80,6 +80,7 @@ mod tests {
     use super::*;
     use crate::cpu::Cpu;
     use crate::cpu::loss::Loss;
+    use crate::target::Target;
     use crate::{Image, ImageGradients, Projected, ProjectedGradients, Stages};
 
     thread_local! {
@@ -108,12 +109,20 @@ mod tests {
             v_depth: image.depth.clone(),
         };
         let v = Cpu.rasterize_backward(splats, [0.1, 0.2, 0.3], &image, &v_image, true).unwrap();
-        let planes: [Vec<f32>; 3] =
+        let [r, g, b]: [Vec<f32>; 3] =
             std::array::from_fn(|c| image.color.iter().map(|color| color[c]).collect());
-        let [r, g, b] = &planes;
+        let photo = Target {
+            width: splats.width,
+            height: splats.height,
+            channels: 3,
+            pixels: image.color.as_flattened().iter().map(|v| (255.0 * (1.0 - v)) as u8).collect(),
+            weights: Some(r.clone()),
+            background: None,
+            turns: 1,
+            until: None,
+        };
         let mut loss = Loss::default();
-        let width = splats.width as usize;
-        let mut out = vec![loss.run([r, g, b], [g, b, r], Some(r), width, 0.2)];
+        let mut out = vec![loss.run([&r, &g, &b], &photo, [0.0; 3], 0.2)];
         out.extend(loss.v_color.iter().flatten());
         (image, v, out)
     }

@@ -1,101 +1,188 @@
-//! The SSIM window as two passes: along rows, then along columns.
+//! The SSIM window as two passes of 11 taps, and how a picture's rows lie in memory for them.
+//!
+//! A row is cut into as many equal parts as a vector has lanes, and vector k holds the k-th value of
+//! each part. So the neighbours of a vector's values along the row are the vectors beside it: both
+//! passes read whole, aligned vectors, where a row as it lies in the picture would be read across
+//! cache lines, once for each tap. Only where a part begins or ends do values come from the next
+//! lane.
 
+use bytemuck::{Pod, Zeroable};
+use glam::{Mat4, Vec4};
 use pulp::Simd;
 
 use crate::constants::SSIM_WINDOW;
 
 /// Taps on each side of the window's centre.
 pub(super) const HALF: usize = SSIM_WINDOW.len() / 2;
-/// Zeros kept before and after each row: at least the window's half.
-const PAD: usize = 16;
-/// Vectors that are summed side by side, so that no sum waits for the one before it and the bounds
-/// of what they read are checked once.
-pub(super) const RUN: usize = 4;
-/// Floats of a run of the widest vectors.
-const WIDEST: usize = 16 * RUN;
+/// Neighbouring results that are computed side by side, since they share most of what they read.
+pub(super) const STEP: usize = 4;
+/// Values that so many results are made of.
+pub(super) const REACH: usize = STEP + 2 * HALF;
+/// Rows that a ring keeps: at least [`REACH`], a multiple of [`STEP`], and a power of two.
+pub(super) const SLOTS: usize = 16;
+/// Side of the blocks in which a row's values are put into another order, as a [`Mat4`], which has
+/// instructions for it.
+const BLOCK: usize = 4;
+/// Floats of the widest vectors.
+const WIDEST: usize = 16;
 
-/// Some neighbouring rows of several maps, filtered along the rows. Rows outside the picture and
-/// values beyond its width are zero.
-pub(super) struct Rows {
-    stride: usize,
-    per_map: usize,
-    data: Vec<f32>,
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C, align(64))]
+struct CacheLine([f32; WIDEST]);
+
+/// Scratch memory that begins on a cache line, so that no vector lies across two.
+#[derive(Debug, Default)]
+pub(super) struct Aligned(Vec<CacheLine>);
+
+impl Aligned {
+    /// So many vectors, whatever they hold.
+    pub fn vectors<S: Simd>(&mut self, count: usize) -> &mut [S::f32s] {
+        let lines = (count * S::F32_LANES).div_ceil(WIDEST);
+        if self.0.len() < lines {
+            self.0.resize(lines, CacheLine::zeroed());
+        }
+        &mut bytemuck::cast_slice_mut(&mut self.0)[..count]
+    }
 }
 
-/// A picture's row with zeros around it.
-pub(super) struct Padded(Vec<f32>);
+/// Vectors of a row: at least as many as the window reaches into a part from the next one.
+#[inline(always)]
+pub(super) fn vectors_of_row<S: Simd>(width: usize) -> usize {
+    width.div_ceil(S::F32_LANES).max(HALF)
+}
 
-/// A row of vectors, in runs.
-pub(super) type Line<S> = Vec<[<S as Simd>::f32s; RUN]>;
-
-impl Rows {
-    /// Zeros for `maps` maps of as many rows as a window needs around `rows` rows of `width`.
-    pub fn new(maps: usize, rows: usize, width: usize) -> Self {
-        let (stride, per_map) = (width.next_multiple_of(WIDEST), rows + 2 * HALF);
-        Self { stride, per_map, data: vec![0.0; maps * per_map * stride] }
-    }
-
-    /// A row to filter, all zeros.
-    pub fn padded(&self) -> Padded {
-        Padded(vec![0.0; self.stride + 2 * PAD])
-    }
-
-    /// A row for what [`Rows::filter_column`] gives.
-    pub fn line<S: Simd>(&self, s: S) -> Line<S> {
-        vec![[s.splat_f32s(0.0); RUN]; self.stride / (RUN * S::F32_LANES)]
-    }
-
-    /// Filters a row and keeps it as row `row` of `map`; the rows asked for begin at row [`HALF`].
-    #[inline(always)]
-    pub fn filter_row<S: Simd>(&mut self, s: S, padded: &Padded, map: usize, row: usize) {
-        let out = &mut self.data[(map * self.per_map + row) * self.stride..][..self.stride];
-        let (runs, _) = S::as_mut_simd_f32s(out).0.as_chunks_mut::<RUN>();
-        let lanes = S::F32_LANES;
-        for (run, out) in runs.iter_mut().enumerate() {
-            let from = &padded.0[run * RUN * lanes + PAD - HALF..][..RUN * lanes + 2 * HALF];
-            let mut sums = [s.splat_f32s(0.0); RUN];
-            let center = s.splat_f32s(SSIM_WINDOW[HALF]);
-            for j in 0..RUN {
-                sums[j] = s.mul_f32s(center, load::<S>(from, j * lanes + HALF));
-            }
-            for k in 0..HALF {
-                let tap = s.splat_f32s(SSIM_WINDOW[k]);
-                for j in 0..RUN {
-                    let (left, right) = (j * lanes + k, j * lanes + 2 * HALF - k);
-                    let pair = s.add_f32s(load::<S>(from, left), load::<S>(from, right));
-                    sums[j] = s.mul_add_e_f32s(tap, pair, sums[j]);
-                }
-            }
-            *out = sums;
+/// Spreads a row that lies as in a picture, a whole number of vectors, over the parts: the vectors
+/// are `stride` floats apart in `to`.
+#[inline(always)]
+pub(super) fn spread<S: Simd>(row: &[f32], to: &mut [f32], stride: usize) {
+    let vectors = row.len() / S::F32_LANES;
+    if S::F32_LANES < BLOCK {
+        for (k, value) in row.iter().enumerate() {
+            to[k * stride] = *value;
         }
+        return;
     }
-
-    /// Filters the columns of `map` around the row that is `row`th of those asked for.
-    #[inline(always)]
-    pub fn filter_column<S: Simd>(&self, s: S, map: usize, row: usize, out: &mut Line<S>) {
-        let at = (map * self.per_map + row) * self.stride;
-        let window = &self.data[at..at + SSIM_WINDOW.len() * self.stride];
-        let (window, _) = S::as_simd_f32s(window).0.as_chunks::<RUN>();
-        let runs = out.len();
-        for (run, out) in out.iter_mut().enumerate() {
-            let mut sums = [s.splat_f32s(0.0); RUN];
-            for k in 0..SSIM_WINDOW.len() {
-                let (tap, row) = (s.splat_f32s(SSIM_WINDOW[k]), &window[k * runs + run]);
-                for j in 0..RUN {
-                    sums[j] = s.mul_add_e_f32s(tap, row[j], sums[j]);
-                }
-            }
-            *out = sums;
+    for k in blocks(vectors) {
+        for lane in (0..S::F32_LANES).step_by(BLOCK) {
+            let block = Mat4::from_cols(
+                Vec4::from_slice(&row[lane * vectors + k..]),
+                Vec4::from_slice(&row[(lane + 1) * vectors + k..]),
+                Vec4::from_slice(&row[(lane + 2) * vectors + k..]),
+                Vec4::from_slice(&row[(lane + 3) * vectors + k..]),
+            );
+            let block = block.transpose();
+            block.x_axis.write_to_slice(&mut to[k * stride + lane..]);
+            block.y_axis.write_to_slice(&mut to[(k + 1) * stride + lane..]);
+            block.z_axis.write_to_slice(&mut to[(k + 2) * stride + lane..]);
+            block.w_axis.write_to_slice(&mut to[(k + 3) * stride + lane..]);
         }
     }
 }
 
-impl Padded {
-    /// The `width` values between the zeros.
-    #[inline(always)]
-    pub fn row(&mut self, width: usize) -> &mut [f32] {
-        &mut self.0[PAD..PAD + width]
+/// The opposite of [`spread`], of vectors side by side.
+#[inline(always)]
+pub(super) fn collect<S: Simd>(from: &[f32], row: &mut [f32]) {
+    let vectors = row.len() / S::F32_LANES;
+    if S::F32_LANES < BLOCK {
+        row.copy_from_slice(from);
+        return;
     }
+    let lanes = S::F32_LANES;
+    for k in blocks(vectors) {
+        for lane in (0..lanes).step_by(BLOCK) {
+            let block = Mat4::from_cols(
+                Vec4::from_slice(&from[k * lanes + lane..]),
+                Vec4::from_slice(&from[(k + 1) * lanes + lane..]),
+                Vec4::from_slice(&from[(k + 2) * lanes + lane..]),
+                Vec4::from_slice(&from[(k + 3) * lanes + lane..]),
+            );
+            let block = block.transpose();
+            block.x_axis.write_to_slice(&mut row[lane * vectors + k..]);
+            block.y_axis.write_to_slice(&mut row[(lane + 1) * vectors + k..]);
+            block.z_axis.write_to_slice(&mut row[(lane + 2) * vectors + k..]);
+            block.w_axis.write_to_slice(&mut row[(lane + 3) * vectors + k..]);
+        }
+    }
+}
+
+/// Where blocks begin that cover so many vectors; the last one may overlap the one before it.
+#[inline(always)]
+fn blocks(vectors: usize) -> impl Iterator<Item = usize> {
+    (0..vectors.div_ceil(BLOCK)).map(move |block| (block * BLOCK).min(vectors - BLOCK))
+}
+
+/// Fills the [`HALF`] vectors before and after those of a row with the neighbouring parts' values,
+/// zero beyond the picture.
+#[inline(always)]
+pub(super) fn fill_ends<S: Simd>(s: S, row: &mut [S::f32s]) {
+    const INDEX: [f32; WIDEST] = {
+        let mut index = [0.0; WIDEST];
+        let mut k = 0;
+        while k < WIDEST {
+            index[k] = k as f32;
+            k += 1;
+        }
+        index
+    };
+    let (lanes, vectors) = (S::F32_LANES, row.len() - 2 * HALF);
+    let (zero, index) = (s.splat_f32s(0.0), load::<S>(&INDEX, 0));
+    let not_first = s.greater_than_f32s(index, s.splat_f32s(0.5));
+    let not_last = s.less_than_f32s(index, s.splat_f32s(lanes as f32 - 1.5));
+    for k in 0..HALF {
+        // One float further left or right is one lane on, but for the lane that has none beside it.
+        let values = bytemuck::cast_slice::<S::f32s, f32>(row);
+        let before = load::<S>(values, (vectors + k) * lanes - 1);
+        let after = load::<S>(values, (HALF + k) * lanes + 1);
+        row[k] = s.select_f32s(not_first, before, zero);
+        row[HALF + vectors + k] = s.select_f32s(not_last, after, zero);
+    }
+}
+
+/// The [`REACH`] rows of one vector of a ring from slot `first` on.
+#[inline(always)]
+pub(super) fn window<S: Simd>(ring: &[S::f32s; SLOTS], first: usize) -> [S::f32s; REACH] {
+    let mut rows = [ring[0]; REACH];
+    for j in 0..REACH {
+        rows[j] = ring[(first + j) % SLOTS];
+    }
+    rows
+}
+
+/// Whether the values of [`STEP`] results fit into the registers.
+#[inline(always)]
+pub(super) fn many_registers<S: Simd>() -> bool {
+    S::REGISTER_COUNT >= 32
+}
+
+/// [`STEP`] neighbouring results of a pass.
+#[inline(always)]
+pub(super) fn filter_step<S: Simd>(s: S, values: &[S::f32s; REACH]) -> [S::f32s; STEP] {
+    if many_registers::<S>() {
+        return filter::<S, STEP>(s, values);
+    }
+    let [a, b] = filter::<S, 2>(s, values);
+    let [c, d] = filter::<S, 2>(s, &values[2..]);
+    [a, b, c, d]
+}
+
+/// `N` neighbouring results of a pass from their N + 2 [`HALF`] values.
+#[inline(always)]
+pub(super) fn filter<S: Simd, const N: usize>(s: S, values: &[S::f32s]) -> [S::f32s; N] {
+    let values = &values[..N + 2 * HALF];
+    let mut sums = [s.splat_f32s(0.0); N];
+    let center = s.splat_f32s(SSIM_WINDOW[HALF]);
+    for j in 0..N {
+        sums[j] = s.mul_f32s(center, values[j + HALF]);
+    }
+    // The window is symmetric: one multiplication for two taps.
+    for k in 0..HALF {
+        let tap = s.splat_f32s(SSIM_WINDOW[k]);
+        for j in 0..N {
+            let pair = s.add_f32s(values[j + k], values[j + 2 * HALF - k]);
+            sums[j] = s.mul_add_e_f32s(tap, pair, sums[j]);
+        }
+    }
+    sums
 }
 
 #[inline(always)]

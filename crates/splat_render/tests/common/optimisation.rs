@@ -57,7 +57,7 @@ pub fn random_picture(rng: &mut Pcg64, width: u32, height: u32) -> Image<f32> {
 pub fn loss_matches_the_reference(stages: &dyn Stages<f32>) {
     let mut rng = rng(60);
     let background = [0.1f32, 0.6, 0.9];
-    let sizes = [(23, 37), (40, 9), (3, 2), (1, 1), (64, 48), (130, 7)];
+    let sizes = [(23, 37), (40, 9), (3, 2), (1, 1), (64, 48), (130, 7), (21, 200)];
     for (k, (width, height)) in sizes.into_iter().enumerate() {
         for ssim_weight in [0.0f32, 0.2, 1.0] {
             let target = random_target(&mut rng, width, height, k % 2 == 0, k % 3 == 1);
