@@ -185,6 +185,19 @@ pub(crate) struct SplatSlices<'a> {
 }
 
 impl<'a> SplatSlices<'a> {
+    /// Borrowed as the stages take them, where they are raw parameters: SH of `degree` of `stride`
+    /// rows per splat.
+    pub fn params(&self, degree: u32, stride: usize) -> SplatParams<'_, f32> {
+        SplatParams {
+            means: self.means,
+            quats: self.quats,
+            scales: self.scales,
+            opacities: self.opacities,
+            colors: Colors::Sh { degree, stride, coeffs: self.sh },
+            raw: true,
+        }
+    }
+
     /// Runs of `size` splats, in order, the last one shorter; each splat has `stride` rows of colour.
     pub fn into_blocks(
         self,

@@ -4,17 +4,16 @@ use glam::{Mat3, Quat, Vec3};
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::project::Splat;
-use super::project_backward::VSplat;
+use super::block::BLOCK;
+use super::elementary::exp;
+use super::lanes::Lanes;
+use super::project::sigmoid;
 use super::simd::dispatch;
 use crate::constants::{ADAM, QUAT_NORM2_MIN};
 use crate::fit_device::noise_normal;
 use crate::sh;
 use crate::splats::SplatSlices;
 use crate::stages::{AdamState, AdamStep, Rates, SplatGradients};
-
-/// Splats whose gradients are gathered before Adam runs over them: they stay in the cache.
-pub(super) const BLOCK: usize = 64;
 
 /// Gradients of a block of splats, laid out as the parameters are.
 pub(super) struct BlockGradients {
@@ -37,13 +36,22 @@ impl BlockGradients {
         }
     }
 
-    /// Takes what belongs to splat `k` of the block, coefficients apart.
-    #[inline(always)]
-    pub fn set(&mut self, k: usize, v: &VSplat) {
-        self.means[k] = v.v_mean;
-        self.quats[k] = v.v_quat;
-        self.scales[k] = v.v_scales;
-        self.opacities[k] = v.v_opacity;
+    /// Room for the gradients of the block's first `n` splats, all zero.
+    pub fn zeroed(&mut self, n: usize) -> SplatSlices<'_> {
+        let rows = self.sh.len() / BLOCK * n;
+        let Self { means, quats, scales, opacities, sh } = self;
+        means.fill([0.0; 3]);
+        quats.fill([0.0; 4]);
+        scales.fill([0.0; 3]);
+        opacities.fill(0.0);
+        sh.fill([0.0; 3]);
+        SplatSlices {
+            means: &mut means[..n],
+            quats: &mut quats[..n],
+            scales: &mut scales[..n],
+            opacities: &mut opacities[..n],
+            sh: &mut sh[..rows],
+        }
     }
 }
 
@@ -100,13 +108,19 @@ impl BlockStep {
         }
     }
 
-    /// Adds the regularisers' gradients to those of one splat.
-    #[inline(always)]
-    pub fn pull(&self, splat: &Splat, v: &mut VSplat) {
-        v.v_opacity += self.opacity_pull * splat.opacity_slope;
-        for (v, scale) in v.v_scales.iter_mut().zip(splat.scales.to_array()) {
-            *v += self.scale_pull * scale;
+    /// Adds the regularisers' gradients to those of a block of splats.
+    pub fn pull(&self, values: &SplatSlices<'_>, gradients: &mut BlockGradients) {
+        if self.opacity_pull == 0.0 && self.scale_pull == 0.0 {
+            return;
         }
+        dispatch(Pull {
+            log_scales: values.scales.as_flattened(),
+            v_scales: gradients.scales.as_flattened_mut(),
+            scale_pull: self.scale_pull,
+            logits: values.opacities,
+            v_opacities: &mut gradients.opacities,
+            opacity_pull: self.opacity_pull,
+        });
     }
 
     /// Moves a block of splats, the first of them splat `first_id` of the scene.
@@ -198,6 +212,38 @@ impl WithSimd for Adam<'_> {
     }
 }
 
+/// What the regularisers pull at: log-scales and logits of a block, with their gradients.
+struct Pull<'a> {
+    log_scales: &'a [f32],
+    v_scales: &'a mut [f32],
+    scale_pull: f32,
+    logits: &'a [f32],
+    v_opacities: &'a mut [f32],
+    opacity_pull: f32,
+}
+
+impl WithSimd for Pull<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        for at in (0..self.log_scales.len()).step_by(S::F32_LANES) {
+            let scales = exp(Lanes::new(s, s.partial_load_f32s(&self.log_scales[at..])));
+            let v = &mut self.v_scales[at..];
+            let sum = Lanes::new(s, s.partial_load_f32s(v));
+            let sum = scales.mul_add(sum.all(self.scale_pull), sum);
+            s.partial_store_f32s(v, sum.vector());
+        }
+        for at in (0..self.logits.len()).step_by(S::F32_LANES) {
+            let (_, slope) = sigmoid(Lanes::new(s, s.partial_load_f32s(&self.logits[at..])));
+            let v = &mut self.v_opacities[at..];
+            let sum = Lanes::new(s, s.partial_load_f32s(v));
+            let sum = slope.mul_add(sum.all(self.opacity_pull), sum);
+            s.partial_store_f32s(v, sum.vector());
+        }
+    }
+}
+
 /// 3DGS-MCMC's exploration: nearly transparent splats take a random step shaped by their covariance.
 #[inline(always)]
 fn explore(
@@ -236,25 +282,14 @@ pub(super) fn adam(state: &mut AdamState<f32>, gradients: &SplatGradients<f32>, 
             |v_block, (block, (values, first, second))| {
                 let first_id = block * BLOCK;
                 let n = values.means.len();
-                for k in 0..n {
-                    let i = first_id + k;
-                    let mut v = VSplat {
-                        v_mean: gradients.v_means[i],
-                        v_quat: gradients.v_quats[i],
-                        v_scales: gradients.v_scales[i],
-                        v_opacity: gradients.v_opacities[i],
-                    };
-                    let splat = Splat::activate(
-                        values.means[k],
-                        values.quats[k],
-                        values.scales[k],
-                        values.opacities[k],
-                    );
-                    plan.pull(&splat, &mut v);
-                    v_block.set(k, &v);
-                }
+                let rows = first_id..first_id + n;
+                v_block.means[..n].copy_from_slice(&gradients.v_means[rows.clone()]);
+                v_block.quats[..n].copy_from_slice(&gradients.v_quats[rows.clone()]);
+                v_block.scales[..n].copy_from_slice(&gradients.v_scales[rows.clone()]);
+                v_block.opacities[..n].copy_from_slice(&gradients.v_opacities[rows]);
                 v_block.sh[..n * stride]
                     .copy_from_slice(&gradients.v_colors[first_id * stride..][..n * stride]);
+                plan.pull(&values, v_block);
                 plan.apply(values, [first, second], v_block, first_id);
             },
         );

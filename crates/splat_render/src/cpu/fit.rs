@@ -3,11 +3,12 @@
 
 use rayon::prelude::*;
 
-use super::adam::{BLOCK, BlockGradients, BlockStep};
+use super::adam::{BlockGradients, BlockStep};
 use super::bin::{Bins, CHUNK, ChunkTiles};
+use super::block::{BLOCK, Ids};
 use super::loss::Loss;
-use super::project::{Splat, View, project_splat};
-use super::project_backward::{SplatBackward, VCamera, VSplat};
+use super::project::{ProjectBlock, View};
+use super::project_backward::{Backward, BackwardBlock, VCamera};
 use super::rasterize::{Planes, rasterize_tiles};
 use super::rasterize_backward::{
     COLOR_SUMS, PairSums, PictureGradients, gather, rasterize_backward_tiles,
@@ -16,7 +17,7 @@ use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::Result;
 use crate::fit_device::{CameraGradient, FitDevice, FitState, StepInput, is_dropped};
-use crate::stages::{Colors, ProjectOptions};
+use crate::stages::ProjectOptions;
 use crate::target::Target;
 
 /// Fits on the CPU.
@@ -76,23 +77,22 @@ impl FitDevice for CpuFit {
         (self.splats.par_chunks_mut(CHUNK), &mut self.chunks, stats.seen.par_chunks_mut(CHUNK))
             .into_par_iter()
             .enumerate()
-            .for_each(|(chunk, (splats, tiles, seen))| {
+            .for_each_init(ProjectBlock::new, |block, (chunk, (splats, tiles, seen))| {
                 tiles.clear();
-                for (k, out) in splats.iter_mut().enumerate() {
-                    let i = chunk * CHUNK + k;
-                    if dropout.drops(i) {
-                        tiles.push_culled();
-                        continue;
+                for (number, splats) in splats.chunks_mut(BLOCK).enumerate() {
+                    let start = number * BLOCK;
+                    let first = chunk * CHUNK + start;
+                    let ids = dropout.kept(first, splats.len());
+                    block.run(&view, &params, first, ids, dropout.compensation);
+                    let mut next = 0;
+                    for (k, splat) in block.visible() {
+                        (next..k).for_each(|_| tiles.push_culled());
+                        splats[k] = TileSplat::new(&splat);
+                        tiles.push(&splat, width, height);
+                        seen[start + k] += 1.0;
+                        next = k + 1;
                     }
-                    let splat = Splat::load(&params, i).compensated(dropout.compensation);
-                    match project_splat(&view, &splat, &params.colors, i) {
-                        None => tiles.push_culled(),
-                        Some(splat) => {
-                            *out = TileSplat::new(&splat);
-                            tiles.push(&splat, width, height);
-                            seen[k] += 1.0;
-                        }
-                    }
+                    (next..splats.len()).for_each(|_| tiles.push_culled());
                 }
             });
         let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
@@ -143,15 +143,24 @@ impl Dropout {
         }
     }
 
-    fn drops(&self, i: usize) -> bool {
-        self.rate > 0.0 && is_dropped(self.seed, i as u32, self.rate)
+    /// Which of `n` splats from `first` on are not left out.
+    fn kept(&self, first: usize, n: usize) -> Ids {
+        if self.rate == 0.0 {
+            return Ids::all(n);
+        }
+        let mut ids = Ids::NONE;
+        for k in 0..n {
+            ids.push_if(k, !is_dropped(self.seed, (first + k) as u32, self.rate));
+        }
+        ids
     }
 }
 
-/// One task's scratch: a block of gradients and what the block's pairs summed up.
+/// One task's scratch: a block's gradients on their way from its pairs to its parameters.
 struct Scratch {
-    v: BlockGradients,
     pairs: Vec<PairSums<COLOR_SUMS>>,
+    backward: Box<BackwardBlock>,
+    v: BlockGradients,
 }
 
 impl CpuFit {
@@ -177,42 +186,37 @@ impl CpuFit {
             .into_par_iter()
             .enumerate()
             .for_each_init(
-                || Scratch { v: BlockGradients::new(stride), pairs: Vec::new() },
+                || Scratch {
+                    pairs: Vec::new(),
+                    backward: BackwardBlock::new(),
+                    v: BlockGradients::new(stride),
+                },
                 |scratch, (block, (values, first, second, grad_sum, v_camera))| {
                     let first_id = block * BLOCK;
                     let n = values.means.len();
-                    let backward = SplatBackward {
-                        view,
-                        colors: Colors::Sh { degree, stride, coeffs: values.sh },
-                        raw: true,
-                    };
-                    bins.take_pairs(first_id..first_id + n, sums, &mut scratch.pairs);
+                    let Scratch { pairs, backward, v } = scratch;
+                    bins.take_pairs(first_id..first_id + n, sums, pairs);
+                    backward.clear();
                     for k in 0..n {
                         let i = first_id + k;
-                        let splat = Splat::activate(
-                            values.means[k],
-                            values.quats[k],
-                            values.scales[k],
-                            values.opacities[k],
-                        );
-                        let v_sh = &mut scratch.v.sh[k * stride..(k + 1) * stride];
-                        let mut v = VSplat::default();
                         if bins.slots[i + 1] > bins.slots[i] {
-                            let pairs = &scratch.pairs[bins.pairs_of(first_id, i)];
+                            let pairs = &pairs[bins.pairs_of(first_id, i)];
                             let (v2d, _) = gather(&tile_splats[i], pairs);
                             let [x, y] = v2d.v_mean;
                             let (x, y) = (0.5 * size[0] * x, 0.5 * size[1] * y);
                             grad_sum[k] += (x * x + y * y).sqrt();
-                            let splat = splat.compensated(dropout.compensation);
-                            let v_camera = input.camera_gradient.then_some(&mut *v_camera);
-                            v = backward.run(k, &splat, &v2d, v_sh, v_camera);
-                        } else {
-                            v_sh.fill([0.0; 3]);
+                            backward.push(k, &v2d);
                         }
-                        plan.pull(&splat, &mut v);
-                        scratch.v.set(k, &v);
                     }
-                    plan.apply(values, [first, second], &scratch.v, first_id);
+                    let stage = Backward {
+                        view,
+                        splats: values.params(degree, stride),
+                        compensation: dropout.compensation,
+                        camera: input.camera_gradient,
+                    };
+                    *v_camera = backward.run(&stage, 0, v.zeroed(n));
+                    plan.pull(&values, v);
+                    plan.apply(values, [first, second], v, first_id);
                 },
             );
         if input.camera_gradient {

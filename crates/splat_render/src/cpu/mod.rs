@@ -4,7 +4,10 @@
 
 mod adam;
 mod bin;
+mod block;
+mod elementary;
 mod fit;
+mod lanes;
 mod loss;
 mod peak;
 mod project;

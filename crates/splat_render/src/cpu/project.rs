@@ -1,17 +1,21 @@
-//! project: splats and camera to 2D splats, f32.
+//! project: splats and camera to 2D splats, f32, a block of splats at a time, one splat per lane.
 
-use glam::{Mat3, Vec2, Vec3};
+use glam::{Vec2, Vec3};
+use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
+use super::block::{BLOCK, ColorRows, Ids, Row, SplatRows, get3, set3, vectors};
+use super::elementary::{exp, ln};
+use super::lanes::{Lanes, Mask, Mat3s, Vec3s};
+use super::simd::dispatch;
 use crate::camera::Camera;
-use crate::constants::{ALPHA_MIN, QUAT_NORM2_MIN};
+use crate::constants::{ALPHA_MIN, QUAT_NORM2_MIN, SH_COEFFS_MAX};
 use crate::sh;
 use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 
 /// A camera and the stage's options, rounded to f32 once.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct View {
-    pub rotation: Mat3,
     /// The rotation's rows: the camera's axes in the world.
     pub rows: [Vec3; 3],
     pub translation: Vec3,
@@ -27,10 +31,8 @@ pub(super) struct View {
 
 impl View {
     pub fn new(camera: &Camera, options: &ProjectOptions) -> Self {
-        let rotation = camera.rotation().as_mat3();
-        let rows = rotation.transpose();
+        let rows = camera.rotation().as_mat3().transpose();
         Self {
-            rotation,
             rows: [rows.x_axis, rows.y_axis, rows.z_axis],
             translation: camera.translation().as_vec3(),
             focal: Vec2::new(camera.fx as f32, camera.fy as f32),
@@ -41,168 +43,201 @@ impl View {
             nearest: options.nearest(),
         }
     }
-}
 
-/// One splat's activated parameters.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Splat {
-    pub mean: Vec3,
-    pub quat: [f32; 4],
-    pub scales: Vec3,
-    pub opacity: f32,
-    /// Derivative of the opacity with respect to the parameter as given.
-    pub opacity_slope: f32,
-}
-
-impl Splat {
-    /// The same splat where others are left out at random: more opaque by `factor`.
+    /// The camera's axes in every lane.
     #[inline(always)]
-    pub fn compensated(mut self, factor: f32) -> Self {
-        self.opacity *= factor;
-        self.opacity_slope *= factor;
-        self
-    }
-
-    /// A splat as it is given to the stages.
-    #[inline(always)]
-    pub fn load(splats: &SplatParams<'_, f32>, i: usize) -> Self {
-        let (scales, opacity) = (splats.scales[i], splats.opacities[i]);
-        if splats.raw {
-            return Self::activate(splats.means[i], splats.quats[i], scales, opacity);
-        }
-        Self {
-            mean: Vec3::from(splats.means[i]),
-            quat: splats.quats[i],
-            scales: Vec3::from(scales),
-            opacity: if opacity.is_finite() { opacity } else { f32::NAN },
-            opacity_slope: 1.0,
-        }
-    }
-
-    /// A splat as it is fitted: from log-scales and an opacity logit.
-    #[inline(always)]
-    pub fn activate(mean: [f32; 3], quat: [f32; 4], log_scales: [f32; 3], logit: f32) -> Self {
-        let log_scales = Vec3::from(log_scales);
-        // A logit of +inf is poisoned too, though its sigmoid is not.
-        let logit = if logit.is_finite() { logit } else { f32::NAN };
-        // o (1 - o) would be 0 where o rounds to 1.
-        let e = (-logit.abs()).exp();
-        Self {
-            mean: Vec3::from(mean),
-            quat,
-            // A log-scale of -inf is no splat of size 0 but a poisoned one: NaN is culled.
-            scales: if log_scales.is_finite() { log_scales.exp() } else { Vec3::NAN },
-            opacity: 1.0 / (1.0 + (-logit).exp()),
-            opacity_slope: e / ((1.0 + e) * (1.0 + e)),
-        }
+    pub fn axes<S: Simd>(&self, s: S) -> [Vec3s<S>; 3] {
+        let [x, y, z] = self.rows;
+        [Vec3s::splat(s, x), Vec3s::splat(s, y), Vec3s::splat(s, z)]
     }
 }
 
-/// What both directions of the stage need of one splat.
-pub(super) struct Geometry {
-    pub t: Vec3,
-    pub axes: Mat3,
-    pub quat_norm: f32,
-    pub quat: [f32; 4],
-    pub xz: f32,
-    pub yz: f32,
-    pub inside: [bool; 2],
-    /// Rows of J times the camera's rotation.
-    pub a: [Vec3; 2],
-    /// The same in the splat's axes.
-    pub b: [Vec3; 2],
-    /// The same times the scales: the 2D covariance is m m^T + blur.
-    pub m: [Vec3; 2],
-    /// b0 x b1.
-    pub normal: Vec3,
-}
-
-/// None if the splat is culled for its own values or its depth. Comparisons are written so that
-/// NaN is culled.
+/// A vector in camera axes, brought into the world.
 #[inline(always)]
-pub(super) fn geometry(view: &View, splat: &Splat) -> Option<Geometry> {
-    let t = view.rotation * splat.mean + view.translation;
-    if !(t.z >= view.nearest && t.z <= view.options.far && t.is_finite()) {
-        return None;
+pub(super) fn to_world<S: Simd>([x, y, z]: [Vec3s<S>; 3], v: Vec3s<S>) -> Vec3s<S> {
+    z.mul_add(v.z, y.mul_add(v.y, x * v.x))
+}
+
+/// Splats' shape, size and opacity, one splat per lane.
+#[derive(Clone, Copy)]
+pub(super) struct Splats<S: Simd> {
+    pub mean: Vec3s<S>,
+    pub quat: [Lanes<S>; 4],
+    pub scales: Vec3s<S>,
+    pub opacity: Lanes<S>,
+    /// Derivative of the opacity with respect to the parameter as given.
+    pub opacity_slope: Lanes<S>,
+    /// Whether scales and opacity were given as finite numbers. A log-scale of -inf or a logit of
+    /// +inf is poisoned too, though what it stands for is finite.
+    pub given: Mask<S>,
+}
+
+/// The sigmoid of a logit and its derivative, o (1 - o), which keeps its digits where o rounds to 1.
+#[inline(always)]
+pub(super) fn sigmoid<S: Simd>(logit: Lanes<S>) -> (Lanes<S>, Lanes<S>) {
+    let (one, e) = (logit.all(1.0), exp(-logit.abs()));
+    let positive = logit.ge(logit.all(0.0));
+    let opacity = positive.select(one, e) / (e + one);
+    (opacity, opacity * (positive.select(e, one) / (e + one)))
+}
+
+impl<S: Simd> Splats<S> {
+    /// The vector `at` of a block's splats, their opacities multiplied by `compensation`; scales
+    /// are logarithms and opacities logits if `raw`.
+    #[inline(always)]
+    pub fn load(s: S, rows: &SplatRows, at: usize, raw: bool, compensation: f32) -> Self {
+        let (scales, opacity) = (get3(&rows.scales, s, at), rows.opacities.get(s, at));
+        let given = scales.is_finite() & opacity.is_finite();
+        let (scales, opacity, opacity_slope) = if raw {
+            let scales = Vec3s::new(exp(scales.x), exp(scales.y), exp(scales.z));
+            let (opacity, slope) = sigmoid(opacity);
+            (scales, opacity, slope)
+        } else {
+            (scales, opacity, opacity.all(1.0))
+        };
+        let quats = &rows.quats;
+        Self {
+            mean: get3(&rows.means, s, at),
+            quat: [
+                quats[0].get(s, at),
+                quats[1].get(s, at),
+                quats[2].get(s, at),
+                quats[3].get(s, at),
+            ],
+            scales,
+            opacity: opacity * compensation,
+            opacity_slope: opacity_slope * compensation,
+            given,
+        }
     }
-    let [w, x, y, z] = splat.quat;
-    let norm2 = w * w + x * x + y * y + z * z;
-    if !(norm2 >= QUAT_NORM2_MIN && norm2.is_finite()) {
-        return None;
-    }
-    if !(splat.scales.min_element() >= 0.0 && splat.scales.is_finite()) {
-        return None;
-    }
-    let quat_norm = norm2.sqrt();
-    let inverse = quat_norm.recip();
-    let quat = [w * inverse, x * inverse, y * inverse, z * inverse];
-    let axes = Mat3::from_quat(glam::Quat::from_xyzw(quat[1], quat[2], quat[3], quat[0]));
+}
+
+/// What both directions of the stage need of splats.
+#[derive(Clone, Copy)]
+pub(super) struct Geometry<S: Simd> {
+    /// False where a splat is culled for its own values or its depth; nothing else of it has a
+    /// meaning then.
+    pub drawn: Mask<S>,
+    pub t: Vec3s<S>,
+    pub inverse_z: Lanes<S>,
+    pub axes: Mat3s<S>,
+    /// One over the norm of the quaternion as given.
+    pub inverse_norm: Lanes<S>,
+    pub quat: [Lanes<S>; 4],
+    pub xz: Lanes<S>,
+    pub yz: Lanes<S>,
+    pub inside: [Mask<S>; 2],
+    /// Rows of J times the camera's rotation.
+    pub a: [Vec3s<S>; 2],
+    /// The same in the splat's axes.
+    pub b: [Vec3s<S>; 2],
+    /// The same times the scales: the 2D covariance is m m^T + blur.
+    pub m: [Vec3s<S>; 2],
+    /// b0 x b1.
+    pub normal: Vec3s<S>,
+}
+
+/// Comparisons are written so that NaN is culled.
+#[inline(always)]
+pub(super) fn geometry<S: Simd>(s: S, view: &View, splats: &Splats<S>) -> Geometry<S> {
+    let Splats { mean, scales, .. } = *splats;
+    let [row_x, row_y, row_z] = view.axes(s);
+    let (zero, translation) = (Lanes::splat(s, 0.0), Vec3s::splat(s, view.translation));
+    let t = Vec3s::new(row_x.dot(mean), row_y.dot(mean), row_z.dot(mean)) + translation;
+    let mut drawn = splats.given & t.is_finite();
+    drawn = drawn & t.z.ge(zero.all(view.nearest)) & t.z.le(zero.all(view.options.far));
+    let [w, x, y, z] = splats.quat;
+    let norm2 = w.mul_add(w, x.mul_add(x, y.mul_add(y, z * z)));
+    drawn = drawn & norm2.ge(zero.all(QUAT_NORM2_MIN)) & norm2.is_finite();
+    drawn = drawn & scales.x.ge(zero) & scales.y.ge(zero) & scales.z.ge(zero) & scales.is_finite();
+    let inverse_norm = norm2.sqrt().recip();
+    let quat = [w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm];
+    let axes = Mat3s::from_quat(quat);
     let [x_low, x_high, y_low, y_high] = view.limits;
     let inverse_z = t.z.recip();
     let raw = [t.x * inverse_z, t.y * inverse_z];
-    let (xz, yz) = (raw[0].clamp(x_low, x_high), raw[1].clamp(y_low, y_high));
-    let a = [
-        (view.rows[0] - view.rows[2] * xz) * (view.focal.x * inverse_z),
-        (view.rows[1] - view.rows[2] * yz) * (view.focal.y * inverse_z),
-    ];
-    let b =
-        a.map(|row| Vec3::new(axes.x_axis.dot(row), axes.y_axis.dot(row), axes.z_axis.dot(row)));
-    let m = b.map(|row| row * splat.scales);
+    let xz = raw[0].max(zero.all(x_low)).min(zero.all(x_high));
+    let yz = raw[1].max(zero.all(y_low)).min(zero.all(y_high));
+    let (jx, jy) = (inverse_z * view.focal.x, inverse_z * view.focal.y);
+    let a = [row_z.mul_add(-xz, row_x) * jx, row_z.mul_add(-yz, row_y) * jy];
+    let b = [axes.transpose_mul(a[0]), axes.transpose_mul(a[1])];
     // J's rows have the cross product (x/z, y/z, 1) fx fy / z^2: no difference of two near-equal
     // products, so a needle seen from any side keeps its area.
-    let across = view.rows[0] * xz + view.rows[1] * yz + view.rows[2];
-    let across = across * (view.focal.x * inverse_z) * (view.focal.y * inverse_z);
-    let normal =
-        Vec3::new(axes.x_axis.dot(across), axes.y_axis.dot(across), axes.z_axis.dot(across));
-    let inside = [raw[0] == xz, raw[1] == yz];
-    Some(Geometry { t, axes, quat_norm, quat, xz, yz, inside, a, b, m, normal })
+    let across = row_x.mul_add(xz, row_y.mul_add(yz, row_z)) * jx * jy;
+    Geometry {
+        drawn,
+        t,
+        inverse_z,
+        axes,
+        inverse_norm,
+        quat,
+        xz,
+        yz,
+        inside: [raw[0].eq(xz), raw[1].eq(yz)],
+        a,
+        b,
+        m: [b[0] * scales, b[1] * scales],
+        normal: axes.transpose_mul(across),
+    }
 }
 
-/// A splat's outline in the picture.
-pub(super) struct Ellipse {
+/// Splats' outlines in the picture.
+#[derive(Clone, Copy)]
+pub(super) struct Ellipses<S: Simd> {
     /// (p, q, r)
-    pub factor: [f32; 3],
+    pub factor: [Lanes<S>; 3],
     /// Variances along x and y, blur included.
-    pub variances: Vec2,
+    pub variances: [Lanes<S>; 2],
     /// m0 x m1; its length is the root of the determinant without blur.
-    pub area: Vec3,
+    pub area: Vec3s<S>,
     /// What the opacity is multiplied by; 1 if not antialiased.
-    pub compensation: f32,
+    pub compensation: Lanes<S>,
 }
 
 #[inline(always)]
-pub(super) fn ellipse(view: &View, scales: Vec3, g: &Geometry) -> Ellipse {
-    let blur = view.options.blur;
-    let (sxx, sxy, syy) = (g.m[0].length_squared(), g.m[0].dot(g.m[1]), g.m[1].length_squared());
-    let r = (syy + blur).sqrt().recip();
-    let [x, y, z] = scales.to_array();
+pub(super) fn ellipses<S: Simd>(view: &View, scales: Vec3s<S>, g: &Geometry<S>) -> Ellipses<S> {
+    let sxy = g.m[0].dot(g.m[1]);
+    let blur = sxy.all(view.options.blur);
+    let cxx = g.m[0].length_squared() + blur;
+    let syy = g.m[1].length_squared();
+    let cyy = syy + blur;
+    let r = cyy.sqrt().recip();
+    let rr = r * r;
+    let Vec3s { x, y, z } = scales;
     // Divided by cyy early, so that nothing overflows before the covariance itself does.
-    let area_r = g.normal * Vec3::new(y * r * z, z * r * x, x * r * y);
+    let area_r = g.normal * Vec3s::new(y * r * z, z * r * x, x * r * y);
     // det / cyy, the variance of x given y, as a sum of positive terms (Cauchy-Binet).
-    let given = area_r.length_squared() + blur * (sxx + syy + blur) * (r * r);
+    let given = (blur * (cxx + syy)).mul_add(rr, area_r.length_squared());
     let p = given.sqrt().recip();
-    Ellipse {
-        factor: [p, -sxy * (r * r) * p, r],
-        variances: Vec2::new(sxx + blur, syy + blur),
-        area: g.normal * Vec3::new(y * z, z * x, x * y),
-        compensation: if view.options.antialiased { area_r.length() * p } else { 1.0 },
+    Ellipses {
+        factor: [p, -(sxy * rr * p), r],
+        variances: [cxx, cyy],
+        area: g.normal * Vec3s::new(y * z, z * x, x * y),
+        compensation: if view.options.antialiased { area_r.length() * p } else { p.all(1.0) },
     }
 }
 
 /// Unit view direction in the world and the length it was normalised by.
 #[inline(always)]
-pub(super) fn direction(view: &View, t: Vec3) -> (Vec3, f32) {
-    let along = view.rows[0] * t.x + view.rows[1] * t.y + view.rows[2] * t.z;
+pub(super) fn direction<S: Simd>(view: &View, t: Vec3s<S>) -> (Vec3s<S>, Lanes<S>) {
+    let along = to_world(view.axes(t.x.simd()), t);
     let length = along.length();
-    (along / length, length)
+    // Not times one over the length: it would double the rounding.
+    (Vec3s::new(along.x / length, along.y / length, along.z / length), length)
 }
 
-/// SH colour before the cut at zero.
+/// SH colours before the cut at zero, of the vector `at` of a block's coefficients.
 #[inline(always)]
-pub(super) fn sh_color(degree: u32, basis: &[f32], coeffs: &[[f32; 3]]) -> Vec3 {
-    let mut color = Vec3::splat(0.5);
-    for (b, c) in basis.iter().zip(coeffs).take(sh::coeffs(degree)) {
-        color += *b * Vec3::from(*c);
+pub(super) fn sh_color<S: Simd>(
+    degree: u32,
+    basis: &[Lanes<S>; SH_COEFFS_MAX],
+    coeffs: &ColorRows,
+    at: usize,
+) -> Vec3s<S> {
+    let half = basis[0].all(0.5);
+    let mut color = Vec3s::new(half, half, half);
+    for k in 0..sh::coeffs(degree) {
+        color = coeffs.get3(half.simd(), k, at).mul_add(basis[k], color);
     }
     color
 }
@@ -218,53 +253,182 @@ pub(super) struct Splat2d {
     pub radii: [f32; 2],
 }
 
-/// None if the splat is culled.
-#[inline(always)]
-pub(super) fn project_splat(
-    view: &View,
-    splat: &Splat,
-    colors: &Colors<'_, f32>,
-    i: usize,
-) -> Option<Splat2d> {
-    let g = geometry(view, splat)?;
-    let ellipse = ellipse(view, splat.scales, &g);
-    let opacity = splat.opacity * ellipse.compensation;
-    let reach = 2.0 * (opacity / ALPHA_MIN).ln();
-    if !(reach > 0.0 && reach.is_finite()) {
-        return None;
+/// The stage's room for one block of splats: what is read and what comes out.
+#[derive(Debug)]
+pub(super) struct ProjectBlock {
+    /// Which splats of the block are projected; what follows has them in this order.
+    ids: Ids,
+    splats: SplatRows,
+    /// Camera-space centres.
+    t: [Row; 3],
+    means2d: [Row; 2],
+    factors: [Row; 3],
+    opacities: Row,
+    radii: [Row; 2],
+    /// 1 where a splat is visible as far as its shape goes.
+    reaches: Row,
+    /// Places of those, in whose order is what follows: fewer, so that lanes are full.
+    visible: Ids,
+    visible_t: [Row; 3],
+    coeffs: ColorRows,
+    colors: [Row; 3],
+    /// 1 where the colour is finite.
+    finite: Row,
+}
+
+impl ProjectBlock {
+    pub fn new() -> Box<Self> {
+        Box::new(Self {
+            ids: Ids::NONE,
+            splats: SplatRows::ZERO,
+            t: [Row::ZERO; 3],
+            means2d: [Row::ZERO; 2],
+            factors: [Row::ZERO; 3],
+            opacities: Row::ZERO,
+            radii: [Row::ZERO; 2],
+            reaches: Row::ZERO,
+            visible: Ids::NONE,
+            visible_t: [Row::ZERO; 3],
+            coeffs: ColorRows::ZERO,
+            colors: [Row::ZERO; 3],
+            finite: Row::ZERO,
+        })
     }
-    let [p, q, r] = ellipse.factor;
-    let radii = (ellipse.variances * reach).map(f32::sqrt);
-    let center = view.focal * g.t.truncate() / g.t.z + view.center;
-    // Written so that a NaN or infinity anywhere culls.
-    let reaches_image = (center + radii).cmpge(Vec2::ZERO).all()
-        && (center - radii).cmple(view.size).all()
-        && radii.is_finite()
-        && center.is_finite();
-    if !(reaches_image && p > 0.0 && p.is_finite() && q.is_finite() && r.is_finite()) {
-        return None;
+
+    /// Projects the splats `ids` of the block that begins with splat `first`, with opacities
+    /// multiplied by `compensation`.
+    pub fn run(
+        &mut self,
+        view: &View,
+        splats: &SplatParams<'_, f32>,
+        first: usize,
+        ids: Ids,
+        compensation: f32,
+    ) {
+        self.ids = ids;
+        dispatch(Project { block: self, view, splats, first, compensation });
     }
-    let color = match *colors {
-        Colors::Direct(colors) => Vec3::from(colors[i]),
-        Colors::Sh { degree, stride, coeffs } => {
-            let basis = sh::basis(degree, direction(view, g.t).0.to_array());
-            let color = sh_color(degree, &basis, &coeffs[i * stride..(i + 1) * stride]);
-            // Before the cut at zero, which would hide a poisoned coefficient here and let it out
-            // in the gradients.
-            if !color.is_finite() {
-                return None;
-            }
-            color.max(Vec3::ZERO)
+
+    /// What came out: the visible splats with their numbers in the block, in order.
+    pub fn visible(&self) -> impl Iterator<Item = (usize, Splat2d)> {
+        let places = self.visible.get().iter().enumerate();
+        places.filter(|&(at, _)| self.finite.0[at] != 0.0).map(|(at, &place)| {
+            let k = usize::from(place);
+            let [red, green, blue] = &self.colors;
+            let splat = Splat2d {
+                mean: [self.means2d[0].0[k], self.means2d[1].0[k]],
+                factor: [self.factors[0].0[k], self.factors[1].0[k], self.factors[2].0[k]],
+                depth: self.t[2].0[k],
+                color: [red.0[at], green.0[at], blue.0[at]],
+                opacity: self.opacities.0[k],
+                radii: [self.radii[0].0[k], self.radii[1].0[k]],
+            };
+            (usize::from(self.ids.get()[k]), splat)
+        })
+    }
+}
+
+struct Project<'a> {
+    block: &'a mut ProjectBlock,
+    view: &'a View,
+    splats: &'a SplatParams<'a, f32>,
+    first: usize,
+    compensation: f32,
+}
+
+impl WithSimd for Project<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let Self { block, view, splats, first, compensation } = self;
+        let ids = block.ids.get();
+        block.splats.take(splats, first, ids);
+        for at in 0..vectors::<S>(ids.len()) {
+            let splats = Splats::load(s, &block.splats, at, splats.raw, compensation);
+            block.outline(s, view, &splats, at);
         }
-    };
-    color.is_finite().then(|| Splat2d {
-        mean: center.to_array(),
-        factor: [p, q, r],
-        depth: g.t.z,
-        color: color.to_array(),
-        opacity,
-        radii: radii.to_array(),
-    })
+        block.visible.clear();
+        for k in 0..block.ids.get().len() {
+            block.visible.push_if(k, block.reaches.0[k] != 0.0);
+        }
+        block.color(s, view, splats, first);
+    }
+}
+
+impl ProjectBlock {
+    /// Everything but the colours.
+    #[inline(always)]
+    fn outline<S: Simd>(&mut self, s: S, view: &View, splats: &Splats<S>, at: usize) {
+        let g = geometry(s, view, splats);
+        let ellipses = ellipses(view, splats.scales, &g);
+        let (zero, largest) = (Lanes::splat(s, 0.0), Lanes::splat(s, f32::MAX));
+        let opacity = splats.opacity * ellipses.compensation;
+        // exp(reach / 2): the logarithm is asked for where it is positive.
+        let contrast = opacity / zero.all(ALPHA_MIN);
+        let mut visible = g.drawn & contrast.gt(zero.all(1.0)) & contrast.le(largest);
+        let reach = ln(contrast) * 2.0;
+        let [cxx, cyy] = ellipses.variances;
+        let (rx, ry) = ((cxx * reach).sqrt(), (cyy * reach).sqrt());
+        let x = g.t.x * view.focal.x / g.t.z + view.center.x;
+        let y = g.t.y * view.focal.y / g.t.z + view.center.y;
+        // Written so that a NaN or infinity anywhere culls.
+        visible = visible & (x + rx).ge(zero) & (y + ry).ge(zero);
+        visible = visible & (x - rx).le(zero.all(view.size.x)) & (y - ry).le(zero.all(view.size.y));
+        visible = visible & rx.le(largest) & ry.le(largest) & x.is_finite() & y.is_finite();
+        let [p, q, r] = ellipses.factor;
+        visible = visible & p.gt(zero) & p.le(largest) & q.is_finite() & r.le(largest);
+        set3(&mut self.t, at, g.t);
+        self.means2d[0].set(at, x);
+        self.means2d[1].set(at, y);
+        set3(&mut self.factors, at, Vec3s::new(p, q, r));
+        self.opacities.set(at, opacity);
+        self.radii[0].set(at, rx);
+        self.radii[1].set(at, ry);
+        self.reaches.set(at, visible.keep(zero.all(1.0)));
+    }
+
+    /// Colours of the visible splats.
+    #[inline(always)]
+    fn color<S: Simd>(&mut self, s: S, view: &View, splats: &SplatParams<'_, f32>, first: usize) {
+        let places = self.visible.get();
+        let mut numbers = Ids::NONE;
+        for &place in places {
+            numbers.push(usize::from(self.ids.get()[usize::from(place)]));
+        }
+        let one = Lanes::splat(s, 1.0);
+        match splats.colors {
+            Colors::Direct(colors) => {
+                self.coeffs.take(colors, [1, 1], first, numbers.get());
+                for at in 0..vectors::<S>(places.len()) {
+                    let color = self.coeffs.get3(s, 0, at);
+                    set3(&mut self.colors, at, color);
+                    self.finite.set(at, color.is_finite().keep(one));
+                }
+            }
+            Colors::Sh { degree, stride, coeffs } => {
+                let used = sh::coeffs(degree);
+                self.coeffs.take(coeffs, [stride, used], first, numbers.get());
+                for (at, &place) in places.iter().enumerate() {
+                    for (row, t) in self.visible_t.iter_mut().zip(&self.t) {
+                        row.0[at] = t.0[usize::from(place)];
+                    }
+                }
+                for at in 0..vectors::<S>(places.len()) {
+                    let (dir, _) = direction(view, get3(&self.visible_t, s, at));
+                    let basis = sh::basis(degree, [dir.x, dir.y, dir.z]);
+                    let color = sh_color(degree, &basis, &self.coeffs, at);
+                    // Before the cut at zero, which would hide a poisoned coefficient here and let
+                    // it out in the gradients.
+                    self.finite.set(at, color.is_finite().keep(one));
+                    let zero = one.all(0.0);
+                    let Vec3s { x, y, z } = color;
+                    let color = Vec3s::new(x.max(zero), y.max(zero), z.max(zero));
+                    set3(&mut self.colors, at, color);
+                }
+            }
+        }
+    }
 }
 
 pub(super) fn project(
@@ -273,19 +437,30 @@ pub(super) fn project(
     options: &ProjectOptions,
 ) -> Projected<f32> {
     let view = View::new(camera, options);
-    let list: Vec<Option<Splat2d>> = (0..splats.len())
-        .into_par_iter()
-        .map(|i| project_splat(&view, &Splat::load(splats, i), &splats.colors, i))
-        .collect();
     let mut out = Projected::culled(splats.len(), camera.width, camera.height);
-    for (i, splat) in list.iter().enumerate() {
-        let Some(splat) = splat else { continue };
-        out.means2d[i] = splat.mean;
-        out.factors[i] = splat.factor;
-        out.depths[i] = splat.depth;
-        out.colors[i] = splat.color;
-        out.opacities[i] = splat.opacity;
-        out.radii[i] = splat.radii;
-    }
+    (
+        out.means2d.par_chunks_mut(BLOCK),
+        out.factors.par_chunks_mut(BLOCK),
+        out.depths.par_chunks_mut(BLOCK),
+        out.colors.par_chunks_mut(BLOCK),
+        out.opacities.par_chunks_mut(BLOCK),
+        out.radii.par_chunks_mut(BLOCK),
+    )
+        .into_par_iter()
+        .enumerate()
+        .for_each_init(
+            ProjectBlock::new,
+            |block, (number, (means2d, factors, depths, colors, opacities, radii))| {
+                block.run(&view, splats, number * BLOCK, Ids::all(means2d.len()), 1.0);
+                for (k, splat) in block.visible() {
+                    means2d[k] = splat.mean;
+                    factors[k] = splat.factor;
+                    depths[k] = splat.depth;
+                    colors[k] = splat.color;
+                    opacities[k] = splat.opacity;
+                    radii[k] = splat.radii;
+                }
+            },
+        );
     out
 }

@@ -1,11 +1,15 @@
-//! project_backward: gradients of the 2D splats to gradients of the splats and the camera, f32.
+//! project_backward: gradients of the 2D splats to gradients of the splats and the camera, f32, a
+//! block of splats at a time, one splat per lane.
 
-use glam::{Mat3, Vec3};
+use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::bin::CHUNK;
-use super::project::{Splat, View, direction, ellipse, geometry, sh_color};
+use super::block::{BLOCK, ColorRows, Ids, Row, SplatRows, get3, set3, vectors};
+use super::lanes::{Lanes, Mask, Mat3s, Vec3s};
+use super::project::{Splats, View, direction, ellipses, geometry, sh_color, to_world};
+use super::simd::dispatch;
 use crate::camera::Camera;
+use crate::constants::SH_COEFFS_MAX;
 use crate::sh;
 use crate::splats::SplatSlices;
 use crate::stages::{
@@ -42,15 +46,6 @@ impl V2d {
     }
 }
 
-/// Gradients of one splat's parameters, colours apart.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct VSplat {
-    pub v_mean: [f32; 3],
-    pub v_quat: [f32; 4],
-    pub v_scales: [f32; 3],
-    pub v_opacity: f32,
-}
-
 /// Gradients of the camera, summed in f64: they gather from every splat.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct VCamera {
@@ -71,212 +66,409 @@ impl VCamera {
             *sum += value;
         }
     }
+}
 
-    fn add_rotation(&mut self, rows: [Vec3; 3]) {
-        for (sum, row) in self.v_viewmat.iter_mut().zip(rows) {
-            for (s, v) in sum.iter_mut().zip(row.to_array()) {
-                *s += f64::from(v);
+/// What each splat of a block adds to the camera's gradient.
+#[derive(Debug)]
+struct CameraRows {
+    /// Rows of the rotation.
+    rotation: [[Row; 3]; 3],
+    translation: [Row; 3],
+    intrinsics: [Row; 4],
+}
+
+impl CameraRows {
+    const ZERO: Self = Self {
+        rotation: [[Row::ZERO; 3]; 3],
+        translation: [Row::ZERO; 3],
+        intrinsics: [Row::ZERO; 4],
+    };
+
+    /// The sums over the first `count` splats. Their order does not depend on the vectors' width.
+    #[inline(always)]
+    fn sum(&self, count: usize) -> VCamera {
+        let mut out = VCamera::default();
+        for r in 0..3 {
+            for c in 0..3 {
+                out.v_viewmat[r][c] = sum(&self.rotation[r][c], count);
             }
+            out.v_viewmat[r][3] = sum(&self.translation[r], count);
+        }
+        for k in 0..4 {
+            out.v_intrinsics[k] = sum(&self.intrinsics[k], count);
+        }
+        out
+    }
+}
+
+/// The sum of a row's first `count` numbers, as eight sums that do not wait for each other.
+#[inline(always)]
+fn sum(row: &Row, count: usize) -> f64 {
+    let mut sums = [0.0f64; 8];
+    let (eights, rest) = row.0[..count].as_chunks::<8>();
+    for eight in eights {
+        for k in 0..8 {
+            sums[k] += f64::from(eight[k]);
         }
     }
+    for (k, value) in rest.iter().enumerate() {
+        sums[k] += f64::from(*value);
+    }
+    let [a, b, c, d, e, f, g, h] = sums;
+    ((a + b) + (c + d)) + ((e + f) + (g + h))
 }
 
 /// Gradient of a unit quaternion's rotation matrix, as (w, x, y, z).
 #[inline(always)]
-fn quat_gradient([w, x, y, z]: [f32; 4], v: Mat3) -> [f32; 4] {
-    let (vx, vy, vz) = (v.x_axis, v.y_axis, v.z_axis);
+fn quat_gradient<S: Simd>([w, x, y, z]: [Lanes<S>; 4], v: Mat3s<S>) -> [Lanes<S>; 4] {
+    let Mat3s([vx, vy, vz]) = v;
+    // What is antisymmetric and symmetric in v.
+    let (ax, ay, az) = (vy.z - vz.y, vz.x - vx.z, vx.y - vy.x);
+    let (sx, sy, sz) = (vz.y + vy.z, vx.z + vz.x, vy.x + vx.y);
+    let two = w.all(2.0);
     [
-        2.0 * (x * (vy.z - vz.y) + y * (vz.x - vx.z) + z * (vx.y - vy.x)),
-        2.0 * (-2.0 * x * (vy.y + vz.z)
-            + y * (vy.x + vx.y)
-            + z * (vz.x + vx.z)
-            + w * (vy.z - vz.y)),
-        2.0 * (x * (vy.x + vx.y) - 2.0 * y * (vx.x + vz.z) + z * (vz.y + vy.z) + w * (vz.x - vx.z)),
-        2.0 * (x * (vz.x + vx.z) + y * (vz.y + vy.z) - 2.0 * z * (vx.x + vy.y) + w * (vx.y - vy.x)),
+        two * x.mul_add(ax, y.mul_add(ay, z * az)),
+        two * w.mul_add(ax, y.mul_add(sz, z.mul_add(sy, x * -2.0 * (vy.y + vz.z)))),
+        two * w.mul_add(ay, x.mul_add(sz, z.mul_add(sx, y * -2.0 * (vx.x + vz.z)))),
+        two * w.mul_add(az, x.mul_add(sy, y.mul_add(sx, z * -2.0 * (vx.x + vy.y)))),
     ]
 }
 
 /// The stage for one camera and one way that splats are given.
-pub(super) struct SplatBackward<'a> {
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Backward<'a> {
     pub view: &'a View,
-    pub colors: Colors<'a, f32>,
-    /// Whether scales are logarithms.
-    pub raw: bool,
+    pub splats: SplatParams<'a, f32>,
+    /// What opacities are multiplied by.
+    pub compensation: f32,
+    /// Whether the camera's gradient is wanted.
+    pub camera: bool,
 }
 
-impl SplatBackward<'_> {
-    /// Gradients of one visible splat, number `i` of the colours. `v_sh` receives the coefficients'
-    /// gradients (or the direct colour's); `v_camera`, where wanted, is added to.
-    ///
-    /// A finite picture can still have gradients that overflow (a coefficient of 1e38, or -inf
-    /// behind the clamp of the colour). All of that splat's are zero then: they must not reach the
-    /// camera or, through Adam's moments, later steps.
-    #[inline(always)]
-    pub fn run(
-        &self,
-        i: usize,
-        splat: &Splat,
-        v: &V2d,
-        v_sh: &mut [[f32; 3]],
-        v_camera: Option<&mut VCamera>,
-    ) -> VSplat {
-        let mut v_own = v_camera.is_some().then(VCamera::default);
-        let out = self.gradients(i, splat, v, v_sh, v_own.as_mut());
-        // A sum is finite only where every term is; one that overflows by itself is as useless.
-        let mut sum = out.v_opacity;
-        sum += out.v_mean.iter().chain(&out.v_quat).chain(&out.v_scales).sum::<f32>();
-        sum += v_sh.as_flattened().iter().sum::<f32>();
-        if !sum.is_finite() {
-            v_sh.fill([0.0; 3]);
-            return VSplat::default();
-        }
-        if let (Some(sum), Some(own)) = (v_camera, v_own) {
-            sum.add(&own);
-        }
-        out
+/// The stage's room for one block of splats: what is read and what comes out.
+#[derive(Debug)]
+pub(super) struct BackwardBlock {
+    /// Which splats of the block have gradients; what follows has them in this order.
+    ids: Ids,
+    splats: SplatRows,
+    coeffs: ColorRows,
+    // Gradients of the 2D splats: V2d.
+    v_means2d: [Row; 2],
+    v_whitened: [Row; 3],
+    v_depths: Row,
+    v_colors2d: [Row; 3],
+    v_opacities2d: Row,
+    // Gradients of the splats. Those of the coefficients are the basis times those of the colour.
+    v_means: [Row; 3],
+    v_quats: [Row; 4],
+    v_scales: [Row; 3],
+    v_opacities: Row,
+    basis: [Row; SH_COEFFS_MAX],
+    v_colors: [Row; 3],
+    v_camera: CameraRows,
+}
+
+impl BackwardBlock {
+    pub fn new() -> Box<Self> {
+        Box::new(Self {
+            ids: Ids::NONE,
+            splats: SplatRows::ZERO,
+            coeffs: ColorRows::ZERO,
+            v_means2d: [Row::ZERO; 2],
+            v_whitened: [Row::ZERO; 3],
+            v_depths: Row::ZERO,
+            v_colors2d: [Row::ZERO; 3],
+            v_opacities2d: Row::ZERO,
+            v_means: [Row::ZERO; 3],
+            v_quats: [Row::ZERO; 4],
+            v_scales: [Row::ZERO; 3],
+            v_opacities: Row::ZERO,
+            basis: [Row::ZERO; SH_COEFFS_MAX],
+            v_colors: [Row::ZERO; 3],
+            v_camera: CameraRows::ZERO,
+        })
     }
 
+    /// Begins a block.
     #[inline(always)]
-    fn gradients(
-        &self,
-        i: usize,
-        splat: &Splat,
-        v: &V2d,
-        v_sh: &mut [[f32; 3]],
-        mut v_camera: Option<&mut VCamera>,
-    ) -> VSplat {
-        let Self { view, ref colors, raw } = *self;
-        let Some(g) = geometry(view, splat) else { return VSplat::default() };
-        let mut out = VSplat::default();
-        let (fx, fy) = (view.focal.x, view.focal.y);
-        let inverse_z = g.t.z.recip();
-        let mut v_t = Vec3::ZERO;
+    pub fn clear(&mut self) {
+        self.ids.clear();
+    }
+
+    /// Takes the gradient of splat `k` of the block, the splats in order.
+    #[inline(always)]
+    pub fn push(&mut self, k: usize, v: &V2d) {
+        let at = self.ids.get().len();
+        self.ids.push(k);
+        for (row, value) in self.v_means2d.iter_mut().zip(v.v_mean) {
+            row.0[at] = value;
+        }
+        for (row, value) in self.v_whitened.iter_mut().zip(v.v_whitened) {
+            row.0[at] = value;
+        }
+        for (row, value) in self.v_colors2d.iter_mut().zip(v.v_color) {
+            row.0[at] = value;
+        }
+        self.v_depths.0[at] = v.v_depth;
+        self.v_opacities2d.0[at] = v.v_opacity;
+    }
+
+    /// Writes the gradients of the splats that were pushed to `out`, the block's part of the arrays,
+    /// and returns the camera's. The block begins with splat `first` of `stage.splats`.
+    pub fn run(&mut self, stage: &Backward<'_>, first: usize, out: SplatSlices<'_>) -> VCamera {
+        dispatch(Run { block: self, stage, first, out })
+    }
+}
+
+struct Run<'a, 'b> {
+    block: &'a mut BackwardBlock,
+    stage: &'a Backward<'b>,
+    first: usize,
+    out: SplatSlices<'a>,
+}
+
+impl WithSimd for Run<'_, '_> {
+    type Output = VCamera;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> VCamera {
+        let Self { block, stage, first, out } = self;
+        let ids = block.ids;
+        let ids = ids.get();
+        block.splats.take(&stage.splats, first, ids);
+        let mut rows = [1, 1];
+        if let Colors::Sh { degree, stride, coeffs } = stage.splats.colors {
+            rows = [stride, sh::coeffs(degree)];
+            block.coeffs.take(coeffs, rows, first, ids);
+        }
+        for at in 0..vectors::<S>(ids.len()) {
+            block.gradients(s, stage, at);
+        }
+        block.write(ids, rows, out);
+        if stage.camera { block.v_camera.sum(ids.len()) } else { VCamera::default() }
+    }
+}
+
+impl BackwardBlock {
+    #[inline(always)]
+    fn gradients<S: Simd>(&mut self, s: S, stage: &Backward<'_>, at: usize) {
+        let Backward { view, ref splats, compensation, camera } = *stage;
+        let raw = splats.raw;
+        let colors = &splats.colors;
+        let splats = Splats::load(s, &self.splats, at, raw, compensation);
+        let g = geometry(s, view, &splats);
+        let [row_x, row_y, row_z] = view.axes(s);
+        let zero = Lanes::splat(s, 0.0);
+        let none = Vec3s::new(zero, zero, zero);
+        let (inverse_z, xz, yz) = (g.inverse_z, g.xz, g.yz);
+        let (jx, jy) = (inverse_z * view.focal.x, inverse_z * view.focal.y);
+        let mut v_t = none;
 
         // Colour and, through the view direction, t and the rotation.
-        let mut v_color = Vec3::from(v.v_color);
-        match *colors {
-            Colors::Direct(_) => v_sh[0] = v.v_color,
-            Colors::Sh { degree, stride, coeffs } => {
-                let coeffs = &coeffs[i * stride..(i + 1) * stride];
-                let (dir, length) = direction(view, g.t);
-                let basis = sh::basis(degree, dir.to_array());
-                let color = sh_color(degree, &basis, coeffs);
-                v_color = Vec3::select(color.cmpgt(Vec3::ZERO), v_color, Vec3::ZERO);
-                for (v_coeff, b) in v_sh.iter_mut().zip(basis).take(sh::coeffs(degree)) {
-                    *v_coeff = (b * v_color).to_array();
-                }
-                if degree > 0 {
-                    let slopes = sh::basis_gradient(degree, dir.to_array());
-                    let mut v_dir = Vec3::ZERO;
-                    for (slope, coeff) in slopes.iter().zip(coeffs).take(sh::coeffs(degree)) {
-                        v_dir += Vec3::from(*slope) * v_color.dot(Vec3::from(*coeff));
-                    }
-                    let v_along = (v_dir - dir * dir.dot(v_dir)) / length;
-                    v_t += view.rotation * v_along;
-                    if let Some(camera) = v_camera.as_deref_mut() {
-                        camera.add_rotation([v_along * g.t.x, v_along * g.t.y, v_along * g.t.z]);
-                    }
-                }
+        let mut v_color = get3(&self.v_colors2d, s, at);
+        let mut v_along = none;
+        if let Colors::Sh { degree, .. } = *colors {
+            let (dir, length) = direction(view, g.t);
+            // Where nothing is drawn it may be anything, and zero times infinity is NaN.
+            let dir = dir.is_finite().keep3(dir);
+            let basis = sh::basis(degree, [dir.x, dir.y, dir.z]);
+            for k in 0..sh::coeffs(degree) {
+                self.basis[k].set(at, basis[k]);
             }
+            let color = sh_color(degree, &basis, &self.coeffs, at);
+            v_color = Vec3s::new(
+                color.x.gt(zero).keep(v_color.x),
+                color.y.gt(zero).keep(v_color.y),
+                color.z.gt(zero).keep(v_color.z),
+            );
+            if degree > 0 {
+                let slopes = sh::basis_gradient(degree, [dir.x, dir.y, dir.z]);
+                let mut v_dir = none;
+                for k in 1..sh::coeffs(degree) {
+                    let [x, y, z] = slopes[k];
+                    let along = v_color.dot(self.coeffs.get3(s, k, at));
+                    v_dir = Vec3s::new(x, y, z).mul_add(along, v_dir);
+                }
+                v_along = dir.mul_add(-dir.dot(v_dir), v_dir) * length.recip();
+                v_t = Vec3s::new(row_x.dot(v_along), row_y.dot(v_along), row_z.dot(v_along));
+            }
+        } else {
+            self.basis[0].set(at, zero.all(1.0));
         }
 
-        let ellipse = ellipse(view, splat.scales, &g);
-        out.v_opacity = v.v_opacity * ellipse.compensation * splat.opacity_slope;
+        let ellipses = ellipses(view, splats.scales, &g);
+        let v_opacity2d = self.v_opacities2d.get(s, at);
+        let v_opacity = v_opacity2d * ellipses.compensation * splats.opacity_slope;
 
         // Whitened 2D covariance -> M = J R A S. The rows of F B and F M are of order 1 even for a
         // needle, and found without the cancellation that F, B and M would bring to their products.
-        let [p, q, r] = ellipse.factor;
-        let [v_uu, v_uv, v_vv] = v.v_whitened;
-        let squares = splat.scales * splat.scales;
-        let fb_u = ((squares * g.b[1]).cross(g.normal) + view.options.blur * g.b[0]) * (p * r * r);
+        let [p, q, r] = ellipses.factor;
+        let Vec3s { x: v_uu, y: v_uv, z: v_vv } = get3(&self.v_whitened, s, at);
+        let scales = splats.scales;
+        let blur = zero.all(view.options.blur);
+        let fb_u = g.b[0].mul_add(blur, (scales * scales * g.b[1]).cross(g.normal)) * (p * r * r);
         let fb_v = g.b[1] * r;
-        let (fm_u, fm_v) = (fb_u * splat.scales, fb_v * splat.scales);
-        let v_fm_u = 2.0 * v_uu * fm_u + v_uv * fm_v;
-        let v_fm_v = v_uv * fm_u + 2.0 * v_vv * fm_v;
+        let (fm_u, fm_v) = (fb_u * scales, fb_v * scales);
+        let v_fm_u = fm_u.mul_add(v_uu + v_uu, fm_v * v_uv);
+        let v_fm_v = fm_v.mul_add(v_vv + v_vv, fm_u * v_uv);
         let mut v_scales = v_fm_u * fb_u + v_fm_v * fb_v;
-        let mut v_m = [p * v_fm_u, q * v_fm_u + r * v_fm_v];
+        let mut v_m = [v_fm_u * p, v_fm_u.mul_add(q, v_fm_v * r)];
         if view.options.antialiased {
             // With S = M M^T and C = S + blur I, ln compensation = (ln det S - ln det C) / 2 has the
             // gradient S^-1 M - C^-1 M, whose terms cancel for large splats; it is blur C^-1 S^-1 M.
             // The rows of S^-1 M are m1 x n / n^2 and n x m0 / n^2 with n = m0 x m1; divided by the
             // length twice, since its square may underflow where it does not.
-            let length = ellipse.area.length();
-            let n = ellipse.area / length / length;
+            let inverse_length = ellipses.area.length().recip();
+            let n = ellipses.area * inverse_length * inverse_length;
             let w = [g.m[1].cross(n), n.cross(g.m[0])];
-            let v_log = v.v_opacity * splat.opacity * ellipse.compensation * view.options.blur;
-            let (e_u, e_v) = ((p * w[0] + q * w[1]) * v_log, r * w[1] * v_log);
-            v_scales += e_u * fb_u + e_v * fb_v;
-            v_m = [v_m[0] + p * e_u, v_m[1] + q * e_u + r * e_v];
+            let v_log = v_opacity2d * splats.opacity * ellipses.compensation * blur;
+            let e_u = w[0].mul_add(p, w[1] * q) * v_log;
+            let e_v = w[1] * r * v_log;
+            v_scales = v_scales + (e_u * fb_u + e_v * fb_v);
+            v_m = [e_u.mul_add(p, v_m[0]), v_m[1] + e_u.mul_add(q, e_v * r)];
         }
-        out.v_scales = if raw { v_scales * splat.scales } else { v_scales }.to_array();
-        let v_b = v_m.map(|v| v * splat.scales);
+        if raw {
+            v_scales = v_scales * scales;
+        }
+        let v_b = [v_m[0] * scales, v_m[1] * scales];
 
         // Axes -> quaternion, through its normalisation.
-        let v_axes = Mat3::from_cols(
-            g.a[0] * v_b[0].x + g.a[1] * v_b[1].x,
-            g.a[0] * v_b[0].y + g.a[1] * v_b[1].y,
-            g.a[0] * v_b[0].z + g.a[1] * v_b[1].z,
-        );
+        let v_axes = Mat3s([
+            g.a[0].mul_add(v_b[0].x, g.a[1] * v_b[1].x),
+            g.a[0].mul_add(v_b[0].y, g.a[1] * v_b[1].y),
+            g.a[0].mul_add(v_b[0].z, g.a[1] * v_b[1].z),
+        ]);
         let v_unit = quat_gradient(g.quat, v_axes);
-        let along = v_unit[0] * g.quat[0]
-            + v_unit[1] * g.quat[1]
-            + v_unit[2] * g.quat[2]
-            + v_unit[3] * g.quat[3];
-        out.v_quat = std::array::from_fn(|k| (v_unit[k] - along * g.quat[k]) / g.quat_norm);
+        let mut along = v_unit[0] * g.quat[0];
+        for k in 1..4 {
+            along = v_unit[k].mul_add(g.quat[k], along);
+        }
+        let mut v_quat = v_unit;
+        for k in 0..4 {
+            v_quat[k] = g.quat[k].mul_add(-along, v_unit[k]) * g.inverse_norm;
+        }
 
         // a = J R, with x/z and y/z held where they are limited.
-        let v_a = v_b.map(|v| g.axes * v);
-        let (jx, jy) = (fx * inverse_z, fy * inverse_z);
-        let (v_j00, v_j02) = (v_a[0].dot(view.rows[0]), v_a[0].dot(view.rows[2]));
-        let (v_j11, v_j12) = (v_a[1].dot(view.rows[1]), v_a[1].dot(view.rows[2]));
-        v_t.z -= ((v_j00 - v_j02 * g.xz) * jx + (v_j11 - v_j12 * g.yz) * jy) * inverse_z;
-        let (v_xz, v_yz) = (-v_j02 * jx, -v_j12 * jy);
-        if g.inside[0] {
-            v_t.x += v_xz * inverse_z;
-            v_t.z -= v_xz * g.xz * inverse_z;
-        }
-        if g.inside[1] {
-            v_t.y += v_yz * inverse_z;
-            v_t.z -= v_yz * g.yz * inverse_z;
-        }
+        let v_a = [g.axes * v_b[0], g.axes * v_b[1]];
+        let (v_j02, v_j12) = (v_a[0].dot(row_z), v_a[1].dot(row_z));
+        let v_jx = v_j02.mul_add(-xz, v_a[0].dot(row_x));
+        let v_jy = v_j12.mul_add(-yz, v_a[1].dot(row_y));
+        v_t.z = v_t.z - v_jx.mul_add(jx, v_jy * jy) * inverse_z;
+        let (v_xz, v_yz) = (-(v_j02 * jx), -(v_j12 * jy));
+        let [inside_x, inside_y] = g.inside;
+        let (by_x, by_y) = (inside_x.keep(v_xz * inverse_z), inside_y.keep(v_yz * inverse_z));
+        v_t.x = v_t.x + by_x;
+        v_t.y = v_t.y + by_y;
+        v_t.z = v_t.z - by_x.mul_add(xz, by_y * yz);
 
         // Centre and depth.
-        let [v_u, v_v] = v.v_mean;
+        let (v_u, v_v) = (self.v_means2d[0].get(s, at), self.v_means2d[1].get(s, at));
         let (x_z, y_z) = (g.t.x * inverse_z, g.t.y * inverse_z);
-        v_t += Vec3::new(v_u * jx, v_v * jy, v.v_depth - (v_u * jx * x_z + v_v * jy * y_z));
+        let (v_x, v_y) = (v_u * jx, v_v * jy);
+        let v_z = self.v_depths.get(s, at) - v_x.mul_add(x_z, v_y * y_z);
+        v_t = v_t + Vec3s::new(v_x, v_y, v_z);
+        let v_mean = to_world([row_x, row_y, row_z], v_t);
 
-        out.v_mean =
-            (view.rows[0] * v_t.x + view.rows[1] * v_t.y + view.rows[2] * v_t.z).to_array();
-        if let Some(camera) = v_camera {
-            let mean = splat.mean;
-            camera.add_rotation([
-                v_a[0] * jx + mean * v_t.x,
-                v_a[1] * jy + mean * v_t.y,
-                -v_a[0] * (jx * g.xz) - v_a[1] * (jy * g.yz) + mean * v_t.z,
-            ]);
-            for (row, v) in camera.v_viewmat.iter_mut().zip(v_t.to_array()) {
-                row[3] += f64::from(v);
+        // A finite picture can still have gradients that overflow (a coefficient of 1e38, or -inf
+        // behind the cut of the colour). All of that splat's are zero then: they must not reach the
+        // camera or, through Adam's moments, later steps.
+        let mut finite = Finite::new(v_opacity);
+        finite.add3(v_color);
+        finite.add3(v_mean);
+        finite.add3(v_scales);
+        for v in v_quat {
+            finite.add(v);
+        }
+        let kept = g.drawn & finite.mask();
+        set3(&mut self.v_means, at, kept.keep3(v_mean));
+        set3(&mut self.v_scales, at, kept.keep3(v_scales));
+        set3(&mut self.v_colors, at, kept.keep3(v_color));
+        self.v_opacities.set(at, kept.keep(v_opacity));
+        for k in 0..4 {
+            self.v_quats[k].set(at, kept.keep(v_quat[k]));
+        }
+        if !camera {
+            return;
+        }
+
+        let mean = splats.mean;
+        let v_row_x = v_along.mul_add(g.t.x, v_a[0].mul_add(jx, mean * v_t.x));
+        let v_row_y = v_along.mul_add(g.t.y, v_a[1].mul_add(jy, mean * v_t.y));
+        let v_row_z = v_a[0].mul_add(jx * xz, v_a[1] * (jy * yz));
+        let v_row_z = v_along.mul_add(g.t.z, mean * v_t.z - v_row_z);
+        // The limits are affine functions of the principal point, over the focal length.
+        let at_x = (!inside_x).keep(v_xz * (1.0 / view.focal.x));
+        let at_y = (!inside_y).keep(v_yz * (1.0 / view.focal.y));
+        let v_fx = v_u.mul_add(x_z, v_jx * inverse_z) - at_x * xz;
+        let v_fy = v_v.mul_add(y_z, v_jy * inverse_z) - at_y * yz;
+        let (v_cx, v_cy) = (v_u - at_x, v_v - at_y);
+        let mut finite = Finite::new(v_fx);
+        finite.add(v_fy);
+        finite.add3(v_row_x);
+        finite.add3(v_row_y);
+        finite.add3(v_row_z);
+        let kept = kept & finite.mask();
+        let CameraRows { rotation, translation, intrinsics } = &mut self.v_camera;
+        set3(&mut rotation[0], at, kept.keep3(v_row_x));
+        set3(&mut rotation[1], at, kept.keep3(v_row_y));
+        set3(&mut rotation[2], at, kept.keep3(v_row_z));
+        set3(translation, at, kept.keep3(v_t));
+        intrinsics[0].set(at, kept.keep(v_fx));
+        intrinsics[1].set(at, kept.keep(v_fy));
+        intrinsics[2].set(at, kept.keep(v_cx));
+        intrinsics[3].set(at, kept.keep(v_cy));
+    }
+
+    /// Writes what came out, in the parameters' layout: `used` of `stride` coefficients per splat.
+    #[inline(always)]
+    fn write(&self, ids: &[u8], [stride, used]: [usize; 2], out: SplatSlices<'_>) {
+        for (at, &k) in (0..BLOCK).zip(ids) {
+            let k = usize::from(k);
+            for (value, row) in out.means[k].iter_mut().zip(&self.v_means) {
+                *value = row.0[at];
             }
-            let mut intrinsics = [
-                (v_j00 - v_j02 * g.xz) * inverse_z + v_u * x_z,
-                (v_j11 - v_j12 * g.yz) * inverse_z + v_v * y_z,
-                v_u,
-                v_v,
-            ];
-            // The limits are affine functions of the principal point, over the focal length.
-            if !g.inside[0] {
-                intrinsics[0] -= v_xz * g.xz / fx;
-                intrinsics[2] -= v_xz / fx;
+            for (value, row) in out.quats[k].iter_mut().zip(&self.v_quats) {
+                *value = row.0[at];
             }
-            if !g.inside[1] {
-                intrinsics[1] -= v_yz * g.yz / fy;
-                intrinsics[3] -= v_yz / fy;
+            for (value, row) in out.scales[k].iter_mut().zip(&self.v_scales) {
+                *value = row.0[at];
             }
-            for (sum, value) in camera.v_intrinsics.iter_mut().zip(intrinsics) {
-                *sum += f64::from(value);
+            out.opacities[k] = self.v_opacities.0[at];
+            let [red, green, blue] = &self.v_colors;
+            let (red, green, blue) = (red.0[at], green.0[at], blue.0[at]);
+            for (v, basis) in out.sh[k * stride..][..used].iter_mut().zip(&self.basis) {
+                let basis = basis.0[at];
+                *v = [basis * red, basis * green, basis * blue];
             }
         }
-        out
+    }
+}
+
+/// Whether everything that was added is finite.
+struct Finite<S: Simd>(Lanes<S>);
+
+impl<S: Simd> Finite<S> {
+    #[inline(always)]
+    fn new(value: Lanes<S>) -> Self {
+        Self(value * 0.0)
+    }
+
+    // Zero times a number that is not finite is NaN, and stays it.
+    #[inline(always)]
+    fn add(&mut self, value: Lanes<S>) {
+        self.0 = value.mul_add(value.all(0.0), self.0);
+    }
+
+    #[inline(always)]
+    fn add3(&mut self, value: Vec3s<S>) {
+        self.add(value.x);
+        self.add(value.y);
+        self.add(value.z);
+    }
+
+    #[inline(always)]
+    fn mask(self) -> Mask<S> {
+        self.0.eq(self.0.all(0.0))
     }
 }
 
@@ -288,7 +480,7 @@ pub(super) fn project_backward(
     v_projected: &ProjectedGradients<f32>,
 ) -> SplatGradients<f32> {
     let view = View::new(camera, options);
-    let backward = SplatBackward { view: &view, colors: splats.colors, raw: splats.raw };
+    let stage = Backward { view: &view, splats: *splats, compensation: 1.0, camera: true };
     let n = splats.len();
     let (stride, rows) = match splats.colors {
         Colors::Direct(colors) => (1, colors.len()),
@@ -309,14 +501,15 @@ pub(super) fn project_backward(
         opacities: &mut out.v_opacities,
         sh: &mut out.v_colors,
     };
-    // Chunks of fixed size, so that the camera's sums do not depend on the threads.
+    // By block, so that the camera's sums do not depend on the threads.
     let cameras: Vec<VCamera> = all
-        .into_blocks(CHUNK, stride)
+        .into_blocks(BLOCK, stride)
         .enumerate()
-        .map(|(chunk, out)| {
-            let mut v_camera = VCamera::default();
+        .map_init(BackwardBlock::new, |block, (number, out)| {
+            let first = number * BLOCK;
+            block.clear();
             for k in 0..out.means.len() {
-                let i = chunk * CHUNK + k;
+                let i = first + k;
                 if projected.radii[i] == [0.0; 2] {
                     continue;
                 }
@@ -328,15 +521,9 @@ pub(super) fn project_backward(
                     v_color: v_projected.v_colors[i],
                     v_opacity: v_projected.v_opacities[i],
                 };
-                let v_sh = &mut out.sh[k * stride..(k + 1) * stride];
-                let splat = Splat::load(splats, i);
-                let v = backward.run(i, &splat, &v, v_sh, Some(&mut v_camera));
-                out.means[k] = v.v_mean;
-                out.quats[k] = v.v_quat;
-                out.scales[k] = v.v_scales;
-                out.opacities[k] = v.v_opacity;
+                block.push(k, &v);
             }
-            v_camera
+            block.run(&stage, first, out)
         })
         .collect();
     let mut v_camera = VCamera::default();

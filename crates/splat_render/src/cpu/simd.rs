@@ -13,6 +13,7 @@ pub(crate) fn dispatch<Operation: WithSimd>(operation: Operation) -> Operation::
     match tests::LANES.get() {
         1 => return pulp::Scalar.vectorize(operation),
         4 => return pulp::Scalar128b.vectorize(operation),
+        8 => return pulp::Scalar256b.vectorize(operation),
         16 => return pulp::Scalar512b.vectorize(operation),
         _ => {}
     }
@@ -80,8 +81,13 @@ mod tests {
     use super::*;
     use crate::cpu::Cpu;
     use crate::cpu::loss::Loss;
+    use crate::splats::SplatArrays;
+    use crate::stages::{AdamState, AdamStep, Rates};
     use crate::target::Target;
-    use crate::{Image, ImageGradients, Projected, ProjectedGradients, Stages};
+    use crate::{
+        Camera, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients,
+        SplatGradients, Stages,
+    };
 
     thread_local! {
         /// Lanes to run with in place of the machine's own, 0 for those. Each thread has its own:
@@ -91,14 +97,19 @@ mod tests {
 
     type Results = (Image<f32>, ProjectedGradients<f32>, Vec<f32>);
 
-    /// A picture, its gradients and its loss, at this many lanes.
-    fn run(lanes: usize, splats: &Projected<f32>) -> Results {
+    /// What `work` gives at this many lanes.
+    fn at<T: Send>(lanes: usize, work: impl FnOnce() -> T + Send) -> T {
         rayon::ThreadPoolBuilder::new()
             .num_threads(2)
             .start_handler(move |_| LANES.set(lanes))
             .build()
             .unwrap()
-            .install(|| run_here(splats))
+            .install(work)
+    }
+
+    /// A picture, its gradients and its loss, at this many lanes.
+    fn run(lanes: usize, splats: &Projected<f32>) -> Results {
+        at(lanes, || run_here(splats))
     }
 
     fn run_here(splats: &Projected<f32>) -> Results {
@@ -136,8 +147,8 @@ mod tests {
         most / largest
     }
 
-    /// Machines with other vectors than this one's must draw the same: 16 lanes as AVX-512 has,
-    /// 4 as NEON, 1 as where there are none, computed here without their instructions.
+    /// Machines with other vectors than this one's must draw the same: 16 lanes as AVX-512 has, 8 as
+    /// AVX2, 4 as NEON, 1 as where there are none, computed here without their instructions.
     #[test]
     fn every_vector_width_draws_the_same() {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(6);
@@ -157,7 +168,7 @@ mod tests {
                 splats.radii[i] = [60.0, 60.0];
             }
             let (image, v, loss) = run(0, &splats);
-            for lanes in [1, 4, 16] {
+            for lanes in [1, 4, 8, 16] {
                 let (image_n, v_n, loss_n) = run(lanes, &splats);
                 let what = format!("{width}x{height} on {lanes} lanes");
                 let color =
@@ -177,6 +188,113 @@ mod tests {
                 for (k, (a, b)) in pairs.into_iter().enumerate() {
                     let off = apart(a.iter(), b.iter());
                     assert!(off < 1e-5, "{what}: gradients {k} {off:e}");
+                }
+            }
+        }
+    }
+
+    /// 2D splats, gradients of the splats and where a step of Adam takes them.
+    fn per_splat(
+        splats: &SplatArrays,
+        options: &ProjectOptions,
+    ) -> (Projected<f32>, SplatGradients<f32>, AdamState<f32>) {
+        let mut viewmat = glam::DMat4::from_rotation_y(0.4);
+        viewmat.w_axis = glam::DVec4::new(0.1, -0.2, 3.0, 1.0);
+        let (width, height) = (90, 60);
+        let camera = Camera { viewmat, fx: 80.0, fy: 85.0, cx: 44.0, cy: 31.0, width, height };
+        let params = splats.params(splats.sh_degree);
+        let projected = Cpu.project(&params, &camera, options).unwrap();
+        let n = splats.len();
+        let mut v2d = ProjectedGradients::zeros(n);
+        for i in 0..n {
+            let wave = |k: usize| ((i * 7 + k) as f32).sin();
+            v2d.v_means2d[i] = std::array::from_fn(wave);
+            v2d.v_factors[i] = std::array::from_fn(|k| 0.1 * wave(k + 2));
+            v2d.v_colors[i] = std::array::from_fn(|k| wave(k + 5));
+            (v2d.v_depths[i], v2d.v_opacities[i]) = (wave(8), wave(9));
+        }
+        let v = Cpu.project_backward(&params, &camera, options, &projected, &v2d).unwrap();
+        let zeros = SplatArrays::zeros(n, splats.sh_degree);
+        let mut state = AdamState { splats: splats.clone(), first: zeros.clone(), second: zeros };
+        let rates = Rates {
+            means: 1e-3,
+            quats: 1e-3,
+            scales: 5e-3,
+            opacities: 5e-2,
+            sh0: 2e-3,
+            sh_rest: 1e-4,
+        };
+        let step = AdamStep {
+            number: 3,
+            rates,
+            sh_degree: splats.sh_degree,
+            opacity_regularizer: 0.01,
+            scale_regularizer: 0.01,
+            noise: 10.0,
+            noise_seed: 5,
+        };
+        Cpu.adam(&mut state, &v, &step).unwrap();
+        (projected, v, state)
+    }
+
+    #[test]
+    fn every_vector_width_moves_splats_the_same() {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(8);
+        // Numbers that leave blocks and vectors part full, and splats in between that are not drawn.
+        for (n, degree) in [(1, 0), (63, 1), (130, 2), (331, 3), (90, 4)] {
+            let mut splats = SplatArrays::zeros(n, degree);
+            for i in 0..n {
+                splats.means[i] = std::array::from_fn(|_| rng.random_range(-1.5..1.5));
+                splats.quats[i] = std::array::from_fn(|_| rng.random_range(-1.0..1.0));
+                splats.scales[i] = std::array::from_fn(|_| rng.random_range(-6.0..-1.0));
+                splats.opacities[i] = rng.random_range(-4.0..4.0);
+                match i % 9 {
+                    4 => splats.means[i][1] = f32::NAN,
+                    5 => splats.means[i][2] -= 9.0,
+                    _ => {}
+                }
+            }
+            for row in &mut splats.sh {
+                *row = std::array::from_fn(|_| rng.random_range(-0.5..0.5));
+            }
+            for antialiased in [false, true] {
+                let options = ProjectOptions { antialiased, ..ProjectOptions::default() };
+                let (p, v, a) = at(0, || per_splat(&splats, &options));
+                for lanes in [1, 4, 8, 16] {
+                    let what = format!("{n} splats of SH {degree} on {lanes} lanes");
+                    let (p_n, v_n, a_n) = at(lanes, || per_splat(&splats, &options));
+                    let drawn = |p: &Projected<f32>| {
+                        p.radii.iter().map(|r| *r != [0.0; 2]).collect::<Vec<_>>()
+                    };
+                    assert_eq!(drawn(&p_n), drawn(&p), "{what}");
+                    let moved = |a: &AdamState<f32>, splats: &SplatArrays| -> Vec<f32> {
+                        let rows = a.splats.means.as_flattened().iter();
+                        let rows = rows.zip(splats.means.as_flattened());
+                        rows.map(|(a, b)| a - b).map(|d| if d.is_nan() { 0.0 } else { d }).collect()
+                    };
+                    let viewmat = |v: &SplatGradients<f32>| -> Vec<f32> {
+                        v.v_viewmat.as_flattened().iter().map(|&v| v as f32).collect()
+                    };
+                    let pairs: [(&[f32], &[f32]); 13] = [
+                        (p_n.means2d.as_flattened(), p.means2d.as_flattened()),
+                        (p_n.factors.as_flattened(), p.factors.as_flattened()),
+                        (p_n.colors.as_flattened(), p.colors.as_flattened()),
+                        (p_n.radii.as_flattened(), p.radii.as_flattened()),
+                        (&p_n.opacities, &p.opacities),
+                        (v_n.v_means.as_flattened(), v.v_means.as_flattened()),
+                        (v_n.v_quats.as_flattened(), v.v_quats.as_flattened()),
+                        (v_n.v_scales.as_flattened(), v.v_scales.as_flattened()),
+                        (v_n.v_colors.as_flattened(), v.v_colors.as_flattened()),
+                        (&v_n.v_opacities, &v.v_opacities),
+                        (&viewmat(&v_n), &viewmat(&v)),
+                        (&a_n.first.opacities, &a.first.opacities),
+                        (&moved(&a_n, &splats), &moved(&a, &splats)),
+                    ];
+                    for (k, (a, b)) in pairs.into_iter().enumerate() {
+                        let off = apart(a.iter(), b.iter());
+                        let same = b.iter().all(|&b| b == 0.0) && a == b;
+                        assert!(same || off < 1e-5, "{what}: array {k} {off:e}");
+                    }
                 }
             }
         }
