@@ -6,6 +6,7 @@ import json
 import os
 import runpy
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -420,6 +421,19 @@ def test_two_builds_take_turns(tmp_path):
         assert 0.2 < row["ratio_least"] <= row["ratio"] <= row["ratio_most"] < 5.0
         assert 0.0 < row["mean_error_old"] == row["mean_error_new"] < 1e-5
         assert row["max_error_old"] == row["max_error_new"] < 1e-4
+
+
+def test_a_build_is_used_in_place_of_the_packages_own(tmp_path):
+    copy = str(shutil.copy(_core.__file__, tmp_path / "_core.abi3.so"))
+    code = (
+        "import sys; from igsr._internal.other_build import use_build; use_build(sys.argv[1]);"
+        "from igsr.benchmark import fit_rows, stage_rows, timed_work;"
+        "print({module._core.__file__ for module in (fit_rows, stage_rows, timed_work)});"
+        "use_build(sys.argv[1])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, copy], capture_output=True, text=True)
+    assert done.stdout.strip() == str({copy})
+    assert "in use already" in done.stderr
 
 
 def test_what_is_no_build_is_one_sentence(igsr_bench, tmp_path):

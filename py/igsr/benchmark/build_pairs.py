@@ -16,6 +16,7 @@ from typing import IO, Any, cast
 
 import numpy as np
 
+from igsr import _core
 from igsr.benchmark.machine import describe_machine
 from igsr.benchmark.timed_work import all_work
 from igsr.errors import IgsrError
@@ -27,6 +28,14 @@ PAIR_PROTOCOL = (
     "ratio is old : new, each the least over its repeats of that round: the median over the "
     "rounds, with the least and the most. Errors are against the f64 reference as everywhere."
 )
+#: The build must be there before anything of igsr's benchmark is imported.
+_CHILD = """
+import sys
+from igsr._internal.other_build import use_build
+use_build(sys.argv[1])
+from igsr.benchmark.build_process import main
+main(sys.argv[2])
+"""
 
 
 class Build:
@@ -43,9 +52,9 @@ class Build:
         self._process = subprocess.Popen(
             [
                 sys.executable,
-                "-m",
-                "igsr.benchmark.build_process",
-                "" if file is None else str(file),
+                "-c",
+                _CHILD,
+                _core.__file__ if file is None else str(file),
                 json.dumps(settings),
             ],
             stdin=subprocess.PIPE,
