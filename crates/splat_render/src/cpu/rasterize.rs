@@ -1,5 +1,7 @@
 //! rasterize: ids to colour, alpha, depth and final transmittance, a tile at a time.
 
+use std::sync::atomic::AtomicU32;
+
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -48,7 +50,7 @@ impl Planes {
 
 struct Tile<'a, 'b, const DEPTH: bool> {
     splats: &'a [TileSplat],
-    ids: &'a [u32],
+    ids: &'a [AtomicU32],
     left: f32,
     top: f32,
     background: [f32; 3],

@@ -1,6 +1,8 @@
 //! rasterize_backward: image gradients to per-splat 2D gradients, front to back, so that it rounds
 //! and stops exactly as the forward pass did.
 
+use std::sync::atomic::AtomicU32;
+
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -42,7 +44,7 @@ pub(super) struct PictureGradients<'a> {
 
 struct Tile<'a, const N: usize> {
     splats: &'a [TileSplat],
-    ids: &'a [u32],
+    ids: &'a [AtomicU32],
     left: f32,
     top: f32,
     picture: PictureGradients<'a>,

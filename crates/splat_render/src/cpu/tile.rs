@@ -1,6 +1,8 @@
 //! A tile as the inner loops of rasterize and rasterize_backward see it: how its pixels lie in
 //! memory, what they read of a splat, and which of its vectors a splat reaches.
 
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
 use pulp::Simd;
 
 use super::project::Splat2d;
@@ -114,11 +116,11 @@ pub(super) struct TileSplat {
 #[inline(always)]
 pub(super) fn take(
     splats: &[TileSplat],
-    ids: &[u32],
+    ids: &[AtomicU32],
     batch: &mut [TileSplat; LIVE_INTERVAL],
 ) -> usize {
-    for (copy, &id) in batch.iter_mut().zip(ids) {
-        *copy = splats[id as usize];
+    for (copy, id) in batch.iter_mut().zip(ids) {
+        *copy = splats[id.load(Relaxed) as usize];
     }
     ids.len().min(LIVE_INTERVAL)
 }
