@@ -57,13 +57,12 @@ impl Place {
         pixels
     }
 
-    /// Writes the values within the picture.
+    /// Writes the values within the picture to its rows there.
     #[inline(always)]
-    pub fn store<S: Simd>(&self, pixels: &Pixels, plane: &mut [f32]) {
+    pub fn store<S: Simd>(&self, pixels: &Pixels, rows: &mut [&mut [f32]; SIDE]) {
         let vectors = S::as_simd_f32s(&pixels.0).0;
-        for row in 0..self.rows {
-            let plane = &mut plane[self.first + row * self.width..][..self.columns];
-            let (whole, rest) = S::as_mut_simd_f32s(plane);
+        for (row, out) in rows[..self.rows].iter_mut().enumerate() {
+            let (whole, rest) = S::as_mut_simd_f32s(&mut out[..self.columns]);
             for (c, vector) in whole.iter_mut().enumerate() {
                 *vector = vectors[c * SIDE + row];
             }
