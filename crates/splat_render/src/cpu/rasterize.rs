@@ -1,5 +1,7 @@
 //! rasterize: ids to colour, alpha, depth and final transmittance, a tile at a time.
 
+use std::sync::atomic::AtomicU32;
+
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -46,21 +48,38 @@ impl Planes {
     }
 }
 
-struct Tile<'a, 'b, const DEPTH: bool> {
+/// A tile's rows in each plane.
+type Rows<'a> = [[&'a mut [f32]; SIDE]; 5];
+
+/// Cuts a row of tiles into its tiles.
+fn tiles(band: [&mut [f32]; 5], width: usize) -> Vec<Rows<'_>> {
+    let mut tiles: Vec<Rows<'_>> = Vec::new();
+    tiles.resize_with(width.div_ceil(SIDE), Rows::default);
+    for (k, plane) in band.into_iter().enumerate() {
+        for (row, values) in plane.chunks_mut(width).enumerate() {
+            for (tile, values) in tiles.iter_mut().zip(values.chunks_mut(SIDE)) {
+                tile[k][row] = values;
+            }
+        }
+    }
+    tiles
+}
+
+struct Tile<'a, const DEPTH: bool> {
     splats: &'a [TileSplat],
-    ids: &'a [u32],
+    ids: &'a [AtomicU32],
     left: f32,
     top: f32,
     background: [f32; 3],
     place: Place,
-    band: &'a mut [&'b mut [f32]; 5],
+    out: Rows<'a>,
 }
 
-impl<const DEPTH: bool> WithSimd for Tile<'_, '_, DEPTH> {
+impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) {
+    fn with_simd<S: Simd>(mut self, s: S) {
         let mut sums = [Pixels([0.0; PIXELS]); 4];
         // Negative once the pixel has stopped.
         let mut t = self.place.clear(S::F32_LANES);
@@ -71,17 +90,16 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, '_, DEPTH> {
                 sums[c].0[k] += *t * self.background[c];
             }
         }
-        for (plane, sums) in self.band.iter_mut().zip(&sums) {
-            self.place.store::<S>(sums, plane);
+        for (rows, sums) in self.out.iter_mut().zip(sums.iter().chain([&t])) {
+            self.place.store::<S>(sums, rows);
         }
-        self.place.store::<S>(&t, self.band[4]);
     }
 }
 
 #[inline(always)]
 fn blend<S: Simd, const DEPTH: bool>(
     s: S,
-    tile: &Tile<'_, '_, DEPTH>,
+    tile: &Tile<'_, DEPTH>,
     [r, g, b, d]: &mut [Pixels; 4],
     t: &mut Pixels,
 ) {
@@ -137,9 +155,11 @@ pub(super) fn rasterize_tiles<const DEPTH: bool>(
 ) {
     let width = out.width;
     let columns = width.div_ceil(SIDE);
-    out.bands().enumerate().for_each(|(tile_row, mut band)| {
+    // Tasks are tiles: rows of tiles are too few for many threads and hold very different numbers of
+    // pairs.
+    out.bands().enumerate().for_each(|(tile_row, band)| {
         let rows = band[0].len() / width;
-        for column in 0..columns {
+        tiles(band, width).into_par_iter().enumerate().for_each(|(column, out)| {
             let first = column * SIDE;
             dispatch(Tile::<DEPTH> {
                 splats,
@@ -148,9 +168,9 @@ pub(super) fn rasterize_tiles<const DEPTH: bool>(
                 top: (tile_row * SIDE) as f32,
                 background,
                 place: Place { first, width, rows, columns: SIDE.min(width - first) },
-                band: &mut band,
+                out,
             });
-        }
+        });
     });
 }
 

@@ -1,6 +1,8 @@
 //! rasterize_backward: image gradients to per-splat 2D gradients, front to back, so that it rounds
 //! and stops exactly as the forward pass did.
 
+use std::sync::atomic::AtomicU32;
+
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -42,7 +44,7 @@ pub(super) struct PictureGradients<'a> {
 
 struct Tile<'a, const N: usize> {
     splats: &'a [TileSplat],
-    ids: &'a [u32],
+    ids: &'a [AtomicU32],
     left: f32,
     top: f32,
     picture: PictureGradients<'a>,
@@ -177,35 +179,29 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
     let columns = width.div_ceil(SIDE);
     sums.resize(bins.splats.len(), [0.0; N]);
 
-    // One task per row of tiles, each with the part of `sums` that is its own.
-    let mut bands = Vec::with_capacity(height.div_ceil(SIDE));
+    // Tasks are tiles, each with the part of `sums` that is its own: rows of tiles are too few for
+    // many threads and hold very different numbers of pairs.
+    let mut tiles = Vec::with_capacity(bins.starts.len());
     let mut rest = sums.as_mut_slice();
-    for tile_row in 0..height.div_ceil(SIDE) {
-        let range = bins.starts[tile_row * columns]..bins.starts[(tile_row + 1) * columns];
-        let (band, after) = rest.split_at_mut(range.len());
-        bands.push(band);
+    for tile in 0..bins.starts.len() - 1 {
+        let (sums, after) = rest.split_at_mut(bins.range(tile).len());
         rest = after;
-    }
-    bands.into_par_iter().enumerate().for_each(|(tile_row, mut band)| {
-        let rows = SIDE.min(height - tile_row * SIDE);
-        for column in 0..columns {
-            let range = bins.range(tile_row * columns + column);
-            let (sums, after) = std::mem::take(&mut band).split_at_mut(range.len());
-            band = after;
-            if range.is_empty() {
-                continue;
-            }
-            let (x, y) = (column * SIDE, tile_row * SIDE);
-            dispatch(Tile::<N> {
-                splats,
-                ids: &bins.splats[range],
-                left: x as f32,
-                top: y as f32,
-                picture,
-                place: Place { first: y * width + x, width, rows, columns: SIDE.min(width - x) },
-                sums,
-            });
+        if !sums.is_empty() {
+            tiles.push((tile, sums));
         }
+    }
+    tiles.into_par_iter().for_each(|(tile, sums)| {
+        let (x, y) = (tile % columns * SIDE, tile / columns * SIDE);
+        let (rows, columns) = (SIDE.min(height - y), SIDE.min(width - x));
+        dispatch(Tile::<N> {
+            splats,
+            ids: &bins.splats[bins.range(tile)],
+            left: x as f32,
+            top: y as f32,
+            picture,
+            place: Place { first: y * width + x, width, rows, columns },
+            sums,
+        });
     });
 }
 

@@ -1,6 +1,8 @@
 //! A tile as the inner loops of rasterize and rasterize_backward see it: how its pixels lie in
 //! memory, what they read of a splat, and which of its vectors a splat reaches.
 
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
 use pulp::Simd;
 
 use super::project::Splat2d;
@@ -55,13 +57,12 @@ impl Place {
         pixels
     }
 
-    /// Writes the values within the picture.
+    /// Writes the values within the picture to its rows there.
     #[inline(always)]
-    pub fn store<S: Simd>(&self, pixels: &Pixels, plane: &mut [f32]) {
+    pub fn store<S: Simd>(&self, pixels: &Pixels, rows: &mut [&mut [f32]; SIDE]) {
         let vectors = S::as_simd_f32s(&pixels.0).0;
-        for row in 0..self.rows {
-            let plane = &mut plane[self.first + row * self.width..][..self.columns];
-            let (whole, rest) = S::as_mut_simd_f32s(plane);
+        for (row, out) in rows[..self.rows].iter_mut().enumerate() {
+            let (whole, rest) = S::as_mut_simd_f32s(&mut out[..self.columns]);
             for (c, vector) in whole.iter_mut().enumerate() {
                 *vector = vectors[c * SIDE + row];
             }
@@ -114,11 +115,11 @@ pub(super) struct TileSplat {
 #[inline(always)]
 pub(super) fn take(
     splats: &[TileSplat],
-    ids: &[u32],
+    ids: &[AtomicU32],
     batch: &mut [TileSplat; LIVE_INTERVAL],
 ) -> usize {
-    for (copy, &id) in batch.iter_mut().zip(ids) {
-        *copy = splats[id as usize];
+    for (copy, id) in batch.iter_mut().zip(ids) {
+        *copy = splats[id.load(Relaxed) as usize];
     }
     ids.len().min(LIVE_INTERVAL)
 }
