@@ -1,16 +1,15 @@
 //! adam: one optimiser step of all parameters, a block of splats at a time.
 
-use glam::{Mat3, Quat, Vec3};
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::block::BLOCK;
 use super::elementary::exp;
+use super::explore::ExploreBlock;
 use super::lanes::Lanes;
 use super::project::sigmoid;
 use super::simd::dispatch;
-use crate::constants::{ADAM, QUAT_NORM2_MIN};
-use crate::fit_device::noise_normal;
+use crate::constants::ADAM;
 use crate::sh;
 use crate::splats::SplatSlices;
 use crate::stages::{AdamState, AdamStep, Rates, SplatGradients};
@@ -123,14 +122,13 @@ impl BlockStep {
         });
     }
 
-    /// Moves a block of splats, the first of them splat `first_id` of the scene.
+    /// Moves a block of splats by its gradients.
     #[inline(always)]
     pub fn apply(
         &self,
-        values: SplatSlices<'_>,
+        values: &mut SplatSlices<'_>,
         [first, second]: [SplatSlices<'_>; 2],
         gradients: &BlockGradients,
-        first_id: usize,
     ) {
         if self.frozen {
             return;
@@ -159,17 +157,12 @@ impl BlockStep {
         } else {
             adam!(sh, self.stored, self.used);
         }
-        if self.step.noise > 0.0 {
-            for k in 0..n {
-                values.means[k] = explore(
-                    values.means[k],
-                    values.quats[k],
-                    values.scales[k],
-                    values.opacities[k],
-                    &self.step,
-                    first_id + k,
-                );
-            }
+    }
+
+    /// Takes the exploration's step, after Adam's, on the same block.
+    pub fn explore(&self, values: &mut SplatSlices<'_>, block: &mut ExploreBlock, first_id: usize) {
+        if self.step.noise > 0.0 && !self.frozen {
+            block.run(values, self.step.noise, self.step.noise_seed, first_id);
         }
     }
 }
@@ -244,32 +237,6 @@ impl WithSimd for Pull<'_> {
     }
 }
 
-/// 3DGS-MCMC's exploration: nearly transparent splats take a random step shaped by their covariance.
-#[inline(always)]
-fn explore(
-    mean: [f32; 3],
-    quat: [f32; 4],
-    log_scales: [f32; 3],
-    logit: f32,
-    step: &AdamStep,
-    id: usize,
-) -> [f32; 3] {
-    let opacity = 1.0 / (1.0 + (-logit).exp());
-    let gate = 1.0 / (1.0 + (-100.0 * (0.005 - opacity)).exp());
-    let [w, x, y, z] = quat;
-    // Under this gate the step is under 1e-7 of the splat's size times the rate. A quaternion that
-    // names no rotation has no covariance.
-    if gate < 1e-7 || w * w + x * x + y * y + z * z < QUAT_NORM2_MIN {
-        return mean;
-    }
-    let axes = Mat3::from_quat(Quat::from_xyzw(x, y, z, w).normalize());
-    let scales = Vec3::from(log_scales).exp();
-    let z = Vec3::from(noise_normal(step.noise_seed, id as u32));
-    let moved = axes * (scales * scales * (axes.transpose() * z)) * (gate * step.noise);
-    let out = Vec3::from(mean) + moved;
-    if out.is_finite() { out.to_array() } else { mean }
-}
-
 pub(super) fn adam(state: &mut AdamState<f32>, gradients: &SplatGradients<f32>, step: &AdamStep) {
     let AdamState { splats, first, second } = state;
     let (n, degree, stride) = (splats.len(), splats.sh_degree, splats.stride());
@@ -278,8 +245,8 @@ pub(super) fn adam(state: &mut AdamState<f32>, gradients: &SplatGradients<f32>, 
         .into_par_iter()
         .enumerate()
         .for_each_init(
-            || BlockGradients::new(stride),
-            |v_block, (block, (values, first, second))| {
+            || (BlockGradients::new(stride), ExploreBlock::new()),
+            |(v_block, explore), (block, (mut values, first, second))| {
                 let first_id = block * BLOCK;
                 let n = values.means.len();
                 let rows = first_id..first_id + n;
@@ -290,7 +257,8 @@ pub(super) fn adam(state: &mut AdamState<f32>, gradients: &SplatGradients<f32>, 
                 v_block.sh[..n * stride]
                     .copy_from_slice(&gradients.v_colors[first_id * stride..][..n * stride]);
                 plan.pull(&values, v_block);
-                plan.apply(values, [first, second], v_block, first_id);
+                plan.apply(&mut values, [first, second], v_block);
+                plan.explore(&mut values, explore, first_id);
             },
         );
 }

@@ -105,6 +105,13 @@ impl SplatRows {
         opacities: Row::ZERO,
     };
 
+    /// The vector `at` of the quaternions.
+    #[inline(always)]
+    pub fn quat<S: Simd>(&self, s: S, at: usize) -> [Lanes<S>; 4] {
+        let [w, x, y, z] = &self.quats;
+        [w.get(s, at), x.get(s, at), y.get(s, at), z.get(s, at)]
+    }
+
     /// Takes the splats `ids` of the block that begins with splat `first`.
     #[inline(always)]
     pub fn take(&mut self, splats: &SplatParams<'_, f32>, first: usize, ids: &[u8]) {

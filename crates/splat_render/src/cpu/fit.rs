@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::adam::{BlockGradients, BlockStep};
 use super::bin::{Bins, CHUNK, ChunkTiles};
 use super::block::{BLOCK, Ids};
+use super::explore::ExploreBlock;
 use super::loss::Loss;
 use super::project::{ProjectBlock, View};
 use super::project_backward::{Backward, BackwardBlock, VCamera};
@@ -161,6 +162,7 @@ struct Scratch {
     pairs: Vec<PairSums<COLOR_SUMS>>,
     backward: Box<BackwardBlock>,
     v: BlockGradients,
+    explore: Box<ExploreBlock>,
 }
 
 impl CpuFit {
@@ -190,11 +192,12 @@ impl CpuFit {
                     pairs: Vec::new(),
                     backward: BackwardBlock::new(),
                     v: BlockGradients::new(stride),
+                    explore: ExploreBlock::new(),
                 },
-                |scratch, (block, (values, first, second, grad_sum, v_camera))| {
+                |scratch, (block, (mut values, first, second, grad_sum, v_camera))| {
                     let first_id = block * BLOCK;
                     let n = values.means.len();
-                    let Scratch { pairs, backward, v } = scratch;
+                    let Scratch { pairs, backward, v, explore } = scratch;
                     bins.take_pairs(first_id..first_id + n, sums, pairs);
                     backward.clear();
                     for k in 0..n {
@@ -216,7 +219,8 @@ impl CpuFit {
                     };
                     *v_camera = backward.run(&stage, 0, v.zeroed(n));
                     plan.pull(&values, v);
-                    plan.apply(values, [first, second], v, first_id);
+                    plan.apply(&mut values, [first, second], v);
+                    plan.explore(&mut values, explore, first_id);
                 },
             );
         if input.camera_gradient {

@@ -301,6 +301,15 @@ impl<S: Simd> Mul<Lanes<S>> for Vec3s<S> {
     }
 }
 
+/// A quaternion's squared norm, one over its norm, and itself with the norm 1.
+#[inline(always)]
+pub(super) fn normalized<S: Simd>(quat: [Lanes<S>; 4]) -> (Lanes<S>, Lanes<S>, [Lanes<S>; 4]) {
+    let [w, x, y, z] = quat;
+    let norm2 = w.mul_add(w, x.mul_add(x, y.mul_add(y, z * z)));
+    let inverse = norm2.sqrt().recip();
+    (norm2, inverse, [w * inverse, x * inverse, y * inverse, z * inverse])
+}
+
 /// One 3x3 matrix per lane, by its columns.
 #[derive(Clone, Copy)]
 pub(super) struct Mat3s<S: Simd>(pub [Vec3s<S>; 3]);

@@ -6,6 +6,7 @@ mod adam;
 mod bin;
 mod block;
 mod elementary;
+mod explore;
 mod fit;
 mod lanes;
 mod loss;

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::block::{BLOCK, ColorRows, Ids, Row, SplatRows, get3, set3, vectors};
 use super::elementary::{exp, ln};
-use super::lanes::{Lanes, Mask, Mat3s, Vec3s};
+use super::lanes::{Lanes, Mask, Mat3s, Vec3s, normalized};
 use super::simd::dispatch;
 use crate::camera::Camera;
 use crate::constants::{ALPHA_MIN, QUAT_NORM2_MIN, SH_COEFFS_MAX};
@@ -95,15 +95,9 @@ impl<S: Simd> Splats<S> {
         } else {
             (scales, opacity, opacity.all(1.0))
         };
-        let quats = &rows.quats;
         Self {
             mean: get3(&rows.means, s, at),
-            quat: [
-                quats[0].get(s, at),
-                quats[1].get(s, at),
-                quats[2].get(s, at),
-                quats[3].get(s, at),
-            ],
+            quat: rows.quat(s, at),
             scales,
             opacity: opacity * compensation,
             opacity_slope: opacity_slope * compensation,
@@ -146,12 +140,9 @@ pub(super) fn geometry<S: Simd>(s: S, view: &View, splats: &Splats<S>) -> Geomet
     let t = Vec3s::new(row_x.dot(mean), row_y.dot(mean), row_z.dot(mean)) + translation;
     let mut drawn = splats.given & t.is_finite();
     drawn = drawn & t.z.ge(zero.all(view.nearest)) & t.z.le(zero.all(view.options.far));
-    let [w, x, y, z] = splats.quat;
-    let norm2 = w.mul_add(w, x.mul_add(x, y.mul_add(y, z * z)));
+    let (norm2, inverse_norm, quat) = normalized(splats.quat);
     drawn = drawn & norm2.ge(zero.all(QUAT_NORM2_MIN)) & norm2.is_finite();
     drawn = drawn & scales.x.ge(zero) & scales.y.ge(zero) & scales.z.ge(zero) & scales.is_finite();
-    let inverse_norm = norm2.sqrt().recip();
-    let quat = [w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm];
     let axes = Mat3s::from_quat(quat);
     let [x_low, x_high, y_low, y_high] = view.limits;
     let inverse_z = t.z.recip();

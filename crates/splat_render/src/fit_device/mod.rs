@@ -3,7 +3,7 @@
 mod random;
 mod state;
 
-pub(crate) use random::dropout_threshold;
+pub(crate) use random::{dropout_threshold, noise_draw};
 pub use random::{is_dropped, noise_normal};
 pub use state::{DensityStats, FitState};
 

@@ -2,6 +2,7 @@
 //! from a seed and a splat's index, the same on every device.
 
 /// PCG's output function on one 32-bit word.
+#[inline(always)]
 fn hash(x: u32) -> u32 {
     let state = x.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
     let word = ((state >> ((state >> 28) + 4)) ^ state).wrapping_mul(277_803_737);
@@ -19,13 +20,23 @@ pub fn is_dropped(seed: u32, index: u32, rate: f32) -> bool {
     hash(index ^ hash(seed ^ 0x5bd1_e995)) < dropout_threshold(rate)
 }
 
-/// Three standard normal numbers from (seed, splat index): integer hash (PCG output function
-/// applied thrice), then Box-Muller. The same on every backend up to the rounding of log, sqrt, cos.
-pub fn noise_normal(seed: u32, index: u32) -> [f32; 3] {
-    // In (0, 1]: the logarithm stays finite.
-    let unit = |h: u32| ((h >> 8) as f32 + 1.0) * (1.0 / 16_777_216.0);
+/// Four numbers in (0, 1] of (seed, splat index), which [`noise_normal`] makes its own of: integer
+/// hash (PCG output function applied thrice).
+#[inline(always)]
+pub(crate) fn noise_draw(seed: u32, index: u32) -> [f32; 4] {
     let base = hash(index ^ hash(seed));
-    let draw: [f32; 4] = std::array::from_fn(|k| unit(hash(base.wrapping_add(k as u32))));
+    let mut draw = [0.0; 4];
+    for (k, draw) in (0..).zip(&mut draw) {
+        // Above 0: the logarithm stays finite.
+        *draw = ((hash(base.wrapping_add(k)) >> 8) as f32 + 1.0) * (1.0 / 16_777_216.0);
+    }
+    draw
+}
+
+/// Three standard normal numbers from (seed, splat index): four drawn numbers, then Box-Muller. The
+/// same on every backend up to the rounding of log, sqrt, cos.
+pub fn noise_normal(seed: u32, index: u32) -> [f32; 3] {
+    let draw = noise_draw(seed, index);
     let (r0, r1) = ((-2.0 * draw[0].ln()).sqrt(), (-2.0 * draw[2].ln()).sqrt());
     let (a0, a1) = (std::f32::consts::TAU * draw[1], std::f32::consts::TAU * draw[3]);
     [r0 * a0.cos(), r0 * a0.sin(), r1 * a1.cos()]
