@@ -54,7 +54,7 @@ class Estimator(Protocol):
         Args:
             photos: upright, their names unique.
             seed: random seed; deterministic for a given seed.
-            progress: called with a stage ("pairs", "alignment", "features", "matching" or
+            progress: called with a stage ("pairs", "passes", "alignment", "features", "matching" or
                 "mapping"), how much of it is done, and how much there is.
 
         Raises:

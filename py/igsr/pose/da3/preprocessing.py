@@ -8,7 +8,7 @@ columns, in float64.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -70,12 +70,16 @@ class Resampling:
         scaled[:2, 2] -= self.left, self.top
         return scaled
 
+    def resized(self, width: int, height: int) -> Resampling:
+        """The same, resized to another size; nothing may be cut."""
+        sizes = {"resized_width": width, "resized_height": height}
+        return replace(self, **sizes, width=width, height=height)
+
     def cut(self, width: int, height: int) -> Resampling:
         """The same, cut about the middle to a smaller size."""
         left = self.left + (self.width - width) // 2
         top = self.top + (self.height - height) // 2
-        kept = {**vars(self), "left": left, "top": top, "width": width, "height": height}
-        return Resampling(**kept)
+        return replace(self, left=left, top=top, width=width, height=height)
 
 
 def resampling_of(
