@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from dataclasses import replace
 
@@ -17,7 +18,7 @@ from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
-from igsr.pose import estimate
+from igsr.pose import FoundCameras, estimate, read_found
 from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.da3 import passes
 from igsr.pose.da3.chunks import chunks_of, joined, mapped
@@ -355,6 +356,13 @@ def test_from_a_checkpoint_by_name(small_photos, tmp_path, monkeypatch):
     name, found = estimate(small_photos, "da3", checkpoint=tmp_path)
     assert name == "da3"
     assert all(camera is not None for camera in found.cameras)
+    content = (tmp_path / "model.safetensors").read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    assert found.weights == {"name": "da3-small", "licence": "Apache-2.0", "sha256": digest}
+    # What is kept of the cameras has the licence too.
+    kept = FoundCameras.of(small_photos, found, {"estimator": "da3"})
+    (tmp_path / "found.npz").write_bytes(kept.to_bytes())
+    assert read_found(tmp_path / "found.npz").estimate.weights == found.weights
 
 
 def test_numbers_that_are_not_finite_are_the_checkpoints_fault(small_photos):

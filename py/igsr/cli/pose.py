@@ -278,6 +278,7 @@ def _posed(
         "not_placed": found.not_placed,
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "warnings": found.estimate.warnings,
+        "weights": found.estimate.weights,
         "seed": finder.seed,
         "version": _core.__version__,
         "out": str(out),

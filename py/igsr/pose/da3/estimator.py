@@ -86,7 +86,7 @@ class Da3:
             only = f"; all are the same as {photos[0].name}" if len(photos) > 1 else ""
             raise IgsrError(f"Cameras are found from {FEWEST} different photos at least{only}")
         self._check_cameras(photos)
-        predictor = self._network() if self.predictor is None else self.predictor
+        predictor, weights = (self.predictor, None) if self.predictor else self._network()
         shown = [photos[i] for i in different]
         chunks = chunks_of(len(shown), predictor.most_photos(shown))
         in_all, done = sum(len(chunk) for chunk in chunks), 0
@@ -95,8 +95,8 @@ class Da3:
             part = [shown[i] for i in chunk]
             known = [self.cameras[photo.name] for photo in part] if self.cameras else None
             _check_apart(known)
-            found = predictor(part, known, seed)
-            placed = {i: one for i, one in zip(chunk, found, strict=True) if one is not None}
+            predicted = predictor(part, known, seed)
+            placed = {i: one for i, one in zip(chunk, predicted, strict=True) if one is not None}
             passes.append(self._with_given(placed, shown) if known else placed)
             done += len(chunk)
             if progress is not None:
@@ -109,7 +109,9 @@ class Da3:
         aligned = [world.get(i) for i in range(len(shown))]
         if not self.cameras:
             aligned = with_shared_focals(shown, aligned)
-        return self._estimate(photos, shown, same_as, aligned, lost)
+        found = self._estimate(photos, shown, same_as, aligned, lost)
+        found.weights = weights
+        return found
 
     def _estimate(
         self,
@@ -194,9 +196,11 @@ class Da3:
         )
         return {i: replace(mapped(placed[i], similarity), camera=given[i]) for i in order}
 
-    def _network(self) -> Predictor:
-        from igsr.pose.da3.checkpoint import find_checkpoint, load_network
+    def _network(self) -> tuple[Predictor, dict[str, str]]:
+        from igsr.pose.da3.checkpoint import LICENCE, find_checkpoint, load_network
+        from igsr.pose.da3.config import SIZES
         from igsr.pose.da3.passes import Da3Predictor
+        from igsr.pose.weights import sha256_of
 
         found = find_checkpoint(self.checkpoint)
         if found is None:
@@ -204,7 +208,10 @@ class Da3:
                 "no checkpoint of Depth Anything 3 is found; get one by 'igsr weights fetch "
                 "da3-base', or name one by --checkpoint"
             )
-        return Da3Predictor(load_network(found), self.cameras_from)
+        network = load_network(found)
+        name = next((name for name, size in SIZES.items() if size == network.config), "")
+        weights = {"name": name, "licence": LICENCE, "sha256": sha256_of(found)}
+        return Da3Predictor(network, self.cameras_from), weights
 
     def _check_cameras(self, photos: Sequence[Photo]) -> None:
         sizes = {photo.name: photo.image.shape[:2] for photo in photos}
