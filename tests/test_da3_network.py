@@ -94,6 +94,25 @@ def test_without_rays_the_rest_is_the_same(network):
         assert torch.equal(one.pose_encoding, other.pose_encoding)
 
 
+def test_half_precision_is_near_and_predictions_stay_float32(network):
+    # As on CUDA devices, where blocks run in half precision.
+    views = list(hashed_pixels("half", 3, 42, 56))
+    cameras = {
+        "viewmats": torch.eye(4).repeat(3, 1, 1),
+        "intrinsics": torch.diag(torch.tensor([60.0, 60.0, 1.0])).repeat(3, 1, 1),
+    }
+    for given in ({}, cameras):
+        exact = network.predict(views, "first", **given)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            near = network.predict(views, "first", **given)
+        for one, other in zip(exact, near, strict=True):
+            for name in FIELDS:
+                value, found = getattr(one, name), getattr(other, name)
+                assert found.dtype == torch.float32
+                off = float((found - value).abs().max() / value.abs().max())
+                assert 1e-6 < off < 0.05, (name, off)
+
+
 def test_published_sizes_have_their_number_of_parameters():
     # Distinct parameters less the levels of the ray head that only training needs.
     for config, count in ((SMALL, 34_299_463 - 305_589), (BASE, 135_366_599 - 1_163_349)):

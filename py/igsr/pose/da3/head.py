@@ -186,7 +186,7 @@ def _resized(maps: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _with_places(maps: Tensor, aspect: float) -> Tensor:
-    """Maps [1, c, h, w] with the places of their pixels added.
+    """Maps [1, c, h, w] with the places of their pixels added to them, in place.
 
     Args:
         maps: c is a multiple of four.
@@ -203,7 +203,7 @@ def _with_places(maps: Tensor, aspect: float) -> Tensor:
         angles = place * (extent * (size - 1) / size) * turn[:, None]
         parts.append(PLACE_SIZE * torch.cat([angles.sin(), angles.cos()]).to(maps.dtype))
     across, down = parts
-    result = maps.clone()
-    result[0, : 2 * quarter] += across[:, None, :]
-    result[0, 2 * quarter :] += down[:, :, None]
-    return result
+    # A copy of the largest maps takes as long as a convolution.
+    maps[0, : 2 * quarter] += across[:, None, :]
+    maps[0, 2 * quarter :] += down[:, :, None]
+    return maps

@@ -133,7 +133,9 @@ class Da3Network(nn.Module):
         if viewmats is not None and intrinsics is not None:
             sizes = [(view.shape[-2], view.shape[-1]) for view in views]
             encoding = encode_pose(normalized_viewmats(viewmats), intrinsics, sizes)
-            tokens = self.cam_enc(encoding.to(views[0].device, torch.float32))
+            device = views[0].device
+            with torch.autocast(device.type, enabled=False):
+                tokens = self.cam_enc(encoding.to(device, torch.float32))
         features = self.backbone(
             views, lambda all_tokens: reference_view(all_tokens, reference), tokens
         )
