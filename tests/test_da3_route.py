@@ -88,6 +88,11 @@ class ExactPredictor:
         return mapped(exact, world)
 
 
+def unadjusted(*arguments, **more):
+    """The estimator without bundle adjustment: photos here are noise, without features to match."""
+    return Da3(*arguments, bundle_adjustment=False, **more)
+
+
 def check_cameras(found, wanted, degrees=0.01):
     errors = pose_errors(found, wanted)
     assert errors["rotation"] < degrees
@@ -99,7 +104,7 @@ def check_cameras(found, wanted, degrees=0.01):
 @pytest.mark.parametrize(("count", "size"), [(2, (64, 64)), (5, (80, 60)), (5, (60, 80))])
 def test_cameras_depths_and_points_of_one_pass(count, size):
     cameras, photos = scene(count, *size)
-    found = Da3(ExactPredictor(cameras, photos))(photos)
+    found = unadjusted(ExactPredictor(cameras, photos))(photos)
     check_cameras(found.cameras, cameras)
     assert found.warnings == []
     world = similarity_between(found.cameras, cameras)
@@ -118,7 +123,7 @@ def test_thirty_three_photos_in_passes_become_one_world():
     cameras, photos = scene(33, step=0.18)
     predictor = ExactPredictor(cameras, photos, most=12)
     told = []
-    found = Da3(predictor)(photos, progress=lambda *what: told.append(what))
+    found = unadjusted(predictor)(photos, progress=lambda *what: told.append(what))
     assert len(predictor.shown) > 2
     assert max(len(shown) for shown in predictor.shown) <= 12
     check_cameras(found.cameras, cameras)
@@ -174,7 +179,7 @@ def test_a_pass_that_shares_nothing_sure_is_not_registered():
         return one
 
     predictor.aligned = unsure
-    found = Da3(predictor)(photos)
+    found = unadjusted(predictor)(photos)
     missing = [photo.name for photo, one in zip(photos, found.cameras, strict=True) if one is None]
     assert missing
     assert set(missing) == set(predictor.shown[1]) - set(predictor.shown[0])
@@ -186,7 +191,7 @@ def test_a_prediction_that_is_no_camera_is_not_registered():
     predictor = ExactPredictor(cameras, photos)
     exact = predictor.aligned
     predictor.aligned = lambda photo, world: None if photo.name == "01.png" else exact(photo, world)
-    found = Da3(predictor)(photos)
+    found = unadjusted(predictor)(photos)
     assert [one is None for one in found.cameras] == [False, True, False, False]
     assert "Not registered: 01.png. What Depth Anything 3 predicts" in found.warnings[0]
 
@@ -195,7 +200,7 @@ def test_photos_that_are_the_same_picture_have_the_same_camera():
     cameras, photos = scene(3)
     copies = [photos[0], replace(photos[0], name="copy.png"), *photos[1:]]
     predictor = ExactPredictor(cameras, photos)
-    found = Da3(predictor)(copies)
+    found = unadjusted(predictor)(copies)
     assert predictor.shown == [["00.png", "01.png", "02.png"]]
     np.testing.assert_array_equal(found.cameras[0].viewmat, found.cameras[1].viewmat)
     check_cameras([found.cameras[i] for i in (0, 2, 3)], cameras)
@@ -205,9 +210,9 @@ def test_photos_of_which_no_two_differ():
     _, photos = scene(1)
     copies = [replace(photos[0], name=f"{n}.png") for n in range(3)]
     with pytest.raises(IgsrError, match=r"2 different photos at least; all are the same as 0\.png"):
-        Da3(ExactPredictor([], []))(copies)
+        unadjusted(ExactPredictor([], []))(copies)
     with pytest.raises(IgsrError, match=r"from 2 different photos at least$"):
-        Da3(ExactPredictor([], []))(photos)
+        unadjusted(ExactPredictor([], []))(photos)
 
 
 def test_cameras_at_one_place_are_told_of():
@@ -217,7 +222,7 @@ def test_cameras_at_one_place_are_told_of():
         viewmat = camera.viewmat.copy()
         viewmat[:3, 3] = -viewmat[:3, :3] @ cameras[0].centre
         here.append(replace(camera, viewmat=viewmat))
-    found = Da3(ExactPredictor(here, photos))(photos)
+    found = unadjusted(ExactPredictor(here, photos))(photos)
     assert found.warnings[0].startswith("All photos seem to be taken from one place")
 
 
@@ -229,7 +234,7 @@ def test_one_camera_has_one_focal_length():
         K[0, 0] *= factor * 1.02
         K[1, 1] *= factor / 1.02
         cameras[i] = replace(cameras[i], K=K)
-    found = Da3(ExactPredictor(cameras, photos))(photos)
+    found = unadjusted(ExactPredictor(cameras, photos))(photos)
     wanted = ring_camera(0.0, SIZE).K[0, 0]
     focals = [camera.K[[0, 1], [0, 1]] for camera in found.cameras]
     np.testing.assert_allclose(focals, wanted * np.array([[1], [1], [1], [1.3]]) * np.ones(2))
@@ -242,7 +247,7 @@ def test_known_cameras_stay_and_set_world_and_unit():
     off[0, 2] += 0.2 * SIZE
     given = {photo.name: camera for photo, camera in zip(photos, cameras, strict=True)}
     predictor = ExactPredictor(cameras, photos, most=5)
-    found = Da3(predictor, cameras=given)(photos)
+    found = unadjusted(predictor, cameras=given)(photos)
     assert len(predictor.shown) > 1
     for camera, wanted, depth in zip(found.cameras, cameras, found.depths, strict=True):
         assert camera is wanted
@@ -250,7 +255,7 @@ def test_known_cameras_stay_and_set_world_and_unit():
         np.testing.assert_allclose(depth.ravel(), truth, rtol=1e-4)
     assert found.warnings == []
     given["04.png"] = replace(cameras[4], K=off)
-    found = Da3(predictor, cameras=given)(photos)
+    found = unadjusted(predictor, cameras=given)(photos)
     assert found.warnings[0].startswith("The principal point is far from the middle of 04.png")
 
 
@@ -270,7 +275,7 @@ def test_known_cameras_that_cannot_be_used(change, message):
     cameras, photos = scene(3)
     given = {photo.name: camera for photo, camera in zip(photos, cameras, strict=True)}
     with pytest.raises(IgsrError, match=message):
-        Da3(ExactPredictor(cameras, photos), cameras=change(given))(photos)
+        unadjusted(ExactPredictor(cameras, photos), cameras=change(given))(photos)
 
 
 def test_what_only_one_photo_says_is_not_trusted():
@@ -327,7 +332,7 @@ def small_photos(monkeypatch):
 
 @pytest.mark.parametrize("source", ["decoder", "rays"])
 def test_the_network_itself_on_photos_of_two_formats(small_photos, source):
-    estimator = Da3(Da3Predictor(hashed_network(), source))
+    estimator = unadjusted(Da3Predictor(hashed_network(), source))
     one, again = estimator(small_photos, seed=1), estimator(small_photos, seed=1)
     for photo, camera, depth, other in zip(
         small_photos, one.cameras, one.depths, again.cameras, strict=True
@@ -369,7 +374,7 @@ def test_numbers_that_are_not_finite_are_the_checkpoints_fault(small_photos):
     network = hashed_network()
     network.cam_dec.fc_t.bias.data.fill_(torch.nan)
     with pytest.raises(IgsrError, match=r"not finite for 00\.png; its checkpoint is damaged"):
-        Da3(Da3Predictor(network))(small_photos)
+        unadjusted(Da3Predictor(network))(small_photos)
 
 
 def test_passes_are_as_large_as_memory_allows(monkeypatch):

@@ -60,7 +60,8 @@ def estimate_poses(
             from photos of at most 1600 pixels.
         progress: called with a stage, how much of it is done, and how much there is.
         options: of the estimator alone: DUSt3R's ``checkpoint``, ``graph`` and ``cameras``; those
-            of Depth Anything 3, ``checkpoint``, ``cameras`` and ``cameras_from``.
+            of Depth Anything 3, ``checkpoint``, ``cameras``, ``cameras_from`` and
+            ``bundle_adjustment``.
 
     Returns:
         The registered photos, upright and undistorted, in one world frame of unknown scale; all are

@@ -50,10 +50,16 @@ def _da3(
     checkpoint: str | os.PathLike[str] | None = None,
     cameras: Mapping[str, Camera] | None = None,
     cameras_from: str = "decoder",
+    bundle_adjustment: bool = True,
 ) -> Estimator:
     from igsr.pose.da3.estimator import Da3
 
-    return Da3(checkpoint=checkpoint, cameras=cameras, cameras_from=cameras_from)
+    return Da3(
+        checkpoint=checkpoint,
+        cameras=cameras,
+        cameras_from=cameras_from,
+        bundle_adjustment=bundle_adjustment,
+    )
 
 
 def _da3_is_ready(options: Mapping[str, Any]) -> bool:

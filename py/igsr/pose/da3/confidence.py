@@ -16,7 +16,7 @@ from igsr.pose.alignment import AlignedPhoto
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
 
-#: A pixel's confidence is above this, and above this quantile of its photo's.
+#: A pixel's confidence is above this, and not below this quantile of its photo's.
 LEAST, QUANTILE = 1.05, 0.4
 #: Depths that differ by less than this part agree; neighbours that differ by more are at an edge.
 AGREES = 0.05
@@ -62,8 +62,8 @@ def _sure(photo: AlignedPhoto) -> Bool:
     known = np.isfinite(photo.depth) & (photo.depth > 0.0) & (photo.confidence > 1.0)
     if not known.any():
         return known
-    least = max(LEAST, float(np.quantile(photo.confidence[known], QUANTILE)))
-    return known & (photo.confidence > least)
+    surer = photo.confidence >= np.quantile(photo.confidence[known], QUANTILE)
+    return known & surer & (photo.confidence > LEAST)
 
 
 def _on_edge(depth: npt.NDArray[np.float32]) -> Bool:

@@ -15,6 +15,7 @@ from igsr.capture.photo_folder import FEWEST, Photo
 from igsr.errors import IgsrError
 from igsr.geometry.similarity import similarity_between
 from igsr.pose.alignment import AlignedPhoto
+from igsr.pose.da3.bundle_adjustment import with_adjusted_cameras
 from igsr.pose.da3.chunks import chunks_of, joined, mapped
 from igsr.pose.da3.confidence import trusted_depths
 from igsr.pose.da3.passes import SOURCES, Predictor
@@ -42,6 +43,7 @@ class Da3:
             and depths are found for them.
         cameras_from: "decoder", the network's prediction of cameras, or "rays", what fits its
             prediction of every pixel's ray best; that takes longer.
+        bundle_adjustment: whether cameras that are found are adjusted where photos share features.
     """
 
     name = "da3"
@@ -52,12 +54,14 @@ class Da3:
         checkpoint: str | os.PathLike[str] | None = None,
         cameras: Mapping[str, Camera] | None = None,
         cameras_from: str = SOURCES[0],
+        bundle_adjustment: bool = True,
     ) -> None:
         """Keep the settings; nothing is loaded yet."""
         self.predictor = predictor
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.cameras = dict(cameras or {})
         self.cameras_from = cameras_from
+        self.bundle_adjustment = bundle_adjustment
 
     def __call__(
         self,
@@ -73,8 +77,9 @@ class Da3:
 
         Args:
             photos: at least two, of which two differ.
-            seed: of what samples rays.
-            progress: called with ("passes", photos that are done, photos of all passes).
+            seed: of what samples rays and verifies matches.
+            progress: called with ("passes", photos that are done, photos of all passes), then with
+                COLMAP's stages.
 
         Raises:
             IgsrError: there are under two different photos, cameras are known of some photos only,
@@ -102,6 +107,7 @@ class Da3:
             if progress is not None:
                 progress("passes", done, in_all)
         lost: list[int] = []
+        adjusted = 0
         if self.cameras:
             world = {i: one for each in reversed(passes) for i, one in each.items()}
         else:
@@ -109,7 +115,14 @@ class Da3:
         aligned = [world.get(i) for i in range(len(shown))]
         if not self.cameras:
             aligned = with_shared_focals(shown, aligned)
+            if self.bundle_adjustment:
+                aligned, adjusted = with_adjusted_cameras(shown, aligned, seed, progress)
         found = self._estimate(photos, shown, same_as, aligned, lost)
+        if self.bundle_adjustment and not self.cameras and adjusted < FEWEST:
+            found.warnings.append(
+                "Cameras are as Depth Anything 3 predicts them and may be degrees off: the photos "
+                "share too few features for bundle adjustment"
+            )
         found.weights = weights
         return found
 
