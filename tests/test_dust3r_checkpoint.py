@@ -314,3 +314,19 @@ def test_devices_that_are_not_there(tmp_path):
         warnings.simplefilter("ignore")
         with pytest.raises(IgsrError, match="device 'toaster'"):
             load_network(path, "toaster")
+
+
+@pytest.mark.parametrize(
+    "before", [[], [argparse.Namespace], [argparse.Namespace, zipfile.ZipInfo]]
+)
+def test_torchs_safe_globals_are_left_as_they_were(tmp_path, before):
+    path = saved(tmp_path / "a.pth")
+    damaged = tmp_path / "b.pth"
+    damaged.write_bytes(path.read_bytes()[:-100])
+    with torch.serialization.safe_globals(before):
+        wanted = set(torch.serialization.get_safe_globals())
+        assert wanted >= set(before)
+        load_checkpoint(path)
+        with pytest.raises(IgsrError):
+            load_checkpoint(damaged)
+        assert set(torch.serialization.get_safe_globals()) == wanted

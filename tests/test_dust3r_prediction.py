@@ -21,7 +21,8 @@ from igsr.pose.dust3r.prediction import (
     memory_bound,
     stride_for,
 )
-from igsr.pose.dust3r.preprocessing import crop_of, network_input, usable
+from igsr.pose.dust3r.preprocessing import crop_of, network_input
+from igsr.pose.photo_samples import usable
 
 
 def photo(width, height, name="a.jpg", seed=0, mask=None, channels=3):

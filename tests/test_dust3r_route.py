@@ -17,6 +17,7 @@ from igsr.capture.write_colmap import write_colmap
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
+from igsr.pose import fused_points as fused_points_module
 from igsr.pose import registry
 from igsr.pose.alignment import TRUSTED, Grid, PairPrediction
 from igsr.pose.dust3r import estimator as estimator_module
@@ -231,7 +232,7 @@ def test_devices_have_focal_lengths_of_their_own(scene):
 
 
 def test_points_are_bounded(scene, monkeypatch):
-    monkeypatch.setattr(estimator_module, "MOST_POINTS", 50)
+    monkeypatch.setattr(fused_points_module, "MOST_POINTS", 50)
     points = Dust3r(scene.predictor)(scene.photos).points
     assert len(points.xyz) == len(points.rgb) == len(points.confidence) == 50
     assert len(np.unique(points.confidence)) > 1  # of more than one photo

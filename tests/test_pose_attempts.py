@@ -15,7 +15,7 @@ from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.colmap import attempts
 from igsr.pose.colmap.attempts import mapped
 from igsr.pose.colmap.database import image_id, list_photos
-from igsr.pose.colmap.estimator import _guarded
+from igsr.pose.colmap.estimator import guarded
 from igsr.pose.colmap.evidence import STEPS
 from igsr.pose.colmap.features import find_features
 from igsr.pose.colmap.mapping import extend, map_photos
@@ -145,7 +145,7 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
 
     photos = rooms.photos(CAMERAS)
     features = tmp_path / "features.db"
-    with _guarded(0):
+    with guarded(0):
         list_photos(photos, features)
         find_features(photos, tmp_path, features, silent)
         matches = matched(5, features, 0, silent)

@@ -61,6 +61,9 @@ class _Commands(LazyGroup):
         "denoise": LazyCommand(
             "igsr.cli.denoise", "app", "Make training pairs, train the denoiser, apply it."
         ),
+        "weights": LazyCommand(
+            "igsr.cli.weights", "app", "List and download the weights of pose networks."
+        ),
         "study": LazyCommand(
             "igsr.cli.study", "app", "Run the experiments of the literature and of docs/."
         ),

@@ -50,15 +50,15 @@ EstimatorOption = Annotated[
     typer.Option(
         "--estimator",
         metavar="NAME",
-        help=f"What finds the cameras: {', '.join(ESTIMATORS)}, or auto, the first of these that "
-        "can run.",
+        help=f"What finds the cameras: {', '.join(ESTIMATORS)}, or auto: dust3r where its weights "
+        "are found, else colmap.",
     ),
 ]
 
 
 CheckpointOption = Annotated[
     Path | None,
-    typer.Option("--checkpoint", metavar="FILE", help="For dust3r: the weights."),
+    typer.Option("--checkpoint", metavar="FILE", help="For dust3r and da3: the weights."),
 ]
 
 
@@ -87,7 +87,7 @@ class CameraFinder:
 
     Attributes:
         estimator: a name of ``igsr.pose.registry.ESTIMATORS``, or "auto".
-        checkpoint: weights of dust3r's network, or None.
+        checkpoint: weights of the estimator's network, or None.
         graph: which pairs of photos dust3r sees, or None for its default.
         frames: number of frames taken from each video.
         seed: of everything random.
@@ -278,6 +278,7 @@ def _posed(
         "not_placed": found.not_placed,
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "warnings": found.estimate.warnings,
+        "weights": found.estimate.weights,
         "seed": finder.seed,
         "version": _core.__version__,
         "out": str(out),

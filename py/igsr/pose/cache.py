@@ -34,6 +34,8 @@ FOUND = "found.npz"
 USAGE = "usage.json"
 #: Fewer registered photos than this part of all end a fit that does not allow it.
 ENOUGH = 0.5
+#: Estimators that need fewer matches between photos than COLMAP does.
+NETWORKS = ("dust3r", "da3")
 #: Names shown of a long list.
 _NAMED = 5
 
@@ -137,9 +139,11 @@ def check_enough_placed(
         return
     lost = found.not_placed
     more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
-    network = ""
-    if found.made_by.get("estimator") != "dust3r" and ESTIMATORS["dust3r"].ready(options):
-        network = ", try --estimator dust3r"
+    used = found.made_by.get("estimator")
+    # A checkpoint that was named is that of the network which ran.
+    known = {} if used in NETWORKS else options
+    ready = [name for name in NETWORKS if name != used and ESTIMATORS[name].ready(known)]
+    network = f", try --estimator {' or '.join(ready)}" if ready else ""
     raise IgsrError(
         f"Only {placed} of {count} photos could be placed, not {', '.join(lost[:_NAMED])}{more}: "
         f"take photos between them that overlap more, leave out what shows another scene{network}, "

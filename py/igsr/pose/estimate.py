@@ -31,6 +31,8 @@ class Estimate:
         warnings: messages for the user: which photos are not registered, and why.
         lenses: per photo the distortion that ``cameras`` leave out, None for none; an empty list
             says none for all. ``igsr.estimate_poses`` undoes it.
+        weights: of the network that was used: its "name", the "licence" that its publisher states,
+            and the "sha256" of its file; None where there is none.
     """
 
     cameras: list[Camera | None]
@@ -39,6 +41,7 @@ class Estimate:
     trusted: list[np.ndarray | None]
     warnings: list[str]
     lenses: list[Lens | None] = field(default_factory=list)
+    weights: dict[str, str] | None = None
 
 
 class Estimator(Protocol):
@@ -54,7 +57,7 @@ class Estimator(Protocol):
         Args:
             photos: upright, their names unique.
             seed: random seed; deterministic for a given seed.
-            progress: called with a stage ("pairs", "alignment", "features", "matching" or
+            progress: called with a stage ("pairs", "passes", "alignment", "features", "matching" or
                 "mapping"), how much of it is done, and how much there is.
 
         Raises:

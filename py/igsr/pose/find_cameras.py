@@ -50,16 +50,18 @@ def estimate_poses(
 
     Args:
         photos: a folder, a video, or a list of files or of ``Photo``.
-        estimator: "colmap" (nothing to download), "dust3r" (a network, whose checkpoint the user
-            has), or "auto": the cameras that the folder already has, else DUSt3R where a checkpoint
-            is found, else COLMAP.
+        estimator: "colmap" (nothing to download), "dust3r" or "da3" (networks, whose checkpoint
+            the user has), or "auto": the cameras that the folder already has, else DUSt3R where a
+            checkpoint is found, else COLMAP.
         seed: random seed; deterministic for a given seed.
         frames: how many frames are taken of each video.
         max_size: longest side, in pixels, of the capture's photos; larger ones are reduced, none is
             enlarged. None keeps all as they are. The cameras do not depend on it: they are found
             from photos of at most 1600 pixels.
         progress: called with a stage, how much of it is done, and how much there is.
-        options: of the estimator alone: DUSt3R's ``checkpoint``, ``graph`` and ``cameras``.
+        options: of the estimator alone: DUSt3R's ``checkpoint``, ``graph`` and ``cameras``; those
+            of Depth Anything 3, ``checkpoint``, ``cameras``, ``cameras_from`` and
+            ``bundle_adjustment``.
 
     Returns:
         The registered photos, upright and undistorted, in one world frame of unknown scale; all are

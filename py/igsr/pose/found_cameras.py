@@ -147,6 +147,7 @@ class FoundCameras:
             "warnings": found.warnings,
             "track_names": points.tracks.names if points and points.tracks else [],
             "made_by": self.made_by,
+            "weights": found.weights,
         }
         arrays[_ABOUT] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
         file = io.BytesIO()
@@ -178,6 +179,7 @@ def read_found(path: Path) -> FoundCameras:
         estimate = Estimate(
             cameras, points, [None] * count, trusted, _texts(about["warnings"]), lenses
         )
+        estimate.weights = _weights(about.get("weights"))
         if len(set(names)) < count or not isinstance(about["made_by"], dict):
             raise ValueError("its names or settings are wrong")
         return FoundCameras(names, estimate, about["made_by"])
@@ -191,6 +193,14 @@ def _texts(value: Any) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
         raise ValueError("it has something else where texts belong")
     return value
+
+
+def _weights(value: Any) -> dict[str, str] | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        raise ValueError("it has something else where weights belong")
+    return dict(zip(_texts(list(value)), _texts(list(value.values())), strict=True))
 
 
 def _camera(arrays: dict[str, np.ndarray], index: int, size: Any) -> Camera | None:

@@ -46,8 +46,32 @@ def _colmap() -> Estimator:
     return Colmap()
 
 
-#: In the order that "auto" tries them; the last is always ready.
+def _da3(
+    checkpoint: str | os.PathLike[str] | None = None,
+    cameras: Mapping[str, Camera] | None = None,
+    cameras_from: str = "decoder",
+    bundle_adjustment: bool = True,
+) -> Estimator:
+    from igsr.pose.da3.estimator import Da3
+
+    return Da3(
+        checkpoint=checkpoint,
+        cameras=cameras,
+        cameras_from=cameras_from,
+        bundle_adjustment=bundle_adjustment,
+    )
+
+
+def _da3_is_ready(options: Mapping[str, Any]) -> bool:
+    from igsr.pose.da3.checkpoint import find_checkpoint
+
+    return find_checkpoint(options.get("checkpoint")) is not None
+
+
+#: In the order that "auto" tries them. COLMAP is always ready: what stands behind it is taken by
+#: name only, as Depth Anything 3, of which nobody measured that it finds better cameras.
 ESTIMATORS = {
     "dust3r": Entry(_dust3r, _dust3r_is_ready),
     "colmap": Entry(_colmap, lambda options: True),
+    "da3": Entry(_da3, _da3_is_ready),
 }

@@ -44,7 +44,7 @@ class Colmap:
                 "is mostly enough",
                 stacklevel=2,
             )
-        with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, _guarded(seed):
+        with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, guarded(seed):
             workspace = Path(folder)
             database = workspace / "database.db"
             list_photos(photos, database)
@@ -56,8 +56,15 @@ class Colmap:
 
 
 @contextlib.contextmanager
-def _guarded(seed: int) -> Iterator[None]:
-    """pycolmap without its log, with a fixed seed, and with failures as error messages."""
+def guarded(seed: int) -> Iterator[None]:
+    """pycolmap without its log, with a fixed seed, and with failures as error messages.
+
+    Args:
+        seed: random seed.
+
+    Raises:
+        IgsrError: COLMAP fails.
+    """
     import pycolmap
 
     level = pycolmap.logging.minloglevel

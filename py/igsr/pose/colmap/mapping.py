@@ -17,7 +17,9 @@ def map_photos(
 
     models = pycolmap.ReconstructionManager()
     with pycolmap.Database.open(database) as opened:
-        pipeline = pycolmap.IncrementalPipeline(_options(count, evidence, seed), opened, models)
+        pipeline = pycolmap.IncrementalPipeline(
+            mapping_options(count, evidence, seed), opened, models
+        )
         _tell(pipeline, _Placed(count, 0, show))
         pipeline.run()
     found = [models.get(index) for index in range(models.size())]
@@ -30,7 +32,7 @@ def extend(
     """Add photos to a model, in place, with points that its own photos have by new matches."""
     import pycolmap
 
-    options = _options(count, evidence, seed)
+    options = mapping_options(count, evidence, seed)
     mapper_options, triangulation = options.get_mapper(), options.get_triangulation()
     with pycolmap.Database.open(database) as opened:
         pipeline = pycolmap.IncrementalPipeline(options, opened, pycolmap.ReconstructionManager())
@@ -51,7 +53,8 @@ def extend(
         mapper.end_reconstruction(False)
 
 
-def _options(count: int, evidence: Evidence, seed: int) -> Any:
+def mapping_options(count: int, evidence: Evidence, seed: int) -> Any:
+    """COLMAP's options for ``count`` photos, with one thread so that sums come in one order."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()

@@ -7,12 +7,13 @@ constructor call, and safetensors with the sizes in a ``config.json`` beside it.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import re
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from igsr.errors import IgsrError
 from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig
+from igsr.pose.huggingface_cache import cached_snapshots
 
 #: Names a checkpoint that is to be used wherever it lies.
 VARIABLE = "IGSR_DUST3R"
@@ -106,7 +108,8 @@ def find_checkpoint(named: str | Path | None = None) -> Path | None:
             return path
     hub = Path(torch.hub.get_dir()) / "checkpoints"
     for name in PUBLISHED:
-        for path in (hub / f"{name}.pth", *_snapshots(name)):
+        cached = [one / "model.safetensors" for one in cached_snapshots(f"naver/{name}")]
+        for path in (hub / f"{name}.pth", *cached):
             if _is_file(path):
                 return path
     return None
@@ -185,25 +188,22 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _snapshots(name: str) -> list[Path]:
-    """Safetensors of a published model in huggingface_hub's cache, the current revision first."""
-    home = os.environ.get("HF_HOME") or (
-        Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "huggingface"
-    )
-    cache = Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
-    model = cache / f"models--naver--{name}"
-    try:
-        current = (model / "refs" / "main").read_text(errors="replace").strip()
-    except OSError:
-        current = ""
-    snapshots = sorted(model.glob("snapshots/*/"), key=lambda folder: folder.name)
-    snapshots.sort(key=lambda folder: folder.name != current)
-    return [folder / "model.safetensors" for folder in snapshots]
-
-
 def _without_weights(config: NetworkConfig) -> Dust3rNetwork:
     with torch.device("meta"):
         return Dust3rNetwork(config).eval()
+
+
+@contextlib.contextmanager
+def _safe(name: type) -> Iterator[None]:
+    """Let torch's restricted reader make one more class for a while.
+
+    torch's own context manager takes a class off the list at the end that was on it before.
+    """
+    if name in torch.serialization.get_safe_globals():
+        yield
+        return
+    with torch.serialization.safe_globals([name]):
+        yield
 
 
 def _read_torch(path: Path) -> tuple[NetworkConfig, dict[str, Any]]:
@@ -217,7 +217,7 @@ def _read_torch(path: Path) -> tuple[NetworkConfig, dict[str, Any]]:
                 held > path.stat().st_size
             ):
                 raise IgsrError(damaged)
-        with torch.serialization.safe_globals([argparse.Namespace]):
+        with _safe(argparse.Namespace):
             content = torch.load(path, map_location="cpu", mmap=True, weights_only=True)
     except IgsrError:
         raise

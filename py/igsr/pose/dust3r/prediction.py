@@ -22,7 +22,8 @@ from igsr.errors import IgsrError
 from igsr.pose.alignment.predictions import Grid, PairPrediction
 from igsr.pose.dust3r.heads import PATCH
 from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig, Tokens
-from igsr.pose.dust3r.preprocessing import Crop, crop_of, network_input, usable
+from igsr.pose.dust3r.preprocessing import Crop, crop_of, network_input
+from igsr.pose.photo_samples import usable
 
 Float32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]

@@ -16,6 +16,7 @@ from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.alignment.predictions import Grid
 from igsr.pose.dust3r.heads import PATCH
+from igsr.pose.photo_samples import over_white
 
 Float32 = npt.NDArray[np.float32]
 
@@ -114,7 +115,7 @@ def crop_of(photo: Photo, image_size: int) -> Crop:
 
 def network_input(photo: Photo, crop: Crop) -> Float32:
     """The pixels [3, h, w] of a crop in [-1, 1]; what is transparent is white."""
-    image = Image.fromarray(_opaque(photo.image))
+    image = Image.fromarray(over_white(photo.image))
     # Resampling is that of the models' training: it shows in the predictions.
     shrinks = max(crop.photo_width, crop.photo_height) > max(
         crop.resized_width, crop.resized_height
@@ -124,29 +125,3 @@ def network_input(photo: Photo, crop: Crop) -> Float32:
     part = resized[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
     values = part.transpose(2, 0, 1).astype(np.float32) / np.float32(255.0)
     return (values - np.float32(0.5)) / np.float32(0.5)
-
-
-def usable(photo: Photo, grid: Grid) -> npt.NDArray[np.bool_]:
-    """Which samples [h, w] of a grid fall on pixels that are neither masked nor transparent."""
-    column = _sampled(grid.width, grid.scale_x, grid.offset_x, photo.image.shape[1])
-    row = _sampled(grid.height, grid.scale_y, grid.offset_y, photo.image.shape[0])
-    at = np.ix_(row, column)
-    shown = np.ones((grid.height, grid.width), dtype=bool)
-    if photo.mask is not None:
-        shown &= photo.mask[at]
-    if photo.image.shape[2] == 4:
-        shown &= photo.image[..., 3][at] > 0
-    return shown
-
-
-def _sampled(count: int, scale: float, offset: float, size: int) -> npt.NDArray[np.int64]:
-    at = (np.arange(count) + 0.5) * scale + offset
-    return np.clip(np.floor(at).astype(np.int64), 0, size - 1)
-
-
-def _opaque(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    if image.shape[2] == 3:
-        return image
-    alpha = image[..., 3:].astype(np.uint16)
-    over_white = image[..., :3] * alpha + 255 * (255 - alpha)
-    return ((over_white + 127) // 255).astype(np.uint8)

@@ -1,0 +1,67 @@
+"""``igsr weights``: list, download and find the weights of pose networks."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from igsr.cli.error_messages import error_messages, print_message
+from igsr.cli.shared import JsonOption, output_console, print_json
+from igsr.pose.huggingface_cache import cache_folder
+from igsr.pose.weights import KNOWN, fetch_weights, known_weights, weights_path
+
+app = typer.Typer(
+    help="List, download and find the weights of pose networks.", no_args_is_help=True
+)
+
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help=f"One of {', '.join(KNOWN)}.")]
+
+
+@app.command("list")
+def list_command(as_json: JsonOption = False) -> None:
+    """List the weights that igsr can use, their licences, and which are downloaded."""
+    with error_messages():
+        rows = [
+            {
+                "name": one.name,
+                "estimator": one.estimator,
+                "licence": one.licence,
+                "bytes": one.size,
+                "page": one.page,
+                "purpose": one.purpose,
+                "path": None if one.path is None else str(one.path),
+            }
+            for one in KNOWN.values()
+        ]
+        if as_json:
+            print_json({"cache": str(cache_folder()), "weights": rows})
+            return
+        console = output_console()
+        for one in KNOWN.values():
+            state = "downloaded" if one.path else "not downloaded"
+            console.print(
+                f"{one.name:15} {one.size / 1e9:4.2f} GB  {one.licence:16} {state:14}  "
+                f"--estimator {one.estimator}: {one.purpose}",
+                soft_wrap=True,
+            )
+        console.print(f"cache: {cache_folder()}", style="dim", soft_wrap=True)
+
+
+@app.command("fetch")
+def fetch_command(name: NameArgument) -> None:
+    """Download weights NAME to the cache, check them, and print where they are."""
+    with error_messages(lambda: "Interrupted; nothing unfinished is kept."):
+        weights = known_weights(name)
+        if weights.fetched:
+            print_message(f"{name} is published under {weights.licence}: {weights.page}")
+        path = fetch_weights(name)
+    typer.echo(path)
+
+
+@app.command("path")
+def path_command(name: NameArgument) -> None:
+    """Print where the downloaded weights NAME are."""
+    with error_messages():
+        path = weights_path(name)
+    typer.echo(path)

@@ -1,0 +1,307 @@
+"""Cameras of photos by Depth Anything 3: one pass over all photos, or several that are joined."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from igsr.capture import Camera
+from igsr.capture.photo_folder import FEWEST, Photo
+from igsr.errors import IgsrError
+from igsr.geometry.similarity import similarity_between
+from igsr.pose.alignment import AlignedPhoto
+from igsr.pose.da3.bundle_adjustment import with_adjusted_cameras
+from igsr.pose.da3.chunks import chunks_of, joined, mapped
+from igsr.pose.da3.confidence import trusted_depths
+from igsr.pose.da3.passes import SOURCES, Predictor
+from igsr.pose.estimate import Estimate
+from igsr.pose.fused_points import fused_points
+from igsr.pose.photo_samples import usable
+
+#: Distance of a principal point from the middle, in units of the side, that is told of: the network
+#: takes it to be in the middle.
+OFF_CENTRE = 0.05
+#: Greatest distance of cameras, in units of the median depth, that is called one place.
+ONE_PLACE = 1e-3
+#: Names shown of a long list.
+_NAMED = 5
+
+
+class Da3:
+    """Depth Anything 3 (arXiv 2511.10647) as an estimator.
+
+    Args:
+        predictor: what stands where the network stands; by default the network itself.
+        checkpoint: safetensors file with the network's weights, or the folder that it lies in; by
+            default where they usually lie.
+        cameras: by photo name, the cameras of all photos, if they are known; they stay as they are,
+            and depths are found for them.
+        cameras_from: "decoder", the network's prediction of cameras, or "rays", what fits its
+            prediction of every pixel's ray best; that takes longer.
+        bundle_adjustment: whether cameras that are found are adjusted where photos share features.
+    """
+
+    name = "da3"
+
+    def __init__(
+        self,
+        predictor: Predictor | None = None,
+        checkpoint: str | os.PathLike[str] | None = None,
+        cameras: Mapping[str, Camera] | None = None,
+        cameras_from: str = SOURCES[0],
+        bundle_adjustment: bool = True,
+    ) -> None:
+        """Keep the settings; nothing is loaded yet."""
+        self.predictor = predictor
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.cameras = dict(cameras or {})
+        self.cameras_from = cameras_from
+        self.bundle_adjustment = bundle_adjustment
+
+    def __call__(
+        self,
+        photos: Sequence[Photo],
+        *,
+        seed: int = 0,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> Estimate:
+        """Find the cameras of photos, or depths for cameras that are known.
+
+        Photos of one device, size and EXIF focal length, upright or not, share their focal length;
+        principal points are in the middle. Photos that are the same picture get the same camera.
+
+        Args:
+            photos: at least two, of which two differ.
+            seed: of what samples rays and verifies matches.
+            progress: called with ("passes", photos that are done, photos of all passes), then with
+                COLMAP's stages.
+
+        Raises:
+            IgsrError: there are under two different photos, cameras are known of some photos only,
+                of none of them or of another size, no checkpoint is found, a photo is too narrow,
+                or two photos do not fit into memory.
+        """
+        different, same_as = _different(photos)
+        if len(different) < FEWEST:
+            only = f"; all are the same as {photos[0].name}" if len(photos) > 1 else ""
+            raise IgsrError(f"Cameras are found from {FEWEST} different photos at least{only}")
+        self._check_cameras(photos)
+        predictor, weights = (self.predictor, None) if self.predictor else self._network()
+        shown = [photos[i] for i in different]
+        chunks = chunks_of(len(shown), predictor.most_photos(shown))
+        in_all, done = sum(len(chunk) for chunk in chunks), 0
+        passes = []
+        for chunk in chunks:
+            part = [shown[i] for i in chunk]
+            known = [self.cameras[photo.name] for photo in part] if self.cameras else None
+            _check_apart(known)
+            predicted = predictor(part, known, seed)
+            placed = {i: one for i, one in zip(chunk, predicted, strict=True) if one is not None}
+            passes.append(self._with_given(placed, shown) if known else placed)
+            done += len(chunk)
+            if progress is not None:
+                progress("passes", done, in_all)
+        lost: list[int] = []
+        adjusted = 0
+        if self.cameras:
+            world = {i: one for each in reversed(passes) for i, one in each.items()}
+        else:
+            world, lost = joined(passes)
+        aligned = [world.get(i) for i in range(len(shown))]
+        if not self.cameras:
+            aligned = with_shared_focals(shown, aligned)
+            if self.bundle_adjustment:
+                aligned, adjusted = with_adjusted_cameras(shown, aligned, seed, progress)
+        found = self._estimate(photos, shown, same_as, aligned, lost)
+        if self.bundle_adjustment and not self.cameras and adjusted < FEWEST:
+            found.warnings.append(
+                "Cameras are as Depth Anything 3 predicts them and may be degrees off: the photos "
+                "share too few features for bundle adjustment"
+            )
+        found.weights = weights
+        return found
+
+    def _estimate(
+        self,
+        photos: Sequence[Photo],
+        shown: Sequence[Photo],
+        same_as: Sequence[int],
+        aligned: Sequence[AlignedPhoto | None],
+        lost: Sequence[int],
+    ) -> Estimate:
+        trusted = trusted_depths(aligned)
+        for photo, placed, sure in zip(shown, aligned, trusted, strict=True):
+            if placed is not None and sure is not None:
+                sure &= usable(photo, placed.grid)
+        places = [aligned[i] for i in same_as]
+        return Estimate(
+            cameras=[
+                self.cameras.get(photo.name) if one is None or self.cameras else one.camera
+                for photo, one in zip(photos, places, strict=True)
+            ],
+            points=fused_points(shown, aligned, trusted),
+            depths=[None if one is None else one.depth for one in places],
+            trusted=[trusted[i] for i in same_as],
+            warnings=self._warnings(photos, shown, aligned, lost),
+        )
+
+    def _warnings(
+        self,
+        photos: Sequence[Photo],
+        shown: Sequence[Photo],
+        aligned: Sequence[AlignedPhoto | None],
+        lost: Sequence[int],
+    ) -> list[str]:
+        found = []
+        no_camera = [
+            photo.name
+            for i, (photo, one) in enumerate(zip(shown, aligned, strict=True))
+            if one is None and i not in lost
+        ]
+        if no_camera:
+            found.append(
+                f"Not registered: {_names(no_camera)}. What Depth Anything 3 predicts for them is "
+                "no camera; leave them out, or take more photos between them and the others"
+            )
+        if lost:
+            found.append(
+                f"Not registered: {_names([shown[i].name for i in lost])}. Their pass shares "
+                "nothing with the others that both are sure of; name photos in the order they were "
+                "taken"
+            )
+        placed = [one for one in aligned if one is not None]
+        if len(placed) > 1:
+            centres = np.stack([one.camera.centre for one in placed])
+            spread = float(np.linalg.norm(centres - centres[0], axis=1).max())
+            if spread <= ONE_PLACE * float(np.median([np.nanmedian(one.depth) for one in placed])):
+                found.append(
+                    "All photos seem to be taken from one place, from where nothing shows how far "
+                    "things are; take photos from different places"
+                )
+        off = [
+            name
+            for name, camera in self.cameras.items()
+            if abs(camera.K[0, 2] / camera.width - 0.5) > OFF_CENTRE
+            or abs(camera.K[1, 2] / camera.height - 0.5) > OFF_CENTRE
+        ]
+        if off:
+            found.append(
+                f"The principal point is far from the middle of {_names(off)}, where Depth "
+                "Anything 3 takes it to be, so depths may be off; give whole photos, not parts"
+            )
+        return found
+
+    def _with_given(
+        self, placed: dict[int, AlignedPhoto], shown: Sequence[Photo]
+    ) -> dict[int, AlignedPhoto]:
+        """A pass brought to the world of the cameras that are known, with those cameras."""
+        if not placed:
+            return placed
+        given = {i: self.cameras[shown[i].name] for i in placed}
+        order = sorted(placed)
+        similarity = similarity_between(
+            [placed[i].camera for i in order], [given[i] for i in order]
+        )
+        return {i: replace(mapped(placed[i], similarity), camera=given[i]) for i in order}
+
+    def _network(self) -> tuple[Predictor, dict[str, str]]:
+        from igsr.pose.da3.checkpoint import LICENCE, find_checkpoint, load_network
+        from igsr.pose.da3.config import SIZES
+        from igsr.pose.da3.passes import Da3Predictor
+        from igsr.pose.weights import sha256_of
+
+        found = find_checkpoint(self.checkpoint)
+        if found is None:
+            raise IgsrError(
+                "no checkpoint of Depth Anything 3 is found; get one by 'igsr weights fetch "
+                "da3-base', or name one by --checkpoint"
+            )
+        network = load_network(found)
+        name = next((name for name, size in SIZES.items() if size == network.config), "")
+        weights = {"name": name, "licence": LICENCE, "sha256": sha256_of(found)}
+        return Da3Predictor(network, self.cameras_from), weights
+
+    def _check_cameras(self, photos: Sequence[Photo]) -> None:
+        sizes = {photo.name: photo.image.shape[:2] for photo in photos}
+        for name, camera in self.cameras.items():
+            if name not in sizes:
+                raise IgsrError(f"cameras names {name!r}, which is none of the photos")
+            if sizes[name] != (camera.height, camera.width):
+                height, width = sizes[name]
+                raise IgsrError(
+                    f"the camera given for {name} is of {camera.width} x {camera.height} pixels, "
+                    f"and the photo has {width} x {height}; scale its intrinsics"
+                )
+        missing = [name for name in sizes if name not in self.cameras]
+        if self.cameras and missing:
+            raise IgsrError(
+                f"cameras has none for {_names(missing)}; Depth Anything 3 takes the cameras of "
+                "all photos or of none"
+            )
+
+
+def _check_apart(cameras: Sequence[Camera] | None) -> None:
+    centres = [camera.centre for camera in cameras or ()]
+    if centres and np.allclose(centres, centres[0]):
+        raise IgsrError(
+            "the cameras given for photos of one pass all stand at one place, which sets no scale; "
+            "leave cameras out"
+        )
+
+
+def with_shared_focals(
+    photos: Sequence[Photo], aligned: Sequence[AlignedPhoto | None]
+) -> list[AlignedPhoto | None]:
+    """The photos with one focal length for those of one camera, in both directions.
+
+    The network predicts one for each photo and direction. They differ by some per cent even where a
+    lens has only one.
+
+    Args:
+        photos: of one device, size and EXIF focal length were taken by one camera.
+        aligned: what is known of them; None where one has no place.
+    """
+    focals: dict[Hashable, list[float]] = {}
+    for photo, one in zip(photos, aligned, strict=True):
+        if one is not None:
+            K = one.camera.K
+            focals.setdefault(_camera_key(photo), []).append(float(np.sqrt(K[0, 0] * K[1, 1])))
+    result: list[AlignedPhoto | None] = []
+    for photo, one in zip(photos, aligned, strict=True):
+        if one is not None:
+            K = one.camera.K.copy()
+            K[0, 0] = K[1, 1] = float(np.median(focals[_camera_key(photo)]))
+            one = replace(one, camera=replace(one.camera, K=K))
+        result.append(one)
+    return result
+
+
+def _camera_key(photo: Photo) -> Hashable:
+    """Equal for photos that one camera took, upright or not."""
+    return photo.device, photo.focal, *sorted(photo.image.shape[:2])
+
+
+def _different(photos: Sequence[Photo]) -> tuple[list[int], list[int]]:
+    """Indices of the photos that differ, and per photo which of these it is the same as."""
+    first: dict[Hashable, int] = {}
+    different: list[int] = []
+    same_as: list[int] = []
+    for i, photo in enumerate(photos):
+        content = hashlib.sha256(photo.image.tobytes()).digest()
+        masked = None if photo.mask is None else np.packbits(photo.mask).tobytes()
+        key = photo.image.shape, content, masked
+        if key not in first:
+            first[key] = len(different)
+            different.append(i)
+        same_as.append(first[key])
+    return different, same_as
+
+
+def _names(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more

@@ -1,0 +1,396 @@
+"""The Depth Anything 3 route, photos to estimate, with exact depths in the network's place."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from da3_networks import hashed_network
+from safetensors.torch import save_file
+from scenes import ring_camera
+
+from igsr.capture import Camera
+from igsr.capture.photo_folder import Photo
+from igsr.errors import IgsrError
+from igsr.geometry.pose_errors import pose_errors
+from igsr.geometry.similarity import Similarity, similarity_between
+from igsr.pose import FoundCameras, estimate, read_found
+from igsr.pose.alignment import AlignedPhoto
+from igsr.pose.da3 import passes
+from igsr.pose.da3.chunks import chunks_of, joined, mapped
+from igsr.pose.da3.confidence import trusted_depths
+from igsr.pose.da3.config import BASE, SIZES
+from igsr.pose.da3.estimator import Da3, with_shared_focals
+from igsr.pose.da3.passes import Da3Predictor, memory_of_pass, resamplings_of
+from igsr.pose.da3.preprocessing import resampling_of
+
+SIZE = 64
+
+
+def spheres(camera, pixels):
+    """Depths [P] of a ball inside a hollow one, as a camera sees them at pixels [P, 2]."""
+    K, rotation = camera.K, camera.viewmat[:3, :3]
+    local = np.pad((pixels - K[[0, 1], 2]) / K[[0, 1], [0, 1]], ((0, 0), (0, 1)), constant_values=1)
+    rays, centre = local @ rotation, camera.centre
+    a, b = (rays * rays).sum(1), rays @ centre
+
+    def hit(radius, sign):
+        inside = b * b - a * (centre @ centre - radius**2)
+        return np.where(inside > 0, (-b + sign * np.sqrt(np.maximum(inside, 0))) / a, np.nan)
+
+    ball, shell = hit(1.0, -1), hit(9.0, 1)
+    return np.where(np.isfinite(ball), ball, shell)
+
+
+def scene(count, width=SIZE, height=SIZE, step=0.25):
+    """Cameras on a ring and photos of noise."""
+    random = np.random.default_rng(count)
+    cameras, photos = [], []
+    for i in range(count):
+        camera = ring_camera(step * i, SIZE)
+        K = camera.K.copy()
+        K[:2, 2] = width / 2, height / 2
+        cameras.append(Camera(camera.viewmat, K, width, height))
+        image = random.integers(0, 256, (height, width, 3), dtype=np.uint8)
+        photos.append(Photo(f"{i:02}.png", image, device="phone"))
+    return cameras, photos
+
+
+class ExactPredictor:
+    """Exact depths and cameras, every pass in a world and a unit of its own."""
+
+    def __init__(self, cameras, photos, most=99, worlds=True):
+        self.cameras = {photo.name: camera for photo, camera in zip(photos, cameras, strict=True)}
+        self.most, self.worlds = most, worlds
+        self.shown = []
+
+    def most_photos(self, photos):
+        return self.most
+
+    def __call__(self, photos, cameras, seed):
+        self.shown.append([photo.name for photo in photos])
+        random = np.random.default_rng(len(self.shown))
+        rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        rotation *= np.sign(np.linalg.det(rotation))
+        world = Similarity(random.uniform(0.1, 5.0), rotation, random.normal(size=3))
+        return [self.aligned(photo, world) for photo in photos]
+
+    def aligned(self, photo, world):
+        camera = self.cameras[photo.name]
+        grid = resampling_of(camera.width, camera.height, 56).grid()
+        depth = spheres(camera, grid.photo_pixels()).reshape(grid.height, grid.width)
+        sure = np.where(depth < 5.0, 3.0, 1.5) + 0.01 * np.arange(depth.size).reshape(depth.shape)
+        exact = AlignedPhoto(camera, grid, depth.astype(np.float32), sure.astype(np.float32))
+        return mapped(exact, world)
+
+
+def unadjusted(*arguments, **more):
+    """The estimator without bundle adjustment: photos here are noise, without features to match."""
+    return Da3(*arguments, bundle_adjustment=False, **more)
+
+
+def check_cameras(found, wanted, degrees=0.01):
+    errors = pose_errors(found, wanted)
+    assert errors["rotation"] < degrees
+    assert errors["centre"] < 1e-3
+    for camera, truth in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(camera.K, truth.K, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "size"), [(2, (64, 64)), (5, (80, 60)), (5, (60, 80))])
+def test_cameras_depths_and_points_of_one_pass(count, size):
+    cameras, photos = scene(count, *size)
+    found = unadjusted(ExactPredictor(cameras, photos))(photos)
+    check_cameras(found.cameras, cameras)
+    assert found.warnings == []
+    world = similarity_between(found.cameras, cameras)
+    xyz = world.scale * found.points.xyz @ world.rotation.T + world.translation
+    radius = np.linalg.norm(xyz, axis=1)
+    # All points lie on the one sphere or the other.
+    assert np.minimum(np.abs(radius - 1.0), np.abs(radius - 9.0)).max() < 1e-3
+    assert (radius < 1.01).mean() > 0.1
+    for depth, trusted in zip(found.depths, found.trusted, strict=True):
+        assert depth.shape == trusted.shape
+        assert depth.dtype == np.float32
+        assert trusted.mean() > 0.1
+
+
+def test_thirty_three_photos_in_passes_become_one_world():
+    cameras, photos = scene(33, step=0.18)
+    predictor = ExactPredictor(cameras, photos, most=12)
+    told = []
+    found = unadjusted(predictor)(photos, progress=lambda *what: told.append(what))
+    assert len(predictor.shown) > 2
+    assert max(len(shown) for shown in predictor.shown) <= 12
+    check_cameras(found.cameras, cameras)
+    world = similarity_between(found.cameras, cameras)
+    depths = [float(np.nanmedian(depth)) * world.scale for depth in found.depths]
+    truth = [
+        np.median(spheres(camera, resampling_of(SIZE, SIZE, 56).grid().photo_pixels()))
+        for camera in cameras
+    ]
+    np.testing.assert_allclose(depths, truth, rtol=1e-4)
+    assert told[-1][0] == "passes"
+    assert told[-1][1] == told[-1][2] == sum(len(shown) for shown in predictor.shown)
+
+
+@pytest.mark.parametrize(("count", "most"), [(33, 32), (33, 12), (200, 32), (5, 4), (7, 2), (9, 3)])
+def test_every_photo_is_in_a_pass_and_every_pass_is_joined_to_the_others(count, most):
+    plan = chunks_of(count, most)
+    assert set(itertools.chain(*plan)) == set(range(count))
+    assert all(len(chunk) <= most and chunk == sorted(set(chunk)) for chunk in plan)
+    seen = set(plan[0])
+    for chunk in plan[1:]:
+        assert len(seen & set(chunk)) >= max(1, most // 4)
+        assert set(chunk) - seen
+        seen |= set(chunk)
+
+
+def test_photos_that_fit_are_one_pass():
+    assert chunks_of(32, 32) == [list(range(32))]
+
+
+def test_wrong_pixels_of_shared_photos_move_nothing():
+    cameras, photos = scene(6)
+    predictor = ExactPredictor(cameras, photos)
+    one = dict(enumerate(predictor(photos[:4], None, 0)))
+    two = dict(enumerate(predictor(photos[2:], None, 0), start=2))
+    depth = two[2].depth.copy()
+    depth[:20] *= 3.0  # a third of one shared photo of two
+    two[2] = replace(two[2], depth=depth)
+    world, lost = joined([one, two])
+    assert lost == []
+    check_cameras([world[i].camera for i in range(6)], cameras, degrees=0.1)
+
+
+def test_a_pass_that_shares_nothing_sure_is_not_registered():
+    cameras, photos = scene(6)
+    predictor = ExactPredictor(cameras, photos, most=4)
+    exact = predictor.aligned
+
+    def unsure(photo, world):
+        one = exact(photo, world)
+        if len(predictor.shown) > 1:
+            one = replace(one, confidence=np.ones_like(one.confidence))
+        return one
+
+    predictor.aligned = unsure
+    found = unadjusted(predictor)(photos)
+    missing = [photo.name for photo, one in zip(photos, found.cameras, strict=True) if one is None]
+    assert missing
+    assert set(missing) == set(predictor.shown[1]) - set(predictor.shown[0])
+    assert found.warnings[0].startswith(f"Not registered: {', '.join(missing)}. Their pass shares")
+
+
+def test_a_prediction_that_is_no_camera_is_not_registered():
+    cameras, photos = scene(4)
+    predictor = ExactPredictor(cameras, photos)
+    exact = predictor.aligned
+    predictor.aligned = lambda photo, world: None if photo.name == "01.png" else exact(photo, world)
+    found = unadjusted(predictor)(photos)
+    assert [one is None for one in found.cameras] == [False, True, False, False]
+    assert "Not registered: 01.png. What Depth Anything 3 predicts" in found.warnings[0]
+
+
+def test_photos_that_are_the_same_picture_have_the_same_camera():
+    cameras, photos = scene(3)
+    copies = [photos[0], replace(photos[0], name="copy.png"), *photos[1:]]
+    predictor = ExactPredictor(cameras, photos)
+    found = unadjusted(predictor)(copies)
+    assert predictor.shown == [["00.png", "01.png", "02.png"]]
+    np.testing.assert_array_equal(found.cameras[0].viewmat, found.cameras[1].viewmat)
+    check_cameras([found.cameras[i] for i in (0, 2, 3)], cameras)
+
+
+def test_photos_of_which_no_two_differ():
+    _, photos = scene(1)
+    copies = [replace(photos[0], name=f"{n}.png") for n in range(3)]
+    with pytest.raises(IgsrError, match=r"2 different photos at least; all are the same as 0\.png"):
+        unadjusted(ExactPredictor([], []))(copies)
+    with pytest.raises(IgsrError, match=r"from 2 different photos at least$"):
+        unadjusted(ExactPredictor([], []))(photos)
+
+
+def test_cameras_at_one_place_are_told_of():
+    cameras, photos = scene(3)
+    here = []
+    for camera in cameras:
+        viewmat = camera.viewmat.copy()
+        viewmat[:3, 3] = -viewmat[:3, :3] @ cameras[0].centre
+        here.append(replace(camera, viewmat=viewmat))
+    found = unadjusted(ExactPredictor(here, photos))(photos)
+    assert found.warnings[0].startswith("All photos seem to be taken from one place")
+
+
+def test_one_camera_has_one_focal_length():
+    cameras, photos = scene(4)
+    photos[3] = replace(photos[3], device="other")
+    for i, factor in enumerate((1.0, 1.1, 0.9, 1.3)):
+        K = cameras[i].K.copy()
+        K[0, 0] *= factor * 1.02
+        K[1, 1] *= factor / 1.02
+        cameras[i] = replace(cameras[i], K=K)
+    found = unadjusted(ExactPredictor(cameras, photos))(photos)
+    wanted = ring_camera(0.0, SIZE).K[0, 0]
+    focals = [camera.K[[0, 1], [0, 1]] for camera in found.cameras]
+    np.testing.assert_allclose(focals, wanted * np.array([[1], [1], [1], [1.3]]) * np.ones(2))
+    assert with_shared_focals(photos[:1], [None]) == [None]
+
+
+def test_known_cameras_stay_and_set_world_and_unit():
+    cameras, photos = scene(9)
+    off = cameras[4].K.copy()
+    off[0, 2] += 0.2 * SIZE
+    given = {photo.name: camera for photo, camera in zip(photos, cameras, strict=True)}
+    predictor = ExactPredictor(cameras, photos, most=5)
+    found = unadjusted(predictor, cameras=given)(photos)
+    assert len(predictor.shown) > 1
+    for camera, wanted, depth in zip(found.cameras, cameras, found.depths, strict=True):
+        assert camera is wanted
+        truth = spheres(wanted, resampling_of(SIZE, SIZE, 56).grid().photo_pixels())
+        np.testing.assert_allclose(depth.ravel(), truth, rtol=1e-4)
+    assert found.warnings == []
+    given["04.png"] = replace(cameras[4], K=off)
+    found = unadjusted(predictor, cameras=given)(photos)
+    assert found.warnings[0].startswith("The principal point is far from the middle of 04.png")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda given: {**given, "x.png": given["00.png"]}, "'x.png', which is none of the photos"),
+        (lambda given: {"00.png": given["00.png"]}, "has none for 01.png, 02.png"),
+        (
+            lambda given: {**given, "00.png": replace(given["00.png"], width=9)},
+            "of 9 x 64 pixels, and the photo has 64 x 64",
+        ),
+        (lambda given: dict.fromkeys(given, given["00.png"]), "all stand at one place"),
+    ],
+)
+def test_known_cameras_that_cannot_be_used(change, message):
+    cameras, photos = scene(3)
+    given = {photo.name: camera for photo, camera in zip(photos, cameras, strict=True)}
+    with pytest.raises(IgsrError, match=message):
+        unadjusted(ExactPredictor(cameras, photos), cameras=change(given))(photos)
+
+
+def test_what_only_one_photo_says_is_not_trusted():
+    cameras, photos = scene(6)
+    predictor = ExactPredictor(cameras, photos)
+    exact = predictor(photos, None, 0)
+    before = trusted_depths(exact)
+    wrong = exact[2].depth.copy()
+    wrong[20:30, 20:40] *= 0.7
+    after = trusted_depths([*exact[:2], replace(exact[2], depth=wrong), *exact[3:]])
+    assert before[2][20:30, 20:40].mean() > 0.2
+    assert after[2][20:30, 20:40].mean() < 0.02
+    # A step of depth is an edge, whose pixels are of neither side.
+    steps = np.abs(np.diff(exact[0].depth, axis=1)) > 0.05 * exact[0].depth[:, 1:]
+    assert steps.any()
+    assert not (before[0][:, 1:] & steps).any()
+    assert not (before[0][:, :-1] & steps).any()
+
+
+def test_masked_and_transparent_pixels_weigh_nothing():
+    _, photos = scene(2)
+    image = np.dstack([photos[0].image, np.full((SIZE, SIZE), 255, np.uint8)])
+    image[:, :32, 3] = 0
+    mask = np.ones((SIZE, SIZE), dtype=bool)
+    mask[:16] = False
+    given = [replace(photos[0], image=image, mask=mask), photos[1]]
+    first, second = Da3Predictor(hashed_network())(given, None, 0)
+    assert (first.confidence[:, : first.confidence.shape[1] // 2] == 1.0).all()
+    assert (first.confidence[: first.confidence.shape[0] // 4] == 1.0).all()
+    assert (first.confidence[-3:, -3:] > 1.0).all()
+    assert (second.confidence > 1.0).all()
+
+
+def test_photos_of_almost_one_size_are_shown_at_one():
+    def photo(width, height):
+        return Photo(f"{width}x{height}", np.zeros((height, width, 3), np.uint8))
+
+    shown = resamplings_of([photo(400, 300), photo(400, 300), photo(400, 290), photo(300, 400)])
+    assert [(one.width, one.height) for one in shown] == [(504, 378)] * 3 + [(378, 504)]
+    assert shown[2].grid().scale_y == pytest.approx(290 / 378)
+    with pytest.raises(IgsrError, match="400x3: a photo of 400x3 pixels is too narrow"):
+        resamplings_of([photo(400, 3)])
+
+
+@pytest.fixture
+def small_photos(monkeypatch):
+    """Photos of two formats, shown small so that the network is fast."""
+    usual = passes.resampling_of
+    monkeypatch.setattr(passes, "resampling_of", lambda w, h: usual(w, h, 70))
+    _, photos = scene(3, 64, 40)
+    high = replace(photos[2], image=np.ascontiguousarray(photos[2].image.swapaxes(0, 1)))
+    return [*photos[:2], high]
+
+
+@pytest.mark.parametrize("source", ["decoder", "rays"])
+def test_the_network_itself_on_photos_of_two_formats(small_photos, source):
+    estimator = unadjusted(Da3Predictor(hashed_network(), source))
+    one, again = estimator(small_photos, seed=1), estimator(small_photos, seed=1)
+    for photo, camera, depth, other in zip(
+        small_photos, one.cameras, one.depths, again.cameras, strict=True
+    ):
+        if camera is None:
+            continue
+        height, width = photo.image.shape[:2]
+        assert (camera.width, camera.height) == (width, height)
+        np.testing.assert_allclose(camera.K[:2, 2], [width / 2, height / 2])
+        assert (depth.shape[0] > depth.shape[1]) == (height > width)
+        np.testing.assert_array_equal(camera.viewmat, other.viewmat)
+
+
+def test_from_a_checkpoint_by_name(small_photos, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "none"))
+    monkeypatch.delenv("IGSR_DA3", raising=False)
+    with pytest.raises(IgsrError, match="igsr weights fetch da3-base"):
+        estimate(small_photos, "da3")
+    network = hashed_network()
+    monkeypatch.setitem(SIZES, "da3-small", network.config)
+    weights = {f"model.{key}": value for key, value in network.state_dict().items()}
+    save_file(weights, tmp_path / "model.safetensors")
+    (tmp_path / "config.json").write_text('{"model_name": "da3-small"}')
+    monkeypatch.setattr(passes, "SHORTEST", 0.0)
+    monkeypatch.setattr(passes, "LONGEST", np.inf)
+    name, found = estimate(small_photos, "da3", checkpoint=tmp_path)
+    assert name == "da3"
+    assert all(camera is not None for camera in found.cameras)
+    content = (tmp_path / "model.safetensors").read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    assert found.weights == {"name": "da3-small", "licence": "Apache-2.0", "sha256": digest}
+    # What is kept of the cameras has the licence too.
+    kept = FoundCameras.of(small_photos, found, {"estimator": "da3"})
+    (tmp_path / "found.npz").write_bytes(kept.to_bytes())
+    assert read_found(tmp_path / "found.npz").estimate.weights == found.weights
+
+
+def test_numbers_that_are_not_finite_are_the_checkpoints_fault(small_photos):
+    network = hashed_network()
+    network.cam_dec.fc_t.bias.data.fill_(torch.nan)
+    with pytest.raises(IgsrError, match=r"not finite for 00\.png; its checkpoint is damaged"):
+        unadjusted(Da3Predictor(network))(small_photos)
+
+
+def test_passes_are_as_large_as_memory_allows(monkeypatch):
+    predictor, photos = Da3Predictor(hashed_network()), scene(4, 640, 480)[1]
+    assert predictor.most_photos(photos) == passes.MOST_ON_CPU
+    pixels = 504 * 378
+    for wanted in (31, 7, 2):
+        free = memory_of_pass(predictor.network.config, wanted, pixels) / passes.USABLE
+        monkeypatch.setattr(passes, "available_memory", lambda free=free: free + 1)
+        assert predictor.most_photos(photos) == wanted
+    monkeypatch.setattr(passes, "available_memory", lambda: free - 10)
+    with pytest.raises(IgsrError, match=r"needs \d.\d GB for two photos and \d.\d GB are free"):
+        predictor.most_photos(photos)
+    assert memory_of_pass(BASE, 16, pixels) < 6e9
+
+
+def test_an_unknown_source_of_cameras():
+    with pytest.raises(IgsrError, match="cameras_from is 'both'; give decoder or rays"):
+        Da3Predictor(hashed_network(), "both")
