@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use super::adam::{BLOCK, BlockGradients, BlockStep};
 use super::bin::{Bins, CHUNK, ChunkTiles};
+use super::exposure::Exposed;
 use super::loss::Loss;
 use super::project::{Splat, View, project_splat};
 use super::project_backward::{SplatBackward, VCamera, VSplat};
@@ -15,7 +16,9 @@ use super::rasterize_backward::{
 use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::Result;
-use crate::fit_device::{CameraGradient, FitDevice, FitState, StepInput, is_dropped};
+use crate::fit_device::{
+    CameraGradient, ExposureGradient, FitDevice, FitState, StepInput, is_dropped,
+};
 use crate::stages::{Colors, ProjectOptions};
 use crate::target::Target;
 
@@ -26,11 +29,13 @@ pub struct CpuFit {
     state: FitState,
     loss_value: f32,
     camera_gradients: Vec<CameraGradient>,
+    exposure_gradients: Vec<ExposureGradient>,
     // Buffers kept from step to step.
     chunks: Vec<ChunkTiles>,
     splats: Vec<TileSplat>,
     bins: Bins,
     image: Planes,
+    exposed: Exposed,
     photo: [Vec<f32>; 3],
     loss: Loss,
     sums: Vec<PairSums<COLOR_SUMS>>,
@@ -103,22 +108,37 @@ impl FitDevice for CpuFit {
         self.image.resize(width, height);
         rasterize_tiles::<false>(&self.splats, &self.bins, input.background, &mut self.image);
         target.composite(input.background, &mut self.photo);
+        if let Some(exposure) = &input.exposure {
+            self.exposed.run(&self.image, exposure);
+        }
         let [r, g, b, ..] = &self.image.planes;
+        let colors = match input.exposure {
+            None => [r, g, b],
+            Some(_) => self.exposed.color.each_ref(),
+        };
         let [photo_r, photo_g, photo_b] = &self.photo;
         self.loss_value = self.loss.run(
-            [r, g, b],
+            colors.map(|plane| plane.as_slice()),
             [photo_r, photo_g, photo_b],
             target.weights.as_deref(),
             width as usize,
             input.ssim_weight,
         );
+        let mut v_alpha = None;
+        if let Some(exposure) = &input.exposure {
+            let v_color = &mut self.loss.v_color;
+            let [v_gain, v_offset] = self.exposed.backward(&self.image, exposure, v_color);
+            let gradient = ExposureGradient { view: input.view, v_gain, v_offset };
+            self.exposure_gradients.push(gradient);
+            v_alpha = exposure.background.map(|_| self.exposed.v_alpha.as_slice());
+        }
         rasterize_backward_tiles(
             &self.splats,
             &self.bins,
             PictureGradients {
                 image: &self.image,
                 v_color: &self.loss.v_color,
-                v_alpha: None,
+                v_alpha,
                 v_depth: None,
             },
             &mut self.sums,
@@ -129,6 +149,10 @@ impl FitDevice for CpuFit {
 
     fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>> {
         Ok(std::mem::take(&mut self.camera_gradients))
+    }
+
+    fn exposure_gradients(&mut self) -> Result<Vec<ExposureGradient>> {
+        Ok(std::mem::take(&mut self.exposure_gradients))
     }
 
     fn loss(&mut self) -> Result<f32> {

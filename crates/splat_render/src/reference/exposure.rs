@@ -1,0 +1,39 @@
+//! exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them.
+
+use crate::stages::{Exposure, ExposureGradients, Image};
+
+pub(super) fn exposure(image: &Image<f64>, exposure: &Exposure<f64>) -> Vec<[f64; 3]> {
+    let Exposure { gain, offset, background } = *exposure;
+    let corrected = |(color, &t): (&[f64; 3], &f64)| {
+        std::array::from_fn(|c| match background {
+            None => gain[c] * color[c] + offset[c],
+            Some(b) => gain[c] * (color[c] - t * b[c]) + offset[c] * (1.0 - t) + t * b[c],
+        })
+    };
+    image.color.iter().zip(&image.transmittance).map(corrected).collect()
+}
+
+pub(super) fn exposure_backward(
+    image: &Image<f64>,
+    exposure: &Exposure<f64>,
+    v_corrected: &[[f64; 3]],
+) -> ExposureGradients<f64> {
+    let mut out = ExposureGradients::default();
+    for ((color, &transmittance), v) in
+        image.color.iter().zip(&image.transmittance).zip(v_corrected)
+    {
+        // What of the pixel the exposure leaves as it is.
+        let (t, b) = exposure.background.map_or((0.0, [0.0; 3]), |b| (transmittance, b));
+        let mut v_t = 0.0;
+        for c in 0..3 {
+            out.v_gain[c] += v[c] * (color[c] - t * b[c]);
+            out.v_offset[c] += v[c] * (1.0 - t);
+            if exposure.background.is_some() {
+                v_t += v[c] * (b[c] - exposure.gain[c] * b[c] - exposure.offset[c]);
+            }
+        }
+        out.v_color.push(std::array::from_fn(|c| exposure.gain[c] * v[c]));
+        out.v_alpha.push(-v_t);
+    }
+    out
+}

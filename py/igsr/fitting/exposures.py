@@ -1,0 +1,234 @@
+"""Where the exposures of photos start in a fit, and whether they are fitted at all.
+
+Photos that see the same points tell how bright they are to each other: the logarithm of a point's
+color in a photo is that of the photo's gain plus that of the point. Gains are their robust least
+squares solution (M-estimator with Cauchy's weights, iteratively reweighted). How far it is to be
+believed says a delete-one-group jackknife (Efron and Stein 1981) over groups of points that lie
+together, since what is near changes alike: highlights, vignetting, shadows.
+
+Exposures are fitted ("auto") where gains of the photos differ by ``LEAST_SPREAD`` or more, beyond
+what the jackknife leaves open. Where the capture has no tracks, EXIF decides, if all photos have
+it; without either, exposures are not fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.capture import Exposure, Points, View
+from igsr.fitting.settings import ExposureMode
+
+Float64 = npt.NDArray[np.float64]
+
+#: Root mean square of the photos' log gains from which on exposures are fitted: a tenth of a stop.
+LEAST_SPREAD = 0.03
+#: Encoded brightness (sRGB) that one stop more of light makes: a power of 1/2.2 of it.
+LOG_GAIN_OF_STOP = float(np.log(2.0) / 2.2)
+#: A point's color in a photo is the mean of so many pixels on a side.
+PATCH = 5
+#: Patches with darker or brighter pixels than these say little of gains: noise, and clipping.
+DARK, BRIGHT = 10, 250
+#: Fewest points that a photo must share with others for its gain to be believed.
+LEAST_POINTS = 30
+#: Groups of the jackknife.
+GROUPS = 8
+#: Rounds of reweighting.
+ROUNDS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeGains:
+    """How bright photos are to each other.
+
+    Attributes:
+        log_gain: float64 [V, 3], with a mean of zero over the photos that are known.
+        error: float64 [V, 3], its standard error; infinite where nothing is known.
+    """
+
+    log_gain: Float64
+    error: Float64
+
+    @property
+    def spread(self) -> float:
+        """Root mean square of the log gains less what their errors explain; 0 where none is known.
+
+        The square is the mean of each one's square less its error's, over photos and channels.
+        """
+        known = np.isfinite(self.error)
+        if not known.any():
+            return 0.0
+        square = float(np.mean(self.log_gain[known] ** 2 - self.error[known] ** 2))
+        return float(np.sqrt(max(0.0, square)))
+
+
+def starting_exposures(
+    views: Sequence[View], points: Points | None, mode: ExposureMode
+) -> list[Exposure | None] | None:
+    """Where exposures of views start, or None where they are not fitted.
+
+    Views that bring an exposure start from it. Pseudo-views have none, but the splats' own colors.
+
+    Args:
+        views: to fit.
+        points: of the capture.
+        mode: "auto", "on" or "off".
+    """
+    if mode == "off":
+        return None
+    photos = [view for view in views if view.weights is None]
+    if any(view.exposure is not None for view in photos):
+        known = [view.exposure or Exposure() for view in photos]
+    else:
+        gains = gains_by_points(photos, points) or gains_by_exif(photos)
+        if mode == "auto" and (gains is None or gains.spread < LEAST_SPREAD):
+            return None
+        rows = np.zeros((len(photos), 3)) if gains is None else gains.log_gain
+        known = [Exposure(tuple(np.exp(row))) for row in rows]
+    each = iter(known)
+    return [next(each) if view.weights is None else None for view in views]
+
+
+def gains_by_exif(photos: Sequence[View]) -> RelativeGains | None:
+    """Gains by how much light photos took; None where one of them does not tell."""
+    stops = [photo.exposure_value for photo in photos]
+    if not stops or any(value is None for value in stops):
+        return None
+    log_gain = LOG_GAIN_OF_STOP * np.array(stops, np.float64)
+    rows = np.repeat((log_gain - log_gain.mean())[:, None], 3, axis=1)
+    return RelativeGains(rows, np.zeros_like(rows))
+
+
+def gains_by_points(photos: Sequence[View], points: Points | None) -> RelativeGains | None:
+    """Gains by the colors of points that photos share; None where there are no tracks of them.
+
+    Args:
+        photos: V photos.
+        points: with tracks in their pixels.
+    """
+    if points is None or points.tracks is None or len(photos) < 2:
+        return None
+    view, point, log_color = _observed(photos, points)
+    if not len(view):
+        return None
+    groups = _groups(points.xyz, point)
+    whole, count = _solved(view, point, log_color, len(photos))
+    parts = np.stack(
+        [_solved(view[k], point[k], log_color[k], len(photos))[0] for k in _without_each(groups)]
+    )
+    deviation = parts - parts.mean(axis=0)
+    error = np.sqrt((GROUPS - 1) / GROUPS * np.sum(deviation**2, axis=0))
+    believed = count >= LEAST_POINTS
+    if believed.sum() < 2:
+        return None
+    log_gain = np.where(believed[:, None], whole - whole[believed].mean(axis=0), 0.0)
+    return RelativeGains(log_gain, np.where(believed[:, None], error, np.inf))
+
+
+def _observed(
+    photos: Sequence[View], points: Points
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Float64]:
+    """Photo, point and log color [M, 3] of each observation that tells of gains."""
+    tracks = points.tracks
+    assert tracks is not None
+    index = {name: k for k, name in enumerate(tracks.names)}
+    views, seen, colors = [], [], []
+    for k, photo in enumerate(photos):
+        mine = np.flatnonzero(tracks.view == index.get(photo.name, -1))
+        patches, usable = _patches(photo, tracks.xy[mine])
+        views.append(np.full(int(usable.sum()), k))
+        seen.append(tracks.point[mine][usable])
+        colors.append(np.log(patches[usable]))
+    view, point = np.concatenate(views), np.concatenate(seen)
+    shared = np.bincount(point, minlength=len(points.xyz))[point] >= 2
+    return view[shared], point[shared], np.concatenate(colors)[shared]
+
+
+def _patches(photo: View, xy: Float64) -> tuple[Float64, npt.NDArray[np.bool_]]:
+    """Mean colors [M, 3] in (0, 1] around pixel coordinates, and which of them may be used."""
+    height, width = photo.image.shape[:2]
+    half = PATCH // 2
+    column, row = np.floor(xy).astype(np.int64).T
+    usable = (column >= half) & (row >= half) & (column < width - half) & (row < height - half)
+    column, row = np.where(usable, column, half), np.where(usable, row, half)
+    if min(height, width) < PATCH:
+        return np.ones((len(xy), 3)), np.zeros(len(xy), np.bool_)
+    offsets = np.arange(PATCH) - half
+    rows, columns = row[:, None, None] + offsets[:, None], column[:, None, None] + offsets
+    pixels = photo.image[rows, columns]
+    colors = pixels[..., :3]
+    usable &= (colors.min(axis=(1, 2, 3)) >= DARK) & (colors.max(axis=(1, 2, 3)) <= BRIGHT)
+    if photo.image.shape[2] == 4:
+        usable &= pixels[..., 3].min(axis=(1, 2)) == 255
+    if photo.mask is not None:
+        usable &= photo.mask[rows, columns].all(axis=(1, 2))
+    means = colors.mean(axis=(1, 2), dtype=np.float64) / 255.0
+    return np.maximum(means, 1.0 / 255.0), usable
+
+
+def _groups(xyz: Float64, point: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The group of each observation: its point's place along the points' longest axis."""
+    used = np.unique(point)
+    centred = xyz[used] - np.median(xyz[used], axis=0)
+    # Few points are far off; those do not decide the axis.
+    near = np.linalg.norm(centred, axis=1)
+    inner = centred[near <= np.quantile(near, 0.9)]
+    axis = np.linalg.svd(inner, full_matrices=False)[2][0]
+    order = np.argsort(np.argsort(centred @ axis))
+    group = np.zeros(len(xyz), np.int64)
+    group[used] = order * GROUPS // len(used)
+    return group[point]
+
+
+def _without_each(groups: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
+    return [np.flatnonzero(groups != k) for k in range(GROUPS)]
+
+
+def _solved(
+    view: npt.NDArray[np.int64], point: npt.NDArray[np.int64], log_color: Float64, count: int
+) -> tuple[Float64, npt.NDArray[np.int64]]:
+    """Log gains [V, 3] with a mean of zero, and how many shared points each photo has."""
+    seen = np.bincount(point)
+    kept = seen[point] >= 2
+    view, point, log_color = view[kept], point[kept], log_color[kept]
+    _, point = np.unique(point, return_inverse=True)
+    seen = np.bincount(view, minlength=count)
+    gains = np.zeros((count, 3))
+    if not len(view):
+        return gains, seen
+    for channel in range(3):
+        gains[:, channel] = _solved_channel(view, point, log_color[:, channel], count)
+    return gains, seen
+
+
+def _solved_channel(
+    view: npt.NDArray[np.int64], point: npt.NDArray[np.int64], values: Float64, count: int
+) -> Float64:
+    """Log gains [V] of one channel; photos that share nothing keep zero."""
+    weights: Float64 = np.ones(len(values))
+    gains: Float64 = np.zeros(count)
+    for _ in range(ROUNDS):
+        # Normal equations with the points' colors eliminated.
+        of_point = np.bincount(point, weights)
+        color = np.bincount(point, weights * values) / of_point
+        right = np.bincount(view, weights * (values - color[point]), minlength=count)
+        matrix: Float64 = np.diag(np.bincount(view, weights, minlength=count)).astype(np.float64)
+        for start in range(0, len(of_point), 4096):
+            rows = np.flatnonzero((point >= start) & (point < start + 4096))
+            table = np.zeros((min(4096, len(of_point) - start), count))
+            np.add.at(table, (point[rows] - start, view[rows]), weights[rows])
+            matrix = matrix - table.T @ (table / of_point[start : start + 4096, None])
+        # All gains may grow together: their mean stays zero. What shares nothing stays zero, too.
+        scale = max(float(np.trace(matrix)) / count, 1e-12)
+        gains = np.linalg.solve(
+            matrix + scale * (np.full((count, count), 1.0 / count) + 1e-9 * np.eye(count)), right
+        )
+        of_photo = values - gains[view]
+        color = np.bincount(point, weights * of_photo) / of_point
+        residual = of_photo - color[point]
+        width = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+        weights = 1.0 / (1.0 + (residual / (2.0 * width)) ** 2)
+    return np.asarray(gains)
