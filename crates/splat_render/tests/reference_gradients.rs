@@ -315,9 +315,10 @@ fn the_exposure_s_gradients_match_central_differences() {
         let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0xe5e);
         image.transmittance.iter_mut().for_each(|t| *t = rng.random());
         let background = [0.2, 0.7, 0.4];
+        // So that no colour is cut.
         let mut exposure = Exposure {
-            gain: std::array::from_fn(|_| rng.random_range(0.5..2.0)),
-            offset: std::array::from_fn(|_| rng.random_range(-0.1..0.1)),
+            gain: std::array::from_fn(|_| rng.random_range(0.4..0.8)),
+            offset: std::array::from_fn(|_| rng.random_range(0.02..0.15)),
             background: (target.channels == 4).then_some(background),
         };
         let loss = |image: &Image<f64>, exposure: &Exposure<f64>| {
@@ -371,6 +372,27 @@ fn the_exposure_s_gradients_match_central_differences() {
         }
     }
     println!("worst {worst:.1e} of the largest");
+}
+
+#[test]
+fn a_cut_colour_is_only_brought_back() {
+    let image = Image {
+        width: 4,
+        height: 1,
+        color: vec![[0.9; 3], [0.9; 3], [0.05; 3], [0.05; 3]],
+        alpha: vec![1.0; 4],
+        depth: vec![0.0; 4],
+        transmittance: vec![0.0; 4],
+    };
+    let exposure = Exposure { gain: [2.0; 3], offset: [-0.2; 3], background: None };
+    let corrected = Reference.exposure(&image, &exposure).unwrap();
+    assert_eq!(corrected, [[1.0; 3], [1.0; 3], [0.0; 3], [0.0; 3]]);
+    let v = [[0.5; 3], [-0.5; 3], [0.5; 3], [-0.5; 3]];
+    let back = Reference.exposure_backward(&image, &exposure, &v).unwrap();
+    // Brighter than white goes down and blacker than black goes up, and not the other way.
+    assert_eq!(back.v_color, [[1.0; 3], [0.0; 3], [0.0; 3], [-1.0; 3]]);
+    assert_eq!(back.v_offset, [0.0; 3]);
+    assert!((back.v_gain[0] - 0.5 * (0.9 - 0.05)).abs() < 1e-12);
 }
 
 /// With first moments that keep nothing but the gradient, a step goes along it: what adam takes for

@@ -38,6 +38,8 @@ LEAST_POINTS = 30
 GROUPS = 8
 #: Rounds of reweighting.
 ROUNDS = 12
+#: Turns in which photos and points are fitted; an offset that is likely; and the largest gain.
+AFFINE_ROUNDS, LIKELY_OFFSET, MOST_GAIN = 50, 0.05, 16.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +85,12 @@ def starting_exposures(
     if any(view.exposure is not None for view in photos):
         known = [view.exposure or Exposure() for view in photos]
     else:
-        gains = gains_by_points(photos, points) or gains_by_exif(photos)
+        observed = _observed(photos, points)
+        gains = _gains(observed, len(photos)) or gains_by_exif(photos)
         if mode == "auto" and (gains is None or gains.spread < LEAST_SPREAD):
             return None
-        rows = np.zeros((len(photos), 3)) if gains is None else gains.log_gain
-        known = [Exposure(tuple(np.exp(row))) for row in rows]
+        log_gain = np.zeros((len(photos), 3)) if gains is None else gains.log_gain
+        known = _affine(observed, log_gain)
     each = iter(known)
     return [next(each) if view.weights is None else None for view in views]
 
@@ -109,16 +112,34 @@ def gains_by_points(photos: Sequence[View], points: Points | None) -> RelativeGa
         photos: V photos.
         points: with tracks in their pixels.
     """
-    if points is None or points.tracks is None or len(photos) < 2:
+    return _gains(_observed(photos, points), len(photos))
+
+
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """Observations of points that tell of gains.
+
+    Attributes:
+        view: int64 [M], photo of each.
+        point: int64 [M], its point, from 0 without gaps; at least two observations have it.
+        color: float64 [M, 3], mean color there, in (0, 1].
+        group: int64 [M], of the jackknife.
+    """
+
+    view: npt.NDArray[np.int64]
+    point: npt.NDArray[np.int64]
+    color: Float64
+    group: npt.NDArray[np.int64]
+
+
+def _gains(observed: _Observed | None, photos: int) -> RelativeGains | None:
+    """See ``gains_by_points``."""
+    if observed is None:
         return None
-    view, point, log_color = _observed(photos, points)
-    if not len(view):
-        return None
-    groups = _groups(points.xyz, point)
-    whole, count = _solved(view, point, log_color, len(photos))
-    parts = np.stack(
-        [_solved(view[k], point[k], log_color[k], len(photos))[0] for k in _without_each(groups)]
-    )
+    view, point, log_color = observed.view, observed.point, np.log(observed.color)
+    whole, count = _solved(view, point, log_color, photos)
+    others = [np.flatnonzero(observed.group != k) for k in range(GROUPS)]
+    parts = np.stack([_solved(view[k], point[k], log_color[k], photos)[0] for k in others])
     deviation = parts - parts.mean(axis=0)
     error = np.sqrt((GROUPS - 1) / GROUPS * np.sum(deviation**2, axis=0))
     believed = count >= LEAST_POINTS
@@ -128,12 +149,11 @@ def gains_by_points(photos: Sequence[View], points: Points | None) -> RelativeGa
     return RelativeGains(log_gain, np.where(believed[:, None], error, np.inf))
 
 
-def _observed(
-    photos: Sequence[View], points: Points
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Float64]:
-    """Photo, point and log color [M, 3] of each observation that tells of gains."""
+def _observed(photos: Sequence[View], points: Points | None) -> _Observed | None:
+    """What photos show of points that they share; None where that is nothing."""
+    if points is None or points.tracks is None or len(photos) < 2:
+        return None
     tracks = points.tracks
-    assert tracks is not None
     index = {name: k for k, name in enumerate(tracks.names)}
     views, seen, colors = [], [], []
     for k, photo in enumerate(photos):
@@ -141,10 +161,15 @@ def _observed(
         patches, usable = _patches(photo, tracks.xy[mine])
         views.append(np.full(int(usable.sum()), k))
         seen.append(tracks.point[mine][usable])
-        colors.append(np.log(patches[usable]))
-    view, point = np.concatenate(views), np.concatenate(seen)
+        colors.append(patches[usable])
+    view, point, color = np.concatenate(views), np.concatenate(seen), np.concatenate(colors)
     shared = np.bincount(point, minlength=len(points.xyz))[point] >= 2
-    return view[shared], point[shared], np.concatenate(colors)[shared]
+    view, point, color = view[shared], point[shared], color[shared]
+    if not len(view):
+        return None
+    group = _groups(points.xyz, point)
+    _, point = np.unique(point, return_inverse=True)
+    return _Observed(view, point, color, group)
 
 
 def _patches(photo: View, xy: Float64) -> tuple[Float64, npt.NDArray[np.bool_]]:
@@ -181,10 +206,6 @@ def _groups(xyz: Float64, point: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]
     group = np.zeros(len(xyz), np.int64)
     group[used] = order * GROUPS // len(used)
     return group[point]
-
-
-def _without_each(groups: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
-    return [np.flatnonzero(groups != k) for k in range(GROUPS)]
 
 
 def _solved(
@@ -232,3 +253,55 @@ def _solved_channel(
         width = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
         weights = 1.0 / (1.0 + (residual / (2.0 * width)) ** 2)
     return np.asarray(gains)
+
+
+def _affine(observed: _Observed | None, log_gain: Float64) -> list[Exposure]:
+    """Gain and offset of each photo, from its gain alone.
+
+    Photos' gains and offsets and points' colors are fitted in turn, by robust least squares; an
+    offset must be told by the points against a pull to none.
+
+    Args:
+        observed: what the points tell, if anything.
+        log_gain: float64 [V, 3].
+    """
+    gain, offset = np.exp(log_gain), np.zeros_like(log_gain)
+    if observed is not None:
+        believed = np.bincount(observed.view, minlength=len(gain)) >= LEAST_POINTS
+        for channel in range(3):
+            start = gain[:, channel].copy()
+            found = _affine_channel(observed, observed.color[:, channel], start)
+            for values, one in zip((gain, offset), found, strict=True):
+                values[believed, channel] = one[believed]
+    return [Exposure(tuple(one), tuple(by)) for one, by in zip(gain, offset, strict=True)]
+
+
+def _affine_channel(observed: _Observed, values: Float64, gain: Float64) -> tuple[Float64, Float64]:
+    """Gains and offsets [V] of one channel, with means of log gain and of offset of zero."""
+    view, point, count = observed.view, observed.point, len(gain)
+    weights, offset = np.ones(len(values)), np.zeros(count)
+
+    def sums(terms: Float64) -> Float64:
+        return np.bincount(view, weights * terms, minlength=count).astype(np.float64)
+
+    for turn in range(AFFINE_ROUNDS):
+        squares = np.bincount(point, weights * gain[view] ** 2)
+        color = (np.bincount(point, weights * gain[view] * (values - offset[view])) / squares)[
+            point
+        ]
+        residual = values - gain[view] * color - offset[view]
+        width = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+        if turn % 5 == 0:
+            weights = 1.0 / (1.0 + (residual / (2.0 * width)) ** 2)
+        # Two normal equations for each photo, with the pull on the offset.
+        one = sums(np.ones_like(values)) + (width / LIKELY_OFFSET) ** 2
+        by, by_by, to, by_to = sums(color), sums(color**2), sums(values), sums(color * values)
+        determinant = by_by * one - by**2
+        told = determinant > 1e-9 * one**2
+        determinant = np.where(told, determinant, 1.0)
+        gain = np.where(told, (by_to * one - by * to) / determinant, gain)
+        offset = np.where(told, (by_by * to - by * by_to) / determinant, offset)
+        gain = np.clip(gain, 1.0 / MOST_GAIN, MOST_GAIN)
+        gain /= np.exp(np.log(gain).mean())
+        offset -= gain * (offset.sum() / gain.sum())
+    return gain, offset

@@ -34,11 +34,11 @@ impl Exposed {
             parts.into_par_iter().for_each(|(out, from, t)| {
                 if exposure.background.is_none() {
                     for (out, color) in out.iter_mut().zip(from) {
-                        *out = gain * color + offset;
+                        *out = (gain * color + offset).clamp(0.0, 1.0);
                     }
                 } else {
                     for ((out, color), t) in out.iter_mut().zip(from).zip(t) {
-                        *out = gain * color + offset + t * behind;
+                        *out = (gain * color + offset + t * behind).clamp(0.0, 1.0);
                     }
                 }
             });
@@ -63,36 +63,56 @@ impl Exposed {
         let (mut v_gain, mut v_offset) = ([0.0; 3], [0.0; 3]);
         for (c, color) in [r, g, b].into_iter().enumerate() {
             let v_color = &mut v_color[c];
-            if kept.is_some() {
-                let pairs = self.v_alpha.par_chunks_mut(PART).zip(v_color.par_chunks(PART));
-                pairs.for_each(|(v_alpha, v)| {
-                    for (v_alpha, v) in v_alpha.iter_mut().zip(v) {
-                        *v_alpha -= v * behind[c];
-                    }
-                });
-            }
+            let raw = Raw { gain: exposure.gain[c], offset: exposure.offset[c], behind: behind[c] };
             let parts = (
                 v_color.par_chunks_mut(PART),
                 color.par_chunks(PART),
                 transmittance.par_chunks(PART),
             );
-            let sums: Vec<[f64; 2]> = parts
-                .into_par_iter()
-                .map(|(v, color, t)| {
-                    let sums = match kept {
-                        None => plain_sums(v, color),
-                        Some(b) => matted_sums(v, color, t, b[c]),
-                    };
-                    v.iter_mut().for_each(|v| *v *= exposure.gain[c]);
-                    sums
-                })
-                .collect();
+            let sums: Vec<[f64; 2]> = match kept {
+                None => parts
+                    .into_par_iter()
+                    .map(|(v, color, _)| {
+                        let pixels = v.iter_mut().zip(color);
+                        pixels.for_each(|(v, &color)| *v = raw.passed(*v, color, 0.0));
+                        plain_sums(v, color)
+                    })
+                    .collect(),
+                Some(b) => (parts, self.v_alpha.par_chunks_mut(PART))
+                    .into_par_iter()
+                    .map(|((v, color, t), v_alpha)| {
+                        let pixels = v.iter_mut().zip(color).zip(t).zip(v_alpha);
+                        pixels.for_each(|(((v, &color), &t), v_alpha)| {
+                            *v = raw.passed(*v, color, t);
+                            *v_alpha -= *v * raw.behind;
+                        });
+                        matted_sums(v, color, t, b[c])
+                    })
+                    .collect(),
+            };
+            v_color.par_iter_mut().for_each(|v| *v *= raw.gain);
             for [gain, offset] in sums {
                 v_gain[c] += gain;
                 v_offset[c] += offset;
             }
         }
         [v_gain, v_offset]
+    }
+}
+
+/// One channel's exposure.
+#[derive(Clone, Copy)]
+struct Raw {
+    gain: f32,
+    offset: f32,
+    behind: f32,
+}
+
+impl Raw {
+    /// What of a gradient goes back; see [`Exposure`].
+    #[inline(always)]
+    fn passed(self, v: f32, color: f32, t: f32) -> f32 {
+        Exposure::passed(self.gain * color + self.offset + t * self.behind, v)
     }
 }
 

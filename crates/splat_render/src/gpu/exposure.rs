@@ -154,10 +154,10 @@ pub(super) fn exposure_backward(
     let [v_gain, v_offset] = ExposureBuffers::gradients(&data[1]);
     let behind = exposure.behind();
     // On the device it goes into the totals of rasterize_backward alone.
-    let v_alpha = |v: &[f32; 3]| -v.iter().zip(behind).map(|(v, b)| v * b).sum::<f32>();
+    let v_alpha = |v: &[f32; 4]| -(0..3).map(|c| v[c] / exposure.gain[c] * behind[c]).sum::<f32>();
     Ok(ExposureGradients {
         v_color: v_picture.iter().map(|v| [v[0], v[1], v[2]]).collect(),
-        v_alpha: v_corrected.iter().map(v_alpha).collect(),
+        v_alpha: v_picture.iter().map(v_alpha).collect(),
         v_gain,
         v_offset,
     })

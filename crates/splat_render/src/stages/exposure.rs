@@ -9,6 +9,10 @@ use crate::error::{Error, Result};
 /// with T the picture's transmittance and b its background, colours become
 /// `gain * (color - T b) + offset * (1 - T) + T b`.
 ///
+/// What comes out is cut to 0..=1, which is all that a photo holds: where a photo is white, a colour
+/// may be any that is white in it. Back goes what brings a colour that was cut closer to what a photo
+/// holds, and nothing that takes it further away.
+///
 /// Colours are encoded as photos are (sRGB), 1 at the brightest: one stop is a gain of about
 /// 2^(1/2.2).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,6 +36,13 @@ impl<T: Float> Exposure<T> {
     pub(crate) fn behind(&self) -> [T; 3] {
         let Some(background) = self.background else { return [T::zero(); 3] };
         std::array::from_fn(|c| background[c] - self.gain[c] * background[c] - self.offset[c])
+    }
+
+    /// What of a corrected colour's gradient `v` goes back, where the colour was `raw` before the cut.
+    #[inline(always)]
+    pub(crate) fn passed(raw: T, v: T) -> T {
+        let leaves = (raw > T::one() && v < T::zero()) || (raw < T::zero() && v > T::zero());
+        if leaves { T::zero() } else { v }
     }
 
     /// Checks that all values are finite.

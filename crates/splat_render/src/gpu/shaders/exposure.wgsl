@@ -29,6 +29,11 @@ const SUMS = 6u;
 
 var<workgroup> partial_sums: array<f32, 384>; // SUMS THREADS
 
+// A pixel before it is cut to what a photo holds.
+fn raw(pixel: vec4<f32>) -> vec3<f32> {
+    return exposed.gain.xyz * pixel.xyz + exposed.offset.xyz + pixel.w * exposed.behind.xyz;
+}
+
 @compute @workgroup_size(THREADS)
 fn exposure(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -37,8 +42,7 @@ fn exposure(
     let pixels = view.width * view.height;
     for (var i = workgroup.x * THREADS + local; i < pixels; i += EXPOSURE_GROUPS * THREADS) {
         let pixel = picture[i];
-        let color = exposed.gain.xyz * pixel.xyz + exposed.offset.xyz + pixel.w * exposed.behind.xyz;
-        corrected[i] = vec4(color, pixel.w);
+        corrected[i] = vec4(clamp(raw(pixel), vec3(0.0), vec3(1.0)), pixel.w);
     }
 }
 
@@ -52,7 +56,12 @@ fn exposure_backward(
     var v_offset = vec3(0.0);
     for (var i = workgroup.x * THREADS + local; i < pixels; i += EXPOSURE_GROUPS * THREADS) {
         let pixel = picture[i];
-        let v = v_picture[i].xyz;
+        let before = raw(pixel);
+        let gradient = v_picture[i].xyz;
+        // What takes a cut colour further away from what a photo holds stays behind.
+        let leaves = (before > vec3(1.0) & gradient < vec3(0.0))
+            | (before < vec3(0.0) & gradient > vec3(0.0));
+        let v = select(gradient, vec3(0.0), leaves);
         // What of the pixel the exposure leaves as it is.
         let kept = pixel.w * exposed.background.w;
         v_gain += v * (pixel.xyz - kept * exposed.background.xyz);
