@@ -272,8 +272,9 @@ class Fitter:
                 information [V, 6, 6] (the inverse covariance of a rotation in radians about, and a
                 translation along, the camera's axes) and focal_information [V] (of the logarithm of
                 the focal length); zero where nothing is known.
-            exposures: where the exposures that are fitted start: gains [V, 3], offsets [V, 3], and
-                fitted [V], False for photos with the splats' own colors.
+            exposures: where the exposures that are fitted start: gains [V, 3], offsets [V, 3],
+                fitted [V], False for photos with the splats' own colors, and pulls [V] back to
+                the start.
         """
 
     def step(self, count: int) -> dict[str, Any]:

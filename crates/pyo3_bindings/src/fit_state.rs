@@ -55,12 +55,12 @@ pub fn camera_state_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Opt
     }))
 }
 
-/// Where exposures start: `gains` [V, 3], `offsets` [V, 3] and `fitted` [V], False for photos that have
-/// none of their own.
-pub fn exposures_from(
-    dict: &Bound<'_, PyDict>,
-    count: usize,
-) -> PyResult<Vec<Option<Exposure<f64>>>> {
+/// Starts of exposures and the pulls to them.
+pub type ExposureStarts = (Vec<Option<Exposure<f64>>>, Vec<f64>);
+
+/// Where exposures start: `gains` [V, 3], `offsets` [V, 3], `fitted` [V], False for photos that have
+/// none of their own, and `pulls` [V] to the starts.
+pub fn exposures_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<ExposureStarts> {
     let n = count as isize;
     let gains = entry::<f64>(dict, "gains")?;
     let gains = rows::<f64, 3>("gains", &gains, &[n])?;
@@ -69,7 +69,9 @@ pub fn exposures_from(
     let fitted = entry::<bool>(dict, "fitted")?;
     let fitted = elements("fitted", &fitted, &[n])?;
     let start = |k: usize| Exposure { gain: gains[k], offset: offsets[k], background: None };
-    Ok((0..count).map(|k| fitted[k].then(|| start(k))).collect())
+    let pulls = entry::<f64>(dict, "pulls")?;
+    let pulls = elements("pulls", &pulls, &[n])?.to_vec();
+    Ok(((0..count).map(|k| fitted[k].then(|| start(k))).collect(), pulls))
 }
 
 /// Reads the state of the exposures, if the dict holds one.

@@ -80,8 +80,8 @@ impl Fitter {
             if let Some(holds) = holds {
                 fitter.hold_cameras(holds)?;
             }
-            if let Some(exposures) = exposures {
-                fitter.start_exposures(&exposures)?;
+            if let Some((exposures, pulls)) = exposures {
+                fitter.start_exposures(&exposures, &pulls)?;
             }
             if let Some(exposure_state) = exposure_state {
                 fitter.resume_exposures(exposure_state)?;

@@ -297,7 +297,8 @@ fn exposure_fitter(state: &FitState, step: u32) -> Fitter {
     let config = FitConfig { exposures: true, ..config(DensityControl::Mcmc) };
     let device = Box::new(CpuFit::default());
     let mut fitter = Fitter::new(device, targets, cameras, state.clone(), step, config).unwrap();
-    fitter.start_exposures(&start).unwrap();
+    let pulls = vec![0.1; start.len()];
+    fitter.start_exposures(&start, &pulls).unwrap();
     fitter
 }
 

@@ -36,6 +36,11 @@ DARK, BRIGHT = 10, 250
 LEAST_POINTS = 30
 #: Groups of the jackknife.
 GROUPS = 8
+#: A start whose log gain has this standard error is pulled to with a weight of 1, others with its
+#: square over theirs, at most the second.
+UNIT_ERROR, MOST_PULL = 0.03, 100.0
+#: Standard errors of log gains by EXIF, and of those that a view brings from a fit.
+EXIF_ERROR, FITTED_ERROR = 0.1, 0.02
 #: Rounds of reweighting.
 ROUNDS = 12
 #: Turns in which photos and points are fitted; an offset that is likely; and the largest gain.
@@ -67,9 +72,24 @@ class RelativeGains:
         return float(np.sqrt(max(0.0, square)))
 
 
+@dataclass(frozen=True, eq=False)
+class StartingExposures:
+    """Where exposures of V views start in a fit.
+
+    Attributes:
+        exposures: one for each view; None for views with the splats' own colors.
+        pulls: float64 [V], how much each is pulled back to its start: the loss grows by this times
+            half the squares of what log gains and offsets are off. A slope of the loss of 0.01,
+            which a poor render may make, so moves them by 0.01 / pull at most.
+    """
+
+    exposures: list[Exposure | None]
+    pulls: Float64
+
+
 def starting_exposures(
     views: Sequence[View], points: Points | None, mode: ExposureMode
-) -> list[Exposure | None] | None:
+) -> StartingExposures | None:
     """Where exposures of views start, or None where they are not fitted.
 
     Views that bring an exposure start from it. Pseudo-views have none, but the splats' own colors.
@@ -84,6 +104,7 @@ def starting_exposures(
     photos = [view for view in views if view.weights is None]
     if any(view.exposure is not None for view in photos):
         known = [view.exposure or Exposure() for view in photos]
+        error = np.full(len(photos), FITTED_ERROR)
     else:
         observed = _observed(photos, points)
         gains = _gains(observed, len(photos)) or gains_by_exif(photos)
@@ -91,8 +112,13 @@ def starting_exposures(
             return None
         log_gain = np.zeros((len(photos), 3)) if gains is None else gains.log_gain
         known = _affine(observed, log_gain)
-    each = iter(known)
-    return [next(each) if view.weights is None else None for view in views]
+        error = np.full(len(photos), np.inf)
+        if gains is not None:
+            error = np.sqrt(np.mean(gains.error**2, axis=1))
+    pull = np.minimum(MOST_PULL, (UNIT_ERROR / np.maximum(error, 1e-9)) ** 2)
+    each = iter(zip(known, pull, strict=True))
+    rows = [next(each) if view.weights is None else (None, 0.0) for view in views]
+    return StartingExposures([one for one, _ in rows], np.array([by for _, by in rows]))
 
 
 def gains_by_exif(photos: Sequence[View]) -> RelativeGains | None:
@@ -102,7 +128,7 @@ def gains_by_exif(photos: Sequence[View]) -> RelativeGains | None:
         return None
     log_gain = LOG_GAIN_OF_STOP * np.array(stops, np.float64)
     rows = np.repeat((log_gain - log_gain.mean())[:, None], 3, axis=1)
-    return RelativeGains(rows, np.zeros_like(rows))
+    return RelativeGains(rows, np.full_like(rows, EXIF_ERROR))
 
 
 def gains_by_points(photos: Sequence[View], points: Points | None) -> RelativeGains | None:

@@ -14,11 +14,11 @@ import numpy as np
 
 from igsr._internal.choices import FitBackend
 from igsr._internal.progress_bar import progress_or_bar
-from igsr.capture import Capture, Exposure
+from igsr.capture import Capture
 from igsr.capture.photo_checks import check_photos
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import CheckpointFile, recorded_settings
-from igsr.fitting.exposures import starting_exposures
+from igsr.fitting.exposures import StartingExposures, starting_exposures
 from igsr.fitting.fingerprint import fingerprint, hash_of
 from igsr.fitting.fitter import (
     camera_rows,
@@ -284,14 +284,14 @@ def _fitted(
     return splats, capture
 
 
-def _seen_alike(capture: Capture, exposures: list[Exposure | None] | None) -> Capture:
+def _seen_alike(capture: Capture, start: StartingExposures | None) -> Capture:
     """The capture's train views with the scene's colors, as far as they are known before the fit.
 
     Initialization compares colors of photos.
     """
-    if exposures is None:
+    if start is None:
         return capture
-    return replace(capture, views=without_exposures(capture.train_views, exposures))
+    return replace(capture, views=without_exposures(capture.train_views, start.exposures))
 
 
 def _check_capture(capture: object) -> None:

@@ -15,6 +15,7 @@ from igsr.capture import Camera, Capture, Exposure, View
 from igsr.capture.types import intrinsic_matrix
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import GIVEN
+from igsr.fitting.exposures import StartingExposures
 from igsr.fitting.initialization.initial_splats import initial_splats
 from igsr.fitting.pose_priors import PosePriors
 from igsr.fitting.settings import FitSettings
@@ -36,7 +37,7 @@ def fitter_of(
     settings: dict[str, Any],
     backend: str,
     priors: PosePriors | None = None,
-    exposures: Sequence[Exposure | None] | None = None,
+    exposures: StartingExposures | None = None,
 ) -> _core.Fitter:
     """The renderer's fitter of splats to views; see ``_core.Fitter``.
 
@@ -49,8 +50,7 @@ def fitter_of(
             as they are) and "camera_warm_up" (fraction of the steps before cameras move).
         backend: "cpu" or "gpu".
         priors: of the V cameras, where these are optimized and something is known of them.
-        exposures: where those of the V views start, None for views with the splats' own colors;
-            None where no exposure is optimized.
+        exposures: where those of the V views start; None where none is optimized.
 
     Raises:
         ValueError: a view, the state or a setting cannot be used; the message names it.
@@ -165,12 +165,13 @@ def _prior_arrays(
     }
 
 
-def _exposure_arrays(exposures: Sequence[Exposure | None]) -> dict[str, npt.NDArray[Any]]:
-    known = [one or Exposure() for one in exposures]
+def _exposure_arrays(start: StartingExposures) -> dict[str, npt.NDArray[Any]]:
+    known = [one or Exposure() for one in start.exposures]
     return {
         "gains": np.array([one.gain for one in known], np.float64),
         "offsets": np.array([one.offset for one in known], np.float64),
-        "fitted": np.array([one is not None for one in exposures], np.bool_),
+        "fitted": np.array([one is not None for one in start.exposures], np.bool_),
+        "pulls": start.pulls,
     }
 
 
@@ -190,12 +191,8 @@ def fitted_exposures(views: Sequence[View], fitter: _core.Fitter) -> list[Exposu
     ]
 
 
-def without_exposures(
-    views: Sequence[View], exposures: Sequence[Exposure | None] | None
-) -> list[View]:
+def without_exposures(views: Sequence[View], exposures: Sequence[Exposure | None]) -> list[View]:
     """The views with the scene's colors: exposures taken out of their pixels, and forgotten."""
-    if exposures is None:
-        return list(views)
     return [
         view if one is None else replace(view, image=one.taken_out_of(view.image), exposure=None)
         for view, one in zip(views, exposures, strict=True)

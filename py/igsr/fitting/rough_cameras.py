@@ -6,12 +6,12 @@ roughly and to start again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-from igsr.capture import Capture, Exposure
+from igsr.capture import Capture
 from igsr.capture.downscaling import halved
 from igsr.errors import IgsrError
+from igsr.fitting.exposures import StartingExposures
 from igsr.fitting.fitter import (
     fitted_cameras,
     fitter_of,
@@ -35,7 +35,7 @@ def with_rough_cameras(
     backend: dict[str, str],
     priors: PosePriors | None,
     report: Report | None,
-    exposures: Sequence[Exposure | None] | None = None,
+    exposures: StartingExposures | None = None,
 ) -> tuple[Capture, bool]:
     """The capture with train cameras as the rough fit has them, and whether ``report`` ended it.
 
@@ -70,7 +70,9 @@ def with_rough_cameras(
         return not stopped
 
     try:
-        alike = replace(small, views=without_exposures(views, exposures))
+        alike = small
+        if exposures is not None:
+            alike = replace(small, views=without_exposures(views, exposures.exposures))
         state, started = initial_state(alike, rough)
         origin = state.pop("origin")
         if priors is not None:

@@ -17,11 +17,16 @@ use crate::target::Target;
 
 /// Adam's decay of the moments and its epsilon, as cameras have them: a photo has one step a round.
 const ADAM: (f64, f64, f64) = (0.9, 0.99, 1e-15);
-/// Adam's rate in the first step, in logarithms of gain and units of colour, and what it has decayed
-/// to at the end, as a part of that.
-const RATE: (f64, f64) = (0.01, 0.03);
-/// Added to the loss: this times half the squares of a photo's log gains and offsets. It decides where
-/// a photo shows nothing.
+/// What Adam's rate decays to until the end of the fit, as a part of the start's.
+const DECAY: f64 = 0.03;
+/// The rates at the start add up to this over the rounds of a fit, in logarithms of gain and units of
+/// colour: with the decay, exposures get about a third as far, a stop and a half.
+const REACH: f64 = 3.5;
+/// Least and most of the rate at the start.
+const RATES: (f64, f64) = (0.005, 0.05);
+/// Standard error of the start whose pull is 1. No step is longer than what a start leaves open.
+const UNIT_ERROR: f64 = 0.03;
+/// The pull of exposures of which nothing is known. It decides where a photo shows nothing.
 const PULL: f64 = 1e-3;
 /// Gains further from 1 than this factor are none of a camera.
 const GAIN_MAX: f64 = 64.0;
@@ -50,6 +55,9 @@ pub struct Exposures {
     is_fitted: Vec<bool>,
     /// Mean colour of each photo where it counts, 0..1.
     means: Vec<[f64; 3]>,
+    /// Gains and offsets that each photo's are pulled to, and how much.
+    start: Vec<[[f64; 3]; 2]>,
+    pulls: Vec<f64>,
     state: ExposureState,
 }
 
@@ -60,6 +68,8 @@ impl Exposures {
         Self {
             is_fitted: vec![true; targets.len()],
             means: targets.par_iter().map(mean_color).collect(),
+            start: vec![[[1.0; 3], [0.0; 3]]; targets.len()],
+            pulls: vec![PULL; targets.len()],
             state: ExposureState {
                 gains: vec![[1.0; 3]; targets.len()],
                 offsets: vec![[0.0; 3]; targets.len()],
@@ -74,14 +84,26 @@ impl Exposures {
     /// Sets where the exposures start: a gain above 0 and an offset for each photo, or None for one
     /// that has the splats' own colours and keeps them. The starts' backgrounds do not count.
     ///
+    /// What is known of a photo is better than what its render says of it, as long as that is a poor
+    /// one: against a render with errors, a gain seems lower than it is. So each start comes with a
+    /// pull back to it: this times half the squares of what log gains and offsets are off is added to
+    /// the loss.
+    ///
     /// # Errors
-    /// [`Error::Argument`] if there is not one start for each photo, or one of them cannot be used.
-    pub fn start(&mut self, start: &[Option<Exposure<f64>>]) -> Result<()> {
+    /// [`Error::Argument`] if there is not one start and pull for each photo, or one of them cannot be
+    /// used.
+    pub fn start(&mut self, start: &[Option<Exposure<f64>>], pulls: &[f64]) -> Result<()> {
         let count = self.is_fitted.len();
-        if start.len() != count {
+        if start.len() != count || pulls.len() != count {
             return Err(Error::argument(
                 "exposures",
-                format!("must have one entry for each of {count} images"),
+                format!("must have one start and one pull for each of {count} images"),
+            ));
+        }
+        if !pulls.iter().all(|pull| pull.is_finite() && *pull >= 0.0) {
+            return Err(Error::argument(
+                "exposures",
+                "must have pulls that are finite and not negative",
             ));
         }
         let each = || start.iter().map(|start| start.unwrap_or_else(Exposure::none));
@@ -92,6 +114,9 @@ impl Exposures {
         })?;
         self.is_fitted = start.iter().map(Option::is_some).collect();
         self.anchor();
+        let ExposureState { gains, offsets, .. } = &self.state;
+        self.start = gains.iter().zip(offsets).map(|(&gain, &offset)| [gain, offset]).collect();
+        self.pulls = pulls.iter().map(|pull| pull.max(PULL)).collect();
         Ok(())
     }
 
@@ -138,9 +163,10 @@ impl Exposures {
         for gradient in gradients {
             let k = gradient.view;
             let (gain, offset) = (self.state.gains[k], self.state.offsets[k]);
+            let ([start_gain, start_offset], pull) = (self.start[k], self.pulls[k]);
             let row: [f64; 6] = std::array::from_fn(|i| match i {
-                0..3 => gradient.v_gain[i] + PULL * gain[i].ln() / gain[i],
-                _ => gradient.v_offset[i - 3] + PULL * offset[i - 3],
+                0..3 => gradient.v_gain[i] + pull * (gain[i] / start_gain[i]).ln() / gain[i],
+                _ => gradient.v_offset[i - 3] + pull * (offset[i - 3] - start_offset[i - 3]),
             });
             // A picture that left f32 says nothing.
             if row.iter().all(|v| v.is_finite()) {
@@ -151,10 +177,11 @@ impl Exposures {
         }
     }
 
-    /// Moves the exposures by the gradients of the round; `progress` is that of the fit, 0..1.
-    pub fn step(&mut self, progress: f64) {
-        let (rate, decay) = RATE;
-        let rate = rate * decay.powf(progress.clamp(0.0, 1.0));
+    /// Moves the exposures by the gradients of the round; `progress` is that of the fit, 0..1, which
+    /// has about so many `rounds`.
+    pub fn step(&mut self, progress: f64, rounds: f64) {
+        let decayed = DECAY.powf(progress.clamp(0.0, 1.0));
+        let rate = (REACH / rounds.max(1.0)).clamp(RATES.0, RATES.1);
         self.state.rounds += 1;
         for k in 0..self.is_fitted.len() {
             let v = std::mem::take(&mut self.state.gradients[k]);
@@ -168,7 +195,8 @@ impl Exposures {
                 0..3 => gain[i] * v[i] - (mean[i] - offset[i]) * v[i + 3],
                 _ => v[i],
             });
-            let moved = self.adam(k, v, rate);
+            let rate = rate.min(UNIT_ERROR / self.pulls[k].sqrt());
+            let moved = self.adam(k, v, decayed * rate);
             for c in 0..3 {
                 let factor = moved[c].exp();
                 let turned = (factor - 1.0) * (mean[c] - offset[c]);
@@ -266,7 +294,7 @@ mod tests {
                 let v_gain = off[0] * scene[0] + off[1] * scene[1];
                 fitted.add(&[gradient(view, v_gain, off[0] + off[1])]);
             }
-            fitted.step(f64::from(round) / f64::from(rounds));
+            fitted.step(f64::from(round) / f64::from(rounds), f64::from(rounds));
         }
         // The truth in the same gauge: its offsets have a mean of zero already.
         for (view, (gain, offset)) in truth.into_iter().enumerate() {
@@ -283,12 +311,12 @@ mod tests {
             Some(Exposure { gain: [gain; 3], offset: [offset; 3], background: None })
         };
         let mut fitted = Exposures::new(&targets);
-        fitted.start(&[start(2.0, 0.2), start(1.5, 0.0), None]).unwrap();
+        fitted.start(&[start(2.0, 0.2), start(1.5, 0.0), None], &[0.0; 3]).unwrap();
         for round in 0..5 {
             for view in 0..3 {
                 fitted.add(&[gradient(view, 1.0 + view as f64, -0.3)]);
             }
-            fitted.step(0.1 * f64::from(round));
+            fitted.step(0.1 * f64::from(round), 10.0);
             let state = fitted.state();
             let logs: f64 = state.gains[..2].iter().map(|g| g[1].ln()).sum();
             let offsets: f64 = state.offsets[..2].iter().map(|o| o[1]).sum();
@@ -298,18 +326,25 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_that_shows_nothing_goes_back_to_none() {
+    fn a_photo_that_shows_nothing_keeps_its_start() {
         let start =
             |gain: f64| Some(Exposure { gain: [gain; 3], offset: [0.0; 3], background: None });
         let targets = [photo(200), photo(120)];
         let mut fitted = Exposures::new(&targets);
-        fitted.start(&[start(1.2), start(1.0 / 1.2)]).unwrap();
-        for _ in 0..300 {
-            fitted.add(&[gradient(0, 0.0, 0.0), gradient(1, 0.0, 0.0)]);
-            fitted.step(0.3);
-        }
-        let gain = fitted.state().gains[0][0];
-        assert!((gain - 1.0).abs() < 0.02, "{gain}");
+        let starts = [start(1.2), start(1.0 / 1.2)];
+        fitted.start(&starts, &[10.0; 2]).unwrap();
+        let mut run = |v_gain: f64| {
+            for _ in 0..300 {
+                fitted.add(&[gradient(0, v_gain, 0.0), gradient(1, -v_gain, 0.0)]);
+                fitted.step(0.5, 600.0);
+            }
+            fitted.state().gains[0][0]
+        };
+        // A slope of the loss moves it by a tenth of that at most.
+        let moved = run(0.1);
+        assert!(moved < 1.2 && moved > 1.17, "{moved}");
+        let back = run(0.0);
+        assert!((back - 1.2).abs() < 2e-3, "{back}");
     }
 
     #[test]
@@ -318,8 +353,12 @@ mod tests {
         let lost = Some(Exposure { offset: [f64::NAN; 3], ..Exposure::none() });
         for start in [vec![], vec![dark], vec![lost]] {
             let mut fitted = Exposures::new(&[photo(9)]);
-            let error = fitted.start(&start).unwrap_err().to_string();
+            let error = fitted.start(&start, &[1.0]).unwrap_err().to_string();
             assert!(error.starts_with("exposures: "), "{error}");
+        }
+        for pulls in [&[][..], &[-1.0], &[f64::NAN]] {
+            let mut fitted = Exposures::new(&[photo(9)]);
+            assert!(fitted.start(&[Some(Exposure::none())], pulls).is_err(), "{pulls:?}");
         }
     }
 }

@@ -280,11 +280,15 @@ impl Fitter {
     ///
     /// # Errors
     /// [`Error::Argument`] if exposures are not fitted, or the starts cannot be used.
-    pub fn start_exposures(&mut self, start: &[Option<Exposure<f64>>]) -> Result<()> {
+    pub fn start_exposures(
+        &mut self,
+        start: &[Option<Exposure<f64>>],
+        pulls: &[f64],
+    ) -> Result<()> {
         let Some(exposures) = self.exposures.as_mut() else {
             return Err(Error::argument("exposures", "are not fitted here"));
         };
-        exposures.start(start)
+        exposures.start(start, pulls)
     }
 
     /// Goes on with exposures where another fit's had come to.
@@ -384,7 +388,8 @@ impl Fitter {
             self.cameras = cameras.now().to_vec();
         }
         if let Some(exposures) = self.exposures.as_mut() {
-            exposures.step(progress);
+            let rounds = f64::from(self.config.steps) / self.round.len() as f64;
+            exposures.step(progress, rounds);
         }
         Ok(())
     }
