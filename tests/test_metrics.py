@@ -104,3 +104,35 @@ def test_ms_ssim_needs_176_pixels():
 def test_unusable_pictures_are_named(render, photo, mask, name):
     with pytest.raises(ValueError, match=name):
         metrics.score(render, photo, mask)
+
+
+def test_color_correction_takes_exposure_and_tone_out():
+    photo = np.clip(picture(height=48, width=56).astype(float) * 0.6 + 40, 0, 255).astype(np.uint8)
+    brighter = np.clip(photo.astype(float) * [0.7, 0.8, 0.9] + [20, 0, 10], 0, 255).astype(np.uint8)
+    curve = (255 * (photo / 255) ** 1.3).astype(np.uint8)
+    for render in (brighter, curve):
+        assert metrics.psnr(render, photo) < 26
+        assert metrics.psnr(metrics.color_corrected(render, photo), photo) > 38
+    # What is no matter of colors stays.
+    scores = metrics.score(noisy(photo, 40), photo)
+    assert scores["cc_psnr"] < scores["psnr"] + 1.5
+    assert scores["cc_ssim"] < scores["ssim"] + 0.1
+
+
+def test_color_correction_is_fitted_to_pixels_that_count_and_are_not_clipped():
+    photo = np.clip(picture(height=48, width=56).astype(float) * 0.6 + 40, 0, 255).astype(np.uint8)
+    render = (photo * 0.8).astype(np.uint8)
+    mask = np.ones(photo.shape[:2], dtype=bool)
+    mask[:, :20] = False
+    spoiled = photo.copy()
+    spoiled[:, :20] = 255 - spoiled[:, :20]
+    score = metrics.score(render, spoiled, mask)
+    assert score["cc_psnr"] > 38
+    white = np.full_like(photo, 255)
+    assert (metrics.color_corrected(white, photo) == white).all(), "nothing to fit a map to"
+    white_patch = render.copy()
+    white_patch[:10, :10] = 255
+    inner = np.zeros(photo.shape[:2], dtype=bool)
+    inner[12:, 12:] = True
+    mended = metrics.color_corrected(white_patch, photo)
+    assert metrics.psnr(mended, photo, inner) > 38

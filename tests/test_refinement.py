@@ -94,13 +94,13 @@ def test_folds_are_fitted_as_all_photos_are(ball_photos, monkeypatch):
     dropout = settings_for("default", support_of(photos)).dropout
     assert settings_for("default", support_of(photos[::2])).dropout != dropout
     settings = []
-    real = stages.fit
+    real = stages.fit_with_cameras
 
     def watched(made, **given):
         settings.append((len(made.views), given["density"], given["sh_degree"], given["dropout"]))
         return real(made, **given)
 
-    monkeypatch.setattr(stages, "fit", watched)
+    monkeypatch.setattr(stages, "fit_with_cameras", watched)
     refine(ball_photos, 1, lying, steps=40)
     assert [photos for photos, *_ in settings][:3] == [9, 7, 8]
     assert {tuple(some) for _, *some in settings} == {("original", 2, dropout)}

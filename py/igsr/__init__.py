@@ -18,7 +18,7 @@ from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from igsr._core import __version__
-    from igsr.capture import Camera, Capture, Points, View, load_capture
+    from igsr.capture import Camera, Capture, Exposure, Points, View, load_capture
     from igsr.compaction import Compaction, compact
     from igsr.denoiser import denoise
     from igsr.errors import IgsrError
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from igsr.pose import estimate_poses
     from igsr.refinement import Refined, refine
     from igsr.rendering import Render, render
+    from igsr.rendering.exposure import apply_exposure
     from igsr.rendering.rasterization import rasterization
     from igsr.splats import Splats
 
@@ -34,6 +35,7 @@ __all__ = [
     "Camera",
     "Capture",
     "Compaction",
+    "Exposure",
     "IgsrError",
     "Points",
     "Progress",
@@ -43,6 +45,7 @@ __all__ = [
     "Splats",
     "View",
     "__version__",
+    "apply_exposure",
     "compact",
     "denoise",
     "estimate_poses",
@@ -61,7 +64,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "igsr._core": ("__version__",),
-            "igsr.capture": ("Camera", "Capture", "Points", "View", "load_capture"),
+            "igsr.capture": ("Camera", "Capture", "Exposure", "Points", "View", "load_capture"),
             "igsr.compaction": ("Compaction", "compact"),
             "igsr.denoiser": ("denoise",),
             "igsr.errors": ("IgsrError",),
@@ -70,6 +73,7 @@ if not TYPE_CHECKING:
             "igsr.pose": ("estimate_poses",),
             "igsr.refinement": ("Refined", "refine"),
             "igsr.rendering": ("Render", "render"),
+            "igsr.rendering.exposure": ("apply_exposure",),
             "igsr.rendering.rasterization": ("rasterization",),
             "igsr.splats": ("Splats",),
         },

@@ -246,6 +246,7 @@ class Fitter:
         config: dict[str, Any],
         backend: str,
         holds: dict[str, Float64] | None = None,
+        exposures: dict[str, npt.NDArray[Any]] | None = None,
     ) -> None:
         """A fit to V photos.
 
@@ -264,12 +265,16 @@ class Fitter:
                 coarse_to_fine (the first steps are on photos of a fraction of their size); poses
                 ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate (pixels per
                 step), camera_decay, camera_warm_up (fraction of the steps), frozen (splats are not
-                changed). An absent or None entry takes the default.
+                changed), exposures (whether gains and offsets of the photos are fitted). An absent
+                or None entry takes the default.
             backend: "cpu" or "gpu".
             holds: pose priors of the cameras that are fitted: viewmats and intrinsics as above,
                 information [V, 6, 6] (the inverse covariance of a rotation in radians about, and a
                 translation along, the camera's axes) and focal_information [V] (of the logarithm of
                 the focal length); zero where nothing is known.
+            exposures: where the exposures that are fitted start: gains [V, 3], offsets [V, 3],
+                fitted [V], False for photos with the splats' own colors, and pulls [V] back to
+                the start.
         """
 
     def step(self, count: int) -> dict[str, Any]:
@@ -284,6 +289,9 @@ class Fitter:
 
     def cameras(self) -> dict[str, Float64]:
         """The cameras as they are now: camera_viewmats [V, 4, 4] and camera_intrinsics [V, 4]."""
+
+    def exposures(self) -> dict[str, Float64] | None:
+        """The exposures as they are now: gains and offsets, [V, 3] each; None if not fitted."""
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Everything needed to resume the fit with the same bits: the constructor's ``state``."""

@@ -57,6 +57,7 @@ pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
         coarse_to_fine: setting(config, "coarse_to_fine")?.unwrap_or(default.coarse_to_fine),
         rates: if frozen { Rates::ZERO } else { default.rates },
         cameras,
+        exposures: setting(config, "exposures")?.unwrap_or(default.exposures),
         ..default
     })
 }

@@ -3,7 +3,7 @@
 use glam::DMat4;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use splat_render::fit::{CameraState, DensityStats, FitState, Hold};
+use splat_render::fit::{CameraState, DensityStats, Exposure, ExposureState, FitState, Hold};
 
 use crate::arrays::{elements, entry, rows, shaped, shaped_rows};
 use crate::camera::viewmat;
@@ -53,6 +53,62 @@ pub fn camera_state_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Opt
         distances: elements("camera_distances", &distances, &[n])?.to_vec(),
         rounds: elements("camera_rounds", &rounds, &[1])?[0],
     }))
+}
+
+/// Starts of exposures and the pulls to them.
+pub type ExposureStarts = (Vec<Option<Exposure<f64>>>, Vec<f64>);
+
+/// Where exposures start: `gains` [V, 3], `offsets` [V, 3], `fitted` [V], False for photos that have
+/// none of their own, and `pulls` [V] to the starts.
+pub fn exposures_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<ExposureStarts> {
+    let n = count as isize;
+    let gains = entry::<f64>(dict, "gains")?;
+    let gains = rows::<f64, 3>("gains", &gains, &[n])?;
+    let offsets = entry::<f64>(dict, "offsets")?;
+    let offsets = rows::<f64, 3>("offsets", &offsets, &[n])?;
+    let fitted = entry::<bool>(dict, "fitted")?;
+    let fitted = elements("fitted", &fitted, &[n])?;
+    let start = |k: usize| Exposure { gain: gains[k], offset: offsets[k], background: None };
+    let pulls = entry::<f64>(dict, "pulls")?;
+    let pulls = elements("pulls", &pulls, &[n])?.to_vec();
+    Ok(((0..count).map(|k| fitted[k].then(|| start(k))).collect(), pulls))
+}
+
+/// Reads the state of the exposures, if the dict holds one.
+pub fn exposure_state_from(
+    dict: &Bound<'_, PyDict>,
+    count: usize,
+) -> PyResult<Option<ExposureState>> {
+    if !dict.contains("exposure_gains")? {
+        return Ok(None);
+    }
+    let n = count as isize;
+    let colors = |name: &str| -> PyResult<Vec<[f64; 3]>> {
+        Ok(rows(name, &entry::<f64>(dict, name)?, &[n])?.to_vec())
+    };
+    let table = |name: &str| -> PyResult<Vec<[f64; 6]>> {
+        Ok(rows(name, &entry::<f64>(dict, name)?, &[n])?.to_vec())
+    };
+    let rounds = entry::<u32>(dict, "exposure_rounds")?;
+    Ok(Some(ExposureState {
+        gains: colors("exposure_gains")?,
+        offsets: colors("exposure_offsets")?,
+        first: table("exposure_first")?,
+        second: table("exposure_second")?,
+        gradients: table("exposure_gradients")?,
+        rounds: elements("exposure_rounds", &rounds, &[1])?[0],
+    }))
+}
+
+/// Writes what [`exposure_state_from`] reads.
+pub fn set_exposure_state(dict: &Bound<'_, PyDict>, state: ExposureState) -> PyResult<()> {
+    let (py, n) = (dict.py(), state.gains.len());
+    dict.set_item("exposure_gains", shaped_rows(py, state.gains, &[n])?)?;
+    dict.set_item("exposure_offsets", shaped_rows(py, state.offsets, &[n])?)?;
+    dict.set_item("exposure_first", shaped_rows(py, state.first, &[n])?)?;
+    dict.set_item("exposure_second", shaped_rows(py, state.second, &[n])?)?;
+    dict.set_item("exposure_gradients", shaped_rows(py, state.gradients, &[n])?)?;
+    dict.set_item("exposure_rounds", shaped(py, vec![state.rounds], &[1])?)
 }
 
 /// Pose priors of the cameras: `viewmats` [V, 4, 4], `intrinsics` [V, 4], `information` [V, 6, 6] (the

@@ -7,17 +7,20 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
 use crate::arguments::Call;
-use crate::arrays::{array, rows, shaped};
+use crate::arrays::{array, rows, shaped, shaped_rows};
 use crate::backend::fit_device;
 use crate::camera::cameras;
 use crate::error::to_python;
 use crate::fit_settings::config_from;
-use crate::fit_state::{camera_state_from, holds_from, set_camera_state, set_cameras, state_from};
+use crate::fit_state::{
+    camera_state_from, exposure_state_from, exposures_from, holds_from, set_camera_state,
+    set_cameras, set_exposure_state, state_from,
+};
 use crate::photos::targets_from;
 use crate::splat_arrays::set_splat_arrays;
 
 /// Names of the constructor's arguments, in their order.
-const ARGUMENTS: [&str; 10] = [
+const ARGUMENTS: [&str; 11] = [
     "images",
     "masks",
     "backgrounds",
@@ -28,6 +31,7 @@ const ARGUMENTS: [&str; 10] = [
     "config",
     "backend",
     "holds",
+    "exposures",
 ];
 
 /// A fit in progress. Its parameters stay on the device that computes.
@@ -48,7 +52,7 @@ impl Fitter {
     #[new]
     #[pyo3(
         signature = (*positional, **named),
-        text_signature = "(images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, holds=None)"
+        text_signature = "(images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, holds=None, exposures=None)"
     )]
     fn new<'py>(
         py: Python<'py>,
@@ -62,6 +66,9 @@ impl Fitter {
         let cameras = cameras(&call.object("viewmats")?, &call.object("intrinsics")?, &sizes)?;
         let state = call.dict("state")?;
         let camera_state = camera_state_from(&state, cameras.len())?;
+        let exposure_state = exposure_state_from(&state, cameras.len())?;
+        let exposures = call.optional::<Bound<'_, PyDict>>("exposures")?;
+        let exposures = exposures.map(|start| exposures_from(&start, cameras.len())).transpose()?;
         let holds = call.optional::<Bound<'_, PyDict>>("holds")?;
         let holds = holds.map(|holds| holds_from(&holds, cameras.len())).transpose()?;
         let (state, step) = state_from(&state, config.first_step)?;
@@ -72,6 +79,12 @@ impl Fitter {
                 splat_render::fit::Fitter::new(device, targets, cameras, state, step, config)?;
             if let Some(holds) = holds {
                 fitter.hold_cameras(holds)?;
+            }
+            if let Some((exposures, pulls)) = exposures {
+                fitter.start_exposures(&exposures, &pulls)?;
+            }
+            if let Some(exposure_state) = exposure_state {
+                fitter.resume_exposures(exposure_state)?;
             }
             if let Some(camera_state) = camera_state {
                 fitter.resume_cameras(camera_state)?;
@@ -121,13 +134,25 @@ impl Fitter {
         Ok(dict)
     }
 
+    /// The exposures as they are now, where they are fitted: `gains` and `offsets`, [V, 3] each.
+    fn exposures<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
+        let Some(state) = py.detach(|| self.lock()?.exposure_state().map_err(to_python))? else {
+            return Ok(None);
+        };
+        let (n, dict) = (state.gains.len(), PyDict::new(py));
+        dict.set_item("gains", shaped_rows(py, state.gains, &[n])?)?;
+        dict.set_item("offsets", shaped_rows(py, state.offsets, &[n])?)?;
+        Ok(Some(dict))
+    }
+
     /// Everything needed to go on bit for bit: the constructor's `state`.
     fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let (state, step, cameras) = py.detach(|| {
+        let (state, step, cameras, exposures) = py.detach(|| {
             let mut fitter = self.lock()?;
             let state = fitter.state().map_err(to_python)?;
             let cameras = fitter.camera_state().map_err(to_python)?;
-            PyResult::Ok((state, fitter.steps_done(), cameras))
+            let exposures = fitter.exposure_state().map_err(to_python)?;
+            PyResult::Ok((state, fitter.steps_done(), cameras, exposures))
         })?;
         let n = state.splats.len();
         let dict = PyDict::new(py);
@@ -139,6 +164,9 @@ impl Fitter {
         dict.set_item("step", shaped(py, vec![step], &[1])?)?;
         if let Some(cameras) = cameras {
             set_camera_state(&dict, cameras)?;
+        }
+        if let Some(exposures) = exposures {
+            set_exposure_state(&dict, exposures)?;
         }
         Ok(dict)
     }

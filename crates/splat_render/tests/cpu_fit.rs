@@ -6,8 +6,8 @@ mod common;
 use common::{random_camera, random_scene, rng};
 use splat_render::cpu::{Cpu, CpuFit};
 use splat_render::fit::{
-    Background, CameraConfig, CameraState, DensityControl, FitConfig, FitDevice, FitState, Fitter,
-    Focal, Rates, StepInput, Target, splats_from_points,
+    Background, CameraConfig, CameraState, DensityControl, Exposure, FitConfig, FitDevice,
+    FitState, Fitter, Focal, Rates, StepInput, Target, splats_from_points,
 };
 use splat_render::{Camera, Error, ProjectOptions, Stages};
 
@@ -249,6 +249,7 @@ fn still_step(device: &mut CpuFit, camera: Camera, step: u32) -> StepInput {
         dropout: 0.2,
         noise_seed: 3,
         camera_gradient: true,
+        exposure: None,
     };
     device.step(&input).unwrap();
     input
@@ -287,6 +288,106 @@ fn the_camera_gradient_is_the_slope_of_the_loss() {
     let got = slope(&|camera, by| camera.fx += by, 0.05);
     assert!((got - expected).abs() < 0.03 * expected.abs() + 1e-6, "fx: {got} for {expected}");
     assert!(device.download().unwrap().splats == state.splats, "frozen splats moved");
+}
+
+/// A fit of exposures, from splats that are on their way, with a photo that has no exposure.
+fn exposure_fitter(state: &FitState, step: u32) -> Fitter {
+    let (targets, cameras) = photos();
+    let start: Vec<_> = (0..targets.len()).map(|k| (k != 1).then(Exposure::none)).collect();
+    let config = FitConfig { exposures: true, ..config(DensityControl::Mcmc) };
+    let device = Box::new(CpuFit::default());
+    let mut fitter = Fitter::new(device, targets, cameras, state.clone(), step, config).unwrap();
+    let pulls = vec![0.1; start.len()];
+    fitter.start_exposures(&start, &pulls).unwrap();
+    fitter
+}
+
+#[test]
+fn exposures_have_the_same_bits_on_any_number_of_threads_and_after_a_resume() {
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let mut fitter = exposure_fitter(&start(1), 0);
+            (run(&mut fitter, 40), fitter.exposure_state().unwrap().unwrap())
+        })
+    };
+    let whole = on(1);
+    assert!(on(3) == whole, "the number of threads changed bits");
+    assert_ne!(whole.1.gains[0], [1.0; 3]);
+    assert_eq!(whole.1.gains[1], [1.0; 3], "a photo without exposure got one");
+    // Within a round, so that sums of gradients are under way.
+    let mut first = exposure_fitter(&start(1), 0);
+    let (state, exposures) = (run(&mut first, 23), first.exposure_state().unwrap().unwrap());
+    let mut resumed = exposure_fitter(&state, 23);
+    resumed.resume_exposures(exposures).unwrap();
+    let ended = (run(&mut resumed, 40), resumed.exposure_state().unwrap().unwrap());
+    assert!(ended == whole, "resumed it ends otherwise");
+    let plain = fitter(DensityControl::Mcmc, &start(1), 0).exposure_state().unwrap();
+    assert!(plain.is_none(), "a fit without exposures has some");
+}
+
+#[test]
+fn the_exposure_gradient_is_the_slope_of_the_loss() {
+    let (matted, cameras) = photos();
+    let plain: Vec<Target> = matted
+        .iter()
+        .map(|target| Target {
+            channels: 3,
+            pixels: target.pixels.chunks(4).flat_map(|p| [p[0], p[1], p[2]]).collect(),
+            ..target.clone()
+        })
+        .collect();
+    for (targets, background) in [(plain, None), (matted, Some([0.2, 0.5, 0.7]))] {
+        let mut device = CpuFit::default();
+        device.set_targets(targets).unwrap();
+        let mut state = start(1);
+        state.splats.scales.iter_mut().for_each(|s| *s = s.map(|v| v + 1.5));
+        state.splats.opacities.iter_mut().for_each(|o| *o = -1.0);
+        state.splats.sh.iter_mut().for_each(|c| *c = c.map(|v| v + 0.3));
+        device.upload(state.clone()).unwrap();
+        let camera = cameras[0];
+        let exposure = Exposure { gain: [1.3, 0.8, 1.1], offset: [0.05, -0.02, 0.1], background };
+        let input = still_step(&mut device, camera, 1);
+        let mut step = |exposure: Exposure<f32>, camera: Camera| {
+            let input = StepInput { exposure: Some(exposure), camera, ..input };
+            device.step(&input).unwrap();
+            let exposures = device.exposure_gradients().unwrap();
+            let camera = device.camera_gradients().unwrap().pop().unwrap();
+            (f64::from(device.loss().unwrap()), exposures[0], camera)
+        };
+        let (_, gradient, v_camera) = step(exposure, camera);
+        let largest = gradient.v_gain.iter().fold(0.0f64, |a, v| a.max(v.abs()));
+        for c in 0..3 {
+            let mut at = |by: f32| {
+                let mut moved = exposure;
+                moved.gain[c] += by;
+                step(moved, camera).0
+            };
+            let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
+            let off = (slope - gradient.v_gain[c]).abs();
+            assert!(off < 0.03 * largest, "gain {c}: {slope} for {}", gradient.v_gain[c]);
+            let mut at = |by: f32| {
+                let mut moved = exposure;
+                moved.offset[c] += by;
+                step(moved, camera).0
+            };
+            let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
+            let off = (slope - gradient.v_offset[c]).abs();
+            assert!(off < 0.03 * largest, "offset {c}: {slope} for {}", gradient.v_offset[c]);
+        }
+        // What lies before the exposure gets its gradient through it, alpha's part included.
+        let largest = v_camera.v_viewmat.iter().map(|row| row[3].abs()).fold(0.0, f64::max);
+        for axis in 0..3 {
+            let mut at = |by: f64| {
+                let mut moved = camera;
+                moved.viewmat.w_axis[axis] += by;
+                step(exposure, moved).0
+            };
+            let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
+            let expected = v_camera.v_viewmat[axis][3];
+            assert!((slope - expected).abs() < 0.03 * largest, "{axis}: {slope} for {expected}");
+        }
+    }
 }
 
 #[test]

@@ -146,6 +146,11 @@ fn a_far_away_scene_renders_as_one_at_the_origin() {
 }
 
 #[test]
+fn exposure_matches_the_reference() {
+    common::optimisation::exposure_matches_the_reference(&Cpu);
+}
+
+#[test]
 fn loss_matches_the_reference() {
     common::optimisation::loss_matches_the_reference(&Cpu);
 }

@@ -314,6 +314,11 @@ fn drawn_pictures_match_the_reference() {
 }
 
 #[test]
+fn exposure_matches_the_reference() {
+    common::optimisation::exposure_matches_the_reference(gpu());
+}
+
+#[test]
 fn loss_matches_the_reference() {
     common::optimisation::loss_matches_the_reference(gpu());
 }

@@ -7,7 +7,7 @@ use rand_pcg::Pcg64Mcg;
 use splat_render::fit::{Rates, Target};
 use splat_render::reference::{Reference, decisions};
 use splat_render::splats::SplatArrays;
-use splat_render::stages::{AdamState, AdamStep};
+use splat_render::stages::{AdamState, AdamStep, Exposure};
 use splat_render::{
     Camera, Colors, Image, ImageGradients, ProjectOptions, SplatGradients, SplatParams, Stages,
 };
@@ -304,6 +304,95 @@ fn the_loss_s_gradient_matches_central_differences() {
         }
     }
     println!("{samples} samples: worst {worst:.1e} of the largest");
+}
+
+/// Through the loss, of everything that a corrected picture is made from.
+#[test]
+fn the_exposure_s_gradients_match_central_differences() {
+    let mut worst = 0.0f64;
+    for seed in 0..40 {
+        let (target, mut image) = photo_and_picture(seed);
+        let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0xe5e);
+        image.transmittance.iter_mut().for_each(|t| *t = rng.random());
+        let background = [0.2, 0.7, 0.4];
+        // So that no colour is cut.
+        let mut exposure = Exposure {
+            gain: std::array::from_fn(|_| rng.random_range(0.4..0.8)),
+            offset: std::array::from_fn(|_| rng.random_range(0.02..0.15)),
+            background: (target.channels == 4).then_some(background),
+        };
+        let loss = |image: &Image<f64>, exposure: &Exposure<f64>| {
+            let color = Reference.exposure(image, exposure).unwrap();
+            let corrected = Image { color, ..image.clone() };
+            Reference.loss(&corrected, &target, background, 0.2).unwrap()
+        };
+        let v = loss(&image, &exposure).v_color;
+        let analytic = Reference.exposure_backward(&image, &exposure, &v).unwrap();
+        let largest = analytic.v_gain.iter().fold(0.0f64, |a, v| a.max(v.abs())).max(1e-3);
+        let mut check = |what: &str, slope: f64, expected: f64, largest: f64| {
+            let error = (slope - expected).abs() / largest;
+            assert!(error <= 1e-5, "seed {seed}, {what}: {slope} for {expected}");
+            worst = worst.max(error);
+        };
+        let h = 1e-6;
+        for c in 0..3 {
+            let value = exposure.gain[c];
+            let mut at = |value: f64| {
+                exposure.gain[c] = value;
+                loss(&image, &exposure).value
+            };
+            let (high, low, _) = (at(value + h), at(value - h), at(value));
+            check("gain", (high - low) / (2.0 * h), analytic.v_gain[c], largest);
+            let value = exposure.offset[c];
+            let mut at = |value: f64| {
+                exposure.offset[c] = value;
+                loss(&image, &exposure).value
+            };
+            let (high, low, _) = (at(value + h), at(value - h), at(value));
+            check("offset", (high - low) / (2.0 * h), analytic.v_offset[c], largest);
+        }
+        let largest = analytic.v_color.as_flattened().iter().fold(0.0f64, |a, v| a.max(v.abs()));
+        for _ in 0..6 {
+            let (pixel, c) = (rng.random_range(0..image.color.len()), rng.random_range(0..3));
+            let value = image.color[pixel][c];
+            let mut at = |value: f64| {
+                image.color[pixel][c] = value;
+                loss(&image, &exposure).value
+            };
+            let (high, low, _) = (at(value + h), at(value - h), at(value));
+            check("color", (high - low) / (2.0 * h), analytic.v_color[pixel][c], largest);
+            let value = image.transmittance[pixel];
+            let mut at = |value: f64| {
+                image.transmittance[pixel] = value;
+                loss(&image, &exposure).value
+            };
+            // Alpha is 1 - transmittance.
+            let (high, low, _) = (at(value - h), at(value + h), at(value));
+            check("alpha", (high - low) / (2.0 * h), analytic.v_alpha[pixel], largest);
+        }
+    }
+    println!("worst {worst:.1e} of the largest");
+}
+
+#[test]
+fn a_cut_colour_is_only_brought_back() {
+    let image = Image {
+        width: 4,
+        height: 1,
+        color: vec![[0.9; 3], [0.9; 3], [0.05; 3], [0.05; 3]],
+        alpha: vec![1.0; 4],
+        depth: vec![0.0; 4],
+        transmittance: vec![0.0; 4],
+    };
+    let exposure = Exposure { gain: [2.0; 3], offset: [-0.2; 3], background: None };
+    let corrected = Reference.exposure(&image, &exposure).unwrap();
+    assert_eq!(corrected, [[1.0; 3], [1.0; 3], [0.0; 3], [0.0; 3]]);
+    let v = [[0.5; 3], [-0.5; 3], [0.5; 3], [-0.5; 3]];
+    let back = Reference.exposure_backward(&image, &exposure, &v).unwrap();
+    // Brighter than white goes down and blacker than black goes up, and not the other way.
+    assert_eq!(back.v_color, [[1.0; 3], [0.0; 3], [0.0; 3], [-1.0; 3]]);
+    assert_eq!(back.v_offset, [0.0; 3]);
+    assert!((back.v_gain[0] - 0.5 * (0.9 - 0.05)).abs() < 1e-12);
 }
 
 /// With first moments that keep nothing but the gradient, a step goes along it: what adam takes for

@@ -46,6 +46,11 @@ fn a_far_away_scene_renders_as_one_at_the_origin() {
 }
 
 #[test]
+fn exposure_gets_through_what_the_others_must() {
+    optimisation::exposure_matches_the_reference(&Narrowed);
+}
+
+#[test]
 fn frozen_splats_keep_their_moments() {
     optimisation::frozen_splats_keep_their_moments(&Narrowed);
 }

@@ -6,7 +6,8 @@ undistorted photos, and masks of the pixels that may be used.
 
 from __future__ import annotations
 
+from igsr.capture.exposure import Exposure
 from igsr.capture.load import load_capture
 from igsr.capture.types import Camera, Capture, Points, View
 
-__all__ = ["Camera", "Capture", "Points", "View", "load_capture"]
+__all__ = ["Camera", "Capture", "Exposure", "Points", "View", "load_capture"]

@@ -18,12 +18,15 @@ from PIL import Image
 _ORIENTATION, _MAKE, _MODEL, _SUB_FOLDER = 0x0112, 0x010F, 0x0110, 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
 _PIXEL_WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA20E, 0xA210
+_EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 _MM_FROM_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 #: Orientations that exchange width and height.
 TURNED = (5, 6, 7, 8)
 _FILM_DIAGONAL = math.hypot(36.0, 24.0)
 # In units of the longer side. Fisheyes and telescopes are within; other numbers are wrong fields.
 _FOCAL_RANGE = (0.2, 50.0)
+# Seconds, f-number and ISO of cameras there are; other numbers are wrong fields.
+_TIMES, _F_NUMBERS, _ISOS = (1e-6, 3600.0), (0.5, 128.0), (1.0, 5e6)
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,32 @@ def read_exif(image: Image.Image) -> Exif:
     names = [_text(fields.get(tag)) for tag in (_MAKE, _MODEL, _LENS_MODEL)]
     device = " ".join(name for name in names if name) or None
     return Exif(orientation, _focal(fields, *image.size), device)
+
+
+def exposure_value(image: Image.Image) -> float | None:
+    """How much light an open image took, in stops: log2(seconds * ISO / 100 / f-number squared).
+
+    By EXIF exposure time, f-number and ISO (Exif 2.32, section 4.6.5). It compares photos of one
+    place: a larger one is brighter there. None where a field is missing or cannot be true.
+    """
+    try:
+        fields = dict(image.getexif().get_ifd(_SUB_FOLDER))
+    except Exception:  # as in read_exif
+        return None
+    iso = fields.get(_ISO)
+    if isinstance(iso, (tuple, list)) and iso:
+        iso = iso[0]
+    numbers = [_number(value) for value in (fields.get(_EXPOSURE_TIME), fields.get(_F_NUMBER), iso)]
+    ranges = (_TIMES, _F_NUMBERS, _ISOS)
+    sane = [
+        number
+        for number, (low, high) in zip(numbers, ranges, strict=True)
+        if number is not None and low <= number <= high
+    ]
+    if len(sane) < len(ranges):
+        return None
+    seconds, f_number, speed = sane
+    return math.log2(seconds * speed / 100.0 / f_number**2)
 
 
 def _focal(fields: dict[int, Any], width: int, height: int) -> float | None:

@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from igsr.capture.downscaling import area_means, check_max_size, reduced_size
-from igsr.capture.exif import TURNED, read_exif, turned_back, upright
+from igsr.capture.exif import TURNED, exposure_value, read_exif, turned_back, upright
 from igsr.capture.memory_check import check_memory, decoding_threads
 from igsr.capture.photos import (
     SUFFIXES,
@@ -56,6 +56,7 @@ class Photo:
             and focal length share their intrinsics. None if it is not known.
         taken: width and height in pixels of the upright photo before it was reduced to ``image``;
             None if it was not.
+        exposure_value: how much light the photo took, as ``View.exposure_value``.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Photo:
     focal: float | None = None
     device: str | None = None
     taken: tuple[int, int] | None = None
+    exposure_value: float | None = None
 
     @property
     def full_size(self) -> tuple[int, int]:
@@ -255,6 +257,7 @@ def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> Phot
     mask_path = next(filter(is_file, mask_paths(masks, name)), None)
     with open_image(file) as image:
         full, exif = image.size, read_exif(image)
+        light = exposure_value(image)
         mask = None
         if mask_path is not None:
             mask = _mask_as_stored(mask_path, name, full, exif.orientation)
@@ -267,7 +270,7 @@ def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> Phot
     if size != full:
         taken = full[::-1] if exif.orientation in TURNED else full
         focal = None if focal is None else focal * max(size) / max(full)
-    return Photo(name, pixels, mask, focal, exif.device, taken)
+    return Photo(name, pixels, mask, focal, exif.device, taken, light)
 
 
 def _mask_as_stored(path: Path, name: str, size: tuple[int, int], orientation: int) -> np.ndarray:

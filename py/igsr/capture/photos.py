@@ -18,6 +18,7 @@ from igsr.capture.downscaling import (
     reduced_size,
     resized_camera,
 )
+from igsr.capture.exif import exposure_value
 from igsr.capture.memory_check import decoding_threads
 from igsr.capture.types import Camera, View
 from igsr.capture.undistort import Lens, Undistorter
@@ -352,13 +353,14 @@ def load_views(
                 raise IgsrError(f"{shot.path} was changed while it was read; try again")
             mask = _mask(shot, header.size)
             image, mask = decoded(opened, shot.path, size, mask)
+            light = exposure_value(opened)
         if not shot.lens.is_pinhole:
             undistorter = undistorters.take(shot, camera)
             image = undistorter.image(image)
             mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
             if mask.all():
                 mask = None
-        return View(shot.name, camera, shot.split, image, mask)
+        return View(shot.name, camera, shot.split, image, mask, exposure_value=light)
 
     threads = decoding_threads(
         [header.size for header in headers],

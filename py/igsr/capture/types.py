@@ -12,6 +12,7 @@ import numpy as np
 from igsr._internal.array_equality import ArrayEquality
 from igsr._internal.choices import Split
 from igsr._internal.notebook import NotebookPicture, numbers
+from igsr.capture.exposure import Exposure
 from igsr.errors import IgsrError
 
 # Files written with four or five decimals are this far from a rotation. What is further away has a
@@ -91,6 +92,10 @@ class View(ArrayEquality, NotebookPicture):
             one on a pseudo-view), and not at all in the last fifth of the steps.
         background: RGB in [0, 1] behind the content of an ``image`` without alpha, where it is
             known: fits render over it. None for photos.
+        exposure: gain and offset of the photo's colors, where a fit has found them; None where they
+            are not known, or are those of the scene. Scores of the view are of renders with them.
+        exposure_value: how much light the photo took by its EXIF, in stops (log2 of seconds times
+            ISO / 100 over the f-number squared), or None.
 
     Raises:
         IgsrError: the image, mask or weights have another dtype or shape than the camera's size
@@ -107,6 +112,8 @@ class View(ArrayEquality, NotebookPicture):
     mask: np.ndarray | None = None
     weights: np.ndarray | None = None
     background: tuple[float, float, float] | None = None
+    exposure: Exposure | None = None
+    exposure_value: float | None = None
 
     def __post_init__(self) -> None:
         """Check the pixels against the camera."""

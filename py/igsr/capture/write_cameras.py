@@ -15,7 +15,8 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
     """Write the cameras of photos in the format of nerfstudio's ``transforms.json``.
 
     One frame per photo: ``file_path`` (its name in the capture), ``w``, ``h``, ``fl_x``, ``fl_y``,
-    ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes.
+    ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes;
+    ``exposure`` where a fit has found it: ``gain`` and ``offset`` of R, G and B (see ``Exposure``).
 
     Raises:
         IgsrError: the file cannot be written.
@@ -35,6 +36,7 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
                 "cx": float(camera.K[0, 2]),
                 "cy": float(camera.K[1, 2]),
                 "transform_matrix": to_world.tolist(),
+                **({} if view.exposure is None else {"exposure": view.exposure.plain()}),
             }
         )
     write_json(path, {"camera_model": "PINHOLE", "frames": frames})

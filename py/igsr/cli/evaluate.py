@@ -59,7 +59,7 @@ def eval_command(
         print_json(report)
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("view", "PSNR", "SSIM", "MS-SSIM", "FLIP"):
+    for heading in ("view", "PSNR", "SSIM", "MS-SSIM", "FLIP", "cc PSNR", "cc SSIM"):
         table.add_column(heading, justify="left" if heading == "view" else "right")
     for row in scores["views"]:
         table.add_row(
@@ -68,6 +68,8 @@ def eval_command(
             f"{row['ssim']:.4f}",
             "-" if row["ms_ssim"] is None else f"{row['ms_ssim']:.4f}",
             f"{row['flip']:.4f}",
+            f"{row['cc_psnr']:.2f}",
+            f"{row['cc_ssim']:.4f}",
         )
     console = output_console()
     console.print(table)

@@ -184,7 +184,7 @@ def fit_command(
         }
         write_scene(out, splats, fitted)
         with parts.measured("score"):
-            is_refined = bool(fitted.test_views) and (fitted is not loaded or found)
+            is_refined = bool(fitted.test_views) and (settings.moves_cameras or found)
             scores = _scored(splats, fitted, color, name, is_refined=is_refined, shown=not as_json)
         scores.scores.protocol["holdout"] = holdout
         if last:

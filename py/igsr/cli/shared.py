@@ -243,6 +243,7 @@ def score_line(scores: dict[str, Any]) -> str:
         f"SSIM {scores['ssim']:.4f}",
         "MS-SSIM " + (f"{scores['ms_ssim']:.4f}" if scores["ms_ssim"] is not None else "-"),
         f"FLIP {scores['flip']:.4f}",
+        f"color-corrected PSNR {scores['cc_psnr']:.2f} dB SSIM {scores['cc_ssim']:.4f}",
     ]
     return "   ".join(parts)
 

@@ -1,4 +1,4 @@
-"""Image metrics: PSNR, SSIM, MS-SSIM and FLIP between a render and its photo.
+"""Metrics of a render and its photo: PSNR, SSIM, MS-SSIM, FLIP; the first two color-corrected, too.
 
 Every function takes two uint8 pictures [H, W, 3], sRGB-encoded: the 8-bit picture is scored, not
 the renderer's floats. ``mask`` (bool [H, W], True for pixels that count) limits the score to a
@@ -28,6 +28,8 @@ SSIM_ROWS = 16
 MS_SSIM_MIN_SIDE = SSIM_WINDOW * 2**4
 #: PSNR of identical 8-bit pictures is infinite, which JSON cannot hold and a mean cannot use.
 PSNR_CAP = 100.0
+#: Color correction: repetitions, and how far from 0 and 1 a channel counts as not clipped.
+CORRECTIONS, CLIPPED = 5, 0.5 / 255.0
 
 
 def _checked(render: Image, photo: Image, mask: Mask | None) -> tuple[Image, Image, Mask | None]:
@@ -182,11 +184,62 @@ def flip(render: Image, photo: Image, mask: Mask | None = None) -> float:
     return float(np.asarray(error_map).reshape(photo.shape[0], photo.shape[1], -1)[mask].mean())
 
 
+def color_corrected(render: Image, photo: Image, mask: Mask | None = None) -> Image:
+    """The render with the photo's colors: mapped by a quadratic polynomial of R, G and B.
+
+    Each channel is fitted to the photo's by least squares over pixels that are clipped in neither
+    picture, five times, each on the result of the last. What is left are errors that no exposure,
+    white balance or tone curve explains. As ``color_correct`` of Mip-NeRF 360's code (Barron et al.
+    2022, multinerf ``internal/image.py``) and of gsplat, whose cc_psnr is of such pictures, but
+    rounded to 8 bits.
+
+    Args:
+        render: uint8 [H, W, 3].
+        photo: uint8 [H, W, 3].
+        mask: bool [H, W], True for pixels to fit the map to; all are mapped.
+
+    Returns:
+        uint8 [H, W, 3]. A channel with too few pixels to fit a map to stays as it is.
+    """
+    render, photo, mask = _checked(render, photo, mask)
+    chosen = np.ones(photo.shape[:2], np.bool_) if mask is None else mask
+    wanted = photo[chosen] / 255.0
+    start = colors = render.reshape(-1, 3) / 255.0
+    inside = chosen.reshape(-1)
+    for _ in range(CORRECTIONS):
+        features = _quadratic(colors)
+        mapped = colors.copy()
+        for channel in range(3):
+            usable = np.ones(len(wanted), np.bool_)
+            for values in (start[inside, channel], colors[inside, channel], wanted[:, channel]):
+                usable &= (values >= CLIPPED) & (values <= 1.0 - CLIPPED)
+            if usable.sum() >= features.shape[1]:
+                rows = features[inside][usable]
+                weights = np.linalg.lstsq(rows.T @ rows, rows.T @ wanted[usable, channel])[0]
+                mapped[:, channel] = np.clip(features @ weights, 0.0, 1.0)
+        colors = mapped
+    return np.asarray((colors * 255.0 + 0.5).astype(np.uint8)).reshape(render.shape)
+
+
+def _quadratic(colors: Planes) -> Planes:
+    """Products of two channels, the channels, and 1: float64 [P, 10]."""
+    red, green, blue = colors.T
+    products = (red * red, red * green, red * blue, green * green, green * blue, blue * blue)
+    return np.stack([*products, red, green, blue, np.ones(len(colors))], axis=1)
+
+
 def score(render: Image, photo: Image, mask: Mask | None = None) -> dict[str, float | None]:
-    """All four metrics of one picture: ``psnr``, ``ssim``, ``ms_ssim`` (or None), ``flip``."""
+    """All metrics of one picture.
+
+    ``psnr``, ``ssim``, ``ms_ssim`` (or None) and ``flip`` of the render as it is; ``cc_psnr`` and
+    ``cc_ssim`` of the render after ``color_corrected``.
+    """
+    corrected = color_corrected(render, photo, mask)
     return {
         "psnr": psnr(render, photo, mask),
         "ssim": ssim(render, photo, mask),
         "ms_ssim": ms_ssim(render, photo, mask),
         "flip": flip(render, photo, mask),
+        "cc_psnr": psnr(corrected, photo, mask),
+        "cc_ssim": ssim(corrected, photo, mask),
     }

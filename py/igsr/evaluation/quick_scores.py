@@ -10,8 +10,7 @@ import numpy as np
 from igsr._internal.choices import Backend
 from igsr.capture import Capture, View
 from igsr.evaluation import metrics
-from igsr.evaluation.scores import ScoredView, check_masks, over_background
-from igsr.rendering.renders import render
+from igsr.evaluation.scores import ScoredView, check_masks, over_background, render_of
 from igsr.splats import Splats
 
 #: Most fitted photos that are scored: their mean hardly changes with more, and each costs seconds.
@@ -103,7 +102,7 @@ def quick_views(
     check_masks(views)
     for view in views:
         photo = over_background(view.image, background)
-        picture = render(splats, view.camera, background, backend).to_uint8()
+        picture = render_of(splats, view, background, backend)
         scores: dict[str, float | None] = {
             "psnr": metrics.psnr(picture, photo, view.mask),
             "ssim": metrics.ssim(picture, photo, view.mask),

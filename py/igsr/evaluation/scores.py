@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypedDict
 
 import numpy as np
@@ -21,7 +21,7 @@ from igsr.splats import Splats
 logger = logging.getLogger(__name__)
 
 #: Names of the metrics, in the order of tables.
-METRICS = ("psnr", "ssim", "ms_ssim", "flip")
+METRICS = ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim")
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
@@ -36,7 +36,8 @@ class ScoredView(ArrayEquality):
         photo: uint8 [H, W, 3], composited over the background if it had alpha.
         render: uint8 [H, W, 3].
         mask: bool [H, W], True for pixels that counted, or None if all did.
-        scores: "psnr" in dB, "ssim", "ms_ssim" (None if the picture is too small) and "flip".
+        scores: "psnr" in dB, "ssim", "ms_ssim" (None if the picture is too small), "flip", and
+            "cc_psnr" and "cc_ssim" after color correction.
     """
 
     name: str
@@ -57,6 +58,8 @@ class ViewScores(TypedDict):
     ssim: float
     ms_ssim: float | None
     flip: float
+    cc_psnr: float
+    cc_ssim: float
     width: int
     height: int
     masked: bool
@@ -66,7 +69,8 @@ class Protocol(TypedDict, total=False):
     """How views were scored, for reports.
 
     ``split`` is "test" or "train", ``views`` their number, ``background`` RGB in [0, 1];
-    ``pixels``, ``ssim`` and ``flip`` are in words. Commands add ``holdout``: every
+    ``pixels``, ``ssim``, ``flip`` and
+    ``color_correction`` are in words. Commands add ``holdout``: every
     ``holdout``-th view is held out for testing; and ``of``, where the views are evenly spaced ones
     of as many.
     """
@@ -77,6 +81,7 @@ class Protocol(TypedDict, total=False):
     pixels: str
     ssim: str
     flip: str
+    color_correction: str
     holdout: int | None
     of: int
 
@@ -110,6 +115,16 @@ class Scores(dict[str, Any]):
         return float(self["flip"])
 
     @property
+    def cc_psnr(self) -> float:
+        """PSNR in dB after color correction, which takes exposure and white balance out."""
+        return float(self["cc_psnr"])
+
+    @property
+    def cc_ssim(self) -> float:
+        """SSIM after color correction."""
+        return float(self["cc_ssim"])
+
+    @property
     def protocol(self) -> Protocol:
         """How the views were scored."""
         protocol: Protocol = self["protocol"]
@@ -125,7 +140,8 @@ class Scores(dict[str, Any]):
         ms_ssim = "-" if self.ms_ssim is None else f"{self.ms_ssim:.4f}"
         return (
             f"Scores(PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}, MS-SSIM {ms_ssim}, "
-            f"FLIP {self.flip:.4f}; {len(self.views)} {self.protocol['split']} views)"
+            f"FLIP {self.flip:.4f}, color-corrected PSNR {self.cc_psnr:.2f} dB; "
+            f"{len(self.views)} {self.protocol['split']} views)"
         )
 
 
@@ -202,9 +218,28 @@ def score_views(
     check_masks(views)
     for view in views:
         photo = over_background(view.image, background)
-        picture = render(splats, view.camera, background, backend).to_uint8()
+        picture = render_of(splats, view, background, backend)
         scores = metrics.score(picture, photo, view.mask)
         yield ScoredView(view.name, photo, picture, view.mask, scores)
+
+
+def render_of(
+    splats: Splats, view: View, background: Sequence[float], backend: Backend = "auto"
+) -> metrics.Image:
+    """A view's render in 8 bits, uint8 [H, W, 3], with the view's exposure where that is known.
+
+    Args:
+        splats: the scene.
+        view: its camera, and its exposure, are the render's.
+        background: RGB in [0, 1].
+        backend: "auto", "cpu", "gpu" or "reference".
+    """
+    picture = render(splats, view.camera, background, backend)
+    if view.exposure is not None:
+        alpha = picture.alpha if view.image.shape[2] == 4 else None
+        color = view.exposure.given_to(picture.color, alpha, tuple(background))
+        picture = replace(picture, color=color)
+    return picture.to_uint8()
 
 
 def check_masks(views: Sequence[View]) -> None:
@@ -229,6 +264,9 @@ def evaluate(
     """Score ``splats`` on the views of one split.
 
     Scores are of the 8-bit pictures (see ``igsr.evaluation.metrics``). Masked pixels do not count.
+    A view whose ``exposure`` is known, as that of a fitted photo, is compared with a render of that
+    exposure. Nothing is learned from held-out photos but for "cc_psnr" and "cc_ssim", whose name
+    says so: there the render's colors are mapped to the photo's first.
     Photos with alpha are composited over ``background``, which is also behind the renders.
 
     Args:
@@ -277,6 +315,7 @@ def evaluate(
         + (", masked pixels left out" if any(row["masked"] for row in rows) else ""),
         "ssim": "11x11 Gaussian window, sigma 1.5, zero-padded (3DGS)",
         "flip": "LDR-FLIP, 67 pixels per degree",
+        "color_correction": "quadratic map to each photo, least squares (Mip-NeRF 360)",
     }
     return Scores(**means, protocol=protocol, views=rows)
 

@@ -141,6 +141,7 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         if not isinstance(settings, dict) or settings.pop("format", None) != FORMAT:
             raise ValueError(f"it is not of format {FORMAT}")
         settings.setdefault("coarse_to_fine", False)  # the first fits had no such setting
+        settings.setdefault("exposure", "off")  # nor this one
         seconds = settings.get("seconds")
         if not isinstance(seconds, float) or not math.isfinite(seconds):
             raise ValueError(f"its seconds are {seconds!r} where a finite number belongs")

@@ -18,17 +18,21 @@ from igsr.capture import Capture
 from igsr.capture.photo_checks import check_photos
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import CheckpointFile, recorded_settings
+from igsr.fitting.exposures import StartingExposures, starting_exposures
 from igsr.fitting.fingerprint import fingerprint, hash_of
 from igsr.fitting.fitter import (
     camera_rows,
     check_fits,
     fitted_cameras,
+    fitted_exposures,
     fitter_of,
     initial_state,
     photos_among,
     splat_arrays,
     with_camera_rows,
     with_train_cameras,
+    with_train_exposures,
+    without_exposures,
 )
 from igsr.fitting.photo_support import PhotoSupport, support_of
 from igsr.fitting.pose_priors import pose_priors
@@ -37,6 +41,7 @@ from igsr.fitting.rough_cameras import with_rough_cameras
 from igsr.fitting.run import FitRun, Progress, Report, bar_state
 from igsr.fitting.settings import (
     Density,
+    ExposureMode,
     FitSettings,
     Focal,
     Initialization,
@@ -79,6 +84,7 @@ def fit(
     start: Initialization | Splats | None = None,
     poses: Poses | None = None,
     focal: Focal | None = None,
+    exposure: ExposureMode | None = None,
     background: tuple[float, float, float] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
@@ -124,6 +130,9 @@ def fit(
             capture has tracks, these give each camera a pose prior.
         focal: "fixed", "shared" (one factor for all cameras' focal lengths is optimized) or
             "per-camera".
+        exposure: "on": a gain and an offset per channel of each photo are optimized with the
+            splats, which get the colors of the mean photo; "off"; or "auto": on where points that
+            photos share, or EXIF, show that exposures differ (``igsr.fitting.exposures``).
         background: RGB in [0, 1] behind splats and photos with alpha; None is a new random color in
             every step for photos with alpha and black for photos without.
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
@@ -158,11 +167,11 @@ def _with_arguments_of(
 
 @_with_arguments_of(fit)
 def fit_with_cameras(*args: Any, **kwargs: Any) -> tuple[Splats, Capture]:
-    """As ``fit``, with the same arguments; also returns the cameras.
+    """As ``fit``, with the same arguments; also returns cameras and exposures.
 
     Returns:
-        The splats, and the capture with its train cameras as they were optimized; the capture
-        itself where poses and focal lengths are fixed.
+        The splats, and the capture with its train cameras and the exposures of its train views
+        (``View.exposure``) as they were optimized; the capture itself where neither were.
 
     Raises:
         IgsrError, UserWarning, RuntimeError: as ``fit``.
@@ -202,6 +211,7 @@ def _fitted(
         raise IgsrError("resume needs checkpoint, the file to continue from.")
     check_photos(views)
     device = check_fits(backend)
+    exposures = starting_exposures(views, capture.points, settings.exposure)
     tracks = None
     if settings.moves_cameras and capture.points is not None:
         tracks = capture.points.tracks
@@ -226,9 +236,11 @@ def _fitted(
         if not resume:
             if settings.moves_cameras and initial is None:
                 rough, began = True, time.perf_counter()
-                capture, stopped = with_rough_cameras(capture, settings, device, priors, report)
+                capture, stopped = with_rough_cameras(
+                    capture, settings, device, priors, report, exposures
+                )
                 seconds = time.perf_counter() - began
-            state, started = initial_state(capture, settings, initial)
+            state, started = initial_state(_seen_alike(capture, exposures), settings, initial)
 
         # Make the fitter of views, splats and settings.
         origin = state.pop("origin", np.zeros(0))
@@ -237,7 +249,7 @@ def _fitted(
             if origin.shape != (3,) or not np.isfinite(origin).all():
                 raise ValueError("origin: must be three finite numbers")
             values = {**settings.plain(), "first_step": settings.first_step}
-            fitter = fitter_of(views, origin, state, values, device["backend"], priors)
+            fitter = fitter_of(views, origin, state, values, device["backend"], priors, exposures)
         except ValueError as error:
             if resume:
                 raise IgsrError(f"The checkpoint {checkpoint} cannot be used: {error}.") from error
@@ -267,7 +279,19 @@ def _fitted(
     splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
     if settings.moves_cameras:
         capture = with_train_cameras(capture, fitted_cameras(views, fitter, origin))
+    if exposures is not None:
+        capture = with_train_exposures(capture, fitted_exposures(views, fitter))
     return splats, capture
+
+
+def _seen_alike(capture: Capture, start: StartingExposures | None) -> Capture:
+    """The capture's train views with the scene's colors, as far as they are known before the fit.
+
+    Initialization compares colors of photos.
+    """
+    if start is None:
+        return capture
+    return replace(capture, views=without_exposures(capture.train_views, start.exposures))
 
 
 def _check_capture(capture: object) -> None:

@@ -90,7 +90,7 @@ def _score_rows(report: dict[str, Any]) -> list[dict[str, str]]:
 
 
 def _row(label: str, scores: dict[str, Any]) -> dict[str, str]:
-    digits = {"psnr": 2, "ssim": 4, "ms_ssim": 4, "flip": 4}
+    digits = {"psnr": 2, "ssim": 4, "ms_ssim": 4, "flip": 4, "cc_psnr": 2, "cc_ssim": 4}
     return {
         "label": label,
         **{name: number(scores.get(name), places) for name, places in digits.items()},

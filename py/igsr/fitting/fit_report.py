@@ -98,6 +98,11 @@ def fit_report(fit: FinishedFit, scored: FitScores, parts: Parts) -> dict[str, A
         "seconds": round(fit.seconds, 3),
         "parts": used,
         "peak_memory_bytes": total(used).peak_memory_bytes,
+        "exposures": {
+            view.name: view.exposure.plain()
+            for view in fit.capture.train_views
+            if view.exposure is not None
+        },
         "photos": {
             "given": len(views) + len(fit.not_placed),
             "placed": len(views),

@@ -11,10 +11,11 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.choices import FitBackend
-from igsr.capture import Camera, Capture, View
+from igsr.capture import Camera, Capture, Exposure, View
 from igsr.capture.types import intrinsic_matrix
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import GIVEN
+from igsr.fitting.exposures import StartingExposures
 from igsr.fitting.initialization.initial_splats import initial_splats
 from igsr.fitting.pose_priors import PosePriors
 from igsr.fitting.settings import FitSettings
@@ -36,6 +37,7 @@ def fitter_of(
     settings: dict[str, Any],
     backend: str,
     priors: PosePriors | None = None,
+    exposures: StartingExposures | None = None,
 ) -> _core.Fitter:
     """The renderer's fitter of splats to views; see ``_core.Fitter``.
 
@@ -48,6 +50,7 @@ def fitter_of(
             as they are) and "camera_warm_up" (fraction of the steps before cameras move).
         backend: "cpu" or "gpu".
         priors: of the V cameras, where these are optimized and something is known of them.
+        exposures: where those of the V views start; None where none is optimized.
 
     Raises:
         ValueError: a view, the state or a setting cannot be used; the message names it.
@@ -59,9 +62,10 @@ def fitter_of(
         _schedule(views, int(settings["steps"]), int(settings.get("first_step", 0))),
         *_arrays(views, origin),
         state,
-        settings,
+        {**settings, "exposures": exposures is not None},
         backend,
         None if priors is None else _prior_arrays(priors, origin),
+        None if exposures is None else _exposure_arrays(exposures),
     )
 
 
@@ -161,6 +165,40 @@ def _prior_arrays(
     }
 
 
+def _exposure_arrays(start: StartingExposures) -> dict[str, npt.NDArray[Any]]:
+    known = [one or Exposure() for one in start.exposures]
+    return {
+        "gains": np.array([one.gain for one in known], np.float64),
+        "offsets": np.array([one.offset for one in known], np.float64),
+        "fitted": np.array([one is not None for one in start.exposures], np.bool_),
+        "pulls": start.pulls,
+    }
+
+
+def fitted_exposures(views: Sequence[View], fitter: _core.Fitter) -> list[Exposure | None]:
+    """The views' exposures as a fitter has them; None where they are not optimized.
+
+    Args:
+        views: V views.
+        fitter: of these views.
+    """
+    arrays = fitter.exposures()
+    if arrays is None:
+        return [None] * len(views)
+    return [
+        None if view.weights is not None else Exposure(tuple(gain), tuple(offset))
+        for view, gain, offset in zip(views, arrays["gains"], arrays["offsets"], strict=True)
+    ]
+
+
+def without_exposures(views: Sequence[View], exposures: Sequence[Exposure | None]) -> list[View]:
+    """The views with the scene's colors: exposures taken out of their pixels, and forgotten."""
+    return [
+        view if one is None else replace(view, image=one.taken_out_of(view.image), exposure=None)
+        for view, one in zip(views, exposures, strict=True)
+    ]
+
+
 def fitted_cameras(
     views: Sequence[View], fitter: _core.Fitter, origin: npt.NDArray[np.float64]
 ) -> list[Camera]:
@@ -182,6 +220,16 @@ def fitted_cameras(
             views, arrays["camera_viewmats"], arrays["camera_intrinsics"], strict=True
         )
     ]
+
+
+def with_train_exposures(capture: Capture, exposures: Sequence[Exposure | None]) -> Capture:
+    """The capture with these exposures for its train views, given in their order."""
+    each = iter(exposures)
+    views = [
+        replace(view, exposure=next(each)) if view.split == "train" else view
+        for view in capture.views
+    ]
+    return Capture(capture.path, views, capture.points)
 
 
 def with_train_cameras(capture: Capture, cameras: list[Camera]) -> Capture:

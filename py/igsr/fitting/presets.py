@@ -61,6 +61,7 @@ _DEFAULT = FitSettings(
     coarse_to_fine=True,
     poses="fixed",
     focal="fixed",
+    exposure="auto",
 )
 #: As Kerbl et al. 2023 fit, at their shorter number of steps: SfM points where there are some, and
 #: as many splats as their density control adds.
@@ -71,6 +72,7 @@ _3DGS = replace(
     sh_degree=3,
     start="sfm",
     coarse_to_fine=False,
+    exposure="off",
 )
 #: As InstantSplat (Fan et al. 2024) fits: many splats from dense points, which stay as many, with
 #: cameras and one focal length optimized. Here the points are the capture's or made from its
@@ -84,6 +86,7 @@ _INSTANTSPLAT = replace(
     coarse_to_fine=False,
     poses="joint",
     focal="shared",
+    exposure="off",
 )
 #: What a preset says nothing of.
 _NOT_OF_PRESETS = ("seed", "background")

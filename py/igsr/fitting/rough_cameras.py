@@ -11,7 +11,14 @@ from dataclasses import replace
 from igsr.capture import Capture
 from igsr.capture.downscaling import halved
 from igsr.errors import IgsrError
-from igsr.fitting.fitter import fitted_cameras, fitter_of, initial_state, with_train_cameras
+from igsr.fitting.exposures import StartingExposures
+from igsr.fitting.fitter import (
+    fitted_cameras,
+    fitter_of,
+    initial_state,
+    with_train_cameras,
+    without_exposures,
+)
 from igsr.fitting.pose_priors import PosePriors
 from igsr.fitting.run import FitRun, Progress, Report
 from igsr.fitting.settings import FitSettings
@@ -28,6 +35,7 @@ def with_rough_cameras(
     backend: dict[str, str],
     priors: PosePriors | None,
     report: Report | None,
+    exposures: StartingExposures | None = None,
 ) -> tuple[Capture, bool]:
     """The capture with train cameras as the rough fit has them, and whether ``report`` ended it.
 
@@ -39,6 +47,7 @@ def with_rough_cameras(
         backend: "backend" is the resolved one.
         priors: pose priors of the train views, if there are any.
         report: called with step 0 of the fit that follows.
+        exposures: where those of the train views start, if they are optimized.
     """
     if len(capture.train_views) == 1 and settings.focal == "fixed":
         return capture, False  # a camera alone stays where it is
@@ -61,12 +70,17 @@ def with_rough_cameras(
         return not stopped
 
     try:
-        state, started = initial_state(small, rough)
+        alike = small
+        if exposures is not None:
+            alike = replace(small, views=without_exposures(views, exposures.exposures))
+        state, started = initial_state(alike, rough)
         origin = state.pop("origin")
         if priors is not None:
             # What is known of rotations, moves and focal lengths' logarithms holds for any size.
             priors = replace(priors, views=views)
-        fitter = fitter_of(views, origin, state, rough.plain(), backend["backend"], priors)
+        fitter = fitter_of(
+            views, origin, state, rough.plain(), backend["backend"], priors, exposures
+        )
     except (IgsrError, ValueError):
         return capture, False  # what cannot be started from at half size may be at full size
     FitRun(fitter, rough, started, backend, report_rough).optimize()

@@ -19,6 +19,7 @@ Initialization: TypeAlias = Literal[
 ]
 Poses: TypeAlias = Literal["fixed", "joint"]
 Focal: TypeAlias = Literal["fixed", "shared", "per-camera"]
+ExposureMode: TypeAlias = Literal["auto", "on", "off"]
 
 #: Highest degree of spherical harmonics, as ``igsr.splats.MAX_SH_DEGREE``.
 _MAX_SH_DEGREE = 4
@@ -103,6 +104,12 @@ class FitSettings:
         metadata=about(
             "Focal lengths that are optimized: none (fixed), one factor for all (shared), or "
             "each (per-camera)."
+        ),
+    )
+    exposure: ExposureMode = field(
+        metadata=about(
+            "Gain and offset per channel of each photo, optimized with the splats: on, off, or "
+            "auto (on where points that photos share, or EXIF, show other exposures)."
         ),
     )
     background: tuple[float, float, float] | None = field(

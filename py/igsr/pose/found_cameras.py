@@ -250,4 +250,4 @@ def _undistorted(
         mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
     if mask is not None and mask.all():
         mask = None
-    return View(photo.name, camera, "train", image, mask)
+    return View(photo.name, camera, "train", image, mask, exposure_value=photo.exposure_value)

@@ -43,6 +43,10 @@ class CrossValidation:
         self._photos, self._share = _fold_photos(photos)
         self._folds: list[Fold] = []
 
+    def use(self, photos: Sequence[View]) -> None:
+        """Take these photos instead, which have the scene's colors; before the first round."""
+        self._photos, self._share = _fold_photos(photos)
+
     @property
     def work(self) -> float:
         """What fitting all folds takes, in units of a fit to all photos."""

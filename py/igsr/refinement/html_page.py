@@ -125,7 +125,7 @@ def _score_row(
     label: str, scores: dict[str, float] | dict[str, float | None], splats: int | str
 ) -> dict[str, Any]:
     row: dict[str, Any] = {"label": label, "splats": splats, "verdict": ""}
-    for name, digits in (("psnr", 2), ("ssim", 4), ("flip", 4)):
+    for name, digits in (("psnr", 2), ("ssim", 4), ("flip", 4), ("cc_psnr", 2), ("cc_ssim", 4)):
         row[name] = number(scores.get(name), digits)
     return row
 

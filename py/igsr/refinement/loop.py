@@ -109,9 +109,11 @@ def refine(
         fits = 1.0 + (validation.work if validation else 0.0)
         run.prepare(work=fits * (1.0 + settings.most_rounds * (NOVEL_VIEWS_WORK + 1.0)))
 
-        whole = stages.fit("whole", capture.train_views)
+        whole = stages.fit_whole()
+        if validation is not None:
+            validation.use(whole.photos)
         test = stages.test_scores(whole.splats)
-        refined = Refined(whole.splats, whole.splats, test, capture, [], None, [], {})
+        refined = Refined(whole.splats, whole.splats, test, stages.capture, [], None, [], {})
         while refined.stop is None:
             refined = run.write(refined)
             run.round += 1

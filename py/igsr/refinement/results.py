@@ -18,7 +18,8 @@ from igsr.splats import Splats
 Stage = Literal["pose", "fit", "novel_views", "cross_validate", "refit", "test"]
 #: Stages by the names that reports of format 1 and ``RefineProgress.doing`` have for them.
 OLD_STAGES: dict[str, Stage] = {"look": "novel_views", "judge": "cross_validate"}
-#: Mean scores by name ("psnr", "ssim", "ms_ssim", "flip"); None where a score is not defined.
+#: Mean scores by name ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim"); None where a score
+#: is not defined.
 Scores = dict[str, float | None]
 
 

@@ -16,9 +16,11 @@ from igsr.evaluation.scores import (
     known_background,
     score_views,
 )
-from igsr.fitting.fit_capture import Progress, fit
+from igsr.fitting.fit_capture import Progress, fit_with_cameras
+from igsr.fitting.fitter import with_train_exposures, without_exposures
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import preset_settings
+from igsr.fitting.settings import ExposureMode
 from igsr.refinement.near_sources import NearSources
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.results import Scores, Stage
@@ -45,7 +47,8 @@ class Reconstruction:
 
     Attributes:
         name: "whole" or "fold0", "fold1" ...; checkpoints are named after it.
-        photos: that are fitted.
+        photos: that are fitted, with the scene's colors: exposures that the first fit has found are
+            taken out of them.
         share: the photos' pixels as a part of all; time and number of splats go by it.
         splats: after the last fit.
         added: novel views that the rounds so far have added.
@@ -105,9 +108,24 @@ class Stages:
         }
         self._max_splats = int(preset["max_splats"])
 
+    @property
+    def capture(self) -> Capture:
+        """The capture, its train views with the exposures that ``fit_whole`` has found."""
+        return self._capture
+
+    def fit_whole(self) -> Reconstruction:
+        """Fit all photos, and find their exposures where these differ."""
+        splats, fitted = self._fit("whole", "fit", self._capture.train_views, 1.0, "auto")
+        exposures = [view.exposure for view in fitted.train_views]
+        if any(exposures):
+            self._capture = with_train_exposures(self._capture, exposures)
+        photos = without_exposures(fitted.train_views, exposures)
+        return Reconstruction("whole", photos, 1.0, splats)
+
     def fit(self, name: str, photos: list[View], share: float = 1.0) -> Reconstruction:
-        """Fit photos alone."""
-        return Reconstruction(name, photos, share, self._fit(name, "fit", photos, share))
+        """Fit photos alone, which have the scene's colors."""
+        splats, _ = self._fit(name, "fit", photos, share)
+        return Reconstruction(name, photos, share, splats)
 
     def render_and_denoise(self, reconstruction: Reconstruction) -> DenoisedViews:
         """Render novel views, and again those that were added before, and denoise them."""
@@ -165,7 +183,7 @@ class Stages:
             for number, candidate in enumerate((*selected, *added_before))
         ]
         pictures = [*reconstruction.photos, *views]
-        reconstruction.splats = self._fit(name, stage, pictures, reconstruction.share)
+        reconstruction.splats, _ = self._fit(name, stage, pictures, reconstruction.share)
         reconstruction.added += [candidate.view for candidate in selected]
 
     def validation_scores(self, splats: Splats, photos: list[View]) -> list[dict[str, float]]:
@@ -186,7 +204,14 @@ class Stages:
         self._run.tell("test")
         return {metric: scores[metric] for metric in METRICS}
 
-    def _fit(self, name: str, stage: Stage, views: list[View], share: float) -> Splats:
+    def _fit(
+        self,
+        name: str,
+        stage: Stage,
+        views: list[View],
+        share: float,
+        exposure: ExposureMode = "off",
+    ) -> tuple[Splats, Capture]:
         goes_on = True
 
         def progress(now: Progress) -> bool:
@@ -195,7 +220,7 @@ class Stages:
             return goes_on
 
         checkpoint, resume = self._run.checkpoint(name)
-        splats = fit(
+        fitted = fit_with_cameras(
             Capture(self._capture.path, views, self._capture.points),
             progress=progress,
             backend=self._settings.backend,
@@ -203,9 +228,10 @@ class Stages:
             max_splats=max(1, round(share * self._max_splats)),
             checkpoint=checkpoint,
             resume=resume,
+            exposure=exposure,
             **self._fit_settings,
         )
         if not goes_on:  # not raised in the callback, so that the fit saves its checkpoint
             raise IgsrError(STOPPED)
         self._run.work_done(share)
-        return splats
+        return fitted

@@ -145,6 +145,7 @@ def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
     }
     was, are = ([view.camera for view in of.train_views] for of in (capture, moved))
     cameras = {view.name: view.camera for view in moved.train_views}
+    exposures = {view.name: view.exposure for view in moved.train_views}
     del capture, moved
     with parts.measured("score"):
         scored = _loaded(data, one, one.score_size)
@@ -160,6 +161,7 @@ def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
         again = psnr_and_ssim(splats, refined, background, one.backend)
         for view, (psnr, ssim) in zip(row["views"], again, strict=True):
             view |= {"psnr_refined": psnr, "ssim_refined": ssim}
+        train = [replace(view, exposure=exposures[view.name]) for view in train]
         of_train = psnr_and_ssim(splats, train, background, one.backend)
         row["psnr_refined"], row["ssim_refined"] = _means(again)
         row["train_psnr"], row["train_ssim"] = _means(of_train)

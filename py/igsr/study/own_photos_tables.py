@@ -20,6 +20,8 @@ SCORES = {
     "ssim": ("SSIM", ".4f"),
     "ms_ssim": ("MS-SSIM", ".4f"),
     "flip": ("FLIP", ".4f"),
+    "cc_psnr": ("cc PSNR, dB", ".2f"),
+    "cc_ssim": ("cc SSIM", ".4f"),
     "perceptual": ("perceptual", ".4f"),
     "train_psnr": ("train PSNR, dB", ".2f"),
     "train_ssim": ("train SSIM", ".4f"),
@@ -29,7 +31,17 @@ SCORES = {
     "peak_memory_bytes": ("peak, GiB", ".2f"),
 }
 #: Scores of held-out photos whose differences are told.
-COMPARED = ("psnr", "psnr_refined", "ssim", "ssim_refined", "ms_ssim", "flip", "perceptual")
+COMPARED = (
+    "psnr",
+    "psnr_refined",
+    "ssim",
+    "ssim_refined",
+    "ms_ssim",
+    "flip",
+    "cc_psnr",
+    "cc_ssim",
+    "perceptual",
+)
 #: Of runs, whose differences are told, too.
 COMPARED_RUNS = ("train_psnr", "train_ssim", "splats", "seconds", "cpu_seconds")
 HEADS = {**{name: head for name, (head, _) in SCORES.items()}, "ssim_refined": "refined SSIM"}

@@ -20,7 +20,7 @@ from igsr.fitting.presets import Preset, preset_settings
 from igsr.geometry.similarity import similarity_between
 from igsr.splats import Splats
 
-SCORES = ("psnr", "ssim", "flip")
+SCORES = ("psnr", "ssim", "flip", "cc_psnr", "cc_ssim")
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ SCORES = {
     "psnr_refined": ("refined PSNR, dB", ".2f"),
     "ssim": ("SSIM", ".4f"),
     "flip": ("FLIP", ".4f"),
+    "cc_psnr": ("cc PSNR, dB", ".2f"),
+    "cc_ssim": ("cc SSIM", ".4f"),
     "splats": ("splats", ".0f"),
     "seconds": ("seconds a fit", ".0f"),
 }

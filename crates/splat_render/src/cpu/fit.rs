@@ -7,6 +7,7 @@ use super::adam::{BlockGradients, BlockStep};
 use super::bin::{Bins, CHUNK, ChunkTiles};
 use super::block::{BLOCK, Ids};
 use super::explore::ExploreBlock;
+use super::exposure::Exposed;
 use super::loss::Loss;
 use super::project::{ProjectBlock, View};
 use super::project_backward::{Backward, BackwardBlock, VCamera};
@@ -17,7 +18,9 @@ use super::rasterize_backward::{
 use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::Result;
-use crate::fit_device::{CameraGradient, FitDevice, FitState, StepInput, is_dropped};
+use crate::fit_device::{
+    CameraGradient, ExposureGradient, FitDevice, FitState, StepInput, is_dropped,
+};
 use crate::stages::ProjectOptions;
 use crate::target::Target;
 
@@ -28,11 +31,13 @@ pub struct CpuFit {
     state: FitState,
     loss_value: f32,
     camera_gradients: Vec<CameraGradient>,
+    exposure_gradients: Vec<ExposureGradient>,
     // Buffers kept from step to step.
     chunks: Vec<ChunkTiles>,
     splats: Vec<TileSplat>,
     bins: Bins,
     image: Planes,
+    exposed: Exposed,
     loss: Loss,
     sums: Vec<PairSums<COLOR_SUMS>>,
     /// The camera's gradient by block of splats, so that its sum does not depend on the threads.
@@ -102,15 +107,35 @@ impl FitDevice for CpuFit {
 
         self.image.resize(width, height);
         rasterize_tiles::<false>(&self.splats, &self.bins, input.background, &mut self.image);
+        if let Some(exposure) = &input.exposure {
+            self.exposed.run(&self.image, exposure);
+        }
         let [r, g, b, ..] = &self.image.planes;
-        self.loss_value = self.loss.run([r, g, b], target, input.background, input.ssim_weight);
+        let colors = match input.exposure {
+            None => [r, g, b],
+            Some(_) => self.exposed.color.each_ref(),
+        };
+        self.loss_value = self.loss.run(
+            colors.map(|plane| plane.as_slice()),
+            target,
+            input.background,
+            input.ssim_weight,
+        );
+        let mut v_alpha = None;
+        if let Some(exposure) = &input.exposure {
+            let v_color = &mut self.loss.v_color;
+            let [v_gain, v_offset] = self.exposed.backward(&self.image, exposure, v_color);
+            let gradient = ExposureGradient { view: input.view, v_gain, v_offset };
+            self.exposure_gradients.push(gradient);
+            v_alpha = exposure.background.map(|_| self.exposed.v_alpha.as_slice());
+        }
         rasterize_backward_tiles(
             &self.splats,
             &self.bins,
             PictureGradients {
                 image: &self.image,
                 v_color: &self.loss.v_color,
-                v_alpha: None,
+                v_alpha,
                 v_depth: None,
             },
             &mut self.sums,
@@ -121,6 +146,10 @@ impl FitDevice for CpuFit {
 
     fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>> {
         Ok(std::mem::take(&mut self.camera_gradients))
+    }
+
+    fn exposure_gradients(&mut self) -> Result<Vec<ExposureGradient>> {
+        Ok(std::mem::take(&mut self.exposure_gradients))
     }
 
     fn loss(&mut self) -> Result<f32> {

@@ -7,6 +7,7 @@ mod bin;
 mod block;
 mod elementary;
 mod explore;
+mod exposure;
 mod fit;
 mod lanes;
 mod loss;
@@ -27,8 +28,8 @@ pub use simd::instruction_set;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
-    AdamState, AdamStep, Image, ImageGradients, Loss, ProjectOptions, Projected,
-    ProjectedGradients, SplatGradients, SplatParams, Stages, check,
+    AdamState, AdamStep, Exposure, ExposureGradients, Image, ImageGradients, Loss, ProjectOptions,
+    Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
 };
 use crate::target::Target;
 
@@ -74,6 +75,21 @@ impl Stages<f32> for Cpu {
     ) -> Result<SplatGradients<f32>> {
         check::project_backward(splats, camera, options, projected, v_projected)?;
         Ok(project_backward::project_backward(splats, camera, options, projected, v_projected))
+    }
+
+    fn exposure(&self, image: &Image<f32>, exposure: &Exposure<f32>) -> Result<Vec<[f32; 3]>> {
+        check::exposure(image, exposure)?;
+        Ok(exposure::exposure(image, exposure))
+    }
+
+    fn exposure_backward(
+        &self,
+        image: &Image<f32>,
+        exposure: &Exposure<f32>,
+        v_corrected: &[[f32; 3]],
+    ) -> Result<ExposureGradients<f32>> {
+        check::exposure_backward(image, exposure, v_corrected)?;
+        Ok(exposure::exposure_backward(image, exposure, v_corrected))
     }
 
     fn loss(

@@ -57,6 +57,8 @@ pub struct FitConfig {
     pub hull: bool,
     /// How cameras are fitted, or None: they are taken as exact.
     pub cameras: Option<CameraConfig>,
+    /// Whether a gain and an offset per channel of each photo are fitted; see [`super::Exposures`].
+    pub exposures: bool,
     /// Whether the first steps are on photos of a fraction of their size; see
     /// [`FitConfig::reduction`].
     pub coarse_to_fine: bool,
@@ -87,6 +89,7 @@ impl Default for FitConfig {
             dropout: 0.0,
             hull: false,
             cameras: None,
+            exposures: false,
             coarse_to_fine: false,
             means_decay: 0.01,
         }

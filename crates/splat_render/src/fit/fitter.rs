@@ -13,11 +13,12 @@ use rayon::prelude::*;
 use super::cameras::{CameraState, Cameras, PosePrior, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
+use super::exposures::{ExposureState, Exposures};
 use super::hull::Hull;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::fit_device::{FitDevice, FitState, StepInput};
-use crate::stages::Rates;
+use crate::stages::{Exposure, Rates};
 use crate::target::Target;
 
 /// Density control starts after this many steps and then runs every so many.
@@ -52,6 +53,8 @@ pub struct Fitter {
     cameras: Vec<Camera>,
     /// The cameras, where they are fitted; `cameras` follows them.
     moving: Option<Cameras>,
+    /// Exposures of the photos, where they are fitted.
+    exposures: Option<Exposures>,
     has_alpha: Vec<bool>,
     /// Each photo's own background, where that is known.
     behind: Vec<Option<[f32; 3]>>,
@@ -137,6 +140,7 @@ impl Fitter {
             let distances = cameras.iter().map(|camera| scene_distance(camera, means)).collect();
             Cameras::new(&cameras, distances, moving)
         });
+        let exposures = config.exposures.then(|| Exposures::new(&targets));
         device.upload(state)?;
         let mut fitter = Self {
             device,
@@ -147,6 +151,7 @@ impl Fitter {
             moving,
             config,
             cameras,
+            exposures,
             has_alpha,
             behind,
             hull,
@@ -179,8 +184,11 @@ impl Fitter {
         })
     }
 
-    /// Adds the gradients of the cameras of all steps until now.
+    /// Adds the gradients of cameras and exposures of all steps until now.
     fn collect_gradients(&mut self) -> Result<()> {
+        if let Some(exposures) = self.exposures.as_mut() {
+            exposures.add(&self.device.exposure_gradients()?);
+        }
         let Some(cameras) = self.moving.as_mut() else { return Ok(()) };
         let mut gradients = self.device.camera_gradients()?;
         for gradient in &mut gradients {
@@ -268,6 +276,35 @@ impl Fitter {
         Ok(())
     }
 
+    /// Sets where the exposures that are fitted start; see [`Exposures::start`]. Before anything else.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] if exposures are not fitted, or the starts cannot be used.
+    pub fn start_exposures(
+        &mut self,
+        start: &[Option<Exposure<f64>>],
+        pulls: &[f64],
+    ) -> Result<()> {
+        let Some(exposures) = self.exposures.as_mut() else {
+            return Err(Error::argument("exposures", "are not fitted here"));
+        };
+        exposures.start(start, pulls)
+    }
+
+    /// Goes on with exposures where another fit's had come to.
+    pub fn resume_exposures(&mut self, state: ExposureState) -> Result<()> {
+        let Some(exposures) = self.exposures.as_mut() else {
+            return Err(Error::argument("exposures", "are not fitted here"));
+        };
+        exposures.resume(state)
+    }
+
+    /// What [`Fitter::resume_exposures`] needs, where exposures are fitted.
+    pub fn exposure_state(&mut self) -> Result<Option<ExposureState>> {
+        self.collect_gradients()?;
+        Ok(self.exposures.as_ref().map(|exposures| exposures.state().clone()))
+    }
+
     /// The photo of step `step` (from 0): every photo takes its turns in a round, in a new order each
     /// round. When some leave, a round of the others begins.
     fn view(&mut self, step: u32) -> usize {
@@ -326,27 +363,33 @@ impl Fitter {
             noise: if mcmc { MCMC.2 * rates.means } else { 0.0 },
             dropout: config.dropout * progress as f32,
             noise_seed,
+            exposure: self
+                .exposures
+                .as_ref()
+                .map(|exposures| exposures.of(view, self.has_alpha[view].then_some(background))),
             camera_gradient: self.moving.as_ref().is_some_and(|cameras| cameras.moving(progress)),
         };
         self.device.step(&input)?;
         self.step += 1;
-        self.move_cameras(progress)?;
+        self.move_photos(progress)?;
         self.control_density()
     }
 
-    /// At the end of a round, when each camera has its gradient.
-    fn move_cameras(&mut self, progress: f64) -> Result<()> {
-        if !self.moving.as_ref().is_some_and(|cameras| cameras.moving(progress)) {
+    /// Moves cameras and exposures at the end of a round, when each photo has its gradient.
+    fn move_photos(&mut self, progress: f64) -> Result<()> {
+        let moves = self.moving.as_ref().is_some_and(|cameras| cameras.moving(progress));
+        let is_last = (self.step - self.rounds_from).is_multiple_of(self.round.len() as u32);
+        if !is_last || !(moves || self.exposures.is_some()) {
             return Ok(());
         }
-        if (self.step - self.rounds_from).is_multiple_of(self.round.len() as u32) {
-            self.collect_gradients()?;
-        }
-        if let Some(cameras) = self.moving.as_mut()
-            && (self.step - self.rounds_from).is_multiple_of(self.round.len() as u32)
-        {
+        self.collect_gradients()?;
+        if let Some(cameras) = self.moving.as_mut().filter(|_| moves) {
             cameras.step(progress);
             self.cameras = cameras.now().to_vec();
+        }
+        if let Some(exposures) = self.exposures.as_mut() {
+            let rounds = f64::from(self.config.steps) / self.round.len() as f64;
+            exposures.step(progress, rounds);
         }
         Ok(())
     }

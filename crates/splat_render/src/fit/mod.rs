@@ -4,6 +4,7 @@
 mod cameras;
 mod config;
 mod density;
+mod exposures;
 mod fitter;
 mod hull;
 mod initial;
@@ -11,16 +12,18 @@ mod plane_sweep;
 
 pub use cameras::{CameraConfig, CameraState, Cameras, Focal, PosePrior, scene_distance};
 pub use config::{Background, DensityControl, FitConfig};
+pub use exposures::{ExposureState, Exposures};
 pub use fitter::{Fitter, scene_extent};
 pub use initial::splats_from_points;
 pub use plane_sweep::{DepthMap, GreyPhoto, Sweep, plane_sweep};
 
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
 pub use crate::fit_device::{
-    CameraGradient, DensityStats, FitDevice, FitState, StepInput, is_dropped, noise_normal,
+    CameraGradient, DensityStats, ExposureGradient, FitDevice, FitState, StepInput, is_dropped,
+    noise_normal,
 };
 pub use crate::splats::SplatArrays;
-pub use crate::stages::Rates;
+pub use crate::stages::{Exposure, Rates};
 pub use crate::target::{Target, Weight};
 
 /// [`PosePrior`] under its first name.

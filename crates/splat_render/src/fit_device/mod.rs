@@ -9,7 +9,7 @@ pub use state::{DensityStats, FitState};
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};
-use crate::stages::{AdamStep, Rates};
+use crate::stages::{AdamStep, Exposure, Rates};
 use crate::target::Target;
 
 /// Gradient of a step's loss with respect to its camera.
@@ -21,6 +21,17 @@ pub struct CameraGradient {
     pub v_viewmat: [[f64; 4]; 3],
     /// Gradient of (fx, fy, cx, cy).
     pub v_intrinsics: [f64; 4],
+}
+
+/// Gradient of a step's loss with respect to its photo's exposure.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ExposureGradient {
+    /// Which target.
+    pub view: usize,
+    /// Of the gain of R, G and B.
+    pub v_gain: [f64; 3],
+    /// Of the offset of R, G and B.
+    pub v_offset: [f64; 3],
 }
 
 /// What one step is to do.
@@ -55,6 +66,9 @@ pub struct StepInput {
     pub noise_seed: u32,
     /// Whether [`FitDevice::camera_gradients`] will ask for this step's.
     pub camera_gradient: bool,
+    /// What the picture is corrected by before the loss; [`FitDevice::exposure_gradients`] then has
+    /// this step's. None compares the picture as it is.
+    pub exposure: Option<Exposure<f32>>,
 }
 
 impl StepInput {
@@ -92,6 +106,9 @@ impl StepInput {
                 "ssim_weight",
                 format!("must lie in 0..=1, got {}", self.ssim_weight),
             ));
+        }
+        if let Some(exposure) = &self.exposure {
+            exposure.validate()?;
         }
         self.adam().validate()
     }
@@ -134,12 +151,15 @@ pub trait FitDevice: Send {
         self.upload(state)
     }
 
-    /// One step: project, bin, rasterize, loss, rasterize_backward, project_backward, Adam, noise,
-    /// density statistics.
+    /// One step: project, bin, rasterize, exposure, loss, exposure_backward, rasterize_backward,
+    /// project_backward, Adam, noise, density statistics.
     fn step(&mut self, input: &StepInput) -> Result<()>;
 
     /// Gradients of the cameras of all steps since the last call that were to have them, in order.
     fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>>;
+
+    /// Gradients of the exposures of all steps since the last call that had one, in order.
+    fn exposure_gradients(&mut self) -> Result<Vec<ExposureGradient>>;
 
     /// Loss of the last step (before its update, regularisers not included).
     fn loss(&mut self) -> Result<f32>;

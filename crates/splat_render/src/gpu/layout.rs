@@ -7,7 +7,7 @@ use bytemuck::{Pod, Zeroable};
 
 use crate::camera::Camera;
 use crate::constants::TILE;
-use crate::stages::{AdamStep, Colors, ProjectOptions, Rates, SplatParams};
+use crate::stages::{AdamStep, Colors, Exposure, ProjectOptions, Rates, SplatParams};
 use crate::target::Weight;
 
 /// Floats per splat in the geometry buffer: mean 3, scales 3, quaternion 4 (wxyz), opacity 1.
@@ -29,6 +29,9 @@ pub(super) const STATS: usize = 2;
 /// Splats per workgroup of the per-splat kernels; windows are multiples of it, which also keeps
 /// every per-splat buffer's offset a multiple of 256 bytes.
 pub(super) const SPLATS_PER_GROUP: u32 = 64;
+
+/// Workgroups of the exposure kernels, each with sums of its own.
+pub(super) const EXPOSURE_GROUPS: u32 = 64;
 
 /// Camera, background and how colours and parameters are stored.
 #[repr(C)]
@@ -188,6 +191,28 @@ pub(super) struct StatusHead {
     pub step: u32,
     pub overflow: u32,
     pub unused: u32,
+}
+
+/// What a photo's exposure does to a picture.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(super) struct ExposureUniform {
+    pub gain: [f32; 4],
+    pub offset: [f32; 4],
+    pub behind: [f32; 4],
+    pub background: [f32; 4],
+}
+
+impl From<&Exposure<f32>> for ExposureUniform {
+    fn from(exposure: &Exposure<f32>) -> Self {
+        let row = |[r, g, b]: [f32; 3], w: f32| [r, g, b, w];
+        Self {
+            gain: row(exposure.gain, 0.0),
+            offset: row(exposure.offset, 0.0),
+            behind: row(exposure.behind(), 0.0),
+            background: exposure.background.map_or([0.0; 4], |color| row(color, 1.0)),
+        }
+    }
 }
 
 /// What one step of a fit is to do.

@@ -9,6 +9,7 @@ mod adam;
 mod bin;
 mod desktop;
 mod device;
+mod exposure;
 mod fit;
 mod layout;
 mod loss;
@@ -29,8 +30,8 @@ pub use shaders::shared_wgsl;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
-    AdamState, AdamStep, Image, ImageGradients, Loss, ProjectOptions, Projected,
-    ProjectedGradients, SplatGradients, SplatParams, Stages, check,
+    AdamState, AdamStep, Exposure, ExposureGradients, Image, ImageGradients, Loss, ProjectOptions,
+    Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
 };
 use crate::target::Target;
 
@@ -74,6 +75,21 @@ impl Stages<f32> for Gpu {
     ) -> Result<SplatGradients<f32>> {
         check::project_backward(splats, camera, options, projected, v_projected)?;
         project_backward::project_backward(self, splats, camera, options, projected, v_projected)
+    }
+
+    fn exposure(&self, image: &Image<f32>, exposure: &Exposure<f32>) -> Result<Vec<[f32; 3]>> {
+        check::exposure(image, exposure)?;
+        exposure::exposure(self, image, exposure)
+    }
+
+    fn exposure_backward(
+        &self,
+        image: &Image<f32>,
+        exposure: &Exposure<f32>,
+        v_corrected: &[[f32; 3]],
+    ) -> Result<ExposureGradients<f32>> {
+        check::exposure_backward(image, exposure, v_corrected)?;
+        exposure::exposure_backward(self, image, exposure, v_corrected)
     }
 
     fn loss(

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::layout::{CAMERA, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS};
+use super::layout::{CAMERA, EXPOSURE_GROUPS, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS};
 use crate::constants::{
     ADAM, ALPHA_MAX, ALPHA_MIN, QUAT_NORM2_MIN, SSIM_C, SSIM_WINDOW, TILE, TRANSMITTANCE_MIN,
 };
@@ -57,7 +57,7 @@ const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 14] = [
+pub(super) static SOURCES: [Source; 15] = [
     Source {
         name: "project",
         shared_work: None,
@@ -143,6 +143,13 @@ pub(super) static SOURCES: [Source; 14] = [
         segmented: false,
     },
     Source {
+        name: "exposure",
+        shared_work: None,
+        parts: &[SHARED, include_str!("shaders/exposure.wgsl")],
+        bindings: &[Uniform, Uniform, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
         name: "loss",
         shared_work: None,
         parts: &[SHARED, include_str!("shaders/loss.wgsl")],
@@ -180,6 +187,8 @@ pub(super) enum Kernel {
     RasterizeBackwardSum,
     RasterizeBackwardAbsolute,
     RasterizeBackwardSumAbsolute,
+    Exposure,
+    ExposureBackward,
     LossSlopes,
     LossGradient,
     AdamGeometry,
@@ -188,7 +197,7 @@ pub(super) enum Kernel {
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 22] = [
         Self::Project,
         Self::ProjectBackward,
         Self::DepthKeys,
@@ -205,6 +214,8 @@ impl Kernel {
         Self::RasterizeBackwardSum,
         Self::RasterizeBackwardAbsolute,
         Self::RasterizeBackwardSumAbsolute,
+        Self::Exposure,
+        Self::ExposureBackward,
         Self::LossSlopes,
         Self::LossGradient,
         Self::AdamGeometry,
@@ -234,6 +245,8 @@ impl Kernel {
             Self::RasterizeBackwardSumAbsolute => {
                 ("rasterize_backward_sum_absolute", "rasterize_backward_sum")
             }
+            Self::Exposure => ("exposure", "exposure"),
+            Self::ExposureBackward => ("exposure", "exposure_backward"),
             Self::LossSlopes => ("loss", "loss_slopes"),
             Self::LossGradient => ("loss", "loss_gradient"),
             Self::AdamGeometry => ("adam", "adam_geometry"),
@@ -251,6 +264,7 @@ fn constants(rows: u32) -> String {
         ("GRADIENT_ABSOLUTE", GRADIENT_ABSOLUTE as u32),
         ("CAMERA", CAMERA as u32),
         ("STATS", STATS as u32),
+        ("EXPOSURE_GROUPS", EXPOSURE_GROUPS),
     ]) {
         let _ = writeln!(out, "const {name} = {value}u;");
     }
@@ -338,7 +352,7 @@ mod tests {
     use super::*;
     use crate::gpu::device::ROWS;
     use crate::gpu::layout::{
-        Chunk, ChunkCount, SortPass, Splat2d, StatusHead, Step, View, Window,
+        Chunk, ChunkCount, ExposureUniform, SortPass, Splat2d, StatusHead, Step, View, Window,
     };
 
     fn parse_with(source: &Source, rows: u32, subgroups: bool) -> naga::Module {
@@ -474,6 +488,17 @@ mod tests {
             compensation
         );
         layout!("project", Window, first, count);
+        assert_layout(
+            "exposure",
+            "Exposure",
+            size_of::<ExposureUniform>(),
+            &[
+                ("gain", offset_of!(ExposureUniform, gain)),
+                ("offset", offset_of!(ExposureUniform, offset)),
+                ("behind", offset_of!(ExposureUniform, behind)),
+                ("background", offset_of!(ExposureUniform, background)),
+            ],
+        );
         layout!(
             "bin_count",
             Chunk,

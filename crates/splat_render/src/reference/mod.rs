@@ -2,6 +2,7 @@
 //! against it, stage by stage.
 
 mod adam;
+mod exposure;
 mod kinks;
 mod loss;
 mod project;
@@ -15,8 +16,8 @@ pub use rasterize::band_pixels;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
-    AdamState, AdamStep, Image, ImageGradients, Loss, ProjectOptions, Projected,
-    ProjectedGradients, SplatGradients, SplatParams, Stages, check,
+    AdamState, AdamStep, Exposure, ExposureGradients, Image, ImageGradients, Loss, ProjectOptions,
+    Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
 };
 use crate::target::Target;
 
@@ -62,6 +63,21 @@ impl Stages<f64> for Reference {
     ) -> Result<SplatGradients<f64>> {
         check::project_backward(splats, camera, options, projected, v_projected)?;
         Ok(project_backward::project_backward(splats, camera, options, projected, v_projected))
+    }
+
+    fn exposure(&self, image: &Image<f64>, exposure: &Exposure<f64>) -> Result<Vec<[f64; 3]>> {
+        check::exposure(image, exposure)?;
+        Ok(exposure::exposure(image, exposure))
+    }
+
+    fn exposure_backward(
+        &self,
+        image: &Image<f64>,
+        exposure: &Exposure<f64>,
+        v_corrected: &[[f64; 3]],
+    ) -> Result<ExposureGradients<f64>> {
+        check::exposure_backward(image, exposure, v_corrected)?;
+        Ok(exposure::exposure_backward(image, exposure, v_corrected))
     }
 
     fn loss(

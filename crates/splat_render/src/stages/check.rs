@@ -1,10 +1,12 @@
 //! What every implementation checks of what a stage is given, before it does anything.
 
 use super::{
-    AdamState, AdamStep, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients,
-    SplatGradients, check_lengths,
+    AdamState, AdamStep, Exposure, Image, ImageGradients, ProjectOptions, Projected,
+    ProjectedGradients, SplatGradients, check_lengths,
 };
-use crate::camera::Camera;
+use num_traits::Float;
+
+use crate::camera::{Camera, check_size};
 use crate::error::{Error, Result};
 use crate::splats::SplatParams;
 use crate::target::Target;
@@ -38,6 +40,24 @@ pub fn project_backward<T: Copy + Default>(
     project(splats, camera, options)?;
     projected.validate()?;
     v_projected.validate(splats.len(), projected.len())
+}
+
+pub fn exposure<T: Float>(image: &Image<T>, exposure: &Exposure<T>) -> Result<()> {
+    exposure.validate()?;
+    check_size(image.width, image.height)?;
+    let pixels = image.width as usize * image.height as usize;
+    let lengths = [("image", image.color.len()), ("image", image.transmittance.len())];
+    check_lengths(&lengths, pixels, "pixels where its size asks for")
+}
+
+pub fn exposure_backward<T: Float>(
+    image: &Image<T>,
+    by: &Exposure<T>,
+    v_corrected: &[[T; 3]],
+) -> Result<()> {
+    exposure(image, by)?;
+    let given = [("v_corrected", v_corrected.len())];
+    check_lengths(&given, image.color.len(), "pixels where the picture has")
 }
 
 pub fn loss<T>(image: &Image<T>, target: &Target, ssim_weight: f32) -> Result<()> {

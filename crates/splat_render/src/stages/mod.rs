@@ -4,6 +4,7 @@
 //! `T` is f64 in the reference and f32 elsewhere.
 
 pub(crate) mod check;
+mod exposure;
 
 use num_traits::Float;
 
@@ -14,6 +15,7 @@ use crate::splats::SplatArrays;
 use crate::target::Target;
 
 pub use crate::splats::{Colors, SplatParams};
+pub use exposure::{Exposure, ExposureGradients};
 
 /// Checks that every named length is `expected`; `unit` goes between the two numbers of the error.
 fn check_lengths(lengths: &[(&str, usize)], expected: usize, unit: &str) -> Result<()> {
@@ -452,6 +454,19 @@ pub trait Stages<T> {
         projected: &Projected<T>,
         v_projected: &ProjectedGradients<T>,
     ) -> Result<SplatGradients<T>>;
+
+    /// A picture's colours as a photo of some gain and offset has them, `[H * W]`; see [`Exposure`].
+    /// Of the image, colour and transmittance are read.
+    fn exposure(&self, image: &Image<T>, exposure: &Exposure<T>) -> Result<Vec<[T; 3]>>;
+
+    /// Gradients of the corrected colours, `[H * W]`, to those of the picture and of gain and offset.
+    /// The arguments are those of [`Stages::exposure`].
+    fn exposure_backward(
+        &self,
+        image: &Image<T>,
+        exposure: &Exposure<T>,
+        v_corrected: &[[T; 3]],
+    ) -> Result<ExposureGradients<T>>;
 
     /// Loss of a picture against a photo over `background`, with its gradient:
     /// `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / count` over pixels p of weight w

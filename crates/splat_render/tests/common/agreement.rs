@@ -137,6 +137,7 @@ fn fitted(device: &mut dyn FitDevice) -> (FitState, StepInput) {
         dropout: 0.1,
         noise_seed: 9,
         camera_gradient: true,
+        exposure: None,
     };
     (state, input)
 }

@@ -14,7 +14,7 @@ use rand_pcg::Pcg64;
 use splat_render::constants::BLUR;
 use splat_render::splats::SplatArrays;
 use splat_render::stages::{
-    AdamState, Colors, Image, ImageGradients, Projected, ProjectedGradients,
+    AdamState, Colors, Exposure, Image, ImageGradients, Projected, ProjectedGradients,
 };
 use splat_render::{Camera, SplatGradients, SplatParams};
 
@@ -130,6 +130,14 @@ pub fn widen_image(i: &Image<f32>) -> Image<f64> {
         alpha: widen1(&i.alpha),
         depth: widen1(&i.depth),
         transmittance: widen1(&i.transmittance),
+    }
+}
+
+pub fn widen_exposure(e: &Exposure<f32>) -> Exposure<f64> {
+    Exposure {
+        gain: e.gain.map(f64::from),
+        offset: e.offset.map(f64::from),
+        background: e.background.map(|color| color.map(f64::from)),
     }
 }
 

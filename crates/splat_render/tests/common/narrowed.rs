@@ -3,7 +3,7 @@
 
 use splat_render::fit::Target;
 use splat_render::reference::Reference;
-use splat_render::stages::{AdamState, AdamStep, Loss};
+use splat_render::stages::{AdamState, AdamStep, Exposure, ExposureGradients, Loss};
 use splat_render::{
     Camera, Colors, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, Result,
     SplatGradients, SplatParams, Stages,
@@ -102,6 +102,26 @@ impl Stages<f32> for Narrowed {
             v_colors: narrow(&v.v_colors),
             v_viewmat: v.v_viewmat,
             v_intrinsics: v.v_intrinsics,
+        })
+    }
+
+    fn exposure(&self, image: &Image<f32>, exposure: &Exposure<f32>) -> Result<Vec<[f32; 3]>> {
+        Ok(narrow(&Reference.exposure(&widen_image(image), &widen_exposure(exposure))?))
+    }
+
+    fn exposure_backward(
+        &self,
+        image: &Image<f32>,
+        exposure: &Exposure<f32>,
+        v_corrected: &[[f32; 3]],
+    ) -> Result<ExposureGradients<f32>> {
+        let (image, exposure) = (widen_image(image), widen_exposure(exposure));
+        let v = Reference.exposure_backward(&image, &exposure, &widen(v_corrected))?;
+        Ok(ExposureGradients {
+            v_color: narrow(&v.v_color),
+            v_alpha: narrow1(&v.v_alpha),
+            v_gain: v.v_gain,
+            v_offset: v.v_offset,
         })
     }
 

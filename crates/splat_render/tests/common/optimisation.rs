@@ -1,10 +1,10 @@
-//! What loss and adam must show against the f64 reference. Each check prints its figures.
+//! What exposure, loss and adam must show against the f64 reference. Each check prints its figures.
 
 use rand::Rng;
 use splat_render::fit::{Rates, Target};
 use splat_render::reference::Reference;
 use splat_render::splats::SplatArrays;
-use splat_render::stages::{AdamState, AdamStep, Image};
+use splat_render::stages::{AdamState, AdamStep, Exposure, Image};
 use splat_render::{SplatGradients, Stages};
 
 use super::*;
@@ -79,6 +79,63 @@ pub fn loss_matches_the_reference(stages: &dyn Stages<f32>) {
     let loss = stages.loss(&random_picture(&mut rng, 4, 3), &masked, [0.0; 3], 0.2).unwrap();
     assert_eq!(loss.value, 0.0, "a photo masked out everywhere asks for nothing");
     assert!(loss.v_color.as_flattened().iter().all(|&v| v == 0.0));
+}
+
+/// A picture with holes, an exposure of a photo with or without alpha, and gradients.
+fn random_exposure(
+    rng: &mut Pcg64,
+    (width, height): (u32, u32),
+    matted: bool,
+) -> (Image<f32>, Exposure<f32>, Vec<[f32; 3]>) {
+    let mut image = random_picture(rng, width, height);
+    image.transmittance.iter_mut().for_each(|t| *t = rng.random::<f32>().powi(3));
+    let exposure = Exposure {
+        gain: std::array::from_fn(|_| rng.random_range(0.5..2.0)),
+        offset: std::array::from_fn(|_| rng.random_range(-0.1..0.1)),
+        background: matted.then(|| std::array::from_fn(|_| rng.random())),
+    };
+    let pixels = (width * height) as usize;
+    let v = (0..pixels).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0))).collect();
+    (image, exposure, v)
+}
+
+/// Corrected pictures and their gradients, for photos with and without alpha.
+pub fn exposure_matches_the_reference(stages: &dyn Stages<f32>) {
+    let mut rng = rng(61);
+    for size in [(23, 37), (1, 1), (130, 7), (300, 200)] {
+        for matted in [false, true] {
+            let (image, exposure, v) = random_exposure(&mut rng, size, matted);
+            let (wide_image, wide) = (widen_image(&image), widen_exposure(&exposure));
+            let what = format!("{size:?}, alpha {matted}");
+            let got = stages.exposure(&image, &exposure).unwrap();
+            let expected = Reference.exposure(&wide_image, &wide).unwrap();
+            let off = difference(&got, &expected, &[]);
+            assert!(off.max <= 1e-6, "{what}: {off:?}");
+            let got = stages.exposure_backward(&image, &exposure, &v).unwrap();
+            let expected = Reference.exposure_backward(&wide_image, &wide, &widen(&v)).unwrap();
+            let off = difference(&got.v_color, &expected.v_color, &[]).relative();
+            assert!(off <= 1e-6, "{what}: v_color {off:.1e}");
+            let off = difference1(&got.v_alpha, &expected.v_alpha, &[]).max;
+            assert!(off <= 1e-6, "{what}: v_alpha {off:.1e}");
+            // Sums of so many numbers of either sign: by what their sizes add up to.
+            let scale = 1e-6 * v.len() as f64;
+            for c in 0..3 {
+                let gain = (got.v_gain[c] - expected.v_gain[c]).abs();
+                let offset = (got.v_offset[c] - expected.v_offset[c]).abs();
+                assert!(gain <= scale && offset <= scale, "{what}: {gain:.1e}, {offset:.1e}");
+            }
+            let again = stages.exposure_backward(&image, &exposure, &v).unwrap();
+            assert!(got == again, "{what}: the same twice gave other bits");
+        }
+    }
+    let (image, exposure, v) = random_exposure(&mut rng, (4, 3), false);
+    let none = stages.exposure(&image, &Exposure::none()).unwrap();
+    assert_eq!(none, image.color, "no exposure changes no bit");
+    let bad = Exposure { gain: [f32::NAN; 3], ..exposure };
+    let named = |error: splat_render::Error| error.to_string();
+    assert!(stages.exposure(&image, &bad).map_err(named).unwrap_err().starts_with("gain"));
+    let short = stages.exposure_backward(&image, &exposure, &v[1..]).map_err(named).unwrap_err();
+    assert!(short.starts_with("v_corrected"), "{short}");
 }
 
 /// Splats under optimisation, with moments of earlier steps, and gradients.

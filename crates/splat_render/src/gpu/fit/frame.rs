@@ -7,6 +7,7 @@ use crate::error::Result;
 use crate::gpu::adam::AdamInput;
 use crate::gpu::bin::{TileChunk, tile_count};
 use crate::gpu::device::{Gpu, Op};
+use crate::gpu::exposure::{Exposed, ExposureBuffers};
 use crate::gpu::layout::Chunk;
 use crate::gpu::loss::LossBuffers;
 use crate::gpu::project::{Projection, project_ops};
@@ -22,10 +23,14 @@ pub(super) struct Frame {
     pub picture: PictureBuffers,
     pub transmittances: wgpu::Buffer,
     pub loss: LossBuffers,
+    /// Made for the first step that has an exposure.
+    pub exposure: Option<ExposureBuffers>,
     /// Tiles of each chunk; more than one only where the pairs of all do not fit one binding.
     pub chunks: Vec<Range<u32>>,
     /// Empty until needed, and again whenever a buffer was replaced.
     pub ops: Vec<Op>,
+    /// Whether they correct the picture by an exposure.
+    pub is_exposed: bool,
 }
 
 impl Frame {
@@ -37,17 +42,41 @@ impl Frame {
             picture: PictureBuffers::new(gpu, pixels)?,
             transmittances: gpu.transmittances(pixels)?,
             loss: LossBuffers::new(gpu, width, height)?,
+            exposure: None,
             chunks: std::iter::once(0..tile_count(width, height)).collect(),
             ops: Vec::new(),
+            is_exposed: false,
         })
     }
 
-    /// The commands of a whole step.
-    pub fn step_ops(
+    /// Makes the commands of a whole step, unless they are there already; `exposure` is the uniform
+    /// of a step that has one.
+    pub fn prepare(
+        &mut self,
+        gpu: &Gpu,
+        view: &wgpu::Buffer,
+        step: &wgpu::Buffer,
+        exposure: Option<&wgpu::Buffer>,
+        scene: &Scene,
+    ) -> Result<()> {
+        if !self.ops.is_empty() && self.is_exposed == exposure.is_some() {
+            return Ok(());
+        }
+        if exposure.is_some() && self.exposure.is_none() {
+            let pixels = u64::from(self.width) * u64::from(self.height);
+            self.exposure = Some(ExposureBuffers::new(gpu, pixels)?);
+        }
+        self.is_exposed = exposure.is_some();
+        self.ops = self.step_ops(gpu, view, step, exposure, scene);
+        Ok(())
+    }
+
+    fn step_ops(
         &self,
         gpu: &Gpu,
         view: &wgpu::Buffer,
         step: &wgpu::Buffer,
+        exposure: Option<&wgpu::Buffer>,
         scene: &Scene,
     ) -> Vec<Op> {
         let n = scene.len();
@@ -74,7 +103,20 @@ impl Frame {
             bin(&mut ops, chunk);
             ops.extend(rasterize_ops(gpu, drawn, chunk, pairs, &self.picture));
         }
-        ops.extend(self.loss.ops(gpu, view, step, &self.picture.picture));
+        let exposed = exposure.zip(self.exposure.as_ref()).map(|(uniform, buffers)| {
+            let of = Exposed {
+                view,
+                uniform,
+                picture: &self.picture.picture,
+                v_picture: &self.loss.v_picture,
+                totals: &self.loss.totals,
+            };
+            (buffers, of)
+        });
+        ops.extend(exposed.map(|(buffers, of)| buffers.forward(gpu, of)));
+        let compared = exposed.map_or(&self.picture.picture, |(buffers, _)| &buffers.corrected);
+        ops.extend(self.loss.ops(gpu, view, step, compared));
+        ops.extend(exposed.map(|(buffers, of)| buffers.backward(gpu, of)));
         for chunk in &chunks {
             // Chunks share the pair buffers, so that the lists of all but one are gone by now.
             if chunks.len() > 1 {

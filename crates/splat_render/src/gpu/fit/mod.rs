@@ -9,7 +9,7 @@
 //! gradient and two moments make 4 P, statistics, 2D splats, their gradients and the depth order 120
 //! bytes. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
 //! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
-//! slopes of SSIM; a photo 4 per pixel, and 4 more for weights. A test holds the sum per splat.
+//! slopes of SSIM, and 16 more where exposures are fitted; a photo 4 per pixel, and 4 more for weights. A test holds the sum per splat.
 
 mod frame;
 mod scene;
@@ -18,11 +18,14 @@ use std::sync::Arc;
 
 use super::bin::{SplatBins, pair_limit, tile_count};
 use super::device::{Gpu, Op};
-use super::layout::{ChunkCount, GRADIENT, StatusHead, Step, View};
+use super::exposure::ExposureBuffers;
+use super::layout::{ChunkCount, ExposureUniform, GRADIENT, StatusHead, Step, View};
 use super::loss::{LossBuffers, rgba};
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
-use crate::fit_device::{CameraGradient, FitDevice, FitState, StepInput, dropout_threshold};
+use crate::fit_device::{
+    CameraGradient, ExposureGradient, FitDevice, FitState, StepInput, dropout_threshold,
+};
 use crate::sh;
 use crate::stages::ProjectOptions;
 use crate::target::{Target, Weight};
@@ -42,10 +45,14 @@ pub struct GpuFit {
     tiles: u32,
     view: wgpu::Buffer,
     step: wgpu::Buffer,
+    exposure: wgpu::Buffer,
     scene: Option<Scene>,
     /// Steps not known to have been done.
     pending: Vec<StepInput>,
     camera_gradients: Vec<CameraGradient>,
+    exposure_gradients: Vec<ExposureGradient>,
+    /// The exposure sums of each pending step; None until a step has them.
+    pending_exposures: Option<wgpu::Buffer>,
     /// The last step: its photo and SSIM weight.
     last: Option<(usize, f32)>,
 }
@@ -65,6 +72,7 @@ impl GpuFit {
         Self {
             view: gpu.uniform(&View::of_picture(1, 1, [0.0; 3])),
             step: gpu.uniform(&<Step as bytemuck::Zeroable>::zeroed()),
+            exposure: gpu.uniform(&<ExposureUniform as bytemuck::Zeroable>::zeroed()),
             gpu,
             photos: Vec::new(),
             frames: Vec::new(),
@@ -72,6 +80,8 @@ impl GpuFit {
             scene: None,
             pending: Vec::new(),
             camera_gradients: Vec::new(),
+            exposure_gradients: Vec::new(),
+            pending_exposures: None,
             last: None,
         }
     }
@@ -90,9 +100,8 @@ impl GpuFit {
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))?;
         let photo = &self.photos[input.view];
         let frame = &mut self.frames[photo.frame];
-        if frame.ops.is_empty() {
-            frame.ops = frame.step_ops(&self.gpu, &self.view, &self.step, scene);
-        }
+        let exposure = input.exposure.map(|_| &self.exposure);
+        frame.prepare(&self.gpu, &self.view, &self.step, exposure, scene)?;
         let view = View {
             sh_degree: input.sh_degree.min(scene.sh_degree),
             sh_stride: sh::coeffs(scene.sh_degree) as u32,
@@ -110,6 +119,10 @@ impl GpuFit {
         let queue = &self.gpu.queue;
         queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view));
         queue.write_buffer(&self.step, 0, bytemuck::bytes_of(&step));
+        if let Some(exposure) = &input.exposure {
+            let uniform = ExposureUniform::from(exposure);
+            queue.write_buffer(&self.exposure, 0, bytemuck::bytes_of(&uniform));
+        }
         let step_at = std::mem::offset_of!(StatusHead, step) as u64;
         queue.write_buffer(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
         let bytes = u64::from(frame.width) * u64::from(frame.height) * 4;
@@ -117,7 +130,18 @@ impl GpuFit {
         if let Some(weights) = &photo.weights {
             copies.push(Op::Copy(weights.clone(), frame.loss.weights.clone(), 0, bytes));
         }
-        let mut cameras = Vec::new();
+        let mut sums = Vec::new();
+        if let (Some(_), Some(buffers)) = (input.exposure, &frame.exposure) {
+            let bytes = ExposureBuffers::SUM_BYTES;
+            let log = match &self.pending_exposures {
+                Some(log) => log,
+                None => {
+                    let log = self.gpu.readable(STEPS_AHEAD as u64 * bytes);
+                    self.pending_exposures.insert(log)
+                }
+            };
+            sums.push(Op::Copy(buffers.sums.clone(), log.clone(), at as u64 * bytes, bytes));
+        }
         if input.camera_gradient {
             let bytes = scene.camera_bytes();
             let log = match &scene.pending_cameras {
@@ -128,13 +152,35 @@ impl GpuFit {
                 }
             };
             let (from, to) = (scene.gradients.camera.clone(), log.clone());
-            cameras.push(Op::Copy(from, to, at as u64 * bytes, bytes));
+            sums.push(Op::Copy(from, to, at as u64 * bytes, bytes));
         }
         self.last = Some((input.view, input.ssim_weight));
-        self.gpu.submit(&[&copies, &frame.ops, &cameras])
+        self.gpu.submit(&[&copies, &frame.ops, &sums])
     }
 
-    /// Takes in the camera sums of these steps, which have been done.
+    /// Takes in the sums of these steps, which have been done, for cameras and exposures.
+    fn read_sums(&mut self, steps: &[StepInput]) -> Result<()> {
+        self.read_exposures(steps)?;
+        self.read_cameras(steps)
+    }
+
+    fn read_exposures(&mut self, steps: &[StepInput]) -> Result<()> {
+        let Some(log) = &self.pending_exposures else { return Ok(()) };
+        if steps.iter().all(|input| input.exposure.is_none()) {
+            return Ok(());
+        }
+        let bytes = ExposureBuffers::SUM_BYTES;
+        let data = self.gpu.read(&[(log, steps.len() as u64 * bytes)])?;
+        for (input, sums) in steps.iter().zip(data[0].chunks_exact(bytes as usize)) {
+            if input.exposure.is_some() {
+                let [v_gain, v_offset] = ExposureBuffers::gradients(sums);
+                let gradient = ExposureGradient { view: input.view, v_gain, v_offset };
+                self.exposure_gradients.push(gradient);
+            }
+        }
+        Ok(())
+    }
+
     fn read_cameras(&mut self, steps: &[StepInput]) -> Result<()> {
         if !steps.iter().any(|input| input.camera_gradient) {
             return Ok(());
@@ -175,7 +221,7 @@ impl GpuFit {
         let (head, _) = self.status()?;
         let pending = std::mem::take(&mut self.pending);
         if head.overflow == 0 {
-            return self.read_cameras(&pending);
+            return self.read_sums(&pending);
         }
         let first = pending.iter().position(|p| p.step == head.overflow).unwrap_or(0);
         // One at a time, so that the counts read are those of the step that needs the room.
@@ -192,7 +238,7 @@ impl GpuFit {
                 self.grow(self.photos[input.view].frame, &counts)?;
             }
         }
-        self.read_cameras(&pending)
+        self.read_sums(&pending)
     }
 
     /// Makes room for the pairs that a step needs.
@@ -306,6 +352,11 @@ impl FitDevice for GpuFit {
     fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>> {
         self.settle()?;
         Ok(std::mem::take(&mut self.camera_gradients))
+    }
+
+    fn exposure_gradients(&mut self) -> Result<Vec<ExposureGradient>> {
+        self.settle()?;
+        Ok(std::mem::take(&mut self.exposure_gradients))
     }
 
     fn loss(&mut self) -> Result<f32> {
