@@ -393,9 +393,9 @@ mod tests {
         let depths = [3.0f32, 1.0, 2.0, 1.0, 1e-3, 1e9, 2.0];
         for groups in [1, 2, 5] {
             let key = |(i, d): (usize, &f32)| (u64::from(d.to_bits()) << 32 | i as u64).into();
-            let mut sort = DepthSort::default();
-            sort.keys = depths.iter().enumerate().map(key).collect();
-            sort.spare.resize_with(sort.keys.len(), AtomicU64::default);
+            let keys = depths.iter().enumerate().map(key).collect();
+            let spare = depths.iter().map(|_| AtomicU64::default()).collect();
+            let mut sort = DepthSort { keys, spare, counts: Vec::new() };
             sort.run(groups);
             let ids: Vec<u64> = sort.keys.iter().map(|k| k.load(Relaxed) & 0xffff_ffff).collect();
             assert_eq!(ids, [4, 1, 3, 2, 6, 0, 5], "{groups} groups");
