@@ -62,12 +62,12 @@ def ring_camera(angle, size=48, distance=4.0, centre=(0.0, 0.0, 0.0)):
     return Camera(viewmat, K, size, size)
 
 
-def capture(views=8, size=48, alpha=False, scene=None):
-    """Photos rendered from a scene by the reference; every fourth is a test view."""
+def capture(views=8, size=48, alpha=False, scene=None, arc=2.0 * np.pi):
+    """Photos of a scene by the reference, along an arc; every fourth is a test view."""
     scene = splats() if scene is None else scene
     result = []
     for i in range(views):
-        camera = ring_camera(2.0 * np.pi * i / views, size)
+        camera = ring_camera(arc * i / views, size)
         picture = render(scene, camera, backend="reference")
         image = picture.to_uint8()
         if alpha:

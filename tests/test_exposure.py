@@ -166,14 +166,15 @@ def fitted(capture, **options):
 
 @pytest.mark.parametrize("alpha", [False, True])
 def test_a_fit_finds_exposures_and_the_colors_of_the_mean_photo(alpha):
-    capture = scenes.capture(views=12, size=40, alpha=alpha)
+    # All see the same side: what only few photos show tells little of the others.
+    capture = scenes.capture(views=16, size=40, alpha=alpha, arc=1.0)
     count = len(capture.train_views)
-    exposures = made_up(count, largest=0.25, offset=0.0 if not alpha else 0.02)
+    exposures = made_up(count, largest=0.25, offset=0.0)
     photos = with_exposures(capture, exposures)
-    (plain, _), (splats, found) = fitted(photos, exposure="off"), fitted(photos, exposure="on")
+    (plain, _), (splats, found) = (fitted(photos, steps=1500, exposure=m) for m in ("off", "on"))
     gains = np.array([view.exposure.gain for view in found.train_views])
     off = np.log(gains / [one.gain for one in exposures])
-    assert np.sqrt(np.mean(off**2)) < 0.05, off
+    assert np.sqrt(np.mean(off**2)) < 0.05, np.sqrt(np.mean(off**2))
     assert np.abs(np.log(gains).mean(axis=0)).max() < 1e-9
     before, after = (igsr.evaluate(one, capture, backend="cpu") for one in (plain, splats))
     assert after.psnr > before.psnr + 0.5
@@ -328,10 +329,15 @@ def test_a_refinement_sees_photos_without_their_exposures(ball_photos, monkeypat
     refined = refinements.refine(photos, 1, refinements.lying)
     assert len(seen) >= 2, "all photos, and folds"
     by_name = {view.name: view for view in ball_photos.views}
+    was = {view.name: view.image[..., :3].astype(int) for view in photos.views}
     for view in seen[0]:
-        off = np.abs(view.image[..., :3].astype(int) - by_name[view.name].image[..., :3])
-        taken_off = next(v for v in photos.views if v.name == view.name).image[..., :3].astype(int)
-        assert off.mean() < 0.5 * np.abs(taken_off - by_name[view.name].image[..., :3]).mean()
+        true = by_name[view.name].image[..., :3].astype(int)
+        whole = (was[view.name] > 0) & (was[view.name] < 255)
+        off, before = (
+            np.abs(one - true)[whole].mean()
+            for one in (view.image[..., :3].astype(int), was[view.name])
+        )
+        assert off < 0.5 * before
     for fold in seen[1:]:
         assert all(view.exposure is None for view in fold)
     assert all(view.exposure is not None for view in refined.capture.train_views)

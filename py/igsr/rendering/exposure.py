@@ -39,7 +39,11 @@ def apply_exposure(image: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
     if colors.requires_grad:
         raw = colors.detach()
         colors.register_hook(
-            lambda v: v.masked_fill(((raw > 1.0) & (v < 0.0)) | ((raw < 0.0) & (v > 0.0)), 0.0)
+            lambda v: (
+                None
+                if v is None
+                else v.masked_fill(((raw > 1.0) & (v < 0.0)) | ((raw < 0.0) & (v > 0.0)), 0.0)
+            )
         )
     # The value is the cut one, the gradient that of what was cut.
     return colors + (colors.clamp(0.0, 1.0) - colors).detach()

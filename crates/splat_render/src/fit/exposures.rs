@@ -26,8 +26,10 @@ const REACH: f64 = 3.5;
 const RATES: (f64, f64) = (0.005, 0.05);
 /// Standard error of the start whose pull is 1. No step is longer than what a start leaves open.
 const UNIT_ERROR: f64 = 0.03;
-/// The pull of exposures of which nothing is known. It decides where a photo shows nothing.
-const PULL: f64 = 1e-3;
+/// Least pulls of gains and of offsets. The first decides where a photo shows nothing. Cameras make
+/// few offsets, and against a render that is poor still, the best exposure is all offset and no gain:
+/// with the first pull for both, fits of unknown exposures got lost there.
+const PULLS: (f64, f64) = (1e-3, 5.0);
 /// Gains further from 1 than this factor are none of a camera.
 const GAIN_MAX: f64 = 64.0;
 
@@ -69,7 +71,7 @@ impl Exposures {
             is_fitted: vec![true; targets.len()],
             means: targets.par_iter().map(mean_color).collect(),
             start: vec![[[1.0; 3], [0.0; 3]]; targets.len()],
-            pulls: vec![PULL; targets.len()],
+            pulls: vec![0.0; targets.len()],
             state: ExposureState {
                 gains: vec![[1.0; 3]; targets.len()],
                 offsets: vec![[0.0; 3]; targets.len()],
@@ -116,7 +118,7 @@ impl Exposures {
         self.anchor();
         let ExposureState { gains, offsets, .. } = &self.state;
         self.start = gains.iter().zip(offsets).map(|(&gain, &offset)| [gain, offset]).collect();
-        self.pulls = pulls.iter().map(|pull| pull.max(PULL)).collect();
+        self.pulls = pulls.to_vec();
         Ok(())
     }
 
@@ -164,9 +166,10 @@ impl Exposures {
             let k = gradient.view;
             let (gain, offset) = (self.state.gains[k], self.state.offsets[k]);
             let ([start_gain, start_offset], pull) = (self.start[k], self.pulls[k]);
+            let (of_gain, of_offset) = (pull.max(PULLS.0), pull.max(PULLS.1));
             let row: [f64; 6] = std::array::from_fn(|i| match i {
-                0..3 => gradient.v_gain[i] + pull * (gain[i] / start_gain[i]).ln() / gain[i],
-                _ => gradient.v_offset[i - 3] + pull * (offset[i - 3] - start_offset[i - 3]),
+                0..3 => gradient.v_gain[i] + of_gain * (gain[i] / start_gain[i]).ln() / gain[i],
+                _ => gradient.v_offset[i - 3] + of_offset * (offset[i - 3] - start_offset[i - 3]),
             });
             // A picture that left f32 says nothing.
             if row.iter().all(|v| v.is_finite()) {
@@ -195,7 +198,7 @@ impl Exposures {
                 0..3 => gain[i] * v[i] - (mean[i] - offset[i]) * v[i + 3],
                 _ => v[i],
             });
-            let rate = rate.min(UNIT_ERROR / self.pulls[k].sqrt());
+            let rate = rate.min(UNIT_ERROR / self.pulls[k].max(PULLS.0).sqrt());
             let moved = self.adam(k, v, decayed * rate);
             for c in 0..3 {
                 let factor = moved[c].exp();
@@ -280,7 +283,7 @@ mod tests {
     fn exposures_of_photos_of_known_colours_are_found_up_to_their_mean() {
         // A scene of two colours whose photos have these gains and offsets.
         let scene = [0.2, 0.6];
-        let truth = [(1.3, 0.02), (0.8, -0.04), (1.0 / (1.3 * 0.8), 0.02)];
+        let truth = [(1.3, 0.002), (0.8, -0.004), (1.0 / (1.3 * 0.8), 0.002)];
         let targets = [photo(200), photo(120), photo(160)];
         let mut fitted = Exposures::new(&targets);
         let rounds = 400;
