@@ -43,7 +43,7 @@ def test_default_follows_what_photos_tell_and_gives_way_to_the_caller():
         "original",
         "mcmc",
     )
-    assert (few.max_splats, many.max_splats) == (20_000, 30_210)
+    assert (few.max_splats, many.max_splats) == (30_000, 30_210)
     assert settings_for("default", support(8, pixels=1e9)).max_splats == presets.MOST_SPLATS
     given = preset_settings("default", 8, dropout=0.0, hull=True, steps=None)
     assert (given["dropout"], given["hull"]) == (0.0, True)
@@ -57,7 +57,7 @@ def test_the_default_has_no_cliff():
     for photos in range(1, 200):
         now = settings_for("default", support(photos, max(1.0, 0.4 * photos)))
         assert steps <= now.steps <= max(2 * presets.STEPS_PER_PHOTO, 1.5 * steps)
-        assert splats <= now.max_splats <= max(20_000, 1.32 * splats)
+        assert splats <= now.max_splats <= max(30_000, 1.32 * splats)
         assert dropout - 0.1 <= now.dropout <= dropout
         steps, splats, dropout = now.steps, now.max_splats, now.dropout
     assert (steps, dropout) == (presets.MOST_STEPS, 0.0)

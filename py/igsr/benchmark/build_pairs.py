@@ -178,7 +178,12 @@ def _pair_rows(
 
 
 def slower_rows(rows: list[dict[str, Any]], percent: float) -> list[str]:
-    """One sentence per row in which this build takes more than ``percent`` longer."""
+    """One sentence per row in which this build takes more than ``percent`` longer.
+
+    Args:
+        rows: of ``compare_builds``.
+        percent: of the other build's time.
+    """
     return [
         f"{row['workload']} {row['pass']} with {row['splats']} splats at {row['width']} x "
         f"{row['height']} on {row['backend']} takes {100.0 / row['ratio'] - 100.0:.0f} % longer."

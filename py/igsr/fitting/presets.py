@@ -31,7 +31,7 @@ WIDE_APART = 7.0
 #: From so many photos of the same place on, view-dependent color is more than a way to overfit.
 SH2_PHOTOS = 12.0
 #: Steps of any fit, and more for each photo, up to a most; but for few photos only so many each.
-STEPS, STEPS_MORE, MOST_STEPS = 2500, 25, 5000
+STEPS, STEPS_MORE, MOST_STEPS = 3200, 18, 5000
 STEPS_PER_PHOTO = 500
 #: Most splats per pixel of one photo, times this power of the photos over ``FEW``: more photos show
 #: more of a scene, but not as many times more. With more splats, few photos are only overfitted.
@@ -39,7 +39,7 @@ SPLATS_PER_PIXEL = 0.11
 FEW, SPLATS_POWER = 8.0, 0.4
 MOST_SPLATS = 1_000_000
 #: Small photos may have this many, or so many per pixel: they cost little there.
-SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL = 20_000, 0.3
+SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL = 30_000, 0.3
 #: Steps of the paper's fits to photos whose cameras have noise.
 PAPER_STEPS = 5000
 
