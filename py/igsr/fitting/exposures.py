@@ -270,9 +270,8 @@ def _solved_channel(
             matrix = matrix - table.T @ (table / of_point[start : start + 4096, None])
         # All gains may grow together: their mean stays zero. What shares nothing stays zero, too.
         scale = max(float(np.trace(matrix)) / count, 1e-12)
-        gains = np.linalg.solve(
-            matrix + scale * (np.full((count, count), 1.0 / count) + 1e-9 * np.eye(count)), right
-        )
+        matrix = matrix + scale * (np.full((count, count), 1.0 / count) + 1e-9 * np.eye(count))
+        gains = np.linalg.solve(matrix, right).astype(np.float64)
         of_photo = values - gains[view]
         color = np.bincount(point, weights * of_photo) / of_point
         residual = of_photo - color[point]
