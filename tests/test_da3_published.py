@@ -24,9 +24,7 @@ from igsr.pose.da3.config import SMALL, NetworkConfig
 from igsr.pose.da3.network import Da3Network
 from igsr.pose.da3.reference_view import REFERENCES
 
-PUBLISHED = os.environ.get("IGSR_DA3_FIXTURES")
-pytestmark = pytest.mark.skipif(not PUBLISHED, reason="IGSR_DA3_FIXTURES names no folder")
-FOLDER = Path(PUBLISHED or ".")
+FOLDER = Path(os.environ["IGSR_DA3_FIXTURES"])
 
 #: Largest differences that are allowed; activations and cameras, predictions, focal lengths.
 ACTIVATION, PREDICTION, PIXELS = 2e-5, 5e-5, 1e-3

@@ -59,8 +59,10 @@ fn exposure_backward(
         let before = raw(pixel);
         let gradient = v_picture[i].xyz;
         // What takes a cut colour further away from what a photo holds stays behind.
-        let leaves = (before > vec3(1.0) & gradient < vec3(0.0))
-            | (before < vec3(0.0) & gradient > vec3(0.0));
+        // Brackets, or "<" and ">" of one expression open and close a template list.
+        let over = (before > vec3(1.0)) & (gradient < vec3(0.0));
+        let under = (before < vec3(0.0)) & (gradient > vec3(0.0));
+        let leaves = over | under;
         let v = select(gradient, vec3(0.0), leaves);
         // What of the pixel the exposure leaves as it is.
         let kept = pixel.w * exposed.background.w;
