@@ -143,12 +143,13 @@ def test_notebooks_show_photos(capture):
 def test_scores_are_a_dictionary_with_typed_attributes(capture):
     scores = igsr.evaluate(scenes.splats(seed=1), capture, backend="cpu")
     assert isinstance(scores, igsr.Scores)
-    for name in ("psnr", "ssim", "ms_ssim", "flip", "protocol", "views"):
+    for name in ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim", "protocol", "views"):
         assert getattr(scores, name) == scores[name]
     assert json.loads(json.dumps(scores)) == {**scores}
     assert pickle.loads(pickle.dumps(scores)) == scores
     assert repr(scores).startswith(f"Scores(PSNR {scores.psnr:.2f} dB, SSIM ")
-    assert repr(scores).endswith("MS-SSIM -, FLIP " + f"{scores.flip:.4f}; 2 test views)")
+    corrected = f"color-corrected PSNR {scores.cc_psnr:.2f} dB"
+    assert repr(scores).endswith(f"MS-SSIM -, FLIP {scores.flip:.4f}, {corrected}; 2 test views)")
     assert [row["name"] for row in scores.views] == [view.name for view in capture.test_views]
 
 

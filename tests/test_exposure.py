@@ -94,6 +94,26 @@ def test_gains_that_are_not_told_apart_from_their_errors_are_left_alone():
     assert starting_exposures(uneven, points, "auto") is None
 
 
+def test_gains_that_drift_from_photo_to_photo_are_left_alone():
+    """As of a video whose camera adapts: each photo shares points with the next ones alone."""
+    views, points = wall(count=16, points=1600)
+    tracks = points.tracks
+    # Photo k sees the points from 100 k to 100 k + 300.
+    first = 100 * tracks.view
+    kept = (tracks.point >= first) & (tracks.point < first + 300)
+    tracks = replace(tracks, view=tracks.view[kept], point=tracks.point[kept], xy=tracks.xy[kept])
+    points = replace(points, tracks=tracks)
+    drift = [Exposure((np.exp(0.3 * np.sin(2 * np.pi * k / 16)),) * 3) for k in range(16)]
+    jumps = [Exposure((np.exp(0.2 * (-1.0) ** k),) * 3) for k in range(16)]
+    one, other = (
+        gains_by_points([taken(v, e) for v, e in zip(views, each, strict=True)], points)
+        for each in (drift, jumps)
+    )
+    assert np.abs(one.log_gain[:, 0]).max() > 0.2
+    assert one.log_gain.std() > 0.9 * other.log_gain.std()
+    assert other.spread > 2.0 * one.spread
+
+
 def test_few_points_tell_nothing():
     views, points = wall(points=12)
     photos = [taken(view, one) for view, one in zip(views, made_up(len(views)), strict=True)]

@@ -464,7 +464,10 @@ def test_a_checkpoint_of_format_1_goes_on(capture, tmp_path):
     assert np.array_equal(splats.origin, np.zeros(3))
     # Eight steps away from what the file holds, and no other fit.
     assert 0 < np.abs(splats.means - state["means"]).max() < 0.2
-    assert load_checkpoint(path)[1].keys() == settings.keys() - {"format"} | {"coarse_to_fine"}
+    assert load_checkpoint(path)[1].keys() == settings.keys() - {"format"} | {
+        "coarse_to_fine",
+        "exposure",
+    }
     with pytest.raises(igsr.IgsrError, match="it is not of format 1"):
         resumed(format=2)
     with pytest.raises(igsr.IgsrError, match=r"was made with igsr '0\.0\.9', not"):

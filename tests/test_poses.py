@@ -420,6 +420,7 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
         coarse_to_fine=False,
         poses="fixed",
         focal="fixed",
+        exposure="off",
     )
     monkeypatch.setattr(presets, "_default", lambda support, quality: short)
     row = run_fit(str(data), PoseFit("ball", Noise("turn", 1.0), "joint", 0, "cpu"))

@@ -163,7 +163,7 @@ def test_bad_arguments(ball_photos, rounds, options, message, monkeypatch, tmp_p
 def test_photos_that_cannot_be_fitted_or_scored_are_told_before_anything_is_done(
     ball_photos, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(stages, "fit", lambda *_, **__: pytest.fail("it is fitted"))
+    monkeypatch.setattr(stages, "fit_with_cameras", lambda *_, **__: pytest.fail("it is fitted"))
     earlier = tmp_path / "checkpoints/whole.npz"
     earlier.parent.mkdir()
     earlier.write_bytes(b"of an earlier run")

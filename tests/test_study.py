@@ -35,6 +35,7 @@ SHORT = FitSettings(
     coarse_to_fine=False,
     poses="fixed",
     focal="fixed",
+    exposure="off",
 )
 
 

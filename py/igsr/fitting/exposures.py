@@ -6,14 +6,16 @@ squares solution (M-estimator with Cauchy's weights, iteratively reweighted). Ho
 believed says a delete-one-group jackknife (Efron and Stein 1981) over groups of points that lie
 together, since what is near changes alike: highlights, vignetting, shadows.
 
-Exposures are fitted ("auto") where gains of the photos differ by ``LEAST_SPREAD`` or more, beyond
-what the jackknife leaves open. Where the capture has no tracks, EXIF decides, if all photos have
-it; without either, exposures are not fitted.
+Exposures are fitted ("auto") where photos differ in gain by ``LEAST_SPREAD`` or more from those
+that they share most points with, beyond what the jackknife leaves open. A gain that drifts from
+photo to photo is no reason: splats follow it with the direction, and photos between have it, too.
+Where the capture has no tracks, EXIF decides, if all photos have it; without either, exposures are
+not fitted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +26,9 @@ from igsr.fitting.settings import ExposureMode
 
 Float64 = npt.NDArray[np.float64]
 
-#: Root mean square of the photos' log gains from which on exposures are fitted: a tenth of a stop.
-LEAST_SPREAD = 0.03
+#: Spread of the photos' log gains from which on exposures are fitted: a sixth of a stop. A photo is
+#: compared with so many others.
+LEAST_SPREAD, NEAREST = 0.05, 2
 #: Encoded brightness (sRGB) that one stop more of light makes: a power of 1/2.2 of it.
 LOG_GAIN_OF_STOP = float(np.log(2.0) / 2.2)
 #: A point's color in a photo is the mean of so many pixels on a side.
@@ -41,6 +44,8 @@ GROUPS = 8
 UNIT_ERROR, MOST_PULL = 0.03, 100.0
 #: Standard errors of log gains by EXIF, and of those that a view brings from a fit.
 EXIF_ERROR, FITTED_ERROR = 0.1, 0.02
+#: Points that are held in one table.
+TABLE_POINTS = 4096
 #: Rounds of reweighting.
 ROUNDS = 12
 #: Turns in which photos and points are fitted; an offset that is likely; and the largest gain.
@@ -54,22 +59,14 @@ class RelativeGains:
     Attributes:
         log_gain: float64 [V, 3], with a mean of zero over the photos that are known.
         error: float64 [V, 3], its standard error; infinite where nothing is known.
+        spread: root mean square of what a photo's log gain differs from those of the photos that it
+            shares most with, over the square root of 2, less what errors explain: what it would be
+            if each photo's were independent of the others'.
     """
 
     log_gain: Float64
     error: Float64
-
-    @property
-    def spread(self) -> float:
-        """Root mean square of the log gains less what their errors explain; 0 where none is known.
-
-        The square is the mean of each one's square less its error's, over photos and channels.
-        """
-        known = np.isfinite(self.error)
-        if not known.any():
-            return 0.0
-        square = float(np.mean(self.log_gain[known] ** 2 - self.error[known] ** 2))
-        return float(np.sqrt(max(0.0, square)))
+    spread: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +125,7 @@ def gains_by_exif(photos: Sequence[View]) -> RelativeGains | None:
         return None
     log_gain = LOG_GAIN_OF_STOP * np.array(stops, np.float64)
     rows = np.repeat((log_gain - log_gain.mean())[:, None], 3, axis=1)
-    return RelativeGains(rows, np.full_like(rows, EXIF_ERROR))
+    return RelativeGains(rows, np.full_like(rows, EXIF_ERROR), float(log_gain.std()))
 
 
 def gains_by_points(photos: Sequence[View], points: Points | None) -> RelativeGains | None:
@@ -166,13 +163,55 @@ def _gains(observed: _Observed | None, photos: int) -> RelativeGains | None:
     whole, count = _solved(view, point, log_color, photos)
     others = [np.flatnonzero(observed.group != k) for k in range(GROUPS)]
     parts = np.stack([_solved(view[k], point[k], log_color[k], photos)[0] for k in others])
-    deviation = parts - parts.mean(axis=0)
-    error = np.sqrt((GROUPS - 1) / GROUPS * np.sum(deviation**2, axis=0))
+    error = _jackknifed(parts)
     believed = count >= LEAST_POINTS
     if believed.sum() < 2:
         return None
+    spread = _spread(observed, whole, parts, believed)
     log_gain = np.where(believed[:, None], whole - whole[believed].mean(axis=0), 0.0)
-    return RelativeGains(log_gain, np.where(believed[:, None], error, np.inf))
+    return RelativeGains(log_gain, np.where(believed[:, None], error, np.inf), spread)
+
+
+def _jackknifed(parts: Float64) -> Float64:
+    """Standard error of a value by what it is without each group, [GROUPS, ...]."""
+    squares = np.sum((parts - parts.mean(axis=0)) ** 2, axis=0)
+    return np.asarray(np.sqrt((GROUPS - 1) / GROUPS * squares))
+
+
+def _spread(
+    observed: _Observed, gains: Float64, parts: Float64, believed: npt.NDArray[np.bool_]
+) -> float:
+    """``RelativeGains.spread`` of log gains [V, 3], which are ``parts`` without each group."""
+    shared = _shared_points(observed, len(gains))
+    shared[~believed] = shared[:, ~believed] = 0.0
+    square, number = 0.0, 0
+    for photo in np.flatnonzero(believed):
+        for other in np.argsort(-shared[photo], kind="stable")[:NEAREST]:
+            if shared[photo, other] > 0.0:
+                error = _jackknifed(parts[:, photo] - parts[:, other])
+                square += float(np.mean((gains[photo] - gains[other]) ** 2 - error**2))
+                number += 1
+    return float(np.sqrt(max(0.0, square / max(number, 1) / 2.0)))
+
+
+def _shared_points(observed: _Observed, photos: int) -> Float64:
+    """How many points each two photos share, float64 [V, V]; 0 for a photo and itself."""
+    shared = np.zeros((photos, photos))
+    for seen in _tables(observed.view, observed.point, np.ones(len(observed.view)), photos):
+        shared += (seen > 0.0).astype(np.float64).T @ (seen > 0.0)
+    np.fill_diagonal(shared, 0.0)
+    return shared
+
+
+def _tables(
+    view: npt.NDArray[np.int64], point: npt.NDArray[np.int64], values: Float64, photos: int
+) -> Iterator[Float64]:
+    """Values by point and photo, [P', V], for some thousand points at a time."""
+    for start in range(0, int(point.max()) + 1, TABLE_POINTS):
+        rows = np.flatnonzero((point >= start) & (point < start + TABLE_POINTS))
+        table = np.zeros((min(TABLE_POINTS, int(point.max()) + 1 - start), photos))
+        np.add.at(table, (point[rows] - start, view[rows]), values[rows])
+        yield table
 
 
 def _observed(photos: Sequence[View], points: Points | None) -> _Observed | None:
@@ -263,15 +302,13 @@ def _solved_channel(
         color = np.bincount(point, weights * values) / of_point
         right = np.bincount(view, weights * (values - color[point]), minlength=count)
         matrix: Float64 = np.diag(np.bincount(view, weights, minlength=count)).astype(np.float64)
-        for start in range(0, len(of_point), 4096):
-            rows = np.flatnonzero((point >= start) & (point < start + 4096))
-            table = np.zeros((min(4096, len(of_point) - start), count))
-            np.add.at(table, (point[rows] - start, view[rows]), weights[rows])
-            matrix = matrix - table.T @ (table / of_point[start : start + 4096, None])
+        for number, table in enumerate(_tables(view, point, weights, count)):
+            totals = of_point[number * TABLE_POINTS :][: len(table), None]
+            matrix = matrix - table.T @ (table / totals)
         # All gains may grow together: their mean stays zero. What shares nothing stays zero, too.
         scale = max(float(np.trace(matrix)) / count, 1e-12)
-        matrix = matrix + scale * (np.full((count, count), 1.0 / count) + 1e-9 * np.eye(count))
-        gains = np.linalg.solve(matrix, right).astype(np.float64)
+        together = np.full((count, count), 1.0 / count) + 1e-9 * np.eye(count)
+        gains = np.asarray(np.linalg.solve(matrix + scale * together, right), np.float64)
         of_photo = values - gains[view]
         color = np.bincount(point, weights * of_photo) / of_point
         residual = of_photo - color[point]
@@ -304,7 +341,8 @@ def _affine(observed: _Observed | None, log_gain: Float64) -> list[Exposure]:
 def _affine_channel(observed: _Observed, values: Float64, gain: Float64) -> tuple[Float64, Float64]:
     """Gains and offsets [V] of one channel, with means of log gain and of offset of zero."""
     view, point, count = observed.view, observed.point, len(gain)
-    weights, offset = np.ones(len(values)), np.zeros(count)
+    weights: Float64 = np.ones(len(values))
+    offset: Float64 = np.zeros(count)
 
     def sums(terms: Float64) -> Float64:
         return np.bincount(view, weights * terms, minlength=count).astype(np.float64)

@@ -223,7 +223,9 @@ def _fitted(
     file = None
     if checkpoint is not None:
         splats_hash = None if initial is None else hash_of(splat_arrays(initial).values())
-        recorded = recorded_settings(settings, device, fingerprint(views, tracks), splats_hash)
+        # What "auto" came to.
+        decided = replace(settings, exposure="off" if exposures is None else "on")
+        recorded = recorded_settings(decided, device, fingerprint(views, tracks), splats_hash)
         file = CheckpointFile(Path(checkpoint), recorded)
 
     with progress_or_bar(progress, "fit", bar_state) as report:
