@@ -116,8 +116,7 @@ def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
     igsr.fit(capture, steps=3, backend="cpu", checkpoint=tmp_path / "a.npz")
     _, settings = load_checkpoint(tmp_path / "a.npz")
     expected = preset_settings("default", support_of(capture.train_views), steps=3)
-    # A checkpoint holds what "auto" came to: these photos share no points to tell exposures by.
-    assert {name: settings[name] for name in expected} == expected | {"exposure": "off"}
+    assert {name: settings[name] for name in expected} == expected
 
 
 def test_instantsplat_starts_with_all_its_splats_and_moves_the_cameras(capture):
