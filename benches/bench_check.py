@@ -36,7 +36,7 @@ def build_of(commit: str, folder: Path) -> Path:
         subprocess.run(["git", "worktree", "remove", "--force", tree], cwd=ROOT, check=True)
     built = next(
         target / "release" / name
-        for name in ("lib_core.so", "lib_core.dylib", "_core.dll")
+        for name in ("lib_core.so", "lib_core.dylib")
         if (target / "release" / name).is_file()
     )
     # Python loads a module by the end of its name.

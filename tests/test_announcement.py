@@ -75,7 +75,7 @@ def test_cameras_take_longer_for_more_and_larger_photos():
 def said(monkeypatch, seen, **options):
     lines = []
     monkeypatch.setattr(announcement, "print_message", lines.append)
-    monkeypatch.setattr(announcement, "timed_steps", lambda backend, degree: BY_PIXELS)
+    monkeypatch.setattr(announcement, "timed_steps", lambda backend, degree, alpha: BY_PIXELS)
     given = {
         "holdout": None,
         "max_size": 1000,

@@ -454,8 +454,26 @@ def test_a_build_without_a_function_is_a_row_that_says_so(monkeypatch):
             return {"failed": "AttributeError: no time_rasterize"}
 
     rows = build_pairs._pair_rows({"workload": "W1"}, Old(), Old(), "W1 20000 400", 0.0, 2)
-    assert [row["not_run"] for row in rows] == ["AttributeError: no time_rasterize"]
+    assert [row["not_run"] for row in rows] == [
+        "the old build failed: AttributeError: no time_rasterize"
+    ]
     assert build_pairs.slower_rows(rows, 10.0) == []
+
+
+def test_a_failure_of_this_build_is_told():
+    class Fine:
+        def ask(self, name, seconds):
+            return {"fit step": [1.0, 2.0]}
+
+    class Broken:
+        def ask(self, name, seconds):
+            return {"failed": "ValueError: no"}
+
+    size = {"workload": "W4", "splats": 5, "backend": "cpu"}
+    rows = build_pairs._pair_rows(size, Fine(), Broken(), "W4 5 8", 0.0, 2)
+    assert build_pairs.slower_rows(rows, 10.0) == [
+        "W4 with 5 splats on cpu: the new build failed: ValueError: no."
+    ]
 
 
 def test_slower_builds_are_named():

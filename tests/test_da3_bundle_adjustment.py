@@ -74,8 +74,8 @@ def test_cameras_that_are_off_by_degrees_become_right(truth, photos):
     start = predicted(truth)
     before = pose_errors([one.camera for one in start], truth)
     assert before["rotation"] > 1.5
-    found, count = with_adjusted_cameras(photos, start, 0)
-    assert count == COUNT
+    found, adjusted, why = with_adjusted_cameras(photos, start, 0)
+    assert (adjusted, why) == (list(range(COUNT)), "")
     cameras = [one.camera for one in found]
     after = pose_errors(cameras, truth)
     assert after["rotation"] < 0.1
@@ -100,8 +100,9 @@ def test_a_photo_without_matches_keeps_its_prediction(truth, photos):
     blank = replace(photos[2], image=np.full_like(photos[2].image, 128))
     start = predicted(truth)
     start[4] = None
-    found, count = with_adjusted_cameras([*photos[:2], blank, *photos[3:]], start, 0)
-    assert count == 3
+    shown = [*photos[:2], blank, *photos[3:]]
+    found, adjusted, why = with_adjusted_cameras(shown, start, 0)
+    assert (adjusted, why) == ([0, 1, 3], "")
     assert found[2] is start[2]
     assert found[4] is None
     cameras = [found[i].camera for i in (0, 1, 3)]
@@ -115,18 +116,19 @@ def test_photos_that_share_nothing_are_left_alone(truth, photos):
         for photo in photos
     ]
     start = predicted(truth)
-    found, count = with_adjusted_cameras(noise, start, 0)
-    assert count == 0
+    found, adjusted, why = with_adjusted_cameras(noise, start, 0)
+    assert (adjusted, why) == ([], "the photos share too few features")
     assert all(one is other for one, other in zip(found, start, strict=True))
     told = Da3(RoughPredictor(truth))(noise).warnings
     assert told[-1].startswith("Cameras are as Depth Anything 3 predicts them")
+    assert told[-1].endswith("the photos share too few features")
 
 
 def test_an_adjustment_that_leads_far_away_is_not_taken(truth, photos, monkeypatch):
     monkeypatch.setattr(bundle_adjustment, "FARTHEST", 0.5)
     start = predicted(truth)
-    found, count = with_adjusted_cameras(photos, start, 0)
-    assert count == 0
+    found, adjusted, why = with_adjusted_cameras(photos, start, 0)
+    assert (adjusted, why) == ([], "it led too far from the prediction")
     assert found == start
 
 
@@ -150,6 +152,9 @@ def test_the_estimator_adjusts_unless_told_not_to(truth, photos):
     assert errors[0] < 0.1
     assert errors[1] > 1.5
     assert adjusted.warnings == plain.warnings == []
+    blank = replace(photos[2], image=np.full_like(photos[2].image, 128))
+    (told,) = Da3(RoughPredictor(truth))([*photos[:2], blank, *photos[3:]]).warnings
+    assert told.startswith(f"Cameras of {blank.name} are as Depth Anything 3 predicts them")
     # Where cameras are right, photos agree on depths.
     trusted = [np.mean([one.mean() for one in found.trusted]) for found in (adjusted, plain)]
     assert trusted[0] > trusted[1]

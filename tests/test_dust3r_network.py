@@ -12,7 +12,8 @@ from dust3r_networks import TINY, empty_network, hashed_image, hashed_network, h
 
 from igsr.errors import IgsrError
 from igsr.pose.dust3r.heads import Tokens
-from igsr.pose.dust3r.network import NetworkConfig, rotary_tables, rotated
+from igsr.pose.dust3r.network import NetworkConfig, places_of
+from igsr.pose.transformer_layers import rotary_tables, rotated
 
 DPT_512 = NetworkConfig()
 LINEAR_224 = NetworkConfig(image_size=224, head="linear")
@@ -154,7 +155,7 @@ def test_keys_and_shapes_are_those_of_the_published_checkpoints(config, keys, ch
 def test_rotated_products_depend_on_distances_alone():
     random = torch.Generator().manual_seed(0)
     q, k = torch.randn(2, 1, 1, 1, 24, generator=random)
-    tables = rotary_tables(40, 50, 24, torch.device("cpu"))
+    tables = rotary_tables(places_of(40, 50, torch.device("cpu")), 24)
 
     def turned(x, row, column):
         return rotated(x, tuple(table[[row * 50 + column]] for table in tables))

@@ -183,7 +183,7 @@ def test_a_held_fit_resumes_with_its_own_tracks_alone(made, tmp_path):
     capture, means = made
     given = Capture(capture.path, capture.views, tracked(capture.train_views, means, noise=0.3))
     checkpoint = tmp_path / "checkpoint.npz"
-    options = OPTIONS | {"steps": 90, "focal": "shared", "exposure": "off"}
+    options = OPTIONS | {"steps": 90, "focal": "shared"}
     whole, cameras_whole = igsr.fit_with_cameras(given, **options)
     igsr.fit(given, checkpoint=checkpoint, progress=lambda now: now.step < 40, **options)
     part, cameras_part = igsr.fit_with_cameras(given, checkpoint=checkpoint, resume=True, **options)

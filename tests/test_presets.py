@@ -39,6 +39,7 @@ def test_default_follows_what_photos_tell_and_gives_way_to_the_caller():
     assert many.dropout == 0.0
     assert settings_for("default", support(3, 1.5)).dropout == presets.MOST_DROPOUT
     assert (few.sh_degree, many.sh_degree) == (1, 2)
+    assert few.exposure == many.exposure == "off"
     assert (few.density, settings_for("default", support(8, apart=30.0)).density) == (
         "original",
         "mcmc",

@@ -45,9 +45,8 @@ def test_a_batch_is_its_cameras_one_by_one(backend, cameras, packed, per_camera_
     (picture * weights).sum().backward()
 
     single = leaves(scene)
-    summands = dict.fromkeys(single, 0.0)
-    for c in range(cameras):
-        before = {n: 0.0 if t.grad is None else t.grad.clone() for n, t in single.items()}
+    # Autograd adds up the last camera's gradients first.
+    for c in reversed(range(cameras)):
         of_camera = {
             name: tensor[c : c + 1] if name in names else tensor for name, tensor in single.items()
         }
@@ -55,13 +54,11 @@ def test_a_batch_is_its_cameras_one_by_one(backend, cameras, packed, per_camera_
         assert torch.equal(picture[c], one[0])
         assert torch.equal(alpha[c], one_alpha[0])
         (one[0] * weights[c]).sum().backward()
-        for name, tensor in single.items():
-            summands[name] += float((tensor.grad - before[name]).abs().max())
     for name, tensor in single.items():
         if name in names:
             assert torch.equal(batch[name].grad, tensor.grad), name
-        else:  # sums over cameras, perhaps in another order: they may cancel
-            bound = 2e-7 * summands[name]
+        else:  # sums over cameras, perhaps in another order
+            bound = 1e-6 * tensor.grad.abs().max()
             assert (batch[name].grad - tensor.grad).abs().max() <= bound, name
 
 

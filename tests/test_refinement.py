@@ -34,8 +34,10 @@ def test_rounds_that_help_are_accepted_and_make_views_better(helped):
             assert sign * one.validation_after[name] > sign * one.validation_before[name]
         assert 0 < len(one.selected) <= len(one.selected) + len(one.rejected) <= stages.CANDIDATES
     psnr = [refined.first_test["psnr"], *(one.test["psnr"] for one in refined.rounds)]
-    # A round's own gain on three photos may be chance; what rounds give over none is not.
-    assert psnr[0] + 0.1 < min(psnr[1:])
+    # On three photos, a second round's own gain is chance (seeds 0 to 7: -0.3 to +0.5 dB, 0.0 in
+    # the mean); what rounds give over none is not.
+    assert psnr[0] + 0.1 < psnr[1]
+    assert psnr[0] + 0.1 < psnr[2]
     done = [now.done for now in seen]
     assert done == sorted(done)
     assert done[-1] <= 1.0

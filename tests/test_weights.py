@@ -10,6 +10,7 @@ import threading
 import warnings
 
 import pytest
+from huggingface_hub import file_download as download
 
 from igsr.errors import IgsrError
 from igsr.pose import weights as module
@@ -108,7 +109,6 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def server(cache, monkeypatch):
-    download = pytest.importorskip("huggingface_hub.file_download")
     monkeypatch.setattr(download.time, "sleep", lambda seconds: None)
     # What arrived is kept in parts of this size, which are larger than these files.
     monkeypatch.setattr(download.constants, "DOWNLOAD_CHUNK_SIZE", 1000)

@@ -21,5 +21,9 @@ def use_build(file: str) -> None:
         raise ImportError(f"{file} is no compiled Python module.")
     module = importlib.util.module_from_spec(spec)
     sys.modules["igsr._core"] = module
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules["igsr._core"]
+        raise
     importlib.import_module("igsr").__dict__["_core"] = module

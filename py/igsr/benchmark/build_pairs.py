@@ -10,6 +10,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, cast
@@ -49,6 +50,8 @@ class Build:
             settings: keywords of ``all_work``.
         """
         self.name = "this build" if file is None else str(file)
+        # A file: a pipe that nobody reads would stop a driver that says much.
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 (__exit__ closes it)
         self._process = subprocess.Popen(
             [
                 sys.executable,
@@ -59,7 +62,7 @@ class Build:
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._errors,
             text=True,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
@@ -70,6 +73,7 @@ class Build:
     def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.communicate()
+        self._errors.close()
 
     def ask(self, name: str, seconds: float | None) -> dict[str, Any]:
         """Times of one workload, or its errors where ``seconds`` is None.
@@ -77,9 +81,8 @@ class Build:
         Raises:
             IgsrError: the process ended.
         """
-        questions, answers, errors = (
-            cast(IO[str], stream)
-            for stream in (self._process.stdin, self._process.stdout, self._process.stderr)
+        questions, answers = (
+            cast(IO[str], stream) for stream in (self._process.stdin, self._process.stdout)
         )
         try:
             print(json.dumps([name, seconds]), file=questions, flush=True)
@@ -87,7 +90,9 @@ class Build:
         except BrokenPipeError:
             line = ""
         if not line:
-            reason = (errors.read().strip().splitlines() or ["no reason given"])[-1]
+            self._process.wait()
+            self._errors.seek(0)
+            reason = (self._errors.read().strip().splitlines() or ["no reason given"])[-1]
             raise IgsrError(f"{self.name} could not be run ({reason}); give --compare a build.")
         found: dict[str, Any] = json.loads(line)
         return found
@@ -148,9 +153,11 @@ def _pair_rows(
         order = (old, new) if turn % 2 == 0 else (new, old)
         found = {id(build): build.ask(name, seconds if turn >= 0 else 0.0) for build in order}
         pair = found[id(old)], found[id(new)]
-        for answer in (*errors, *pair):
-            if "failed" in answer:
-                return [{**common, "pass": "", "ratio": None, "not_run": answer["failed"]}]
+        for build, answers in (("old", (errors[0], pair[0])), ("new", (errors[1], pair[1]))):
+            for answer in answers:
+                if "failed" in answer:
+                    why = f"the {build} build failed: {answer['failed']}"
+                    return [{**common, "pass": "", "ratio": None, "failed": build, "not_run": why}]
         if turn >= 0:
             for key in pair[0]:
                 fastest.setdefault(key, []).append((min(pair[0][key]), min(pair[1][key])))
@@ -178,13 +185,18 @@ def _pair_rows(
 
 
 def slower_rows(rows: list[dict[str, Any]], percent: float) -> list[str]:
-    """One sentence per row in which this build takes more than ``percent`` longer.
+    """One sentence per row in which this build takes more than ``percent`` longer, or fails.
 
     Args:
         rows: of ``compare_builds``.
         percent: of the other build's time.
     """
-    return [
+    failed = [
+        f"{row['workload']} with {row['splats']} splats on {row['backend']}: {row['not_run']}."
+        for row in rows
+        if row["ratio"] is None and row["failed"] == "new"
+    ]
+    return failed + [
         f"{row['workload']} {row['pass']} with {row['splats']} splats at {row['width']} x "
         f"{row['height']} on {row['backend']} takes {100.0 / row['ratio'] - 100.0:.0f} % longer."
         for row in rows

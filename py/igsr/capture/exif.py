@@ -37,11 +37,16 @@ class Exif:
         orientation: 1 to 8, as in EXIF; 1 is upright.
         focal: focal length in pixels of the photo as stored, or None.
         device: make, model and lens of the camera, or None.
+        exposure_value: how much light the photo took, in stops: log2(seconds * ISO / 100 /
+            f-number squared), by exposure time, f-number and ISO (Exif 2.32, section 4.6.5). It
+            compares photos of one place: a larger one is brighter there. None where a field is
+            missing or cannot be true.
     """
 
     orientation: int
     focal: float | None
     device: str | None
+    exposure_value: float | None
 
 
 def read_exif(image: Image.Image) -> Exif:
@@ -56,19 +61,10 @@ def read_exif(image: Image.Image) -> Exif:
         orientation = 1
     names = [_text(fields.get(tag)) for tag in (_MAKE, _MODEL, _LENS_MODEL)]
     device = " ".join(name for name in names if name) or None
-    return Exif(orientation, _focal(fields, *image.size), device)
+    return Exif(orientation, _focal(fields, *image.size), device, _exposure_value(fields))
 
 
-def exposure_value(image: Image.Image) -> float | None:
-    """How much light an open image took, in stops: log2(seconds * ISO / 100 / f-number squared).
-
-    By EXIF exposure time, f-number and ISO (Exif 2.32, section 4.6.5). It compares photos of one
-    place: a larger one is brighter there. None where a field is missing or cannot be true.
-    """
-    try:
-        fields = dict(image.getexif().get_ifd(_SUB_FOLDER))
-    except Exception:  # as in read_exif
-        return None
+def _exposure_value(fields: dict[int, Any]) -> float | None:
     iso = fields.get(_ISO)
     if isinstance(iso, (tuple, list)) and iso:
         iso = iso[0]

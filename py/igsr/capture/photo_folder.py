@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from igsr.capture.downscaling import area_means, check_max_size, reduced_size
-from igsr.capture.exif import TURNED, exposure_value, read_exif, turned_back, upright
+from igsr.capture.exif import TURNED, read_exif, turned_back, upright
 from igsr.capture.memory_check import check_memory, decoding_threads
 from igsr.capture.photos import (
     SUFFIXES,
@@ -257,7 +257,6 @@ def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> Phot
     mask_path = next(filter(is_file, mask_paths(masks, name)), None)
     with open_image(file) as image:
         full, exif = image.size, read_exif(image)
-        light = exposure_value(image)
         mask = None
         if mask_path is not None:
             mask = _mask_as_stored(mask_path, name, full, exif.orientation)
@@ -270,7 +269,7 @@ def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> Phot
     if size != full:
         taken = full[::-1] if exif.orientation in TURNED else full
         focal = None if focal is None else focal * max(size) / max(full)
-    return Photo(name, pixels, mask, focal, exif.device, taken, light)
+    return Photo(name, pixels, mask, focal, exif.device, taken, exif.exposure_value)
 
 
 def _mask_as_stored(path: Path, name: str, size: tuple[int, int], orientation: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from igsr.capture.downscaling import (
     reduced_size,
     resized_camera,
 )
-from igsr.capture.exif import exposure_value
+from igsr.capture.exif import read_exif
 from igsr.capture.memory_check import decoding_threads
 from igsr.capture.types import Camera, View
 from igsr.capture.undistort import Lens, Undistorter
@@ -353,7 +353,7 @@ def load_views(
                 raise IgsrError(f"{shot.path} was changed while it was read; try again")
             mask = _mask(shot, header.size)
             image, mask = decoded(opened, shot.path, size, mask)
-            light = exposure_value(opened)
+            light = read_exif(opened).exposure_value
         if not shot.lens.is_pinhole:
             undistorter = undistorters.take(shot, camera)
             image = undistorter.image(image)

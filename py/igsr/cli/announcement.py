@@ -55,7 +55,7 @@ def announce(
     settings = settings_for(preset, support, quality, **given)
     cameras = 0.0 if cameras_kept else camera_seconds(seen.sizes)
     fit = (1.0 + ROUND * rounds) * fit_seconds(
-        settings, width, height, timed_steps(backend, settings.sh_degree)
+        settings, width, height, timed_steps(backend, settings.sh_degree, seen.channels == 4)
     )
     held_out = len(seen.sizes) - train
     fit += other_seconds(photos, held_out + min(photos, MOST_TRAIN), pixels)

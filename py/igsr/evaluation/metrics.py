@@ -9,6 +9,7 @@ see the same in both.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,10 @@ MS_SSIM_MIN_SIDE = SSIM_WINDOW * 2**4
 PSNR_CAP = 100.0
 #: Color correction: repetitions, and how far from 0 and 1 a channel counts as not clipped.
 CORRECTIONS, CLIPPED = 5, 0.5 / 255.0
+#: Pixels whose features are held at a time.
+PART = 1 << 16
+#: What ``score`` gives.
+NAMES = ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim")
 
 
 def _checked(render: Image, photo: Image, mask: Mask | None) -> tuple[Image, Image, Mask | None]:
@@ -203,20 +208,33 @@ def color_corrected(render: Image, photo: Image, mask: Mask | None = None) -> Im
     """
     render, photo, mask = _checked(render, photo, mask)
     chosen = np.ones(photo.shape[:2], np.bool_) if mask is None else mask
-    wanted = photo[chosen] / 255.0
+    wanted = photo.reshape(-1, 3) / 255.0
     start = colors = render.reshape(-1, 3) / 255.0
     inside = chosen.reshape(-1)
+    # Large photos are taken in parts: ten features of each pixel are many.
+    parts = [slice(at, at + PART) for at in range(0, len(colors), PART)]
     for _ in range(CORRECTIONS):
-        features = _quadratic(colors)
+        squares, products = np.zeros((3, 10, 10)), np.zeros((3, 10))
+        counts = np.zeros(3, np.int64)
+        for part in parts:
+            features = _quadratic(colors[part])
+            for channel in range(3):
+                usable = inside[part].copy()
+                for values in (start, colors, wanted):
+                    each = values[part, channel]
+                    usable &= (each >= CLIPPED) & (each <= 1.0 - CLIPPED)
+                rows = features[usable]
+                squares[channel] += rows.T @ rows
+                products[channel] += rows.T @ wanted[part, channel][usable]
+                counts[channel] += len(rows)
         mapped = colors.copy()
         for channel in range(3):
-            usable = np.ones(len(wanted), np.bool_)
-            for values in (start[inside, channel], colors[inside, channel], wanted[:, channel]):
-                usable &= (values >= CLIPPED) & (values <= 1.0 - CLIPPED)
-            if usable.sum() >= features.shape[1]:
-                rows = features[inside][usable]
-                weights = np.linalg.lstsq(rows.T @ rows, rows.T @ wanted[usable, channel])[0]
-                mapped[:, channel] = np.clip(features @ weights, 0.0, 1.0)
+            if counts[channel] < 10:
+                continue
+            weights = np.linalg.lstsq(squares[channel], products[channel])[0]
+            for part in parts:
+                line = _quadratic(colors[part]) @ weights
+                mapped[part, channel] = np.clip(line, 0.0, 1.0)
         colors = mapped
     return np.asarray((colors * 255.0 + 0.5).astype(np.uint8)).reshape(render.shape)
 
@@ -228,18 +246,25 @@ def _quadratic(colors: Planes) -> Planes:
     return np.stack([*products, red, green, blue, np.ones(len(colors))], axis=1)
 
 
-def score(render: Image, photo: Image, mask: Mask | None = None) -> dict[str, float | None]:
-    """All metrics of one picture.
+def score(
+    render: Image, photo: Image, mask: Mask | None = None, names: Sequence[str] = NAMES
+) -> dict[str, float | None]:
+    """Metrics of one picture.
 
     ``psnr``, ``ssim``, ``ms_ssim`` (or None) and ``flip`` of the render as it is; ``cc_psnr`` and
     ``cc_ssim`` of the render after ``color_corrected``.
+
+    Args:
+        render, photo, mask: as each metric takes them.
+        names: those wanted; others are not computed.
     """
-    corrected = color_corrected(render, photo, mask)
-    return {
-        "psnr": psnr(render, photo, mask),
-        "ssim": ssim(render, photo, mask),
-        "ms_ssim": ms_ssim(render, photo, mask),
-        "flip": flip(render, photo, mask),
-        "cc_psnr": psnr(corrected, photo, mask),
-        "cc_ssim": ssim(corrected, photo, mask),
-    }
+    metrics = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "flip": flip}
+    found = {name: metric(render, photo, mask) for name, metric in metrics.items() if name in names}
+    if any(name.startswith("cc_") for name in names):
+        corrected = color_corrected(render, photo, mask)
+        found |= {
+            f"cc_{name}": metrics[name](corrected, photo, mask)
+            for name in ("psnr", "ssim")
+            if f"cc_{name}" in names
+        }
+    return found

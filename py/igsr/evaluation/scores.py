@@ -200,6 +200,7 @@ def score_views(
     views: Sequence[View],
     background: Sequence[float],
     backend: Backend = "auto",
+    names: Sequence[str] = metrics.NAMES,
 ) -> Iterator[ScoredView]:
     """Render and score views one by one, so that only what the caller keeps stays in memory.
 
@@ -208,6 +209,7 @@ def score_views(
         views: the photos with their cameras.
         background: RGB in [0, 1], behind renders and behind photos with alpha.
         backend: "auto", "cpu", "gpu" or "reference".
+        names: of the scores that are wanted.
 
     Yields:
         Each view with its scores.
@@ -219,7 +221,7 @@ def score_views(
     for view in views:
         photo = over_background(view.image, background)
         picture = render_of(splats, view, background, backend)
-        scores = metrics.score(picture, photo, view.mask)
+        scores = metrics.score(picture, photo, view.mask, names)
         yield ScoredView(view.name, photo, picture, view.mask, scores)
 
 

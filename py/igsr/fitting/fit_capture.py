@@ -281,9 +281,10 @@ def _fitted(
     splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
     if settings.moves_cameras:
         capture = with_train_cameras(capture, fitted_cameras(views, fitter, origin))
-    if exposures is not None:
-        capture = with_train_exposures(capture, fitted_exposures(views, fitter))
-    return splats, capture
+    # Without a fit of them, exposures that views have of an earlier one are not these splats'.
+    none = [None] * len(views)
+    found = none if exposures is None else fitted_exposures(views, fitter)
+    return splats, with_train_exposures(capture, found)
 
 
 def _seen_alike(capture: Capture, start: StartingExposures | None) -> Capture:

@@ -224,6 +224,8 @@ def fitted_cameras(
 
 def with_train_exposures(capture: Capture, exposures: Sequence[Exposure | None]) -> Capture:
     """The capture with these exposures for its train views, given in their order."""
+    if all(one is view.exposure for one, view in zip(exposures, capture.train_views, strict=True)):
+        return capture
     each = iter(exposures)
     views = [
         replace(view, exposure=next(each)) if view.split == "train" else view

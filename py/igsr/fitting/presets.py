@@ -73,7 +73,6 @@ _3DGS = replace(
     sh_degree=3,
     start="sfm",
     coarse_to_fine=False,
-    exposure="off",
 )
 #: As InstantSplat (Fan et al. 2024) fits: many splats from dense points, which stay as many, with
 #: cameras and one focal length optimized. Here the points are the capture's or made from its
@@ -87,7 +86,6 @@ _INSTANTSPLAT = replace(
     coarse_to_fine=False,
     poses="joint",
     focal="shared",
-    exposure="off",
 )
 #: What a preset says nothing of.
 _NOT_OF_PRESETS = ("seed", "background")

@@ -17,8 +17,9 @@ SIDES = (128, 384)
 SPLATS = (2_000, 20_000)
 #: Steps timed of each, after one that is not.
 TIMED = 3
-#: Splats cover their photo so often: as those of fitted scenes do, on average over a fit.
-COVER = 12.0
+#: Splats cover their photo so often: as those of fitted scenes do. Photos with alpha show nothing
+#: in much of their area.
+COVER, COVER_OF_ALPHA = 40.0, 18.0
 #: Part of the most splats that fits start with, from which step on they have as many as they come
 #: to, and how many of the most that mostly is.
 START_PART, GROWN, REACHED = 0.5, 0.5, 0.95
@@ -53,21 +54,23 @@ class StepTime:
 USUAL = StepTime(1e-3, 7e-8, 4e-7)
 
 
-def timed_steps(backend: str, sh_degree: int = 1) -> StepTime:
+def timed_steps(backend: str, sh_degree: int = 1, alpha: bool = False) -> StepTime:
     """Time a few steps on made-up photos and splats; takes about a second.
 
     Args:
         backend: "cpu" or "gpu".
         sh_degree: of the fit.
+        alpha: whether the photos have alpha.
 
     Raises:
         RuntimeError: no adapter answers for backend "gpu".
     """
     small, large = SIDES[0] ** 2, SIDES[1] ** 2
     few, many = SPLATS
-    base = _timed(backend, SIDES[0], few, sh_degree)
-    more_pixels = _timed(backend, SIDES[1], few, sh_degree)
-    more_splats = _timed(backend, SIDES[1], many, sh_degree)
+    cover = COVER_OF_ALPHA if alpha else COVER
+    base = _timed(backend, SIDES[0], few, sh_degree, cover)
+    more_pixels = _timed(backend, SIDES[1], few, sh_degree, cover)
+    more_splats = _timed(backend, SIDES[1], many, sh_degree, cover)
     per_pixel = max(0.0, more_pixels - base) / (large - small)
     per_splat = max(0.0, more_splats - more_pixels) / (many - few)
     return StepTime(max(0.0, base - per_pixel * small - per_splat * few), per_pixel, per_splat)
@@ -129,14 +132,14 @@ def other_seconds(photos: int, scored: int, pixels: float) -> float:
     return SWEPT * min(photos, MOST_SWEPT) + SCORED * scored * pixels
 
 
-def _timed(backend: str, side: int, splats: int, sh_degree: int) -> float:
+def _timed(backend: str, side: int, splats: int, sh_degree: int, cover: float) -> float:
     """Seconds of a step: the least of some."""
     random = np.random.default_rng(0)
     # Before a camera at the origin that sees from -1 to 1 at depth 1.
     depth = random.uniform(2.0, 4.0, size=splats)
     means = np.stack([random.uniform(-1.0, 1.0, splats) * depth for _ in range(2)] + [depth], 1)
     # Three standard deviations to all sides, about, are rasterized.
-    radius = np.sqrt(COVER * 4.0 / (np.pi * splats)) / 3.0 * depth
+    radius = np.sqrt(cover * 4.0 / (np.pi * splats)) / 3.0 * depth
     state = {
         "means": means.astype(np.float32),
         "quats": random.normal(size=(splats, 4)).astype(np.float32),

@@ -31,8 +31,9 @@ class Estimate:
         warnings: messages for the user: which photos are not registered, and why.
         lenses: per photo the distortion that ``cameras`` leave out, None for none; an empty list
             says none for all. ``igsr.estimate_poses`` undoes it.
-        weights: of the network that was used: its "name", the "licence" that its publisher states,
-            and the "sha256" of its file; None where there is none.
+        weights: of the network that was used: its "name", the "licence" that the publisher states
+            for weights of that name, and the "sha256" of its file, which tells whether it is those;
+            None where there is none.
     """
 
     cameras: list[Camera | None]

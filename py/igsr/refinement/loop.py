@@ -23,6 +23,7 @@ from igsr.errors import IgsrError
 from igsr.evaluation.scores import check_masks
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import Quality, default_max_size
+from igsr.fitting.settings import ExposureMode
 from igsr.refinement.cross_validation import FEWEST_PHOTOS, CrossValidation, combined_error
 from igsr.refinement.novel_views import novel_views
 from igsr.refinement.results import Refined, RefineProgress, Round, Stop, StopReason
@@ -50,6 +51,7 @@ def refine(
     propose: Propose = novel_views,
     select: Select = select_views,
     cross_validate: bool = True,
+    exposure: ExposureMode = "off",
     quality: Quality = "normal",
     max_size: int | None = None,
     allow_missing: bool = False,
@@ -76,6 +78,8 @@ def refine(
         propose: what proposes the cameras of novel views.
         select: which of the denoised views to add.
         cross_validate: whether a round is kept only if it improves the scores of held-out photos.
+        exposure: "on", "off" or "auto": whether the first fit finds the photos' exposures, which
+            are then taken out of them, as ``igsr.fit``.
         quality: "draft", "normal" or "high": size of photos, steps and splats.
         max_size: longest side, in pixels, of photos as loaded; larger ones are reduced. None is
             ``igsr.fitting.presets.default_max_size``. A ``Capture`` has its size.
@@ -93,6 +97,7 @@ def refine(
         backend=backend,  # type: ignore[arg-type]  # checked there
         seed=seed,
         cross_validate=cross_validate,
+        exposure=exposure,
         quality=quality,
     )
     resolved = _core.resolve_backend(settings.backend)  # a missing GPU is found here

@@ -174,7 +174,8 @@ class RefineRun:
         Raises:
             IgsrError: a file cannot be written.
         """
-        seconds = {name: usage.seconds for name, usage in self._parts.used.items()}
+        # As the report keeps them: what a resumed run reads there never counts as less.
+        seconds = {name: part["seconds"] for name, part in self._parts.plain().items()}
         refined = replace(refined, seconds=RenamedKeys(seconds, OLD_STAGES))
         if self._out is not None and (self._has_news or refined.stop is not None):
             cameras = read_usage(refined.capture.path)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from igsr._internal.settings import about, validate
 from igsr.errors import IgsrError
 from igsr.fitting.presets import Quality
+from igsr.fitting.settings import ExposureMode
 
 #: As many rounds as help, but at most ``MOST_ROUNDS``.
 AUTO = "auto"
@@ -39,6 +40,8 @@ class RefineSettings:
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
         seed: of everything random. The result is deterministic for a given seed on one backend,
             instruction set and number of threads.
+        exposure: whether the first fit finds exposures of photos: "off", "on" or "auto", as
+            ``FitSettings.exposure``.
         cross_validate: whether a round is kept only if it improves the scores of held-out photos.
 
     Raises:
@@ -70,6 +73,14 @@ class RefineSettings:
         metadata=about(
             "Of everything random; the result is deterministic for a given seed.",
             limits=(0, 2**63 - 1),
+        ),
+    )
+    exposure: ExposureMode = field(
+        default="off",
+        metadata=about(
+            "Gain and offset per channel of each photo, found by the first fit and taken out of "
+            "the photos: on, off, or auto (on where points that photos share, or EXIF, show other "
+            "exposures)."
         ),
     )
     cross_validate: bool = field(

@@ -114,8 +114,9 @@ class Stages:
         return self._capture
 
     def fit_whole(self) -> Reconstruction:
-        """Fit all photos, and find their exposures where these differ."""
-        splats, fitted = self._fit("whole", "fit", self._capture.train_views, 1.0, "auto")
+        """Fit all photos, and find their exposures where that is asked for."""
+        views, exposure = self._capture.train_views, self._settings.exposure
+        splats, fitted = self._fit("whole", "fit", views, 1.0, exposure)
         exposures = [view.exposure for view in fitted.train_views]
         if any(exposures):
             self._capture = with_train_exposures(self._capture, exposures)
@@ -188,9 +189,10 @@ class Stages:
 
     def validation_scores(self, splats: Splats, photos: list[View]) -> list[dict[str, float]]:
         """Scores of each held-out photo."""
+        backend = self._settings.backend
         scores = [
             {name: float(one.scores[name] or 0.0) for name in VALIDATED}
-            for one in score_views(splats, photos, self._background, self._settings.backend)
+            for one in score_views(splats, photos, self._background, backend, VALIDATED)
         ]
         self._run.tell("cross_validate")
         return scores

@@ -39,3 +39,20 @@ class AlignedPhoto:
         rays = np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0)
         local = rays * self.depth.ravel()[index, None]
         return (local - viewmat[:3, 3]) @ viewmat[:3, :3], index
+
+    def shown_at(self, xyz: Float64) -> tuple[npt.NDArray[np.bool_], Float64, Float32, Float32]:
+        """Where the photo shows world points [M, 3].
+
+        Returns:
+            Which points are before the camera and in the grid, bool [M]; their z-depths [M]; depth
+            and confidence [M] of the pixels that show them, of any pixel for the others.
+        """
+        local = xyz @ self.camera.viewmat[:3, :3].T + self.camera.viewmat[:3, 3]
+        z, K, grid = local[:, 2], self.camera.K, self.grid
+        shown = z > 0.0
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            pixels = local[:, :2] / z[:, None] * K[[0, 1], [0, 1]] + K[[0, 1], 2]
+            cells = (pixels - [grid.offset_x, grid.offset_y]) / [grid.scale_x, grid.scale_y]
+            shown &= ((cells >= 0.0) & (cells < [grid.width, grid.height])).all(axis=1)
+        column, row = np.where(shown[:, None], cells, 0.0).astype(np.int64).T
+        return shown, z, self.depth[row, column], self.confidence[row, column]

@@ -54,13 +54,6 @@ def _looked_through(
     xyz: npt.NDArray[np.float64], confidence: npt.NDArray[np.float32], other: AlignedPhoto
 ) -> Bool:
     """Which world points [M, 3] stand before a surface that another photo is surer of."""
-    local = xyz @ other.camera.viewmat[:3, :3].T + other.camera.viewmat[:3, 3]
-    z, K, grid = local[:, 2], other.camera.K, other.grid
-    ahead = z > 0.0
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        pixels = local[:, :2] / z[:, None] * K[[0, 1], [0, 1]] + K[[0, 1], 2]
-        cells = (pixels - [grid.offset_x, grid.offset_y]) / [grid.scale_x, grid.scale_y]
-        ahead &= ((cells >= 0.0) & (cells < [grid.width, grid.height])).all(axis=1)
-        column, row = np.where(ahead[:, None], cells, 0.0).astype(np.int64).T
-        surface = other.depth[row, column]
-        return ahead & (z < IN_FRONT * surface) & (confidence < other.confidence[row, column])
+    shown, z, surface, surer = other.shown_at(xyz)
+    with np.errstate(invalid="ignore", over="ignore"):  # the other photo's depth may be unknown
+        return shown & (z < IN_FRONT * surface) & (confidence < surer)

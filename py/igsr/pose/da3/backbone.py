@@ -15,8 +15,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from igsr.pose.da3.blocks import Block, Rotation, rotary_tables
+from igsr.pose.da3.blocks import Block
 from igsr.pose.da3.config import ALTERNATES, DEPTH, PATCH, POSITIONS, TAKEN, NetworkConfig
+from igsr.pose.transformer_layers import Rotation, rotary_tables
 
 #: Of the norms before attention and perceptron; all others have torch's default of 1e-5.
 BLOCK_NORM_EPS = 1e-6

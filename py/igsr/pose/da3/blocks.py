@@ -13,13 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from igsr.pose.da3.config import MLP_RATIO
-
-#: Base of the rotary embedding's frequencies.
-ROTARY_BASE = 100.0
-
-#: Cosines and sines [T, 2, head_dim / 4].
-Rotation = tuple[Tensor, Tensor]
+from igsr.pose.transformer_layers import Mlp, Rotation, rotated
 
 
 class Block(nn.Module):
@@ -39,7 +33,7 @@ class Block(nn.Module):
         self.attn = _Attention(dim, heads, normalised)
         self.ls1 = _Scale(dim)
         self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
-        self.mlp = _Mlp(dim)
+        self.mlp = Mlp(dim)
         self.ls2 = _Scale(dim)
 
     def forward(
@@ -97,40 +91,3 @@ class _Attention(nn.Module):
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(1, 2, 0, 3)
         q, k = rotated(self.q_norm(q), rotation), rotated(self.k_norm(k), rotation)
         return q.to(v.dtype), k.to(v.dtype), v
-
-
-class _Mlp(nn.Module):
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(dim, MLP_RATIO * dim)
-        self.act = nn.GELU()
-        self.fc2 = nn.Linear(MLP_RATIO * dim, dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(self.act(self.fc1(x)))
-
-
-def rotary_tables(places: Tensor, head_dim: int) -> Rotation:
-    """Cosines and sines float32 [T, 2, head_dim / 4] of the turns of tokens.
-
-    The first half of a head's channels is turned by the token's row, the second by its column;
-    within a half of 2q channels, those i and i + q are turned together by row * 100^(-i / q).
-
-    Args:
-        places: [T, 2], row and column.
-        head_dim: channels of a head, a multiple of four.
-    """
-    quarter = head_dim // 4
-    turn = ROTARY_BASE ** (-torch.arange(quarter, device=places.device) / quarter)
-    angles = places.float()[..., None] * turn
-    return angles.cos(), angles.sin()
-
-
-def rotated(x: Tensor, rotation: Rotation | None) -> Tensor:
-    """Queries or keys [heads, T, head_dim] turned by their tokens' places; None turns nothing."""
-    if rotation is None:
-        return x
-    cosine, sine = rotation
-    # In float32 whatever x is in: half precision cannot tell the angles of distant tokens apart.
-    u, v = x.float().unflatten(-1, (2, 2, -1)).unbind(-2)
-    return torch.stack([u * cosine - v * sine, v * cosine + u * sine], dim=-2).flatten(-3)

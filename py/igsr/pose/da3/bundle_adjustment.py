@@ -31,7 +31,7 @@ def with_adjusted_cameras(
     aligned: Sequence[AlignedPhoto | None],
     seed: int,
     progress: Progress | None = None,
-) -> tuple[list[AlignedPhoto | None], int]:
+) -> tuple[list[AlignedPhoto | None], list[int], str]:
     """The photos with adjusted cameras, where at least two photos have features that bear them out.
 
     World and unit stay those of the prediction, and a photo that is not adjusted keeps its
@@ -45,17 +45,18 @@ def with_adjusted_cameras(
         progress: as for estimators.
 
     Returns:
-        The photos, and how many of them are adjusted: none, where COLMAP fails, or the adjustment
-        leads so far away from the prediction that it must be wrong.
+        The photos; which of them are adjusted; and why none is, where none is: COLMAP fails, the
+        photos share too few features, or the adjustment leads so far away from the prediction that
+        it must be wrong.
     """
     cameras = [None if one is None else one.camera for one in aligned]
     try:
         found = adjusted(photos, cameras, seed, progress or (lambda stage, done, total: None))
-    except IgsrError:
-        found = {}
+    except IgsrError as error:
+        return list(aligned), [], f"COLMAP failed ({error})"
     order = sorted(found)
     if len(order) < 2:
-        return list(aligned), 0
+        return list(aligned), [], "the photos share too few features"
     before = [camera for i in order if (camera := cameras[i]) is not None]
     after = [found[i].camera for i in order]
     stretched = [
@@ -63,7 +64,7 @@ def with_adjusted_cameras(
         for a, b in zip(after, before, strict=True)
     ]
     if pose_errors(after, before)["rotation"] > FARTHEST or max(stretched) > STRETCHED:
-        return list(aligned), 0
+        return list(aligned), [], "it led too far from the prediction"
     back = similarity_between(after, before)
     result = list(aligned)
     for i in order:
@@ -71,7 +72,7 @@ def with_adjusted_cameras(
         if one is not None:
             rescaled = _rescaled(one, found[i], back.scale)
             result[i] = replace(rescaled, camera=back.camera(found[i].camera))
-    return result, len(order)
+    return result, order, ""
 
 
 def _rescaled(photo: AlignedPhoto, seen: AdjustedPhoto, unit: float) -> AlignedPhoto:

@@ -81,13 +81,6 @@ def _on_edge(depth: npt.NDArray[np.float32]) -> Bool:
 
 def _agreed(xyz: Float64, other: AlignedPhoto) -> Bool:
     """Which world points [M, 3] lie on the surface that another photo sees."""
-    local = xyz @ other.camera.viewmat[:3, :3].T + other.camera.viewmat[:3, 3]
-    z, K, grid = local[:, 2], other.camera.K, other.grid
-    ahead = z > 0.0
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        pixels = local[:, :2] / z[:, None] * K[[0, 1], [0, 1]] + K[[0, 1], 2]
-        cells = (pixels - [grid.offset_x, grid.offset_y]) / [grid.scale_x, grid.scale_y]
-        ahead &= ((cells >= 0.0) & (cells < [grid.width, grid.height])).all(axis=1)
-        column, row = np.where(ahead[:, None], cells, 0.0).astype(np.int64).T
-        surface = other.depth[row, column]
-        return ahead & (other.confidence[row, column] > 1.0) & (np.abs(z - surface) < AGREES * z)
+    shown, z, surface, confidence = other.shown_at(xyz)
+    with np.errstate(invalid="ignore"):  # the other photo's depth may be unknown
+        return shown & (confidence > 1.0) & (np.abs(z - surface) < AGREES * z)

@@ -22,8 +22,6 @@ DEPTH, ALTERNATES = 12, 4
 TAKEN = (5, 7, 9, 11)
 #: Blocks of the camera encoder.
 CAMERA_DEPTH = 4
-#: Hidden channels of a block's perceptron per channel of the block.
-MLP_RATIO = 4
 
 #: What SMALL and BASE have in common, under the names that ``config.json`` has for it.
 _SHARED_NET = {

@@ -21,6 +21,7 @@ from igsr.pose.da3.confidence import trusted_depths
 from igsr.pose.da3.passes import SOURCES, Predictor
 from igsr.pose.estimate import Estimate
 from igsr.pose.fused_points import fused_points
+from igsr.pose.given_cameras import check_given_cameras
 from igsr.pose.photo_samples import usable
 
 #: Distance of a principal point from the middle, in units of the side, that is told of: the network
@@ -107,7 +108,8 @@ class Da3:
             if progress is not None:
                 progress("passes", done, in_all)
         lost: list[int] = []
-        adjusted = 0
+        adjusted: list[int] = []
+        unadjusted = ""
         if self.cameras:
             world = {i: one for each in reversed(passes) for i, one in each.items()}
         else:
@@ -116,12 +118,20 @@ class Da3:
         if not self.cameras:
             aligned = with_shared_focals(shown, aligned)
             if self.bundle_adjustment:
-                aligned, adjusted = with_adjusted_cameras(shown, aligned, seed, progress)
+                aligned, adjusted, unadjusted = with_adjusted_cameras(
+                    shown, aligned, seed, progress
+                )
         found = self._estimate(photos, shown, same_as, aligned, lost)
-        if self.bundle_adjustment and not self.cameras and adjusted < FEWEST:
+        left = [shown[i].name for i, one in enumerate(aligned) if one and i not in adjusted]
+        if unadjusted:
             found.warnings.append(
-                "Cameras are as Depth Anything 3 predicts them and may be degrees off: the photos "
-                "share too few features for bundle adjustment"
+                "Cameras are as Depth Anything 3 predicts them and may be degrees off; bundle "
+                f"adjustment gave none: {unadjusted}"
+            )
+        elif adjusted and left:
+            found.warnings.append(
+                f"Cameras of {_names(left)} are as Depth Anything 3 predicts them and may be "
+                "degrees off: they share too few features with the others"
             )
         found.weights = weights
         return found
@@ -227,17 +237,8 @@ class Da3:
         return Da3Predictor(network, self.cameras_from), weights
 
     def _check_cameras(self, photos: Sequence[Photo]) -> None:
-        sizes = {photo.name: photo.image.shape[:2] for photo in photos}
-        for name, camera in self.cameras.items():
-            if name not in sizes:
-                raise IgsrError(f"cameras names {name!r}, which is none of the photos")
-            if sizes[name] != (camera.height, camera.width):
-                height, width = sizes[name]
-                raise IgsrError(
-                    f"the camera given for {name} is of {camera.width} x {camera.height} pixels, "
-                    f"and the photo has {width} x {height}; scale its intrinsics"
-                )
-        missing = [name for name in sizes if name not in self.cameras]
+        check_given_cameras(self.cameras, photos)
+        missing = [photo.name for photo in photos if photo.name not in self.cameras]
         if self.cameras and missing:
             raise IgsrError(
                 f"cameras has none for {_names(missing)}; Depth Anything 3 takes the cameras of "
@@ -246,8 +247,9 @@ class Da3:
 
 
 def _check_apart(cameras: Sequence[Camera] | None) -> None:
-    centres = [camera.centre for camera in cameras or ()]
-    if centres and np.allclose(centres, centres[0]):
+    centres = np.array([camera.centre for camera in cameras or ()])
+    # Rounding of the coordinates alone: they may be of a map, millions of metres from its origin.
+    if len(centres) and np.ptp(centres, axis=0).max() <= 1e-9 * np.abs(centres).max():
         raise IgsrError(
             "the cameras given for photos of one pass all stand at one place, which sets no scale; "
             "leave cameras out"

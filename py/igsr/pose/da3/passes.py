@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from igsr.capture import Camera
 from igsr.capture.memory_check import available_memory
@@ -20,6 +19,7 @@ from igsr.pose.da3.cameras import cameras_of_rays, decode_pose
 from igsr.pose.da3.config import PATCH, NetworkConfig
 from igsr.pose.da3.network import Da3Network, ViewPrediction
 from igsr.pose.da3.preprocessing import Resampling, network_input, resampling_of
+from igsr.pose.network_arrays import float32_array, half_precision
 from igsr.pose.photo_samples import over_white, usable
 
 Float64 = npt.NDArray[np.float64]
@@ -129,7 +129,7 @@ class Da3Predictor:
             pairs = zip(resamplings, cameras, strict=True)
             viewmats = torch.from_numpy(np.stack([camera.viewmat for camera in cameras]))
             intrinsics = torch.from_numpy(np.stack([one.intrinsics(c.K) for one, c in pairs]))
-        with torch.inference_mode(), _half_precision(self.device):
+        with torch.inference_mode(), half_precision(self.device):
             views = self.network.predict(
                 inputs, viewmats=viewmats, intrinsics=intrinsics, rays=self.cameras_from == "rays"
             )
@@ -141,8 +141,8 @@ class Da3Predictor:
     def _aligned(
         self, photo: Photo, resampling: Resampling, view: ViewPrediction, seed: int
     ) -> AlignedPhoto | None:
-        depth, confidence = _array(view.depth), _array(view.confidence)
-        encoding = _array(view.pose_encoding)
+        depth, confidence = float32_array(view.depth), float32_array(view.confidence)
+        encoding = float32_array(view.pose_encoding)
         if not all(np.isfinite(one).all() for one in (depth, confidence, encoding)):
             raise IgsrError(
                 f"The network gives numbers that are not finite for {photo.name}; its checkpoint "
@@ -211,15 +211,3 @@ def memory_of_pass(config: NetworkConfig, photos: int, pixels: int) -> int:
     backbone = photos * tokens * config.embed_dim * PER_TOKEN
     results = photos * pixels * 5
     return 4 * (backbone + results + PER_PIXEL * config.features * pixels)
-
-
-def _half_precision(device: torch.device) -> torch.autocast:
-    if device.type != "cuda":
-        return torch.autocast(device.type, enabled=False)
-    native = torch.cuda.is_bf16_supported(including_emulation=False)
-    return torch.autocast("cuda", dtype=torch.bfloat16 if native else torch.float16)
-
-
-def _array(tensor: Tensor) -> Float32:
-    array: Float32 = tensor.float().cpu().numpy()
-    return array

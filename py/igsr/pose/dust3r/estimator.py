@@ -15,6 +15,7 @@ from igsr.pose.alignment import AlignedPhoto, Grid, PhotoToAlign, Predictor, ali
 from igsr.pose.dust3r.pairs import pair_graph, usual_graph
 from igsr.pose.estimate import Estimate
 from igsr.pose.fused_points import fused_points
+from igsr.pose.given_cameras import check_given_cameras
 from igsr.pose.photo_samples import usable
 
 
@@ -66,7 +67,7 @@ class Dust3r:
                 no checkpoint is found, or no two photos show the same thing.
         """
         pairs = pair_graph(self.graph or usual_graph(len(photos)), len(photos))
-        self._check_cameras(photos)
+        check_given_cameras(self.cameras, photos)
         predictor = self._network() if self.predictor is None else self.predictor
         grids, predictions = predictor(photos, pairs, progress)
         alignment = align(predictions, self._known(photos, grids), seed=seed, progress=progress)
@@ -102,18 +103,6 @@ class Dust3r:
                 "no checkpoint of DUSt3R is found where downloads usually lie; name one"
             )
         return DustPredictor(load_network(found))
-
-    def _check_cameras(self, photos: Sequence[Photo]) -> None:
-        sizes = {photo.name: photo.image.shape[:2] for photo in photos}
-        for name, camera in self.cameras.items():
-            if name not in sizes:
-                raise IgsrError(f"cameras names {name!r}, which is none of the photos")
-            if sizes[name] != (camera.height, camera.width):
-                height, width = sizes[name]
-                raise IgsrError(
-                    f"the camera given for {name} is of {camera.width} x {camera.height} pixels, "
-                    f"and the photo has {width} x {height}; scale its intrinsics"
-                )
 
     def _known(self, photos: Sequence[Photo], grids: Sequence[Grid]) -> list[PhotoToAlign]:
         given: dict[Hashable, np.ndarray] = {}

@@ -15,16 +15,11 @@ from torch.nn.functional import scaled_dot_product_attention
 
 from igsr.errors import IgsrError
 from igsr.pose.dust3r.heads import PATCH, DptHead, LinearHead, PointMaps, Tokens, point_maps
+from igsr.pose.transformer_layers import Mlp, Rotation, rotary_tables, rotated
 
-#: Hidden channels of a block's perceptron per channel of the block.
-MLP_RATIO = 4
 NORM_EPS = 1e-6
-#: Base of the rotary embedding's frequencies.
-ROTARY_BASE = 100.0
 #: Largest size that a configuration may have: what a damaged file claims must not be built.
 MOST_DIM, MOST_BLOCKS, MOST_IMAGE_SIZE = 4096, 64, 2048
-
-Rotation = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -155,31 +150,14 @@ class Dust3rNetwork(nn.Module):
 
     def _rotation(self, part: str, rows: int, columns: int, device: torch.device) -> Rotation:
         dim, heads = getattr(self.config, f"{part}_dim"), getattr(self.config, f"{part}_heads")
-        return rotary_tables(rows, columns, dim // heads, device)
+        return rotary_tables(places_of(rows, columns, device), dim // heads)
 
 
-def rotary_tables(rows: int, columns: int, head_dim: int, device: torch.device) -> Rotation:
-    """Cosines and sines [rows * columns, 2, head_dim / 4] of the turns of each token.
-
-    The first half of a head's channels is turned by the token's row, the second by its column;
-    within a half of 2q channels, those i and i + q are turned together by row * 100^(-i / q).
-    """
-    quarter = head_dim // 4
-    turn = ROTARY_BASE ** (-torch.arange(quarter, device=device) / quarter)
-    places = torch.cartesian_prod(
+def places_of(rows: int, columns: int, device: torch.device) -> Tensor:
+    """Row and column [rows * columns, 2] of each token."""
+    return torch.cartesian_prod(
         torch.arange(rows, device=device), torch.arange(columns, device=device)
     )
-    angles = places.float()[..., None] * turn
-    return angles.cos(), angles.sin()
-
-
-def rotated(x: Tensor, rotation: Rotation) -> Tensor:
-    """Queries or keys [B, heads, T, head_dim] turned by their tokens' places."""
-    cosine, sine = rotation
-    # In float32 whatever x is in: half precision cannot tell the angles of distant tokens apart.
-    u, v = x.float().unflatten(-1, (2, 2, -1)).unbind(-2)
-    turned = torch.stack([u * cosine - v * sine, v * cosine + u * sine], dim=-2)
-    return turned.flatten(-3).to(x.dtype)
 
 
 def _norm(dim: int) -> nn.LayerNorm:
@@ -243,24 +221,13 @@ class _CrossAttention(nn.Module):
         return self.proj(_attended(q, k, _per_head(self.projv(y), self.heads)))
 
 
-class _Mlp(nn.Module):
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(dim, MLP_RATIO * dim)
-        self.act = nn.GELU()
-        self.fc2 = nn.Linear(MLP_RATIO * dim, dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(self.act(self.fc1(x)))
-
-
 class _EncoderBlock(nn.Module):
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
         self.norm1 = _norm(dim)
         self.attn = _SelfAttention(dim, heads)
         self.norm2 = _norm(dim)
-        self.mlp = _Mlp(dim)
+        self.mlp = Mlp(dim)
 
     def forward(self, x: Tensor, rotation: Rotation) -> Tensor:
         x = x + self.attn(self.norm1(x), rotation)
@@ -276,7 +243,7 @@ class _DecoderBlock(nn.Module):
         self.norm_y = _norm(dim)
         self.cross_attn = _CrossAttention(dim, heads)
         self.norm3 = _norm(dim)
-        self.mlp = _Mlp(dim)
+        self.mlp = Mlp(dim)
 
     def forward(self, x: Tensor, y: Tensor, rotation_x: Rotation, rotation_y: Rotation) -> Tensor:
         """``x`` after it has looked at ``y``, the other photo's tokens of the same layer."""

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
@@ -23,6 +22,7 @@ from igsr.pose.alignment.predictions import Grid, PairPrediction
 from igsr.pose.dust3r.heads import PATCH
 from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig, Tokens
 from igsr.pose.dust3r.preprocessing import Crop, crop_of, network_input
+from igsr.pose.network_arrays import float32_array, half_precision
 from igsr.pose.photo_samples import usable
 
 Float32 = npt.NDArray[np.float32]
@@ -169,12 +169,14 @@ class DustPredictor:
         predictions: list[PairPrediction] = []
         dense: list[DensePrediction | None] = [None] * len(photos)
         scores = [0.0] * len(photos)
-        with torch.inference_mode(), _half_precision(encoded.device):
+        with torch.inference_mode(), half_precision(encoded.device):
             for batch in _batches(pairs, views):
                 firsts, seconds = (encoded.batch([pair[side] for pair in batch]) for side in (0, 1))
                 maps = self.network.decode(firsts, seconds)
                 encoded.release(batch)
-                whole = [(_array(side.points), _array(side.confidence)) for side in maps]
+                whole = [
+                    (float32_array(side.points), float32_array(side.confidence)) for side in maps
+                ]
                 for n, (first, second) in enumerate(batch):
                     points = [side[0][n] for side in whole]
                     confidences = [
@@ -321,15 +323,3 @@ def _batches(
         batch.append(pair)
     if batch:
         yield batch
-
-
-def _half_precision(device: torch.device) -> torch.autocast:
-    if device.type != "cuda":
-        return torch.autocast(device.type, enabled=False)
-    native = torch.cuda.is_bf16_supported(including_emulation=False)
-    return torch.autocast("cuda", dtype=torch.bfloat16 if native else torch.float16)
-
-
-def _array(tensor: Tensor) -> Float32:
-    array: Float32 = tensor.float().cpu().numpy()
-    return array
