@@ -10,11 +10,11 @@ from da3_slow import SlowDa3
 
 from igsr.errors import IgsrError
 from igsr.pose.da3.backbone import Backbone
-from igsr.pose.da3.blocks import rotary_tables, rotated
 from igsr.pose.da3.cameras import encode_pose, normalized_viewmats
 from igsr.pose.da3.config import BASE, SMALL, NetworkConfig
 from igsr.pose.da3.network import Da3Network
 from igsr.pose.da3.reference_view import reference_view
+from igsr.pose.transformer_layers import rotary_tables, rotated
 
 FIELDS = ("depth", "confidence", "rays", "ray_confidence", "pose_encoding")
 #: The float32 network reached 2e-6 of the largest value; half precision is off by 1e-3.

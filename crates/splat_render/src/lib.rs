@@ -9,7 +9,9 @@
 //! | project | splats ([`SplatParams`]), [`Camera`] | 2D splats ([`Projected`]) |
 //! | bin | 2D splats | lists of splats per tile, inside the two rasterize stages |
 //! | rasterize | 2D splats, background | [`Image`]: colour, alpha, depth |
+//! | exposure | image, gain and offset ([`stages::Exposure`]) | the image's colours as a photo has them |
 //! | loss | image, photo ([`target::Target`]) | L1 and D-SSIM, and the image's gradient |
+//! | exposure_backward | gradient of those colours | gradients of image, gain and offset |
 //! | rasterize_backward | the image's gradient | gradients of the 2D splats |
 //! | project_backward | gradients of the 2D splats | gradients of splats and camera |
 //! | adam | gradients of the splats | splats after one optimiser step |

@@ -164,16 +164,20 @@ def fetch_weights(name: str) -> Path:
             "downloads need huggingface_hub; install it by: pip install 'igsr[weights]'"
         ) from error
     source: dict[str, Any] = {"endpoint": os.environ.get(ENDPOINT) or None, "token": False}
+    commit: str | None = None  # of the first file: all must be of one revision
     try:
         # The small file first: what answers wrongly is known before the large one is loaded.
         for file in reversed(weights.files):
-            url = huggingface_hub.hf_hub_url(weights.model, file, endpoint=source["endpoint"])
+            url = huggingface_hub.hf_hub_url(
+                weights.model, file, revision=commit, endpoint=source["endpoint"]
+            )
             announced = huggingface_hub.get_hf_file_metadata(url, **source)
+            commit = commit or announced.commit_hash
             path = Path(
                 huggingface_hub.hf_hub_download(
                     weights.model,
                     file,
-                    revision=announced.commit_hash,
+                    revision=commit,
                     cache_dir=cache_folder(),
                     **source,
                 )

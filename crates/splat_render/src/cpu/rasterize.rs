@@ -8,8 +8,7 @@ use rayon::prelude::*;
 use super::bin::{Binned, Bins, bin};
 use super::simd::dispatch;
 use super::tile::{
-    LIVE_INTERVAL, PIXELS, Pixels, Place, Reached, SIDE, TileSplat, Vectors, centers, live_vectors,
-    take,
+    LIVE_INTERVAL, PIXELS, Pixels, Reached, SIDE, TileSplat, Vectors, centers, live_vectors, take,
 };
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
 use crate::error::Result;
@@ -71,7 +70,9 @@ struct Tile<'a, const DEPTH: bool> {
     left: f32,
     top: f32,
     background: [f32; 3],
-    place: Place,
+    /// Rows and columns that the picture has of it.
+    rows: usize,
+    columns: usize,
     out: Rows<'a>,
 }
 
@@ -82,7 +83,7 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
     fn with_simd<S: Simd>(mut self, s: S) {
         let mut sums = [Pixels([0.0; PIXELS]); 4];
         // Negative once the pixel has stopped.
-        let mut t = self.place.clear(S::F32_LANES);
+        let mut t = Pixels::clear(self.rows, self.columns, S::F32_LANES);
         blend::<S, DEPTH>(s, &self, &mut sums, &mut t);
         for (t, k) in t.0.iter_mut().zip(0..) {
             *t = t.abs();
@@ -91,7 +92,7 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
             }
         }
         for (rows, sums) in self.out.iter_mut().zip(sums.iter().chain([&t])) {
-            self.place.store::<S>(sums, rows);
+            sums.store::<S>(rows);
         }
     }
 }
@@ -167,7 +168,8 @@ pub(super) fn rasterize_tiles<const DEPTH: bool>(
                 left: first as f32,
                 top: (tile_row * SIDE) as f32,
                 background,
-                place: Place { first, width, rows, columns: SIDE.min(width - first) },
+                rows,
+                columns: SIDE.min(width - first),
                 out,
             });
         });

@@ -77,7 +77,7 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
             add_product(&mut behind, 1.0, &self.place.load::<S>(&image.planes[3]), &v[3]);
         }
         // Negative once the pixel has stopped.
-        let mut t = self.place.clear(S::F32_LANES);
+        let mut t = Pixels::clear(self.place.rows, self.place.columns, S::F32_LANES);
         let [v_r, v_g, v_b, v_d] = &v;
         let (v_r, v_g) = (S::as_simd_f32s(&v_r.0).0, S::as_simd_f32s(&v_g.0).0);
         let (v_b, v_d) = (S::as_simd_f32s(&v_b.0).0, S::as_simd_f32s(&v_d.0).0);

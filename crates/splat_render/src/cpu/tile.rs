@@ -24,7 +24,7 @@ const WHITEN: f32 = 0.849_321_8;
 #[repr(align(64))]
 pub(super) struct Pixels(pub [f32; PIXELS]);
 
-/// Where a tile lies in a plane, row-major, of a picture or of a row of tiles.
+/// Where a tile lies in a plane, row-major, of a picture.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
     /// Index of its first pixel.
@@ -56,34 +56,37 @@ impl Place {
         }
         pixels
     }
+}
 
-    /// Writes the values within the picture to its rows there.
+impl Pixels {
+    /// Transmittance before the first splat: 1, and negative, as if stopped, beyond the rows and
+    /// columns that the picture has.
     #[inline(always)]
-    pub fn store<S: Simd>(&self, pixels: &Pixels, rows: &mut [&mut [f32]; SIDE]) {
-        let vectors = S::as_simd_f32s(&pixels.0).0;
-        for (row, out) in rows[..self.rows].iter_mut().enumerate() {
-            let (whole, rest) = S::as_mut_simd_f32s(&mut out[..self.columns]);
-            for (c, vector) in whole.iter_mut().enumerate() {
-                *vector = vectors[c * SIDE + row];
-            }
-            let from = (whole.len() * SIDE + row) * S::F32_LANES;
-            for (k, value) in rest.iter_mut().enumerate() {
-                *value = pixels.0[from + k];
-            }
-        }
-    }
-
-    /// Transmittance before the first splat: 1, and negative, as if stopped, beyond the picture.
-    #[inline(always)]
-    pub fn clear(&self, lanes: usize) -> Pixels {
-        let mut pixels = Pixels([1.0; PIXELS]);
+    pub fn clear(rows: usize, columns: usize, lanes: usize) -> Self {
+        let mut pixels = Self([1.0; PIXELS]);
         for row in 0..SIDE {
-            let columns = if row < self.rows { self.columns } else { 0 };
+            let columns = if row < rows { columns } else { 0 };
             for column in columns..SIDE {
                 pixels.0[offset(row, column, lanes)] = -1.0;
             }
         }
         pixels
+    }
+
+    /// Writes the values within the picture to its rows; those beyond it are empty.
+    #[inline(always)]
+    pub fn store<S: Simd>(&self, rows: &mut [&mut [f32]; SIDE]) {
+        let vectors = S::as_simd_f32s(&self.0).0;
+        for (row, out) in rows.iter_mut().enumerate() {
+            let (whole, rest) = S::as_mut_simd_f32s(out);
+            for (c, vector) in whole.iter_mut().enumerate() {
+                *vector = vectors[c * SIDE + row];
+            }
+            let from = (whole.len() * SIDE + row) * S::F32_LANES;
+            for (k, value) in rest.iter_mut().enumerate() {
+                *value = self.0[from + k];
+            }
+        }
     }
 }
 

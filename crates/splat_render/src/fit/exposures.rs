@@ -20,15 +20,14 @@ const ADAM: (f64, f64, f64) = (0.9, 0.99, 1e-15);
 /// What Adam's rate decays to until the end of the fit, as a part of the start's.
 const DECAY: f64 = 0.03;
 /// The rates at the start add up to this over the rounds of a fit, in logarithms of gain and units of
-/// colour: with the decay, exposures get about a third as far, a stop and a half.
+/// colour: with the decay, exposures get a bit more than a quarter as far, three stops.
 const REACH: f64 = 3.5;
 /// Least and most of the rate at the start.
 const RATES: (f64, f64) = (0.005, 0.05);
 /// Standard error of the start whose pull is 1. No step is longer than what a start leaves open.
 const UNIT_ERROR: f64 = 0.03;
 /// Least pulls of gains and of offsets. The first decides where a photo shows nothing. Cameras make
-/// few offsets, and against a render that is poor still, the best exposure is all offset and no gain:
-/// with the first pull for both, fits of unknown exposures got lost there.
+/// few offsets, and against a render that is poor still, the best exposure is all offset and no gain.
 const PULLS: (f64, f64) = (1e-3, 5.0);
 /// Gains further from 1 than this factor are none of a camera.
 const GAIN_MAX: f64 = 64.0;
@@ -108,6 +107,13 @@ impl Exposures {
                 "must have pulls that are finite and not negative",
             ));
         }
+        let gains = start.iter().flatten().flat_map(|exposure| exposure.gain);
+        if !gains.into_iter().all(|gain| (1.0 / GAIN_MAX..=GAIN_MAX).contains(&gain)) {
+            return Err(Error::argument(
+                "exposures",
+                format!("must have gains between 1/{GAIN_MAX} and {GAIN_MAX}"),
+            ));
+        }
         let each = || start.iter().map(|start| start.unwrap_or_else(Exposure::none));
         self.resume(ExposureState {
             gains: each().map(|exposure| exposure.gain).collect(),
@@ -133,11 +139,12 @@ impl Exposures {
         if lengths.iter().any(|&length| length != n) {
             return Err(Error::argument("exposures", format!("must have one row for {n} images")));
         }
-        if !gains.as_flattened().iter().all(|g| (1.0 / GAIN_MAX..=GAIN_MAX).contains(g)) {
-            return Err(Error::argument(
-                "exposures",
-                format!("must have gains between 1/{GAIN_MAX} and {GAIN_MAX}"),
-            ));
+        // Not the bounds of a start: bringing the mean back to 1 may lead out of them.
+        if !gains.as_flattened().iter().all(|gain| gain.is_finite() && *gain > 0.0) {
+            return Err(Error::argument("exposures", "has a gain that is not above 0"));
+        }
+        if !second.as_flattened().iter().all(|moment| *moment >= 0.0) {
+            return Err(Error::argument("exposures", "has a negative second moment"));
         }
         let moments = [first, second, gradients].map(|rows| rows.as_flattened());
         let values = moments.into_iter().chain([offsets.as_flattened()]).flatten();
@@ -164,6 +171,9 @@ impl Exposures {
     pub fn add(&mut self, gradients: &[ExposureGradient]) {
         for gradient in gradients {
             let k = gradient.view;
+            if !self.is_fitted[k] {
+                continue;
+            }
             let (gain, offset) = (self.state.gains[k], self.state.offsets[k]);
             let ([start_gain, start_offset], pull) = (self.start[k], self.pulls[k]);
             let (of_gain, of_offset) = (pull.max(PULLS.0), pull.max(PULLS.1));

@@ -147,17 +147,19 @@ pub(super) fn exposure_backward(
     let uploaded = Uploaded::new(gpu, image, exposure, v_corrected)?;
     let op = uploaded.buffers.backward(gpu, uploaded.exposed());
     let bytes = 16 * image.color.len() as u64;
-    let wanted =
-        [(&uploaded.v_picture, bytes), (&uploaded.buffers.sums, ExposureBuffers::SUM_BYTES)];
+    let buffers = &uploaded.buffers;
+    let wanted = [
+        (&uploaded.v_picture, bytes),
+        (&buffers.sums, ExposureBuffers::SUM_BYTES),
+        (&buffers.corrected, bytes),
+    ];
     let data = gpu.download(&[op], &wanted)?;
     let v_picture: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&data[0]);
     let [v_gain, v_offset] = ExposureBuffers::gradients(&data[1]);
-    let behind = exposure.behind();
-    // On the device it goes into the totals of rasterize_backward alone.
-    let v_alpha = |v: &[f32; 4]| -(0..3).map(|c| v[c] / exposure.gain[c] * behind[c]).sum::<f32>();
+    let corrected: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&data[2]);
     Ok(ExposureGradients {
         v_color: v_picture.iter().map(|v| [v[0], v[1], v[2]]).collect(),
-        v_alpha: v_picture.iter().map(v_alpha).collect(),
+        v_alpha: corrected.iter().map(|c| c[3]).collect(),
         v_gain,
         v_offset,
     })

@@ -16,6 +16,7 @@ struct Exposure {
 @group(0) @binding(1) var<uniform> exposed: Exposure;
 // Colours (xyz) and transmittance (w).
 @group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
+// Colours a photo has (xyz) and, from backward, the gradient of alpha (w).
 @group(0) @binding(3) var<storage, read_write> corrected: array<vec4<f32>>;
 // Gradients: of the corrected colours before, of the picture's after.
 @group(0) @binding(4) var<storage, read_write> v_picture: array<vec4<f32>>;
@@ -70,7 +71,9 @@ fn exposure_backward(
         v_offset += v * (1.0 - kept);
         let v_color = exposed.gain.xyz * v;
         v_picture[i] = vec4(v_color, v_picture[i].w);
-        totals[i] = dot(pixel.xyz, v_color) + pixel.w * dot(v, exposed.behind.xyz);
+        let v_transmittance = dot(v, exposed.behind.xyz);
+        corrected[i].w = -v_transmittance;
+        totals[i] = dot(pixel.xyz, v_color) + pixel.w * v_transmittance;
     }
     for (var c = 0u; c < 3u; c++) {
         partial_sums[c * THREADS + local] = v_gain[c];
