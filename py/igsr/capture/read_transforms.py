@@ -85,6 +85,29 @@ def described_split_transforms(folder: Path) -> DescribedCapture:
     return DescribedCapture(folder, shots, lambda: None)
 
 
+def read_cameras(path: Path) -> list[tuple[str, Camera]]:
+    """The photos' names and cameras of a ``cameras.json`` as igsr writes it, without the photos.
+
+    Raises:
+        IgsrError: the file cannot be read, a field of a frame is missing or out of range, or a
+            lens distorts.
+    """
+    document = _read_json(path)
+    if document.get("camera_model") != "PINHOLE":
+        raise IgsrError(f"{path}: camera_model must be PINHOLE, as igsr writes it")
+    cameras = []
+    for index, frame in enumerate(_frames(document, path)):
+        name = _text(frame, "file_path", f"{path}, frame {index}")
+        where = f"{path}, frame {index} ({name})"
+        for key in ("w", "h"):
+            _required(frame, key, where)
+        width, height = _size(frame, path, where)
+        K, _ = _intrinsics(frame, width, height, where)
+        viewmat = _viewmat(_required(frame, "transform_matrix", where), where)
+        cameras.append((name, Camera(viewmat, K, width, height)))
+    return cameras
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_bytes())

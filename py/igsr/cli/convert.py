@@ -1,4 +1,4 @@
-"""``igsr convert``: a splat file in another format."""
+"""``igsr convert``: a splat file in another format, or a page that shows it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ from igsr.cli.error_messages import error_messages, print_message, warning_messa
 from igsr.cli.shared import (
     JsonOption,
     SceneArgument,
+    background_color,
     output_console,
     print_json,
 )
+from igsr.errors import IgsrError
 from igsr.splats import Splats
+
+#: Ending of pages.
+PAGE = ".html"
 
 
 def convert_command(
@@ -25,16 +30,43 @@ def convert_command(
         typer.Argument(
             metavar="TARGET",
             help="File to write. Its ending sets the format: .ply, .compressed.ply, .splat, .spz, "
-            ".sog, .glb or .gltf.",
+            ".sog, .glb or .gltf; or .html, a page that shows the scene in a browser.",
         ),
     ],
+    *,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            "--cameras",
+            metavar="CAPTURE",
+            help="For .html: the capture, or cameras.json, whose cameras to jump to. "
+            "Default: the cameras.json beside SCENE, if there is one.",
+        ),
+    ] = None,
+    background: Annotated[
+        str | None,
+        typer.Option(
+            "--background",
+            metavar="COLOR",
+            help="For .html: color behind the splats: white, black, grey, or R,G,B from 0 to 1. "
+            "Default: as in the report.json beside SCENE, else black.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write SCENE in the format of TARGET; name what that format cannot hold."""
     with error_messages(lambda: "Interrupted; nothing is written."), warning_messages():
+        is_page = target.suffix.lower() == PAGE
+        for option, value in (("--cameras", cameras), ("--background", background)):
+            if value is not None and not is_page:
+                raise IgsrError(f"{option} is for pages; end {target} in {PAGE} or leave it out")
         check_writable(target)
+        color = background_color(background)
         splats = Splats.load(scene)
-        notes = splats.save(target)
+        if is_page:
+            notes = _write_page(target, scene, splats, cameras, color)
+        else:
+            notes = splats.save(target)
     size = target.stat().st_size
     if as_json:
         print_json(
@@ -56,3 +88,18 @@ def convert_command(
     output_console().print(
         f"{len(splats)} splats in {target}, {size} bytes ({size / max(before, 1):.2f} of {scene})"
     )
+
+
+def _write_page(
+    target: Path,
+    scene: Path,
+    splats: Splats,
+    capture: Path | None,
+    background: tuple[float, float, float] | None,
+) -> list[str]:
+    from igsr.rendering.scene_page import write_scene_page
+    from igsr.rendering.scene_surroundings import background_beside, cameras_beside, cameras_of
+
+    seen = cameras_beside(scene) if capture is None else cameras_of(capture)
+    color = background or background_beside(scene) or (0.0, 0.0, 0.0)
+    return write_scene_page(target, splats, seen, color, scene.stem)

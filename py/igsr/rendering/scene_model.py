@@ -1,0 +1,100 @@
+"""What a scene page embeds of a model: the bytes of a ``.spz``, and where its splats are."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.splats import Splats
+
+#: Log-scales that a .spz holds, and the middle of them.
+LOG_SCALES = (-10.0, 5.9375)
+MIDDLE_LOG_SCALE = -2.0
+#: Splats of a lower opacity logit do not count for the extent, as in splat-view.
+FAINT_LOGIT = -2.2
+#: Number of splats that the extent is computed from.
+SAMPLES = 100_000
+
+
+@dataclass(frozen=True)
+class EmbeddedModel:
+    """A model as a page embeds it: relative to ``origin``, and in lengths times ``unit``.
+
+    Attributes:
+        spz: bytes of a ``.spz`` of version 3; empty where there are no splats.
+        count: number of splats in it.
+        origin: float64 [3], world position that its splats are relative to, world units.
+        unit: what lengths were multiplied by.
+        center: float64 [3], middle of the visible splats, relative to the origin, times ``unit``.
+        radius: about the centre: of 90% of the visible splats, at most four times that of 50%.
+        notes: a message for each thing that the page cannot hold.
+    """
+
+    spz: bytes
+    count: int
+    origin: npt.NDArray[np.float64]
+    unit: float
+    center: npt.NDArray[np.float64]
+    radius: float
+    notes: list[str]
+
+
+def embedded_model(splats: Splats) -> EmbeddedModel:
+    """Pack a model for a page.
+
+    Splats that are not finite are left out, as in every ``.spz``.
+
+    Raises:
+        IgsrError: a ``.spz`` cannot hold the model.
+    """
+    unit = _unit(splats)
+    shown = replace(
+        splats,
+        # The page keeps the origin beside the model, so that no position is rounded for it.
+        origin=np.zeros(3),
+        means=splats.means * np.float32(unit),
+        scales=splats.scales + np.float32(np.log(unit)),
+    )
+    with tempfile.TemporaryDirectory(prefix="igsr-page-") as folder:
+        path = Path(folder) / "scene.spz"
+        notes = shown.save(path)
+        spz = path.read_bytes()
+    count = _count(spz)
+    if count == 0:
+        return EmbeddedModel(b"", 0, splats.origin, 1.0, np.zeros(3), 1.0, notes)
+    center, radius = _extent(shown)
+    return EmbeddedModel(spz, count, splats.origin, unit, center, radius, notes)
+
+
+def _count(spz: bytes) -> int:
+    """Number of splats by the file's header: its writer decides which are left out."""
+    with gzip.GzipFile(fileobj=io.BytesIO(spz)) as file:
+        return int.from_bytes(file.read(16)[8:12], "little")
+
+
+def _unit(splats: Splats) -> float:
+    """A power of two for lengths, 1 where a ``.spz`` holds all log-scales as they are."""
+    scales = splats.scales[splats.finite]
+    if len(scales) == 0:
+        return 1.0
+    low, high = np.quantile(scales.max(axis=1), [0.01, 0.99])
+    if low >= LOG_SCALES[0] and float(scales.max()) <= LOG_SCALES[1]:
+        return 1.0
+    return float(2.0 ** np.round((MIDDLE_LOG_SCALE - 0.5 * (low + high)) / np.log(2.0)))
+
+
+def _extent(splats: Splats) -> tuple[npt.NDArray[np.float64], float]:
+    """Centre [3] and radius. Medians, because captures have a few splats very far out."""
+    chosen = np.flatnonzero(splats.finite)
+    chosen = chosen[:: -(-len(chosen) // SAMPLES)]
+    clear = chosen[splats.opacities[chosen] > FAINT_LOGIT]
+    means = splats.means[clear if len(clear) else chosen].astype(np.float64)
+    center = np.median(means, axis=0)
+    half, most = np.quantile(np.linalg.norm(means - center, axis=1), [0.5, 0.9])
+    return center, float(min(most, 4.0 * half)) or 1.0

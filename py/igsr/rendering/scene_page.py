@@ -1,0 +1,192 @@
+"""``scene.html``: a model and a viewer in one file, which needs nothing but a browser.
+
+The page's parts are the files of ``web/``, one job each; this module puts them together.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from igsr import _core
+from igsr._internal.atomic_write import atomic_write
+from igsr.capture import Camera
+from igsr.errors import IgsrError
+from igsr.rendering.scene_model import EmbeddedModel, embedded_model
+from igsr.splats import Splats
+
+#: Scripts in the order that they are put together; the last one starts the page.
+SCRIPTS = (
+    "unpack.js",
+    "spz.js",
+    "sort.js",
+    "viewpoint.js",
+    "painter.js",
+    "gestures.js",
+    "viewer.js",
+    "panel.js",
+    "main.js",
+)
+#: Shaders by the names that the painter knows.
+SHADERS = {
+    "harmonics": "harmonics.glsl",
+    "splatVertex": "splat.vert",
+    "splatFragment": "splat.frag",
+    "presentVertex": "present.vert",
+    "presentFragment": "present.frag",
+}
+#: Part of tan(fov / 2) beyond each edge that limits the Jacobian, as the renderer's.
+JACOBIAN_MARGIN = 0.3
+#: Near plane of small scenes, in their radii, as in splat-view.
+NEAR_PART = 0.05
+#: Up axis of scenes without cameras, as COLMAP's and INRIA's scenes have it.
+UP = (0.0, -1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class PageCamera:
+    """A camera that the page can jump to.
+
+    Attributes:
+        name: what the page calls it, a photo's name.
+        camera: pinhole camera, OpenCV axes, world frame of the capture.
+    """
+
+    name: str
+    camera: Camera
+
+
+def write_scene_page(
+    path: str | os.PathLike[str],
+    splats: Splats,
+    cameras: Sequence[PageCamera] = (),
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    title: str = "scene",
+) -> list[str]:
+    """Write a page that shows a model, whole or not at all.
+
+    The page asks no other file or address for anything. It starts at the first camera; without
+    cameras, at a view of the whole scene from a little above.
+
+    Args:
+        path: where to; its folder is made if it is missing.
+        splats: the model. Splats that are not finite are left out.
+        cameras: cameras to jump to, in the order of the page's list.
+        background: RGB in [0, 1] behind the splats.
+        title: the page's title, and the name of its screenshots.
+
+    Returns:
+        A message for each thing that the page cannot hold, such as clipped values.
+
+    Raises:
+        IgsrError: ``background`` is not three numbers in [0, 1], the page's packed format cannot
+            hold the model, or the file cannot be written.
+    """
+    text, notes = scene_page(splats, cameras, background, title)
+    with atomic_write(path) as temporary:
+        # A photo may be named by bytes that are no text.
+        temporary.write_text(text, encoding="utf-8", errors="xmlcharrefreplace")
+    return notes
+
+
+def scene_page(
+    splats: Splats,
+    cameras: Sequence[PageCamera] = (),
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    title: str = "scene",
+) -> tuple[str, list[str]]:
+    """The page of ``write_scene_page`` as text, and its messages."""
+    color = [float(channel) for channel in background]
+    if len(color) != 3 or not all(0.0 <= channel <= 1.0 for channel in color):
+        raise IgsrError("background must be three numbers in [0, 1]")
+    model = embedded_model(splats)
+    script = '"use strict";\n(() => {\n' + "\n".join(map(_part, SCRIPTS)) + "})();\n"
+    style = _part("style.css")
+    values = {
+        "CSP": _content_security_policy(script, style),
+        "VERSION": _core.__version__,
+        "TITLE": html.escape(title),
+        "STYLE": style,
+        "SCENE": _json(_described(model, cameras, color)),
+        "MODEL": base64.b64encode(model.spz).decode("ascii"),
+        "SCRIPT": script,
+    }
+    # In one pass: what is put in may itself look like a place.
+    page = re.sub(r"@([A-Z]+)@", lambda place: values[place[1]], _part("page.html"))
+    return page, model.notes
+
+
+def _described(
+    model: EmbeddedModel, cameras: Sequence[PageCamera], background: list[float]
+) -> dict[str, Any]:
+    """What the page's script reads beside the model."""
+    near = min(_core.NEAR_PLANE * model.unit, NEAR_PART * model.radius)
+    return {
+        "count": model.count,
+        "origin": model.origin.tolist(),
+        "unit": model.unit,
+        "center": model.center.tolist(),
+        "radius": model.radius,
+        "near": near,
+        "up": _up(cameras),
+        "background": background,
+        "cameras": [_camera(one) for one in cameras],
+        "constants": {
+            "BLUR": _core.EPS2D,
+            "ALPHA_MIN": _core.ALPHA_MIN,
+            "ALPHA_MAX": _core.ALPHA_MAX,
+            "JACOBIAN_MARGIN": JACOBIAN_MARGIN,
+        },
+        "shaders": {name: _part(file) for name, file in SHADERS.items()},
+    }
+
+
+def _camera(one: PageCamera) -> dict[str, Any]:
+    K, camera = one.camera.K, one.camera
+    lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height]
+    return {
+        "name": one.name,
+        "rows": camera.viewmat[:3].ravel().tolist(),
+        "lens": [float(number) for number in lens],
+    }
+
+
+def _up(cameras: Sequence[PageCamera]) -> list[float]:
+    """The mean up axis of the cameras; -y where there are none, or they have none in common."""
+    up = np.asarray(UP)
+    if cameras:
+        mean = -np.mean([one.camera.viewmat[1, :3] for one in cameras], axis=0)
+        length = float(np.linalg.norm(mean))
+        up = mean / length if length > 1e-6 else up
+    return [float(number) for number in up]
+
+
+def _content_security_policy(script: str, style: str) -> str:
+    """Allows this script and style alone, a worker made of the script's text, and no request."""
+    hashes = {
+        name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+        for name, text in (("script", script), ("style", style))
+    }
+    return (
+        f"default-src 'none'; script-src 'sha256-{hashes['script']}'; "
+        f"style-src 'sha256-{hashes['style']}'; worker-src blob:; img-src data: blob:"
+    )
+
+
+def _json(value: dict[str, Any]) -> str:
+    """JSON that may stand in an HTML script element, whatever names it holds."""
+    return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
+
+
+def _part(name: str) -> str:
+    return resources.files("igsr.rendering").joinpath("web", name).read_text(encoding="utf-8")

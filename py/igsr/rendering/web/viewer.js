@@ -1,0 +1,168 @@
+// What is shown, and when it is drawn: only after something has changed.
+
+// Vertical field of view where no camera says it, radians.
+const FOV = (50 * Math.PI) / 180;
+// Most pixels of the canvas for one of the page: phones have three and more.
+const PIXEL_RATIO_MAX = 2;
+
+class Viewer {
+  constructor(canvas, model, scene) {
+    Object.assign(this, { canvas, scene, up: scene.up, flies: false, showsDepth: false });
+    this.camera = -1;
+    this.fixedSize = null;
+    this.frame = 0;
+    this.waiters = [];
+    this.onChange = () => {};
+    this.painter = new Painter(canvas, model, scene);
+    this.sorter = new Sorter(model.positions, (order) => {
+      this.painter.setOrder(order);
+      this.redraw();
+    });
+    window.addEventListener("resize", () => this.redraw());
+    if (scene.cameras.length > 0) this.jump(0);
+    else this.frameScene();
+    this.gestures = new Gestures(this);
+  }
+
+  /** Goes to the camera of a photo, by its number; beyond the last follows the first. */
+  jump(number) {
+    const count = this.scene.cameras.length;
+    if (count === 0) return;
+    this.camera = ((number % count) + count) % count;
+    const { rows, lens } = this.scene.cameras[this.camera];
+    this.look(rows, lens);
+  }
+
+  /** Takes a world-to-camera matrix, 3 rows of 4, and fx, fy, cx, cy, width, height in pixels. */
+  look(rows, [fx, fy, cx, cy, width, height]) {
+    const { origin, unit, center, radius } = this.scene;
+    // The model's numbers are relative to an origin, and may be in another unit.
+    const moved = rows.slice();
+    for (let i = 0; i < 3; i++) {
+      moved[4 * i + 3] = (rows[4 * i + 3] + dot(rows.slice(4 * i, 4 * i + 3), origin)) * unit;
+    }
+    this.viewpoint = Viewpoint.ofCamera(moved, center, radius);
+    this.lens = { fx, fy, cx, cy, width, height };
+    this.changed();
+  }
+
+  /** Shows the whole scene, from a little above. */
+  frameScene() {
+    const { center, radius } = this.scene;
+    const [width, height] = this.size();
+    // The narrower side decides.
+    const focal = Math.min(width, height) / 2 / Math.tan(FOV / 2);
+    this.lens = { fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height };
+    this.viewpoint = Viewpoint.framing(center, radius, this.up, FOV);
+    this.camera = -1;
+    this.changed();
+  }
+
+  /** The viewpoint was moved by hand. */
+  moved() {
+    this.camera = -1;
+    this.changed();
+  }
+
+  changed() {
+    this.onChange();
+    this.redraw();
+  }
+
+  redraw() {
+    this.frame ||= requestAnimationFrame((now) => this.drawFrame(now));
+  }
+
+  size() {
+    if (this.fixedSize) return this.fixedSize;
+    const ratio = Math.min(window.devicePixelRatio || 1, PIXEL_RATIO_MAX);
+    return [this.canvas.clientWidth, this.canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+  }
+
+  drawFrame(now) {
+    this.frame = 0;
+    const moving = this.gestures.step(now);
+    this.draw();
+    if (moving) this.moved();
+    if (!this.frame && this.sorter.settled) for (const done of this.waiters.splice(0)) done();
+  }
+
+  draw() {
+    const [width, height] = this.size();
+    if (this.canvas.width !== width) this.canvas.width = width;
+    if (this.canvas.height !== height) this.canvas.height = height;
+    const { forward, translation } = this.viewpoint;
+    // As in the painter: the file's y and z point the other way.
+    const axis = [forward[0], -forward[1], -forward[2]];
+    this.sorter.request(axis, translation[2], this.scene.near);
+    this.painter.draw(this.viewpoint, fittedLens(this.lens, width, height), this.showsDepth);
+  }
+
+  /** World units at the pivot for each pixel of the page. */
+  reach() {
+    const [width, height] = this.size();
+    const scale = height / Math.max(1, this.canvas.clientHeight);
+    return (this.viewpoint.distance * scale) / fittedLens(this.lens, width, height).fy;
+  }
+
+  /** Orbits about what is seen at a point of the page from now on. */
+  focus(clientX, clientY) {
+    const [width, height] = this.size();
+    const lens = fittedLens(this.lens, width, height);
+    const x = Math.min(width - 1, Math.floor((clientX / this.canvas.clientWidth) * width));
+    const y = Math.min(height - 1, Math.floor((clientY / this.canvas.clientHeight) * height));
+    const depth = this.painter.depthAt(this.viewpoint, lens, x, y);
+    if (depth !== null) {
+      const { right, down, forward, position } = this.viewpoint;
+      const across = plus(times(right, (x + 0.5 - lens.cx) / lens.fx), down, (y + 0.5 - lens.cy) / lens.fy);
+      const target = plus(position, plus(forward, across), depth);
+      this.viewpoint.distance = depth;
+      this.viewpoint.position = plus(target, forward, -depth);
+    }
+    this.moved();
+  }
+
+  setDepth(shows) {
+    this.showsDepth = shows;
+    this.changed();
+  }
+
+  setFlies(flies) {
+    this.flies = flies;
+    this.changed();
+  }
+
+  /** What a key does. */
+  command(key) {
+    const commands = {
+      "[": () => this.jump(this.camera < 0 ? 0 : this.camera - 1),
+      "]": () => this.jump(this.camera + 1),
+      v: () => this.setFlies(!this.flies),
+      f: () => this.frameScene(),
+      p: () => this.save(),
+      1: () => this.setDepth(false),
+      4: () => this.setDepth(true),
+    };
+    const name = key.toLowerCase();
+    if (Object.hasOwn(commands, name)) commands[name]();
+  }
+
+  /** Saves what is shown as a PNG. */
+  save() {
+    this.draw();
+    this.canvas.toBlob((blob) => {
+      if (!blob) return;
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(blob);
+      link.download = `${document.title || "scene"}.png`;
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+    });
+  }
+
+  /** Resolves once splats are sorted for the viewpoint, and drawn. */
+  settled() {
+    this.redraw();
+    return new Promise((resolve) => this.waiters.push(resolve));
+  }
+}

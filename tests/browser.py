@@ -1,0 +1,166 @@
+"""A headless browser that tests steer: the DevTools protocol over a pipe, without a library."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+#: WebGL without a GPU.
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--hide-scrollbars",
+    "--force-device-scale-factor=1",
+    "--disable-extensions",
+    "--no-first-run",
+    "--remote-debugging-pipe",
+)
+
+
+class Browser:
+    """One page of a browser.
+
+    Attributes:
+        problems: errors and warnings of the page's console, and exceptions, as text.
+        requests: addresses that the page asked for.
+    """
+
+    def __init__(self, profile: Path, size: tuple[int, int] = (640, 480)) -> None:
+        program = next((name for name in NAMES if shutil.which(name)), None)
+        assert program, "no browser to open the page with: install chromium, as make test does"
+        to_browser, self._write = os.pipe()
+        self._read, from_browser = os.pipe()
+        command = [program, *FLAGS, f"--user-data-dir={profile}"]
+        command += [f"--window-size={size[0]},{size[1]}", "about:blank"]
+        # The browser reads file 3 and writes file 4; the pipes' own numbers may be these.
+        shell = f'exec "$@" 3<&{to_browser} 4>&{from_browser}'
+        self._process = subprocess.Popen(
+            ["bash", "-c", shell, "browser", *command],
+            pass_fds=(to_browser, from_browser),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(to_browser)
+        os.close(from_browser)
+        self._number = 0
+        self._buffer = b""
+        self._session: str | None = None
+        self.problems: list[str] = []
+        self.requests: list[str] = []
+        self._loaded = False
+        found = self._ask("Target.getTargets")["targetInfos"]
+        target = next(one["targetId"] for one in found if one["type"] == "page")
+        attached = self._ask("Target.attachToTarget", targetId=target, flatten=True)
+        self._session = attached["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self._ask(f"{domain}.enable")
+        self._ask(
+            "Emulation.setDeviceMetricsOverride",
+            width=size[0],
+            height=size[1],
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):
+            os.close(self._write)
+        os.close(self._read)
+        self._process.terminate()
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def open(self, page: Path, timeout: float = 60.0) -> None:
+        """Open a file, and wait until its script says that it has started or failed."""
+        self.problems.clear()
+        self.requests.clear()
+        self._loaded = False
+        self._ask("Page.navigate", url=page.as_uri())
+        end = time.monotonic() + timeout
+        while not self._loaded:
+            self._receive(end)
+        self.run("window.igsr.ready.then(() => true)", timeout)
+
+    def run(self, expression: str, timeout: float = 60.0) -> Any:
+        """The value of JavaScript; a promise is waited for."""
+        answer = self._ask(
+            "Runtime.evaluate",
+            timeout,
+            expression=expression,
+            awaitPromise=True,
+            returnByValue=True,
+        )
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        """A mouse event, such as "mousePressed"."""
+        self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+    def touch(self, kind: str, points: list[tuple[float, float]]) -> None:
+        """A touch event, such as "touchStart", with the fingers that are down."""
+        fingers = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
+        self._ask("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
+
+    def key(self, key: str, code: str, kind: str = "keyDown") -> None:
+        """A key goes down, or up with ``kind`` "keyUp"."""
+        self._ask("Input.dispatchKeyEvent", type=kind, key=key, code=code)
+
+    def screenshot(self, path: Path) -> None:
+        """What the page shows, as a PNG."""
+        path.write_bytes(base64.b64decode(self._ask("Page.captureScreenshot")["data"]))
+
+    def _ask(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:
+        self._number += 1
+        number = self._number
+        message: dict[str, Any] = {"id": number, "method": method, "params": parameters}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        end = time.monotonic() + timeout
+        while True:
+            answer = self._receive(end)
+            if answer.get("id") == number:
+                assert "error" not in answer, answer["error"]
+                return dict(answer["result"])
+
+    def _receive(self, end: float) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            ready, _, _ = select.select([self._read], [], [], max(0.0, end - time.monotonic()))
+            assert ready, "the browser does not answer"
+            piece = os.read(self._read, 1 << 20)
+            assert piece, "the browser has ended"
+            self._buffer += piece
+        text, self._buffer = self._buffer.split(b"\0", 1)
+        message: dict[str, Any] = json.loads(text)
+        self._note(message.get("method"), message.get("params", {}))
+        return message
+
+    def _note(self, method: str | None, said: dict[str, Any]) -> None:
+        if method == "Runtime.exceptionThrown":
+            self.problems.append(str(said["exceptionDetails"]))
+        elif method == "Runtime.consoleAPICalled" and said["type"] in ("error", "warning"):
+            self.problems.append(str(said["args"]))
+        elif method == "Log.entryAdded" and said["entry"]["level"] in ("error", "warning"):
+            self.problems.append(said["entry"]["text"])
+        elif method == "Network.requestWillBeSent":
+            self.requests.append(said["request"]["url"])
+        elif method == "Page.loadEventFired":
+            self._loaded = True
