@@ -1,16 +1,13 @@
-"""What a scene page embeds of a model: the bytes of a ``.spz``, and where its splats are."""
+"""What a scene page embeds of a model: its bytes, and where its splats are."""
 
 from __future__ import annotations
 
-import gzip
-import io
-import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from igsr.rendering.scene_packing import packed_model
 from igsr.splats import Splats
 
 #: Log-scales that a .spz holds, and the middle of them.
@@ -18,7 +15,7 @@ LOG_SCALES = (-10.0, 5.9375)
 MIDDLE_LOG_SCALE = -2.0
 #: Splats of a lower opacity logit do not count for the extent, as in splat-view.
 FAINT_LOGIT = -2.2
-#: How far splats may be, in radii: those within keep a step of at most a 8000th of the radius.
+#: How far splats may be, in radii: those within keep a step of at most an 8000th of the radius.
 FAR_RADII = 1000
 #: Number of splats that the extent is computed from.
 SAMPLES = 100_000
@@ -29,7 +26,7 @@ class EmbeddedModel:
     """A model as a page embeds it: relative to ``origin``, and in lengths times ``unit``.
 
     Attributes:
-        spz: bytes of a ``.spz`` of version 3.
+        packed: its bytes, as ``scene_packing`` describes them.
         count: number of splats in it.
         origin: float64 [3], world position that its splats are relative to, world units: the
             middle of the visible ones.
@@ -39,7 +36,7 @@ class EmbeddedModel:
         notes: a message for each thing that the page cannot hold.
     """
 
-    spz: bytes
+    packed: bytes
     count: int
     origin: npt.NDArray[np.float64]
     unit: float
@@ -50,12 +47,12 @@ class EmbeddedModel:
 def embedded_model(splats: Splats) -> EmbeddedModel:
     """Pack a model for a page.
 
-    Splats that are not finite are left out, as in every ``.spz``, and those that are farther than
+    Splats that are not finite are left out, and those that are farther than
     ``FAR_RADII`` from the middle: positions have 24 bits, and such a splat would leave few of them
     to all others.
 
     Raises:
-        IgsrError: a ``.spz`` cannot hold the model.
+        IgsrError: the page's format cannot hold the model.
     """
     center, radius = _extent(splats)
     offsets = splats.means - center.astype(np.float32)
@@ -71,21 +68,12 @@ def embedded_model(splats: Splats) -> EmbeddedModel:
         opacities=splats.opacities[kept],
         sh=splats.sh[kept],
     )
-    with tempfile.TemporaryDirectory(prefix="igsr-page-") as folder:
-        path = Path(folder) / "scene.spz"
-        notes = shown.save(path)
-        spz = path.read_bytes()
+    packed, count, notes = packed_model(shown, radius * unit)
     far = len(kept) - int(kept.sum())
     if far > 0:
         notes.append(f"{far} splats farther than {FAR_RADII} radii of the scene are left out.")
     origin = splats.origin + center.astype(np.float32)
-    return EmbeddedModel(spz, _count(spz), origin, unit, radius * unit, notes)
-
-
-def _count(spz: bytes) -> int:
-    """Number of splats by the file's header: its writer decides which are left out."""
-    with gzip.GzipFile(fileobj=io.BytesIO(spz)) as file:
-        return int.from_bytes(file.read(16)[8:12], "little")
+    return EmbeddedModel(packed, count, origin, unit, radius * unit, notes)
 
 
 def _unit(splats: Splats) -> float:

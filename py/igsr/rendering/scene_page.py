@@ -28,7 +28,7 @@ from igsr.splats import Splats
 #: Scripts in the order that they are put together; the last one starts the page.
 SCRIPTS = (
     "unpack.js",
-    "spz.js",
+    "packed.js",
     "sort.js",
     "viewpoint.js",
     "painter.js",
@@ -118,7 +118,7 @@ def scene_page(
         "TITLE": html.escape(title),
         "STYLE": style,
         "SCENE": _json(_described(model, cameras, color)),
-        "MODEL": base64.b64encode(model.spz).decode("ascii"),
+        "MODEL": base64.b64encode(model.packed).decode("ascii"),
         "SCRIPT": script,
     }
     # In one pass: what is put in may itself look like a place.

@@ -21,8 +21,8 @@ async function loadModel(scene) {
   element.remove();
   try {
     const packed = await decodeBase64(text, (part) => progress(0.4 * part));
-    const bytes = await unpackGzip(packed, SPZ_HEADER, spzSize, (part) => progress(0.4 + 0.4 * part));
-    const model = parseSpz(bytes);
+    const bytes = await unpackGzip(packed, PACKED_HEADER, packedSize, (part) => progress(0.4 + 0.4 * part));
+    const model = unpackSplats(bytes);
     if (model.count !== scene.count) throw new Error("it does not have as many splats as the page says");
     return model;
   } catch (error) {

@@ -177,8 +177,8 @@ class Painter {
     gl.uniform1i(uniforms.showsDepth, showsDepth ? 1 : 0);
     const unit = this.depthUnit(view);
     const middle = -dot(view.forward, view.position);
-    const near = Math.max(this.scene.near, middle - 2 * this.scene.radius);
-    const far = Math.max(2 * near, middle + 2 * this.scene.radius);
+    const near = Math.max(this.scene.near, middle - 1.25 * this.scene.radius);
+    const far = Math.max(2 * near, middle + 1.25 * this.scene.radius);
     gl.uniform2f(uniforms.depthRange, near / unit, far / unit);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -102,7 +102,7 @@ void main() {
     harmonicBasis(normalize(transpose(rotation) * t), basis);
     const uint words = uint(HARMONIC_TEXELS);
     for (uint k = 0u; k < words; k++) {
-        uvec4 four = texel(harmonics, words * index + k);
+        uvec4 four = texel(harmonics, words * second.z + k);
         for (uint c = 0u; c < 4u; c++) {
             uint at = 4u * k + c;
             if (at < uint(COEFFICIENTS)) {
