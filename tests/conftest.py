@@ -66,3 +66,12 @@ def igsr_here(capsys):
         return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
 
     return run
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A headless browser of 640 x 480 pixels."""
+    from browser import Browser
+
+    with Browser(tmp_path_factory.mktemp("profile"), (640, 480)) as opened:
+        yield opened

@@ -3,101 +3,18 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
 import time
 
 import numpy as np
 import pytest
 import scenes
-from browser import Browser
-from typer.testing import CliRunner
+from scene_pages import BACKGROUND, MEAN, check_pictures, drawn, model, named, opened, three_cameras
 
 import igsr
-from igsr.cli import app
-from igsr.cli.scene_page_option import write_page
-from igsr.geometry.camera_paths import look_at
 from igsr.rendering import scene_packing
 from igsr.rendering.renders import render
 from igsr.rendering.scene_page import PageCamera, scene_page, write_scene_page
-
-#: Largest mean difference to the renderer's picture, in 255ths.
-MEAN = 1.0
-BACKGROUND = (0.2, 0.4, 0.6)
-SIZE = (640, 480)
-PICTURE = """
-window.igsr.picture(%s, %s).then((pixels) => {
-  let text = "";
-  for (let i = 0; i < pixels.length; i += 32768) {
-    text += String.fromCharCode(...pixels.subarray(i, i + 32768));
-  }
-  return btoa(text);
-})"""
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("profile"), SIZE) as opened:
-        yield opened
-
-
-def model(degree=1, count=400, antialiased=False, size=1.0, origin=(0.0, 0.0, 0.0)):
-    """Splats whose spherical harmonics a .spz holds without clipping."""
-    made = scenes.splats(count, degree, seed=degree, origin=origin)
-    made.sh[:, 1:] = np.clip(0.3 * made.sh[:, 1:], -0.9, 0.9)
-    made.means *= size
-    made.scales += np.float32(np.log(size) - 1.0)
-    made.antialiased = antialiased
-    return made
-
-
-def three_cameras(size=1.0, origin=(0.0, 0.0, 0.0)):
-    """From above, below and the side, so that no basis function stays small."""
-    middle = np.asarray(origin, dtype=float)
-    K = np.array([[240.0, 0.0, 76.0], [0.0, 250.0, 83.0], [0.0, 0.0, 1.0]])
-    places = ((0.6, -1.9, -2.2), (2.1, 1.6, 1.4), (-2.8, -0.3, 0.9))
-    return [
-        igsr.Camera(
-            look_at(middle + size * np.array(place), middle, np.array([0.0, -1.0, 0.0])),
-            K,
-            160,
-            144,
-        )
-        for place in places
-    ]
-
-
-def named(cameras):
-    return [PageCamera(f"photo {k}", camera) for k, camera in enumerate(cameras)]
-
-
-def convert(*words):
-    return CliRunner().invoke(app, ["convert", *map(str, words)])
-
-
-def opened(browser, path, splats, cameras=(), background=BACKGROUND):
-    write_scene_page(path, splats, cameras, background)
-    browser.open(path)
-    assert browser.run("window.igsr.error") is None
-    return path
-
-
-def drawn(browser, camera, timeout=60.0):
-    """What the page draws for a camera, uint8 [H, W, 3]."""
-    K = camera.K
-    lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height]
-    rows = camera.viewmat[:3].ravel().tolist()
-    text = browser.run(PICTURE % (json.dumps(rows), json.dumps([float(n) for n in lens])), timeout)
-    pixels = np.frombuffer(base64.b64decode(text), np.uint8)
-    return pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3].astype(int)
-
-
-def check_pictures(browser, splats, cameras):
-    for camera in cameras:
-        expected = render(splats, camera, BACKGROUND, backend="cpu").to_uint8().astype(int)
-        assert expected.std() > 20, "the scene is not in the picture"
-        assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
-
 
 # ---- pictures ----------------------------------------------------------------------------------
 
@@ -127,19 +44,6 @@ def test_scenes_in_any_unit(browser, tmp_path, size):
     for camera, same in zip(three_cameras(size), three_cameras(), strict=True):
         expected = render(enlarged, same, BACKGROUND, backend="cpu").to_uint8().astype(int)
         assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
-
-
-def test_splats_that_are_not_finite_are_left_out(browser, tmp_path):
-    splats = model(2)
-    splats.means[3, 1] = splats.sh[40, 5, 0] = np.nan
-    splats.scales[17, 0], splats.opacities[90] = np.inf, np.nan
-    splats.save(tmp_path / "scene.ply")
-    assert convert(tmp_path / "scene.ply", tmp_path / "scene.html").exit_code == 0
-    browser.open(tmp_path / "scene.html")
-    write_scene_page(tmp_path / "scene.html", splats, (), BACKGROUND)
-    browser.open(tmp_path / "scene.html")
-    assert browser.run("JSON.parse(document.getElementById('scene').textContent).count") == 396
-    check_pictures(browser, splats, three_cameras())
 
 
 def test_splats_far_out_do_not_make_the_others_coarse(browser, tmp_path):
@@ -354,64 +258,18 @@ def test_names_cannot_break_out(browser, tmp_path):
     assert "</script>" in browser.run("document.getElementById('cameras').options[1].text")
 
 
-# ---- from the command line -----------------------------------------------------------------------
-
-
-def test_convert_finds_cameras_and_background(browser, tmp_path):
-    from igsr.capture.write_cameras import write_cameras
-
-    made = scenes.capture(views=3, size=40)
-    splats = model()
-    splats.save(tmp_path / "scene.ply")
-    write_cameras(tmp_path / "cameras.json", made.views)
-    (tmp_path / "report.json").write_text('{"protocol": {"background": [1, 1, 1]}}')
-    assert convert(tmp_path / "scene.ply", tmp_path / "page.html").exit_code == 0
-    browser.open(tmp_path / "page.html")
-    names = browser.run("[...document.getElementById('cameras').options].map((one) => one.text)")
-    assert names == ["free view", *(view.name for view in made.views)]
-    camera = made.views[1].camera
-    expected = render(splats, camera, (1.0, 1.0, 1.0), backend="cpu").to_uint8()
-    assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
-
-    elsewhere = tmp_path / "elsewhere" / "page.html"
-    words = ["--cameras", str(scenes.write_capture(tmp_path / "capture", made))]
-    words += ["--background", "0,0.5,0"]
-    assert convert(tmp_path / "scene.ply", elsewhere, *words).exit_code == 0
-    page = elsewhere.read_text(encoding="utf-8")
-    assert '"background": [0.0, 0.5, 0.0]' in page
-    assert made.views[2].name in page
-
-    refused = convert(tmp_path / "scene.ply", tmp_path / "a.spz", "--cameras", "x")
-    assert refused.exit_code != 0
-    assert "--cameras is for pages" in refused.output
-    (tmp_path / "cameras.json").write_text('{"camera_model": "PINHOLE", "frames": [{}]}')
-    without = convert(tmp_path / "scene.ply", tmp_path / "page.html")
-    assert without.exit_code == 0
-    assert "the page has no cameras" in without.output
-
-
-def test_a_fit_writes_it(browser, tmp_path):
-    made = scenes.capture(views=5, size=24)
-    capture, out = scenes.write_capture(tmp_path / "capture", made), tmp_path / "out"
-    words = ["fit", str(capture), "--out", str(out), "--steps", "4", "--backend", "cpu"]
-    done = CliRunner().invoke(app, [*words, "--no-html"])
-    assert done.exit_code == 0, done.output
-    assert not (out / "scene.html").exists()
-    done = CliRunner().invoke(app, [*words, "--resume"])
-    assert done.exit_code == 0, done.output
-    assert "scene.html" in done.output
-    browser.open(out / "scene.html")
-    assert browser.run("window.igsr.error") is None
-    assert browser.run("window.igsr.viewer.scene.cameras.length") == len(made.views)
-    splats, camera = igsr.Splats.load(out / "scene.ply"), made.views[0].camera
-    expected = render(splats, camera, backend="cpu").to_uint8().astype(int)
-    assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
-
-
-def test_a_fit_outlives_a_page_that_cannot_be_written(tmp_path):
-    (tmp_path / "scene.html").mkdir()
-    with pytest.warns(UserWarning, match=r"scene\.html is not written: Cannot write"):
-        assert not write_page(tmp_path, model(), scenes.capture(views=2, size=8))
+def test_a_notebook_shows_it(browser, tmp_path):
+    shown = model().show(scenes.capture(views=2, size=8), height=300)
+    wait = """<script>window.igsr = { ready: new Promise((resolve) => addEventListener("load", () =>
+        frames[0].igsr.ready.then(resolve))) }</script>"""
+    (tmp_path / "book.html").write_text(wait + shown._repr_html_(), encoding="utf-8")
+    browser.open(tmp_path / "book.html")
+    assert browser.problems == []
+    assert browser.run("frames[0].igsr.error") is None
+    assert browser.run("frames[0].igsr.state().camera") == 0
+    assert browser.run("frames[0].innerHeight") == 300
+    with pytest.raises(igsr.IgsrError, match="height"):
+        model().show(height=0)
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0), (0.0, 0.0, 1.5), (0.0, 0.0, float("nan"))])

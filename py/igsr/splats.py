@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import pkgutil
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -172,6 +174,30 @@ class Splats(ArrayEquality, NotebookPicture):
             "sh_degree": self.sh_degree,
             "rasterize_mode": "antialiased" if self.antialiased else "classic",
         }
+
+    def show(
+        self,
+        capture: Any = None,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        height: int = 480,
+    ) -> Any:
+        """A viewer for notebooks: return it from a cell, then drag to orbit.
+
+        Args:
+            capture: an ``igsr.Capture``, whose cameras to jump to; the view starts at the first.
+                None starts at the whole scene.
+            background: RGB in [0, 1] behind the splats.
+            height: of the viewer, pixels.
+
+        Returns:
+            An object that notebooks show (``_repr_html_``): the page that ``igsr convert`` writes.
+
+        Raises:
+            IgsrError: an argument cannot be used, or the page cannot hold the splats.
+        """
+        # By name: the viewer lies in a room above this one.
+        page = pkgutil.resolve_name("igsr.rendering.notebook_page:notebook_page")
+        return page(self, capture, background, height)
 
     def save(self, path: str | os.PathLike[str]) -> list[str]:
         """Write a file; the ending of ``path`` sets its format.

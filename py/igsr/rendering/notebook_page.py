@@ -1,0 +1,47 @@
+"""A scene page within a notebook."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+
+from igsr.capture import Capture
+from igsr.errors import IgsrError
+from igsr.rendering.scene_page import PageCamera, scene_page
+from igsr.splats import Splats
+
+
+class NotebookPage:
+    """A viewer that a notebook shows where a cell returns it."""
+
+    def __init__(self, page: str, height: int) -> None:
+        """Take a page's text and its height in pixels."""
+        self._page, self._height = page, height
+
+    def __repr__(self) -> str:
+        return f"NotebookPage({len(self._page)} bytes, {self._height} pixels high)"
+
+    def _repr_html_(self) -> str:
+        """The page in a frame."""
+        return (
+            f'<iframe srcdoc="{html.escape(self._page)}" '
+            f'style="width:100%;height:{self._height}px;border:0"></iframe>'
+        )
+
+
+def notebook_page(
+    splats: Splats,
+    capture: Capture | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    height: int = 480,
+) -> NotebookPage:
+    """What ``Splats.show`` returns.
+
+    Raises:
+        IgsrError: as ``write_scene_page``, or ``height`` is under 1.
+    """
+    if height < 1:
+        raise IgsrError(f"height must be at least 1 pixel, not {height}")
+    views = [] if capture is None else capture.views
+    cameras = [PageCamera(view.name, view.camera) for view in views]
+    return NotebookPage(scene_page(splats, cameras, background)[0], height)

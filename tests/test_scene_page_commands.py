@@ -1,0 +1,88 @@
+"""``scene.html`` from the command line: ``igsr convert`` and ``igsr fit`` write it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+from scene_pages import BACKGROUND, MEAN, check_pictures, drawn, model, three_cameras
+from typer.testing import CliRunner
+
+import igsr
+from igsr.capture.write_cameras import write_cameras
+from igsr.cli import app
+from igsr.cli.scene_page_option import write_page
+from igsr.rendering.renders import render
+from igsr.rendering.scene_page import write_scene_page
+
+
+def convert(*words):
+    return CliRunner().invoke(app, ["convert", *map(str, words)])
+
+
+def test_splats_that_are_not_finite_are_left_out(browser, tmp_path):
+    splats = model(2)
+    splats.means[3, 1] = splats.sh[40, 5, 0] = np.nan
+    splats.scales[17, 0], splats.opacities[90] = np.inf, np.nan
+    splats.save(tmp_path / "scene.ply")
+    assert convert(tmp_path / "scene.ply", tmp_path / "scene.html").exit_code == 0
+    browser.open(tmp_path / "scene.html")
+    write_scene_page(tmp_path / "scene.html", splats, (), BACKGROUND)
+    browser.open(tmp_path / "scene.html")
+    assert browser.run("JSON.parse(document.getElementById('scene').textContent).count") == 396
+    check_pictures(browser, splats, three_cameras())
+
+
+def test_convert_finds_cameras_and_background(browser, tmp_path):
+    made = scenes.capture(views=3, size=40)
+    splats = model()
+    splats.save(tmp_path / "scene.ply")
+    write_cameras(tmp_path / "cameras.json", made.views)
+    (tmp_path / "report.json").write_text('{"protocol": {"background": [1, 1, 1]}}')
+    assert convert(tmp_path / "scene.ply", tmp_path / "page.html").exit_code == 0
+    browser.open(tmp_path / "page.html")
+    names = browser.run("[...document.getElementById('cameras').options].map((one) => one.text)")
+    assert names == ["free view", *(view.name for view in made.views)]
+    camera = made.views[1].camera
+    expected = render(splats, camera, (1.0, 1.0, 1.0), backend="cpu").to_uint8()
+    assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
+
+    elsewhere = tmp_path / "elsewhere" / "page.html"
+    words = ["--cameras", str(scenes.write_capture(tmp_path / "capture", made))]
+    words += ["--background", "0,0.5,0"]
+    assert convert(tmp_path / "scene.ply", elsewhere, *words).exit_code == 0
+    page = elsewhere.read_text(encoding="utf-8")
+    assert '"background": [0.0, 0.5, 0.0]' in page
+    assert made.views[2].name in page
+
+    refused = convert(tmp_path / "scene.ply", tmp_path / "a.spz", "--cameras", "x")
+    assert refused.exit_code != 0
+    assert "--cameras is for pages" in refused.output
+    (tmp_path / "cameras.json").write_text('{"camera_model": "PINHOLE", "frames": [{}]}')
+    without = convert(tmp_path / "scene.ply", tmp_path / "page.html")
+    assert without.exit_code == 0
+    assert "the page has no cameras" in without.output
+
+
+def test_a_fit_writes_it(browser, tmp_path):
+    made = scenes.capture(views=5, size=24)
+    capture, out = scenes.write_capture(tmp_path / "capture", made), tmp_path / "out"
+    words = ["fit", str(capture), "--out", str(out), "--steps", "4", "--backend", "cpu"]
+    done = CliRunner().invoke(app, [*words, "--no-html"])
+    assert done.exit_code == 0, done.output
+    assert not (out / "scene.html").exists()
+    done = CliRunner().invoke(app, [*words, "--resume"])
+    assert done.exit_code == 0, done.output
+    assert "scene.html" in done.output
+    browser.open(out / "scene.html")
+    assert browser.run("window.igsr.error") is None
+    assert browser.run("window.igsr.viewer.scene.cameras.length") == len(made.views)
+    splats, camera = igsr.Splats.load(out / "scene.ply"), made.views[0].camera
+    expected = render(splats, camera, backend="cpu").to_uint8().astype(int)
+    assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
+
+
+def test_a_fit_outlives_a_page_that_cannot_be_written(tmp_path):
+    (tmp_path / "scene.html").mkdir()
+    with pytest.warns(UserWarning, match=r"scene\.html is not written: Cannot write"):
+        assert not write_page(tmp_path, model(), scenes.capture(views=2, size=8))
