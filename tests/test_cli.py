@@ -71,6 +71,7 @@ def test_fit_writes_scene_report_views_and_checkpoint(fitted):
         "checkpoint.npz",
         "report.html",
         "report.json",
+        "scene.html",
         "scene.ply",
         "views.png",
     ]

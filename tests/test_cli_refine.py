@@ -36,6 +36,7 @@ def test_the_command(ball_photos, tmp_path, igsr_here, monkeypatch):
     assert own.exists()
     assert "rounds accepted; stopped: " in done.stdout
     assert (tmp_path / "out/report.html").is_file()
+    assert (tmp_path / "out/scene.html").is_file()
     again = igsr_here(*command, "--resume", "--json")
     summary = json.loads(again.stdout)
     report = json.loads((tmp_path / "out/report.json").read_text())

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 import igsr
 from igsr.cli import app
+from igsr.cli.scene_page_option import write_page
 from igsr.geometry.camera_paths import look_at
 from igsr.rendering.renders import render
 from igsr.rendering.scene_page import PageCamera, scene_page, write_scene_page
@@ -140,6 +141,16 @@ def test_splats_that_are_not_finite_are_left_out(browser, tmp_path):
     check_pictures(browser, splats, three_cameras())
 
 
+def test_splats_far_out_do_not_make_the_others_coarse(browser, tmp_path):
+    splats = model()
+    splats.means += np.float32(50.0)
+    splats.means[7], splats.means[8, 2] = 1e30, 1e5
+    notes = write_scene_page(tmp_path / "scene.html", splats, (), BACKGROUND)
+    assert notes == ["2 splats farther than 1000 radii of the scene are left out."]
+    browser.open(tmp_path / "scene.html")
+    check_pictures(browser, splats, three_cameras(origin=(50.0, 50.0, 50.0)))
+
+
 def test_depth_view_and_focus(browser, tmp_path):
     opened(browser, tmp_path / "scene.html", model(), named(three_cameras()))
     before = browser.run("window.igsr.state()")
@@ -216,8 +227,8 @@ def test_hands_and_keys_move_the_camera(browser, tmp_path):
     assert state()["camera"] == 0
     browser.run("document.getElementById('next').click()")
     assert state()["camera"] == 1
-    second = three_cameras()[1]
-    assert state()["position"] == pytest.approx(second.centre.tolist(), abs=1e-9)
+    second = three_cameras()[1].centre - browser.run("window.igsr.viewer.scene.origin")
+    assert state()["position"] == pytest.approx(second.tolist(), abs=1e-9)
     browser.key("v", "KeyV")
     assert state()["flies"]
     browser.run("document.getElementById('mode').click()")
@@ -247,10 +258,12 @@ def test_without_cameras_it_shows_the_whole_scene(browser, tmp_path):
     opened(browser, tmp_path / "scene.html", splats)
     assert browser.run("document.getElementById('photos').hidden")
     state = browser.run("window.igsr.state()")
-    middle = np.median(splats.means, axis=0) - state["position"]
-    # From a little above; up is -y.
+    # The page's origin is the middle; it is seen from a little above, and up is -y.
+    origin = browser.run("window.igsr.viewer.scene.origin")
+    assert origin == pytest.approx(np.median(splats.means, axis=0).tolist(), abs=0.1)
     assert state["position"][1] < -0.2
-    assert np.dot(middle, state["forward"]) == pytest.approx(np.linalg.norm(middle), rel=0.02)
+    to_middle = -np.array(state["position"])
+    assert np.dot(to_middle, state["forward"]) == pytest.approx(state["distance"], rel=1e-6)
 
 
 def test_an_empty_model_is_said(browser, tmp_path):
@@ -349,6 +362,30 @@ def test_convert_finds_cameras_and_background(browser, tmp_path):
     without = convert(tmp_path / "scene.ply", tmp_path / "page.html")
     assert without.exit_code == 0
     assert "the page has no cameras" in without.output
+
+
+def test_a_fit_writes_it(browser, tmp_path):
+    made = scenes.capture(views=5, size=24)
+    capture, out = scenes.write_capture(tmp_path / "capture", made), tmp_path / "out"
+    words = ["fit", str(capture), "--out", str(out), "--steps", "4", "--backend", "cpu"]
+    done = CliRunner().invoke(app, [*words, "--no-html"])
+    assert done.exit_code == 0, done.output
+    assert not (out / "scene.html").exists()
+    done = CliRunner().invoke(app, [*words, "--resume"])
+    assert done.exit_code == 0, done.output
+    assert "scene.html" in done.output
+    browser.open(out / "scene.html")
+    assert browser.run("window.igsr.error") is None
+    assert browser.run("window.igsr.viewer.scene.cameras.length") == len(made.views)
+    splats, camera = igsr.Splats.load(out / "scene.ply"), made.views[0].camera
+    expected = render(splats, camera, backend="cpu").to_uint8().astype(int)
+    assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
+
+
+def test_a_fit_outlives_a_page_that_cannot_be_written(tmp_path):
+    (tmp_path / "scene.html").mkdir()
+    with pytest.warns(UserWarning, match=r"scene\.html is not written: Cannot write"):
+        assert not write_page(tmp_path, model(), scenes.capture(views=2, size=8))
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0), (0.0, 0.0, 1.5), (0.0, 0.0, float("nan"))])

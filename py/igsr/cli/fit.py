@@ -22,6 +22,7 @@ from igsr.cli.pose import (
     GraphOption,
     capture_to_fit,
 )
+from igsr.cli.scene_page_option import PAGE, HtmlOption, write_page
 from igsr.cli.settings_options import ConfigOption, given_by_hand, settings_options
 from igsr.cli.shared import (
     BackgroundOption,
@@ -65,7 +66,7 @@ def fit_command(
     capture: CaptureArgument,
     out: Annotated[
         Path,
-        typer.Option("--out", help="Folder for scene.ply, report.html, report.json, views.png."),
+        typer.Option("--out", help="Folder for scene.ply, scene.html, report.html, report.json."),
     ],
     *,
     holdout: HoldoutOption = None,
@@ -91,6 +92,7 @@ def fit_command(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")
     ] = False,
+    html: HtmlOption = True,
     as_json: JsonOption = False,
 ) -> None:
     """Fit splats to the photos of CAPTURE and score them.
@@ -183,6 +185,7 @@ def fit_command(
             "background": background,
         }
         write_scene(out, splats, fitted)
+        has_page = html and write_page(out, splats, fitted, color)
         with parts.measured("score"):
             is_refined = bool(fitted.test_views) and (settings.moves_cameras or found)
             scores = _scored(splats, fitted, color, name, is_refined=is_refined, shown=not as_json)
@@ -197,7 +200,7 @@ def fit_command(
     if as_json:
         print_json(report)
     else:
-        _print_report(report, out)
+        _print_report(report, out, [PAGE] if has_page else [])
 
 
 def _is_complete(given: dict[str, Any]) -> bool:
@@ -295,7 +298,7 @@ def _finished_before(out: Path) -> tuple[float, tuple[str, int]]:
     return settings["seconds"], tuple(settings["started"])
 
 
-def _print_report(report: dict[str, Any], out: Path) -> None:
+def _print_report(report: dict[str, Any], out: Path, pages: list[str]) -> None:
     console = output_console()
     console.print(
         f"{report['splats']} splats in {report['seconds']:.1f} s on {report['backend']} "
@@ -312,5 +315,5 @@ def _print_report(report: dict[str, Any], out: Path) -> None:
     console.print(report["limit"]["sentence"])
     console.print(protocol_line(report["protocol"]), style="dim")
     console.print(parts_line(report["parts"]), style="dim")
-    names = ["scene.ply", "report.html", "report.json", "views.png", "cameras.json"]
+    names = ["scene.ply", *pages, "report.html", "report.json", "views.png", "cameras.json"]
     console.print("  ".join(str(out / name) for name in names), style="dim")

@@ -20,6 +20,7 @@ from igsr.cli.pose import (
     GraphOption,
     capture_to_fit,
 )
+from igsr.cli.scene_page_option import PAGE, HtmlOption, write_page
 from igsr.cli.settings_options import ConfigOption, settings_options
 from igsr.cli.shared import (
     FitSizeOption,
@@ -48,7 +49,7 @@ def refine_command(
     ],
     out: Annotated[
         Path,
-        typer.Option("--out", help="Folder for scene.ply, report.html, report.json and rounds/."),
+        typer.Option("--out", help="Folder for scene.ply, scene.html, report.html and rounds/."),
     ],
     given: dict[str, Any],
     holdout: HoldoutOption = None,
@@ -70,6 +71,7 @@ def refine_command(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the checkpoints in --out.")
     ] = False,
+    html: HtmlOption = True,
     as_json: JsonOption = False,
 ) -> None:
     """Fit few photos, then add denoised novel views and refit, while cross-validation improves."""
@@ -129,10 +131,12 @@ def refine_command(
                 resume=resume,
                 **vars(settings),
             )
+        with warning_messages():
+            has_page = html and write_page(out, refined.splats, refined.capture)
     if as_json:
         print_json(_summary(refined, out))
     else:
-        _print_summary(refined, out)
+        _print_summary(refined, out, [PAGE] if has_page else [])
 
 
 def _check_photo_count(photos: Path, holdout: int | None, frames: int, count: int) -> None:
@@ -191,7 +195,7 @@ def _summary(refined: Refined, out: Path) -> dict[str, Any]:
     }
 
 
-def _print_summary(refined: Refined, out: Path) -> None:
+def _print_summary(refined: Refined, out: Path, pages: list[str]) -> None:
     accepted = [done for done in refined.rounds if done.accepted]
     console = output_console()
     console.print(
@@ -206,5 +210,5 @@ def _print_summary(refined: Refined, out: Path) -> None:
     console.print(fitted_line(report["train"]))
     console.print(report["limit"]["sentence"])
     console.print(parts_line(report["parts"]), style="dim")
-    names = ("scene.ply", "report.html", "report.json", "views.png")
+    names = ["scene.ply", *pages, "report.html", "report.json", "views.png"]
     console.print("  ".join(str(out / file) for file in names), style="dim", markup=False)

@@ -18,6 +18,8 @@ LOG_SCALES = (-10.0, 5.9375)
 MIDDLE_LOG_SCALE = -2.0
 #: Splats of a lower opacity logit do not count for the extent, as in splat-view.
 FAINT_LOGIT = -2.2
+#: How far splats may be, in radii: those within keep a step of at most a 8000th of the radius.
+FAR_RADII = 1000
 #: Number of splats that the extent is computed from.
 SAMPLES = 100_000
 
@@ -27,12 +29,13 @@ class EmbeddedModel:
     """A model as a page embeds it: relative to ``origin``, and in lengths times ``unit``.
 
     Attributes:
-        spz: bytes of a ``.spz`` of version 3; empty where there are no splats.
+        spz: bytes of a ``.spz`` of version 3.
         count: number of splats in it.
-        origin: float64 [3], world position that its splats are relative to, world units.
+        origin: float64 [3], world position that its splats are relative to, world units: the
+            middle of the visible ones.
         unit: what lengths were multiplied by.
-        center: float64 [3], middle of the visible splats, relative to the origin, times ``unit``.
-        radius: about the centre: of 90% of the visible splats, at most four times that of 50%.
+        radius: about the origin, times ``unit``: of 90% of the visible splats, at most four times
+            that of 50%.
         notes: a message for each thing that the page cannot hold.
     """
 
@@ -40,7 +43,6 @@ class EmbeddedModel:
     count: int
     origin: npt.NDArray[np.float64]
     unit: float
-    center: npt.NDArray[np.float64]
     radius: float
     notes: list[str]
 
@@ -48,28 +50,36 @@ class EmbeddedModel:
 def embedded_model(splats: Splats) -> EmbeddedModel:
     """Pack a model for a page.
 
-    Splats that are not finite are left out, as in every ``.spz``.
+    Splats that are not finite are left out, as in every ``.spz``, and those that are farther than
+    ``FAR_RADII`` from the middle: positions have 24 bits, and such a splat would leave few of them
+    to all others.
 
     Raises:
         IgsrError: a ``.spz`` cannot hold the model.
     """
+    center, radius = _extent(splats)
+    offsets = splats.means - center.astype(np.float32)
+    kept = ~(np.abs(offsets).max(axis=1, initial=0.0) > FAR_RADII * radius)
     unit = _unit(splats)
     shown = replace(
         splats,
         # The page keeps the origin beside the model, so that no position is rounded for it.
         origin=np.zeros(3),
-        means=splats.means * np.float32(unit),
-        scales=splats.scales + np.float32(np.log(unit)),
+        means=offsets[kept] * np.float32(unit),
+        scales=splats.scales[kept] + np.float32(np.log(unit)),
+        quats=splats.quats[kept],
+        opacities=splats.opacities[kept],
+        sh=splats.sh[kept],
     )
     with tempfile.TemporaryDirectory(prefix="igsr-page-") as folder:
         path = Path(folder) / "scene.spz"
         notes = shown.save(path)
         spz = path.read_bytes()
-    count = _count(spz)
-    if count == 0:
-        return EmbeddedModel(b"", 0, splats.origin, 1.0, np.zeros(3), 1.0, notes)
-    center, radius = _extent(shown)
-    return EmbeddedModel(spz, count, splats.origin, unit, center, radius, notes)
+    far = len(kept) - int(kept.sum())
+    if far > 0:
+        notes.append(f"{far} splats farther than {FAR_RADII} radii of the scene are left out.")
+    origin = splats.origin + center.astype(np.float32)
+    return EmbeddedModel(spz, _count(spz), origin, unit, radius * unit, notes)
 
 
 def _count(spz: bytes) -> int:
@@ -90,11 +100,16 @@ def _unit(splats: Splats) -> float:
 
 
 def _extent(splats: Splats) -> tuple[npt.NDArray[np.float64], float]:
-    """Centre [3] and radius. Medians, because captures have a few splats very far out."""
+    """Centre [3] and radius, relative to the splats' origin, in world units.
+
+    Medians, because captures have a few splats very far out.
+    """
     chosen = np.flatnonzero(splats.finite)
+    if len(chosen) == 0:
+        return np.zeros(3), 1.0
     chosen = chosen[:: -(-len(chosen) // SAMPLES)]
     clear = chosen[splats.opacities[chosen] > FAINT_LOGIT]
     means = splats.means[clear if len(clear) else chosen].astype(np.float64)
-    center = np.median(means, axis=0)
+    center = np.asarray(np.median(means, axis=0))
     half, most = np.quantile(np.linalg.norm(means - center, axis=1), [0.5, 0.9])
     return center, float(min(most, 4.0 * half)) or 1.0

@@ -135,7 +135,6 @@ def _described(
         "count": model.count,
         "origin": model.origin.tolist(),
         "unit": model.unit,
-        "center": model.center.tolist(),
         "radius": model.radius,
         "near": near,
         "up": _up(cameras),

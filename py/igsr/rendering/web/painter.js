@@ -160,7 +160,7 @@ class Painter {
   }
 
   depthUnit(view) {
-    return Math.max(1e-6, Math.hypot(...plus(this.scene.center, view.position, -1)) + this.scene.radius);
+    return Math.max(1e-6, Math.hypot(...view.position) + this.scene.radius);
   }
 
   /** Draws the picture on the canvas. */
@@ -176,7 +176,7 @@ class Painter {
     gl.uniform3fv(uniforms.background, this.scene.background);
     gl.uniform1i(uniforms.showsDepth, showsDepth ? 1 : 0);
     const unit = this.depthUnit(view);
-    const middle = dot(view.forward, plus(this.scene.center, view.position, -1));
+    const middle = -dot(view.forward, view.position);
     const near = Math.max(this.scene.near, middle - 2 * this.scene.radius);
     const far = Math.max(2 * near, middle + 2 * this.scene.radius);
     gl.uniform2f(uniforms.depthRange, near / unit, far / unit);

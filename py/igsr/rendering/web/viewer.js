@@ -35,25 +35,25 @@ class Viewer {
 
   /** Takes a world-to-camera matrix, 3 rows of 4, and fx, fy, cx, cy, width, height in pixels. */
   look(rows, [fx, fy, cx, cy, width, height]) {
-    const { origin, unit, center, radius } = this.scene;
+    const { origin, unit, radius } = this.scene;
     // The model's numbers are relative to an origin, and may be in another unit.
     const moved = rows.slice();
     for (let i = 0; i < 3; i++) {
       moved[4 * i + 3] = (rows[4 * i + 3] + dot(rows.slice(4 * i, 4 * i + 3), origin)) * unit;
     }
-    this.viewpoint = Viewpoint.ofCamera(moved, center, radius);
+    this.viewpoint = Viewpoint.ofCamera(moved, radius);
     this.lens = { fx, fy, cx, cy, width, height };
     this.changed();
   }
 
   /** Shows the whole scene, from a little above. */
   frameScene() {
-    const { center, radius } = this.scene;
+    const { radius } = this.scene;
     const [width, height] = this.size();
     // The narrower side decides.
     const focal = Math.min(width, height) / 2 / Math.tan(FOV / 2);
     this.lens = { fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height };
-    this.viewpoint = Viewpoint.framing(center, radius, this.up, FOV);
+    this.viewpoint = Viewpoint.framing(radius, this.up, FOV);
     this.camera = -1;
     this.changed();
   }

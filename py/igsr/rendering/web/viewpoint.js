@@ -1,4 +1,5 @@
 // A view of the scene, and how it is moved. Axes of cameras: x right, y down, z forward.
+// The scene's middle is the origin.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -36,22 +37,22 @@ class Viewpoint {
     return new Viewpoint(position, right, cross(forward, right), forward, Math.hypot(...plus(target, position, -1)));
   }
 
-  /** A view in which a ball fills the picture, from a little above. `fov`: radians. */
-  static framing(center, radius, up, fov) {
+  /** A view in which a ball about the origin fills the picture, from a little above. `fov`: radians. */
+  static framing(radius, up, fov) {
     const usual = Math.abs(up[2]) > 0.9 ? [0, 1, 0] : [0, 0, 1];
     let level = plus(usual, up, -dot(up, usual));
     level = Math.hypot(...level) > 1e-9 ? unitVector(level) : anyNormal(up);
     const distance = (1.1 * radius) / Math.sin(fov / 2);
     const back = plus(times(level, -Math.cos(ELEVATION)), up, Math.sin(ELEVATION));
-    return Viewpoint.looking(plus(center, back, distance), center, up);
+    return Viewpoint.looking(times(back, distance), [0, 0, 0], up);
   }
 
-  /** Of a world-to-camera matrix, 3 rows of 4; the pivot is ahead, nearest to `center`. */
-  static ofCamera(rows, center, radius) {
+  /** Of a world-to-camera matrix, 3 rows of 4; the pivot is ahead, nearest to the origin. */
+  static ofCamera(rows, radius) {
     const [right, down, forward] = [0, 1, 2].map((i) => rows.slice(4 * i, 4 * i + 3));
     const axes = [right, down, forward];
     const position = axes.reduce((sum, axis, i) => plus(sum, axis, -rows[4 * i + 3]), [0, 0, 0]);
-    const ahead = dot(forward, plus(center, position, -1));
+    const ahead = -dot(forward, position);
     return new Viewpoint(position, right, down, forward, Math.max(ahead, 0.1 * radius));
   }
 
