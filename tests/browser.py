@@ -28,6 +28,13 @@ FLAGS = (
 )
 
 
+def browser_program() -> str:
+    """The name of the browser that is here."""
+    program = next((name for name in NAMES if shutil.which(name)), None)
+    assert program, "no browser to open the page with: install chromium, as make test does"
+    return program
+
+
 class Browser:
     """One page of a browser.
 
@@ -37,8 +44,7 @@ class Browser:
     """
 
     def __init__(self, profile: Path, size: tuple[int, int] = (640, 480)) -> None:
-        program = next((name for name in NAMES if shutil.which(name)), None)
-        assert program, "no browser to open the page with: install chromium, as make test does"
+        program = browser_program()
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
         command = [program, *FLAGS, f"--user-data-dir={profile}"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from browser import browser_program
 from PIL import Image
 
 import igsr
@@ -18,7 +18,6 @@ from igsr.refinement.report import report_of
 from igsr.refinement.results import Refined, Stop, StopReason
 from igsr.refinement.settings import RefineSettings
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: As the page's script draws photos' cameras and those of added views.
 PHOTOS, ADDED = (59, 125, 216), (224, 138, 30)
 
@@ -37,9 +36,13 @@ def report(tmp_path_factory):
 
 
 def shown(page, picture):
-    browser = next((name for name in BROWSERS if shutil.which(name)), None)
-    assert browser, "no browser to open the page with: install chromium, as make test does"
-    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    command = [
+        browser_program(),
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--hide-scrollbars",
+    ]
     command += ["--window-size=1200,3000", f"--user-data-dir={picture.parent / 'profile'}"]
     command += [f"--screenshot={picture}", page.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240)

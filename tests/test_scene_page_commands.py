@@ -14,6 +14,7 @@ from igsr.cli import app
 from igsr.cli.scene_page_option import write_page
 from igsr.rendering.renders import render
 from igsr.rendering.scene_page import write_scene_page
+from igsr.rendering.scene_surroundings import background_beside
 
 
 def convert(*words):
@@ -62,6 +63,23 @@ def test_convert_finds_cameras_and_background(browser, tmp_path):
     without = convert(tmp_path / "scene.ply", tmp_path / "page.html")
     assert without.exit_code == 0
     assert "the page has no cameras" in without.output
+
+
+@pytest.mark.parametrize(
+    ("report", "background"),
+    [
+        ('{"protocol": {"background": [1, 0, 0.5]}}', (1.0, 0.0, 0.5)),
+        ('{"test": {"protocol": {"background": [0, 1, 0]}}}', (0.0, 1.0, 0.0)),
+        ('{"test": null}', None),
+        ('{"protocol": {"background": [2, 0, 0]}}', None),
+        ('{"protocol": 3}', None),
+        ("[]", None),
+        ("{", None),
+    ],
+)
+def test_the_background_is_that_of_the_report(tmp_path, report, background):
+    (tmp_path / "report.json").write_text(report)
+    assert background_beside(tmp_path / "scene.ply") == background
 
 
 def test_a_fit_writes_it(browser, tmp_path):

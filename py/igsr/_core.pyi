@@ -189,6 +189,7 @@ def time_pipeline(
 NEAR_PLANE: float  # splats nearer than this are culled, world units
 FAR_PLANE: float  # splats farther than this are culled, world units
 EPS2D: float  # variance in square pixels added to every projected Gaussian
+JACOBIAN_MARGIN: float  # part of tan(fov / 2) beyond each edge at which x/z and y/z are clamped
 ALPHA_MIN: float  # a pair fainter than this contributes nothing
 ALPHA_MAX: float  # no pair is more opaque than this
 TRANSMITTANCE_MIN: float  # a pixel stops before its transmittance falls below this
@@ -309,6 +310,9 @@ def write_splats(path: str, splats: dict[str, Any]) -> list[str]:
     Returns a message for each thing that the format cannot hold. Raises OSError where the file
     cannot be written.
     """
+
+def morton_order(points: Float32) -> npt.NDArray[np.int64]:
+    """Ids of points [N, 3] along Morton's curve, as the writers order splats."""
 
 def write_exr(path: str, color: Float32, alpha: Float32, depth: Float32) -> None:
     """Write channels R, G, B, A, Z of [H, W] in 32-bit float.

@@ -35,6 +35,7 @@ mod _core {
         module.add("NEAR_PLANE", constants::NEAR)?;
         module.add("FAR_PLANE", constants::FAR)?;
         module.add("EPS2D", constants::BLUR)?;
+        module.add("JACOBIAN_MARGIN", constants::JACOBIAN_MARGIN)?;
         module.add("ALPHA_MIN", constants::ALPHA_MIN)?;
         module.add("ALPHA_MAX", constants::ALPHA_MAX)?;
         module.add("TRANSMITTANCE_MIN", constants::TRANSMITTANCE_MIN)?;
@@ -55,7 +56,7 @@ mod _core {
     #[pymodule_export]
     use crate::plane_sweep::plane_sweep;
     #[pymodule_export]
-    use crate::splat_files::{read_splats, write_splats};
+    use crate::splat_files::{morton_order, read_splats, write_splats};
     #[pymodule_export]
     use crate::stages::{project, project_backward, rasterize, rasterize_backward};
 }

@@ -2,12 +2,13 @@
 
 use std::path::PathBuf;
 
+use numpy::{IntoPyArray, PyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use splat_render::io::SplatFile;
 
-use crate::arrays::{row, shaped};
+use crate::arrays::{array, row, rows, shaped};
 use crate::error::to_python;
 use crate::splat_arrays::{set_splat_arrays, splat_arrays_from};
 
@@ -41,4 +42,17 @@ pub fn write_splats(
         antialiased: entry("antialiased")?.extract()?,
     };
     py.detach(|| splat_render::io::write_splats(&path, &file)).map_err(to_python)
+}
+
+/// Ids of points, N x 3, along Morton's curve, as the writers order splats.
+#[pyfunction]
+pub fn morton_order<'py>(
+    py: Python<'py>,
+    points: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyArray1<i64>>> {
+    let points = array::<f32>("points", points)?;
+    let points = rows::<f32, 3>("points", &points, &[-1])?;
+    let ids = py.detach(|| splat_render::io::morton_order(points));
+    let ids: Vec<i64> = ids.into_iter().map(|id| id as i64).collect();
+    Ok(ids.into_pyarray(py))
 }

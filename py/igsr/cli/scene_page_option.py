@@ -29,7 +29,7 @@ def write_page(
 ) -> bool:
     """Write ``scene.html`` with the cameras of the train views; whether it was written.
 
-    A model that the page cannot hold is named in a ``UserWarning``: the fit itself stands.
+    What the page cannot hold is named in a ``UserWarning``: the fit itself stands.
 
     Args:
         out: the folder.
@@ -43,8 +43,11 @@ def write_page(
     cameras = [PageCamera(view.name, view.camera) for view in capture.train_views]
     color = default_background(capture) if background is None else background
     try:
-        write_scene_page(out / PAGE, splats, cameras, color, out.resolve().name or "scene")
+        title = out.resolve().name or "scene"
+        notes = write_scene_page(out / PAGE, splats, cameras, color, title)
     except IgsrError as error:
         warnings.warn(f"{PAGE} is not written: {error}", stacklevel=2)
         return False
+    for note in notes:
+        warnings.warn(f"{PAGE}: {note}", stacklevel=2)
     return True

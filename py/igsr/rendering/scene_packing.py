@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from igsr import _core
 from igsr.splats import Splats
 
 #: Models with more splats share rows of spherical harmonics.
@@ -68,10 +69,10 @@ def packed_model(splats: Splats, radius: float) -> tuple[bytes, int, list[str]]:
     count = len(opacities)
     if palette is not None:
         _, (*_, rows), clipped = _spz_arrays(palette)
-        more += [note for note in clipped if "SH" in note]
+        more += clipped
     fraction = int(header[13])
     fixed, dropped = _coarser(_integers(positions), fraction, radius)
-    order = np.argsort(_morton(fixed), kind="stable")
+    order = _core.morton_order(np.ascontiguousarray(fixed, np.float32))
     if palette is None:
         rows = rows[order]
     else:
@@ -102,17 +103,22 @@ def _through_sog(splats: Splats) -> tuple[Splats, list[str]]:
 
 
 def _palette(splats: Splats) -> tuple[Splats, npt.NDArray[np.uint16]]:
-    """One splat for each different row of spherical harmonics, and each splat's row."""
+    """One splat for each different row of spherical harmonics, and each splat's row.
+
+    All else of these splats is zero, so that writing them tells nothing but of the rows.
+    """
     rows = np.ascontiguousarray(splats.sh[:, 1:]).reshape(len(splats), -1)
     as_bytes = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()
     _, first, numbers = np.unique(as_bytes, return_index=True, return_inverse=True)
     assert len(first) <= PALETTE_MOST
+    sh = splats.sh[first]
+    sh[:, 0] = 0.0
     chosen = Splats(
-        means=splats.means[first],
-        quats=splats.quats[first],
-        scales=splats.scales[first],
-        opacities=splats.opacities[first],
-        sh=splats.sh[first],
+        means=np.zeros((len(first), 3), np.float32),
+        quats=np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(first), 1)),
+        scales=np.zeros((len(first), 3), np.float32),
+        opacities=np.zeros(len(first), np.float32),
+        sh=sh,
     )
     return chosen, numbers.astype(np.uint16)
 
@@ -148,20 +154,6 @@ def _coarser(
     steps = radius * 2.0**fraction / STEPS_IN_RADIUS
     dropped = min(fraction, max(0, int(np.floor(np.log2(steps))) if steps > 0.0 else 0))
     return (fixed + ((1 << dropped) >> 1)) >> dropped, dropped
-
-
-def _morton(fixed: npt.NDArray[np.int64]) -> npt.NDArray[np.uint64]:
-    """Places along Morton's curve; the lowest bits do not matter."""
-    places = np.zeros(len(fixed), np.uint64)
-    if len(fixed) == 0:
-        return places
-    shifted = fixed - fixed.min(axis=0)
-    shifted >>= max(0, int(shifted.max()).bit_length() - 21)
-    for bit in range(21):
-        for axis in range(3):
-            digit = (shifted[:, axis] >> bit & 1).astype(np.uint64)
-            places |= digit << np.uint64(3 * bit + axis)
-    return places
 
 
 def _zigzag(differences: npt.NDArray[np.int64]) -> Bytes:

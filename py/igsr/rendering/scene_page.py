@@ -45,8 +45,6 @@ SHADERS = {
     "presentVertex": "present.vert",
     "presentFragment": "present.frag",
 }
-#: Part of tan(fov / 2) beyond each edge that limits the Jacobian, as the renderer's.
-JACOBIAN_MARGIN = 0.3
 #: Near plane of small scenes, in their radii, as in splat-view.
 NEAR_PART = 0.05
 #: Up axis of scenes without cameras, as COLMAP's and INRIA's scenes have it.
@@ -144,14 +142,15 @@ def _described(
             "BLUR": _core.EPS2D,
             "ALPHA_MIN": _core.ALPHA_MIN,
             "ALPHA_MAX": _core.ALPHA_MAX,
-            "JACOBIAN_MARGIN": JACOBIAN_MARGIN,
+            "JACOBIAN_MARGIN": _core.JACOBIAN_MARGIN,
         },
         "shaders": {name: _part(file) for name, file in SHADERS.items()},
     }
 
 
 def _camera(one: PageCamera) -> dict[str, Any]:
-    K, camera = one.camera.K, one.camera
+    camera = one.camera
+    K = camera.K
     lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height]
     return {
         "name": one.name,

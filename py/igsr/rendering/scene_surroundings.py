@@ -54,8 +54,10 @@ def background_beside(scene: Path) -> tuple[float, float, float] | None:
     """
     try:
         report = json.loads((scene.parent / REPORT).read_bytes())
-        red, green, blue = (float(channel) for channel in report["protocol"]["background"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        # A refinement's report has the protocol of its last scores alone.
+        protocol = report.get("protocol") or report["test"]["protocol"]
+        red, green, blue = (float(channel) for channel in protocol["background"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     in_range = all(0.0 <= channel <= 1.0 for channel in (red, green, blue))
     return (red, green, blue) if in_range else None

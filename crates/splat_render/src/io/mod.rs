@@ -28,6 +28,7 @@ mod spz;
 pub use atomic::write_atomically;
 pub use exr::{ExrPicture, encode_exr, write_exr};
 pub use format::Format;
+pub use morton::morton_order;
 pub use splat_file::{Loaded, SplatFile};
 
 use std::fs::File;

@@ -24,7 +24,7 @@ class Gestures {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("dblclick", (event) => viewer.focus(event.clientX, event.clientY));
-    window.addEventListener("keydown", (event) => this.press_key(event));
+    window.addEventListener("keydown", (event) => this.pressKey(event));
     window.addEventListener("keyup", (event) => this.down.delete(event.code));
     window.addEventListener("blur", () => this.down.clear());
   }
@@ -77,7 +77,7 @@ class Gestures {
     else viewpoint.zoom(factor);
   }
 
-  press_key(event) {
+  pressKey(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
     const moves = /^(Key[WASDQE]|Arrow(Left|Right|Up|Down))$/.test(event.code);
     if (moves) {
