@@ -35,6 +35,7 @@ RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o
 demo: build
 	$(BIN)/igsr refine $(EXAMPLE) --photos 8 --out out/demo
 	@printf '%s\n' '' 'The demo wrote' \
+		'  out/demo/scene.html   the scene to turn, in a browser' \
 		'  out/demo/scene.ply    the splats: any splat viewer opens it' \
 		'  out/demo/report.html  what each round did, in a browser' \
 		'  out/demo/report.json  the scores on the held-out views' \
