@@ -117,5 +117,5 @@ def test_few_of_many_photos_are_counted(monkeypatch):
     given = {"steps": None}
     many = said(monkeypatch, seen, cameras_kept=True, given=given)[1]
     few = said(monkeypatch, seen, cameras_kept=True, given=given, photos=8)[1]
-    assert many.endswith("5000 steps.")
-    assert few.endswith("3344 steps.")
+    assert many.endswith("2500 steps.")
+    assert few.endswith("1672 steps.")

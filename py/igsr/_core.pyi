@@ -262,9 +262,10 @@ class Fitter:
             state: the initialization (``SplatArrays`` without origin), or what ``state()``
                 returned.
             config: steps, first_step (where in the schedule the fit begins), seed, sh_degree,
-                max_splats, density ("mcmc", "original", "fixed"), dropout, hull, background,
-                coarse_to_fine (the first steps are on photos of a fraction of their size); poses
-                ("fixed", "joint"), focal ("fixed", "shared", "per-camera"), camera_rate (pixels per
+                max_splats, density ("mcmc", "original", "fixed"), learning_rate (what the first
+                half of the steps multiplies rates by), dropout, hull, background, coarse_to_fine
+                (the first steps are on photos of a fraction of their size); poses ("fixed",
+                "joint"), focal ("fixed", "shared", "per-camera"), camera_rate (pixels per
                 step), camera_decay, camera_warm_up (fraction of the steps), frozen (splats are not
                 changed), exposures (whether gains and offsets of the photos are fitted). An absent
                 or None entry takes the default.

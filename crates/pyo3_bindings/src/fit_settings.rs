@@ -56,6 +56,7 @@ pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
         hull: setting(config, "hull")?.unwrap_or(default.hull),
         coarse_to_fine: setting(config, "coarse_to_fine")?.unwrap_or(default.coarse_to_fine),
         rates: if frozen { Rates::ZERO } else { default.rates },
+        rate_scale: setting(config, "learning_rate")?.unwrap_or(default.rate_scale),
         cameras,
         exposures: setting(config, "exposures")?.unwrap_or(default.exposures),
         ..default

@@ -30,6 +30,7 @@ pub mod fit;
 pub mod fit_device;
 pub mod gpu;
 pub mod io;
+mod morton;
 pub mod reference;
 pub mod sh;
 pub mod splats;

@@ -9,7 +9,7 @@ use std::path::Path;
 /// Top-level modules from the lowest layer to the highest. Modules of one layer do not know each
 /// other.
 const LAYERS: [&[&str]; 7] = [
-    &["constants", "error"],
+    &["constants", "error", "morton"],
     &["camera", "sh"],
     &["splats", "target"],
     &["stages"],

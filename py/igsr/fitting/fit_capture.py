@@ -78,6 +78,7 @@ def fit(
     max_splats: int | None = None,
     sh_degree: int | None = None,
     density: Density | None = None,
+    learning_rate: float | None = None,
     dropout: float | None = None,
     coarse_to_fine: bool | None = None,
     hull: bool | None = None,
@@ -114,6 +115,9 @@ def fit(
         sh_degree: degree of the spherical harmonics of colors, 0-4.
         density: how splats are added and removed: "mcmc" (relocation and growth up to the maximum,
             Kheradmand et al. 2024), "original" (clone, split, prune, Kerbl et al. 2023), "fixed".
+        learning_rate: what the first half of the steps multiplies the learning rates of 3DGS by; it
+            falls to 1 in the second half. None: the default preset's is the square root of 30 000,
+            the steps that those rates are for, over ``steps``.
         dropout: fraction of the splats that a step leaves out at random, growing from 0 in the
             first step to this in the last, while the others' opacities are raised to make up for it
             (DropGaussian, Park et al. 2025); 0 to 0.9. Against overfitting few photos.
@@ -328,5 +332,8 @@ def _settings_from_splats(
         )
     if splats.antialiased:
         raise IgsrError("start has antialiased splats, which igsr does not fit; give others.")
-    whole = max(settings.steps, settings_for(preset, photos, quality).steps)
+    usual = settings_for(preset, photos, quality)
+    whole = max(settings.steps, usual.steps)
+    if given.get("learning_rate") is None and whole == usual.steps:
+        settings = replace(settings, learning_rate=usual.learning_rate)
     return replace(settings, steps=whole, first_step=whole - settings.steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -31,8 +32,12 @@ WIDE_APART = 7.0
 #: From so many photos of the same place on, view-dependent color is more than a way to overfit.
 SH2_PHOTOS = 12.0
 #: Steps of any fit, and more for each photo, up to a most; but for few photos only so many each.
-STEPS, STEPS_MORE, MOST_STEPS = 3200, 18, 5000
-STEPS_PER_PHOTO = 500
+STEPS, STEPS_MORE, MOST_STEPS = 1600, 9, 2500
+STEPS_PER_PHOTO = 250
+#: 3DGS's learning rates are for this many steps. With ``n`` times fewer, rates ``sqrt(n)`` times as
+#: large reach more than theirs do; above ``MOST_LEARNING_RATE`` splats overshoot.
+RATE_STEPS = 30_000
+MOST_LEARNING_RATE = 3.0
 #: Most splats per pixel of one photo, times this power of the photos over ``FEW``: more photos show
 #: more of a scene, but not as many times more. With more splats, few photos are only overfitted.
 SPLATS_PER_PIXEL = 0.11
@@ -136,7 +141,15 @@ def settings_for(
     base = {"default": _default(support, quality), "3dgs": _3DGS, "instantsplat": _INSTANTSPLAT}[
         preset
     ]
-    return replace(base, **checked_given(FitSettings, given))
+    given = checked_given(FitSettings, given)
+    if preset == "default" and "steps" in given:
+        base = replace(base, learning_rate=learning_rate_for(given["steps"]))
+    return replace(base, **given)
+
+
+def learning_rate_for(steps: int) -> float:
+    """What so many steps multiply 3DGS's learning rates by: the more, the fewer they are."""
+    return round(min(MOST_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps))), 2)
 
 
 def _default(support: PhotoSupport, quality: Quality) -> FitSettings:
@@ -146,9 +159,11 @@ def _default(support: PhotoSupport, quality: Quality) -> FitSettings:
     steps = more_steps * min(MOST_STEPS, STEPS + STEPS_MORE * support.photos)
     splats = SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** SPLATS_POWER
     splats = max(splats, min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * support.pixels))
+    steps = round(min(steps, more_steps * STEPS_PER_PHOTO * support.photos))
     return replace(
         _DEFAULT,
-        steps=round(min(steps, more_steps * STEPS_PER_PHOTO * support.photos)),
+        steps=steps,
+        learning_rate=learning_rate_for(steps),
         max_splats=max(1000, min(MOST_SPLATS, round(more_splats * splats))),
         sh_degree=2 if support.seen_by >= SH2_PHOTOS else 1,
         density="mcmc" if support.apart > WIDE_APART else "original",

@@ -74,6 +74,14 @@ class FitSettings:
             aliases=("strategy",),
         )
     )
+    learning_rate: float = field(
+        default=1.0,
+        metadata=about(
+            "What the first half of the steps multiplies the learning rates of 3DGS by; in the "
+            "second half it falls to 1. Short fits need larger steps.",
+            limits=(0.01, 100.0),
+        ),
+    )
     dropout: float = field(
         metadata=about(
             "Fraction of the splats that a step leaves out at random, 0 to 0.9. It grows from 0 "

@@ -104,7 +104,14 @@ class Stages:
         )
         self._fit_settings = {
             name: preset[name]
-            for name in ("steps", "sh_degree", "density", "dropout", "coarse_to_fine")
+            for name in (
+                "steps",
+                "sh_degree",
+                "density",
+                "learning_rate",
+                "dropout",
+                "coarse_to_fine",
+            )
         }
         self._max_splats = int(preset["max_splats"])
 

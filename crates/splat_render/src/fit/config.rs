@@ -38,7 +38,7 @@ pub struct FitConfig {
     pub seed: u64,
     /// Degree of SH fitted, 0..=4.
     pub sh_degree: u32,
-    /// Steps after which the degree in use grows by one.
+    /// Steps after which the degree in use grows by one; at most a fifth of all steps.
     pub sh_interval: u32,
     /// Most splats there may be.
     pub max_splats: usize,
@@ -48,8 +48,12 @@ pub struct FitConfig {
     pub background: Background,
     /// Weight of D-SSIM in the loss.
     pub ssim_weight: f32,
-    /// Adam's rates at the start; that of the centres in units of the scene's extent.
+    /// Adam's rates at the end; that of the centres before `means_decay`, in units of the scene's
+    /// extent.
     pub rates: Rates,
+    /// What the first half of the steps multiplies all rates by; the factor then falls to 1, but for
+    /// the centres, whose rate decays by itself. See [`FitConfig::rates_at`].
+    pub rate_scale: f32,
     /// Part of the splats that a step leaves out at random, growing from none in the first step to
     /// this in the last (DropGaussian).
     pub dropout: f32,
@@ -86,6 +90,7 @@ impl Default for FitConfig {
                 sh0: 2.5e-3,
                 sh_rest: 2.5e-3 / 20.0,
             },
+            rate_scale: 1.0,
             dropout: 0.0,
             hull: false,
             cameras: None,
@@ -103,6 +108,9 @@ const MOST_HALVINGS: u32 = 3;
 /// Part of the steps after which photos have their whole size.
 const COARSE_UNTIL: f64 = 0.3;
 
+/// Steps until density control first runs, and from one run to the next, at most.
+const REFINE: (u32, u32) = (300, 100);
+
 impl FitConfig {
     /// What both sides of photos are divided by in a step, from 0: a power of two, each for as many
     /// steps as the next, and 1 in the last seven tenths of all steps.
@@ -119,6 +127,43 @@ impl FitConfig {
         }
         let done = (progress / COARSE_UNTIL * f64::from(halvings)) as u32;
         1 << halvings.saturating_sub(done)
+    }
+
+    /// Adam's rates in a step, from 0, of a scene of this extent.
+    ///
+    /// 3DGS's rates are for 30 000 steps. In a fit of a tenth of these, splats do not get to where
+    /// they belong: larger steps take them there, and small ones at the end settle them.
+    pub fn rates_at(&self, step: u32, extent: f32) -> Rates {
+        let progress = f64::from(step) / f64::from(self.steps);
+        let decay = f64::from(self.means_decay).powf(progress) as f32;
+        let scale = self.rate_scale;
+        let settling = scale.powf((2.0 - 2.0 * progress).min(1.0) as f32);
+        let Rates { means, quats, scales, opacities, sh0, sh_rest } = self.rates;
+        Rates {
+            means: means * extent * decay * scale,
+            quats: quats * settling,
+            scales: scales * settling,
+            opacities: opacities * settling,
+            sh0: sh0 * settling,
+            sh_rest: sh_rest * settling,
+        }
+    }
+
+    /// Degree of SH in use in a step, from 0.
+    pub fn sh_degree_at(&self, step: u32) -> u32 {
+        if self.rates == Rates::ZERO {
+            return self.sh_degree;
+        }
+        let interval = self.sh_interval.min(self.steps.div_ceil(5));
+        (step / interval).min(self.sh_degree)
+    }
+
+    /// The step that density control first runs after, and how many lie between two runs: those of
+    /// 3DGS, but short fits are looked at as often as long ones, as long as photos have their turns
+    /// in between.
+    pub fn refine_steps(&self) -> (u32, u32) {
+        let (start, every) = REFINE;
+        ((self.steps / 10).clamp(start / 4, start), (self.steps / 30).clamp(every / 4, every))
     }
 
     /// Checks every setting.
@@ -149,6 +194,9 @@ impl FitConfig {
         if !rates.iter().all(|r| r.is_finite() && *r >= 0.0) {
             return Err(Error::argument("rates", "must be finite and not negative"));
         }
+        if !(self.rate_scale > 0.0 && self.rate_scale.is_finite()) {
+            return Err(Error::argument("rate_scale", "must be finite and above 0"));
+        }
         if !(0.0..=0.9).contains(&self.dropout) {
             return Err(Error::argument("dropout", "must lie in 0..=0.9"));
         }
@@ -170,6 +218,33 @@ impl FitConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn rates_are_scaled_at_first_and_those_of_3dgs_at_the_end() {
+        let plain = FitConfig { steps: 1000, ..FitConfig::default() };
+        let config = FitConfig { rate_scale: 4.0, ..plain.clone() };
+        for (step, scale) in [(0, 4.0), (500, 4.0), (750, 2.0), (1000, 1.0)] {
+            let (base, rates) = (plain.rates_at(step, 3.0), config.rates_at(step, 3.0));
+            let close = |a: f32, b: f32| assert!((a / b - 1.0).abs() < 1e-5, "{step}: {a} {b}");
+            close(rates.means, 4.0 * base.means);
+            close(rates.quats, scale * base.quats);
+            close(rates.scales, scale * base.scales);
+            close(rates.opacities, scale * base.opacities);
+            close(rates.sh0, scale * base.sh0);
+            close(rates.sh_rest, scale * base.sh_rest);
+        }
+        assert_eq!(plain.rates_at(400, 1.0).opacities, plain.rates.opacities);
+    }
+
+    #[test]
+    fn short_fits_are_looked_at_as_often_as_long_ones() {
+        let of = |steps| FitConfig { steps, ..FitConfig::default() };
+        let runs: Vec<_> = [1, 900, 3000, 7000].map(|steps| of(steps).refine_steps()).into();
+        assert_eq!(runs, [(75, 25), (90, 30), (300, 100), (300, 100)]);
+        let degrees = |steps: u32, at: [u32; 4]| at.map(|step| of(steps).sh_degree_at(step));
+        assert_eq!(degrees(7000, [999, 1000, 1999, 2000]), [0, 1, 1, 2]);
+        assert_eq!(degrees(1000, [199, 200, 399, 400]), [0, 1, 1, 2]);
+    }
 
     #[test]
     fn photos_grow_to_their_whole_size() {

@@ -18,12 +18,11 @@ use super::hull::Hull;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::fit_device::{FitDevice, FitState, StepInput};
-use crate::stages::{Exposure, Rates};
+use crate::morton::morton_order;
+use crate::stages::Exposure;
 use crate::target::Target;
 
-/// Density control starts after this many steps and then runs every so many.
-const REFINE: (u32, u32) = (300, 100);
-/// Part of all steps after which it runs no more (MCMC; original).
+/// Part of all steps after which density control runs no more (MCMC; original).
 const REFINE_STOP: (f64, f64) = (0.85, 0.5);
 /// Part of all steps after which MCMC has as many splats as there may be.
 const MCMC_GROWN: f64 = 0.5;
@@ -342,19 +341,14 @@ impl Fitter {
             }
         };
         let progress = f64::from(step) / f64::from(config.steps);
-        let decay = f64::from(config.means_decay).powf(progress) as f32;
-        let rates = Rates { means: config.rates.means * self.extent * decay, ..config.rates };
+        let rates = config.rates_at(step, self.extent);
         let mcmc = config.density == DensityControl::Mcmc;
         let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();
         let input = StepInput {
             view,
             camera: self.camera(view),
             background,
-            sh_degree: if config.rates == Rates::ZERO {
-                config.sh_degree
-            } else {
-                (step / config.sh_interval).min(config.sh_degree)
-            },
+            sh_degree: config.sh_degree_at(step),
             rates,
             step: step - config.first_step + 1,
             ssim_weight: config.ssim_weight,
@@ -396,7 +390,7 @@ impl Fitter {
 
     fn control_density(&mut self) -> Result<()> {
         let (step, config) = (self.step, &self.config);
-        let (start, every) = REFINE;
+        let (start, every) = config.refine_steps();
         let stop = match config.density {
             DensityControl::Mcmc => REFINE_STOP.0,
             DensityControl::Original => REFINE_STOP.1,
@@ -432,6 +426,11 @@ impl Fitter {
             }
             if reset {
                 density::reset_opacities(state);
+            }
+            if refine {
+                // Neighbours in space are neighbours in memory: tiles and pairs of splats then are
+                // near each other, too.
+                state.select(&morton_order(&state.splats.means));
             }
             *splats = state.splats.len();
         })

@@ -7,7 +7,6 @@ use std::io::{BufRead, Read};
 
 use super::bytes::{Bytes, Named, f32_at, u32_at};
 use super::limits;
-use super::morton::morton_order;
 use super::ply_header::{Element, Header, Kind, write_comments};
 use super::prepare::{Room, prepare, say_clipped};
 use super::quantize::{
@@ -15,6 +14,7 @@ use super::quantize::{
 };
 use super::{Format, Loaded, SplatFile};
 use crate::error::Result;
+use crate::morton::morton_order;
 use crate::sh;
 use crate::splats::SplatArrays;
 

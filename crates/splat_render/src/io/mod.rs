@@ -14,7 +14,6 @@ mod frame;
 mod gltf;
 mod ksplat;
 mod limits;
-mod morton;
 mod ply;
 mod ply_header;
 mod prepare;
@@ -25,10 +24,10 @@ mod splat;
 mod splat_file;
 mod spz;
 
+pub use crate::morton::morton_order;
 pub use atomic::write_atomically;
 pub use exr::{ExrPicture, encode_exr, write_exr};
 pub use format::Format;
-pub use morton::morton_order;
 pub use splat_file::{Loaded, SplatFile};
 
 use std::fs::File;

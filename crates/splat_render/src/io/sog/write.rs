@@ -7,9 +7,9 @@ use super::palette::palette;
 use super::{META, PALETTE_COLUMNS, ROTATION_TAG, SH_DEGREE};
 use crate::error::Result;
 use crate::io::SplatFile;
-use crate::io::morton::morton_order;
 use crate::io::prepare::{Room, prepare, unfit};
 use crate::io::quantize::{SmallestThree, opacity_byte, to_f64, unit_byte};
+use crate::morton::morton_order;
 use crate::splats::SplatArrays;
 
 const ROOM: Room = Room { name: ".sog", sh_degree: SH_DEGREE, origin: false, antialiased: true };

@@ -1,5 +1,5 @@
-//! Splats in an order in which neighbours in space are neighbours in the file: formats that pack
-//! runs of splats against the run's own bounds, or as images, gain by it.
+//! Splats in an order in which neighbours in space are neighbours in memory or in a file. Fits gain by
+//! it, and so do formats that pack runs of splats against the run's own bounds, or as images.
 
 /// Bits per axis of the cells that are ordered.
 const BITS: u32 = 20;
