@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from igsr.fitting import presets
 from igsr.fitting.initialization.initial_splats import chosen_start, initial_splats
 from igsr.fitting.photo_support import PhotoSupport, support_of
 from igsr.fitting.presets import preset_settings, settings_for
+from igsr.fitting.settings import FitSettings
 
 
 @pytest.fixture(scope="module")
@@ -276,3 +278,21 @@ def test_a_photo_that_is_held_out_has_no_part_in_first_splats():
     assert len(splats) == (counts >= 2).sum()
     untold = Points(xyz, points.rgb, tracks=Tracks([], *(tracks.view[:0],) * 2, tracks.xy[:0]))
     assert untold.seen_by([]) is untold
+
+
+def test_settings_that_presets_decide_have_no_default():
+    """The command would hand such a default on as if it had been asked for."""
+    defaults = {
+        one.name
+        for one in dataclasses.fields(FitSettings)
+        if one.default is not dataclasses.MISSING
+    }
+    assert defaults == {"seed", "background", "first_step"}
+
+
+def test_short_fits_take_larger_steps_and_baselines_do_not():
+    rates = [settings_for("default", 8, steps=n).learning_rate for n in (10, 7500, 30_000, 90_000)]
+    assert rates == [3.0, 2.0, 1.0, 1.0]
+    assert settings_for("default", 8).learning_rate == presets.MOST_LEARNING_RATE
+    assert settings_for("default", 8, learning_rate=1.5).learning_rate == 1.5
+    assert {settings_for(name, 8).learning_rate for name in ("3dgs", "instantsplat")} == {1.0}

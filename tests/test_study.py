@@ -33,6 +33,7 @@ SHORT = FitSettings(
     hull=False,
     start="random",
     coarse_to_fine=False,
+    learning_rate=1.0,
     poses="fixed",
     focal="fixed",
     exposure="off",

@@ -75,7 +75,6 @@ class FitSettings:
         )
     )
     learning_rate: float = field(
-        default=1.0,
         metadata=about(
             "What the first half of the steps multiplies the learning rates of 3DGS by; in the "
             "second half it falls to 1. Short fits need larger steps.",
