@@ -136,7 +136,7 @@ def test_photos_in_a_folder_of_their_own_are_no_further_scene(tmp_path):
 def test_the_study(data, tmp_path, monkeypatch, igsr_here):
     assert scenes_in(data) == ("ball", "more/cube")
     short = replace(presets.settings_for("default", 8), steps=20, max_splats=200)
-    monkeypatch.setattr(presets, "_default", lambda support, quality: short)
+    monkeypatch.setattr(presets, "_default", lambda *_: short)
     monkeypatch.setattr(denoiser_comparison, "SHIPPED", tmp_path / "same.safetensors")
     weights(tmp_path / "same.safetensors")
     dark = weights(tmp_path / "dark.safetensors", brighter=-0.2)
@@ -180,7 +180,7 @@ def test_the_study(data, tmp_path, monkeypatch, igsr_here):
 
 def test_a_fit_of_other_photos_is_not_taken_for_done(tmp_path, monkeypatch):
     short = replace(presets.settings_for("default", 8), steps=5, max_splats=50)
-    monkeypatch.setattr(presets, "_default", lambda support, quality: short)
+    monkeypatch.setattr(presets, "_default", lambda *_: short)
     monkeypatch.setattr(degraded_fits, "PAPER_STEPS", 5)
     made = scenes.capture(views=6, size=24)
     scenes.write_capture(tmp_path / "data/ball", made)

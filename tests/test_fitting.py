@@ -65,14 +65,12 @@ def test_fit_repeats_itself_bit_for_bit(capture):
     assert not same(first, small_fit(capture, seed=1))
 
 
-def test_cpu_and_gpu_fit_alike(capture):
+# Until density control has run, rounding decides nothing; with splats that stay as many, it never
+# does.
+@pytest.mark.parametrize("options", [{"steps": 75}, {"steps": 200, "density": "fixed"}])
+def test_cpu_and_gpu_fit_alike(capture, options):
     scores = [
-        igsr.evaluate(
-            # Before density control and at 3DGS's rates: rounding has no room to grow in.
-            small_fit(capture, steps=200, backend=backend, density="fixed", learning_rate=1.0),
-            capture,
-            backend="cpu",
-        )
+        igsr.evaluate(small_fit(capture, backend=backend, **options), capture, backend="cpu")
         for backend in ("cpu", "gpu")
     ]
     assert abs(scores[0]["psnr"] - scores[1]["psnr"]) < 0.1

@@ -68,7 +68,7 @@ def test_views_of_a_run():
 @pytest.fixture
 def data(tmp_path, monkeypatch):
     short = replace(presets.settings_for("default", 8), max_splats=200)
-    monkeypatch.setattr(presets, "_default", lambda support, quality: short)
+    monkeypatch.setattr(presets, "_default", lambda *_: short)
     scenes.write_capture(tmp_path / "data/ball", ball(20))
     network = DenoiserNetwork(Architecture(4, (0, 0, 0)))
     with torch.no_grad():

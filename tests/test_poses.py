@@ -423,7 +423,7 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
         focal="fixed",
         exposure="off",
     )
-    monkeypatch.setattr(presets, "_default", lambda support, quality: short)
+    monkeypatch.setattr(presets, "_default", lambda *_: short)
     row = run_fit(str(data), PoseFit("ball", Noise("turn", 1.0), "joint", 0, "cpu"))
     assert row["before"]["rotation"] == pytest.approx(1.0, abs=0.2)
     assert set(row["refined"]) == {"psnr", "ssim", "flip"}

@@ -296,3 +296,10 @@ def test_short_fits_take_larger_steps_and_baselines_do_not():
     assert settings_for("default", 8).learning_rate == presets.MOST_LEARNING_RATE
     assert settings_for("default", 8, learning_rate=1.5).learning_rate == 1.5
     assert {settings_for(name, 8).learning_rate for name in ("3dgs", "instantsplat")} == {1.0}
+
+
+@pytest.mark.parametrize("joint", [{"poses": "joint"}, {"focal": "shared"}])
+def test_fits_of_cameras_take_more_and_smaller_steps(joint):
+    fixed, moving = settings_for("default", 20), settings_for("default", 20, **joint)
+    assert (moving.steps, moving.learning_rate) == (2 * fixed.steps, 1.0)
+    assert settings_for("default", 20, steps=700, **joint).learning_rate == 1.0

@@ -125,7 +125,7 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
     from igsr.fitting import presets
 
     short = replace(SHORT, steps=30, dropout=0.2, hull=True, start="auto")
-    monkeypatch.setattr(presets, "_default", lambda support, quality: short)
+    monkeypatch.setattr(presets, "_default", lambda *_: short)
     row = run_fit(blender.load_views, str(data), Fit("ball", "76", "default", 1, "cpu"))
     assert row["psnr"] > 10.0
     assert row["splats"] <= 300

@@ -116,8 +116,9 @@ def fit(
         density: how splats are added and removed: "mcmc" (relocation and growth up to the maximum,
             Kheradmand et al. 2024), "original" (clone, split, prune, Kerbl et al. 2023), "fixed".
         learning_rate: what the first half of the steps multiplies the learning rates of 3DGS by; it
-            falls to 1 in the second half. None: the default preset's is the square root of 30 000,
-            the steps that those rates are for, over ``steps``.
+            falls to 1 in the second half. The default preset's is the square root of 30 000, the
+            steps that those rates are for, over ``steps``, from 1 to 3, and 1 where cameras are
+            optimized.
         dropout: fraction of the splats that a step leaves out at random, growing from 0 in the
             first step to this in the last, while the others' opacities are raised to make up for it
             (DropGaussian, Park et al. 2025); 0 to 0.9. Against overfitting few photos.
@@ -332,8 +333,7 @@ def _settings_from_splats(
         )
     if splats.antialiased:
         raise IgsrError("start has antialiased splats, which igsr does not fit; give others.")
-    usual = settings_for(preset, photos, quality)
+    usual = settings_for(preset, photos, quality, **(given | {"steps": None}))
     whole = max(settings.steps, usual.steps)
-    if given.get("learning_rate") is None and whole == usual.steps:
-        settings = replace(settings, learning_rate=usual.learning_rate)
-    return replace(settings, steps=whole, first_step=whole - settings.steps)
+    schedule = settings_for(preset, photos, quality, **(given | {"steps": whole}))
+    return replace(schedule, first_step=whole - settings.steps)

@@ -38,6 +38,9 @@ STEPS_PER_PHOTO = 250
 #: large reach more than theirs do; above ``MOST_LEARNING_RATE`` splats overshoot.
 RATE_STEPS = 30_000
 MOST_LEARNING_RATE = 3.0
+#: Where cameras are optimized, fits have 3DGS's learning rates and so many times the steps: splats
+#: that move fast fit wrong cameras, and cameras move once in a round of the photos.
+JOINT_STEPS = 2
 #: Most splats per pixel of one photo, times this power of the photos over ``FEW``: more photos show
 #: more of a scene, but not as many times more. With more splats, few photos are only overfitted.
 SPLATS_PER_PIXEL = 0.11
@@ -89,7 +92,6 @@ _INSTANTSPLAT = replace(
     max_splats=60_000,
     sh_degree=1,
     density="fixed",
-    learning_rate=1.0,
     coarse_to_fine=False,
     poses="joint",
     focal="shared",
@@ -140,32 +142,37 @@ def settings_for(
     if preset not in PRESETS:
         raise IgsrError(f"preset must be one of {', '.join(PRESETS)}, not {preset!r}.")
     support = photos if isinstance(photos, PhotoSupport) else PhotoSupport.of_number(photos)
-    base = {"default": _default(support, quality), "3dgs": _3DGS, "instantsplat": _INSTANTSPLAT}[
-        preset
-    ]
     given = checked_given(FitSettings, given)
-    if preset == "default" and "steps" in given:
-        base = replace(base, learning_rate=learning_rate_for(given["steps"]))
+    joint = replace(_DEFAULT, **given).moves_cameras
+    default = _default(support, quality, given.get("steps"), joint)
+    base = {"default": default, "3dgs": _3DGS, "instantsplat": _INSTANTSPLAT}[preset]
     return replace(base, **given)
 
 
-def learning_rate_for(steps: int) -> float:
-    """What so many steps multiply 3DGS's learning rates by: the more, the fewer they are."""
-    return round(min(MOST_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps))), 2)
+def _default(
+    support: PhotoSupport, quality: Quality, steps: int | None, joint: bool
+) -> FitSettings:
+    """The default for these photos: one rule from few of them to many.
 
-
-def _default(support: PhotoSupport, quality: Quality) -> FitSettings:
-    """The default for these photos: one rule from few of them to many."""
+    Args:
+        support: what the photos tell.
+        quality: "draft", "normal" or "high".
+        steps: those asked for, if any are.
+        joint: whether cameras are optimized, too.
+    """
     dropout = min(MOST_DROPOUT, DROPOUT_PHOTOS / support.seen_by)
     _, more_steps, more_splats = _quality(quality)
-    steps = more_steps * min(MOST_STEPS, STEPS + STEPS_MORE * support.photos)
+    if steps is None:
+        photos = support.photos
+        usual = min(MOST_STEPS, STEPS + STEPS_MORE * photos, STEPS_PER_PHOTO * photos)
+        steps = round(more_steps * usual * (JOINT_STEPS if joint else 1))
+    rate = 1.0 if joint else min(MOST_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps)))
     splats = SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** SPLATS_POWER
     splats = max(splats, min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * support.pixels))
-    steps = round(min(steps, more_steps * STEPS_PER_PHOTO * support.photos))
     return replace(
         _DEFAULT,
         steps=steps,
-        learning_rate=learning_rate_for(steps),
+        learning_rate=round(rate, 2),
         max_splats=max(1000, min(MOST_SPLATS, round(more_splats * splats))),
         sh_degree=2 if support.seen_by >= SH2_PHOTOS else 1,
         density="mcmc" if support.apart > WIDE_APART else "original",
