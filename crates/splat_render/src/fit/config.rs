@@ -5,6 +5,9 @@ use crate::constants::SH_DEGREE_MAX;
 use crate::error::{Error, Result};
 use crate::stages::Rates;
 
+/// MCMC's noise on the centres, in units of 3DGS's rate (the paper's).
+const MCMC_NOISE: f32 = 5e5;
+
 /// How the number of splats is controlled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DensityControl {
@@ -149,6 +152,19 @@ impl FitConfig {
         }
     }
 
+    /// Size of MCMC's noise on centres in a step, from 0, of a scene of this extent; 0 elsewhere.
+    ///
+    /// It is in units of 3DGS's rate, not of the rate in use: noise explores, and where centres
+    /// take larger steps, as large noise leaves them beside what they show.
+    pub(super) fn noise_at(&self, step: u32, extent: f32) -> f32 {
+        match self.density {
+            DensityControl::Mcmc => {
+                MCMC_NOISE * self.rates_at(step, extent).means / self.rate_scale
+            }
+            _ => 0.0,
+        }
+    }
+
     /// Degree of SH in use in a step, from 0.
     pub fn sh_degree_at(&self, step: u32) -> u32 {
         if self.rates == Rates::ZERO {
@@ -234,6 +250,16 @@ mod tests {
             close(rates.sh_rest, scale * base.sh_rest);
         }
         assert_eq!(plain.rates_at(400, 1.0).opacities, plain.rates.opacities);
+    }
+
+    #[test]
+    fn noise_is_that_of_3dgs_at_every_rate() {
+        let of = |density, rate_scale| {
+            FitConfig { steps: 100, density, rate_scale, ..FitConfig::default() }.noise_at(50, 2.0)
+        };
+        let noise = of(DensityControl::Mcmc, 1.0);
+        assert!(noise > 0.0 && (of(DensityControl::Mcmc, 3.0) / noise - 1.0).abs() < 1e-6);
+        assert_eq!(of(DensityControl::Original, 3.0), 0.0);
     }
 
     #[test]

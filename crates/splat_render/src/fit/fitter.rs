@@ -28,8 +28,8 @@ const REFINE_STOP: (f64, f64) = (0.85, 0.5);
 const MCMC_GROWN: f64 = 0.5;
 /// Steps between two opacity resets of the original control.
 const RESET_EVERY: u32 = 3000;
-/// MCMC's pull on opacities and scales and its noise in units of the centres' rate (the paper's).
-const MCMC: (f32, f32, f32) = (0.01, 0.01, 5e5);
+/// MCMC's pull on opacities and scales (the paper's).
+const MCMC_PULL: (f32, f32) = (0.01, 0.01);
 
 /// What a draw is for; part of its seed.
 #[derive(Clone, Copy)]
@@ -352,9 +352,9 @@ impl Fitter {
             rates,
             step: step - config.first_step + 1,
             ssim_weight: config.ssim_weight,
-            opacity_regularizer: if mcmc { MCMC.0 } else { 0.0 },
-            scale_regularizer: if mcmc { MCMC.1 } else { 0.0 },
-            noise: if mcmc { MCMC.2 * rates.means } else { 0.0 },
+            opacity_regularizer: if mcmc { MCMC_PULL.0 } else { 0.0 },
+            scale_regularizer: if mcmc { MCMC_PULL.1 } else { 0.0 },
+            noise: config.noise_at(step, self.extent),
             dropout: config.dropout * progress as f32,
             noise_seed,
             exposure: self
