@@ -19,7 +19,7 @@ from igsr._internal.settings import settings_of
 ROOMS = (
     *("igsr", "igsr.capture", "igsr.geometry", "igsr.rendering", "igsr.evaluation", "igsr.pose"),
     *("igsr.fitting", "igsr.denoiser", "igsr.denoiser.training", "igsr.refinement"),
-    *("igsr.compaction", "igsr.benchmark"),
+    *("igsr.compaction", "igsr.benchmark", "igsr.floaters"),
 )
 SECTIONS = ("Args", "Attributes", "Raises", "Returns", "Yields")
 

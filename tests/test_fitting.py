@@ -128,10 +128,11 @@ def test_masked_pixels_do_not_reach_the_fit(capture):
         return igsr.Capture(capture.path, views)
 
     # The photo's own surroundings reach the fit through nothing but SSIM's window.
-    start = small_fit(masked(0), steps=30, density="fixed")
-    other = small_fit(masked(255), steps=30, density="fixed")
+    options = {"steps": 30, "density": "fixed", "remove_floaters": False}
+    start = small_fit(masked(0), **options)
+    other = small_fit(masked(255), **options)
     unmasked = [dataclasses.replace(view, mask=None) for view in masked(255).views]
-    spoiled = small_fit(igsr.Capture(capture.path, unmasked), steps=30, density="fixed")
+    spoiled = small_fit(igsr.Capture(capture.path, unmasked), **options)
     inside = np.abs(start.means - other.means).max()
     assert inside < 0.2 * np.abs(start.means - spoiled.means).max()
 
@@ -175,13 +176,14 @@ def test_points_are_where_splats_start(capture):
         moved.append(
             dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat))
         )
-    splats = small_fit(igsr.Capture(capture.path, moved, points), density="fixed")
+    options = {"density": "fixed", "remove_floaters": False}
+    splats = small_fit(igsr.Capture(capture.path, moved, points), **options)
     assert len(splats) == 400  # the cap
     # A million units away, float32 alone could not place a splat within a 1/16 unit.
     assert np.linalg.norm(splats.origin - far) < 1
     near = [dataclasses.replace(view) for view in capture.views]
     close = igsr.Points(points.xyz - far, points.rgb)
-    at_zero = small_fit(igsr.Capture(capture.path, near, close), density="fixed")
+    at_zero = small_fit(igsr.Capture(capture.path, near, close), **options)
     scores = [
         igsr.evaluate(s, c)["psnr"]
         for s, c in (

@@ -119,6 +119,7 @@ def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
     igsr.fit(capture, steps=3, backend="cpu", checkpoint=tmp_path / "a.npz")
     _, settings = load_checkpoint(tmp_path / "a.npz")
     expected = preset_settings("default", support_of(capture.train_views), steps=3)
+    del expected["remove_floaters"]  # nothing of it reaches the checkpoint
     assert {name: settings[name] for name in expected} == expected
 
 
@@ -182,7 +183,7 @@ def outside_hull(splats, capture):
 
 
 def test_splats_outside_the_hull_are_removed(capture):
-    options = {"start": "random", "density": "fixed", "steps": 400}
+    options = {"start": "random", "density": "fixed", "steps": 400, "remove_floaters": False}
     assert outside_hull(fit(capture, hull=False, **options), capture) > 50
     kept = fit(capture, hull=True, **options)
     assert len(kept) > 20

@@ -46,12 +46,15 @@ def test_rounds_that_help_are_accepted_and_make_views_better(helped):
 
 def test_a_round_helps_with_as_many_steps_on_photos_as_igsr_has(ball_photos, helped, monkeypatch):
     monkeypatch.setattr(fitter, "PHOTO_STEPS", SHIPPED_PHOTO_STEPS)
-    refined = refine(ball_photos, 1, truthful)
-    assert same(refined.first, helped[0].first)
-    (one,) = refined.rounds
-    assert one.accepted
-    assert not same(refined.splats, helped[0].rounds[0].splats)
-    assert one.test["psnr"] > refined.first_test["psnr"] + 0.1
+    gains = []
+    for seed in (0, 1, 2):  # three held-out photos: a round's gain is 0.0 to 0.6 dB by the seed
+        refined = refine(ball_photos, 1, truthful, seed=seed)
+        assert same(refined.first, helped[0].first) is (seed == 0)
+        (one,) = refined.rounds
+        assert one.accepted
+        assert not same(refined.splats, helped[0].rounds[0].splats)
+        gains.append(one.test["psnr"] - refined.first_test["psnr"])
+    assert np.mean(gains) > 0.1
 
 
 def test_a_round_that_does_not_help_is_rolled_back(ball_photos, helped, tmp_path):

@@ -24,6 +24,7 @@ from igsr.evaluation.scores import BLACK, ScoredView, over_background
 from igsr.fitting.fit_page import write_fit_page
 from igsr.fitting.fit_report import FinishedFit, FitScores, fit_report
 from igsr.fitting.presets import settings_for
+from igsr.fitting.run import Progress
 
 
 def test_the_true_scene_scores_perfectly_and_another_does_not():
@@ -171,8 +172,9 @@ def test_a_fits_page_escapes_what_it_shows(tmp_path):
     scores = evaluate(splats, capture, "test", BLACK, "cpu")
     train = train_scores(splats, capture, BLACK, "cpu")
     asked = {"capture": "a<b>&c", "preset": "<i>", "backend": "cpu"}
-    fit = FinishedFit(splats, capture, settings_for("default", 3), asked, ("rays", 5), 1.0,
-                      ["<i>lost</i>.png"])  # fmt: skip
+    last = Progress(9, 9, 0.1, len(splats), ("rays", 5), 1.0, 1.0, {"backend": "cpu"})
+    lost = ["<i>lost</i>.png"]
+    fit = FinishedFit(splats, capture, settings_for("default", 3), asked, last, lost)
     parts = Parts()
     parts.add("<fit>", Usage(1.0, 2.0, None))
     scored = FitScores(scores, sheet, train, {"psnr": 20.0, "ssim": 0.5, "flip": 0.1})

@@ -37,6 +37,7 @@ SHORT = FitSettings(
     poses="fixed",
     focal="fixed",
     exposure="off",
+    remove_floaters=False,
 )
 
 

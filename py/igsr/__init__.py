@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from igsr.errors import IgsrError
     from igsr.evaluation import Scores, evaluate
     from igsr.fitting import Progress, fit, fit_with_cameras, refine_cameras
+    from igsr.floaters import remove_floaters
     from igsr.pose import estimate_poses
     from igsr.refinement import Refined, refine
     from igsr.rendering import Render, render
@@ -56,6 +57,7 @@ __all__ = [
     "rasterization",
     "refine",
     "refine_cameras",
+    "remove_floaters",
     "render",
 ]
 
@@ -70,6 +72,7 @@ if not TYPE_CHECKING:
             "igsr.errors": ("IgsrError",),
             "igsr.evaluation": ("Scores", "evaluate"),
             "igsr.fitting": ("Progress", "fit", "fit_with_cameras", "refine_cameras"),
+            "igsr.floaters": ("remove_floaters",),
             "igsr.pose": ("estimate_poses",),
             "igsr.refinement": ("Refined", "refine"),
             "igsr.rendering": ("Render", "render"),

@@ -55,6 +55,9 @@ class _Commands(LazyGroup):
         "compact": LazyCommand(
             "igsr.cli.compact", "compact_command", "Make a scene smaller within a limit on PSNR."
         ),
+        "clean": LazyCommand(
+            "igsr.cli.clean", "clean_command", "Remove floaters: splats that photos do not support."
+        ),
         "convert": LazyCommand(
             "igsr.cli.convert", "convert_command", "Write a splat file in another format."
         ),

@@ -41,6 +41,7 @@ from igsr.cli.shared import (
     parts_line,
     print_json,
     protocol_line,
+    removed_line,
     resolved,
     score_line,
     scored,
@@ -190,11 +191,7 @@ def fit_command(
             is_refined = bool(fitted.test_views) and (settings.moves_cameras or found)
             scores = _scored(splats, fitted, color, name, is_refined=is_refined, shown=not as_json)
         scores.scores.protocol["holdout"] = holdout
-        if last:
-            seconds, started = last[-1].seconds, last[-1].started
-        else:
-            seconds, started = _finished_before(out)
-        done = FinishedFit(splats, fitted, settings, asked, started, seconds, not_placed(fitted))
+        done = FinishedFit(splats, fitted, settings, asked, last[-1], not_placed(fitted))
         report = fit_report(done, scores, parts)
         write_fit_report(out, report, done, scores)
     if as_json:
@@ -224,7 +221,7 @@ def _fitted(
     *,
     shown: bool,
 ) -> tuple[Splats, Capture]:
-    """Fit with a progress bar; ``last`` holds the last progress in the end, if there was any."""
+    """Fit with a progress bar; ``last`` holds the last progress in the end."""
     from igsr.fitting import fit_with_cameras
     from igsr.fitting.run import bar_state
 
@@ -290,14 +287,6 @@ def _scored(
     return FitScores(scores, sheet, train, {metric: again[metric] for metric in METRICS})
 
 
-def _finished_before(out: Path) -> tuple[float, tuple[str, int]]:
-    """Seconds and initialization (see ``Progress``) of a fit that was already complete."""
-    from igsr.fitting.checkpoint import load_checkpoint
-
-    _, settings = load_checkpoint(out / "checkpoint.npz")
-    return settings["seconds"], tuple(settings["started"])
-
-
 def _print_report(report: dict[str, Any], out: Path, pages: list[str]) -> None:
     console = output_console()
     console.print(
@@ -307,6 +296,8 @@ def _print_report(report: dict[str, Any], out: Path, pages: list[str]) -> None:
     console.print(
         f"initialization: {report['start']}, {report['start_splats']} points", style="dim"
     )
+    if report["removed"]:
+        console.print(removed_line(report["removed"]), style="dim")
     console.print(score_line(report))
     if "refined" in report:
         console.print(f"with refined cameras: {score_line(report['refined'])}")

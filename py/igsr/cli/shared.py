@@ -265,6 +265,25 @@ def parts_line(parts: dict[str, dict[str, Any]]) -> str:
     return ", ".join(written(name, part) for name, part in parts.items())
 
 
+#: What the kinds of floaters are, as ``igsr.floaters.Cleaned`` names them.
+_FLOATERS = {
+    "unseen": "that no photo shows",
+    "floating": "floating before the surface",
+    "invisible": "too faint to be drawn",
+    "alone": "with few others near",
+}
+
+
+def removed_line(removed: dict[str, int]) -> str:
+    """How many floaters of which kind are removed, as one line.
+
+    Args:
+        removed: as ``igsr.floaters.Cleaned`` has it.
+    """
+    kinds = (f"{count} {_FLOATERS[kind]}" for kind, count in removed.items())
+    return f"removed {sum(removed.values())} splats: {', '.join(kinds)}"
+
+
 def protocol_line(protocol: dict[str, Any]) -> str:
     """How views were scored, in one line; ``protocol`` as ``Scores.protocol``."""
     background = tuple(protocol["background"])

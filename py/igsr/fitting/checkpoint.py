@@ -43,8 +43,10 @@ def recorded_settings(
         capture: fingerprint of photos, cameras and tracks.
         splats: hash of the splats that the fit goes on from, if it does.
     """
+    # Floaters are removed after the last step, from what the checkpoint keeps.
+    plain = {key: value for key, value in settings.plain().items() if key != "remove_floaters"}
     recorded = {
-        **settings.plain(),
+        **plain,
         "backend": backend["backend"],
         "instruction_set": backend["instruction_set"],
         "igsr": _core.__version__,

@@ -48,6 +48,7 @@ from igsr.fitting.settings import (
     Poses,
     check_whole_number,
 )
+from igsr.floaters import remove_floaters as without_floaters
 from igsr.splats import Splats
 
 __all__ = [
@@ -86,6 +87,7 @@ def fit(
     poses: Poses | None = None,
     focal: Focal | None = None,
     exposure: ExposureMode | None = None,
+    remove_floaters: bool | None = None,
     background: tuple[float, float, float] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
@@ -138,6 +140,8 @@ def fit(
         exposure: "on": a gain and an offset per channel of each photo are optimized with the
             splats, which get the colors of the mean photo; "off"; or "auto": on where points that
             photos share, or EXIF, show that exposures differ (``igsr.fitting.exposures``).
+        remove_floaters: whether splats that photos do not support are removed after the last step
+            (``igsr.remove_floaters``); the last progress counts them. The checkpoint keeps them.
         background: RGB in [0, 1] behind splats and photos with alpha; None is a new random color in
             every step for photos with alpha and black for photos without.
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
@@ -283,12 +287,25 @@ def _fitted(
         if not stopped:
             run.optimize()
 
-    splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
-    if settings.moves_cameras:
-        capture = with_train_cameras(capture, fitted_cameras(views, fitter, origin))
-    # Without a fit of them, exposures that views have of an earlier one are not these splats'.
-    none = [None] * len(views)
-    found = none if exposures is None else fitted_exposures(views, fitter)
+        # Take over cameras and exposures, and leave out floaters.
+        splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
+        if settings.moves_cameras:
+            capture = with_train_cameras(capture, fitted_cameras(views, fitter, origin))
+        # Without a fit of them, exposures that views have of an earlier one are not these splats'.
+        none = [None] * len(views)
+        found = none if exposures is None else fitted_exposures(views, fitter)
+        removed: dict[str, int] = {}
+        if settings.remove_floaters and not stopped and run.is_done:
+            cleaned = without_floaters(
+                splats,
+                replace(capture, views=without_exposures(capture.train_views, found)),
+                background=settings.background,
+                seed=settings.seed,
+                backend=device["backend"],
+            )
+            splats, removed = cleaned.splats, cleaned.removed
+        if not stopped:
+            run.end(len(splats), removed)
     return splats, with_train_exposures(capture, found)
 
 

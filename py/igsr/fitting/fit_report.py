@@ -17,6 +17,7 @@ from igsr.evaluation.limits import limit_of
 from igsr.evaluation.scores import METRICS, ScoredView, Scores
 from igsr.fitting.fit_page import write_fit_page
 from igsr.fitting.presets import preset_keywords
+from igsr.fitting.run import Progress
 from igsr.fitting.settings import FitSettings
 from igsr.splats import Splats
 
@@ -31,8 +32,7 @@ class FinishedFit:
         settings: of the fit.
         asked: all options of the run, for ``report.json``; "preset", "backend" and "capture" among
             them.
-        started: what the splats were initialized from ("points", "hull" ...) and their number.
-        seconds: of the fit, earlier runs that were resumed included.
+        last: the last progress of the fit.
         not_placed: names of photos whose cameras were not found.
     """
 
@@ -40,8 +40,7 @@ class FinishedFit:
     capture: Capture
     settings: FitSettings
     asked: dict[str, Any]
-    started: tuple[str, int]
-    seconds: float
+    last: Progress
     not_placed: Sequence[str] = ()
 
 
@@ -93,9 +92,10 @@ def fit_report(fit: FinishedFit, scored: FitScores, parts: Parts) -> dict[str, A
         "splats": len(fit.splats),
         "preset": fit.asked["preset"],
         **preset_keywords(fit.settings),
-        "start": fit.started[0],
-        "start_splats": fit.started[1],
-        "seconds": round(fit.seconds, 3),
+        "removed": fit.last.removed,
+        "start": fit.last.started[0],
+        "start_splats": fit.last.started[1],
+        "seconds": round(fit.last.seconds, 3),
         "parts": used,
         "peak_memory_bytes": total(used).peak_memory_bytes,
         "exposures": {

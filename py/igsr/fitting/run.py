@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -32,13 +33,17 @@ class Progress:
     Attributes:
         step: steps done, of ``steps``.
         steps: steps in all.
-        loss: 0.8 L1 + 0.2 D-SSIM of the last step's photo, before that step.
+        loss: 0.8 L1 + 0.2 D-SSIM of the last step's photo, before that step; nan where a resumed
+            fit had no step left to take.
         splats: number of splats now.
         started: what the splats were initialized from ("points", "hull" ...) and their number.
-        seconds: time spent fitting, earlier runs that were resumed included.
+        seconds: time spent on steps, and on what comes before them, earlier runs that were resumed
+            included.
         steps_per_second: of the last chunk of steps.
         backend: what runs: "backend", "device" and "instruction_set".
         work: part of the fit's time, in [0, 1], that the steps done take of all.
+        removed: None before the last progress, which all fits that are not told to end give: how
+            many floaters of which kind were removed in the end.
     """
 
     step: int
@@ -50,16 +55,16 @@ class Progress:
     steps_per_second: float
     backend: dict[str, str]
     work: float = 0.0
+    removed: Mapping[str, int] | None = None
 
 
 def bar_state(now: Progress) -> BarState:
     """What a progress bar shows of a fit."""
-    return BarState(
-        now.step,
-        now.steps,
-        f"loss {now.loss:.4f}  {now.splats} splats  {now.steps_per_second:.0f} steps/s",
-        now.work,
-    )
+    speed = f"{now.steps_per_second:.0f} steps/s"
+    details = [f"loss {now.loss:.4f}", f"{now.splats} splats", speed]
+    if math.isnan(now.loss):
+        details = details[1:2]
+    return BarState(now.step, now.steps, "  ".join(details), now.work)
 
 
 #: What is called with the progress of a fit; False ends the fit early.
@@ -96,6 +101,7 @@ class FitRun:
         """Start the clock."""
         self._began = self._saved_at = time.perf_counter()
         self._step = self._saved_step = int(self.fitter.steps_done)
+        self._last: Progress | None = None
 
     def save(self) -> None:
         """Save a checkpoint, if there is a file for it.
@@ -118,8 +124,8 @@ class FitRun:
         """
         chunk = 1
         try:
-            while self._step < self.settings.steps:
-                now = self._stepped(chunk)
+            while not self.is_done:
+                now = self._last = self._stepped(chunk)
                 # A step's time follows the number of splats: follow it, a factor two at a time.
                 chunk = max(1, min(2 * chunk, int(now.steps_per_second * CHUNK_SECONDS)))
                 if self.report is not None and self.report(now) is False:
@@ -135,6 +141,33 @@ class FitRun:
         except KeyboardInterrupt:
             self.save()
             raise
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all steps are taken."""
+        return self._step >= self.settings.steps
+
+    def end(self, splats: int, removed: Mapping[str, int]) -> None:
+        """Report the end of the fit.
+
+        Args:
+            splats: number of splats that it ends with.
+            removed: of ``Progress``.
+        """
+        if self.report is None:
+            return
+        last = self._last or Progress(
+            step=self._step,
+            steps=self.settings.steps,
+            loss=math.nan,
+            splats=splats,
+            started=self.started,
+            seconds=self.seconds_before,
+            steps_per_second=0.0,
+            backend=self.backend,
+            work=work_done(self.settings, *self.size, self._step),
+        )
+        self.report(replace(last, splats=splats, removed=removed))
 
     def _stepped(self, count: int) -> Progress:
         """Take ``count`` steps, or as many as are left, and say where the fit stands."""

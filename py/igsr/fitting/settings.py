@@ -119,6 +119,12 @@ class FitSettings:
             "auto (on where points that photos share, or EXIF, show other exposures)."
         ),
     )
+    remove_floaters: bool = field(
+        metadata=about(
+            "In the end, remove splats that no photo shows, and those far before the surface that "
+            "at most one photo needs."
+        )
+    )
     background: tuple[float, float, float] | None = field(
         default=None,
         metadata=about(

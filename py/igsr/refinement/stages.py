@@ -225,7 +225,8 @@ class Stages:
 
         def progress(now: Progress) -> bool:
             nonlocal goes_on
-            goes_on = self._run.fitting(stage, share * now.step / now.steps)
+            if now.removed is None:  # the end, which resumed fits tell again, is no news
+                goes_on = self._run.fitting(stage, share * now.step / now.steps)
             return goes_on
 
         checkpoint, resume = self._run.checkpoint(name)

@@ -1,0 +1,123 @@
+"""``igsr clean``: a scene without its floaters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from igsr import _core
+from igsr._internal.atomic_write import check_writable
+from igsr.cli.error_messages import error_messages, print_message, warning_messages
+from igsr.cli.shared import (
+    BackendChoice,
+    BackendOption,
+    BackgroundOption,
+    HoldoutOption,
+    JsonOption,
+    MaxSizeOption,
+    SceneArgument,
+    SeedOption,
+    background_color,
+    load,
+    output_console,
+    print_json,
+    removed_line,
+    resolved,
+)
+from igsr.errors import IgsrError
+from igsr.splats import Splats
+
+if TYPE_CHECKING:
+    from igsr._internal.choices import ResolvedBackend
+    from igsr.capture import Capture
+
+
+def clean_command(
+    scene: SceneArgument,
+    capture_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--capture",
+            metavar="CAPTURE",
+            help="The photos that SCENE was fitted to, with their cameras: remove what no photo "
+            "shows, and what floats before the surface and at most one photo needs. Without it, "
+            "remove what is too faint to be drawn, and splats that stand alone.",
+        ),
+    ] = None,
+    holdout: HoldoutOption = None,
+    max_size: MaxSizeOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="The clean scene, in any format that igsr writes. Default: SCENE's name with "
+            ".clean.ply.",
+        ),
+    ] = None,
+    seed: SeedOption = 0,
+    background: BackgroundOption = None,
+    backend: BackendOption = BackendChoice.auto,
+    as_json: JsonOption = False,
+) -> None:
+    """Remove floaters from SCENE: splats that photos do not support, or that stand alone."""
+    from igsr.evaluation.scores import default_background
+    from igsr.floaters import remove_floaters
+
+    with error_messages(lambda: "Interrupted; nothing is written."), warning_messages():
+        name = resolved(backend)
+        target = scene.with_name(f"{scene.name.split('.')[0]}.clean.ply") if out is None else out
+        splats = Splats.load(scene)
+        capture, held_out = None, None
+        if capture_path is not None:
+            capture = load(capture_path, holdout, max_size)
+        elif holdout is not None or max_size is not None:
+            option = "--holdout" if holdout is not None else "--max-size"
+            raise IgsrError(f"{option} needs photos; give --capture, or leave {option} out.")
+        check_writable(target)
+        color = background_color(background)
+        cleaned = remove_floaters(splats, capture, background=color, seed=seed, backend=name)
+        if capture is not None and capture.test_views:
+            color = color or default_background(capture)
+            both = {"before": splats, "after": cleaned.splats}
+            held_out = {when: _scores(of, capture, color, name) for when, of in both.items()}
+        notes = cleaned.splats.save(target)
+    report: dict[str, Any] = {
+        "scene": str(scene),
+        "out": str(target),
+        "capture": None if capture_path is None else str(capture_path),
+        "before": len(splats),
+        "splats": len(cleaned.splats),
+        "removed": cleaned.removed,
+        "held_out": held_out,
+        "notes": notes,
+        "seed": seed,
+        **_core.backend_info(name),
+    }
+    if as_json:
+        print_json(report)
+        return
+    console = output_console()
+    console.print(f"{len(cleaned.splats)} splats of {len(splats)}")
+    console.print(removed_line(cleaned.removed))
+    if held_out is not None:
+        was, now = held_out["before"], held_out["after"]
+        console.print(
+            f"{now['views']} held-out photos: PSNR {was['psnr']:.2f} to {now['psnr']:.2f} dB, "
+            f"SSIM {was['ssim']:.4f} to {now['ssim']:.4f}"
+        )
+    for note in notes:
+        print_message(note)
+    console.print(str(target), style="dim")
+
+
+def _scores(
+    splats: Splats, capture: Capture, color: tuple[float, float, float], backend: ResolvedBackend
+) -> dict[str, Any]:
+    """Mean PSNR and SSIM of held-out photos."""
+    from igsr.evaluation.quick_scores import mean_of, quick_views
+
+    views = capture.test_views
+    return mean_of(list(quick_views(splats, views, color, backend)), len(views))

@@ -1,0 +1,337 @@
+"""Floaters: what photos say about splats, stray splats, their removal from fits, ``igsr clean``."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from typer.testing import CliRunner
+
+import igsr
+from igsr.cli import app
+from igsr.floaters import photo_evidence, removal
+from igsr.floaters.isolation import alone
+from igsr.floaters.photo_evidence import needed_by_others, sightings
+from igsr.floaters.removal import stray_splats, unsupported_splats
+
+BLACK = (0.0, 0.0, 0.0)
+BALL = scenes.splats(60, degree=0)
+
+
+def specks(means, size=0.05, opacity=2.0, color=0.5):
+    """Round splats of one size."""
+    count = len(means)
+    return igsr.Splats(
+        means=np.ascontiguousarray(means, np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), math.log(size), np.float32),
+        opacities=np.full(count, opacity, np.float32),
+        sh=np.full((count, 1, 3), (color - 0.5) / 0.28209479177387814, np.float32),
+    )
+
+
+def joined(*parts):
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return igsr.Splats(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
+
+
+def before(view, distance=1.2):
+    """A place before a view's camera, between it and the ball."""
+    camera = view.camera
+    return camera.centre + distance * camera.viewmat[2, :3]
+
+
+def same(one, other):
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+# ---- evidence of photos ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_sightings_count_who_shows_a_splat_and_who_shows_it_before_the_surface(backend):
+    views = scenes.capture(views=4, scene=BALL).views
+    hidden = [[0.0, 40.0, 0.0]]  # above all pictures
+    model = joined(BALL, specks([before(views[0]), *hidden], size=0.02, opacity=-1.0))
+    seen = sightings(model, [view.camera for view in views], backend)
+    assert seen.shown[-2:].tolist() == [1, 0]
+    assert seen.before[-2:].tolist() == [1, 0]
+    assert seen.area[-1] == 0.0
+    assert not seen.before[:60].any()
+    alpha = sum(igsr.render(model, view.camera, backend=backend).alpha.sum() for view in views)
+    assert seen.area.sum() == pytest.approx(alpha, rel=1e-4)
+
+
+def test_needed_by_others_is_the_growth_of_the_squared_error(monkeypatch):
+    monkeypatch.setattr(photo_evidence, "PROBES", 2000)
+    views = scenes.capture(views=3, size=32, scene=scenes.splats(8, seed=5)).views
+    model = scenes.splats(8, degree=1)
+    model.opacities[:] = np.linspace(-1.0, 1.0, 8)  # below the clamp at 0.99
+    estimated = needed_by_others(model, views, BLACK, backend="reference")
+
+    def errors(splats):
+        renders = [igsr.render(splats, v.camera, BLACK, "reference").color for v in views]
+        return np.array(
+            [np.square(c - v.image / 255.0).sum() for c, v in zip(renders, views, strict=True)]
+        )
+
+    for k in range(8):
+        without = removal._subset(model, np.arange(8) != k)
+        grown = errors(without) - errors(model)
+        assert estimated[k] == pytest.approx(grown.sum() - grown.max(), rel=0.1, abs=0.3)
+
+
+def test_masked_pixels_need_nothing():
+    views = scenes.capture(views=3, size=24).views
+    masked = [replace(view, mask=np.zeros((24, 24), np.bool_)) for view in views]
+    assert not needed_by_others(BALL, masked, BLACK, backend="cpu").any()
+    assert needed_by_others(BALL, views, BLACK, backend="cpu").any()
+
+
+def test_what_no_photo_shows_and_what_only_one_photo_needs_is_found():
+    views = scenes.capture(views=6, scene=BALL).views
+    unseen, floating = [0.0, 40.0, 0.0], before(views[2])
+    model = joined(BALL, specks([unseen, floating], size=0.03, opacity=-1.0))
+    kinds = unsupported_splats(model, views, BLACK, backend="cpu")
+    assert np.flatnonzero(kinds["unseen"]).tolist() == [60]
+    assert np.flatnonzero(kinds["floating"]).tolist() == [61]
+
+
+def test_a_near_thing_that_all_photos_show_is_kept():
+    """A thin veil round the ball: before it in every photo, and needed by all of them."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    ring = [[2.4 * np.sin(a), y, -2.4 * np.cos(a)] for a in angles for y in (-0.3, 0.0, 0.3)]
+    veil = specks(ring, size=0.12, opacity=-2.0, color=0.9)
+    scene = joined(BALL, veil)
+    views = scenes.capture(views=12, scene=scene).views
+    seen = sightings(scene, [view.camera for view in views], "cpu")
+    assert (seen.before[60:] > 0).sum() > 60
+    found = unsupported_splats(scene, views, BLACK, backend="cpu")["floating"]
+    assert not found[seen.shown > 1].any()
+    # Photos without the veil do not need it, those of its back side included.
+    bare = scenes.capture(views=12, scene=BALL).views
+    found = unsupported_splats(scene, bare, BLACK, backend="cpu")["floating"]
+    assert found.sum() > 0
+    assert not found[:60].any()
+
+
+def test_photos_that_are_not_asked_keep_what_they_show(monkeypatch):
+    views = scenes.capture(views=6, scene=BALL, arc=0.3).views
+    speck = specks([before(views[3])], size=0.03, opacity=-1.0)
+    model = joined(BALL, speck)
+    seen = sightings(speck, [view.camera for view in views], "cpu")
+    assert seen.shown[0] > 1
+    assert unsupported_splats(model, views, BLACK, backend="cpu")["floating"][-1]
+    monkeypatch.setattr(removal, "MOST_ASKED", 1)
+    elsewhere = scenes.ring_camera(0.0, centre=(50.0, 0.0, 0.0))
+    photos = [replace(views[0], camera=elsewhere), *views]
+    assert not unsupported_splats(model, photos, BLACK, backend="cpu")["floating"][-1]
+
+
+def test_pseudo_views_keep_what_they_show_but_tell_of_no_floaters():
+    views = scenes.capture(views=6, scene=BALL).views
+    model = joined(BALL, specks([before(views[2])], size=0.03, opacity=-1.0))
+    pseudo = replace(views[2], weights=np.ones((48, 48), np.float32))
+    others = [view for k, view in enumerate(views) if k != 2]
+    assert unsupported_splats(model, others, BLACK, backend="cpu")["unseen"][-1]
+    kinds = unsupported_splats(model, [*others, pseudo], BLACK, backend="cpu")
+    assert not kinds["unseen"][-1]
+    assert not kinds["floating"][-1]
+
+
+def test_cpu_gpu_and_reference_find_the_same():
+    views = scenes.capture(views=4, scene=BALL).views
+    model = joined(BALL, specks([[0.0, 40.0, 0.0], before(views[2])], size=0.03, opacity=-1.0))
+    found = {
+        name: unsupported_splats(model, views, BLACK, backend=name)
+        for name in ("cpu", "gpu", "reference")
+    }
+    for name in ("gpu", "reference"):
+        for kind, mask in found["cpu"].items():
+            assert np.array_equal(mask, found[name][kind]), (name, kind)
+
+
+# ---- stray splats ------------------------------------------------------------------------------
+
+
+def plane(count=20, scale=1.0):
+    """A plane of splats that touch each other."""
+    grid = np.indices((count, count)).reshape(2, -1).T
+    means = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
+    return specks(means * 0.1 * scale, size=0.05 * scale)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_a_speck_far_from_all_others_stands_alone(scale):
+    speck = specks([[1.0 * scale, 1.0 * scale, 30.0 * scale]], size=0.05 * scale)
+    found = alone(joined(plane(scale=scale), speck))
+    assert np.flatnonzero(found).tolist() == [400]
+
+
+def test_large_splats_far_away_do_not_stand_alone():
+    far = specks([[0.0, 0.0, 30.0], [20.0, 0.0, 30.0]], size=15.0)
+    assert not alone(joined(plane(), far)).any()
+
+
+def test_hard_places_are_counted_without_overflow():
+    hard = joined(plane(), specks([[3e38, -3e38, 0.0]]), specks([[0.0, 0.0, 1.0]], size=1e-30))
+    hard.scales[400] = 88.0
+    found = alone(hard)
+    assert found[401]
+    assert not found[:400].any()
+
+
+def test_a_scene_of_lone_splats_keeps_them():
+    lonely = specks([[10.0 * k, 0.0, 0.0] for k in range(30)])
+    assert alone(lonely).all()
+    assert not stray_splats(lonely)["alone"].any()
+
+
+def test_what_cannot_be_drawn_is_removed_and_renders_keep_their_bits():
+    model = joined(plane(), specks([[1.0, 1.0, 0.1]], opacity=-5.6), specks([[0.5, 0.5, 0.1]]))
+    model.means[401] = np.nan
+    cleaned = igsr.remove_floaters(model)
+    assert cleaned.removed == {"invisible": 2, "alone": 0}
+    assert same(cleaned.splats, plane())
+    camera = scenes.ring_camera(0.0)
+    for backend in ("cpu", "reference"):
+        was, now = (igsr.render(s, camera, backend=backend) for s in (model, cleaned.splats))
+        assert np.array_equal(was.color, now.color)
+
+
+# ---- removal -----------------------------------------------------------------------------------
+
+
+def test_photos_decide_and_the_scene_keeps_its_order():
+    capture = scenes.capture(views=8, scene=BALL)
+    floating = specks([before(capture.views[2])], size=0.03, opacity=-1.0)
+    model = joined(specks([[0.0, 40.0, 0.0]]), BALL, floating)
+    origin = np.array([1.0, 0.0, 0.0])
+    model = replace(model, origin=origin, means=(model.means - origin).astype(np.float32))
+    cleaned = igsr.remove_floaters(model, capture, backend="cpu")
+    assert cleaned.removed == {"unseen": 1, "floating": 1}
+    assert np.array_equal(cleaned.splats.means, model.means[1:-1])
+    assert np.array_equal(cleaned.splats.origin, model.origin)
+
+
+def test_a_scene_of_floaters_alone_stays_whole():
+    capture = scenes.capture(views=4)
+    cleaned = igsr.remove_floaters(specks([[0.0, 40.0, 0.0]]), capture, backend="cpu")
+    assert len(cleaned.splats) == 1
+    assert cleaned.removed == {"unseen": 0, "floating": 0}
+
+
+def test_a_capture_without_photos_to_ask_is_refused():
+    capture = scenes.capture(views=4)
+    nothing = replace(capture, views=capture.test_views)
+    with pytest.raises(igsr.IgsrError, match="no train views"):
+        igsr.remove_floaters(BALL, nothing, backend="cpu")
+
+
+# ---- fits --------------------------------------------------------------------------------------
+
+
+def fitted(capture, **options):
+    """Splats, and all progress, of a short fit."""
+    seen = []
+    given = {"steps": 60, "max_splats": 300, "start": "random", "backend": "cpu", **options}
+    splats = igsr.fit(capture, progress=seen.append, **given)
+    return splats, seen
+
+
+def test_a_fit_ends_without_floaters_and_counts_them(tmp_path):
+    capture = scenes.capture(views=8, size=32, scene=BALL)
+    whole, said = fitted(capture, remove_floaters=False)
+    assert said[-1].removed == {}
+    checkpoint = tmp_path / "checkpoint.npz"
+    splats, said = fitted(capture, checkpoint=checkpoint)
+    kinds = unsupported_splats(whole, capture.train_views, BLACK, backend="cpu")
+    assert said[-1].removed == {name: int(kind.sum()) for name, kind in kinds.items()}
+    assert said[-1].removed["unseen"] > 0
+    assert said[-1].splats == len(splats) == len(whole) - sum(said[-1].removed.values())
+    # The checkpoint has them all: going on from the end leaves them out again.
+    again, resumed = fitted(capture, checkpoint=checkpoint, resume=True)
+    assert same(splats, again)
+    assert [now.step for now in resumed] == [60]
+    assert resumed[-1].removed == said[-1].removed
+    assert math.isnan(resumed[-1].loss)
+
+
+def test_a_fit_that_is_ended_early_keeps_all():
+    capture = scenes.capture(views=8, size=32, scene=BALL)
+    seen = []
+
+    def stop(now):
+        seen.append(now)
+        return False
+
+    splats = igsr.fit(capture, 5000, stop, "cpu", max_splats=300, start="random")
+    assert seen[-1].removed == {}
+    assert len(splats) == seen[-1].splats
+
+
+# ---- igsr clean --------------------------------------------------------------------------------
+
+
+def command(*arguments):
+    return CliRunner().invoke(app, ["clean", *map(str, arguments)])
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A scene with a speck far away that no photo shows, and its photos."""
+    capture = scenes.capture(views=8, scene=BALL)
+    joined(BALL, specks([[0.0, 40.0, 0.0]])).save(tmp_path / "scene.ply")
+    scenes.write_capture(tmp_path / "photos", capture)
+    return tmp_path / "scene.ply", tmp_path / "photos"
+
+
+def test_clean_removes_what_photos_do_not_show(scene, tmp_path):
+    path, photos = scene
+    out = tmp_path / "clean.ply"
+    words = ["--capture", photos, "--holdout", 4, "--out", out, "--backend", "cpu"]
+    result = command(path, *words, "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert report["removed"] == {"unseen": 1, "floating": 0}
+    assert (report["before"], report["splats"]) == (61, 60)
+    assert report["held_out"]["before"] == report["held_out"]["after"]
+    assert report["held_out"]["after"]["views"] == 2
+    assert same(igsr.Splats.load(out), BALL)
+    first = out.read_bytes()
+    assert "removed 1 splats: 1 that no photo shows" in command(path, *words).stdout
+    assert out.read_bytes() == first
+
+
+def test_clean_without_photos_goes_by_the_splats(tmp_path):
+    joined(plane(), specks([[1.0, 1.0, 30.0]])).save(tmp_path / "scene.ply")
+    result = command(tmp_path / "scene.ply")
+    assert result.exit_code == 0, result.output
+    assert "removed 1 splats: 0 too faint to be drawn, 1 with few others near" in result.stdout
+    assert same(igsr.Splats.load(tmp_path / "scene.clean.ply"), plane())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--holdout", "4"], "--holdout needs photos; give --capture"),
+        (["--max-size", "64"], "--max-size needs photos; give --capture"),
+        (["--capture", "nowhere"], "nowhere"),
+        (["--out", "scene.xyz"], "scene.xyz"),
+    ],
+)
+def test_clean_names_what_is_wrong_and_writes_nothing(scene, words, message):
+    path, _ = scene
+    before = sorted(path.parent.iterdir())
+    result = command(path, *words)
+    assert result.exit_code == 1
+    assert message in result.stderr
+    assert sorted(path.parent.iterdir()) == before
+    result = command(path.parent / "none.ply")
+    assert result.exit_code == 1
+    assert "none.ply" in result.stderr
