@@ -241,6 +241,14 @@ def own_photos_command(
         typer.Option("--known-cameras", help="Use cameras that lie beside the photos."),
     ] = False,
     features: FeaturesOption = None,
+    left_half: Annotated[
+        bool,
+        typer.Option(
+            "--left-half",
+            help="Score the right halves of held-out photos, too, with the exposure that is found "
+            "on their left halves.",
+        ),
+    ] = False,
     backend: FitBackendOption = FitBackendChoice.auto,
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
@@ -250,7 +258,7 @@ def own_photos_command(
         "own_photos", _own_photos_line, data, out, jobs, None, as_json,
         scenes=scenes, preset=preset, compare=compare, seeds=seeds, holdout=holdout, steps=steps,
         max_size=max_size, score_size=score_size, known_cameras=known_cameras, features=features,
-        backend=backend,
+        left_half=left_half, backend=backend,
     )  # fmt: skip
 
 

@@ -49,6 +49,7 @@ def own_photos(
     score_size: int | None = None,
     known_cameras: bool = False,
     features: str | os.PathLike[str] | None = None,
+    left_half: bool = False,
     backend: FitBackend = "cpu",
     jobs: int = 1,
     on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
@@ -74,6 +75,8 @@ def own_photos(
             None is ``max_size``, or 1600 where that is None.
         known_cameras: use cameras that lie beside the photos, where there are some.
         features: SqueezeNet's arrays (.npz), to score a perceptual distance as well.
+        left_half: score held-out photos' right halves, too, with the exposure that is found on
+            their left halves (``igsr.evaluation.left_half``).
         backend: what fits and renders.
         jobs: runs at a time, each with its share of the cores.
         on_run: called with (done, all, row) after the cameras of a scene, and after each fit.
@@ -131,6 +134,7 @@ def own_photos(
             max_size,
             score_size,
             None if features is None else str(features),
+            left_half,
             None if name in own else str(_cameras(folder, name)),
             str(folder / "splats" / f"{_run_name(name, one, seed, backend)}.ply"),
             str(folder / "sheets" / f"{file_name(name)}-{one}.png") if seed == 0 else None,
@@ -195,6 +199,7 @@ def _fit_task(root: Path, one: OwnFit, cameras: dict[str, Any] | None, features:
         "max_size": one.max_size,
         "scored_at": one.score_size,
         "perceptual": features,
+        **({"left_half": True} if one.left_half else {}),
         "cameras": None if one.cameras is None else file_hash(Path(one.cameras)),
     }
     name = _run_name(one.scene, one.preset, one.seed, one.backend)

@@ -24,6 +24,7 @@ from igsr.denoiser.training.perceptual_distance import (
 )
 from igsr.errors import IgsrError
 from igsr.evaluation.contact_sheet import flip_sheet, save_sheet, sheet_names
+from igsr.evaluation.left_half import LEFT_HALF, left_half_scores
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.quick_scores import psnr_and_ssim, train_photos
 from igsr.evaluation.scores import METRICS, ScoredView, default_background, score_views
@@ -70,6 +71,7 @@ class OwnFit:
         max_size: longest side of the photos that are fitted, pixels; None leaves it as it is.
         score_size: longest side of the photos that are scored, pixels.
         features: SqueezeNet's arrays, for "perceptual"; None leaves that out.
+        left_half: whether "lh_psnr" and "lh_ssim" are scored.
         cameras: file of the found cameras; None where the scene's own are used.
         splats: file that the splats are written to.
         sheet: file for the sheet of pictures, or None.
@@ -84,6 +86,7 @@ class OwnFit:
     max_size: int | None
     score_size: int
     features: str | None
+    left_half: bool
     cameras: str | None
     splats: str
     sheet: str | None
@@ -195,13 +198,15 @@ def _held_out_scores(
                 np.where(shown_pixels, scored.render, np.uint8(0)),
                 np.where(shown_pixels, scored.photo, np.uint8(0)),
             )
+        if one.left_half:
+            scores |= left_half_scores(scored.render, scored.photo, scored.mask)
         rows.append({"name": scored.name, **scores})
         if scored.name in shown:
             pictures.append(scored)
     if one.sheet is not None:
         save_sheet(Path(one.sheet), flip_sheet(pictures, SHEET_SIDE))
     means: dict[str, Any] = {}
-    for name in (*METRICS, "perceptual"):
+    for name in (*METRICS, "perceptual", *LEFT_HALF):
         known = [row[name] for row in rows if row.get(name) is not None]
         means[name] = float(np.mean(known)) if known else None
     return {**means, "views": rows}

@@ -23,6 +23,8 @@ SCORES = {
     "cc_psnr": ("cc PSNR, dB", ".2f"),
     "cc_ssim": ("cc SSIM", ".4f"),
     "perceptual": ("perceptual", ".4f"),
+    "lh_psnr": ("left-half PSNR, dB", ".2f"),
+    "lh_ssim": ("left-half SSIM", ".4f"),
     "train_psnr": ("train PSNR, dB", ".2f"),
     "train_ssim": ("train SSIM", ".4f"),
     "splats": ("splats", ".0f"),
@@ -41,6 +43,8 @@ COMPARED = (
     "cc_psnr",
     "cc_ssim",
     "perceptual",
+    "lh_psnr",
+    "lh_ssim",
 )
 #: Of runs, whose differences are told, too.
 COMPARED_RUNS = ("train_psnr", "train_ssim", "splats", "seconds", "cpu_seconds")
