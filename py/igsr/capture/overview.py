@@ -72,7 +72,7 @@ def look_at(
 
     Args:
         path: as ``igsr.load_capture`` and ``igsr.estimate_poses`` take it.
-        frames: number of frames taken from each video.
+        frames: most frames taken from each video.
         max_size: longest side in pixels of photos as they will be loaded, or None; captures may
             have them at several sizes.
 

@@ -35,8 +35,8 @@ from igsr.capture.photos import (
 from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames, video_size
 from igsr.errors import IgsrError
 
-#: Frames taken from each video.
-FRAMES = 40
+#: Most frames taken from each video.
+FRAMES = 100
 #: The fewest photos that cameras can be found from.
 FEWEST = 2
 #: Names shown of a long list.
@@ -84,7 +84,8 @@ def load_photos(
         path: a folder, a video, or a list of photos and videos. Sub-folders are read too, and files
             that are not photos are ignored. If a folder has no photos itself but ``images/``, the
             photos in that are taken.
-        frames: number of frames taken from each video: the sharpest of as many equal spans.
+        frames: most frames taken from each video: as many as its path needs, evenly along it, and
+            sharp (``igsr.capture.video_frames``).
         max_size: longest side, in pixels, of photos as loaded. Larger ones are reduced with an area
             filter as they are decoded; none is enlarged. None keeps all as they are.
 

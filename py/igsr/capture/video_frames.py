@@ -1,7 +1,8 @@
-"""Photos from a video: its sharpest frames, evenly spaced."""
+"""Photos from a video: as many frames as its path needs, evenly spaced, and sharp."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,57 +10,86 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from igsr.capture.video_motion import BLOCK, SIDE, CameraPath
 from igsr.errors import IgsrError
 
 UInt8 = npt.NDArray[np.uint8]
+Float64 = npt.NDArray[np.float64]
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 #: Longer side, in pixels, of the reduced frame whose sharpness is measured: noise and codec blocks
 #: are finer than its pixels.
 _JUDGED = 480
+#: Fewest frames of a video that has as many, and the path in steps below which it stands still.
+FEWEST, STILL = 12, 1.0
+#: Transfer characteristics of HDR video, by their number in ISO/IEC 23091-2.
+HDR = {16: "PQ", 18: "HLG"}
 
 
-def sharpest_frames(path: Path, count: int) -> list[tuple[int, UInt8]]:
-    """The sharpest frame of each of ``count`` equal spans of a video.
+def sharpest_frames(path: Path, most: int) -> list[tuple[int, UInt8]]:
+    """As many frames of a video as its path needs, evenly spaced along it, and sharp.
 
-    Only the middle half of a span counts, so two frames are at least half a span apart. Sharpness
-    is the variance of the Laplacian (Pech-Pacheco et al., ICPR 2000), which motion blur and
-    defocus lower.
+    The path is how far the picture moves (``igsr.capture.video_motion``). It is divided into equal
+    spans of at most a step, and the sharpest frame in the middle half of each is taken: a slow pan
+    gives as many frames as a fast one, a stop gives one. Sharpness is the variance of the Laplacian
+    (Pech-Pacheco et al., ICPR 2000), which motion blur and defocus lower. A video that does not
+    move is divided by time.
 
     Args:
         path: the video.
-        count: number of frames, at least 1; a video with fewer frames gives all. A damaged video
-            gives those of its readable part.
+        most: most frames, at least 1. A damaged video gives those of its readable part.
 
     Returns:
         (index in the video, uint8 [H, W, 3] RGB, upright), in order.
 
     Raises:
-        IgsrError: the file cannot be read as a video.
+        IgsrError: the file cannot be read as a video, or is HDR.
     """
-    length = _frame_count(path)
-    spans = min(count, length)
-    frames: list[tuple[int, UInt8]] = []
-    best: tuple[float, int, Any] | None = None
-    in_span = -1
-    for index, frame in enumerate(_decoded(path)):
-        place = (index + 0.5) * spans / length
-        span = int(place)
-        # The middle half of a span of a frame or two may hold no frame.
-        if span >= spans or (length >= 4 * spans and abs(place - span - 0.5) > 0.25):
-            continue
-        if span != in_span and best is not None:
-            frames.append((best[1], _pixels(best[2])))
-            best = None
-        in_span = span
-        sharpness = _sharpness(frame)
-        if best is None or sharpness > best[0]:
-            best = (sharpness, index, frame)
-    if best is not None:
-        frames.append((best[1], _pixels(best[2])))
-    if not frames:
+    camera_path = CameraPath()
+    places: list[float] = []
+    sharpness: list[float] = []
+    size = (0, 0)
+    for frame in _decoded(path):
+        if not places:
+            _refuse_hdr(path, frame)
+            size = _reduced(frame, SIDE, BLOCK)
+        places.append(camera_path.add(_grey(frame, size)))
+        sharpness.append(_sharpness(frame))
+    if not places:
         raise IgsrError(f"{path} has no frame that can be read; copy it again")
-    return frames
+    chosen = set(evenly_sharp(np.array(places), np.array(sharpness), most))
+    decoded = zip(range(max(chosen) + 1), _decoded(path), strict=False)
+    return [(index, _pixels(frame)) for index, frame in decoded if index in chosen]
+
+
+def evenly_sharp(places: Float64, sharpness: Float64, most: int) -> list[int]:
+    """Frames to take: the sharpest in the middle half of each of equal spans of the path.
+
+    Args:
+        places: [F], length of the path up to each frame, in steps; does not fall.
+        sharpness: [F].
+        most: most frames, at least 1.
+
+    Returns:
+        Indices of frames, rising: one for each step of the path, but of at least ``FEWEST`` spans.
+    """
+    count, length = len(places), float(places[-1] - places[0])
+    spans = min(most, max(FEWEST, math.ceil(length)))
+    along = (places - places[0]) / max(length, STILL)
+    if length < STILL:
+        spans, along = min(spans, count), (np.arange(count) + 0.5) / count
+    span = np.minimum((along * spans).astype(int), spans - 1)
+    off = np.abs(along * spans - span - 0.5)
+    chosen = []
+    for one in range(spans):
+        inside = np.flatnonzero(span == one)
+        # A fast part of the path may have no frame in the middle half of a span, or none in it.
+        middle = inside[off[inside] <= 0.25]
+        if len(middle):
+            inside = middle
+        if len(inside):
+            chosen.append(int(inside[np.argmax(sharpness[inside])]))
+    return chosen
 
 
 def video_size(path: Path) -> tuple[tuple[int, int], int]:
@@ -80,37 +110,55 @@ def video_size(path: Path) -> tuple[tuple[int, int], int]:
         raise IgsrError(f"{path} cannot be read as a video; save it as MP4 again") from error
 
 
-def _frame_count(path: Path) -> int:
-    """The number of frames that the file lists, without decoding any."""
+def _decoded(path: Path) -> Iterator[Any]:
+    """The frames in order, up to the first damaged one.
+
+    Raises:
+        IgsrError: the file cannot be read as a video.
+    """
     import av
 
     try:
         with av.open(str(path)) as container:
-            count = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            frames = container.decode(stream)
+            while True:
+                try:
+                    frame = next(frames)
+                except (StopIteration, av.FFmpegError):
+                    return
+                yield frame
     except (av.FFmpegError, IndexError, ValueError) as error:
         raise IgsrError(f"{path} cannot be read as a video; save it as MP4 again") from error
-    if count == 0:
-        raise IgsrError(f"{path} has no frame that can be read; copy it again")
-    return count
 
 
-def _decoded(path: Path) -> Iterator[Any]:
-    """The frames in order, up to the first damaged one."""
-    import av
+def _refuse_hdr(path: Path, frame: Any) -> None:
+    """Raise an IgsrError for frames whose colors would come out flat and pale."""
+    name = HDR.get(int(frame.color_trc))
+    if name is not None:
+        raise IgsrError(
+            f"{path} is HDR video ({name}); save it as SDR, or record with HDR video turned off"
+        )
 
-    try:
-        with av.open(str(path)) as container:
-            container.streams.video[0].thread_type = "AUTO"
-            yield from container.decode(video=0)
-    except av.FFmpegError:
-        return
+
+def _reduced(frame: Any, longest: int, shortest: int) -> tuple[int, int]:
+    """Width and height of the frame reduced to ``longest`` pixels, but not below ``shortest``."""
+    reduced = max(1.0, max(frame.width, frame.height) / longest)
+    return (
+        max(shortest, round(frame.width / reduced)),
+        max(shortest, round(frame.height / reduced)),
+    )
+
+
+def _grey(frame: Any, size: tuple[int, int]) -> UInt8:
+    """The frame in grey, at a width and height in pixels."""
+    grey: UInt8 = frame.reformat(width=size[0], height=size[1], format="gray").to_ndarray()
+    return grey
 
 
 def _sharpness(frame: Any) -> float:
-    reduced = max(1.0, max(frame.width, frame.height) / _JUDGED)
-    width, height = (max(3, round(side / reduced)) for side in (frame.width, frame.height))
-    grey = frame.reformat(width=width, height=height, format="gray").to_ndarray()
-    grey = grey.astype(np.int32)
+    grey = _grey(frame, _reduced(frame, _JUDGED, 3)).astype(np.int32)
     inner = grey[1:-1, 1:-1]
     laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
     return float(laplacian.var())

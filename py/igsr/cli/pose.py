@@ -40,9 +40,7 @@ from igsr.pose.registry import ESTIMATORS
 
 logger = logging.getLogger(__name__)
 
-FramesOption = Annotated[
-    int, typer.Option("--frames", help="Number of frames taken from each video.")
-]
+FramesOption = Annotated[int, typer.Option("--frames", help="Most frames taken from each video.")]
 
 
 EstimatorOption = Annotated[
@@ -89,7 +87,7 @@ class CameraFinder:
         estimator: a name of ``igsr.pose.registry.ESTIMATORS``, or "auto".
         checkpoint: weights of the estimator's network, or None.
         graph: which pairs of photos dust3r sees, or None for its default.
-        frames: number of frames taken from each video.
+        frames: most frames taken from each video.
         seed: of everything random.
     """
 
