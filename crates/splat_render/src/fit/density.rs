@@ -24,6 +24,9 @@ const SPLIT_SHRINK: f32 = 1.6;
 /// Opacity that a reset leaves at most.
 const OPACITY_RESET: f32 = 0.01;
 
+/// The logit of an opacity that is dead.
+pub(super) const DEAD: f32 = -10.0;
+
 fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
 }

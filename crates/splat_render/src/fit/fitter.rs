@@ -14,6 +14,7 @@ use super::cameras::{CameraState, Cameras, PosePrior, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
 use super::exposures::{ExposureState, Exposures};
+use super::fog::fog;
 use super::hull::Hull;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
@@ -343,6 +344,9 @@ impl Fitter {
         let progress = f64::from(step) / f64::from(config.steps);
         let rates = config.rates_at(step, self.extent);
         let mcmc = config.density == DensityControl::Mcmc;
+        // Adam makes its full step of a pull that nothing opposes. Where steps are larger, a splat
+        // that few photos show would fade before one of them comes round again.
+        let pull = MCMC_PULL.0 * config.rates.opacities / rates.opacities.max(f32::MIN_POSITIVE);
         let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();
         let input = StepInput {
             view,
@@ -352,7 +356,7 @@ impl Fitter {
             rates,
             step: step - config.first_step + 1,
             ssim_weight: config.ssim_weight,
-            opacity_regularizer: if mcmc { MCMC_PULL.0 } else { 0.0 },
+            opacity_regularizer: if mcmc { pull } else { 0.0 },
             scale_regularizer: if mcmc { MCMC_PULL.1 } else { 0.0 },
             noise: config.noise_at(step, self.extent),
             dropout: config.dropout * progress as f32,
@@ -417,6 +421,9 @@ impl Fitter {
                 }
             }
             if refine && config.density == DensityControl::Mcmc {
+                for i in fog(&state.splats, cameras) {
+                    state.splats.opacities[i] = density::DEAD;
+                }
                 let until = (MCMC_GROWN * f64::from(config.steps)) as u32;
                 let left = if step > until { 0 } else { (until - step) / every + 1 };
                 density::mcmc(state, config.max_splats, left, &mut rng);

@@ -6,6 +6,7 @@ mod config;
 mod density;
 mod exposures;
 mod fitter;
+mod fog;
 mod hull;
 mod initial;
 mod plane_sweep;
