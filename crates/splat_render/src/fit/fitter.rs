@@ -346,7 +346,8 @@ impl Fitter {
         let mcmc = config.density == DensityControl::Mcmc;
         // Adam makes its full step of a pull that nothing opposes. Where steps are larger, a splat
         // that few photos show would fade before one of them comes round again.
-        let pull = MCMC_PULL.0 * config.rates.opacities / rates.opacities.max(f32::MIN_POSITIVE);
+        let faster = rates.opacities / config.rates.opacities.max(f32::MIN_POSITIVE);
+        let pull = MCMC_PULL.0 / faster.max(1.0).sqrt();
         let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();
         let input = StepInput {
             view,

@@ -49,7 +49,7 @@ pub(super) fn fog(splats: &SplatArrays, cameras: &[Camera]) -> Vec<usize> {
 /// centre, widened by `reach` standard deviations.
 fn depth(splats: &SplatArrays, i: usize, camera: &Camera, reach: f64) -> Option<f64> {
     let t = camera.viewmat.transform_point3(glam::DVec3::from(splats.means[i].map(f64::from)));
-    if !(t.z > 0.0) {
+    if t.z.is_nan() || t.z <= 0.0 {
         return None;
     }
     let largest = splats.scales[i].iter().copied().fold(f32::NEG_INFINITY, f32::max);
