@@ -26,7 +26,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test test-long fuzz bench bench-check accuracy docs profile build wheel check-rust check-python vulkan display browser \
+.PHONY: demo test test-long fuzz bench bench-check accuracy docs profile build wheel check-rust check-python vulkan display shader-validators browser \
 	example-capture clean
 .DELETE_ON_ERROR:
 
@@ -100,7 +100,7 @@ test-long: build vulkan browser $(VENV)/.dev-ready
 # A process of tests per core. Each has one torch thread: more of them wait for each other.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
-check-rust: build vulkan display
+check-rust: build vulkan display shader-validators
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy $(PROFILE) --locked --workspace --all-targets -- -D warnings
 	$(CARGO) test
@@ -125,6 +125,13 @@ VULKAN_ANSWERS := $(BIN)/python -c 'from igsr import _core; print("GPU tests run
 vulkan: build
 	@$(VULKAN_ANSWERS) 2>/dev/null || { \
 		$(call apt_install,mesa-vulkan-drivers libvulkan1,no GPU or software Vulkan driver answers) && $(VULKAN_ANSWERS); \
+	}
+
+# Shaders are written in every driver's language, and read by programs that naga's authors did not
+# write. (No compiler for HLSL or MSL of Microsoft's or Apple's own runs here.)
+shader-validators:
+	@[ "$$(uname -s)" != Linux ] || { command -v spirv-val && command -v glslangValidator; } >/dev/null || { \
+		$(call apt_install,spirv-tools glslang-tools,the tests of the shaders need validators); \
 	}
 
 # The report of a refinement is opened in a browser.

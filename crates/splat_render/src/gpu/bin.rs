@@ -96,8 +96,8 @@ impl SplatBins {
             keys: pair("depth keys")?,
             order: pair("depth order")?,
             offsets: gpu.bindable("offsets", words(splats) + 4)?,
-            segment_sums: gpu.buffer("segment sums", words(gpu.segments))?,
-            histogram: gpu.buffer("histogram", words(gpu.segments << BITS_PER_PASS))?,
+            segment_sums: gpu.buffer("segment sums", words(gpu.segments()))?,
+            histogram: gpu.buffer("histogram", words(gpu.segments() << BITS_PER_PASS))?,
             status,
         })
     }
@@ -153,8 +153,8 @@ impl SplatBins {
                 ],
                 gpu.groups(self.splats, 256),
             ),
-            gpu.op(Kernel::ScanSums, &scan, [gpu.segments, 1]),
-            gpu.op(Kernel::ScanApply, &scan, [gpu.segments, 1]),
+            gpu.op(Kernel::ScanSums, &scan, [gpu.segments(), 1]),
+            gpu.op(Kernel::ScanApply, &scan, [gpu.segments(), 1]),
         ]
     }
 
@@ -186,7 +186,7 @@ impl SplatBins {
         ops.extend(self.sort_ops(gpu, index, passes, &pairs.keys, &pairs.slots));
         let last = (passes % 2) as usize;
         // Enough workgroups to fill a device; each walks on by the number of all threads.
-        let groups = pairs.capacity.div_ceil(64).clamp(1, 4 * gpu.segments);
+        let groups = pairs.capacity.div_ceil(64).clamp(1, 4 * gpu.segments());
         ops.push(gpu.op(
             Kernel::Ranges,
             &[
@@ -224,9 +224,9 @@ impl SplatBins {
                 (&keys[to]).into(),
                 (&values[to]).into(),
             ];
-            ops.push(gpu.op(Kernel::SortHistogram, &bindings, [gpu.segments, 1]));
+            ops.push(gpu.op(Kernel::SortHistogram, &bindings, [gpu.segments(), 1]));
             ops.push(gpu.op(Kernel::SortScan, &bindings, [1, 1]));
-            ops.push(gpu.op(Kernel::SortScatter, &bindings, [gpu.segments, 1]));
+            ops.push(gpu.op(Kernel::SortScatter, &bindings, [gpu.segments(), 1]));
         }
         ops
     }

@@ -25,7 +25,7 @@ pub use device::Gpu;
 pub use fit::GpuFit;
 pub use resident::{ResidentSplats, ResidentView};
 pub use resident_picture::ResidentPicture;
-pub use shaders::shared_wgsl;
+pub use shaders::{ShaderVariant, shader_variants, shared_wgsl};
 
 use crate::camera::Camera;
 use crate::error::Result;

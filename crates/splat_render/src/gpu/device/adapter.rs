@@ -6,10 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::task::{Context, Poll, Waker};
 
-use super::{GROUPS_MAX, Gpu, ROWS, list_limit, note};
-use crate::constants::TILE;
+use super::{GROUPS_MAX, Gpu, list_limit, note};
 use crate::error::{Error, Result};
-use crate::gpu::shaders::{Access, Kernel, SOURCES, Source};
+use crate::gpu::shaders::{Access, Build, Kernel, SOURCES, Source};
 
 /// Futures of wgpu's native backends are ready at once or after `poll`.
 fn ready<T>(future: impl Future<Output = T>) -> T {
@@ -108,12 +107,16 @@ impl Gpu {
         let info = adapter.get_info();
         let offered = adapter.limits();
         let software = info.device_type == wgpu::DeviceType::Cpu;
-        let rows = ROWS[usize::from(software)];
-        // Only where it was measured to pay.
-        let threads = TILE * TILE / 4 / rows;
-        let subgroups = software
-            && adapter.features().contains(wgpu::Features::SUBGROUP)
+        let [real, sharing, plain] = Build::ALL;
+        // Subgroups only where they were measured to pay.
+        let threads = sharing.threads();
+        let shares = adapter.features().contains(wgpu::Features::SUBGROUP)
             && (info.subgroup_min_size, info.subgroup_max_size) == (threads, threads);
+        let build = match (software, shares) {
+            (false, _) => real,
+            (true, true) => sharing,
+            (true, false) => plain,
+        };
         // Defaults everywhere but for the sizes, where scenes profit from what the adapter has.
         let required_limits = wgpu::Limits {
             max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
@@ -126,7 +129,7 @@ impl Gpu {
             required_limits,
             // Who draws frames wants to know what they cost.
             required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY
-                | if subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
+                | if build.subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
             memory_hints: wgpu::MemoryHints::Performance,
             ..Default::default()
         }))
@@ -168,11 +171,8 @@ impl Gpu {
             made: Default::default(),
             binding_limit,
             groups_max: GROUPS_MAX,
-            // A few segments per core keep a CPU busy; a GPU needs many workgroups.
-            segments: if software { 16 } else { 256 },
-            rows,
-            subgroups,
-            list_limit: list_limit(software, subgroups),
+            build,
+            list_limit: list_limit(software, build.subgroups),
         };
         gpu.check()?;
         Ok(gpu)

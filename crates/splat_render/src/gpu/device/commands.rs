@@ -47,21 +47,21 @@ impl Gpu {
             self.count(0);
             let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(file),
-                source: wgpu::ShaderSource::Wgsl(source.text(self.rows, self.subgroups).into()),
+                source: wgpu::ShaderSource::Wgsl(source.text(self.build).into()),
             });
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(file),
                 bind_group_layouts: &[Some(self.layout(file))],
                 immediate_size: 0,
             });
-            let segments = [("SEGMENTS", f64::from(self.segments))];
+            let constants = source.constants(self.build);
             self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
                 label: Some(entry),
                 layout: Some(&layout),
                 module: &module,
                 entry_point: Some(entry),
                 compilation_options: wgpu::PipelineCompilationOptions {
-                    constants: if source.segmented { &segments } else { &[] },
+                    constants: &constants,
                     ..Default::default()
                 },
                 cache: None,

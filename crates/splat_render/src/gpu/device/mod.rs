@@ -10,12 +10,8 @@ use std::sync::{Arc, Mutex, OnceLock};
 
 pub(super) use commands::{Bound, Op};
 
-use super::shaders::Kernel;
+use super::shaders::{Build, Kernel};
 use crate::error::{Error, Result};
-
-/// Rows of pixels that a thread of the rasterize kernels owns: on real GPUs, and on software ones,
-/// where reading a splat costs more than blending it and a tile's eight threads are one subgroup.
-pub(super) const ROWS: [u32; 2] = [2, 8];
 
 /// wgpu on one adapter, with this crate's kernels.
 #[derive(Debug)]
@@ -35,12 +31,8 @@ pub struct Gpu {
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
     groups_max: u32,
-    /// Workgroups that scans and sorts are cut into.
-    pub(super) segments: u32,
-    /// One of [`ROWS`].
-    rows: u32,
-    /// Whether a tile's threads are one subgroup and may share through it.
-    subgroups: bool,
+    /// What the shaders are built for.
+    build: Build,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
     pub(super) list_limit: u32,
 }
@@ -81,10 +73,15 @@ impl Gpu {
     /// both ways.
     #[must_use]
     pub fn without_subgroups(mut self) -> Self {
-        self.subgroups = false;
+        self.build.subgroups = false;
         self.list_limit = list_limit(self.is_software(), false);
         self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
         self
+    }
+
+    /// Workgroups that scans and sorts are cut into.
+    pub(super) fn segments(&self) -> u32 {
+        self.build.segments
     }
 
     /// Name of the adapter and its driver.

@@ -55,10 +55,12 @@ fn load_geometry(local: u32) -> Geometry {
     var g: Geometry;
     g.visible = false;
     let at = local * GEOMETRY;
+    var finite = true;
     for (var k = 0u; k < GEOMETRY; k++) {
-        if !is_finite(geometry[at + k]) {
-            return g;
-        }
+        finite = finite && is_finite(geometry[at + k]);
+    }
+    if !finite {
+        return g;
     }
     let index = window.first + local;
     if hash(index ^ hash(view.dropout_seed ^ 0x5bd1e995u)) < view.dropout_threshold {
@@ -152,136 +154,167 @@ fn view_direction(t: vec3<f32>) -> vec4<f32> {
     return vec4(to_world(t / length), length);
 }
 
-// Basis function k at `d` (x, y, z) and its derivatives by x, y and z taken as independent:
-// (value, derivative). Same order and signs as sh.rs.
+// A basis function at a direction (x, y, z) and its derivatives by x, y and z taken as independent.
+// Same order and signs as sh.rs. A degree at a time and not by number: a switch in a loop is what
+// DX12's older compiler is worst at, and a thread needs all of a degree anyway.
 struct Term {
     value: f32,
     derivative: vec3<f32>,
 }
 
-fn sh_term(k: u32, d: vec3<f32>) -> Term {
+fn sh_degree_one(d: vec3<f32>) -> array<Term, 3> {
     let x = d.x;
     let y = d.y;
     let z = d.z;
-    let xx = x * x;
-    let yy = y * y;
-    let zz = z * z;
-    switch k {
-        case 0u: { return Term(SH_C0, vec3(0.0)); }
-        case 1u: { return Term(-SH_C1 * y, vec3(0.0, -SH_C1, 0.0)); }
-        case 2u: { return Term(SH_C1 * z, vec3(0.0, 0.0, SH_C1)); }
-        case 3u: { return Term(-SH_C1 * x, vec3(-SH_C1, 0.0, 0.0)); }
-        case 4u: { return Term(SH_C2_0 * x * y, SH_C2_0 * vec3(y, x, 0.0)); }
-        case 5u: { return Term(-SH_C2_0 * y * z, -SH_C2_0 * vec3(0.0, z, y)); }
-        case 6u: {
-            return Term(SH_C2_1 * (2.0 * zz - xx - yy), 2.0 * SH_C2_1 * vec3(-x, -y, 2.0 * z));
-        }
-        case 7u: { return Term(-SH_C2_0 * x * z, -SH_C2_0 * vec3(z, 0.0, x)); }
-        case 8u: { return Term(SH_C2_2 * (xx - yy), 2.0 * SH_C2_2 * vec3(x, -y, 0.0)); }
-        case 9u: {
-            return Term(
-                -SH_C3_0 * y * (3.0 * xx - yy),
-                -3.0 * SH_C3_0 * vec3(2.0 * x * y, xx - yy, 0.0),
-            );
-        }
-        case 10u: { return Term(SH_C3_1 * x * y * z, SH_C3_1 * vec3(y * z, x * z, x * y)); }
-        case 11u: {
-            return Term(
-                -SH_C3_2 * y * (4.0 * zz - xx - yy),
-                -SH_C3_2 * vec3(-2.0 * x * y, 4.0 * zz - xx - 3.0 * yy, 8.0 * y * z),
-            );
-        }
-        case 12u: {
-            return Term(
-                SH_C3_3 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-                3.0 * SH_C3_3 * vec3(-2.0 * x * z, -2.0 * y * z, 2.0 * zz - xx - yy),
-            );
-        }
-        case 13u: {
-            return Term(
-                -SH_C3_2 * x * (4.0 * zz - xx - yy),
-                -SH_C3_2 * vec3(4.0 * zz - 3.0 * xx - yy, -2.0 * x * y, 8.0 * x * z),
-            );
-        }
-        case 14u: {
-            return Term(
-                SH_C3_4 * z * (xx - yy),
-                SH_C3_4 * vec3(2.0 * x * z, -2.0 * y * z, xx - yy),
-            );
-        }
-        case 15u: {
-            return Term(
-                -SH_C3_0 * x * (xx - 3.0 * yy),
-                -3.0 * SH_C3_0 * vec3(xx - yy, -2.0 * x * y, 0.0),
-            );
-        }
-        case 16u: {
-            return Term(
-                SH_C4_0 * x * y * (xx - yy),
-                SH_C4_0 * vec3(y * (3.0 * xx - yy), x * (xx - 3.0 * yy), 0.0),
-            );
-        }
-        case 17u: {
-            return Term(
-                -SH_C4_1 * y * z * (3.0 * xx - yy),
-                -SH_C4_1 * vec3(6.0 * x * y * z, 3.0 * z * (xx - yy), y * (3.0 * xx - yy)),
-            );
-        }
-        case 18u: {
-            return Term(
-                SH_C4_2 * x * y * (7.0 * zz - 1.0),
-                SH_C4_2 * vec3(y * (7.0 * zz - 1.0), x * (7.0 * zz - 1.0), 14.0 * x * y * z),
-            );
-        }
-        case 19u: {
-            return Term(
-                -SH_C4_3 * y * z * (7.0 * zz - 3.0),
-                -SH_C4_3 * vec3(0.0, z * (7.0 * zz - 3.0), y * (21.0 * zz - 3.0)),
-            );
-        }
-        case 20u: {
-            return Term(
-                SH_C4_4 * (zz * (35.0 * zz - 30.0) + 3.0),
-                SH_C4_4 * vec3(0.0, 0.0, z * (140.0 * zz - 60.0)),
-            );
-        }
-        case 21u: {
-            return Term(
-                -SH_C4_3 * x * z * (7.0 * zz - 3.0),
-                -SH_C4_3 * vec3(z * (7.0 * zz - 3.0), 0.0, x * (21.0 * zz - 3.0)),
-            );
-        }
-        case 22u: {
-            return Term(
-                SH_C4_HALF * (xx - yy) * (7.0 * zz - 1.0),
-                SH_C4_HALF * vec3(
-                    2.0 * x * (7.0 * zz - 1.0),
-                    -2.0 * y * (7.0 * zz - 1.0),
-                    14.0 * z * (xx - yy),
-                ),
-            );
-        }
-        case 23u: {
-            return Term(
-                -SH_C4_1 * x * z * (xx - 3.0 * yy),
-                -SH_C4_1 * vec3(3.0 * z * (xx - yy), -6.0 * x * y * z, x * (xx - 3.0 * yy)),
-            );
-        }
-        default: {
-            return Term(
-                SH_C4_5 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy)),
-                4.0 * SH_C4_5 * vec3(x * (xx - 3.0 * yy), y * (yy - 3.0 * xx), 0.0),
-            );
-        }
-    }
+    return array<Term, 3>(
+        Term(-SH_C1 * y, vec3(0.0, -SH_C1, 0.0)),
+        Term(SH_C1 * z, vec3(0.0, 0.0, SH_C1)),
+        Term(-SH_C1 * x, vec3(-SH_C1, 0.0, 0.0)),
+    );
+}
+
+fn sh_degree_two(d: vec3<f32>) -> array<Term, 5> {
+    let x = d.x;
+    let y = d.y;
+    let z = d.z;
+    let xx = d.x * d.x;
+    let yy = d.y * d.y;
+    let zz = d.z * d.z;
+    return array<Term, 5>(
+        Term(SH_C2_0 * x * y, SH_C2_0 * vec3(y, x, 0.0)),
+        Term(-SH_C2_0 * y * z, -SH_C2_0 * vec3(0.0, z, y)),
+        Term(SH_C2_1 * (2.0 * zz - xx - yy), 2.0 * SH_C2_1 * vec3(-x, -y, 2.0 * z)),
+        Term(-SH_C2_0 * x * z, -SH_C2_0 * vec3(z, 0.0, x)),
+        Term(SH_C2_2 * (xx - yy), 2.0 * SH_C2_2 * vec3(x, -y, 0.0)),
+    );
+}
+
+fn sh_degree_three(d: vec3<f32>) -> array<Term, 7> {
+    let x = d.x;
+    let y = d.y;
+    let z = d.z;
+    let xx = d.x * d.x;
+    let yy = d.y * d.y;
+    let zz = d.z * d.z;
+    return array<Term, 7>(
+        Term(
+            -SH_C3_0 * y * (3.0 * xx - yy),
+            -3.0 * SH_C3_0 * vec3(2.0 * x * y, xx - yy, 0.0),
+        ),
+        Term(SH_C3_1 * x * y * z, SH_C3_1 * vec3(y * z, x * z, x * y)),
+        Term(
+            -SH_C3_2 * y * (4.0 * zz - xx - yy),
+            -SH_C3_2 * vec3(-2.0 * x * y, 4.0 * zz - xx - 3.0 * yy, 8.0 * y * z),
+        ),
+        Term(
+            SH_C3_3 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+            3.0 * SH_C3_3 * vec3(-2.0 * x * z, -2.0 * y * z, 2.0 * zz - xx - yy),
+        ),
+        Term(
+            -SH_C3_2 * x * (4.0 * zz - xx - yy),
+            -SH_C3_2 * vec3(4.0 * zz - 3.0 * xx - yy, -2.0 * x * y, 8.0 * x * z),
+        ),
+        Term(
+            SH_C3_4 * z * (xx - yy),
+            SH_C3_4 * vec3(2.0 * x * z, -2.0 * y * z, xx - yy),
+        ),
+        Term(
+            -SH_C3_0 * x * (xx - 3.0 * yy),
+            -3.0 * SH_C3_0 * vec3(xx - yy, -2.0 * x * y, 0.0),
+        ),
+    );
+}
+
+fn sh_degree_four(d: vec3<f32>) -> array<Term, 9> {
+    let x = d.x;
+    let y = d.y;
+    let z = d.z;
+    let xx = d.x * d.x;
+    let yy = d.y * d.y;
+    let zz = d.z * d.z;
+    return array<Term, 9>(
+        Term(
+            SH_C4_0 * x * y * (xx - yy),
+            SH_C4_0 * vec3(y * (3.0 * xx - yy), x * (xx - 3.0 * yy), 0.0),
+        ),
+        Term(
+            -SH_C4_1 * y * z * (3.0 * xx - yy),
+            -SH_C4_1 * vec3(6.0 * x * y * z, 3.0 * z * (xx - yy), y * (3.0 * xx - yy)),
+        ),
+        Term(
+            SH_C4_2 * x * y * (7.0 * zz - 1.0),
+            SH_C4_2 * vec3(y * (7.0 * zz - 1.0), x * (7.0 * zz - 1.0), 14.0 * x * y * z),
+        ),
+        Term(
+            -SH_C4_3 * y * z * (7.0 * zz - 3.0),
+            -SH_C4_3 * vec3(0.0, z * (7.0 * zz - 3.0), y * (21.0 * zz - 3.0)),
+        ),
+        Term(
+            SH_C4_4 * (zz * (35.0 * zz - 30.0) + 3.0),
+            SH_C4_4 * vec3(0.0, 0.0, z * (140.0 * zz - 60.0)),
+        ),
+        Term(
+            -SH_C4_3 * x * z * (7.0 * zz - 3.0),
+            -SH_C4_3 * vec3(z * (7.0 * zz - 3.0), 0.0, x * (21.0 * zz - 3.0)),
+        ),
+        Term(
+            SH_C4_HALF * (xx - yy) * (7.0 * zz - 1.0),
+            SH_C4_HALF * vec3(
+                2.0 * x * (7.0 * zz - 1.0),
+                -2.0 * y * (7.0 * zz - 1.0),
+                14.0 * z * (xx - yy),
+            ),
+        ),
+        Term(
+            -SH_C4_1 * x * z * (xx - 3.0 * yy),
+            -SH_C4_1 * vec3(3.0 * z * (xx - yy), -6.0 * x * y * z, x * (xx - 3.0 * yy)),
+        ),
+        Term(
+            SH_C4_5 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy)),
+            4.0 * SH_C4_5 * vec3(x * (xx - 3.0 * yy), y * (yy - 3.0 * xx), 0.0),
+        ),
+    );
 }
 
 // SH colour before the cut at zero.
 fn sh_color(local: u32, direction: vec3<f32>) -> vec3<f32> {
-    let count = (view.sh_degree + 1u) * (view.sh_degree + 1u);
-    var color = vec3(0.0);
-    for (var k = 0u; k < count; k++) {
-        color += sh_term(k, direction).value * coefficient(local * view.sh_stride + k);
+    let row = local * view.sh_stride;
+    var color = SH_C0 * coefficient(row);
+    if view.sh_degree >= 1u {
+        let terms = sh_degree_one(direction);
+        color += terms[0].value * coefficient(row + 1u);
+        color += terms[1].value * coefficient(row + 2u);
+        color += terms[2].value * coefficient(row + 3u);
+    }
+    if view.sh_degree >= 2u {
+        let terms = sh_degree_two(direction);
+        color += terms[0].value * coefficient(row + 4u);
+        color += terms[1].value * coefficient(row + 5u);
+        color += terms[2].value * coefficient(row + 6u);
+        color += terms[3].value * coefficient(row + 7u);
+        color += terms[4].value * coefficient(row + 8u);
+    }
+    if view.sh_degree >= 3u {
+        let terms = sh_degree_three(direction);
+        color += terms[0].value * coefficient(row + 9u);
+        color += terms[1].value * coefficient(row + 10u);
+        color += terms[2].value * coefficient(row + 11u);
+        color += terms[3].value * coefficient(row + 12u);
+        color += terms[4].value * coefficient(row + 13u);
+        color += terms[5].value * coefficient(row + 14u);
+        color += terms[6].value * coefficient(row + 15u);
+    }
+    if view.sh_degree >= 4u {
+        let terms = sh_degree_four(direction);
+        color += terms[0].value * coefficient(row + 16u);
+        color += terms[1].value * coefficient(row + 17u);
+        color += terms[2].value * coefficient(row + 18u);
+        color += terms[3].value * coefficient(row + 19u);
+        color += terms[4].value * coefficient(row + 20u);
+        color += terms[5].value * coefficient(row + 21u);
+        color += terms[6].value * coefficient(row + 22u);
+        color += terms[7].value * coefficient(row + 23u);
+        color += terms[8].value * coefficient(row + 24u);
     }
     return color + 0.5;
 }

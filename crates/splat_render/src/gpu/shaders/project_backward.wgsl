@@ -43,16 +43,73 @@ fn write_zeros(i: u32) {
     }
 }
 
+// Writes the gradient of one coefficient; what it adds to that of the direction.
+fn coefficient_backward(row: u32, term: Term, v_color: vec3<f32>) -> vec3<f32> {
+    v_colors[3u * row] = term.value * v_color.x;
+    v_colors[3u * row + 1u] = term.value * v_color.y;
+    v_colors[3u * row + 2u] = term.value * v_color.z;
+    return term.derivative * dot(v_color, coefficient(row));
+}
+
+// Gradients of all coefficients of a splat; returns that of the direction.
+fn sh_backward(i: u32, direction: vec3<f32>, v_color: vec3<f32>) -> vec3<f32> {
+    let row = i * view.sh_stride;
+    var v_direction = coefficient_backward(row, Term(SH_C0, vec3(0.0)), v_color);
+    if view.sh_degree >= 1u {
+        let terms = sh_degree_one(direction);
+        v_direction += coefficient_backward(row + 1u, terms[0], v_color);
+        v_direction += coefficient_backward(row + 2u, terms[1], v_color);
+        v_direction += coefficient_backward(row + 3u, terms[2], v_color);
+    }
+    if view.sh_degree >= 2u {
+        let terms = sh_degree_two(direction);
+        v_direction += coefficient_backward(row + 4u, terms[0], v_color);
+        v_direction += coefficient_backward(row + 5u, terms[1], v_color);
+        v_direction += coefficient_backward(row + 6u, terms[2], v_color);
+        v_direction += coefficient_backward(row + 7u, terms[3], v_color);
+        v_direction += coefficient_backward(row + 8u, terms[4], v_color);
+    }
+    if view.sh_degree >= 3u {
+        let terms = sh_degree_three(direction);
+        v_direction += coefficient_backward(row + 9u, terms[0], v_color);
+        v_direction += coefficient_backward(row + 10u, terms[1], v_color);
+        v_direction += coefficient_backward(row + 11u, terms[2], v_color);
+        v_direction += coefficient_backward(row + 12u, terms[3], v_color);
+        v_direction += coefficient_backward(row + 13u, terms[4], v_color);
+        v_direction += coefficient_backward(row + 14u, terms[5], v_color);
+        v_direction += coefficient_backward(row + 15u, terms[6], v_color);
+    }
+    if view.sh_degree >= 4u {
+        let terms = sh_degree_four(direction);
+        v_direction += coefficient_backward(row + 16u, terms[0], v_color);
+        v_direction += coefficient_backward(row + 17u, terms[1], v_color);
+        v_direction += coefficient_backward(row + 18u, terms[2], v_color);
+        v_direction += coefficient_backward(row + 19u, terms[3], v_color);
+        v_direction += coefficient_backward(row + 20u, terms[4], v_color);
+        v_direction += coefficient_backward(row + 21u, terms[5], v_color);
+        v_direction += coefficient_backward(row + 22u, terms[6], v_color);
+        v_direction += coefficient_backward(row + 23u, terms[7], v_color);
+        v_direction += coefficient_backward(row + 24u, terms[8], v_color);
+    }
+    // Coefficients of degrees that are not in use yet.
+    let used = (view.sh_degree + 1u) * (view.sh_degree + 1u);
+    for (var k = 3u * used; k < 3u * view.sh_stride; k++) {
+        v_colors[3u * row + k] = 0.0;
+    }
+    return v_direction;
+}
+
 fn splat_backward(i: u32) -> array<f32, CAMERA> {
     var camera: array<f32, CAMERA>;
+    var none: array<f32, CAMERA>;
     if all(splats2d[i].radii == vec2(0.0)) {
         write_zeros(i);
-        return camera;
+        return none;
     }
     let g = load_geometry(i);
     if !g.visible {
         write_zeros(i);
-        return camera;
+        return none;
     }
     let at = i * GRADIENT;
     let v_center = vec2(v_splats2d[at], v_splats2d[at + 1u]);
@@ -75,20 +132,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     } else {
         let direction = view_direction(g.t);
         v_color = select(vec3(0.0), v_color, sh_color(i, direction.xyz) > vec3(0.0));
-        var v_direction = vec3(0.0);
-        let count = (view.sh_degree + 1u) * (view.sh_degree + 1u);
-        for (var k = 0u; k < view.sh_stride; k++) {
-            var v_coefficient = vec3(0.0);
-            let row = i * view.sh_stride + k;
-            if k < count {
-                let term = sh_term(k, direction.xyz);
-                v_coefficient = term.value * v_color;
-                v_direction += term.derivative * dot(v_color, coefficient(row));
-            }
-            v_colors[3u * row] = v_coefficient.x;
-            v_colors[3u * row + 1u] = v_coefficient.y;
-            v_colors[3u * row + 2u] = v_coefficient.z;
-        }
+        let v_direction = sh_backward(i, direction.xyz, v_color);
         let v_along =
             (v_direction - direction.xyz * dot(direction.xyz, v_direction)) / direction.w;
         v_t += to_camera(v_along);
@@ -218,7 +262,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     }
     if !finite {
         write_zeros(i);
-        return array<f32, CAMERA>();
+        return none;
     }
     for (var k = 0u; k < GEOMETRY; k++) {
         v_geometry[base + k] = row[k];

@@ -25,24 +25,39 @@ struct Quad {
     depth: vec4<f32>,
 }
 
+// What the dispatch before left of a pixel: `picture`, and the depth.
+struct Kept {
+    pixel: vec4<f32>,
+    depth: f32,
+}
+
+// Pixels outside of the picture have stopped.
+fn kept(x: u32, y: u32) -> Kept {
+    if x < view.width && y < view.height {
+        let pixel = y * view.width + x;
+        return Kept(picture[pixel], depths[pixel]);
+    }
+    return Kept(vec4(0.0, 0.0, 0.0, -1.0), 0.0);
+}
+
+// Vectors are made whole: DX12's older compiler refuses stores to a component that a loop picks.
 fn start(x: u32, y: u32) -> Quad {
     let exists = vec4(x, x + 1u, x + 2u, x + 3u) < vec4(view.width);
     var quad: Quad;
     quad.live = exists & vec4(y < view.height);
     quad.transmittance = vec4(1.0);
     if chunk.list_begin > 0u {
-        for (var k = 0u; k < 4u; k++) {
-            if x + k < view.width && y < view.height {
-                let pixel = y * view.width + x + k;
-                let last = picture[pixel];
-                quad.red[k] = last.x;
-                quad.green[k] = last.y;
-                quad.blue[k] = last.z;
-                quad.transmittance[k] = abs(last.w);
-                quad.live[k] = last.w > 0.0;
-                quad.depth[k] = depths[pixel];
-            }
-        }
+        let a = kept(x, y);
+        let b = kept(x + 1u, y);
+        let c = kept(x + 2u, y);
+        let d = kept(x + 3u, y);
+        let rows = transpose(mat4x4(a.pixel, b.pixel, c.pixel, d.pixel));
+        quad.red = rows[0];
+        quad.green = rows[1];
+        quad.blue = rows[2];
+        quad.transmittance = abs(rows[3]);
+        quad.live = rows[3] > vec4(0.0);
+        quad.depth = vec4(a.depth, b.depth, c.depth, d.depth);
     }
     return quad;
 }

@@ -53,27 +53,55 @@ struct Sums {
     absolute_y: vec4<f32>,
 }
 
+// A pixel's place in the picture, or UINT_MAX outside.
+fn pixel_at(x: u32, y: u32) -> u32 {
+    return select(0xffffffffu, y * view.width + x, x < view.width && y < view.height);
+}
+
+fn gradient_of(pixel: u32) -> vec4<f32> {
+    if pixel == 0xffffffffu {
+        return vec4(0.0);
+    }
+    return v_picture[pixel];
+}
+
+fn total_of(pixel: u32) -> f32 {
+    if pixel == 0xffffffffu {
+        return 0.0;
+    }
+    return totals[pixel];
+}
+
+// Negative where the pixel has stopped, as those outside have.
+fn transmittance_of(pixel: u32) -> f32 {
+    if pixel == 0xffffffffu {
+        return -1.0;
+    }
+    if chunk.list_begin == 0u {
+        return 1.0;
+    }
+    return transmittances[pixel];
+}
+
+// Vectors are made whole, as in rasterize.
 fn load_quad(x: u32, y: u32) -> Quad {
+    let a = pixel_at(x, y);
+    let b = pixel_at(x + 1u, y);
+    let c = pixel_at(x + 2u, y);
+    let d = pixel_at(x + 3u, y);
+    let rows = transpose(mat4x4(gradient_of(a), gradient_of(b), gradient_of(c), gradient_of(d)));
+    let transmittance =
+        vec4(transmittance_of(a), transmittance_of(b), transmittance_of(c), transmittance_of(d));
     var quad: Quad;
     quad.center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
     quad.center_y = f32(y) + 0.5;
-    quad.transmittance = vec4(1.0);
-    for (var k = 0u; k < 4u; k++) {
-        if x + k < view.width && y < view.height {
-            let pixel = y * view.width + x + k;
-            let gradient = v_picture[pixel];
-            quad.live[k] = true;
-            quad.remaining[k] = totals[pixel];
-            quad.v_red[k] = gradient.x;
-            quad.v_green[k] = gradient.y;
-            quad.v_blue[k] = gradient.z;
-            quad.v_depth[k] = gradient.w;
-            if chunk.list_begin > 0u {
-                quad.transmittance[k] = abs(transmittances[pixel]);
-                quad.live[k] = transmittances[pixel] > 0.0;
-            }
-        }
-    }
+    quad.live = transmittance > vec4(0.0);
+    quad.transmittance = abs(transmittance);
+    quad.remaining = vec4(total_of(a), total_of(b), total_of(c), total_of(d));
+    quad.v_red = rows[0];
+    quad.v_green = rows[1];
+    quad.v_blue = rows[2];
+    quad.v_depth = rows[3];
     return quad;
 }
 
