@@ -4,6 +4,8 @@
 # make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
 # make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
 # make bench-check  compares this build's speed with a commit's: [BASE=HEAD~1]; fails at 10 % slower
+# make gpu-check   tests and measures this computer's GPU; writes out/gpu-check/report.html to send
+#             along with a problem: [GARDEN=test_garden.npz] [CAPTURE=DIR] [SECONDS=2]
 # make docs   builds the documentation site into out/docs
 #
 # Needs a Python (3.10 or newer), a Rust toolchain, a C linker and a package manager. Everything
@@ -26,7 +28,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test test-long fuzz bench bench-check accuracy docs profile build wheel check-rust check-python vulkan display shader-validators browser \
+.PHONY: demo test test-long fuzz bench bench-check gpu-check accuracy docs profile build wheel check-rust check-python vulkan display shader-validators browser \
 	example-capture clean
 .DELETE_ON_ERROR:
 
@@ -51,6 +53,13 @@ bench: build
 BASE ?= HEAD~1
 bench-check: build
 	$(BIN)/python benches/bench_check.py '$(BASE)'
+
+# What a person with a GPU can send: tests of the kernels, times beside errors (and beside gsplat where
+# CUDA and gsplat are), driver and limits. On the software driver where there is no GPU.
+SECONDS ?= 2
+gpu-check: build vulkan
+	$(BIN)/python benches/gpu_check.py --seconds $(SECONDS) \
+		$(if $(GARDEN),--garden '$(GARDEN)') $(if $(CAPTURE),--capture '$(CAPTURE)')
 
 # Writes the page of accuracy and its plot; on the software driver where there is no GPU.
 accuracy: build vulkan

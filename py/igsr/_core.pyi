@@ -34,11 +34,27 @@ class SplatArrays(TypedDict):
 def resolve_backend(name: str) -> Literal["cpu", "gpu", "reference"]:
     """The backend that "auto", "cpu", "gpu" or "reference" stands for.
 
-    Raises ValueError for another name, RuntimeError where "gpu" has no adapter.
+    Raises ValueError for another name, RuntimeError where "gpu" has no adapter or the one that
+    answers fails; there, "auto" is "cpu", and a UserWarning says why, once.
     """
 
 def backend_info(name: str) -> dict[str, str]:
     """``backend``, ``device`` and ``instruction_set`` of a resolved backend."""
+
+def gpu_report() -> dict[str, Any]:
+    """Driver and limits of the backend "gpu"'s device."""
+
+def time_gpu_start() -> tuple[float, float, float]:
+    """Milliseconds to open the best adapter, compile all kernels, and test them."""
+
+def inject_gpu_faults(faults: list[str]) -> None:
+    """For tests: close the devices; adapters fail by "shader", "values", "limits" or "memory".
+
+    "real" makes a software adapter pass for a real one.
+    """
+
+def lose_gpu() -> None:
+    """For tests: lose the open devices, as a driver that is reset does."""
 
 def working_dtype(backend: str) -> type[np.floating[Any]]:
     """The dtype of every Real array of a resolved backend."""

@@ -1,14 +1,19 @@
 //! Backends: which implementation of the stages runs, and on what.
 
-use std::sync::{Arc, OnceLock};
+use std::ffi::CString;
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
 
+use crate::error::to_python;
 use numpy::PyArrayDescrMethods;
-use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use pyo3::exceptions::{PyRuntimeError, PyUserWarning, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
+use splat_render::Error;
 use splat_render::cpu::{self, CpuFit};
 use splat_render::fit::FitDevice;
-use splat_render::gpu::{Gpu, GpuFit};
+use splat_render::gpu::{Gpu, GpuFit, Injected};
+use splat_render::gpu_check::{open_tested_with, self_test};
 
 /// A backend by its resolved name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,19 +40,107 @@ impl Backend {
     }
 }
 
-/// The best adapter, opened once per process; an error is kept as its message.
-pub fn gpu() -> PyResult<&'static Arc<Gpu>> {
-    static GPU: OnceLock<Result<Arc<Gpu>, String>> = OnceLock::new();
-    GPU.get_or_init(|| Gpu::new(true).map(Arc::new).map_err(|error| error.to_string()))
-        .as_ref()
-        .map_err(|message| PyRuntimeError::new_err(message.clone()))
+/// What became of opening a device.
+type Opened = Result<Arc<Gpu>, Error>;
+
+/// Devices of this process: the best real one, and the one that "gpu" names where there is none.
+#[derive(Default)]
+struct Devices {
+    real: Option<Opened>,
+    software: Option<Opened>,
+    /// Whether the user was told why "auto" is not the GPU.
+    warned: bool,
+    /// What tests make of the adapters.
+    injected: Injected,
+}
+
+static DEVICES: LazyLock<Mutex<Devices>> = LazyLock::new(Mutex::default);
+
+impl Devices {
+    fn lock() -> MutexGuard<'static, Self> {
+        // What is opened is opened whole.
+        DEVICES.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Opens the device that a slot is for, unless it holds one that is not lost. A failure is kept: to
+    /// try again at each call would cost seconds.
+    fn opened<'a>(slot: &'a mut Option<Opened>, software: bool, injected: &Injected) -> &'a Opened {
+        if slot.as_ref().is_none_or(|opened| opened.as_ref().is_ok_and(|gpu| gpu.is_lost())) {
+            *slot = Some(open_tested_with(software, injected).map(Arc::new));
+        }
+        slot.get_or_insert_with(|| unreachable!("it was filled above"))
+    }
+
+    fn real(&mut self) -> &Opened {
+        Self::opened(&mut self.real, false, &self.injected)
+    }
+
+    /// The device of the backend "gpu".
+    fn named(&mut self) -> &Opened {
+        match self.real() {
+            Err(Error::NoAdapter(_)) => Self::opened(&mut self.software, true, &self.injected),
+            _ => self.real(),
+        }
+    }
+}
+
+/// The device of the backend "gpu": the best adapter, opened and tested once per process, and again
+/// after it was lost.
+pub fn gpu() -> PyResult<Arc<Gpu>> {
+    let mut devices = Devices::lock();
+    match devices.named() {
+        Ok(gpu) => Ok(Arc::clone(gpu)),
+        Err(error) => Err(PyRuntimeError::new_err(error.to_string())),
+    }
+}
+
+/// Whether "auto" is the GPU and, the first time that one answers and cannot be used, why not.
+fn auto() -> (bool, Option<String>) {
+    let mut devices = Devices::lock();
+    let reason = match devices.real() {
+        Ok(_) => return (true, None),
+        Err(Error::NoAdapter(_)) => return (false, None),
+        Err(error) => error.to_string(),
+    };
+    let told = std::mem::replace(&mut devices.warned, true);
+    (false, (!told).then(|| format!("{reason}. The CPU computes instead")))
+}
+
+/// For tests: closes the devices, and makes adapters fail from here on. `faults` are of "real" (a
+/// software adapter passes for a real one), "shader", "values", "limits" and "memory".
+#[pyfunction]
+pub fn inject_gpu_faults(faults: Vec<String>) -> PyResult<()> {
+    let mut injected = Injected::default();
+    for fault in faults {
+        match fault.as_str() {
+            "real" => injected.passes_for_real = true,
+            "shader" => injected.bad_shader = true,
+            "values" => injected.wrong_values = true,
+            "limits" => injected = injected.with_low_limits(),
+            "memory" => injected.buffer_bytes = Some(1 << 20),
+            _ => return Err(PyValueError::new_err(format!("faults: there is no {fault:?}"))),
+        }
+    }
+    *Devices::lock() = Devices { injected, ..Devices::default() };
+    Ok(())
+}
+
+/// For tests: loses the open devices, as a driver that is reset does.
+#[pyfunction]
+pub fn lose_gpu() {
+    let devices = Devices::lock();
+    for opened in [&devices.real, &devices.software] {
+        if let Some(Ok(gpu)) = opened {
+            gpu.lose();
+        }
+    }
 }
 
 /// A device for a fit on a resolved backend.
 pub fn fit_device(name: &str) -> PyResult<Box<dyn FitDevice>> {
     match Backend::named(name)? {
         Backend::Cpu => Ok(Box::new(CpuFit::default())),
-        Backend::Gpu => Ok(Box::new(GpuFit::new(Arc::clone(gpu()?)))),
+        Backend::Gpu => Ok(Box::new(GpuFit::new(gpu()?))),
         Backend::Reference => Err(PyValueError::new_err(
             "backend: reference renders and differentiates but does not fit; use cpu or gpu",
         )),
@@ -56,11 +149,15 @@ pub fn fit_device(name: &str) -> PyResult<Box<dyn FitDevice>> {
 
 /// Resolves a backend's name: "auto" is a real GPU if one answers, else the CPU.
 ///
-/// A software adapter runs only if "gpu" is named: the CPU backend is faster.
+/// A software adapter runs only if "gpu" is named: the CPU backend is faster. A real GPU that cannot be
+/// opened or fails its self-test is named in a UserWarning, once.
 #[pyfunction]
 pub fn resolve_backend<'a>(py: Python<'_>, name: &'a str) -> PyResult<&'a str> {
     if name == "auto" {
-        let real = py.detach(|| gpu().is_ok_and(|gpu| !gpu.is_software()));
+        let (real, warning) = py.detach(auto);
+        if let Some(warning) = warning.and_then(|text| CString::new(text).ok()) {
+            PyErr::warn(py, &py.get_type::<PyUserWarning>(), &warning, 1)?;
+        }
         return Ok(if real { "gpu" } else { "cpu" });
     }
     if Backend::named(name)? == Backend::Gpu {
@@ -84,6 +181,47 @@ pub fn backend_info<'py>(py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyD
     info.set_item("device", device)?;
     info.set_item("instruction_set", instruction_set)?;
     Ok(info)
+}
+
+/// Limits, features and driver of the device of the backend "gpu", for reports.
+///
+/// A dict: `name`, `kind`, `api`, `driver`, `driver_info`, `vendor` and `device` (PCI ids), `features`
+/// and `limits` by WebGPU's names.
+#[pyfunction]
+pub fn gpu_report<'py>(py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+    let gpu = py.detach(gpu)?;
+    let info = gpu.info();
+    let report = PyDict::new(py);
+    report.set_item("name", &info.name)?;
+    report.set_item("kind", format!("{:?}", info.device_type))?;
+    report.set_item("api", format!("{:?}", info.backend))?;
+    report.set_item("driver", &info.driver)?;
+    report.set_item("driver_info", &info.driver_info)?;
+    report.set_item("vendor", info.vendor)?;
+    report.set_item("device", info.device)?;
+    report.set_item("subgroups", (info.subgroup_min_size, info.subgroup_max_size))?;
+    let limits = PyDict::new(py);
+    for (name, value) in gpu.limit_values() {
+        limits.set_item(name, value)?;
+    }
+    report.set_item("limits", limits)?;
+    Ok(report)
+}
+
+/// Milliseconds that opening the best adapter, compiling all kernels and the self-test take, each.
+#[pyfunction]
+pub fn time_gpu_start(py: Python<'_>) -> PyResult<(f64, f64, f64)> {
+    py.detach(|| {
+        let mut last = Instant::now();
+        let mut lap = || 1e3 * std::mem::replace(&mut last, Instant::now()).elapsed().as_secs_f64();
+        let gpu = Gpu::new(true)?;
+        let opened = lap();
+        gpu.compile_all()?;
+        let compiled = lap();
+        self_test(&gpu)?;
+        Ok((opened, compiled, lap()))
+    })
+    .map_err(to_python)
 }
 
 /// The numpy scalar type of a resolved backend's arrays.

@@ -9,7 +9,7 @@ pub fn to_python(error: Error) -> PyErr {
     let message = error.to_string();
     match error {
         Error::Argument { .. } => PyValueError::new_err(message),
-        Error::Device(_) => PyRuntimeError::new_err(message),
+        Error::NoAdapter(_) | Error::Device(_) => PyRuntimeError::new_err(message),
         Error::File { .. } => PyOSError::new_err(message),
     }
 }

@@ -44,7 +44,10 @@ mod _core {
         module.add("SIDE_MAX", constants::SIDE_MAX)
     }
     #[pymodule_export]
-    use crate::backend::{backend_info, resolve_backend, working_dtype};
+    use crate::backend::{
+        backend_info, gpu_report, inject_gpu_faults, lose_gpu, resolve_backend, time_gpu_start,
+        working_dtype,
+    };
     #[pymodule_export]
     use crate::benchmark::{band_pixels, peak_multiply_add, time_pipeline, time_rasterize};
     #[pymodule_export]

@@ -27,7 +27,7 @@ macro_rules! with_stages {
     ($backend:expr, $function:ident($($argument:expr),* $(,)?)) => {
         match Backend::named($backend)? {
             Backend::Cpu => $function::<f32>(&Cpu, $($argument),*),
-            Backend::Gpu => $function::<f32>(&**gpu()?, $($argument),*),
+            Backend::Gpu => $function::<f32>(&*gpu()?, $($argument),*),
             Backend::Reference => $function::<f64>(&Reference, $($argument),*),
         }
     };

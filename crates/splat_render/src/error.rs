@@ -11,7 +11,10 @@ pub enum Error {
         /// What is wrong with it and what would be right.
         reason: String,
     },
-    /// No device answers for the backend that was asked for.
+    /// No adapter answers for the backend that was asked for.
+    #[error("{0}")]
+    NoAdapter(String),
+    /// A device cannot be opened, or fails.
     #[error("{0}")]
     Device(String),
     /// A file cannot be read or written.

@@ -15,7 +15,7 @@ const LAYERS: [&[&str]; 7] = [
     &["stages"],
     &["fit_device"],
     &["reference", "cpu", "gpu", "io"],
-    &["fit"],
+    &["fit", "gpu_check"],
 ];
 
 /// Names of a path, `crate` left out.

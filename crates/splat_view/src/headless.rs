@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use splat_render::cpu::Cpu;
 use splat_render::gpu::Gpu;
+use splat_render::gpu_check::open_tested;
 use splat_render::{Camera, Error, Image, ProjectOptions, Projected, Result, Stages};
 
 use crate::arguments::{Arguments, Backend};
@@ -62,11 +63,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 fn stages(backend: Backend) -> Result<Box<dyn Stages<f32>>> {
     match backend {
         Backend::Cpu => Ok(Box::new(Cpu)),
-        Backend::Gpu => Ok(Box::new(Gpu::new(true)?)),
-        Backend::Auto => match Gpu::new(false) {
+        Backend::Gpu => Ok(Box::new(open_tested(true)?)),
+        Backend::Auto => match open_tested(false) {
             Ok(gpu) => Ok(Box::new(gpu)),
-            Err(_) => {
-                eprintln!("No GPU answers; the CPU draws.");
+            Err(error) => {
+                match error {
+                    Error::NoAdapter(_) => eprintln!("No GPU answers; the CPU draws."),
+                    error => eprintln!("{error}. The CPU draws."),
+                }
                 Ok(Box::new(Cpu))
             }
         },

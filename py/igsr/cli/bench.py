@@ -73,6 +73,15 @@ def bench_command(
             "docs/how-it-works/accuracy.md, its plot beside it.",
         ),
     ] = None,
+    report_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--report",
+            metavar="HTML",
+            help="Write a page of this computer's GPU (driver, limits, all rows) and a JSON file "
+            "beside it: what to attach to a report of a problem.",
+        ),
+    ] = None,
     compare: Annotated[
         Path | None,
         typer.Option(
@@ -116,6 +125,7 @@ def bench_command(
                 "--capture": capture,
                 "--models": models,
                 "--plot": plot,
+                "--report": report_path,
             }
             for name, value in given.items():
                 if value:
@@ -128,11 +138,13 @@ def bench_command(
                 "--garden": garden,
                 "--capture": capture,
                 "--models": models,
+                "--report": report_path,
             }
             for name, value in given.items():
                 if value:
                     raise IgsrError(f"--accuracy runs no workloads; leave {name} out.")
-        for path in (plot, json_path, accuracy):
+        pages = [] if report_path is None else [report_path, benchmark.json_beside(report_path)]
+        for path in (plot, json_path, accuracy, *pages):
             if path is not None:
                 check_writable(path)
         console = error_console()
@@ -156,6 +168,9 @@ def bench_command(
                     seconds,
                     status.update,
                 )
+            elif report_path is not None:
+                report = benchmark.device_report(settings, status.update)
+                benchmark.write_device_report(report_path, report)
             elif accuracy is None:
                 report = benchmark.run_benchmark(settings, status.update)
             else:

@@ -119,6 +119,7 @@ class FitRun:
 
         Raises:
             IgsrError: a step fails, or a checkpoint cannot be written.
+            RuntimeError: the GPU fails; the last checkpoint stays.
             UserWarning: the last checkpoint cannot be written.
             KeyboardInterrupt: on Ctrl-C, after a checkpoint.
         """
@@ -176,6 +177,8 @@ class FitRun:
             done: dict[str, Any] = self.fitter.step(min(count, self.settings.steps - self._step))
         except ValueError as error:
             raise IgsrError(f"{error}.") from error
+        except RuntimeError as error:  # the renderer's RuntimeErrors are the GPU's
+            raise RuntimeError(f"{error}{self._kept_words()}") from error
         now = time.perf_counter()
         advanced, self._step = done["step"] - self._step, done["step"]
         return Progress(
@@ -189,6 +192,12 @@ class FitRun:
             backend=self.backend,
             work=work_done(self.settings, *self.size, self._step),
         )
+
+    def _kept_words(self) -> str:
+        """What is left of a fit whose device failed."""
+        if self.checkpoint is None or not self.checkpoint.path.is_file():
+            return ""
+        return f"; {self.checkpoint.path} keeps step {self._saved_step}, and resume goes on there"
 
     def _is_save_due(self) -> bool:
         steps, seconds = self._step - self._saved_step, time.perf_counter() - self._saved_at

@@ -21,7 +21,7 @@ mod resident;
 mod resident_picture;
 mod shaders;
 
-pub use device::Gpu;
+pub use device::{Gpu, Injected, needed_limits};
 pub use fit::GpuFit;
 pub use resident::{ResidentSplats, ResidentView};
 pub use resident_picture::ResidentPicture;

@@ -2,11 +2,11 @@
 
 use std::future::Future;
 use std::pin::pin;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::task::{Context, Poll, Waker};
 
-use super::{GROUPS_MAX, Gpu, list_limit, note};
+use super::limits::check_limits;
+use super::{GROUPS_MAX, Gpu, Injected, list_limit, note, one_line};
 use crate::error::{Error, Result};
 use crate::gpu::shaders::{Access, Build, Kernel, SOURCES, Source};
 
@@ -56,16 +56,27 @@ fn adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 
 impl Gpu {
     /// Opens the best adapter: a real GPU where there is one, else, if `software_allowed`, a
-    /// software one such as lavapipe.
+    /// software one such as lavapipe. Kernels compile when they are first used;
+    /// `gpu_check` compiles and tries them.
+    ///
+    /// # Errors
+    /// [`Error::NoAdapter`] if none answers, [`Error::Device`] if the one that does fails.
     pub fn new(software_allowed: bool) -> Result<Self> {
+        Self::with_faults(software_allowed, &Injected::default())
+    }
+
+    /// [`Gpu::new`] on an adapter with these faults.
+    pub fn with_faults(software_allowed: bool, injected: &Injected) -> Result<Self> {
         let mut adapters = adapters(&instance());
-        let software_only =
-            adapters.first().is_some_and(|a| a.get_info().device_type == wgpu::DeviceType::Cpu);
+        let is_software = |adapter: &wgpu::Adapter| {
+            !injected.passes_for_real && adapter.get_info().device_type == wgpu::DeviceType::Cpu
+        };
+        let software_only = adapters.first().is_some_and(is_software);
         if !software_allowed {
-            adapters.retain(|a| a.get_info().device_type != wgpu::DeviceType::Cpu);
+            adapters.retain(|adapter| !is_software(adapter));
         }
         let Some(adapter) = adapters.first() else {
-            return Err(Error::Device(
+            return Err(Error::NoAdapter(
                 if software_only {
                     "backend gpu: only a software adapter answers; ask for it by name or use \
                      backend cpu, which is faster"
@@ -76,7 +87,7 @@ impl Gpu {
                 .to_owned(),
             ));
         };
-        Self::open(adapter)
+        Self::open(adapter, injected)
     }
 
     /// Opens the best adapter that can show pictures in a window, a software one where there is no
@@ -93,7 +104,7 @@ impl Gpu {
                 .map_err(|e| Error::Device(format!("no window can be opened ({e})")))?;
             adapters.retain(|a| a.is_surface_supported(&surface));
             if let Some(adapter) = adapters.into_iter().next() {
-                return Ok((Self::open(&adapter)?, adapter, surface));
+                return Ok((Self::open(&adapter, &Injected::default())?, adapter, surface));
             }
         }
         Err(Error::Device(
@@ -103,9 +114,13 @@ impl Gpu {
         ))
     }
 
-    fn open(adapter: &wgpu::Adapter) -> Result<Self> {
+    fn open(adapter: &wgpu::Adapter, injected: &Injected) -> Result<Self> {
         let info = adapter.get_info();
-        let offered = adapter.limits();
+        let mut offered = adapter.limits();
+        if let Some(lower) = &injected.limits {
+            offered = offered.or_worse_values_from(lower);
+        }
+        check_limits(&info.name, &offered)?;
         let software = info.device_type == wgpu::DeviceType::Cpu;
         let [real, sharing, plain] = Build::ALL;
         // Subgroups only where they were measured to pay.
@@ -117,12 +132,14 @@ impl Gpu {
             (true, true) => sharing,
             (true, false) => plain,
         };
-        // Defaults everywhere but for the sizes, where scenes profit from what the adapter has.
+        // What the kernels do not need may be lower than WebGPU's defaults. Scenes profit from large
+        // buffers.
         let required_limits = wgpu::Limits {
             max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
             max_buffer_size: offered.max_buffer_size,
-            ..wgpu::Limits::default()
+            ..wgpu::Limits::default().or_worse_values_from(&offered)
         };
+        let groups_max = required_limits.max_compute_workgroups_per_dimension.min(GROUPS_MAX);
         let binding_limit = required_limits.max_storage_buffer_binding_size;
         let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("splat_render"),
@@ -135,8 +152,9 @@ impl Gpu {
         }))
         .map_err(|e| {
             Error::Device(format!(
-                "backend gpu: {} does not open ({e}); update its driver or use backend cpu",
-                info.name
+                "backend gpu: {} does not open ({}); update its driver or use backend cpu",
+                info.name,
+                one_line(&e.to_string())
             ))
         })?;
         let failure = Arc::new(Mutex::new(None));
@@ -150,14 +168,10 @@ impl Gpu {
                 },
             );
         }));
-        let seen = Arc::clone(&failure);
-        let lost = Arc::new(AtomicBool::new(false));
+        let lost = Arc::new(OnceLock::new());
         let is_lost = Arc::clone(&lost);
-        device.set_device_lost_callback(move |reason, message| {
-            if reason != wgpu::DeviceLostReason::Destroyed {
-                is_lost.store(true, Ordering::Relaxed);
-                note(&seen, format!("was lost ({message})"));
-            }
+        device.set_device_lost_callback(move |_, message| {
+            let _ = is_lost.set(one_line(&message));
         });
         let layouts = SOURCES.iter().map(|source| bind_group_layout(&device, source)).collect();
         let gpu = Self {
@@ -168,9 +182,10 @@ impl Gpu {
             layouts,
             failure,
             lost,
+            injected: injected.clone(),
             made: Default::default(),
             binding_limit,
-            groups_max: GROUPS_MAX,
+            groups_max,
             build,
             list_limit: list_limit(software, build.subgroups),
         };

@@ -21,6 +21,9 @@ impl Gpu {
         if size > self.device.limits().max_buffer_size {
             return Err(self.error(&format!("holds no buffer of {size} bytes for {label}")));
         }
+        if self.injected.buffer_bytes.is_some_and(|most| size > most) {
+            return Err(self.error("is out of memory"));
+        }
         let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
             size,

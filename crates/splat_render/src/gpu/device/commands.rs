@@ -3,6 +3,8 @@
 use std::num::NonZeroU64;
 use std::ops::Range;
 
+use rayon::prelude::*;
+
 use super::Gpu;
 use crate::error::Result;
 use crate::gpu::layout::SPLATS_PER_GROUP;
@@ -47,7 +49,9 @@ impl Gpu {
             self.count(0);
             let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(file),
-                source: wgpu::ShaderSource::Wgsl(source.text(self.build).into()),
+                source: wgpu::ShaderSource::Wgsl(
+                    self.injected.text(source.text(self.build)).into(),
+                ),
             });
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(file),
@@ -67,6 +71,17 @@ impl Gpu {
                 cache: None,
             })
         })
+    }
+
+    /// Compiles every kernel, several at once.
+    ///
+    /// # Errors
+    /// [`crate::Error::Device`] with what the driver says of the first that it refuses.
+    pub fn compile_all(&self) -> Result<()> {
+        Kernel::ALL.par_iter().for_each(|&kernel| {
+            self.pipeline(kernel);
+        });
+        self.check()
     }
 
     fn layout(&self, file: &str) -> &wgpu::BindGroupLayout {

@@ -4,11 +4,15 @@
 mod adapter;
 mod buffers;
 mod commands;
+mod injected;
+mod limits;
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
 pub(super) use commands::{Bound, Op};
+pub use injected::Injected;
+pub use limits::needed_limits;
 
 use super::shaders::{Build, Kernel};
 use crate::error::{Error, Result};
@@ -23,8 +27,10 @@ pub struct Gpu {
     layouts: Vec<wgpu::BindGroupLayout>,
     /// First error that wgpu reported since the last check.
     failure: Arc<Mutex<Option<String>>>,
-    /// Whether the device was lost, after which nothing works on it.
-    lost: Arc<AtomicBool>,
+    /// Why the device was lost, after which nothing works on it.
+    lost: Arc<OnceLock<String>>,
+    /// What tests make it do.
+    injected: Injected,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
     /// Most bytes that a storage binding may have.
@@ -89,6 +95,31 @@ impl Gpu {
         format!("{} ({:?}, {})", self.info.name, self.info.backend, self.info.driver_info)
     }
 
+    /// What wgpu knows of the adapter and its driver.
+    pub fn info(&self) -> &wgpu::AdapterInfo {
+        &self.info
+    }
+
+    /// Limits of the device that decide how large scenes may be, by WebGPU's names.
+    pub fn limit_values(&self) -> [(&'static str, u64); 7] {
+        let limits = self.device.limits();
+        [
+            ("maxBufferSize", limits.max_buffer_size),
+            ("maxStorageBufferBindingSize", limits.max_storage_buffer_binding_size),
+            ("maxStorageBuffersPerShaderStage", limits.max_storage_buffers_per_shader_stage.into()),
+            ("maxComputeWorkgroupStorageSize", limits.max_compute_workgroup_storage_size.into()),
+            (
+                "maxComputeInvocationsPerWorkgroup",
+                limits.max_compute_invocations_per_workgroup.into(),
+            ),
+            (
+                "maxComputeWorkgroupsPerDimension",
+                limits.max_compute_workgroups_per_dimension.into(),
+            ),
+            ("maxTextureDimension2D", limits.max_texture_dimension_2d.into()),
+        ]
+    }
+
     /// Whether the adapter runs on the CPU.
     pub fn is_software(&self) -> bool {
         self.info.device_type == wgpu::DeviceType::Cpu
@@ -96,7 +127,14 @@ impl Gpu {
 
     /// Whether the device was lost: no later call on it succeeds.
     pub fn is_lost(&self) -> bool {
-        self.lost.load(Ordering::Relaxed)
+        self.lost.get().is_some()
+    }
+
+    /// Loses the device as a driver that is reset does, for tests of what becomes of its callers.
+    pub fn lose(&self) {
+        self.device.destroy();
+        // The callback is called from here, once nothing is under way.
+        let _ = self.device.poll(wgpu::PollType::wait_indefinitely());
     }
 
     /// The wgpu device, for callers that draw from the kernels' buffers.
@@ -122,23 +160,37 @@ impl Gpu {
 
     /// The error for a device that fails while running.
     fn error(&self, what: &str) -> Error {
-        Error::Device(format!(
-            "backend gpu: {} {what}; use fewer splats or smaller images, or backend cpu",
-            self.info.name
-        ))
+        let name = &self.info.name;
+        Error::Device(match self.lost.get() {
+            Some(why) => format!(
+                "backend gpu: {name} was lost ({why}): its driver was reset, updated or found a step \
+                 too long; the next call opens it again; if it is lost again, use smaller images or \
+                 backend cpu"
+            ),
+            None => format!(
+                "backend gpu: {name} {what}; use fewer splats or smaller images, or backend cpu"
+            ),
+        })
     }
 
-    /// What wgpu reported since the last call.
+    /// What wgpu reported since the last call; always an error once the device is lost.
     pub fn check(&self) -> Result<()> {
         let failure = self.failure.lock().ok().and_then(|mut f| f.take());
+        if self.is_lost() {
+            return Err(self.error("was lost"));
+        }
         failure.map_or(Ok(()), |what| Err(self.error(&what)))
     }
 }
 
+/// wgpu's text has many lines, this crate's errors have one.
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
 fn note(failure: &Mutex<Option<String>>, what: String) {
     if let Ok(mut failure) = failure.lock() {
-        // The first failure is the cause, what follows its consequences. wgpu's text has many lines,
-        // this crate's errors have one.
-        failure.get_or_insert_with(|| what.split_whitespace().collect::<Vec<_>>().join(" "));
+        // The first failure is the cause, what follows its consequences.
+        failure.get_or_insert_with(|| one_line(&what));
     }
 }

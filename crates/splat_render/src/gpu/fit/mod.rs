@@ -220,10 +220,18 @@ impl GpuFit {
         }
         let (head, _) = self.status()?;
         let pending = std::mem::take(&mut self.pending);
-        if head.overflow == 0 {
-            return self.read_sums(&pending);
+        let settled = if head.overflow == 0 { Ok(()) } else { self.redo(&pending, head.overflow) };
+        if let Err(error) = settled.and_then(|()| self.read_sums(&pending)) {
+            // Whoever asks for the state gets this error again, and none without these steps.
+            self.pending = pending;
+            return Err(error);
         }
-        let first = pending.iter().position(|p| p.step == head.overflow).unwrap_or(0);
+        Ok(())
+    }
+
+    /// Does the pending steps again from the one whose pairs did not fit, with room for them.
+    fn redo(&mut self, pending: &[StepInput], overflow: u32) -> Result<()> {
+        let first = pending.iter().position(|p| p.step == overflow).unwrap_or(0);
         // One at a time, so that the counts read are those of the step that needs the room.
         for (at, input) in pending.iter().enumerate().skip(first) {
             loop {
@@ -238,7 +246,7 @@ impl GpuFit {
                 self.grow(self.photos[input.view].frame, &counts)?;
             }
         }
-        self.read_sums(&pending)
+        Ok(())
     }
 
     /// Makes room for the pairs that a step needs.

@@ -1,0 +1,43 @@
+//! What tests make an adapter do: none that fails is at hand.
+
+use super::limits::needed_limits;
+
+/// Faults of an adapter. The default has none.
+#[derive(Debug, Clone, Default)]
+pub struct Injected {
+    /// A software adapter passes for a real one.
+    pub passes_for_real: bool,
+    /// The driver refuses a shader.
+    pub bad_shader: bool,
+    /// Kernels compute wrong values.
+    pub wrong_values: bool,
+    /// Limits that the adapter has in place of its own, where they are lower.
+    pub limits: Option<wgpu::Limits>,
+    /// Larger buffers are more than the memory holds.
+    pub buffer_bytes: Option<u64>,
+}
+
+impl Injected {
+    /// An adapter that binds fewer buffers than the kernels need.
+    pub fn with_low_limits(self) -> Self {
+        let limits = wgpu::Limits { max_storage_buffers_per_shader_stage: 4, ..needed_limits() };
+        Self { limits: Some(limits), ..self }
+    }
+
+    /// Whether results are those of a sound device.
+    pub fn is_sound(&self) -> bool {
+        !self.bad_shader && !self.wrong_values
+    }
+
+    /// The text of a shader as the driver takes it.
+    pub(super) fn text(&self, text: String) -> String {
+        if self.bad_shader {
+            return text + "\nfn no_driver_takes_this(";
+        }
+        if self.wrong_values {
+            // The cap of alpha, far from where it is.
+            return text.replace("const ALPHA_MAX = ", "const ALPHA_MAX = 0.5 * ");
+        }
+        text
+    }
+}

@@ -1,0 +1,36 @@
+//! What an adapter must have, and the message for one that has not.
+
+use crate::error::{Error, Result};
+
+/// What the kernels ask of an adapter; a test holds it against them. All of it is within WebGPU's
+/// default limits.
+pub fn needed_limits() -> wgpu::Limits {
+    wgpu::Limits {
+        max_storage_buffers_per_shader_stage: 8,
+        max_uniform_buffers_per_shader_stage: 3,
+        max_compute_workgroup_storage_size: 9600,
+        max_compute_invocations_per_workgroup: 256,
+        max_compute_workgroup_size_x: 256,
+        max_compute_workgroup_size_y: 1,
+        max_compute_workgroup_size_z: 1,
+        max_compute_workgroups_per_dimension: 4096,
+        max_storage_buffer_binding_size: 16 << 20,
+        max_buffer_size: 16 << 20,
+        ..wgpu::Limits::downlevel_webgl2_defaults()
+    }
+}
+
+/// Checks that an adapter can run the kernels.
+pub(super) fn check_limits(name: &str, offered: &wgpu::Limits) -> Result<()> {
+    let mut short = Vec::new();
+    needed_limits().check_limits_with_fail_fn(offered, false, |limit, needed, has| {
+        short.push(format!("{limit} is {has} where igsr needs {needed}"));
+    });
+    if short.is_empty() {
+        return Ok(());
+    }
+    Err(Error::Device(format!(
+        "backend gpu: {name} cannot run the kernels: {}; update its driver or use backend cpu",
+        short.join(", ")
+    )))
+}

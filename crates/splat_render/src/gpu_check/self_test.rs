@@ -1,0 +1,271 @@
+//! Whether a device computes what it should: all kernels are compiled, and a small scene goes through
+//! every stage there and in the reference. A driver's compiler may refuse a kernel or get it wrong, and
+//! a fit that is wrong from the start shows in no message.
+
+use glam::{DMat4, DVec3};
+use num_traits::Float;
+
+use crate::camera::Camera;
+use crate::error::{Error, Result};
+use crate::fit_device::noise_draw;
+use crate::gpu::Gpu;
+use crate::reference::Reference;
+use crate::splats::SplatArrays;
+use crate::stages::{
+    AdamState, AdamStep, Exposure, ImageGradients, ProjectOptions, Rates, SplatGradients, Stages,
+};
+use crate::target::Target;
+
+/// Largest difference from the reference, as a part of the largest value: f32 rounds to a hundredth of
+/// it, and a compiler's mistake is no matter of digits.
+const TOLERANCE: f64 = 1e-3;
+/// Of the scene: one whose decisions are clear (a test has how).
+const SEED: u32 = 97;
+const SPLATS: usize = 40;
+const SIZE: (u32, u32) = (56, 40);
+const BACKGROUND: [f64; 3] = [0.25, 0.5, 0.75];
+
+/// What a stage gives, as plain numbers.
+type Outputs = Vec<(&'static str, Vec<f64>)>;
+
+/// Compiles every kernel and compares what they compute of a small scene with the reference.
+///
+/// # Errors
+/// [`Error::Device`] with what the driver says, or with the first stage that is wrong.
+pub fn self_test(gpu: &Gpu) -> Result<()> {
+    gpu.compile_all()?;
+    let outputs = all_stages::<f32>(gpu)?;
+    let expected = all_stages::<f64>(&Reference)?;
+    for ((stage, values), (_, right)) in outputs.iter().zip(&expected) {
+        let off = difference(values, right);
+        if off.is_nan() || off > TOLERANCE {
+            return Err(Error::Device(format!(
+                "backend gpu: {} computes wrong values: {stage} is off by {off:.1e} of the largest; \
+                 update its driver or use backend cpu",
+                gpu.name()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// The largest difference, as a part of the largest value.
+fn difference(values: &[f64], right: &[f64]) -> f64 {
+    if values.len() != right.len() || values.iter().any(|value| value.is_nan()) {
+        return f64::NAN;
+    }
+    let most = |of: f64, x: f64| of.max(x.abs());
+    let apart = values.iter().zip(right).map(|(value, right)| value - right);
+    apart.fold(0.0, most) / right.iter().copied().fold(0.0, most)
+}
+
+/// A number in 0..1 that depends on `k` alone, on every machine.
+fn draw(k: usize) -> f64 {
+    f64::from(noise_draw(SEED, k as u32)[0])
+}
+
+fn cast<T: Float>(x: f64) -> T {
+    // Through f32, so that all implementations are given the same values.
+    T::from(x as f32).unwrap_or_else(T::zero)
+}
+
+/// Splats before the camera, of all sizes and shapes that fit.
+fn scene<T: Float>() -> SplatArrays<T> {
+    let number = |i: usize, k: usize| draw(1000 * i + k) - 0.5;
+    let splats = 0..SPLATS;
+    SplatArrays {
+        means: splats
+            .clone()
+            .map(|i| [3.0 * number(i, 0), 2.0 * number(i, 1), 4.0 + 2.0 * number(i, 2)].map(cast))
+            .collect(),
+        quats: splats.clone().map(|i| [3, 4, 5, 6].map(|k| cast(number(i, k)))).collect(),
+        scales: splats
+            .clone()
+            .map(|i| [7, 8, 9].map(|k| cast(-1.6 + 2.0 * number(i, k))))
+            .collect(),
+        opacities: splats.clone().map(|i| cast(1.5 + 7.0 * number(i, 10))).collect(),
+        sh: splats
+            .flat_map(|i| (0..9).map(move |k| [11, 12, 13].map(|c| cast(number(i, 3 * k + c)))))
+            .collect(),
+        sh_degree: 2,
+    }
+}
+
+fn camera() -> Camera {
+    Camera {
+        viewmat: DMat4::from_translation(DVec3::new(0.1, -0.05, 0.2))
+            * DMat4::from_rotation_y(0.1)
+            * DMat4::from_rotation_x(-0.05),
+        fx: 60.0,
+        fy: 58.0,
+        cx: 27.3,
+        cy: 20.6,
+        width: SIZE.0,
+        height: SIZE.1,
+    }
+}
+
+fn photo() -> Target {
+    Target {
+        width: SIZE.0,
+        height: SIZE.1,
+        channels: 3,
+        pixels: (0..3 * SIZE.0 as usize * SIZE.1 as usize)
+            .map(|k| (255.0 * draw(k)) as u8)
+            .collect(),
+        weights: None,
+        background: None,
+        turns: 1,
+        until: None,
+    }
+}
+
+fn flat<T: Float, const N: usize>(rows: &[[T; N]]) -> Vec<f64> {
+    rows.iter().flatten().map(|x| x.to_f64().unwrap_or(f64::NAN)).collect()
+}
+
+fn plain<T: Float>(values: &[T]) -> Vec<f64> {
+    values.iter().map(|x| x.to_f64().unwrap_or(f64::NAN)).collect()
+}
+
+/// The scene through every stage, as a step of a fit with exposure has them.
+fn all_stages<T: Float>(stages: &impl Stages<T>) -> Result<Outputs> {
+    let (splats, camera, photo) = (scene::<T>(), camera(), photo());
+    let options = ProjectOptions { antialiased: true, ..ProjectOptions::default() };
+    let background = BACKGROUND.map(cast);
+    let exposure = Exposure {
+        gain: [0.9, 1.1, 1.05].map(cast),
+        offset: [0.02, -0.03, 0.01].map(cast),
+        background: Some(background),
+    };
+    let params = splats.params(2);
+    let projected = stages.project(&params, &camera, &options)?;
+    let image = stages.rasterize(&projected, background)?;
+    let corrected = stages.exposure(&image, &exposure)?;
+    let loss = stages.loss(&image, &photo, background, 0.2)?;
+    let exposed = stages.exposure_backward(&image, &exposure, &loss.v_color)?;
+    let v_image = ImageGradients {
+        v_color: exposed.v_color.clone(),
+        v_alpha: exposed.v_alpha.clone(),
+        v_depth: (0..image.depth.len()).map(|k| cast(1e-4 * (draw(k) - 0.5))).collect(),
+    };
+    let mut signed = stages.rasterize_backward(&projected, background, &image, &v_image, false)?;
+    let v_projected = stages.rasterize_backward(&projected, background, &image, &v_image, true)?;
+    let gradients =
+        stages.project_backward(&params, &camera, &options, &projected, &v_projected)?;
+    let mut second = scene::<T>();
+    // Large enough that no update is the sign of a gradient near 0.
+    fill(&mut second, 1e-4);
+    let mut first = scene::<T>();
+    fill(&mut first, 0.0);
+    let mut state = AdamState { splats: scene(), first, second };
+    stages.adam(&mut state, &gradients, &adam_step())?;
+
+    let absolute = v_projected.v_means2d_absolute.clone().unwrap_or_default();
+    let SplatGradients { v_means, v_quats, v_scales, v_opacities, v_colors, .. } = &gradients;
+    Ok(vec![
+        ("project", flat(&projected.means2d)),
+        ("project", flat(&projected.factors)),
+        ("project", flat(&projected.colors)),
+        ("project", plain(&projected.opacities)),
+        ("rasterize", flat(&image.color)),
+        ("rasterize", plain(&image.depth)),
+        ("rasterize", plain(&image.transmittance)),
+        ("exposure", flat(&corrected)),
+        ("loss", plain(&[loss.value])),
+        ("loss", flat(&loss.v_color)),
+        ("exposure_backward", flat(&exposed.v_color)),
+        ("exposure_backward", flat(&[exposed.v_gain, exposed.v_offset])),
+        ("rasterize_backward", flat(&std::mem::take(&mut signed.v_means2d))),
+        ("rasterize_backward", flat(&v_projected.v_means2d)),
+        ("rasterize_backward", flat(&v_projected.v_factors)),
+        ("rasterize_backward", plain(&v_projected.v_opacities)),
+        ("rasterize_backward", flat(&absolute)),
+        ("project_backward", flat(v_means)),
+        ("project_backward", flat(v_quats)),
+        ("project_backward", flat(v_scales)),
+        ("project_backward", plain(v_opacities)),
+        ("project_backward", flat(v_colors)),
+        ("project_backward", flat(&gradients.v_viewmat)),
+        ("adam", flat(&state.splats.means)),
+        ("adam", flat(&state.splats.scales)),
+        ("adam", flat(&state.splats.sh)),
+    ])
+}
+
+fn adam_step() -> AdamStep {
+    AdamStep {
+        number: 5,
+        rates: Rates {
+            means: 0.1,
+            quats: 0.1,
+            scales: 0.1,
+            opacities: 0.1,
+            sh0: 0.1,
+            sh_rest: 0.05,
+        },
+        sh_degree: 2,
+        opacity_regularizer: 0.01,
+        scale_regularizer: 0.01,
+        noise: 0.0,
+        noise_seed: 0,
+    }
+}
+
+fn fill<T: Float>(arrays: &mut SplatArrays<T>, value: f64) {
+    let value = cast(value);
+    arrays.means.fill([value; 3]);
+    arrays.quats.fill([value; 4]);
+    arrays.scales.fill([value; 3]);
+    arrays.opacities.fill(value);
+    arrays.sh.fill([value; 3]);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reference::decisions;
+
+    /// A pair that one device blends and another does not would be an alarm for nothing.
+    #[test]
+    fn no_decision_of_the_scene_is_near_its_threshold() {
+        let options = ProjectOptions { antialiased: true, ..ProjectOptions::default() };
+        let taken = |by: f64| {
+            let mut splats = scene::<f64>();
+            splats.opacities.iter_mut().for_each(|logit| *logit += by);
+            splats.means.iter_mut().for_each(|mean| mean[0] += by);
+            let projected = Reference.project(&splats.params(2), &camera(), &options).unwrap();
+            decisions(&splats.params(2), &camera(), &options, &projected)
+        };
+        assert_eq!(taken(0.0), taken(6e-5));
+        assert_eq!(taken(0.0), taken(-6e-5));
+        assert_ne!(taken(0.0), taken(1e-2));
+    }
+
+    #[test]
+    fn the_scene_has_all_that_a_picture_may_have() {
+        let outputs = all_stages::<f64>(&Reference).unwrap();
+        let of = |stage: &str, k: usize| {
+            &outputs.iter().filter(|(name, _)| *name == stage).nth(k).unwrap().1
+        };
+        let transmittance = of("rasterize", 2);
+        let share = |keep: fn(f64) -> bool| {
+            transmittance.iter().filter(|t| keep(**t)).count() as f64 / transmittance.len() as f64
+        };
+        assert!(share(|t| t > 0.99) > 0.02, "nowhere is the background seen");
+        assert!(share(|t| t < 0.1) > 0.02, "nothing hides what is behind it");
+        assert!(share(|t| (0.1..0.9).contains(&t)) > 0.2, "nothing is half transparent");
+        for (stage, values) in &outputs {
+            assert!(values.iter().any(|v| *v != 0.0), "{stage} has zeros only");
+            assert!(values.iter().all(|v| v.is_finite()), "{stage}");
+        }
+    }
+
+    #[test]
+    fn differences_are_parts_of_the_largest_and_see_nan() {
+        assert_eq!(difference(&[1.0, 4.0], &[1.0, 5.0]), 0.2);
+        assert!(difference(&[1.0, f64::NAN], &[1.0, 5.0]).is_nan());
+        assert!(difference(&[f64::NAN, 5.0], &[1.0, 5.0]).is_nan());
+        assert!(difference(&[1.0], &[1.0, 5.0]).is_nan());
+    }
+}

@@ -1,0 +1,70 @@
+//! That a device passed its self-test, remembered from one process to the next: the test costs a second
+//! or more where kernels have not been compiled before. What failed is tried again each time.
+
+use std::env;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::io::Write;
+use std::path::PathBuf;
+
+use super::self_test::self_test;
+use crate::error::Result;
+use crate::gpu::{Gpu, Injected, shader_variants};
+use crate::io::write_atomically;
+
+/// Folder of the verdicts; an empty value keeps none.
+const VARIABLE: &str = "IGSR_GPU_CACHE";
+
+/// [`Gpu::new`], with a device that passes [`self_test`] now or, with the same driver and the same
+/// kernels, did before.
+///
+/// # Errors
+/// Those of both.
+pub fn open_tested(software_allowed: bool) -> Result<Gpu> {
+    open_tested_with(software_allowed, &Injected::default())
+}
+
+/// [`open_tested`] on an adapter with these faults.
+///
+/// # Errors
+/// Those of [`open_tested`].
+pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<Gpu> {
+    let gpu = Gpu::with_faults(software_allowed, injected)?;
+    let verdict = verdict_file(&gpu).filter(|_| injected.is_sound());
+    if verdict.as_ref().is_some_and(|path| path.is_file()) {
+        return Ok(gpu);
+    }
+    self_test(&gpu)?;
+    if let Some(path) = verdict {
+        // A folder that cannot be written costs the test again, no more.
+        let _ = path.parent().map(std::fs::create_dir_all);
+        let _ = write_atomically(&path, |out| writeln!(out, "{} passed", gpu.name()));
+    }
+    Ok(gpu)
+}
+
+/// The file that says that this adapter, with this driver, computes these kernels right.
+fn verdict_file(gpu: &Gpu) -> Option<PathBuf> {
+    let info = gpu.info();
+    let mut key = DefaultHasher::new();
+    (&info.name, info.vendor, info.device, &info.driver, &info.driver_info).hash(&mut key);
+    format!("{:?} {:?}", info.backend, info.device_type).hash(&mut key);
+    env!("CARGO_PKG_VERSION").hash(&mut key);
+    shader_variants().for_each(|variant| variant.text.hash(&mut key));
+    Some(folder()?.join(format!("{:016x}.passed", key.finish())))
+}
+
+/// Where programs of the system keep what they can make again.
+fn folder() -> Option<PathBuf> {
+    if let Some(folder) = env::var_os(VARIABLE) {
+        return (!folder.is_empty()).then(|| PathBuf::from(folder));
+    }
+    let of = |name: &str| env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let base = if cfg!(windows) {
+        of("LOCALAPPDATA")
+    } else if cfg!(target_os = "macos") {
+        of("HOME").map(|home| home.join("Library/Caches"))
+    } else {
+        of("XDG_CACHE_HOME").or_else(|| of("HOME").map(|home| home.join(".cache")))
+    };
+    Some(base?.join("igsr").join("gpu"))
+}

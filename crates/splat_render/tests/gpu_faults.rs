@@ -1,0 +1,181 @@
+//! What becomes of callers when an adapter fails: each fault is injected, and its message, what is kept
+//! and what works afterwards are looked at.
+
+mod common;
+
+use std::sync::Arc;
+
+use common::*;
+use splat_render::fit::{FitDevice, FitState, Rates, SplatArrays, StepInput, Target};
+use splat_render::gpu::{Gpu, GpuFit, Injected, needed_limits};
+use splat_render::gpu_check::{open_tested_with, self_test};
+use splat_render::{Camera, Error};
+
+fn faulty(injected: &Injected) -> Gpu {
+    Gpu::with_faults(true, injected).unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn message(result: splat_render::Result<()>) -> String {
+    match result {
+        Err(error @ Error::Device(_)) => error.to_string(),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_sound_device_passes() {
+    let gpu = Gpu::new(true).unwrap_or_else(|e| panic!("{e}"));
+    let began = std::time::Instant::now();
+    gpu.compile_all().unwrap_or_else(|e| panic!("{e}"));
+    println!("kernels compiled in {:?}", began.elapsed());
+    let began = std::time::Instant::now();
+    self_test(&gpu).unwrap_or_else(|e| panic!("{e}"));
+    println!("self-test in {:?}", began.elapsed());
+    let plain = Gpu::new(true).unwrap().without_subgroups();
+    self_test(&plain).unwrap_or_else(|e| panic!("{e}"));
+}
+
+#[test]
+fn a_shader_that_does_not_compile_is_found_on_opening() {
+    let injected = Injected { bad_shader: true, ..Injected::default() };
+    let found = message(self_test(&faulty(&injected)));
+    assert!(found.contains("backend gpu: ") && found.contains("Shader"), "{found}");
+    assert!(!found.contains('\n'), "{found}");
+    assert!(matches!(open_tested_with(true, &injected), Err(Error::Device(_))));
+}
+
+#[test]
+fn wrong_values_are_found_and_the_stage_is_named() {
+    let injected = Injected { wrong_values: true, ..Injected::default() };
+    let gpu = faulty(&injected);
+    let found = message(self_test(&gpu));
+    assert!(found.contains("computes wrong values: rasterize is off by"), "{found}");
+    assert!(found.contains(&gpu.name()), "{found}");
+}
+
+#[test]
+fn an_adapter_below_the_limits_is_refused_by_the_limit() {
+    let injected = Injected::default().with_low_limits();
+    let found = message(Gpu::with_faults(true, &injected).map(drop));
+    assert!(
+        found.contains("max_storage_buffers_per_shader_stage is 4 where igsr needs 8"),
+        "{found}"
+    );
+}
+
+#[test]
+fn an_adapter_with_the_smallest_limits_passes() {
+    let injected = Injected { limits: Some(needed_limits()), ..Injected::default() };
+    self_test(&faulty(&injected)).unwrap_or_else(|e| panic!("{e}"));
+    let mut fit = Fit::new(&Arc::new(faulty(&injected)), 200);
+    (1..20).for_each(|step| fit.step(step).unwrap());
+    assert_eq!(fit.device.download().unwrap().splats.len(), 200);
+}
+
+struct Fit {
+    device: GpuFit,
+    camera: Camera,
+}
+
+impl Fit {
+    fn new(gpu: &Arc<Gpu>, splats: usize) -> Self {
+        let mut rng = rng(3);
+        let scene = random_scene(&mut rng, splats, Some(1));
+        let camera = random_camera(&mut rng, 64, 48);
+        let mut device = GpuFit::new(Arc::clone(gpu));
+        let photo = Target {
+            width: 64,
+            height: 48,
+            channels: 3,
+            pixels: vec![90; 3 * 64 * 48],
+            weights: None,
+            background: None,
+            turns: 1,
+            until: None,
+        };
+        device.set_targets(vec![photo]).unwrap();
+        let mut fit = Self { device, camera };
+        fit.upload(FitState::new(SplatArrays {
+            means: scene.means,
+            quats: scene.quats,
+            scales: scene.scales,
+            opacities: scene.opacities,
+            sh: scene.colors,
+            sh_degree: scene.sh_degree,
+        }))
+        .unwrap();
+        fit
+    }
+
+    fn upload(&mut self, state: FitState) -> splat_render::Result<()> {
+        self.device.upload(state)
+    }
+
+    fn step(&mut self, step: u32) -> splat_render::Result<()> {
+        self.device.step(&StepInput {
+            view: 0,
+            camera: self.camera,
+            background: [0.0; 3],
+            sh_degree: 1,
+            rates: Rates {
+                means: 1e-3,
+                quats: 1e-3,
+                scales: 5e-3,
+                opacities: 5e-2,
+                sh0: 5e-3,
+                sh_rest: 2.5e-4,
+            },
+            step,
+            ssim_weight: 0.2,
+            opacity_regularizer: 0.01,
+            scale_regularizer: 0.01,
+            noise: 0.0,
+            dropout: 0.0,
+            noise_seed: step,
+            camera_gradient: false,
+            exposure: None,
+        })
+    }
+}
+
+#[test]
+fn a_device_lost_in_mid_fit_is_one_message_and_the_next_one_works() {
+    let gpu = Arc::new(Gpu::new(true).unwrap());
+    let mut fit = Fit::new(&gpu, 100);
+    (1..20).for_each(|step| fit.step(step).unwrap());
+    assert!(!gpu.is_lost());
+    gpu.lose();
+    assert!(gpu.is_lost());
+    let found = message((20..60).try_for_each(|step| fit.step(step)));
+    assert!(
+        found.contains("was lost") && found.contains("the next call opens it again"),
+        "{found}"
+    );
+    // No call on it gives something that looks like a result.
+    for result in [fit.device.download().map(drop), fit.device.loss().map(drop), fit.step(60)] {
+        assert!(message(result).contains("was lost"));
+    }
+    let mut next = Fit::new(&Arc::new(Gpu::new(true).unwrap()), 100);
+    (1..20).for_each(|step| next.step(step).unwrap());
+    assert!(next.device.loss().unwrap() > 0.0);
+}
+
+#[test]
+fn growth_beyond_the_memory_is_one_message_and_changes_no_step_in_silence() {
+    let injected = Injected { buffer_bytes: Some(600_000), ..Injected::default() };
+    let gpu = Arc::new(faulty(&injected));
+    // Splats as wide as the picture: their pairs outgrow the first guess of four per splat.
+    let mut fit = Fit::new(&gpu, 3000);
+    let mut state = fit.device.download().unwrap();
+    state.splats.scales.iter_mut().for_each(|scale| *scale = [3.0; 3]);
+    state.splats.opacities.fill(0.0);
+    fit.upload(state).unwrap();
+    let found = message((1..40).try_for_each(|step| fit.step(step)));
+    assert!(found.contains("is out of memory; use fewer splats or smaller images"), "{found}");
+    // The steps that were not done are not forgotten: asking for their result is the same error.
+    assert!(message(fit.device.download().map(drop)).contains("is out of memory"));
+    // The device itself is sound.
+    let mut small = Fit::new(&gpu, 50);
+    (1..20).for_each(|step| small.step(step).unwrap());
+    assert_eq!(small.device.download().unwrap().splats.len(), 50);
+}

@@ -1,0 +1,115 @@
+"""``igsr bench --report``: the page and the figures that a person sends of a GPU."""
+
+from __future__ import annotations
+
+import json
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+
+from igsr import _core, benchmark
+from igsr.benchmark import device_report as device_reports
+from igsr.benchmark import gsplat_rows
+from igsr.benchmark.growth import shot_of
+from igsr.benchmark.scenes import upstream
+from igsr.errors import IgsrError
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The ball of a report in a second."""
+    monkeypatch.setattr(device_reports, "GROWN_COUNT", 200)
+    monkeypatch.setattr(device_reports, "GROWN_SIDE", 32)
+
+
+def report_of(monkeypatch, tmp_path, tests=None):
+    settings = benchmark.Settings(backends=("gpu",), workloads=("W2",), seconds=0.0)
+    report = benchmark.device_report(settings)
+    path = tmp_path / "report.html"
+    benchmark.write_device_report(path, {**report, "tests": tests})
+    return path.read_text(), json.loads(path.with_suffix(".json").read_text())
+
+
+@pytest.mark.usefixtures("small")
+def test_the_page_has_device_limits_times_and_errors(monkeypatch, tmp_path):
+    page, figures = report_of(monkeypatch, tmp_path)
+    device = figures["device"]
+    assert device["name"] in page
+    assert device["driver_info"] in page
+    assert device["limits"]["maxStorageBuffersPerShaderStage"] == 8
+    for name, value in device["limits"].items():
+        assert f"<dt>{name}</dt><dd>{value}</dd>" in page
+    assert device["start"]["compile_ms"] > 0.0
+    passes = {row["pass"] for row in figures["rows"] if row["workload"] == "ball" and row["ms"]}
+    assert passes == {"forward", "backward"}
+    for row in figures["rows"]:
+        if row["ms"] is not None:
+            assert row["max_error"] < 1e-3
+            assert f"{row['max_error']:.1e}" in page
+    # What did not run says why.
+    assert "W2 on gpu not run: it needs gsplat" in page
+    if gsplat_rows.why_not():
+        assert f"ball on gsplat not run: {gsplat_rows.why_not()}" in page
+
+
+@pytest.mark.usefixtures("small")
+def test_failed_tests_stand_out(monkeypatch, tmp_path):
+    tests = {"command": "cargo", "passed": 3, "failed": ["a_test"], "seconds": 1.0, "error": "<b>"}
+    page, figures = report_of(monkeypatch, tmp_path, tests)
+    assert "1 failed" in page
+    assert "a_test" in page
+    assert "&lt;b&gt;" in page
+    assert figures["tests"] == tests
+
+
+def test_without_a_device_the_page_says_why(monkeypatch):
+    def fails():
+        raise RuntimeError("backend gpu: no adapter answers")
+
+    monkeypatch.setattr(_core, "gpu_report", fails)
+    assert device_reports.describe_device() == {"error": "backend gpu: no adapter answers"}
+
+
+def test_a_report_is_a_page(tmp_path):
+    with pytest.raises(IgsrError, match=r"ends in \.html"):
+        benchmark.json_beside(tmp_path / "report.json")
+
+
+def made_up_gsplat(draws):
+    module = types.ModuleType("gsplat")
+    module.__version__ = "0"
+    module.rasterization = draws
+    return module
+
+
+def test_gsplat_gets_the_scene_in_its_own_terms(monkeypatch):
+    scene = shot_of(0, 30, 16).scene
+    calls = []
+
+    def draws(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **more):
+        calls.append((scales.detach(), opacities.detach(), Ks, more["backgrounds"].shape))
+        value = means.sum() + quats.sum() + scales.sum() + opacities.sum() + colors.sum()
+        return value.expand(1, height, width, 3), value.expand(1, height, width, 1), {}
+
+    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(draws))
+    rows = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
+    assert [row["pass"] for row in rows] == ["forward", "backward"]
+    assert all(row["ms"] >= 0.0 and row["backend"] == "gsplat" for row in rows)
+    scales, opacities, Ks, backgrounds = calls[0]
+    np.testing.assert_allclose(scales, np.exp(scene.splats["scales"]), rtol=1e-6)
+    assert torch.all((opacities > 0.0) & (opacities < 1.0))
+    assert Ks.shape == (1, 3, 3)
+    assert Ks[0, 0, 0] == scene.intrinsics[0]
+    assert backgrounds == (1, 3)
+
+
+def test_a_gsplat_that_fails_is_one_message(monkeypatch):
+    def fails(**given):
+        raise TypeError("unexpected keyword")
+
+    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(fails))
+    with pytest.raises(IgsrError, match="gsplat 0 failed: unexpected keyword"):
+        gsplat_rows.gsplat_rows("ball", shot_of(0, 30, 16).scene, upstream(0, 16, 16), 0.0, "cpu")
