@@ -81,13 +81,13 @@ impl Fit {
     fn new(gpu: &Arc<Gpu>, splats: usize) -> Self {
         let mut rng = rng(3);
         let scene = random_scene(&mut rng, splats, Some(1));
-        let camera = random_camera(&mut rng, 64, 48);
+        let camera = random_camera(&mut rng, 128, 96);
         let mut device = GpuFit::new(Arc::clone(gpu));
         let photo = Target {
-            width: 64,
-            height: 48,
+            width: 128,
+            height: 96,
             channels: 3,
-            pixels: vec![90; 3 * 64 * 48],
+            pixels: vec![90; 3 * 128 * 96],
             weights: None,
             background: None,
             turns: 1,
@@ -164,7 +164,7 @@ fn a_device_lost_in_mid_fit_is_one_message_and_the_next_one_works() {
 fn growth_beyond_the_memory_is_one_message_and_changes_no_step_in_silence() {
     let injected = Injected { buffer_bytes: Some(600_000), ..Injected::default() };
     let gpu = Arc::new(faulty(&injected));
-    // Splats as wide as the picture: their pairs outgrow the first guess of four per splat.
+    // Splats as wide as the picture: the pairs of those before the camera outgrow the first guess of four per splat.
     let mut fit = Fit::new(&gpu, 3000);
     let mut state = fit.device.download().unwrap();
     state.splats.scales.iter_mut().for_each(|scale| *scale = [3.0; 3]);

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from igsr.benchmark.accuracy import measure_accuracy, write_accuracy
 from igsr.benchmark.build_pairs import compare_builds, slower_rows
-from igsr.benchmark.device_report import device_report, json_beside, write_device_report
+from igsr.benchmark.gpu_report import device_report, json_beside, write_device_report
 from igsr.benchmark.plots import plot_speed_vs_error
 from igsr.benchmark.run import WORKLOADS, Settings, resolved_backends, run_benchmark
 from igsr.benchmark.table import print_pairs, print_report

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from igsr import _core, benchmark
-from igsr.benchmark import device_report as device_reports
-from igsr.benchmark import gsplat_rows
+from igsr.benchmark import gpu_report, gsplat_rows
 from igsr.benchmark.growth import shot_of
 from igsr.benchmark.scenes import upstream
 from igsr.errors import IgsrError
@@ -21,8 +20,8 @@ from igsr.errors import IgsrError
 @pytest.fixture
 def small(monkeypatch):
     """The ball of a report in a second."""
-    monkeypatch.setattr(device_reports, "GROWN_COUNT", 200)
-    monkeypatch.setattr(device_reports, "GROWN_SIDE", 32)
+    monkeypatch.setattr(gpu_report, "GROWN_COUNT", 200)
+    monkeypatch.setattr(gpu_report, "GROWN_SIDE", 32)
 
 
 def report_of(monkeypatch, tmp_path, tests=None):
@@ -65,12 +64,18 @@ def test_failed_tests_stand_out(monkeypatch, tmp_path):
     assert figures["tests"] == tests
 
 
-def test_without_a_device_the_page_says_why(monkeypatch):
+def test_without_a_device_the_page_says_why(monkeypatch, tmp_path):
     def fails():
         raise RuntimeError("backend gpu: no adapter answers")
 
     monkeypatch.setattr(_core, "gpu_report", fails)
-    assert device_reports.describe_device() == {"error": "backend gpu: no adapter answers"}
+    why = "backend gpu: no adapter answers"
+    device = gpu_report.describe_device()
+    assert device == {"name": None, "error": why}
+    machine = benchmark.run_benchmark(benchmark.Settings(("cpu",), ()))["machine"]
+    path = tmp_path / "report.html"
+    benchmark.write_device_report(path, {"device": device, "machine": machine, "rows": []})
+    assert why in path.read_text()
 
 
 def test_a_report_is_a_page(tmp_path):

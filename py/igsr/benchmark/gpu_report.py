@@ -27,9 +27,9 @@ def describe_device() -> dict[str, Any]:
         device = _core.gpu_report()
         opened, compiled, tested = _core.time_gpu_start()
     except RuntimeError as error:
-        return {"error": str(error)}
+        return {"name": None, "error": str(error)}
     start = {"open_ms": opened, "compile_ms": compiled, "self_test_ms": tested}
-    return {**device, "start": start}
+    return {**device, "start": start, "error": None}
 
 
 def device_report(
@@ -115,7 +115,7 @@ def write_device_report(path: Path, report: dict[str, Any]) -> None:
         "json": json_beside(path).name,
     }
     templates = Path(__file__).with_name("templates")
-    write_template(path, templates, "device.html.jinja", variables)
+    write_template(path, templates, "gpu.html.jinja", variables)
 
 
 def _cells(row: dict[str, Any]) -> dict[str, Any]:
