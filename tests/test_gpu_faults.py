@@ -1,4 +1,4 @@
-"""A GPU that fails: "auto" warns and takes the CPU; a fit ends in one message and keeps its file."""
+"""A GPU that fails: "auto" warns and takes the CPU; a fit ends in one message, its file kept."""
 
 from __future__ import annotations
 

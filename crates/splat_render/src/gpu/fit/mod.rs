@@ -279,12 +279,15 @@ impl GpuFit {
             .as_mut()
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))?;
         if need > scene.capacity {
-            scene.capacity = need.saturating_add(need / 4).min(limit);
-            (scene.pairs, scene.slots) = pair_buffers(&gpu, scene.capacity, tiles)?;
+            // The capacity is that of the buffers there are, also where there is no memory for more.
+            let capacity = need.saturating_add(need / 4).min(limit);
+            (scene.pairs, scene.slots) = pair_buffers(&gpu, capacity, tiles)?;
+            scene.capacity = capacity;
         }
         if chunks.len() as u32 > scene.chunks {
-            scene.chunks = chunks.len() as u32;
-            scene.bins = SplatBins::new(&gpu, scene.len(), scene.chunks)?;
+            let count = chunks.len() as u32;
+            scene.bins = SplatBins::new(&gpu, scene.len(), count)?;
+            scene.chunks = count;
             scene.status_copy = gpu.readable(SplatBins::status_bytes(scene.chunks));
         }
         self.frames[frame].chunks = chunks;
