@@ -40,7 +40,7 @@ from igsr.pose.colmap import Colmap
 NOT_RUN = {
     "README.md": 3,
     "docs/getting-started.md": 3,
-    "docs/guides/cameras.md": 2,
+    "docs/guides/cameras.md": 4,
     "docs/guides/denoising.md": 2,
     "docs/guides/smaller-scenes.md": 1,
     "docs/guides/synthetic-captures.md": 1,

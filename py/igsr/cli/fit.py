@@ -20,6 +20,7 @@ from igsr.cli.pose import (
     EstimatorOption,
     FramesOption,
     GraphOption,
+    MatcherOption,
     capture_to_fit,
 )
 from igsr.cli.scene_page_option import PAGE, HtmlOption, write_page
@@ -86,6 +87,7 @@ def fit_command(
     estimator: EstimatorOption = AUTO,
     network: CheckpointOption = None,
     graph: GraphOption = None,
+    matcher: MatcherOption = None,
     frames: FramesOption = FRAMES,
     allow_missing: AllowMissingOption = False,
     background: BackgroundOption = None,
@@ -140,7 +142,7 @@ def fit_command(
                 cameras_kept=kept,
             )
 
-        finder = CameraFinder(estimator, network, graph, frames, given["seed"])
+        finder = CameraFinder(estimator, network, graph, matcher, frames, given["seed"])
         loaded, found = capture_to_fit(
             capture,
             out,
@@ -181,6 +183,7 @@ def fit_command(
             "estimator": estimator,
             "network": None if network is None else str(network),
             "graph": graph,
+            "matcher": matcher,
             "frames": frames,
             "allow_missing": allow_missing,
             "background": background,

@@ -70,6 +70,17 @@ GraphOption = Annotated[
 ]
 
 
+MatcherOption = Annotated[
+    str | None,
+    typer.Option(
+        "--matcher",
+        metavar="NAME",
+        help="For colmap: what finds and matches features: sift, or loma (a network that matches "
+        "photos from further apart; needs igsr[loma]).",
+    ),
+]
+
+
 AllowMissingOption = Annotated[
     bool,
     typer.Option(
@@ -87,6 +98,7 @@ class CameraFinder:
         estimator: a name of ``igsr.pose.registry.ESTIMATORS``, or "auto".
         checkpoint: weights of the estimator's network, or None.
         graph: which pairs of photos dust3r sees, or None for its default.
+        matcher: of colmap, or None for its default.
         frames: most frames taken from each video.
         seed: of everything random.
     """
@@ -94,13 +106,14 @@ class CameraFinder:
     estimator: str
     checkpoint: Path | None
     graph: str | None
+    matcher: str | None
     frames: int
     seed: int
 
     @property
     def options(self) -> dict[str, Any]:
         """Keywords for the estimator itself: those that were given."""
-        given = {"checkpoint": self.checkpoint, "graph": self.graph}
+        given = {"checkpoint": self.checkpoint, "graph": self.graph, "matcher": self.matcher}
         return {name: value for name, value in given.items() if value is not None}
 
 
@@ -156,7 +169,8 @@ def capture_to_fit(
     seen.train_photos(holdout)
     if seen.has_cameras and (finder.options or finder.estimator != AUTO):
         raise IgsrError(
-            f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
+            f"{path} has cameras, or no photos; leave --estimator, --checkpoint, --graph and "
+            "--matcher out"
         )
     if not seen.has_cameras:
         kept_cameras(path, out)
@@ -196,6 +210,7 @@ def pose_command(
     estimator: EstimatorOption = AUTO,
     checkpoint: CheckpointOption = None,
     graph: GraphOption = None,
+    matcher: MatcherOption = None,
     max_size: MaxSizeOption = None,
     plot: Annotated[
         bool, typer.Option("--plot", help="Draw cameras and points to --out/poses.png.")
@@ -215,7 +230,7 @@ def pose_command(
                 f"{given} has cameras already; fit it as it is, or name an --estimator to find "
                 "them again"
             )
-        finder = CameraFinder(estimator, checkpoint, graph, frames, seed)
+        finder = CameraFinder(estimator, checkpoint, graph, matcher, frames, seed)
         report = _posed(given, out, finder, max_size=max_size, plot=plot, shown=not as_json)
         report["seconds"] = round(time.monotonic() - started, 3)
     if as_json:

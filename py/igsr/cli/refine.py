@@ -18,6 +18,7 @@ from igsr.cli.pose import (
     EstimatorOption,
     FramesOption,
     GraphOption,
+    MatcherOption,
     capture_to_fit,
 )
 from igsr.cli.scene_page_option import PAGE, HtmlOption, write_page
@@ -65,6 +66,7 @@ def refine_command(
     estimator: EstimatorOption = AUTO,
     network: CheckpointOption = None,
     graph: GraphOption = None,
+    matcher: MatcherOption = None,
     frames: FramesOption = FRAMES,
     allow_missing: AllowMissingOption = False,
     config: ConfigOption = None,
@@ -113,7 +115,7 @@ def refine_command(
                 photos,
                 out,
                 holdout,
-                CameraFinder(estimator, network, graph, frames, settings.seed),
+                CameraFinder(estimator, network, graph, matcher, frames, settings.seed),
                 max_size=max_size,
                 allow_missing=allow_missing,
                 resume=resume,
