@@ -30,7 +30,7 @@ def test_splats_that_are_not_finite_are_left_out(browser, tmp_path):
     browser.open(tmp_path / "scene.html")
     write_scene_page(tmp_path / "scene.html", splats, (), BACKGROUND)
     browser.open(tmp_path / "scene.html")
-    assert browser.run("JSON.parse(document.getElementById('scene').textContent).count") == 396
+    assert browser.run("window.igsr.viewer.scene.count") == 396
     check_pictures(browser, splats, three_cameras())
 
 

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from igsr.capture.overview import Overview
     from igsr.fitting import Progress
     from igsr.fitting.fit_report import FitScores
+    from igsr.fitting.followed_run import FollowedRun
     from igsr.splats import Splats
 
 
@@ -164,10 +165,15 @@ def fit_command(
             background=None if has_alpha else color,
         )
 
-        with parts.measured("fit"):
-            splats, fitted = _fitted(loaded, settings, name, out, resume, last, shown=not as_json)
-
         from igsr.fitting.fit_report import FinishedFit, fit_report, write_fit_report, write_scene
+        from igsr.fitting.followed_run import FollowedRun
+
+        followed = FollowedRun(out)
+        followed.begin(loaded, color)
+        with parts.measured("fit"):
+            splats, fitted = _fitted(
+                loaded, settings, name, out, resume, last, followed, shown=not as_json
+            )
 
         # Write the scene, its scores and everything that it takes to fit it again.
         asked = {
@@ -187,6 +193,7 @@ def fit_command(
         }
         write_scene(out, splats, fitted)
         has_page = html and write_page(out, splats, fitted, color)
+        followed.tell("score photos", 1.0)
         with parts.measured("score"):
             is_refined = bool(fitted.test_views) and (settings.moves_cameras or found)
             scores = _scored(splats, fitted, color, name, is_refined=is_refined, shown=not as_json)
@@ -194,6 +201,7 @@ def fit_command(
         done = FinishedFit(splats, fitted, settings, asked, last[-1], not_placed(fitted))
         report = fit_report(done, scores, parts)
         write_fit_report(out, report, done, scores)
+        followed.end()
     if as_json:
         print_json(report)
     else:
@@ -218,6 +226,7 @@ def _fitted(
     out: Path,
     resume: bool,
     last: list[Progress],
+    followed: FollowedRun,
     *,
     shown: bool,
 ) -> tuple[Splats, Capture]:
@@ -229,7 +238,9 @@ def _fitted(
 
         def progress(now: Progress) -> None:
             last[:] = [now]
-            show(bar_state(now))
+            state = bar_state(now)
+            show(state)
+            followed.tell(f"fit: step {now.step} of {now.steps}, {state.text}", now.work)
 
         keywords: dict[str, Any] = {**settings.plain(), "backend": backend}
         return fit_with_cameras(

@@ -112,7 +112,7 @@ def refine(
         stages = Stages(capture, settings, run, denoiser or round_denoiser(), propose, select)
         validation = CrossValidation(stages, capture.train_views) if cross_validate else None
         fits = 1.0 + (validation.work if validation else 0.0)
-        run.prepare(work=fits * (1.0 + settings.most_rounds * (NOVEL_VIEWS_WORK + 1.0)))
+        run.prepare(capture, work=fits * (1.0 + settings.most_rounds * (NOVEL_VIEWS_WORK + 1.0)))
 
         whole = stages.fit_whole()
         if validation is not None:

@@ -73,6 +73,12 @@ class Sorter {
     if (!this.busy) this.start();
   }
 
+  /** Ends the worker; nothing is sorted after this. */
+  stop() {
+    this.worker?.terminate();
+    this.onOrder = () => {};
+  }
+
   get settled() {
     return !this.busy && !this.waiting;
   }

@@ -1,0 +1,105 @@
+"""What a fit or a refinement leaves in its folder for ``igsr view --web`` to follow.
+
+``view/`` holds ``run.json`` (what is behind the splats), ``progress.json`` while the run goes on,
+and some photos beside ``cameras.json``: held-out ones in ``held-out/``, else ``fitted/`` ones. The
+models are the run's own checkpoints and scenes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from igsr._internal.atomic_write import atomic_write
+from igsr._internal.json_file import write_json
+from igsr.capture import Capture, View
+from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_files import png_names
+from igsr.errors import IgsrError
+from igsr.evaluation.scores import over_background
+
+#: The folder within that of the run, and its files.
+VIEW = "view"
+RUN = "run.json"
+PROGRESS = "progress.json"
+CAMERAS = "cameras.json"
+#: Folders of photos, by their split.
+PHOTOS = {"test": "held-out", "train": "fitted"}
+#: Most photos, evenly spaced, and the longest side of each, pixels.
+MOST_PHOTOS = 12
+PHOTO_SIDE = 1000
+#: Seconds between two reports of progress.
+TELL_EVERY = 2.0
+
+
+class FollowedRun:
+    """Tells who follows a run where it stands. What cannot be written is left out: the run counts.
+
+    Nothing is written before ``begin``.
+    """
+
+    def __init__(self, out: Path | None) -> None:
+        """Name the folder of the run; None writes nothing."""
+        self._folder = None if out is None else out / VIEW
+        self._told = -TELL_EVERY
+        self._began = time.monotonic()
+
+    def begin(self, capture: Capture, background: Sequence[float]) -> None:
+        """Write photos to compare renders with, and what is behind them.
+
+        Args:
+            capture: photos and cameras.
+            background: RGB in [0, 1] behind the splats, and behind photos with alpha.
+        """
+        if self._folder is None:
+            return
+        views = capture.test_views or capture.train_views
+        chosen = np.unique(np.linspace(0, len(views) - 1, MOST_PHOTOS).round().astype(int))
+        with contextlib.suppress(OSError, IgsrError):
+            for name in PHOTOS.values():
+                for path in (self._folder / name).glob("**/*.jpg"):
+                    path.unlink()
+            _write_photos(self._folder, [views[k] for k in chosen], background)
+            write_json(self._folder / RUN, {"background": [float(part) for part in background]})
+
+    def tell(self, text: str, done: float) -> None:
+        """Write where the run stands, unless that was written a moment ago; its last part at once.
+
+        Args:
+            text: what it is doing.
+            done: part of the whole run, in [0, 1].
+        """
+        now = time.monotonic()
+        if self._folder is None or not self._folder.is_dir():
+            return
+        if done < 1.0 and now - self._told < TELL_EVERY:
+            return
+        self._told = now
+        with contextlib.suppress(OSError, IgsrError):
+            seconds = round(now - self._began, 1)
+            progress = {"text": text, "done": min(1.0, max(0.0, done)), "seconds": seconds}
+            write_json(self._folder / PROGRESS, progress)
+
+    def end(self) -> None:
+        """Tell that the run is done."""
+        if self._folder is not None:
+            with contextlib.suppress(OSError):
+                (self._folder / PROGRESS).unlink()
+
+
+def _write_photos(folder: Path, views: list[View], background: Sequence[float]) -> None:
+    named = []
+    for view, name in zip(views, png_names(views), strict=True):
+        photo = Image.fromarray(over_background(view.image, background))
+        photo.thumbnail((PHOTO_SIDE, PHOTO_SIDE))
+        path = (Path(PHOTOS[view.split]) / name).with_suffix(".jpg")
+        with atomic_write(folder / path) as temporary:
+            photo.save(temporary, format="JPEG", quality=90)
+        named.append(replace(view, name=path.as_posix()))
+    write_cameras(folder / CAMERAS, named)
