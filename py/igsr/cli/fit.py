@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -112,7 +113,7 @@ def fit_command(
             "the same command with --resume continues."
         )
 
-    with error_messages(interrupted), warning_messages():
+    with error_messages(interrupted), warning_messages(), ExitStack() as ending:
         # Check the options, find the cameras, and take what was not given from the preset.
         checked_given(FitSettings, given)
         if config is not None and given_by_hand(ctx, "preset") and _is_complete(given):
@@ -168,8 +169,7 @@ def fit_command(
         from igsr.fitting.fit_report import FinishedFit, fit_report, write_fit_report, write_scene
         from igsr.fitting.followed_run import FollowedRun
 
-        followed = FollowedRun(out)
-        followed.begin(loaded, color)
+        followed = ending.enter_context(closing(FollowedRun(out, loaded, color)))
         with parts.measured("fit"):
             splats, fitted = _fitted(
                 loaded, settings, name, out, resume, last, followed, shown=not as_json
@@ -201,7 +201,6 @@ def fit_command(
         done = FinishedFit(splats, fitted, settings, asked, last[-1], not_placed(fitted))
         report = fit_report(done, scores, parts)
         write_fit_report(out, report, done, scores)
-        followed.end()
     if as_json:
         print_json(report)
     else:

@@ -132,7 +132,7 @@ def refine_command(
                 **vars(settings),
             )
         with warning_messages():
-            has_page = html and write_page(out, refined.splats, refined.capture)
+            has_page = html and write_page(out, refined.models(), refined.capture)
     if as_json:
         print_json(_summary(refined, out))
     else:

@@ -41,56 +41,51 @@ TELL_EVERY = 2.0
 class FollowedRun:
     """Tells who follows a run where it stands. What cannot be written is left out: the run counts.
 
-    Nothing is written before ``begin``.
+    Nothing is written before something is told.
     """
 
-    def __init__(self, out: Path | None) -> None:
-        """Name the folder of the run; None writes nothing."""
-        self._folder = None if out is None else out / VIEW
-        self._told = -TELL_EVERY
-        self._began = time.monotonic()
-
-    def begin(self, capture: Capture, background: Sequence[float]) -> None:
-        """Write photos to compare renders with, and what is behind them.
+    def __init__(self, out: Path, capture: Capture, background: Sequence[float]) -> None:
+        """Name what is told of.
 
         Args:
-            capture: photos and cameras.
+            out: folder of the run.
+            capture: photos and cameras; some of the photos are left to compare renders with.
             background: RGB in [0, 1] behind the splats, and behind photos with alpha.
         """
-        if self._folder is None:
-            return
-        views = capture.test_views or capture.train_views
-        chosen = np.unique(np.linspace(0, len(views) - 1, MOST_PHOTOS).round().astype(int))
-        with contextlib.suppress(OSError, IgsrError):
-            for name in PHOTOS.values():
-                for path in (self._folder / name).glob("**/*.jpg"):
-                    path.unlink()
-            _write_photos(self._folder, [views[k] for k in chosen], background)
-            write_json(self._folder / RUN, {"background": [float(part) for part in background]})
+        self._folder = out / VIEW
+        self._capture, self._background = capture, [float(channel) for channel in background]
+        self._told: float | None = None
 
     def tell(self, text: str, done: float) -> None:
-        """Write where the run stands, unless that was written a moment ago; its last part at once.
+        """Write where the run stands, unless that was written a moment ago; its end at once.
 
         Args:
             text: what it is doing.
             done: part of the whole run, in [0, 1].
         """
         now = time.monotonic()
-        if self._folder is None or not self._folder.is_dir():
+        if self._told is not None and done < 1.0 and now - self._told < TELL_EVERY:
             return
-        if done < 1.0 and now - self._told < TELL_EVERY:
-            return
-        self._told = now
         with contextlib.suppress(OSError, IgsrError):
-            seconds = round(now - self._began, 1)
-            progress = {"text": text, "done": min(1.0, max(0.0, done)), "seconds": seconds}
+            if self._told is None:
+                self._begin()
+            progress = {"text": text, "done": min(1.0, max(0.0, done))}
             write_json(self._folder / PROGRESS, progress)
+        self._told = now
 
-    def end(self) -> None:
-        """Tell that the run is done."""
-        if self._folder is not None:
-            with contextlib.suppress(OSError):
-                (self._folder / PROGRESS).unlink()
+    def close(self) -> None:
+        """Tell that the run has ended, done or not."""
+        with contextlib.suppress(OSError):
+            (self._folder / PROGRESS).unlink()
+
+    def _begin(self) -> None:
+        views = self._capture.test_views or self._capture.train_views
+        chosen = np.unique(np.linspace(0, len(views) - 1, MOST_PHOTOS).round().astype(int))
+        for name in PHOTOS.values():
+            for path in (self._folder / name).glob("**/*.jpg"):
+                path.unlink()
+        _write_photos(self._folder, [views[k] for k in chosen], self._background)
+        write_json(self._folder / RUN, {"background": self._background})
 
 
 def _write_photos(folder: Path, views: list[View], background: Sequence[float]) -> None:

@@ -73,7 +73,7 @@ class RefineRun:
         self.round = 0
         self._settings, self._resume, self._progress = settings, resume, progress
         self._out = None if out is None else Path(out)
-        self._followed = FollowedRun(self._out)
+        self._followed: FollowedRun | None = None
         self._started, self._meter = time.monotonic(), Meter()
         self._parts = Parts()
         # In units of a fit to all photos.
@@ -139,7 +139,7 @@ class RefineRun:
             self._parts.used = parts_so_far(self._out)
         else:
             self._remove_checkpoints()
-        self._followed.begin(capture, default_background(capture))
+        self._followed = FollowedRun(self._out, capture, default_background(capture))
 
     def checkpoint(self, name: str) -> tuple[Path | None, bool]:
         """Where a fit is saved to, and whether it resumes from there."""
@@ -186,9 +186,12 @@ class RefineRun:
             cameras = read_usage(refined.capture.path)
             parts = {} if cameras is None else {"cameras": cameras}
             write_refinement(self._out, refined, self._settings, parts | self._parts.used)
-        if refined.stop is not None:
-            self._followed.end()
         return refined
+
+    def close(self) -> None:
+        """Tell who follows the run that it has ended, done or not."""
+        if self._followed is not None:
+            self._followed.close()
 
     @property
     def _checkpoints(self) -> Path:
@@ -200,7 +203,8 @@ class RefineRun:
             self._parts.add(stage, self._meter.lap())
         done = min(1.0, (self._work_done + part) / self._work)
         now = RefineProgress(self.round, stage, done, time.monotonic() - self._started)
-        self._followed.tell(bar_state(now).text, done)
+        if self._followed is not None:
+            self._followed.tell(bar_state(now).text, done)
         return self._progress is None or self._progress(now) is not False
 
     def _remove_checkpoints(self) -> None:
