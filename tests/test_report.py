@@ -180,7 +180,7 @@ def test_a_fits_page_escapes_what_it_shows(tmp_path):
     scored = FitScores(scores, sheet, train, {"psnr": 20.0, "ssim": 0.5, "flip": 0.1})
     report = fit_report(fit, scored, parts)
     assert report["limit"]["camera_gain"] is not None
-    write_fit_page(tmp_path / "report.html", report, capture, sheet)
+    write_fit_page(tmp_path / "report.html", report, splats, capture, sheet)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "alert(" in page
     for unsafe in ('"photo"', "a<b>", "<i>", "<script>alert", "<fit>"):

@@ -121,7 +121,7 @@ def check_shown(path: Path) -> None:
     """
     if path.is_dir():
         return
-    if not path.exists():
-        raise IgsrError(f"There is no {path}; name a splat file or the folder of a fit.")
+    if not path.is_file():
+        raise IgsrError(f"There is no file or folder {path}; name a splat file or a fit's folder.")
     for found in found_models(path):
         found.load()

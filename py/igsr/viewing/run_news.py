@@ -55,7 +55,7 @@ def run_scores(folder: Path) -> Scores:
     """The scores that a run has written: of a refinement by round, of a fit by split."""
     report = _read(folder / REPORT)
     if isinstance(report.get("rounds"), list):
-        head = ["", "test PSNR, dB", "cross-validation PSNR, dB", "splats"]
+        head = ["PSNR, dB", "test", "cross-validation", "splats"]
         return Scores(head, [_round_row(*one) for one in enumerate(_rounds_of(report))])
     if run_progress(folder) is not None or "psnr" not in report:
         return Scores()  # a report that is here while a fit runs is an earlier one's

@@ -16,7 +16,7 @@ import sys
 import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from igsr.errors import IgsrError
 from igsr.viewing.shown import Shown
@@ -106,8 +106,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer a request that has the token; refuse any other."""
-        address = urlsplit(self.path)
-        token, slash, name = address.path.removeprefix("/").partition("/")
+        path, _, query = self.path.partition("?")
+        token, slash, name = path.removeprefix("/").partition("/")
         if not hmac.compare_digest(token.encode(), self.server.token.encode()):
             message = "This address has no token, or an old one; igsr view printed the right one."
             self._answer_text(HTTPStatus.FORBIDDEN, message)
@@ -117,7 +117,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", "0")
             self.end_headers()
         else:
-            self._answer_name(name, {key: one[-1] for key, one in parse_qs(address.query).items()})
+            self._answer_name(name, {key: one[-1] for key, one in parse_qs(query).items()})
 
     def log_message(self, *_: object) -> None:
         """Log nothing: addresses have the token."""
@@ -138,10 +138,10 @@ class _Handler(BaseHTTPRequestHandler):
                 self._answer("image/jpeg", shown.photo(int(asked["number"])))
             else:
                 raise KeyError(name)
-        except (KeyError, ValueError):
-            self._answer_text(HTTPStatus.NOT_FOUND, "There is no such thing here.")
         except IgsrError as error:
             self._answer_text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+        except (KeyError, ValueError):
+            self._answer_text(HTTPStatus.NOT_FOUND, "There is no such thing here.")
 
     def _answer_json(self, value: object) -> None:
         self._answer("application/json", json.dumps(value, allow_nan=False).encode())

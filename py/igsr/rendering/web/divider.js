@@ -56,6 +56,9 @@ class Divider {
     line.setAttribute("aria-valuenow", String(Math.round(100 * viewer.divider)));
     const [before, after] = this.labels;
     const isAway = this.wantsPhoto && source === undefined;
+    // Above the buttons, which take more rows on a phone.
+    const bottom = `${document.getElementById("panel").offsetHeight + 8}px`;
+    for (const id of ["before", "after"]) document.getElementById(id).style.bottom = bottom;
     document.getElementById("before").textContent = isAway ? "go to a photo's camera" : before;
     document.getElementById("after").textContent = after;
   }

@@ -1,10 +1,12 @@
 // Follows the server of `igsr view --web`: what there is to show, asked for once a second.
 
 const ASK_EVERY = 1000; // milliseconds
+const NARROW = 700; // pixels
 
 /** Models that the server has. Its addresses are relative to the page's, which has the token. */
 class LiveModels {
   constructor() {
+    this.subject = "The model";
     this.entries = [];
     this.newest = undefined;
   }
@@ -31,41 +33,42 @@ async function askServer(path) {
 /** Shows what the server has, again and again; resolves after the first time. */
 async function follow(viewer, models, source, panel) {
   const status = new Status();
-  let surroundings = "";
-  let showing = "";
-  const step = async () => {
-    let state;
+  let [surroundings, showing, problem] = ["", "", ""];
+  const bring = async () => {
+    problem = "";
+    if (!viewer.main && models.mainEntry) say(LOADING);
     try {
-      state = await askServer("state");
-    } catch {
-      status.lost();
-      return;
+      await models.refresh();
+    } catch (error) {
+      // A damaged file, or one that has just been replaced: what is shown stays.
+      problem = error.message;
+      // Where the connection broke, the same is asked for again.
+      if (error.cause instanceof TypeError) showing = "";
     }
+  };
+  const step = async () => {
+    const state = await askServer("state");
     status.show(state);
     if (state.surroundings !== surroundings) {
-      surroundings = state.surroundings;
       viewer.surround(await askServer("surroundings"));
+      surroundings = state.surroundings;
     }
     Object.assign(source, { entries: state.models, newest: state.newest });
     const wanted = JSON.stringify([models.mainEntry, models.otherEntry]);
     if (wanted !== showing) {
       showing = wanted;
-      if (!viewer.main && models.mainEntry) say(LOADING);
-      await models.refresh();
+      await bring();
     }
-    if (viewer.main) {
-      panel.show();
-      say("");
-    } else {
-      say("There is no model yet; it is shown as soon as there is one.");
-    }
+    panel.update();
+    if (viewer.main) panel.show();
+    say(problem || (viewer.main ? "" : "There is no model yet; it is shown as soon as there is one."));
   };
   const again = async () => {
     try {
-      await step();
+      // A page that nobody sees need not know.
+      if (!document.hidden) await step();
     } catch (error) {
-      // A file that was just replaced, or a damaged one: what is shown stays.
-      say(error.message);
+      status.lost(error instanceof TypeError ? "igsr view does not answer; the page asks again." : error.message);
     }
     setTimeout(again, ASK_EVERY);
   };
@@ -76,11 +79,13 @@ async function follow(viewer, models, source, panel) {
 class Status {
   constructor() {
     this.box = document.getElementById("status");
+    // There it would hide the scene.
+    this.box.open = window.innerWidth >= NARROW;
   }
 
-  lost() {
+  lost(message) {
     this.box.hidden = false;
-    document.getElementById("run").textContent = "igsr view does not answer; the page asks again.";
+    document.getElementById("run").textContent = message;
   }
 
   show({ title, run, scores }) {
@@ -91,14 +96,13 @@ class Status {
     text.textContent = run ? run.text : "";
     done.hidden = !run;
     if (run) done.value = run.done;
-    const rows = scores.rows.map(([label, ...values]) => [label, ...values]);
     const table = document.getElementById("scores");
     const line = (tag, cells) => {
       const row = document.createElement("tr");
       row.append(...cells.map((cell) => Object.assign(document.createElement(tag), { textContent: cell })));
       return row;
     };
-    table.replaceChildren(...(rows.length > 0 ? [line("th", scores.head), ...rows.map((row) => line("td", row))] : []));
+    table.replaceChildren(...(scores.rows.length > 0 ? [line("th", scores.head), ...scores.rows.map((row) => line("td", row))] : []));
     this.box.hidden = false;
   }
 }

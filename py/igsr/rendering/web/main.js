@@ -37,6 +37,7 @@ async function start() {
   }
   const models = new Models(viewer, source, progress);
   const panel = new Panel(viewer, models);
+  window.igsr.divider = panel.divider;
   makeHandle(window.igsr, viewer, models);
   if (page.live) {
     await follow(viewer, models, source, panel);

@@ -7,6 +7,7 @@ const MODELS_KEPT = 4;
 /** Models in the page itself. */
 class EmbeddedModels {
   constructor(scenes) {
+    this.subject = "The model in this page";
     this.scenes = scenes;
     this.entries = scenes.map(({ label }, k) => ({ id: String(k), label, version: "" }));
     this.newest = this.entries.at(-1)?.id;
@@ -90,7 +91,7 @@ class Models {
         await breathe();
         shown = this.viewer.load(model, read.scene);
       } catch (error) {
-        throw new Error(`The model in this page cannot be read: ${error.message}.`);
+        throw new Error(`${this.source.subject} cannot be read: ${error.message.replace(/\.$/, "")}.`, { cause: error });
       }
     }
     // The last in the map is the one used last.

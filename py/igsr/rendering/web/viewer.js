@@ -60,13 +60,13 @@ class Viewer {
     this.gestures ||= new Gestures(this);
   }
 
-  /** Takes other cameras, background and up axis; the view stays, if it is not that of a whole scene. */
+  /** Takes other cameras, background and up axis. The view stays, unless nobody has chosen one yet. */
   surround({ cameras, background, up }) {
     const before = this.page.cameras;
     const name = before[this.camera]?.name;
     Object.assign(this.page, { cameras, background, up });
     this.camera = cameras.findIndex((one) => one.name === name);
-    if (before.length === 0 && this.main) this.start();
+    if (this.main && before.length === 0 && !this.wasMoved) this.start();
     this.changed();
   }
 
@@ -106,6 +106,7 @@ class Viewer {
 
   /** The viewpoint was moved by hand. */
   moved() {
+    this.wasMoved = true;
     this.camera = -1;
     this.changed();
   }
