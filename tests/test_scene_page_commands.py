@@ -96,6 +96,7 @@ def test_a_fit_writes_it(browser, tmp_path):
     assert browser.run("window.igsr.error") is None
     assert browser.run("window.igsr.viewer.scene.cameras.length") == len(made.views)
     splats, camera = igsr.Splats.load(out / "scene.ply"), made.views[0].camera
+    assert "<iframe srcdoc=" in (out / "report.html").read_text(encoding="utf-8")
     expected = render(splats, camera, backend="cpu").to_uint8().astype(int)
     assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
 
