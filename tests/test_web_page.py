@@ -105,6 +105,8 @@ def test_it_shows_round_after_round_without_a_reload(browser, tmp_path):
         # A round of a new run: what is shown follows its file.
         ROUNDS[1].save(tmp_path / "rounds" / "0" / "scene.ply")
         wait_for(browser, "window.igsr.viewer.main.scene.count === 400")
+        kept = browser.run("[...window.igsr.models.kept.values()].map((one) => one.scene.count)")
+        assert sorted(kept) == [400, 400, 500], "what has been replaced is let go"
         assert browser.problems == []
         own = server.url.rsplit("/", 2)[0]
         assert all(url.startswith((own, f"blob:{own}", "data:")) for url in browser.requests)
@@ -116,6 +118,9 @@ def test_two_rounds_at_a_divider(browser, tmp_path):
     write_scene_page(tmp_path / "scene.html", models, named(three_cameras()), BLACK)
     browser.open(tmp_path / "scene.html")
     assert browser.run("window.igsr.error") is None
+    assert browser.run("document.getElementById('divider').hidden")
+    choose(browser, "beside", "0")
+    wait_for(browser, "window.igsr.viewer.other?.scene.count === 300")
     assert texts(browser, "#divider span") == ["round 0", "round 2"]
     camera = three_cameras()[0]
     for left in (0, 1):

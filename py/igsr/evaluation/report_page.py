@@ -103,9 +103,10 @@ def scene_frame(
         return None
     cameras = [PageCamera(view.name, view.camera) for view in capture.train_views]
     try:
-        return framed(scene_page(shown, cameras, background, title)[0], SCENE_HEIGHT)
+        page, _ = scene_page(shown, cameras, background, title, compares=True)
     except IgsrError:
         return None
+    return framed(page, SCENE_HEIGHT)
 
 
 def part_rows(

@@ -54,4 +54,4 @@ def notebook_page(
         raise IgsrError(f"height must be at least 1 pixel, not {height}")
     views = [] if capture is None else capture.views
     cameras = [PageCamera(view.name, view.camera) for view in views]
-    return NotebookPage(scene_page(splats, cameras, background)[0], height)
+    return NotebookPage(scene_page(splats, cameras, background, compares=True)[0], height)

@@ -122,15 +122,25 @@ def scene_page(
     cameras: Sequence[PageCamera] = (),
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "scene",
+    *,
+    compares: bool = False,
 ) -> tuple[str, list[str]]:
-    """The page of ``write_scene_page`` as text, and its messages."""
+    """The page of ``write_scene_page`` as text, and its messages.
+
+    With ``compares`` it starts with the first of several models beside the last.
+    """
     named = [PageModel(title, splats)] if isinstance(splats, Splats) else list(splats)
     models = [embedded_model(one.splats) for one in named]
     described = [
         {"label": one.label, **described_model(model)}
         for one, model in zip(named, models, strict=True)
     ]
-    scene = {"live": False, "models": described, **surroundings(cameras, background)}
+    scene = {
+        "live": False,
+        "compares": compares and len(models) > 1,
+        "models": described,
+        **surroundings(cameras, background),
+    }
     return _page(scene, models, title), models[-1].notes
 
 

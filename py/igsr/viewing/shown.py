@@ -42,6 +42,7 @@ class Shown:
         """
         self._paths = list(paths)
         self._cameras = cameras
+        self._last: _Surroundings | None = None
         self._packed: OrderedDict[tuple[str, str], bytes] = OrderedDict()
         # A hundred requests for one model pack it once.
         self._packing = threading.Lock()
@@ -141,9 +142,12 @@ class Shown:
 
     def _surroundings(self) -> _Surroundings:
         version = self._surroundings_version()
+        if self._last is not None and self._last.version == version:
+            return self._last
         cameras = [seen for file in self._camera_files() for seen in seen_cameras(file)]
         cameras.sort(key=lambda one: one.photo is None)
-        return _Surroundings(version, cameras, self._background())
+        self._last = _Surroundings(version, cameras, self._background())
+        return self._last
 
 
 def _packed(found: FoundModel) -> bytes:

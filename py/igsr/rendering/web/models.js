@@ -33,8 +33,7 @@ class Models {
     Object.assign(this, { viewer, source, progress });
     // Ids; "" is the newest model, and nothing beside it.
     this.main = this.other = "";
-    // A page with several models starts with the first beside the last.
-    if (source.entries.length > 1) this.other = source.entries[0].id;
+    if (viewer.page.compares) this.other = source.entries[0].id;
     this.kept = new Map();
     this.running = null;
     this.onChange = () => {};

@@ -14,6 +14,7 @@ class Painter {
     this.gl = gl;
     // Without one of these, pictures are blended in 8 bits.
     this.hasFloats = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
+    this.programs = new Map();
     const { presentVertex, presentFragment } = page.shaders;
     this.presents = this.program(this.head({}) + presentVertex, this.head({}) + presentFragment);
     this.empty = gl.createVertexArray();
@@ -48,7 +49,6 @@ class Painter {
   /** Takes a model off the GPU. */
   unload(layer) {
     const gl = this.gl;
-    gl.deleteProgram(layer.splats.program);
     gl.deleteTexture(layer.splatTexture);
     gl.deleteTexture(layer.harmonicTexture);
     gl.deleteBuffer(layer.order);
@@ -67,7 +67,14 @@ class Painter {
     ].join("\n");
   }
 
+  /** A program of two shaders; one that was made before is used again. */
   program(vertex, fragment) {
+    const key = vertex + fragment;
+    if (!this.programs.has(key)) this.programs.set(key, this.made(vertex, fragment));
+    return this.programs.get(key);
+  }
+
+  made(vertex, fragment) {
     const gl = this.gl;
     const program = gl.createProgram();
     for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
