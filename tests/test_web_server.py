@@ -25,7 +25,7 @@ from igsr.capture.write_cameras import write_cameras
 from igsr.fitting.followed_run import FollowedRun
 from igsr.viewing import run_news, shown
 from igsr.viewing.run_news import run_background, run_progress, run_scores
-from igsr.viewing.server import open_server
+from igsr.viewing.server import is_own, open_server
 
 SECRET = b"nobody but the owner reads this"
 
@@ -170,6 +170,11 @@ def test_a_port_that_is_taken_is_said(scene):
             open_server(server.shown, "127.0.0.1", taken)
         with pytest.raises(igsr.IgsrError, match=r"Cannot listen at 192\.0\.2\.1"):
             open_server(server.shown, "192.0.2.1", 0)
+
+
+def test_addresses_that_other_computers_reach_are_told():
+    assert all(map(is_own, ["127.0.0.1", "127.1.2.3", "::1", "localhost"]))
+    assert not any(map(is_own, ["0.0.0.0", "::", "192.168.1.2", "box", ""]))
 
 
 # ---- what is found -------------------------------------------------------------------------------

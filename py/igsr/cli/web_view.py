@@ -33,7 +33,7 @@ def serve_web_view(
         IgsrError: a scene is not there, or the server cannot listen.
     """
     from igsr.viewing.found_models import check_shown, found_models
-    from igsr.viewing.server import OWN_ADDRESSES, open_server
+    from igsr.viewing.server import is_own, open_server
     from igsr.viewing.shown import Shown
 
     options = [word for word in scenes if word.startswith("-")]
@@ -47,7 +47,7 @@ def serve_web_view(
     with tempfile.TemporaryDirectory(prefix="igsr-view-") as folder:
         cameras = readable_cameras(Path(folder))
         with open_server(Shown(paths, cameras), host, port) as server:
-            _announce(server.url, server.server_port, is_open=host not in OWN_ADDRESSES)
+            _announce(server.url, server.server_port, is_open=not is_own(host))
             # Ctrl-C is how it is meant to end.
             with contextlib.suppress(KeyboardInterrupt):
                 server.serve_forever()

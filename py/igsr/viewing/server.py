@@ -7,6 +7,7 @@ a file system, need no more, and nothing has to be installed.
 from __future__ import annotations
 
 import hmac
+import ipaddress
 import json
 import logging
 import secrets
@@ -33,8 +34,14 @@ WAIT = 10.0
 SILENCE = 30.0
 #: Bytes that are sent at once.
 PIECE = 1 << 16
-#: Addresses that other computers cannot reach.
-OWN_ADDRESSES = ("127.0.0.1", "::1", "localhost")
+
+
+def is_own(host: str) -> bool:
+    """Whether an address is one that other computers cannot reach."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 class ViewServer(ThreadingHTTPServer):
@@ -79,10 +86,14 @@ class ViewServer(ThreadingHTTPServer):
 
     def process_request(self, request: object, client_address: object) -> None:
         """Answer in a thread of its own, when it is its turn."""
-        if self._turns.acquire(timeout=WAIT):
-            super().process_request(request, client_address)  # type: ignore[arg-type]
-        else:
+        if not self._turns.acquire(timeout=WAIT):
             self.shutdown_request(request)  # type: ignore[arg-type]
+            return
+        try:
+            super().process_request(request, client_address)  # type: ignore[arg-type]
+        except RuntimeError:  # there is no thread to be had
+            self._turns.release()
+            raise
 
     def process_request_thread(self, request: object, client_address: object) -> None:
         """Answer, and let another have its turn."""
