@@ -166,8 +166,9 @@ class Refined(ArrayEquality, NotebookPicture):
     def show(self, height: int = 480) -> NotebookPage:
         """A viewer for notebooks: return it from a cell, then drag to orbit.
 
-        It starts at the first photo's camera, and compares any two rounds at a divider: at first
-        the first fit, left of it, with the last round.
+        It starts at the first photo's camera, with the first fit left of a divider and the last
+        round right of it. Lists choose other rounds. Above 300 000 splats in all it has the last
+        round alone.
 
         Args:
             height: of the viewer, pixels.
