@@ -7,7 +7,6 @@ import time
 
 import numpy as np
 import pytest
-import scenes
 from PIL import Image
 from scene_pages import MEAN, drawn, model, named, three_cameras
 from web_views import served
@@ -155,7 +154,9 @@ def test_a_photo_lies_on_its_render(browser, tmp_path):
     camera = three_cameras()[0]
     photo = picture(ROUNDS[1], camera).astype(np.uint8)
     capture = igsr.Capture(tmp_path, [igsr.View("a/b.png", camera, "test", photo)])
-    FollowedRun(tmp_path, capture, BLACK).tell("fit", 0.5)
+    followed = FollowedRun(tmp_path)
+    followed.show(capture, BLACK)
+    followed.tell("fit", 0.5)
     ROUNDS[1].save(tmp_path / "scene.ply")
     screens = {}
     with served(tmp_path) as server:
@@ -208,7 +209,7 @@ def test_a_damaged_file_is_said_and_what_is_shown_stays(browser, tmp_path):
 def test_names_are_text(browser, tmp_path):
     name = "<img src=x onerror='window.broken = true'>"
     (tmp_path / name).mkdir()
-    FollowedRun(tmp_path / name, scenes.capture(views=2, size=8), BLACK).tell(name, 0.1)
+    FollowedRun(tmp_path / name).tell(name, 0.1)
     ROUNDS[0].save(tmp_path / name / "scene.ply")
     with served(tmp_path / name) as server:
         browser.open(server.url)

@@ -193,7 +193,10 @@ def test_a_fit_and_its_checkpoint(tmp_path):
             if not seen:
                 seen.append(state_of(server))
 
-        followed = FollowedRun(folder, made, (1.0, 0.5, 0.0))
+        followed = FollowedRun(folder)
+        followed.tell("find cameras", 0.0)
+        assert state_of(server)["run"] == {"text": "find cameras", "done": 0.0}
+        followed.show(made, (1.0, 0.5, 0.0))
         fitted = igsr.fit(
             made, 6, look, "cpu", remove_floaters=False, checkpoint=folder / "checkpoint.npz"
         )
@@ -223,7 +226,9 @@ def test_a_fit_and_its_checkpoint(tmp_path):
 def test_a_scene_that_lay_there_before_says_so(tmp_path):
     model().save(tmp_path / "scene.ply")
     os.utime(tmp_path / "scene.ply", (1e9, 1e9))
-    FollowedRun(tmp_path, scenes.capture(views=2, size=8), (0.0, 0.0, 0.0)).tell("begins", 0.0)
+    followed = FollowedRun(tmp_path)
+    followed.show(scenes.capture(views=2, size=8), (0.0, 0.0, 0.0))
+    followed.tell("begins", 0.0)
     (tmp_path / "checkpoint.npz").write_bytes(b"damaged")
     with served(tmp_path) as server:
         state = state_of(server)

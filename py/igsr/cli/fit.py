@@ -142,6 +142,9 @@ def fit_command(
                 cameras_kept=kept,
             )
 
+        from igsr.fitting.followed_run import FollowedRun
+
+        followed = ending.enter_context(closing(FollowedRun(out)))
         finder = CameraFinder(estimator, network, graph, frames, given["seed"])
         loaded, found = capture_to_fit(
             capture,
@@ -154,6 +157,7 @@ def fit_command(
             shown=not as_json,
             parts=parts,
             announced=announced,
+            followed=followed,
         )
         color = _background(background, loaded)
         # Photos with alpha are fitted over random colors, so that no background is learned.
@@ -167,9 +171,8 @@ def fit_command(
         )
 
         from igsr.fitting.fit_report import FinishedFit, fit_report, write_fit_report, write_scene
-        from igsr.fitting.followed_run import FollowedRun
 
-        followed = ending.enter_context(closing(FollowedRun(out, loaded, color)))
+        followed.show(loaded, color)
         with parts.measured("fit"):
             splats, fitted = _fitted(
                 loaded, settings, name, out, resume, last, followed, shown=not as_json
@@ -193,7 +196,7 @@ def fit_command(
         }
         write_scene(out, splats, fitted)
         has_page = html and write_page(out, splats, fitted, color)
-        followed.tell("score photos", 1.0)
+        followed.tell("score photos", 1.0, at_once=True)
         with parts.measured("score"):
             is_refined = bool(fitted.test_views) and (settings.moves_cameras or found)
             scores = _scored(splats, fitted, color, name, is_refined=is_refined, shown=not as_json)

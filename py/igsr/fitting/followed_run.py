@@ -44,31 +44,38 @@ class FollowedRun:
     Nothing is written before something is told.
     """
 
-    def __init__(self, out: Path, capture: Capture, background: Sequence[float]) -> None:
-        """Name what is told of.
-
-        Args:
-            out: folder of the run.
-            capture: photos and cameras; some of the photos are left to compare renders with.
-            background: RGB in [0, 1] behind the splats, and behind photos with alpha.
-        """
+    def __init__(self, out: Path) -> None:
+        """Name the folder of the run."""
         self._folder = out / VIEW
-        self._capture, self._background = capture, [float(channel) for channel in background]
+        self._photos: tuple[Capture, list[float]] | None = None
         self._told: float | None = None
 
-    def tell(self, text: str, done: float) -> None:
-        """Write where the run stands, unless that was written a moment ago; its end at once.
+    def show(self, capture: Capture, background: Sequence[float]) -> None:
+        """Leave some photos to compare renders with, once something is told.
+
+        Args:
+            capture: photos and cameras.
+            background: RGB in [0, 1] behind the splats, and behind photos with alpha.
+        """
+        self._photos = (capture, [float(channel) for channel in background])
+        self._told = None
+
+    def tell(self, text: str, done: float, *, at_once: bool = False) -> None:
+        """Write where the run stands, unless that was written a moment ago.
 
         Args:
             text: what it is doing.
             done: part of the whole run, in [0, 1].
+            at_once: write it in any case.
         """
         now = time.monotonic()
-        if self._told is not None and done < 1.0 and now - self._told < TELL_EVERY:
+        is_news = self._told is None or at_once or now - self._told >= TELL_EVERY
+        if not is_news:
             return
         with contextlib.suppress(OSError, IgsrError):
-            if self._told is None:
-                self._begin()
+            if self._photos is not None:
+                photos, self._photos = self._photos, None
+                self._write(*photos)
             progress = {"text": text, "done": min(1.0, max(0.0, done))}
             write_json(self._folder / PROGRESS, progress)
         self._told = now
@@ -77,15 +84,17 @@ class FollowedRun:
         """Tell that the run has ended, done or not."""
         with contextlib.suppress(OSError):
             (self._folder / PROGRESS).unlink()
+            # Empty where no fit began; else it stays.
+            self._folder.rmdir()
 
-    def _begin(self) -> None:
-        views = self._capture.test_views or self._capture.train_views
+    def _write(self, capture: Capture, background: list[float]) -> None:
+        views = capture.test_views or capture.train_views
         chosen = np.unique(np.linspace(0, len(views) - 1, MOST_PHOTOS).round().astype(int))
         for name in PHOTOS.values():
             for path in (self._folder / name).glob("**/*.jpg"):
                 path.unlink()
-        _write_photos(self._folder, [views[k] for k in chosen], self._background)
-        write_json(self._folder / RUN, {"background": self._background})
+        _write_photos(self._folder, [views[k] for k in chosen], background)
+        write_json(self._folder / RUN, {"background": background})
 
 
 def _write_photos(folder: Path, views: list[View], background: Sequence[float]) -> None:

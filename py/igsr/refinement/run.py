@@ -73,7 +73,7 @@ class RefineRun:
         self.round = 0
         self._settings, self._resume, self._progress = settings, resume, progress
         self._out = None if out is None else Path(out)
-        self._followed: FollowedRun | None = None
+        self._followed = None if self._out is None else FollowedRun(self._out)
         self._started, self._meter = time.monotonic(), Meter()
         self._parts = Parts()
         # In units of a fit to all photos.
@@ -139,7 +139,8 @@ class RefineRun:
             self._parts.used = parts_so_far(self._out)
         else:
             self._remove_checkpoints()
-        self._followed = FollowedRun(self._out, capture, default_background(capture))
+        if self._followed is not None:
+            self._followed.show(capture, default_background(capture))
 
     def checkpoint(self, name: str) -> tuple[Path | None, bool]:
         """Where a fit is saved to, and whether it resumes from there."""
