@@ -190,7 +190,7 @@ def test_a_fits_page_escapes_what_it_shows(tmp_path, monkeypatch):
     assert "the same with refined cameras" in page
     assert "<iframe srcdoc=" in page
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise igsr.IgsrError("no")
 
     # A scene that is too large, or that pages cannot hold, is linked to.
