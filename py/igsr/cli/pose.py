@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
@@ -37,6 +37,9 @@ from igsr.cli.shared import (
 from igsr.errors import IgsrError
 from igsr.pose import AUTO, find_cameras, has_found, kept_cameras, kept_capture, photos_at
 from igsr.pose.registry import ESTIMATORS
+
+if TYPE_CHECKING:
+    from igsr.fitting.followed_run import FollowedRun
 
 logger = logging.getLogger(__name__)
 
@@ -137,6 +140,7 @@ def capture_to_fit(
     splats: int = 0,
     parts: Parts | None = None,
     announced: Callable[[Overview, bool], None] | None = None,
+    followed: FollowedRun | None = None,
 ) -> tuple[Capture, bool]:
     """Load the capture at a path; find the cameras first if it has none.
 
@@ -154,6 +158,7 @@ def capture_to_fit(
         splats: most splats of the fit, for the memory that it needs.
         parts: count what "cameras" and "load" take, or None.
         announced: called before anything slow, with what there is and whether cameras are known.
+        followed: told what finding cameras does, or None.
 
     Returns:
         The capture, and whether its cameras were found here (or by the run that is resumed).
@@ -181,6 +186,12 @@ def capture_to_fit(
         with parts.measured("load"):
             return load(path, holdout, max_size), False
     with _pose_bar(shown) as show:
+
+        def progress(step: str, done: int, total: int) -> None:
+            show(step, done, total)
+            if followed is not None:
+                followed.tell(f"find cameras: {step}", 0.0)
+
         capture = kept_capture(
             path,
             out,
@@ -191,7 +202,7 @@ def capture_to_fit(
             max_size=max_size,
             resume=resume,
             allow_missing=allow_missing,
-            progress=show,
+            progress=progress,
             say=print_message,
             warn=print_message,
             parts=parts,

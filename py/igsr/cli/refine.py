@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -85,6 +86,7 @@ def refine_command(
             _check_photo_count(photos, holdout, frames, photo_count)
 
         from igsr._core import resolve_backend
+        from igsr.fitting.followed_run import FollowedRun
         from igsr.refinement.loop import refine, round_denoiser
         from igsr.refinement.run import bar_state
 
@@ -110,7 +112,7 @@ def refine_command(
             )
 
         denoiser = round_denoiser(weights)
-        with warning_messages():
+        with warning_messages(), closing(FollowedRun(out)) as followed:
             capture, _ = capture_to_fit(
                 photos,
                 out,
@@ -121,6 +123,7 @@ def refine_command(
                 resume=resume,
                 shown=not as_json,
                 announced=None if as_json else announced,
+                followed=followed,
             )
         if photo_count is not None:
             capture = _some_photos(capture, photo_count)
@@ -134,7 +137,7 @@ def refine_command(
                 **vars(settings),
             )
         with warning_messages():
-            has_page = html and write_page(out, refined.splats, refined.capture)
+            has_page = html and write_page(out, refined.models(), refined.capture)
     if as_json:
         print_json(_summary(refined, out))
     else:
