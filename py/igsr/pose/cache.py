@@ -258,11 +258,10 @@ def not_placed(capture: Capture) -> list[str]:
     """
     given = _given(capture.path) or {}
     photos = capture.path / "images"
-    placed = {
-        path.relative_to(photos).with_suffix("").as_posix()
-        for path in photos.rglob("*")
-        if path.is_file()
-    }
+    files = [path.relative_to(photos) for path in photos.rglob("*") if path.is_file()]
+    placed = {path.with_suffix("").as_posix() for path in files}
+    # The views of a panorama are in a folder of its name.
+    placed |= {_without_suffix(path.parent.as_posix()) for path in files}
     return [
         name
         for name in given

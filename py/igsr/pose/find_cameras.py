@@ -109,8 +109,14 @@ def find_cameras(
     chosen_estimator(estimator, options)
     if isinstance(photos, (str, os.PathLike)):
         # Before the long work, and not when the photos are loaded at that size.
-        sizes, channels, _ = photo_headers(photos, frames)
-        check_memory(sizes, max_size, channels=channels, masked=True)
+        headers = photo_headers(photos, frames)
+        check_memory(
+            headers.sizes,
+            max_size,
+            channels=headers.channels,
+            masked=True,
+            decoded=headers.decoded,
+        )
     loaded = photos_of(photos, frames, LONGEST)
     name, found = estimate(loaded, estimator, seed=seed, progress=progress, **options)
     made_by = made_by_of(name, seed, frames, options)
@@ -227,7 +233,15 @@ def estimate(
     if len(photos) < FEWEST:
         only = f"; there is only {photos[0].name}" if photos else ""
         raise IgsrError(f"Cameras are found from {FEWEST} photos at least{only}; add photos")
+    panorama = next((photo.place.rig for photo in photos if photo.place is not None), None)
+    if panorama is not None and estimator == AUTO:
+        estimator = "colmap"
     estimator = chosen_estimator(estimator, options)
+    if panorama is not None and estimator != "colmap":
+        raise IgsrError(
+            f"{panorama} is a panorama, whose views {estimator} would place one by one; use "
+            "--estimator colmap"
+        )
     found = ESTIMATORS[estimator].make(**options)(photos, seed=seed, progress=progress)
     if sum(camera is not None for camera in found.cameras) < FEWEST:
         raise IgsrError(
