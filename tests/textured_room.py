@@ -78,15 +78,13 @@ def colors(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     return np.clip(0.5 + 1.4 * (out - 0.5), 0.0, 1.0)
 
 
-def photo(
-    viewmat: np.ndarray, size: tuple[int, int], rays: Rays, samples: int = 3
-) -> np.ndarray:
+def photo(viewmat: np.ndarray, size: tuple[int, int], rays: Rays, samples: int = 3) -> np.ndarray:
     """A photo, uint8 [H, W, 3]: the mean of ``samples`` x ``samples`` rays through each pixel.
 
     Args:
         viewmat: [4, 4], world to camera.
         size: width and height, pixels.
-        rays: from pixel coordinates u, v [N] to rays [N, 3] of the camera, and whether there is one.
+        rays: from pixel coordinates u, v [N] to rays [N, 3] of the camera, and whether it has one.
         samples: per side of a pixel.
     """
     width, height = size

@@ -3,7 +3,7 @@
 A photo is one if its XMP says so (Google's GPano, which cameras and stitchers write), or if it is
 just twice as wide as it is high and its left edge goes on at its right one. Whether edges go on is
 asked of their detail, since a sky over a lawn, or a plain ground, looks alike at both edges of any
-picture.
+picture. And one pole at least must look like one place.
 
 Source: https://developers.google.com/streetview/spherical-metadata. XMP is untrusted: it is
 searched for a few fields, never parsed as XML, and numbers that cannot be true count as missing.
@@ -31,11 +31,15 @@ _ROWS = 256
 _AROUND = 17
 #: Detail of the two edges correlates at least so much, and at least this part of what neighbouring
 #: columns do. Of other pictures it is 0.1 in the root mean square.
-_LEAST_CORRELATION, _PART_OF_NEIGHBOURS = 0.4, 0.6
+_LEAST_CORRELATION, _PART_OF_NEIGHBOURS = 0.4, 0.5
 #: Levels of 255 that detail has at least, in the root mean square: less is noise, and says nothing.
 _LEAST_DETAIL = 1.0
-#: The edges differ by no more than so many times what neighbouring columns do, and so many levels.
-_JUMP, _JUMP_LEVELS = 3.0, 3.0
+#: The edges differ by no more than so many times what the most different of all neighbouring columns
+#: do (but for one in a hundred), and so many levels.
+_JUMP, _JUMP_LEVELS = 1.5, 3.0
+#: The first or the last row, which is about one direction, varies by less than this part of what rows
+#: do in the median.
+_POLE = 0.5
 #: A photo that spans fewer degrees than this has one pinhole: it is left as it is.
 _LEAST_DEGREES = 100.0
 
@@ -150,6 +154,9 @@ def edges_join(image: np.ndarray) -> bool:
     rows = slice(height // 16, height - height // 16)
     columns = detail[rows]
     neighbours = _correlations(columns[:, :-1], columns[:, 1:])
+    spread = grey.std(axis=1)
+    if min(spread[0], spread[-1]) > _POLE * float(np.median(spread)):
+        return False
     edge = columns[:, :1], columns[:, -1:]
     if min(float(np.sqrt((side**2).mean())) for side in edge) < _LEAST_DETAIL:
         return False
@@ -157,8 +164,8 @@ def edges_join(image: np.ndarray) -> bool:
     if joined < max(_LEAST_CORRELATION, _PART_OF_NEIGHBOURS * float(np.median(neighbours))):
         return False
     jump = float(np.sqrt(((grey[rows, 0] - grey[rows, -1]) ** 2).mean()))
-    usual = float(np.median(np.sqrt((np.diff(grey[rows], axis=1) ** 2).mean(axis=0))))
-    return jump <= _JUMP * usual + _JUMP_LEVELS
+    apart = np.sqrt((np.diff(grey[rows], axis=1) ** 2).mean(axis=0))
+    return jump <= _JUMP * float(np.quantile(apart, 0.99)) + _JUMP_LEVELS
 
 
 def _around(grey: Float64) -> Float64:
