@@ -34,11 +34,11 @@ _AROUND = 17
 _LEAST_CORRELATION, _PART_OF_NEIGHBOURS = 0.4, 0.5
 #: Levels of 255 that detail has at least, in the root mean square: less is noise, and says nothing.
 _LEAST_DETAIL = 1.0
-#: The edges differ by no more than so many times what the most different of all neighbouring columns
-#: do (but for one in a hundred), and so many levels.
+#: The edges differ by no more than so many times what the most different of neighbouring columns do
+#: (but for one in a hundred), and so many levels.
 _JUMP, _JUMP_LEVELS = 1.5, 3.0
-#: The first or the last row, which is about one direction, varies by less than this part of what rows
-#: do in the median.
+#: The first or the last row, which is about one direction, varies by less than this part of what
+#: rows do in the median.
 _POLE = 0.5
 #: A photo that spans fewer degrees than this has one pinhole: it is left as it is.
 _LEAST_DEGREES = 100.0

@@ -76,6 +76,7 @@ class Photo:
             None if it was not.
         exposure_value: how much light the photo took, as ``View.exposure_value``.
         place: of a view of a panorama; None for other photos.
+        screenshot: whether EXIF says that it is one.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Photo:
     taken: tuple[int, int] | None = None
     exposure_value: float | None = None
     place: RigPlace | None = None
+    screenshot: bool = False
 
     @property
     def full_size(self) -> tuple[int, int]:
@@ -322,7 +324,8 @@ def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> list
     if size != full:
         taken = full[::-1] if exif.orientation in TURNED else full
         focal = None if focal is None else focal * max(size) / max(full)
-    return [Photo(name, pixels, mask, focal, exif.device, taken, exif.exposure_value)]
+    photo = Photo(name, pixels, mask, focal, exif.device, taken, exif.exposure_value)
+    return [replace(photo, screenshot=exif.screenshot)]
 
 
 def _views_of(

@@ -13,6 +13,7 @@ from igsr._internal.array_equality import ArrayEquality
 from igsr._internal.choices import Split
 from igsr._internal.notebook import NotebookPicture, numbers
 from igsr.capture.exposure import Exposure
+from igsr.capture.sharpness import blurred_photos
 from igsr.errors import IgsrError
 
 # Files written with four or five decimals are this far from a rotation. What is further away has a
@@ -304,7 +305,8 @@ class Capture(ArrayEquality, NotebookPicture):
     def with_holdout(self, every: int) -> Capture:
         """Hold out every Nth view for testing.
 
-        The views of one rig count as one.
+        The views of one rig count as one. A photo that is blurred where the others are not would
+        score a fit that is right as wrong: the next one is held out instead.
 
         Args:
             every: of the views in the order of their names, those whose index is a multiple of
@@ -323,7 +325,10 @@ class Capture(ArrayEquality, NotebookPicture):
             raise IgsrError(
                 f"{self.path} has one view only, so none can be held out; leave holdout out"
             )
-        held_out = set(photos[::every])
+        blurred = blurred_photos((view.photo, view.image, view.mask) for view in self.views)
+        spans = (photos[first : first + every] for first in range(0, len(photos), every))
+        sharp = ([name for name in span if name not in blurred] for span in spans)
+        held_out = {span[0] for span in sharp if span}
         views = [
             replace(view, split="test" if view.photo in held_out else "train")
             for view in self.views

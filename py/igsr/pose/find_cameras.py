@@ -21,6 +21,7 @@ from igsr.capture.photo_folder import (
     photo_headers,
     reduced_photo,
 )
+from igsr.capture.unfit_photos import split_unfit
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Estimate, Progress
 from igsr.pose.found_cameras import FoundCameras
@@ -117,8 +118,14 @@ def find_cameras(
             masked=True,
             decoded=headers.decoded,
         )
-    loaded = photos_of(photos, frames, LONGEST)
+    loaded, left_out = split_unfit(photos_of(photos, frames, LONGEST))
+    if len(loaded) < FEWEST and left_out:
+        raise IgsrError(
+            f"Cameras are found from {FEWEST} photos at least, and {len(loaded)} is left of those "
+            f"given: {' '.join(left_out)} Add photos."
+        )
     name, found = estimate(loaded, estimator, seed=seed, progress=progress, **options)
+    found.warnings = [*left_out, *found.warnings]
     made_by = made_by_of(name, seed, frames, options)
     return FoundCameras.of(loaded, found, made_by), loaded
 
