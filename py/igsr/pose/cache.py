@@ -261,12 +261,13 @@ def not_placed(capture: Capture) -> list[str]:
     files = [path.relative_to(photos) for path in photos.rglob("*") if path.is_file()]
     placed = {path.with_suffix("").as_posix() for path in files}
     # The views of a panorama are in a folder of its name.
-    placed |= {_without_suffix(path.parent.as_posix()) for path in files}
+    panoramas = {path.parent.as_posix() for path in files}
     return [
         name
         for name in given
         if PurePosixPath(name).suffix.lower() not in VIDEO_SUFFIXES
         and _without_suffix(name) not in placed
+        and name not in panoramas
     ]
 
 

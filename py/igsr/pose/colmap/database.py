@@ -95,9 +95,9 @@ def known_cameras(database: Path) -> set[int]:
 
 def _groups(photos: Sequence[Photo]) -> list[list[list[int]]]:
     """Indices of photos that share their intrinsics, those of one rig together."""
-    rigs: dict[str, list[int]] = {}
+    rigs: dict[object, list[int]] = {}
     for index, photo in enumerate(photos):
-        rigs.setdefault(photo.name if photo.place is None else photo.place.rig, []).append(index)
+        rigs.setdefault(index if photo.place is None else photo.place.rig, []).append(index)
     groups: dict[object, list[list[int]]] = {}
     for members in rigs.values():
         key = tuple(
