@@ -21,7 +21,7 @@ Bool = npt.NDArray[np.bool_]
 LONGEST = 480
 #: A photo stands out where it is blurred by more than this, and by so much more than the others in
 #: the median. Photos of eleven captures have 0.2 to 0.46; a blur by 0.4 percent of the width, 0.65.
-BLURRED, MORE_THAN_OTHERS = 0.55, 0.15
+BLURRED, MORE_THAN_OTHERS = 0.6, 0.2
 #: Pixels of the further blur.
 _BLUR = 9
 
