@@ -404,6 +404,36 @@ def test_a_damaged_photo_of_that_shape_is_named(
         assert len(load_photos(tmp_path)) == 12
 
 
+def test_a_lens_beside_photos_makes_them_fisheye(tmp_path: Path, stands: list[np.ndarray]) -> None:
+    size = 200
+    focal = room.fisheye_focal(size, 200.0)
+    photo = room.photo(stands[0], (size, size), room.fisheye(size, 200.0), 1)
+    save(tmp_path / "a.png", photo)
+    save(tmp_path / "b.png", photo[:100])  # of another camera
+    assert len(load_photos(tmp_path)) == 2
+    fields = {"camera_model": "OPENCV_FISHEYE", "w": 2 * size, "h": 2 * size, "fl_x": 2 * focal}
+    write_json(tmp_path / "lens.json", fields)
+    photos = load_photos(tmp_path)
+    sides = ["front", "right", "left", "up", "down"]
+    assert [one.name for one in photos] == [f"a.png/{side}.png" for side in sides] + ["b.png"]
+    place = photos[1].place
+    assert place is not None
+    camera = place.camera
+    seen = photos[1].mask
+    assert seen is not None
+    assert 0.5 < seen.mean() < 0.65
+    truth = traced(replace(camera, viewmat=camera.viewmat @ stands[0])).astype(float)
+    assert np.abs(photos[1].image - truth)[seen].mean() < 4.0
+    for wrong, message in (
+        ({"fl_x": 300.0}, "no fisheye of more than 120 degrees"),
+        ({"camera_model": "FISHEYE624"}, "'FISHEYE624' is not supported"),
+        ({"w": 0}, "w is 0"),
+    ):
+        write_json(tmp_path / "lens.json", fields | wrong)
+        with pytest.raises(IgsrError, match=f"lens.json.*{message}"):
+            load_photos(tmp_path)
+
+
 # --- cameras --------------------------------------------------------------------------------
 
 

@@ -1,6 +1,8 @@
 """Photos without cameras: load folders, files and videos, upright.
 
-Panoramas become a rig of pinhole views each, whose intrinsics and directions are known.
+Panoramas become a rig of pinhole views each, whose intrinsics and directions are known. So do
+fisheye photos of more than 120 degrees, where a file ``lens.json`` in the folder describes the lens
+with the fields that it would have in a ``transforms.json``.
 
 These photos are turned by their EXIF orientation. Those of a capture are not: its cameras belong to
 the pixels as stored.
@@ -35,26 +37,30 @@ from igsr.capture.photos import (
     open_image,
     photo_header,
 )
-from igsr.capture.rig import LEAST_SHOWN, Rig, rig_of, sampled_views, sides_at
+from igsr.capture.read_transforms import read_lens
+from igsr.capture.rig import LEAST_SHOWN, Rig, rig_of, sampled_views, shown_part, sides_at
 from igsr.capture.types import Camera
 from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames, video_size
+from igsr.capture.wide_photos import WideFisheye, WidePhoto
 from igsr.errors import IgsrError
 
 #: Most frames taken from each video.
 FRAMES = 100
 #: The fewest photos that cameras can be found from.
 FEWEST = 2
+#: File in a folder of photos that describes their lens; see the module.
+LENS = "lens.json"
 #: Names shown of a long list.
 _NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
 class RigPlace:
-    """Which view of which panorama a photo is.
+    """Which view of which panorama, or wide fisheye photo, a photo is.
 
     Attributes:
-        rig: the panorama's name.
-        camera: of the view at its full size, in the frame of the panorama's camera.
+        rig: that photo's name.
+        camera: of the view at its full size, in the frame of that photo's camera.
     """
 
     rig: str
@@ -126,19 +132,20 @@ def load_photos(
     check_max_size(max_size)
     root, files, masks = _found(path)
     names = [file.relative_to(root).as_posix() for file in files]
+    lens = _lens_beside(root)
 
     def load(file: Path, name: str) -> list[Photo] | IgsrError:
         try:
             if file.suffix.lower() in VIDEO_SUFFIXES:
                 return _from_video(file, name, frames, max_size)
-            return _from_file(file, name, masks, max_size)
+            return _from_file(file, name, masks, lens, max_size)
         except IgsrError as error:
             return error
 
     with warnings.catch_warnings():
         # Pillow warns of damaged EXIF and the like even where the pixels can be read.
         warnings.filterwarnings("ignore", module="PIL")
-        headers = _headers(files, frames)
+        headers = _headers(files, frames, lens)
         sizes, channels, decoded = headers.sizes, headers.channels, headers.decoded
         check_memory(sizes, max_size, channels=channels, masked=masks.is_dir(), decoded=decoded)
         threads = decoding_threads(sizes, max_size, channels=channels, decoded=decoded)
@@ -174,10 +181,13 @@ def has_photos(path: Path) -> bool:
 def photo_sizes(path: Path) -> dict[str, int]:
     """The size in bytes of each photo and video that ``load_photos`` would load, by name, sorted.
 
+    ``lens.json`` is among them, where there is one: cameras depend on it.
+
     Raises:
         IgsrError: there are none.
     """
     root, files, _ = _found(path)
+    files = [*files, *filter(is_file, [root / LENS])]
     return {file.relative_to(root).as_posix(): file.stat().st_size for file in files}
 
 
@@ -272,10 +282,11 @@ def photo_headers(path: str | os.PathLike[str], frames: int = FRAMES) -> PhotoHe
     Raises:
         IgsrError: there are none.
     """
-    return _headers(_found(path)[1], frames)
+    root, files, _ = _found(path)
+    return _headers(files, frames, _lens_beside(root))
 
 
-def _headers(files: list[Path], frames: int) -> PhotoHeaders:
+def _headers(files: list[Path], frames: int, lens: WideFisheye | None) -> PhotoHeaders:
     """See ``photo_headers``; files that loading will name as broken are passed over."""
     found = PhotoHeaders([], 3, True, [], [])
     channels, exact = 3, True
@@ -289,9 +300,9 @@ def _headers(files: list[Path], frames: int) -> PhotoHeaders:
                 header = photo_header(file)
                 size, sizes, views = header.size, [header.size], [1]
                 channels = max(channels, header.channels)
-                panorama = panorama_of(file)
-                if panorama is not None:
-                    cameras = [side.camera for side in rig_of(panorama).sides]
+                wide = _wide(file, size, lens)
+                if wide is not None:
+                    cameras = [side.camera for side in rig_of(wide).sides]
                     sizes = [(camera.width, camera.height) for camera in cameras]
                     views = [len(sizes)]
         except IgsrError:
@@ -302,17 +313,31 @@ def _headers(files: list[Path], frames: int) -> PhotoHeaders:
     return replace(found, channels=channels, exact=exact)
 
 
-def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> list[Photo]:
-    panorama = panorama_of(file)
+def _lens_beside(root: Path) -> WideFisheye | None:
+    """The lens that a folder's ``lens.json`` describes; None where there is no such file."""
+    path = root / LENS
+    return read_lens(path) if is_file(path) else None
+
+
+def _wide(file: Path, size: tuple[int, int], lens: WideFisheye | None) -> WidePhoto | None:
+    """What a photo of more than one pinhole is; None for others."""
+    if lens is not None and size[0] * lens.height == size[1] * lens.width:
+        return lens.resized(*size)
+    return panorama_of(file)
+
+
+def _from_file(
+    file: Path, name: str, masks: Path, lens: WideFisheye | None, max_size: int | None
+) -> list[Photo]:
     mask_path = next(filter(is_file, mask_paths(masks, name)), None)
     with open_image(file) as image:
         full, exif = image.size, read_exif(image)
         mask = None
         if mask_path is not None:
             mask = _mask_as_stored(mask_path, name, full, exif.orientation)
-        if panorama is not None and exif.orientation != 1:
-            panorama = None  # a panorama that lies on its side is none
-        rig = None if panorama is None else rig_of(panorama)
+        # What lies on its side is no panorama.
+        wide = _wide(file, full, lens) if exif.orientation == 1 else None
+        rig = None if wide is None else rig_of(wide)
         size = reduced_size(*full, max_size) if rig is None else sides_at(rig, max_size)[1]
         pixels, mask = decoded(image, file, size, mask)
     if rig is not None:
@@ -338,6 +363,7 @@ def _views_of(
 ) -> list[Photo]:
     """The views of a panorama."""
     photos = []
+    mask = shown_part(rig, pixels, mask)
     sampled = sampled_views(rig, pixels, mask, max_size)
     for side, (camera, image, shown) in zip(rig.sides, sampled, strict=True):
         if shown is not None and shown.mean() < LEAST_SHOWN:

@@ -20,10 +20,9 @@ from igsr.capture.downscaling import (
 )
 from igsr.capture.exif import read_exif
 from igsr.capture.memory_check import decoding_threads
-from igsr.capture.rig import LEAST_SHOWN, Rig, sampled_views, sides_at
+from igsr.capture.rig import LEAST_SHOWN, Rig, sampled_views, shown_part, sides_at
 from igsr.capture.types import Camera, View
 from igsr.capture.undistort import Lens, Undistorter
-from igsr.capture.wide_photos import WideFisheye, lit_circle
 from igsr.errors import IgsrError
 
 _HEIF_SUFFIXES = (".heic", ".heif")
@@ -459,9 +458,7 @@ def _rig_views(
     light: float | None,
 ) -> list[View]:
     """The views of a wide photo."""
-    if isinstance(rig.photo, WideFisheye) and mask is None:
-        mask = lit_circle(image, rig.photo.resized(image.shape[1], image.shape[0]))
-    sampled = sampled_views(rig, image, mask, max_size)
+    sampled = sampled_views(rig, image, shown_part(rig, image, mask), max_size)
     views = []
     for shot in shots:
         camera, pixels, shown = sampled[shot.side]

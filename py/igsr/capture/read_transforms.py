@@ -26,7 +26,7 @@ from igsr.capture.point_cloud import read_point_cloud
 from igsr.capture.rig import rig_of
 from igsr.capture.types import Camera, Capture, Points, intrinsic_matrix, nearest_rigid
 from igsr.capture.undistort import Lens
-from igsr.capture.wide_photos import WidePhoto, whole_sphere, wide_fisheye
+from igsr.capture.wide_photos import WideFisheye, WidePhoto, whole_sphere, wide_fisheye
 from igsr.errors import IgsrError
 
 # nerfstudio does not distinguish these: the coefficients determine the lens.
@@ -109,6 +109,30 @@ def read_cameras(path: Path) -> list[tuple[str, Camera]]:
         viewmat = _viewmat(_required(frame, "transform_matrix", where), where)
         cameras.append((name, Camera(viewmat, K, width, height)))
     return cameras
+
+
+def read_lens(path: Path) -> WideFisheye:
+    """The lens of fisheye photos without cameras, from the fields that a frame would have.
+
+    Args:
+        path: a JSON file with ``w``, ``h``, ``camera_model`` OPENCV_FISHEYE, ``fl_x`` and so on.
+
+    Raises:
+        IgsrError: a field is missing or out of range, or one pinhole shows what the lens does.
+    """
+    fields, where = _read_json(path), str(path)
+    for key in ("w", "h", "fl_x"):
+        _required(fields, key, where)
+    width, height = _size(fields, path, where)
+    K, lens = _intrinsics(fields, width, height, where)
+    radius = _number(fields, "fisheye_crop_radius", where, math.inf)
+    wide = wide_fisheye(K, lens, width, height, radius)
+    if wide is None:
+        raise IgsrError(
+            f"{path} describes no fisheye of more than 120 degrees; delete it, since cameras of "
+            "other lenses are found with their distortion"
+        )
+    return wide
 
 
 def _read_json(path: Path) -> dict[str, Any]:

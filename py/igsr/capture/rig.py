@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from igsr.capture.downscaling import reduced_size, resized_camera
 from igsr.capture.types import Camera, intrinsic_matrix
-from igsr.capture.wide_photos import WidePhoto
+from igsr.capture.wide_photos import WideFisheye, WidePhoto, lit_circle
 from igsr.errors import IgsrError
 
 Float64 = npt.NDArray[np.float64]
@@ -148,6 +148,13 @@ def sides_at(rig: Rig, max_size: int | None) -> tuple[list[Camera], tuple[int, i
     focal = max(camera.K[0, 0] for camera in cameras)
     factor = min(1.0, OVERSAMPLED * focal / photo.pixels_per_radian)
     return cameras, (math.ceil(factor * photo.width), math.ceil(factor * photo.height))
+
+
+def shown_part(rig: Rig, image: UInt8, mask: Bool | None) -> Bool | None:
+    """The mask of a wide photo; of a fisheye without one, the circle that has light."""
+    if mask is not None or not isinstance(rig.photo, WideFisheye):
+        return mask
+    return lit_circle(image, rig.photo.resized(image.shape[1], image.shape[0]))
 
 
 def sampled_views(

@@ -18,7 +18,7 @@ from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
 from igsr.capture.load import describe_capture, holds_cameras
 from igsr.capture.overview import look_at
-from igsr.capture.photo_folder import FRAMES, VIDEO_SUFFIXES, photo_sizes
+from igsr.capture.photo_folder import FRAMES, LENS, VIDEO_SUFFIXES, photo_sizes
 from igsr.capture.write_colmap import write_colmap
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Progress
@@ -266,6 +266,7 @@ def not_placed(capture: Capture) -> list[str]:
         name
         for name in given
         if PurePosixPath(name).suffix.lower() not in VIDEO_SUFFIXES
+        and name != LENS
         and _without_suffix(name) not in placed
         and name not in panoramas
     ]

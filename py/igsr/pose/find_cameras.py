@@ -246,7 +246,8 @@ def estimate(
     estimator = chosen_estimator(estimator, options)
     if panorama is not None and estimator != "colmap":
         raise IgsrError(
-            f"{panorama} is a panorama, whose views {estimator} would place one by one; use "
+            f"{panorama} is a panorama or wide fisheye photo, whose views {estimator} would place "
+            "one by one; use "
             "--estimator colmap"
         )
     found = ESTIMATORS[estimator].make(**options)(photos, seed=seed, progress=progress)
