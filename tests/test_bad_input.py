@@ -212,8 +212,39 @@ def test_only_the_head_is_positional():
 def test_what_is_not_supported_says_what_to_do_instead():
     with pytest.raises(ValueError, match=r"return_normals: .*render_normals=True"):
         call({"return_normals": True})
-    with pytest.raises(ValueError, match=r"camera_model: only 'pinhole' .*undistort"):
-        call({"camera_model": "fisheye"})
+    for model, instead in (
+        ("ortho", "a pinhole far off: move it back"),
+        ("fisheye", "as igsr.load_capture makes of fisheye lenses"),
+        ("ftheta", "give pinhole views of the photos"),
+        ("panorama", "gsplat's others are ortho, fisheye, ftheta"),
+    ):
+        with pytest.raises(ValueError, match=f"camera_model: only 'pinhole' .*{instead}"):
+            call({"camera_model": model})
+
+
+def test_a_pinhole_far_off_is_nearly_orthographic():
+    """What the message on "ortho" advises: two splats at different depths keep their distance."""
+    scale, back = 10.0, 200.0
+    means = torch.tensor([[-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]])
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = back
+    K = torch.tensor([[scale * back, 0, 16], [0, scale * back, 16], [0, 0, 1]])
+    places = []
+    for index in range(2):
+        _, alpha, _ = rasterization(
+            means[index : index + 1],
+            torch.tensor([[1.0, 0, 0, 0]]),
+            torch.full((1, 3), 0.1),
+            torch.tensor([0.9]),
+            torch.ones(1, 3),
+            viewmat[None],
+            K[None],
+            32,
+            32,
+        )
+        weights = alpha[0, ..., 0].double()
+        places.append(float((weights.sum(0) * (torch.arange(32) + 0.5)).sum() / weights.sum()))
+    assert abs(places[1] - places[0] - scale) < 0.05
 
 
 @pytest.mark.parametrize("slot", ["means", "quats", "scales", "opacities", "colors"])

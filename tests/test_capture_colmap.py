@@ -165,7 +165,7 @@ def test_a_rig_s_cameras_have_their_own_poses(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "EUCM"])
+@pytest.mark.parametrize("model", ["FOV", "RAD_TAN_THIN_PRISM_FISHEYE", "EUCM"])
 def test_other_models_are_refused_by_name(model: str, text: bool, tmp_path: Path) -> None:
     write_colmap(tmp_path, model, text=text)
     with pytest.raises(IgsrError, match=f"camera 7 has the model {model}, which is not supported"):

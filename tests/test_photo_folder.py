@@ -14,6 +14,7 @@ from capture_files import photo, save
 from PIL import Image, ImageOps
 from test_capture_photos import write_png
 
+import igsr
 from igsr.capture import memory_check
 from igsr.capture.photo_folder import load_photos
 from igsr.capture.video_frames import FEWEST, sharpest_frames
@@ -103,6 +104,25 @@ def test_focal_length_and_device_from_exif(tmp_path: Path) -> None:
     assert photos[2].image.shape == (400, 300, 3)
     assert [one.focal for one in photos[3:]] == [None] * 3
     assert {one.device for one in photos} == {"Maker Model 1"}
+
+
+def test_exif_that_lies_is_no_exif(tmp_path: Path) -> None:
+    stored = Image.fromarray(photo(1, 400, 300))
+    # 1 mm on film, 1 mm on a plane of 110 pixels per cm, and a kilometre.
+    lies = [
+        exif_of(focal35=1),
+        exif_of(focal=1.0, resolution=110.0, unit=3, w=400),
+        exif_of(focal=1e6, resolution=1000.0, unit=3, w=400),
+    ]
+    for exposure, f_number, iso in ((0.0, 2.0, 100), (0.01, 0.0, 100), (0.01, 2.0, 0)):
+        lies.append(exif_of())
+        fields = lies[-1].get_ifd(0x8769)
+        fields[0x829A], fields[0x829D], fields[0x8827] = exposure, f_number, iso
+    for index, lie in enumerate(lies):
+        stored.save(tmp_path / f"{index}.jpg", exif=lie)
+    photos = load_photos(tmp_path)
+    assert [one.focal for one in photos] == [None] * 6
+    assert [one.exposure_value for one in photos] == [None] * 6
 
 
 def test_damaged_exif_is_no_exif(tmp_path: Path) -> None:
@@ -233,6 +253,13 @@ def test_sharpest_frames_evenly_spaced(tmp_path: Path) -> None:
     assert photos[0].image.shape == (64, 96, 3)
     assert photos[0].image[:, ::8].mean() - photos[0].image[:, 4::8].mean() > 120.0
     assert len(load_photos(tmp_path / "clip.mp4", frames=1000)) == FEWEST, "it does not move"
+
+
+def test_a_video_of_one_frame_is_one_photo(tmp_path: Path) -> None:
+    write_video(tmp_path / "clip.mp4", film(1, {0}))
+    assert [one.name for one in load_photos(tmp_path)] == ["clip.mp4/000000.png"]
+    with pytest.raises(IgsrError, match=r"2 photos at least; there is only clip\.mp4/000000\.png"):
+        igsr.estimate_poses(tmp_path, "colmap")
 
 
 def test_video_is_turned_as_its_file_says(tmp_path: Path) -> None:

@@ -264,6 +264,7 @@ class Fitter:
         backend: str,
         holds: dict[str, Float64] | None = None,
         exposures: dict[str, npt.NDArray[Any]] | None = None,
+        rigs: Sequence[int] | None = None,
     ) -> None:
         """A fit to V photos.
 

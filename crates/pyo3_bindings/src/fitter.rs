@@ -20,7 +20,7 @@ use crate::photos::targets_from;
 use crate::splat_arrays::set_splat_arrays;
 
 /// Names of the constructor's arguments, in their order.
-const ARGUMENTS: [&str; 11] = [
+const ARGUMENTS: [&str; 12] = [
     "images",
     "masks",
     "backgrounds",
@@ -32,6 +32,7 @@ const ARGUMENTS: [&str; 11] = [
     "backend",
     "holds",
     "exposures",
+    "rigs",
 ];
 
 /// A fit in progress. Its parameters stay on the device that computes.
@@ -52,7 +53,7 @@ impl Fitter {
     #[new]
     #[pyo3(
         signature = (*positional, **named),
-        text_signature = "(images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, holds=None, exposures=None)"
+        text_signature = "(images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, holds=None, exposures=None, rigs=None)"
     )]
     fn new<'py>(
         py: Python<'py>,
@@ -71,12 +72,16 @@ impl Fitter {
         let exposures = exposures.map(|start| exposures_from(&start, cameras.len())).transpose()?;
         let holds = call.optional::<Bound<'_, PyDict>>("holds")?;
         let holds = holds.map(|holds| holds_from(&holds, cameras.len())).transpose()?;
+        let rigs = call.optional::<Vec<u32>>("rigs")?;
         let (state, step) = state_from(&state, config.first_step)?;
         let device = fit_device(&call.take::<String>("backend")?)?;
         call.finish()?;
         py.detach(|| {
             let mut fitter =
                 splat_render::fit::Fitter::new(device, targets, cameras, state, step, config)?;
+            if let Some(rigs) = rigs {
+                fitter.set_rigs(&rigs)?;
+            }
             if let Some(holds) = holds {
                 fitter.hold_cameras(holds)?;
             }

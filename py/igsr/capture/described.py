@@ -8,7 +8,7 @@ from pathlib import Path
 
 from igsr.capture.downscaling import check_max_size
 from igsr.capture.memory_check import check_memory
-from igsr.capture.photos import Shot, checked_headers, load_views
+from igsr.capture.photos import Shot, checked_headers, load_views, loaded_sizes
 from igsr.capture.tracks import resized
 from igsr.capture.types import Capture, Points
 
@@ -41,10 +41,11 @@ class DescribedCapture:
         check_max_size(max_size)
         headers = checked_headers(self.shots)
         check_memory(
-            [header.size for header in headers],
+            loaded_sizes(self.shots, headers),
             max_size,
             channels=max((header.channels for header in headers), default=3),
-            masked=any(not shot.lens.is_pinhole or shot.mask_path for shot in self.shots),
+            masked=any(shot.is_resampled or shot.mask_path for shot in self.shots),
+            decoded=[header.size for header in headers],
         )
         points = self.points()
         views = load_views(self.shots, headers, max_size)

@@ -18,6 +18,7 @@ from PIL import Image
 _ORIENTATION, _MAKE, _MODEL, _SUB_FOLDER = 0x0112, 0x010F, 0x0110, 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
 _PIXEL_WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA20E, 0xA210
+_USER_COMMENT = 0x9286
 _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 _MM_FROM_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 #: Orientations that exchange width and height.
@@ -41,12 +42,14 @@ class Exif:
             f-number squared), by exposure time, f-number and ISO (Exif 2.32, section 4.6.5). It
             compares photos of one place: a larger one is brighter there. None where a field is
             missing or cannot be true.
+        screenshot: whether the comment says that it is one, as phones write it.
     """
 
     orientation: int
     focal: float | None
     device: str | None
     exposure_value: float | None
+    screenshot: bool = False
 
 
 def read_exif(image: Image.Image) -> Exif:
@@ -61,7 +64,12 @@ def read_exif(image: Image.Image) -> Exif:
         orientation = 1
     names = [_text(fields.get(tag)) for tag in (_MAKE, _MODEL, _LENS_MODEL)]
     device = " ".join(name for name in names if name) or None
-    return Exif(orientation, _focal(fields, *image.size), device, _exposure_value(fields))
+    comment = fields.get(_USER_COMMENT)
+    # Eight bytes that name the encoding come first.
+    text = comment[8:].decode("ascii", "replace") if isinstance(comment, bytes) else _text(comment)
+    screenshot = text.strip(" \0").lower() == "screenshot"
+    focal, light = _focal(fields, *image.size), _exposure_value(fields)
+    return Exif(orientation, focal, device, light, screenshot)
 
 
 def _exposure_value(fields: dict[int, Any]) -> float | None:

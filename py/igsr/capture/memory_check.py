@@ -62,6 +62,7 @@ def needed_memory(
     *,
     channels: int = 3,
     masked: bool = False,
+    decoded: Sequence[tuple[int, int]] = (),
 ) -> int:
     """Bytes that photos take at most, at one time.
 
@@ -71,14 +72,15 @@ def needed_memory(
         splats: most splats of a fit to these photos, or None where they are only loaded.
         channels: of the photos: 3, or 4 with alpha.
         masked: whether pixels are masked, or lens distortion is undone.
+        decoded: sizes of the files, where photos are parts of them.
     """
     reduced = [reduced_size(width, height, max_size) for width, height in sizes]
     pixels = sum(width * height for width, height in reduced)
     largest = max((width * height for width, height in reduced), default=0)
     held = pixels * (channels + masked)
     undistorted = UNDISTORTED * largest if masked else 0
-    decoded = DECODED * max((width * height for width, height in sizes), default=0)
-    loading = held + decoded + undistorted
+    files = decoded or sizes
+    loading = held + DECODED * _most_pixels(files) + undistorted
     if splats is None:
         return loading
     copied = pixels * (channels + 4 * masked)  # a mask becomes float32 weights
@@ -93,18 +95,21 @@ def largest_size_that_fits(
     *,
     channels: int = 3,
     masked: bool = False,
+    decoded: Sequence[tuple[int, int]] = (),
     available: int | None = None,
 ) -> int | None:
     """The longest side in pixels at which photos fit into memory; None where no size does.
 
     Args:
-        sizes, splats, channels, masked: as ``needed_memory``.
+        sizes, splats, channels, masked, decoded: as ``needed_memory``.
         available: bytes; None is ``available_memory()``.
     """
     usable = USABLE * (available_memory() if available is None else available)
 
     def fits(size: int) -> bool:
-        needed = needed_memory(sizes, size, splats, channels=channels, masked=masked)
+        needed = needed_memory(
+            sizes, size, splats, channels=channels, masked=masked, decoded=decoded
+        )
         return needed <= usable
 
     longest = max((max(size) for size in sizes), default=1)
@@ -124,11 +129,12 @@ def check_memory(
     *,
     channels: int = 3,
     masked: bool = False,
+    decoded: Sequence[tuple[int, int]] = (),
 ) -> None:
     """Refuse photos that do not fit into memory, and name the size at which they do.
 
     Args:
-        sizes, max_size, splats, channels, masked: as ``needed_memory``.
+        sizes, max_size, splats, channels, masked, decoded: as ``needed_memory``.
 
     Raises:
         IgsrError: they do not fit.
@@ -136,7 +142,7 @@ def check_memory(
     available = available_memory()
 
     def needed_at(size: int | None) -> int:
-        return needed_memory(sizes, size, splats, channels=channels, masked=masked)
+        return needed_memory(sizes, size, splats, channels=channels, masked=masked, decoded=decoded)
 
     if needed_at(max_size) <= USABLE * available:
         return
@@ -149,7 +155,7 @@ def check_memory(
         f"and {_gigabytes(available)} are free"
     )
     size = largest_size_that_fits(
-        sizes, splats, channels=channels, masked=masked, available=available
+        sizes, splats, channels=channels, masked=masked, decoded=decoded, available=available
     )
     if size is None:
         raise IgsrError(f"{says}: give fewer photos, or free memory; no --max-size would do.")
@@ -157,18 +163,25 @@ def check_memory(
 
 
 def decoding_threads(
-    sizes: Sequence[tuple[int, int]], max_size: int | None = None, *, channels: int = 3
+    sizes: Sequence[tuple[int, int]],
+    max_size: int | None = None,
+    *,
+    channels: int = 3,
+    decoded: Sequence[tuple[int, int]] = (),
 ) -> int:
     """How many photos are decoded side by side: as many as memory allows, at least one.
 
     Args:
-        sizes, max_size, channels: as ``needed_memory``.
+        sizes, max_size, channels, decoded: as ``needed_memory``.
     """
-    largest = max((width * height for width, height in sizes), default=1)
-    alone = needed_memory(sizes, max_size, channels=channels, masked=True)
+    alone = needed_memory(sizes, max_size, channels=channels, masked=True, decoded=decoded)
     left = USABLE * available_memory() - alone
-    more = int(max(0.0, left) / (DECODED * largest))
+    more = int(max(0.0, left) / (DECODED * max(1, _most_pixels(decoded or sizes))))
     return min(1 + more, os.cpu_count() or 1, MOST_THREADS)
+
+
+def _most_pixels(sizes: Sequence[tuple[int, int]]) -> int:
+    return max((width * height for width, height in sizes), default=0)
 
 
 def _gigabytes(count: float) -> str:

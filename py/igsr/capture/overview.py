@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from igsr.capture.load import describe_capture, holds_cameras
 from igsr.capture.memory_check import check_memory
 from igsr.capture.photo_folder import FRAMES, has_photos, photo_headers
-from igsr.capture.photos import checked_headers
+from igsr.capture.photos import checked_headers, loaded_sizes, photo_of
 from igsr.errors import IgsrError
 
 
@@ -26,6 +27,9 @@ class Overview:
         channels: of the photos: 3, or 4 if any has alpha.
         masked: whether pixels are masked, or lens distortion is to be undone.
         exact: whether there are as many photos as ``sizes`` says; videos may have fewer frames.
+        views: how many of ``sizes`` each photo has, in the order of names: panoramas become several
+            views. Empty where each is one view.
+        decoded: width and height in pixels of the files, where these are not ``sizes``.
     """
 
     path: Path
@@ -35,6 +39,8 @@ class Overview:
     channels: int
     masked: bool
     exact: bool
+    views: list[int] = field(default_factory=list)
+    decoded: list[tuple[int, int]] = field(default_factory=list)
 
     def train_photos(self, holdout: int | None) -> int:
         """How many photos will be fitted, at most, if every ``holdout``-th is held out.
@@ -46,11 +52,12 @@ class Overview:
             return self.train
         if isinstance(holdout, bool) or not isinstance(holdout, int) or holdout < 2:
             raise IgsrError(f"holdout is {holdout!r}; give a whole number of at least 2, such as 8")
-        if len(self.sizes) < 2:
+        views = self.views or [1] * len(self.sizes)
+        if len(views) < 2:
             raise IgsrError(
                 f"{self.path} has one photo only, so none can be held out; leave holdout out"
             )
-        return len(self.sizes) - len(self.sizes[::holdout])
+        return sum(views) - sum(views[::holdout])
 
     def check_memory(self, max_size: int | None = None, splats: int | None = None) -> None:
         """Refuse photos that do not fit into memory; the message names the size that does.
@@ -62,7 +69,14 @@ class Overview:
         Raises:
             IgsrError: they do not fit.
         """
-        check_memory(self.sizes, max_size, splats, channels=self.channels, masked=self.masked)
+        check_memory(
+            self.sizes,
+            max_size,
+            splats,
+            channels=self.channels,
+            masked=self.masked,
+            decoded=self.decoded,
+        )
 
 
 def look_at(
@@ -87,12 +101,24 @@ def look_at(
         return Overview(
             path,
             True,
-            [header.size for header in headers],
+            loaded_sizes(shots, headers),
             sum(shot.split == "train" for shot in shots),
             max((header.channels for header in headers), default=3),
-            any(not shot.lens.is_pinhole or shot.mask_path is not None for shot in shots),
+            any(shot.is_resampled or shot.mask_path is not None for shot in shots),
             True,
+            [number for _, number in sorted(Counter(map(photo_of, shots)).items())],
+            [header.size for header in headers],
         )
-    sizes, channels, exact = photo_headers(path, frames)
+    found = photo_headers(path, frames)
     # Whether lenses bend is not known yet: it is counted as if they did.
-    return Overview(path, False, sizes, len(sizes), channels, True, exact)
+    return Overview(
+        path,
+        False,
+        found.sizes,
+        len(found.sizes),
+        found.channels,
+        True,
+        found.exact,
+        found.views,
+        found.decoded,
+    )

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 
 from igsr.capture import View
+from igsr.capture.sharpness import blurred_photos
 from igsr.errors import IgsrError
 
 #: Cameras nearer to each other than this part of the largest distance are at the same place.
@@ -24,7 +25,7 @@ def check_photos(views: list[View]) -> None:
     Raises:
         IgsrError: every photo is black or fully transparent, or a mask leaves no pixel of a photo.
         UserWarning: a single photo, cameras at one place, a camera given twice, photos of which no
-            two see anything in common, a photo that is black or fully transparent.
+            two see anything in common, a photo that is black, fully transparent or blurred.
     """
     for view in views:
         if view.mask is not None and not view.mask.any():
@@ -34,6 +35,10 @@ def check_photos(views: list[View]) -> None:
         raise IgsrError("Every photo is black or wholly transparent; there is nothing to fit.")
     if empty:
         _warn(f"{_listed(empty)}: black or wholly transparent; leave out what shows nothing.")
+    photos = ((view.photo, view.image, view.mask) for view in views if view.weights is None)
+    blurred = sorted(blurred_photos(photos))
+    if blurred:
+        _warn(f"{_listed(blurred)}: blurred; leave out what another photo shows sharp.")
     if len(views) == 1:
         _warn(
             "There is one photo only: nothing tells how far away things are, so the scene is "

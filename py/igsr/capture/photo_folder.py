@@ -1,5 +1,9 @@
 """Photos without cameras: load folders, files and videos, upright.
 
+Panoramas become a rig of pinhole views each, whose intrinsics and directions are known. So do
+fisheye photos of more than 120 degrees, where a file ``lens.json`` in the folder describes the lens
+with the fields that it would have in a ``transforms.json``.
+
 These photos are turned by their EXIF orientation. Those of a capture are not: its cameras belong to
 the pixels as stored.
 
@@ -21,7 +25,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from igsr.capture.downscaling import area_means, check_max_size, reduced_size
-from igsr.capture.exif import TURNED, read_exif, turned_back, upright
+from igsr.capture.exif import TURNED, Exif, read_exif, turned_back, upright
+from igsr.capture.find_panoramas import panorama_of
 from igsr.capture.memory_check import check_memory, decoding_threads
 from igsr.capture.photos import (
     SUFFIXES,
@@ -32,15 +37,34 @@ from igsr.capture.photos import (
     open_image,
     photo_header,
 )
+from igsr.capture.read_transforms import read_lens
+from igsr.capture.rig import LEAST_SHOWN, Rig, rig_of, sampled_views, shown_part, sides_at
+from igsr.capture.types import Camera
 from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames, video_size
+from igsr.capture.wide_photos import WideFisheye, WidePhoto
 from igsr.errors import IgsrError
 
 #: Most frames taken from each video.
 FRAMES = 100
 #: The fewest photos that cameras can be found from.
 FEWEST = 2
+#: File in a folder of photos that describes their lens; see the module.
+LENS = "lens.json"
 #: Names shown of a long list.
 _NAMED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class RigPlace:
+    """Which view of which panorama, or wide fisheye photo, a photo is.
+
+    Attributes:
+        rig: that photo's name.
+        camera: of the view at its full size, in the frame of that photo's camera.
+    """
+
+    rig: str
+    camera: Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +81,8 @@ class Photo:
         taken: width and height in pixels of the upright photo before it was reduced to ``image``;
             None if it was not.
         exposure_value: how much light the photo took, as ``View.exposure_value``.
+        place: of a view of a panorama; None for other photos.
+        screenshot: whether EXIF says that it is one.
     """
 
     name: str
@@ -66,6 +92,8 @@ class Photo:
     device: str | None = None
     taken: tuple[int, int] | None = None
     exposure_value: float | None = None
+    place: RigPlace | None = None
+    screenshot: bool = False
 
     @property
     def full_size(self) -> tuple[int, int]:
@@ -104,21 +132,23 @@ def load_photos(
     check_max_size(max_size)
     root, files, masks = _found(path)
     names = [file.relative_to(root).as_posix() for file in files]
+    lens = _lens_beside(root)
 
     def load(file: Path, name: str) -> list[Photo] | IgsrError:
         try:
             if file.suffix.lower() in VIDEO_SUFFIXES:
                 return _from_video(file, name, frames, max_size)
-            return [_from_file(file, name, masks, max_size)]
+            return _from_file(file, name, masks, lens, max_size)
         except IgsrError as error:
             return error
 
     with warnings.catch_warnings():
         # Pillow warns of damaged EXIF and the like even where the pixels can be read.
         warnings.filterwarnings("ignore", module="PIL")
-        sizes, channels, _ = _headers(files, frames)
-        check_memory(sizes, max_size, channels=channels, masked=masks.is_dir())
-        threads = decoding_threads(sizes, max_size, channels=channels)
+        headers = _headers(files, frames, lens)
+        sizes, channels, decoded = headers.sizes, headers.channels, headers.decoded
+        check_memory(sizes, max_size, channels=channels, masked=masks.is_dir(), decoded=decoded)
+        threads = decoding_threads(sizes, max_size, channels=channels, decoded=decoded)
         with ThreadPoolExecutor(max_workers=threads) as pool:
             loaded = list(pool.map(load, files, names))
     photos = [photo for found in loaded if isinstance(found, list) for photo in found]
@@ -151,10 +181,13 @@ def has_photos(path: Path) -> bool:
 def photo_sizes(path: Path) -> dict[str, int]:
     """The size in bytes of each photo and video that ``load_photos`` would load, by name, sorted.
 
+    ``lens.json`` is among them, where there is one: cameras depend on it.
+
     Raises:
         IgsrError: there are none.
     """
     root, files, _ = _found(path)
+    files = [*files, *filter(is_file, [root / LENS])]
     return {file.relative_to(root).as_posix(): file.stat().st_size for file in files}
 
 
@@ -218,51 +251,97 @@ def _files(files: list[Path]) -> tuple[Path, list[Path], Path]:
     return root, files, root / "masks"
 
 
-def photo_headers(
-    path: str | os.PathLike[str], frames: int = FRAMES
-) -> tuple[list[tuple[int, int]], int, bool]:
-    """The sizes of the photos that ``load_photos`` would load, without decoding any.
+@dataclass(frozen=True)
+class PhotoHeaders:
+    """What is known of photos before any is decoded.
+
+    Attributes:
+        sizes: width and height in pixels of each as stored, and as often as frames may be taken of
+            each video; of a panorama, those of its views.
+        channels: the most channels of one.
+        exact: whether there are just as many photos.
+        views: how many of ``sizes`` are of each photo.
+        decoded: width and height in pixels of the files.
+    """
+
+    sizes: list[tuple[int, int]]
+    channels: int
+    exact: bool
+    views: list[int]
+    decoded: list[tuple[int, int]]
+
+
+def photo_headers(path: str | os.PathLike[str], frames: int = FRAMES) -> PhotoHeaders:
+    """The sizes of the photos that ``load_photos`` would load.
+
+    Pixels are looked at only of what may be a panorama.
 
     Args:
         path, frames: as ``load_photos``.
 
-    Returns:
-        Width and height in pixels of each as stored, and as often as frames may be taken of each
-        video; the most channels of one; whether there are just as many photos.
-
     Raises:
         IgsrError: there are none.
     """
-    return _headers(_found(path)[1], frames)
+    root, files, _ = _found(path)
+    return _headers(files, frames, _lens_beside(root))
 
 
-def _headers(files: list[Path], frames: int) -> tuple[list[tuple[int, int]], int, bool]:
+def _headers(files: list[Path], frames: int, lens: WideFisheye | None) -> PhotoHeaders:
     """See ``photo_headers``; files that loading will name as broken are passed over."""
-    sizes, channels, exact = [], 3, True
+    found = PhotoHeaders([], 3, True, [], [])
+    channels, exact = 3, True
     for file in files:
         try:
             if file.suffix.lower() in VIDEO_SUFFIXES:
                 size, count = video_size(file)
-                sizes += [size] * (min(frames, count) if count else frames)
-                exact = False
+                number = min(frames, count) if count else frames
+                sizes, views, exact = [size] * number, [1] * number, False
             else:
                 header = photo_header(file)
-                sizes.append(header.size)
+                size, sizes, views = header.size, [header.size], [1]
                 channels = max(channels, header.channels)
+                wide = _wide(file, size, lens)
+                if wide is not None:
+                    cameras = [side.camera for side in rig_of(wide).sides]
+                    sizes = [(camera.width, camera.height) for camera in cameras]
+                    views = [len(sizes)]
         except IgsrError:
             continue
-    return sizes, channels, exact
+        found.sizes.extend(sizes)
+        found.views.extend(views)
+        found.decoded.append(size)
+    return replace(found, channels=channels, exact=exact)
 
 
-def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> Photo:
+def _lens_beside(root: Path) -> WideFisheye | None:
+    """The lens that a folder's ``lens.json`` describes; None where there is no such file."""
+    path = root / LENS
+    return read_lens(path) if is_file(path) else None
+
+
+def _wide(file: Path, size: tuple[int, int], lens: WideFisheye | None) -> WidePhoto | None:
+    """What a photo of more than one pinhole is; None for others."""
+    if lens is not None and size[0] * lens.height == size[1] * lens.width:
+        return lens.resized(*size)
+    return panorama_of(file)
+
+
+def _from_file(
+    file: Path, name: str, masks: Path, lens: WideFisheye | None, max_size: int | None
+) -> list[Photo]:
     mask_path = next(filter(is_file, mask_paths(masks, name)), None)
     with open_image(file) as image:
         full, exif = image.size, read_exif(image)
         mask = None
         if mask_path is not None:
             mask = _mask_as_stored(mask_path, name, full, exif.orientation)
-        size = reduced_size(*full, max_size)
+        # What lies on its side is no panorama.
+        wide = _wide(file, full, lens) if exif.orientation == 1 else None
+        rig = None if wide is None else rig_of(wide)
+        size = reduced_size(*full, max_size) if rig is None else sides_at(rig, max_size)[1]
         pixels, mask = decoded(image, file, size, mask)
+    if rig is not None:
+        return _views_of(name, rig, pixels, mask, max_size, exif)
     pixels = upright(pixels, exif.orientation)
     if mask is not None:
         mask = upright(mask, exif.orientation)
@@ -270,7 +349,38 @@ def _from_file(file: Path, name: str, masks: Path, max_size: int | None) -> Phot
     if size != full:
         taken = full[::-1] if exif.orientation in TURNED else full
         focal = None if focal is None else focal * max(size) / max(full)
-    return Photo(name, pixels, mask, focal, exif.device, taken, exif.exposure_value)
+    photo = Photo(name, pixels, mask, focal, exif.device, taken, exif.exposure_value)
+    return [replace(photo, screenshot=exif.screenshot)]
+
+
+def _views_of(
+    name: str,
+    rig: Rig,
+    pixels: np.ndarray,
+    mask: np.ndarray | None,
+    max_size: int | None,
+    exif: Exif,
+) -> list[Photo]:
+    """The views of a panorama."""
+    photos = []
+    mask = shown_part(rig, pixels, mask)
+    sampled = sampled_views(rig, pixels, mask, max_size)
+    for side, (camera, image, shown) in zip(rig.sides, sampled, strict=True):
+        if shown is not None and shown.mean() < LEAST_SHOWN:
+            continue  # all masked
+        photos.append(
+            Photo(
+                side.named(name),
+                image,
+                shown,
+                float(camera.K[0, 0]),
+                exif.device,
+                (side.camera.width, side.camera.height),
+                exif.exposure_value,
+                RigPlace(name, side.camera),
+            )
+        )
+    return photos
 
 
 def _mask_as_stored(path: Path, name: str, size: tuple[int, int], orientation: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from igsr.capture.downscaling import (
 )
 from igsr.capture.exif import read_exif
 from igsr.capture.memory_check import decoding_threads
+from igsr.capture.rig import LEAST_SHOWN, Rig, sampled_views, shown_part, sides_at
 from igsr.capture.types import Camera, View
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
@@ -50,6 +51,9 @@ class Shot:
         mask_path: the mask's file, or None.
         source: the file that describes the camera, for error messages.
         factor: by which the photo is smaller than its camera says, within a pixel.
+        rig: of a view of a wide photo, all views that this becomes; None for other photos.
+        side: which of these the shot is.
+        photo: the wide photo's name; also of views that were written as such.
     """
 
     name: str
@@ -60,6 +64,47 @@ class Shot:
     mask_path: Path | None
     source: Path
     factor: int = 1
+    rig: Rig | None = None
+    side: int = 0
+    photo: str | None = None
+
+    @property
+    def photo_size(self) -> tuple[int, int]:
+        """Width and height in pixels that the photo has by its camera, before it is reduced."""
+        if self.rig is not None:
+            return self.rig.photo.width, self.rig.photo.height
+        return self.camera.width, self.camera.height
+
+    @property
+    def is_resampled(self) -> bool:
+        """Whether the view's pixels are not those of the photo."""
+        return self.rig is not None or not self.lens.is_pinhole
+
+
+def rig_shots(shot: Shot, rig: Rig) -> list[Shot]:
+    """The views of a wide photo.
+
+    Args:
+        shot: the photo; of its camera, only the pose counts.
+        rig: its views.
+    """
+    return [
+        replace(
+            shot,
+            name=side.named(shot.name),
+            camera=side.in_world(shot.camera.viewmat),
+            lens=Lens(),
+            rig=rig,
+            side=index,
+            photo=shot.name,
+        )
+        for index, side in enumerate(rig.sides)
+    ]
+
+
+def photo_of(shot: Shot) -> str:
+    """The name of the photo that a shot is of, as ``View.photo``."""
+    return shot.photo or shot.name
 
 
 def is_file(path: Path) -> bool:
@@ -307,10 +352,17 @@ def checked_headers(shots: list[Shot]) -> list[PhotoHeader]:
     return headers
 
 
+def loaded_sizes(shots: list[Shot], headers: list[PhotoHeader]) -> list[tuple[int, int]]:
+    """Width and height in pixels of each view before it is reduced."""
+    return [
+        header.size if shot.rig is None else (shot.camera.width, shot.camera.height)
+        for shot, header in zip(shots, headers, strict=True)
+    ]
+
+
 def _check_size(path: Path, size: tuple[int, int], shot: Shot, what: str) -> None:
     """Check a photo's or mask's size against its camera."""
-    camera = shot.camera
-    wanted = camera.width, camera.height
+    wanted = shot.photo_size
     if size == wanted and (shot.factor == 1 or what == "mask"):
         return
     # Programs round the size of a reduced photo up, down or to the nearest.
@@ -340,40 +392,91 @@ def load_views(
     Raises:
         IgsrError: a photo cannot be used; of several, the message is about the first.
     """
-    cameras = [
-        resized_camera(shot.camera, *reduced_size(*header.size, max_size))
-        for shot, header in zip(shots, headers, strict=True)
-    ]
-    undistorters = _Undistorters(shots, cameras)
+    plain = [(s, h) for s, h in zip(shots, headers, strict=True) if s.rig is None]
+    cameras = {
+        shot.name: resized_camera(shot.camera, *reduced_size(*header.size, max_size))
+        for shot, header in plain
+    }
+    undistorters = _Undistorters([shot for shot, _ in plain], list(cameras.values()))
 
-    def load(shot: Shot, header: PhotoHeader, camera: Camera) -> View:
-        size = camera.width, camera.height
+    def load(group: list[Shot], header: PhotoHeader) -> list[View]:
+        shot, rig = group[0], group[0].rig
+        if rig is None:
+            size = cameras[shot.name].width, cameras[shot.name].height
+        else:
+            size = _sampled_size(rig, header.size, max_size)
         with open_image(shot.path) as opened:
             if opened.size != header.size:
                 raise IgsrError(f"{shot.path} was changed while it was read; try again")
             mask = _mask(shot, header.size)
             image, mask = decoded(opened, shot.path, size, mask)
             light = read_exif(opened).exposure_value
+        if rig is not None:
+            return _rig_views(group, rig, image, mask, max_size, light)
+        camera = cameras[shot.name]
         if not shot.lens.is_pinhole:
             undistorter = undistorters.take(shot, camera)
             image = undistorter.image(image)
             mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
             if mask.all():
                 mask = None
-        return View(shot.name, camera, shot.split, image, mask, exposure_value=light)
+        view = View(shot.name, camera, shot.split, image, mask, exposure_value=light)
+        return [replace(view, rig=shot.photo)]
 
+    # The views of a wide photo come from one decoding of it.
+    groups: dict[str, tuple[list[Shot], PhotoHeader]] = {}
+    for shot, header in zip(shots, headers, strict=True):
+        key = shot.name if shot.rig is None else photo_of(shot)
+        groups.setdefault(key, ([], header))[0].append(shot)
     threads = decoding_threads(
-        [header.size for header in headers],
+        loaded_sizes(shots, headers),
         max_size,
         channels=max((header.channels for header in headers), default=3),
+        decoded=[header.size for header in headers],
     )
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        futures = [pool.submit(load, *each) for each in zip(shots, headers, cameras, strict=True)]
+        futures = [pool.submit(load, *group) for group in groups.values()]
         try:
-            return [future.result() for future in futures]
+            return [view for future in futures for view in future.result()]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def _sampled_size(rig: Rig, size: tuple[int, int], max_size: int | None) -> tuple[int, int]:
+    """The size at which a wide photo is decoded, whose file has ``size`` pixels."""
+    wanted = sides_at(rig, max_size)[1]
+    return min(size[0], wanted[0]), min(size[1], wanted[1])
+
+
+def _rig_views(
+    shots: list[Shot],
+    rig: Rig,
+    image: np.ndarray,
+    mask: np.ndarray | None,
+    max_size: int | None,
+    light: float | None,
+) -> list[View]:
+    """The views of a wide photo."""
+    sampled = sampled_views(rig, image, shown_part(rig, image, mask), max_size)
+    views = []
+    for shot in shots:
+        camera, pixels, shown = sampled[shot.side]
+        if shown is not None and shown.mean() < LEAST_SHOWN:
+            continue  # all masked, or beyond the circle that the lens shows
+        camera = replace(camera, viewmat=shot.camera.viewmat)
+        views.append(
+            View(
+                shot.name,
+                camera,
+                shot.split,
+                pixels,
+                shown,
+                exposure_value=light,
+                rig=shot.photo,
+            )
+        )
+    return views
 
 
 def _mask(shot: Shot, size: tuple[int, int]) -> np.ndarray | None:

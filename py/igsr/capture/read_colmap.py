@@ -3,7 +3,8 @@
 The files cameras, images and points3D are parsed here and not by pycolmap, which reads a truncated
 file as zeros without an error and on other damage ends the whole process. The tests compare this
 reader with models that pycolmap wrote. Models of COLMAP 3.12 and later also have rigs and frames,
-but their images file still has the pose of each image.
+but their images file still has the pose of each image: of frames, only it is taken which images are
+views of one panorama.
 
 The confidence of a point with a track follows from the track's length and the point's error. COLMAP
 itself writes no points without a track: their error, if positive, is 1 / confidence, as
@@ -18,18 +19,21 @@ import math
 import posixpath
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from igsr.capture.colmap_rigs import read_frames, shared_centres
 from igsr.capture.described import DescribedCapture
 from igsr.capture.image_folders import find_images
-from igsr.capture.photos import Shot, is_file
+from igsr.capture.photos import Shot, is_file, rig_shots
+from igsr.capture.rig import Rig, moved_to_side, rig_of
 from igsr.capture.tracks import straightened, track_confidence
 from igsr.capture.types import Camera, Capture, Points, Tracks, intrinsic_matrix
 from igsr.capture.undistort import Lens
+from igsr.capture.wide_photos import WidePhoto, whole_sphere, wide_fisheye
 from igsr.errors import IgsrError
 
 # Camera models by COLMAP's number, to name a model that is refused.
@@ -64,6 +68,10 @@ _PARAMETER_COUNTS = {
     "FULL_OPENCV": 12,
     "SIMPLE_RADIAL_FISHEYE": 4,
     "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EQUIRECTANGULAR": 2,
 }
 _ONE_FOCAL_LENGTH = (
     "SIMPLE_PINHOLE",
@@ -71,7 +79,9 @@ _ONE_FOCAL_LENGTH = (
     "RADIAL",
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
+    "SIMPLE_FISHEYE",
 )
+_SPHERE = "EQUIRECTANGULAR"
 
 
 @dataclass(frozen=True)
@@ -84,6 +94,7 @@ class _ColmapCamera:
 
 @dataclass(frozen=True)
 class _ColmapImage:
+    identity: int
     name: str
     quat: tuple[float, ...]  # wxyz, world to camera
     translation: tuple[float, ...]
@@ -185,19 +196,43 @@ def described_colmap(
     found = find_images(path, names, sizes, max_size, folder, images_path)
     # Photos keep their names at every size.
     prefix = "images" if found.factor > 1 or (path / "images").is_dir() else ""
-    shots = []
+    frames_path = model / f"frames.{kind}"
+    frames = read_frames(frames_path) if is_file(frames_path) else []
+    taken = []
     for image, photo in zip(images, found.files, strict=True):
         viewmat = _viewmat(image, images_path)
         colmap_camera = cameras[image.camera_id]
-        try:
-            K, lens = _intrinsics(colmap_camera)
-            camera = Camera(viewmat, K, colmap_camera.width, colmap_camera.height)
-        except IgsrError as error:
-            raise IgsrError(f"{cameras_path}, camera {image.camera_id}: {error}") from error
+        width, height = colmap_camera.width, colmap_camera.height
         name = posixpath.normpath(posixpath.join(prefix, image.name))
         mask = found.masks / f"{image.name}.png"
         mask_path = mask if is_file(mask) else None
-        shots.append(Shot(name, photo, camera, lens, "train", mask_path, images_path, found.factor))
+        try:
+            K, lens = _intrinsics(colmap_camera)
+            camera = Camera(viewmat, K, width, height)
+            is_sphere = colmap_camera.model == _SPHERE
+            wide: WidePhoto | None = whole_sphere(width, height) if is_sphere else None
+            wide = wide or wide_fisheye(K, lens, width, height)
+            rig = None if wide is None else rig_of(wide)
+        except IgsrError as error:
+            raise IgsrError(f"{cameras_path}, camera {image.camera_id}: {error}") from error
+        shot = Shot(name, photo, camera, lens, "train", mask_path, images_path, found.factor)
+        taken.append(_Taken(shot, rig))
+    plain = {
+        image.identity: one.shot
+        for image, one in zip(images, taken, strict=True)
+        if one.rig is None
+    }
+    shared = shared_centres(
+        frames,
+        {identity: shot.name for identity, shot in plain.items()},
+        {identity: shot.camera.centre for identity, shot in plain.items()},
+    )
+    shots = []
+    for image, one in zip(images, taken, strict=True):
+        if one.rig is None:
+            shots.append(replace(one.shot, photo=shared.get(image.identity)))
+        else:
+            shots += rig_shots(one.shot, one.rig)
 
     def points() -> Points | None:
         if not is_file(points_path):
@@ -206,24 +241,33 @@ def described_colmap(
         if not listed.ids:
             return None
         points = listed.points(points_path)
-        points.tracks = _tracks(images_path, images, shots, listed.ids, points.xyz)
+        points.tracks = _tracks(images_path, images, taken, listed.ids, points.xyz)
         return points
 
     return DescribedCapture(path, shots, points)
 
 
+@dataclass(frozen=True)
+class _Taken:
+    """A photo of a model, and the views that it becomes if it is a wide one."""
+
+    shot: Shot
+    rig: Rig | None
+
+
 def _tracks(
     path: Path,
     images: list[_ColmapImage],
-    shots: list[Shot],
+    taken: list[_Taken],
     ids: list[int],
     xyz: np.ndarray,
 ) -> Tracks | None:
     """Where the images see the points with these COLMAP ids; None if no point is seen."""
     number = np.array(ids, dtype=np.uint64).astype(np.int64)  # as those of the features wrap
     order = np.argsort(number, kind="stable")
+    shots: list[Shot] = []
     views, points, places = [], [], []
-    for index, image in enumerate(images):
+    for image, one in zip(images, taken, strict=True):
         at = order[np.searchsorted(number[order], image.point_ids).clip(0, len(ids) - 1)]
         # An id without a point belongs to a feature without a point, or to a removed point.
         seen = (number[at] == image.point_ids) & (image.point_ids != -1)
@@ -231,9 +275,14 @@ def _tracks(
             raise IgsrError(
                 f"{path}: {image.name} sees a point at no finite place; run COLMAP again"
             )
-        views.append(np.full(int(seen.sum()), index, dtype=np.int64))
-        points.append(at[seen])
-        places.append(image.places[seen])
+        found = [(one.shot, at[seen], image.places[seen])]
+        if one.rig is not None:
+            found = _on_sides(one.shot, one.rig, at[seen], image.places[seen], xyz)
+        for shot, point, place in found:
+            views.append(np.full(len(point), len(shots), dtype=np.int64))
+            points.append(point)
+            places.append(place)
+            shots.append(shot)
     if not any(map(len, views)):
         return None
     tracks = Tracks(
@@ -243,16 +292,34 @@ def _tracks(
     return straightened(tracks, xyz, [shot.camera for shot in shots], [shot.lens for shot in shots])
 
 
+def _on_sides(
+    shot: Shot, rig: Rig, point: np.ndarray, places: np.ndarray, xyz: np.ndarray
+) -> list[tuple[Shot, np.ndarray, np.ndarray]]:
+    """Observations of a wide photo in its views: which points, and where."""
+    viewmat = shot.camera.viewmat
+    directions = xyz[point] @ viewmat[:3, :3].T + viewmat[:3, 3]
+    found = []
+    for side, view in zip(rig.sides, rig_shots(shot, rig), strict=True):
+        moved, shown = moved_to_side(places, directions, rig.photo, side.camera)
+        found.append((view, point[shown], moved[shown]))
+    return found
+
+
 def _intrinsics(camera: _ColmapCamera) -> tuple[np.ndarray, Lens]:
     params = list(camera.params)
     if not all(math.isfinite(value) for value in params):
         raise IgsrError("its camera has a parameter that is not finite; run COLMAP again")
+    if camera.model == _SPHERE:
+        return np.eye(3), Lens()
     if camera.model in _ONE_FOCAL_LENGTH:
         params.insert(1, params[0])
     K, extra = intrinsic_matrix(*params[:4]), params[4:]
     if camera.model in ("OPENCV", "FULL_OPENCV"):
         k1, k2, p1, p2, *rest = extra
         return K, Lens(False, (k1, k2, *rest[:1]), tuple(rest[1:]), (p1, p2))
+    if camera.model == "THIN_PRISM_FISHEYE":
+        k1, k2, p1, p2, k3, k4, sx1, sy1 = extra
+        return K, Lens(True, (k1, k2, k3, k4), (), (p1, p2), (sx1, sy1))
     return K, Lens("FISHEYE" in camera.model, tuple(extra))
 
 
@@ -366,13 +433,19 @@ def _binary_images(path: Path) -> list[_ColmapImage]:
     file = _Bytes(path)
     images = []
     for _ in range(_count(file)):
-        _, *pose, camera_id = file.unpack(_IMAGE)
+        identity, *pose, camera_id = file.unpack(_IMAGE)
         name = file.name()
         (count,) = file.unpack(_COUNT)
         seen = file.table(_OBSERVATION, count)
         images.append(
             _ColmapImage(
-                name, tuple(pose[:4]), tuple(pose[4:]), camera_id, seen["xy"], seen["point"]
+                identity,
+                name,
+                tuple(pose[:4]),
+                tuple(pose[4:]),
+                camera_id,
+                seen["xy"],
+                seen["point"],
             )
         )
     file.finish()
@@ -438,12 +511,14 @@ def _text_images(path: Path) -> list[_ColmapImage]:
         try:
             fields = line.split(maxsplit=9)
             pose = tuple(map(float, fields[1:8]))
-            name, camera_id = fields[9], int(fields[8])
+            name, camera_id, identity = fields[9], int(fields[8]), int(fields[0])
         except (ValueError, IndexError) as error:
             raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from error
         number, line = next(lines, (number + 1, ""))  # its observations, possibly none
         places, point_ids = _text_observations(path, number, line)
-        images.append(_ColmapImage(name, pose[:4], pose[4:], camera_id, places, point_ids))
+        images.append(
+            _ColmapImage(identity, name, pose[:4], pose[4:], camera_id, places, point_ids)
+        )
     return images
 
 

@@ -21,15 +21,18 @@ import numpy as np
 
 from igsr._internal.choices import SPLITS, Split
 from igsr.capture.described import DescribedCapture
-from igsr.capture.photos import Shot, image_size, is_file
+from igsr.capture.photos import Shot, image_size, is_file, rig_shots
 from igsr.capture.point_cloud import read_point_cloud
+from igsr.capture.rig import rig_of
 from igsr.capture.types import Camera, Capture, Points, intrinsic_matrix, nearest_rigid
 from igsr.capture.undistort import Lens
+from igsr.capture.wide_photos import WideFisheye, WidePhoto, whole_sphere, wide_fisheye
 from igsr.errors import IgsrError
 
 # nerfstudio does not distinguish these: the coefficients determine the lens.
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE",)
+_EQUIRECTANGULAR = "EQUIRECTANGULAR"
 
 # NeRF Synthetic omits the suffix.
 _OMITTED_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -59,7 +62,7 @@ def described_transforms(path: Path) -> DescribedCapture:
         name = _frame_name(frame, path, index)
         split: Split | None = "train" if split_from_name is None else split_from_name.get(name)
         if split is not None:
-            shots.append(_shot(document, frame, path, index, split))
+            shots += _shots(document, frame, path, index, split)
 
     def points() -> Points | None:
         if "ply_file_path" not in document:
@@ -81,7 +84,7 @@ def described_split_transforms(folder: Path) -> DescribedCapture:
         if split == "train" or is_file(path):
             document = _read_json(path)
             for index, frame in enumerate(_frames(document, path)):
-                shots.append(_shot(document, frame, path, index, split))
+                shots += _shots(document, frame, path, index, split)
     return DescribedCapture(folder, shots, lambda: None)
 
 
@@ -106,6 +109,30 @@ def read_cameras(path: Path) -> list[tuple[str, Camera]]:
         viewmat = _viewmat(_required(frame, "transform_matrix", where), where)
         cameras.append((name, Camera(viewmat, K, width, height)))
     return cameras
+
+
+def read_lens(path: Path) -> WideFisheye:
+    """The lens of fisheye photos without cameras, from the fields that a frame would have.
+
+    Args:
+        path: a JSON file with ``w``, ``h``, ``camera_model`` OPENCV_FISHEYE, ``fl_x`` and so on.
+
+    Raises:
+        IgsrError: a field is missing or out of range, or one pinhole shows what the lens does.
+    """
+    fields, where = _read_json(path), str(path)
+    for key in ("w", "h", "fl_x"):
+        _required(fields, key, where)
+    width, height = _size(fields, path, where)
+    K, lens = _intrinsics(fields, width, height, where)
+    radius = _number(fields, "fisheye_crop_radius", where, math.inf)
+    wide = wide_fisheye(K, lens, width, height, radius)
+    if wide is None:
+        raise IgsrError(
+            f"{path} describes no fisheye of more than 120 degrees; delete it, since cameras of "
+            "other lenses are found with their distortion"
+        )
+    return wide
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -177,9 +204,10 @@ def _frame_name(frame: dict[str, Any], path: Path, index: int) -> str:
     return posixpath.normpath(_text(frame, "file_path", f"{path}, frame {index}"))
 
 
-def _shot(
+def _shots(
     document: dict[str, Any], frame: dict[str, Any], path: Path, index: int, split: Split
-) -> Shot:
+) -> list[Shot]:
+    """The photo of a frame; of a wide one, the views that it becomes."""
     name = _frame_name(frame, path, index)
     where = f"{path}, frame {index} ({name})"
     for suffix in ("", *_OMITTED_SUFFIXES):
@@ -196,13 +224,22 @@ def _shot(
             raise IgsrError(f"{where}: the mask {mask_path} is missing; put it there")
     fields = {**document, **frame}
     width, height = _size(fields, photo, where)
-    K, lens = _intrinsics(fields, width, height, where)
     viewmat = _viewmat(_required(frame, "transform_matrix", where), where)
+    is_sphere = fields.get("camera_model") == _EQUIRECTANGULAR
+    K, lens = (np.eye(3), Lens()) if is_sphere else _intrinsics(fields, width, height, where)
+    rig = _text(frame, "rig", where) if "rig" in frame else None
     try:
         camera = Camera(viewmat, K, width, height)
+        if is_sphere:
+            wide: WidePhoto | None = whole_sphere(width, height)
+        else:
+            # nerfstudio's, in pixels; without it, what has no light is left out.
+            radius = _number(fields, "fisheye_crop_radius", where, math.inf)
+            wide = wide_fisheye(K, lens, width, height, radius)
+        shot = Shot(name, photo, camera, lens, split, mask_path, path, photo=rig)
+        return [shot] if wide is None else rig_shots(shot, rig_of(wide))
     except IgsrError as error:
         raise IgsrError(f"{where}: {error}") from error
-    return Shot(name, photo, camera, lens, split, mask_path, path)
 
 
 def _size(fields: dict[str, Any], photo: Path, where: str) -> tuple[int, int]:
@@ -255,7 +292,7 @@ def _lens(fields: dict[str, Any], where: str) -> Lens:
     if model not in _PERSPECTIVE + _FISHEYE:
         raise IgsrError(
             f"{where}: the camera_model {_shown(model)} is not supported; undistort the images to "
-            "PINHOLE or use OPENCV or OPENCV_FISHEYE"
+            "PINHOLE or use OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR"
         )
     fisheye = model in _FISHEYE or fields.get("is_fisheye") is True
     k1, k2, k3, k4, p1, p2 = (

@@ -13,6 +13,7 @@ from igsr._internal.array_equality import ArrayEquality
 from igsr._internal.choices import Split
 from igsr._internal.notebook import NotebookPicture, numbers
 from igsr.capture.exposure import Exposure
+from igsr.capture.sharpness import blurred_photos
 from igsr.errors import IgsrError
 
 # Files written with four or five decimals are this far from a rotation. What is further away has a
@@ -96,6 +97,9 @@ class View(ArrayEquality, NotebookPicture):
             are not known, or are those of the scene. Scores of the view are of renders with them.
         exposure_value: how much light the photo took by its EXIF, in stops (log2 of seconds times
             ISO / 100 over the f-number squared), or None.
+        rig: the name that views of one wide photo (a panorama, a fisheye photo of more than 120
+            degrees) share: they have one centre, move together and are held out together. None for
+            other photos.
 
     Raises:
         IgsrError: the image, mask or weights have another dtype or shape than the camera's size
@@ -114,6 +118,7 @@ class View(ArrayEquality, NotebookPicture):
     background: tuple[float, float, float] | None = None
     exposure: Exposure | None = None
     exposure_value: float | None = None
+    rig: str | None = None
 
     def __post_init__(self) -> None:
         """Check the pixels against the camera."""
@@ -131,6 +136,11 @@ class View(ArrayEquality, NotebookPicture):
                 raise IgsrError(f"{self.name}: its background must be three numbers in [0, 1]")
             if self.image.shape[2] == 4:
                 raise IgsrError(f"{self.name}: only an image without alpha has a background")
+
+    @property
+    def photo(self) -> str:
+        """The name of the photo that this is of: that of its rig, or its own."""
+        return self.name if self.rig is None else self.rig
 
     def __repr__(self) -> str:
         parts = [repr(self.name), self.split, f"{self.camera.width}x{self.camera.height}"]
@@ -295,6 +305,9 @@ class Capture(ArrayEquality, NotebookPicture):
     def with_holdout(self, every: int) -> Capture:
         """Hold out every Nth view for testing.
 
+        The views of one rig count as one. A photo that is blurred where the others are not would
+        score a fit that is right as wrong: the next one is held out instead.
+
         Args:
             every: of the views in the order of their names, those whose index is a multiple of
                 ``every`` become "test", all others "train". LLFF and 3DGS use 8.
@@ -307,14 +320,18 @@ class Capture(ArrayEquality, NotebookPicture):
         """
         if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 2:
             raise IgsrError(f"holdout is {every!r}; give a whole number of at least 2, such as 8")
-        if len(self.views) < 2:
+        photos = sorted({view.photo for view in self.views})
+        if len(photos) < 2:
             raise IgsrError(
                 f"{self.path} has one view only, so none can be held out; leave holdout out"
             )
-        by_name = sorted(view.name for view in self.views)
-        held_out = set(by_name[::every])
+        blurred = blurred_photos((view.photo, view.image, view.mask) for view in self.views)
+        spans = (photos[first : first + every] for first in range(0, len(photos), every))
+        sharp = ([name for name in span if name not in blurred] for span in spans)
+        held_out = {span[0] for span in sharp if span}
         views = [
-            replace(view, split="test" if view.name in held_out else "train") for view in self.views
+            replace(view, split="test" if view.photo in held_out else "train")
+            for view in self.views
         ]
         return Capture(self.path, views, self.points)
 

@@ -31,18 +31,63 @@ class Lens:
     Perspective: radial factor (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), with
     ``radial`` = (k1, k2, k3), ``denominator`` = (k4, k5, k6), plus the tangential p1, p2.
     Fisheye: the angle t from the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + ...), with
-    ``radial`` = (k1, k2, k3, k4). Missing trailing coefficients are 0.
+    ``radial`` = (k1, k2, k3, k4). Of a thin prism fisheye, p1, p2 and ``thin_prism`` = (sx1, sy1)
+    are added, all in terms of t. Missing trailing coefficients are 0.
     """
 
     fisheye: bool = False
     radial: tuple[float, ...] = ()
     denominator: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
+    thin_prism: tuple[float, float] = (0.0, 0.0)
 
     @property
     def is_pinhole(self) -> bool:
         """Whether the lens has no distortion."""
         return not self.fisheye and not any(self.radial + self.denominator + self.tangential)
+
+    @np.errstate(all="ignore")
+    def fisheye_places(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where a fisheye lens shows directions, also those beside and behind it.
+
+        Args:
+            directions: float64 [..., 3], x right, y down, z forward, of any length.
+
+        Returns:
+            x, y: float64 [...], distorted normalized coordinates.
+            valid: bool [...], False beyond the angle where the model folds back on itself, and
+                straight behind, which is no one place.
+        """
+        x, y, z = np.moveaxis(directions, -1, 0)
+        across = np.hypot(x, y)
+        angle = np.arctan2(across, z)
+        polynomial = np.polynomial.Polynomial((1.0, *self.radial))
+        s_poly = np.polynomial.Polynomial((0.0, 2.0))
+        fold = _first_positive_root(polynomial + s_poly * polynomial.deriv())
+        valid = (angle * angle < fold) & ((across > 0.0) | (z > 0.0))
+        ratio = np.where(across > 0.0, angle / np.where(across > 0.0, across, 1.0), 0.0)
+        bent_x, bent_y, prism_valid = self._with_prism(x * ratio, y * ratio, polynomial)
+        return bent_x, bent_y, valid & prism_valid
+
+    def _with_prism(
+        self, x: np.ndarray, y: np.ndarray, radial: np.polynomial.Polynomial
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distort x, y of length t: radially, and by the tangential and thin prism terms."""
+        s = x * x + y * y
+        factor = radial(s)
+        if not any(self.tangential + self.thin_prism):
+            return x * factor, y * factor, np.ones(s.shape, dtype=bool)
+        (p1, p2), (sx, sy) = self.tangential, self.thin_prism
+        slope = radial.deriv()(s)
+        along_x = factor + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x + 2.0 * sx * x
+        along_y = factor + 2.0 * y * y * slope + 2.0 * p2 * x + 6.0 * p1 * y + 2.0 * sy * y
+        mixed = 2.0 * (x * y * slope + p1 * x + p2 * y)
+        crossed = (mixed + 2.0 * sx * y) * (mixed + 2.0 * sy * x)
+        return (
+            x * factor + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x) + sx * s,
+            y * factor + 2.0 * p2 * x * y + p1 * (s + 2.0 * y * y) + sy * s,
+            (along_x > 0.0) & (along_x * along_y - crossed > 0.0),
+        )
 
     @np.errstate(all="ignore")  # absurd coefficients overflow, and the result is not valid
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -70,6 +115,8 @@ class Lens:
             angle = np.arctan(r)
             angle_squared = angle * angle
             tiny = r < 1e-12
+            if any(self.tangential + self.thin_prism):
+                return self.fisheye_places(np.stack([x, y, np.ones_like(x)], axis=-1))
             factor = np.where(tiny, 1.0, angle / np.where(tiny, 1.0, r)) * numerator(angle_squared)
             return x * factor, y * factor, angle_squared < fold
         valid = s < fold

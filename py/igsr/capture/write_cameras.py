@@ -15,8 +15,9 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
     """Write the cameras of photos in the format of nerfstudio's ``transforms.json``.
 
     One frame per photo: ``file_path`` (its name in the capture), ``w``, ``h``, ``fl_x``, ``fl_y``,
-    ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes;
-    ``exposure`` where a fit has found it: ``gain`` and ``offset`` of R, G and B (see ``Exposure``).
+    ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes; ``rig``, which
+    views of one wide photo share; ``exposure`` where a fit has found it: ``gain`` and ``offset`` of
+    R, G and B (see ``Exposure``).
 
     Raises:
         IgsrError: the file cannot be written.
@@ -36,6 +37,7 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
                 "cx": float(camera.K[0, 2]),
                 "cy": float(camera.K[1, 2]),
                 "transform_matrix": to_world.tolist(),
+                **({} if view.rig is None else {"rig": view.rig}),
                 **({} if view.exposure is None else {"exposure": view.exposure.plain()}),
             }
         )

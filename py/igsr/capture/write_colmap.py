@@ -1,10 +1,11 @@
 """Write captures for COLMAP: ``sparse/0``, ``images/`` and ``masks/``.
 
-Cameras are PINHOLE. Of an image's features, only those of points are written. A point with a track
-gets the error that its confidence was made from (see ``track_confidence``; -1, as in COLMAP, if it
-is not known). A point without a track gets 1 / confidence as its error (0 if it is not known).
-``load_capture`` reads both back. A mask has the photo's whole name and ``.png``, as COLMAP's
-feature extraction expects.
+Cameras are PINHOLE. Where views are of wide photos, the model has rigs and frames (COLMAP 3.12).
+Of an image's features, only those of points are written. A point with a track gets the error that
+its confidence was made from (see ``track_confidence``; -1, as in COLMAP, if it is not known). A
+point without a track gets 1 / confidence as its error (0 if it is not known). ``load_capture``
+reads both back. A mask has the photo's whole name and ``.png``, as COLMAP's feature extraction
+expects.
 
 Source of the formats: https://colmap.github.io/format.html.
 """
@@ -20,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.atomic_write import atomic_folder
+from igsr.capture.colmap_rigs import Rigs, pose_numbers
 from igsr.capture.types import Camera, Capture, Points
 from igsr.capture.write_files import png_names, save_png, write_pictures
 
@@ -64,7 +66,13 @@ def write_colmap(
         model.mkdir(parents=True)
         cameras = [view.camera for view in capture.views]
         seen = _Seen(capture)
-        (_write_text if text else _write_binary)(model, cameras, names, capture.points, seen)
+        distinct, number_of = _distinct(cameras)
+        if any(view.rig is not None for view in capture.views):
+            rigs = Rigs(capture.views)
+            distinct, number_of = rigs.cameras, rigs.number_of
+            rigs.write(model, text)
+        write = _write_text if text else _write_binary
+        write(model, cameras, names, distinct, number_of, capture.points, seen)
 
 
 class _Seen:
@@ -127,39 +135,6 @@ def _parameters(camera: Camera) -> list[float]:
     return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
 
 
-def _pose(camera: Camera) -> list[float]:
-    """Quaternion wxyz and translation, world to camera."""
-    return [*quaternion(camera.viewmat[:3, :3]), *map(float, camera.viewmat[:3, 3])]
-
-
-def quaternion(rotation: Float64) -> list[float]:
-    """The unit quaternion wxyz of a rotation matrix [3, 3], w not negative.
-
-    Source: Shepperd, "Quaternion from Rotation Matrix", 1978: the largest component comes from the
-    diagonal and the others from it, so that none is divided by a small number.
-    """
-    m = rotation
-    squares = np.array(
-        [
-            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
-            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
-        ]
-    )
-    products = np.array(
-        [
-            [squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], squares[1], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], squares[2], m[2, 1] + m[1, 2]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], squares[3]],
-        ]
-    )
-    row = products[int(squares.argmax())]
-    row = row / np.linalg.norm(row)
-    return [float(value) for value in (row if row[0] >= 0.0 else -row)]
-
-
 def _errors(points: Points, seen: _Seen) -> Float64:
     length = np.array(list(map(len, seen.tracks)))
     if points.confidence is None:
@@ -169,9 +144,14 @@ def _errors(points: Points, seen: _Seen) -> Float64:
 
 
 def _write_binary(
-    model: Path, cameras: list[Camera], names: list[str], points: Points | None, seen: _Seen
+    model: Path,
+    cameras: list[Camera],
+    names: list[str],
+    distinct: list[Camera],
+    number_of: list[int],
+    points: Points | None,
+    seen: _Seen,
 ) -> None:
-    distinct, number_of = _distinct(cameras)
     with open(model / "cameras.bin", "wb") as file:
         file.write(struct.pack("<Q", len(distinct)))
         for number, camera in enumerate(distinct, start=1):
@@ -182,7 +162,7 @@ def _write_binary(
         for image, (camera, name, number) in enumerate(
             zip(cameras, names, number_of, strict=True), start=1
         ):
-            file.write(struct.pack("<I7dI", image, *_pose(camera), number))
+            file.write(struct.pack("<I7dI", image, *pose_numbers(camera.viewmat), number))
             file.write(name.encode() + b"\0")
             features = np.zeros(len(seen.ids[image - 1]), dtype=[("xy", "<f8", 2), ("id", "<i8")])
             features["xy"], features["id"] = seen.places[image - 1], seen.ids[image - 1]
@@ -198,9 +178,14 @@ def _write_binary(
 
 
 def _write_text(
-    model: Path, cameras: list[Camera], names: list[str], points: Points | None, seen: _Seen
+    model: Path,
+    cameras: list[Camera],
+    names: list[str],
+    distinct: list[Camera],
+    number_of: list[int],
+    points: Points | None,
+    seen: _Seen,
 ) -> None:
-    distinct, number_of = _distinct(cameras)
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for number, camera in enumerate(distinct, start=1):
         numbers = " ".join(map(repr, _parameters(camera)))
@@ -212,7 +197,10 @@ def _write_text(
     ):
         features = zip(seen.places[image - 1].tolist(), seen.ids[image - 1].tolist(), strict=True)
         observed = " ".join(f"{x!r} {y!r} {point}" for (x, y), point in features)
-        lines += [f"{image} {' '.join(map(repr, _pose(camera)))} {number} {name}", observed]
+        lines += [
+            f"{image} {' '.join(map(repr, pose_numbers(camera.viewmat)))} {number} {name}",
+            observed,
+        ]
     _write_lines(model / "images.txt", lines)
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
     if points is not None:

@@ -19,6 +19,8 @@ def write_transforms(
 ) -> None:
     """Write ``transforms.json``, ``images/``, ``masks/`` and ``points.ply`` into a folder.
 
+    Views of one wide photo have its name as ``rig``, which ``load_capture`` reads back.
+
     Args:
         capture: the capture to write. The split is written if any view is for testing.
         out: the folder; it must be new or empty.
@@ -33,6 +35,8 @@ def write_transforms(
         frame = {"file_path": f"images/{name}", **_camera_fields(view.camera)}
         if view.mask is not None:
             frame["mask_path"] = f"masks/{name}"
+        if view.rig is not None:
+            frame["rig"] = view.rig
         frames.append(frame)
     document: dict[str, Any] = {"camera_model": "PINHOLE", "frames": frames}
     if capture.test_views:

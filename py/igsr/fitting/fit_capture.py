@@ -14,7 +14,7 @@ import numpy as np
 
 from igsr._internal.choices import FitBackend
 from igsr._internal.progress_bar import progress_or_bar
-from igsr.capture import Capture
+from igsr.capture import Capture, View
 from igsr.capture.photo_checks import check_photos
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import CheckpointFile, recorded_settings
@@ -219,6 +219,7 @@ def _fitted(
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
     check_photos(views)
+    _check_focal(views, settings)
     device = check_fits(backend)
     exposures = starting_exposures(views, capture.points, settings.exposure)
     tracks = None
@@ -324,6 +325,15 @@ def _check_capture(capture: object) -> None:
         raise IgsrError(
             f"capture must be a Capture, not {type(capture).__name__}; igsr.load_capture(path) "
             "makes one."
+        )
+
+
+def _check_focal(views: list[View], settings: FitSettings) -> None:
+    rigged = next((view for view in views if view.rig is not None), None)
+    if rigged is not None and settings.focal != "fixed":
+        raise IgsrError(
+            f"{rigged.name} is a view of a panorama or wide fisheye photo, whose focal lengths "
+            'follow from its size; leave focal "fixed".'
         )
 
 

@@ -66,7 +66,16 @@ def fitter_of(
         backend,
         None if priors is None else _prior_arrays(priors, origin),
         None if exposures is None else _exposure_arrays(exposures),
+        _rigs(views) if settings.get("poses") == "joint" else None,
     )
+
+
+def _rigs(views: Sequence[View]) -> list[int] | None:
+    """A number for each view, the same for those of one rig; None where there is no rig."""
+    if all(view.rig is None for view in views):
+        return None
+    names = {name: number for number, name in enumerate(dict.fromkeys(v.photo for v in views))}
+    return [names[view.photo] for view in views]
 
 
 def check_fits(backend: str) -> dict[str, str]:

@@ -18,7 +18,7 @@ from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
 from igsr.capture.load import describe_capture, holds_cameras
 from igsr.capture.overview import look_at
-from igsr.capture.photo_folder import FRAMES, VIDEO_SUFFIXES, photo_sizes
+from igsr.capture.photo_folder import FRAMES, LENS, VIDEO_SUFFIXES, photo_sizes
 from igsr.capture.write_colmap import write_colmap
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Progress
@@ -258,16 +258,17 @@ def not_placed(capture: Capture) -> list[str]:
     """
     given = _given(capture.path) or {}
     photos = capture.path / "images"
-    placed = {
-        path.relative_to(photos).with_suffix("").as_posix()
-        for path in photos.rglob("*")
-        if path.is_file()
-    }
+    files = [path.relative_to(photos) for path in photos.rglob("*") if path.is_file()]
+    placed = {path.with_suffix("").as_posix() for path in files}
+    # The views of a panorama are in a folder of its name.
+    panoramas = {path.parent.as_posix() for path in files}
     return [
         name
         for name in given
         if PurePosixPath(name).suffix.lower() not in VIDEO_SUFFIXES
+        and name != LENS
         and _without_suffix(name) not in placed
+        and name not in panoramas
     ]
 
 

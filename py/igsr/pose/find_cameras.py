@@ -21,6 +21,7 @@ from igsr.capture.photo_folder import (
     photo_headers,
     reduced_photo,
 )
+from igsr.capture.unfit_photos import split_unfit
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Estimate, Progress
 from igsr.pose.found_cameras import FoundCameras
@@ -109,10 +110,22 @@ def find_cameras(
     chosen_estimator(estimator, options)
     if isinstance(photos, (str, os.PathLike)):
         # Before the long work, and not when the photos are loaded at that size.
-        sizes, channels, _ = photo_headers(photos, frames)
-        check_memory(sizes, max_size, channels=channels, masked=True)
-    loaded = photos_of(photos, frames, LONGEST)
+        headers = photo_headers(photos, frames)
+        check_memory(
+            headers.sizes,
+            max_size,
+            channels=headers.channels,
+            masked=True,
+            decoded=headers.decoded,
+        )
+    loaded, left_out = split_unfit(photos_of(photos, frames, LONGEST))
+    if len(loaded) < FEWEST and left_out:
+        raise IgsrError(
+            f"Cameras are found from {FEWEST} photos at least, and {len(loaded)} is left of those "
+            f"given: {' '.join(left_out)} Add photos."
+        )
     name, found = estimate(loaded, estimator, seed=seed, progress=progress, **options)
+    found.warnings = [*left_out, *found.warnings]
     made_by = made_by_of(name, seed, frames, options)
     return FoundCameras.of(loaded, found, made_by), loaded
 
@@ -231,7 +244,16 @@ def estimate(
     if len(photos) < FEWEST:
         only = f"; there is only {photos[0].name}" if photos else ""
         raise IgsrError(f"Cameras are found from {FEWEST} photos at least{only}; add photos")
+    panorama = next((photo.place.rig for photo in photos if photo.place is not None), None)
+    if panorama is not None and estimator == AUTO:
+        estimator = "colmap"
     estimator = chosen_estimator(estimator, options)
+    if panorama is not None and estimator != "colmap":
+        raise IgsrError(
+            f"{panorama} is a panorama or wide fisheye photo, whose views {estimator} would place "
+            "one by one; use "
+            "--estimator colmap"
+        )
     found = ESTIMATORS[estimator].make(**options)(photos, seed=seed, progress=progress)
     if sum(camera is not None for camera in found.cameras) < FEWEST:
         raise IgsrError(

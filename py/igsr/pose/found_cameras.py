@@ -217,7 +217,8 @@ def _lens(fields: Any) -> Lens | None:
         for name in ("radial", "denominator", "tangential")
     )
     p1, p2 = tangential
-    return Lens(bool(fields["fisheye"]), radial, denominator, (p1, p2))
+    sx, sy = (float(value) for value in fields.get("thin_prism", (0.0, 0.0)))
+    return Lens(bool(fields["fisheye"]), radial, denominator, (p1, p2), (sx, sy))
 
 
 def _points(arrays: dict[str, np.ndarray], track_names: list[str]) -> Points | None:
@@ -250,4 +251,6 @@ def _undistorted(
         mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
     if mask is not None and mask.all():
         mask = None
-    return View(photo.name, camera, "train", image, mask, exposure_value=photo.exposure_value)
+    rig = None if photo.place is None else photo.place.rig
+    view = View(photo.name, camera, "train", image, mask, exposure_value=photo.exposure_value)
+    return replace(view, rig=rig)

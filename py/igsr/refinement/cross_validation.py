@@ -68,11 +68,14 @@ class CrossValidation:
 
     def _fitted(self) -> list[Fold]:
         """Fit the folds: no photo is held out of two, and at least one of each."""
-        every = min(HOLD_OUT_EVERY, len(self._photos))
+        names = list(dict.fromkeys(photo.photo for photo in self._photos))
+        every = min(HOLD_OUT_EVERY, len(names))
         folds = []
         for number in range(FOLDS):
-            held_out = self._photos[number * every // FOLDS :: every]
-            kept = [photo for photo in self._photos if not any(photo is one for one in held_out)]
+            # The views of a panorama are held out together.
+            out = set(names[number * every // FOLDS :: every])
+            held_out = [photo for photo in self._photos if photo.photo in out]
+            kept = [photo for photo in self._photos if photo.photo not in out]
             fitted = self._stages.fit(f"fold{number}", kept, self._share)
             folds.append(Fold(fitted, held_out, self._scores(fitted, held_out)))
         return folds

@@ -25,7 +25,6 @@ _UNSUPPORTED_DEFAULTS: dict[str, Any] = {
     "tile_size": _core.TILE_SIZE,
     "sparse_grad": False,
     "distributed": False,
-    "camera_model": "pinhole",
     "segmented": False,
     "covars": None,
     "with_ut": False,
@@ -51,12 +50,21 @@ _UNSUPPORTED_DEFAULTS: dict[str, Any] = {
 #: What to do instead.
 _INSTEAD = {
     "covars": "give quats and scales",
-    "camera_model": "undistort the photos first, as igsr.load_capture does",
     "radial_coeffs": "undistort the photos first, as igsr.load_capture does",
     "tangential_coeffs": "undistort the photos first, as igsr.load_capture does",
     "thin_prism_coeffs": "undistort the photos first, as igsr.load_capture does",
     "return_normals": "render_normals=True adds normals to meta",
     "extra_signals": "append the signals to colors as further channels",
+}
+
+
+#: gsplat's other camera models, and how to get such pictures with pinholes.
+_INSTEAD_OF_MODEL = {
+    "ortho": "nearly the same is a pinhole far off: move it back along its axis by a distance d of "
+    "100 times the scene's depth, and give fx and fy in pixels per unit of length, times d",
+    "fisheye": "give pinhole views of the photos, as igsr.load_capture makes of fisheye lenses",
+    "ftheta": "give pinhole views of the photos, as igsr.load_capture makes of fisheye lenses",
+    "lidar": "give pinhole views",
 }
 
 
@@ -75,7 +83,17 @@ def check_arguments(arguments: dict[str, Any]) -> None:
     _check_absgrad(arguments)
 
 
+def _check_camera_model(model: object) -> None:
+    if isinstance(model, str) and model == "pinhole":
+        return
+    shown = repr(model) if isinstance(model, str) else f"a {type(model).__name__}"
+    instead = _INSTEAD_OF_MODEL.get(model) if isinstance(model, str) else None
+    known = instead or f"gsplat's others are {', '.join(_INSTEAD_OF_MODEL)}, which are not drawn"
+    raise ValueError(f"camera_model: only 'pinhole' is supported, not {shown}; {known}")
+
+
 def _check_unsupported(arguments: dict[str, Any]) -> None:
+    _check_camera_model(arguments["camera_model"])
     for name, default in _UNSUPPORTED_DEFAULTS.items():
         value = arguments[name]
         if name == "tile_size" and value is None:

@@ -250,6 +250,18 @@ impl Fitter {
         Ok(self.moving.as_ref().map(Cameras::state))
     }
 
+    /// Makes cameras of one number move as one; before pose priors are set.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] if cameras are not fitted, there is not a number for each, or cameras of
+    /// one number do not share a centre.
+    pub fn set_rigs(&mut self, numbers: &[u32]) -> Result<()> {
+        let Some(cameras) = self.moving.as_mut() else {
+            return Err(Error::argument("rigs", "are of cameras that are not fitted"));
+        };
+        cameras.set_rigs(numbers)
+    }
+
     /// [`Fitter::set_pose_priors`] under its first name.
     pub fn hold_cameras(&mut self, holds: Vec<PosePrior>) -> Result<()> {
         self.set_pose_priors(holds)

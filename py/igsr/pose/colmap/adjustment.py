@@ -90,7 +90,7 @@ def _adjusted_model(
 ) -> Any:
     import pycolmap
 
-    options = mapping_options(len(known), STEPS[-1], seed)
+    options = mapping_options(len(known), STEPS[-1], seed, matches)
     options.ba_refine_extra_params = False
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(matches) as opened:

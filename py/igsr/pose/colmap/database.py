@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import Photo
 
 #: Where nothing is known: the focal length over the longer side; 42 degrees, COLMAP's own.
@@ -24,38 +28,81 @@ def image_id(index: int) -> int:
 def list_photos(photos: Sequence[Photo], database: Path) -> None:
     """Number photos and cameras in the database.
 
+    The views of a panorama are a rig: one pose places all of them.
+
     Left to feature extraction, they are numbered as its threads end, and nothing after comes out
     the same twice.
     """
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
-        for number, group in enumerate(_groups(photos), start=1):
-            first = photos[group[0]]
-            height, width = first.image.shape[:2]
-            focal = first.focal if first.focal is not None else GUESSED_FOCAL * max(width, height)
-            camera = pycolmap.Camera.create_from_model_name(
-                number, "SIMPLE_RADIAL", focal, width, height
-            )
-            camera.has_prior_focal_length = first.focal is not None
-            opened.write_camera(camera, use_camera_id=True)
-            rig = pycolmap.Rig(rig_id=number)
-            rig.add_ref_sensor(camera.sensor_id)
-            opened.write_rig(rig, use_rig_id=True)
-            for index in group:
-                image = pycolmap.Image(
-                    name=photo_file(index), camera_id=number, image_id=image_id(index)
-                )
-                opened.write_image(image, use_image_id=True)
-                frame = pycolmap.Frame(frame_id=image_id(index), rig_id=number)
-                frame.add_data_id(image.data_id)
+        number = 0
+        for rig, group in enumerate(_groups(photos), start=1):
+            first = group[0]
+            numbers = []
+            for index in first:
+                number += 1
+                opened.write_camera(_camera(photos[index], number), use_camera_id=True)
+                numbers.append(number)
+            opened.write_rig(_rig(rig, [photos[k] for k in first], numbers), use_rig_id=True)
+            for members in group:
+                frame = pycolmap.Frame(frame_id=image_id(members[0]), rig_id=rig)
+                for index, camera in zip(members, numbers, strict=True):
+                    image = pycolmap.Image(
+                        name=photo_file(index), camera_id=camera, image_id=image_id(index)
+                    )
+                    opened.write_image(image, use_image_id=True)
+                    frame.add_data_id(image.data_id)
                 opened.write_frame(frame, use_frame_id=True)
 
 
-def _groups(photos: Sequence[Photo]) -> list[list[int]]:
-    """Indices of photos that share their intrinsics."""
-    groups: dict[object, list[int]] = {}
+def _camera(photo: Photo, number: int) -> Any:
+    import pycolmap
+
+    height, width = photo.image.shape[:2]
+    focal = photo.focal if photo.focal is not None else GUESSED_FOCAL * max(width, height)
+    camera = pycolmap.Camera.create_from_model_name(number, "SIMPLE_RADIAL", focal, width, height)
+    camera.has_prior_focal_length = photo.focal is not None
+    if photo.place is not None:
+        # Both axes have one focal length, within the rounding of a reduced size.
+        known = resized_camera(photo.place.camera, width, height)
+        camera.params = [known.K[0, 0], known.K[0, 2], known.K[1, 2], 0.0]
+    return camera
+
+
+def _rig(number: int, photos: Sequence[Photo], cameras: Sequence[int]) -> Any:
+    """A rig of one camera, or of the views of a panorama, whose directions are known."""
+    import pycolmap
+
+    rig = pycolmap.Rig(rig_id=number)
+    sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera) for camera in cameras]
+    rig.add_ref_sensor(sensors[0])
+    turns = [photo.place.camera.viewmat[:3, :3] for photo in photos if photo.place is not None]
+    for own, sensor in zip(turns[1:], sensors[1:], strict=True):
+        turn = own @ turns[0].T
+        rig.add_sensor(sensor, pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3)))
+    return rig
+
+
+def known_cameras(database: Path) -> set[int]:
+    """Numbers of the cameras whose intrinsics are known exactly: those of panoramas' views."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        rigs = opened.read_all_rigs()
+    return {int(sensor.id) for rig in rigs if rig.num_sensors() > 1 for sensor in rig.sensor_ids()}
+
+
+def _groups(photos: Sequence[Photo]) -> list[list[list[int]]]:
+    """Indices of photos that share their intrinsics, those of one rig together."""
+    rigs: dict[object, list[int]] = {}
     for index, photo in enumerate(photos):
-        key = (photo.device, photo.image.shape[:2], photo.focal)
-        groups.setdefault(key, []).append(index)
+        rigs.setdefault(index if photo.place is None else photo.place.rig, []).append(index)
+    groups: dict[object, list[list[int]]] = {}
+    for members in rigs.values():
+        key = tuple(
+            (photo.device, photo.image.shape[:2], photo.focal, photo.place and photo.place.camera)
+            for photo in (photos[index] for index in members)
+        )
+        groups.setdefault(key, []).append(members)
     return list(groups.values())

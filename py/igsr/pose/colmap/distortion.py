@@ -21,11 +21,16 @@ def without_distortion(model: Any) -> Any:
         camera.params = [*camera.params[:3], 0.0]
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params = False
+    options.refine_sensor_from_rig = False
     options.print_summary = False
     options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in pinhole.reg_image_ids():
         config.add_image(image_id)
+    for rig in pinhole.rigs.values():
+        if rig.num_sensors() > 1:  # the views of a panorama, which are known
+            for sensor in rig.sensor_ids():
+                config.set_constant_cam_intrinsics(sensor.id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # pycolmap.bundle_adjustment writes to the log whatever its level.
     pycolmap.create_default_bundle_adjuster(options, config, pinhole).solve()

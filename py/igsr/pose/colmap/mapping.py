@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from igsr.pose.colmap.database import known_cameras
 from igsr.pose.colmap.evidence import Evidence
 from igsr.pose.estimate import Progress
 
@@ -18,7 +19,7 @@ def map_photos(
     models = pycolmap.ReconstructionManager()
     with pycolmap.Database.open(database) as opened:
         pipeline = pycolmap.IncrementalPipeline(
-            mapping_options(count, evidence, seed), opened, models
+            mapping_options(count, evidence, seed, database), opened, models
         )
         _tell(pipeline, _Placed(count, 0, show))
         pipeline.run()
@@ -32,7 +33,7 @@ def extend(
     """Add photos to a model, in place, with points that its own photos have by new matches."""
     import pycolmap
 
-    options = mapping_options(count, evidence, seed)
+    options = mapping_options(count, evidence, seed, database)
     mapper_options, triangulation = options.get_mapper(), options.get_triangulation()
     with pycolmap.Database.open(database) as opened:
         pipeline = pycolmap.IncrementalPipeline(options, opened, pycolmap.ReconstructionManager())
@@ -53,8 +54,11 @@ def extend(
         mapper.end_reconstruction(False)
 
 
-def mapping_options(count: int, evidence: Evidence, seed: int) -> Any:
-    """COLMAP's options for ``count`` photos, with one thread so that sums come in one order."""
+def mapping_options(count: int, evidence: Evidence, seed: int, database: Path) -> Any:
+    """COLMAP's options for ``count`` photos, with one thread so that sums come in one order.
+
+    Intrinsics of panoramas' views, which are known, stay as they are.
+    """
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -71,6 +75,8 @@ def mapping_options(count: int, evidence: Evidence, seed: int) -> Any:
     options.triangulation.min_angle = evidence.filter_min_tri_angle
     # Two photos alone tell a focal length too badly to better EXIF's or the fundamental matrix's.
     options.ba_refine_focal_length = options.ba_refine_extra_params = count > 2
+    options.constant_cameras = known_cameras(database)
+    options.ba_refine_sensor_from_rig = False
     return options
 
 

@@ -45,6 +45,8 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
     pairs = pairs_to_match(count, database)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
+    # The views of a panorama share a centre and show different directions.
+    matching.skip_image_pairs_in_same_frame = True
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     listing = pycolmap.ImportedPairingOptions()

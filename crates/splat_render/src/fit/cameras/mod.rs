@@ -14,6 +14,7 @@ mod config;
 mod motion;
 mod pose_prior;
 mod preconditioning;
+mod rigs;
 #[cfg(test)]
 mod tests;
 
@@ -29,6 +30,7 @@ use crate::fit_device::CameraGradient;
 use anchor::anchor;
 use motion::{POSE, PoseMatrix, move_by, tangent};
 use preconditioning::{all_scales, focal_pixels};
+use rigs::Rigs;
 
 /// Adam's decay of the first and second moments and its epsilon. A camera has one step a round: the
 /// second moment must forget within tens of them.
@@ -61,6 +63,7 @@ pub struct Cameras {
     now: Vec<Camera>,
     /// From steps in pixels to turns and moves.
     scales: Vec<PoseMatrix>,
+    rigs: Rigs,
     /// One per camera; empty where nothing is known.
     priors: Vec<PosePrior>,
     /// Pixels by which the picture moves where the logarithm of the focal length grows by 1.
@@ -80,8 +83,10 @@ impl Cameras {
             distances: distances.clone(),
             ..CameraState::default()
         };
+        let rigs = Rigs::none(initial.len());
         Self {
-            scales: all_scales(initial, &distances, &[]),
+            scales: all_scales(initial, &distances, &[], &rigs),
+            rigs,
             priors: Vec::new(),
             focal_pixels: initial.iter().map(focal_pixels).collect(),
             initial: initial.to_vec(),
@@ -89,6 +94,17 @@ impl Cameras {
             config,
             state,
         }
+    }
+
+    /// Makes cameras of one number move as one, before anything else is set.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] if there is not a number for each, or cameras of one number do not share a
+    /// centre.
+    pub fn set_rigs(&mut self, numbers: &[u32]) -> Result<()> {
+        self.rigs = Rigs::new(&self.initial, numbers, &self.state.distances)?;
+        self.scales = all_scales(&self.initial, &self.state.distances, &self.priors, &self.rigs);
+        Ok(())
     }
 
     /// Sets the pose priors, one for each camera, before the first step or [`Cameras::resume`].
@@ -106,8 +122,14 @@ impl Cameras {
         for (k, prior) in priors.iter().enumerate() {
             prior.validate(k)?;
         }
-        self.scales = all_scales(&self.initial, &self.state.distances, &priors);
+        // What is known of a rig is what is known of its cameras together.
+        let known: Vec<PoseMatrix> = priors.iter().map(|prior| prior.pose).collect();
+        let known = self.rigs.sums(&known, false);
         self.priors = priors;
+        for (k, prior) in self.priors.iter_mut().enumerate() {
+            prior.pose = self.rigs.form_at(k, &known);
+        }
+        self.scales = all_scales(&self.initial, &self.state.distances, &self.priors, &self.rigs);
         Ok(())
     }
 
@@ -138,7 +160,7 @@ impl Cameras {
         if !state.distances.iter().all(|d| d.is_finite() && *d > 0.0) {
             return Err(Error::argument("cameras", "has a distance that is not positive"));
         }
-        self.scales = all_scales(&self.initial, &state.distances, &self.priors);
+        self.scales = all_scales(&self.initial, &state.distances, &self.priors, &self.rigs);
         self.state = state;
         Ok(())
     }
@@ -184,6 +206,9 @@ impl Cameras {
         self.state.rounds += 1;
         let mut gradients = std::mem::take(&mut self.state.gradients);
         self.state.gradients = vec![[0.0; POSE + 1]; gradients.len()];
+        if self.rigs.any() {
+            self.rigs.share_gradients(&mut gradients);
+        }
         if self.config.focal == Focal::Shared {
             let sum: f64 = gradients.iter().map(|row| row[POSE]).sum();
             gradients.iter_mut().for_each(|row| row[POSE] = sum);
@@ -228,6 +253,7 @@ impl Cameras {
         if self.config.anchored && self.config.poses {
             anchor(&mut self.now, &self.initial, &self.state.distances);
         }
+        self.rigs.keep(&mut self.now);
     }
 
     /// Adam with one second moment for the pose as a whole: its coordinates have one unit, and the

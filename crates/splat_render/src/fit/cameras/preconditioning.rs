@@ -6,6 +6,7 @@ use glam::DVec3;
 use super::cholesky::inverse_cholesky;
 use super::motion::{POSE, PoseMatrix};
 use super::pose_prior::PosePrior;
+use super::rigs::Rigs;
 use crate::camera::Camera;
 
 /// Depths, in units of the scene's, and picture positions, in units of its size, of the points whose
@@ -38,9 +39,18 @@ pub(super) fn all_scales(
     cameras: &[Camera],
     distances: &[f64],
     priors: &[PosePrior],
+    rigs: &Rigs,
 ) -> Vec<PoseMatrix> {
-    let each = cameras.iter().zip(distances).enumerate();
-    each.map(|(k, (camera, &d))| pixels_to_pose(camera, d, priors.get(k))).collect()
+    let measures: Vec<_> = cameras.iter().zip(distances).map(|(c, &d)| measure(c, d)).collect();
+    if !rigs.any() {
+        let each = measures.iter().enumerate();
+        return each.map(|(k, sum)| pixels_to_pose(sum, priors.get(k))).collect();
+    }
+    // The priors of a rig's cameras are those of the whole rig already.
+    let whole = rigs.sums(&measures, true);
+    let each = whole.iter().enumerate();
+    let scales: Vec<_> = each.map(|(k, sum)| pixels_to_pose(sum, priors.get(k))).collect();
+    (0..cameras.len()).map(|k| rigs.rows_at(k, &scales)).collect()
 }
 
 /// Median depth of the points that a camera has in its picture; of all before it, where it has none
@@ -67,10 +77,8 @@ pub fn scene_distance(camera: &Camera, means: &[[f32; 3]]) -> f64 {
     *depths.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
-/// A matrix from steps in pixels to poses: what it makes of a unit step moves points of the picture by
-/// one pixel in root mean square. A move comes with the turn that keeps the picture in place. Along
-/// what a prior knows to less than a pixel, it moves them by that.
-fn pixels_to_pose(camera: &Camera, distance: f64, prior: Option<&PosePrior>) -> PoseMatrix {
+/// How far, in pixels squared, points of the picture move with the pose, in the mean.
+fn measure(camera: &Camera, distance: f64) -> PoseMatrix {
     let mut sum = [[0.0; POSE]; POSE];
     let points = grid(camera);
     let count = (points.len() * DEPTHS.len()) as f64;
@@ -90,9 +98,16 @@ fn pixels_to_pose(camera: &Camera, distance: f64, prior: Option<&PosePrior>) -> 
             }
         }
     }
+    sum
+}
+
+/// A matrix from steps in pixels to poses: what it makes of a unit step moves points of the picture by
+/// one pixel in root mean square. A move comes with the turn that keeps the picture in place. Along
+/// what a prior knows to less than a pixel, it moves them by that.
+fn pixels_to_pose(sum: &PoseMatrix, prior: Option<&PosePrior>) -> PoseMatrix {
     // Turns are in radians and moves in world units; the damping compares them as pixels.
     let unit: [f64; POSE] = std::array::from_fn(|i| sum[i][i].sqrt().max(f64::MIN_POSITIVE));
-    let mut scaled = sum;
+    let mut scaled = *sum;
     for (i, line) in scaled.iter_mut().enumerate() {
         for (j, v) in line.iter_mut().enumerate() {
             *v = *v / (unit[i] * unit[j]) + if i == j { DAMPING } else { 0.0 };

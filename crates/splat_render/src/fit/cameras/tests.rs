@@ -267,3 +267,94 @@ fn a_state_resumes_and_a_wrong_one_is_refused() {
     broken.viewmats[0] = DMat4::from_scale(DVec3::splat(2.0));
     assert!(second.resume(broken).is_err());
 }
+
+/// Three cameras at one centre that look up to 0.7 radians apart, for each camera of a ring.
+fn rigs(n: usize) -> (Vec<Camera>, Vec<u32>) {
+    let turned = |camera: &Camera, angle: f64| {
+        let turn = DMat4::from_rotation_y(angle) * DMat4::from_rotation_z(0.5 * angle);
+        Camera { viewmat: turn * camera.viewmat, ..*camera }
+    };
+    let cameras = ring(n);
+    let views = cameras.iter().flat_map(|c| [-0.7, 0.0, 0.7].map(|angle| turned(c, angle)));
+    (views.collect(), (0..n as u32).flat_map(|k| [k; 3]).collect())
+}
+
+/// Largest change of a turn between cameras of a rig, and of the distance between their centres.
+fn bend(a: &[Camera], b: &[Camera], numbers: &[u32]) -> (f64, f64) {
+    let (mut turns, mut centres) = (0.0_f64, 0.0_f64);
+    for k in 1..a.len() {
+        if numbers[k] == numbers[k - 1] {
+            let within = |c: &[Camera]| c[k].rotation() * c[k - 1].rotation().transpose();
+            let off = within(a) - within(b);
+            turns = turns.max(off.to_cols_array().map(f64::abs).into_iter().fold(0.0, f64::max));
+            centres = centres.max(a[k].center().distance(a[k - 1].center()));
+        }
+    }
+    (turns, centres)
+}
+
+#[test]
+fn rigs_find_the_points_and_keep_their_shape() {
+    let (truth, numbers) = rigs(4);
+    let mut noisy = truth.clone();
+    for (k, camera) in noisy.iter_mut().enumerate() {
+        // The same move of the whole rig, by its first camera.
+        let first = k - k % 3;
+        let s = if (k / 3) % 2 == 0 { 1.0 } else { -1.0 };
+        let mut moved = truth[first];
+        move_by(&mut moved, [0.01 * s, -0.008, 0.006 * s, 0.01, -0.02 * s, 0.015]);
+        let within = truth[k].viewmat * truth[first].viewmat.inverse();
+        camera.viewmat = within * moved.viewmat;
+    }
+    let off = CameraConfig { anchored: false, ..config() };
+    let before = worst_angle(&noisy, &truth);
+    let mut cameras = Cameras::new(&noisy, vec![4.0; 12], off);
+    cameras.set_rigs(&numbers).unwrap();
+    fitted(&mut cameras, &truth, 1000);
+    let after = worst_angle(cameras.now(), &truth);
+    assert!(after < 0.02 * before, "turns were {before:.2e} off and are {after:.2e}");
+    let (turns, centres) = bend(cameras.now(), &truth, &numbers);
+    assert!(turns < 1e-9 && centres < 1e-9, "a rig bent by {turns:.1e} and {centres:.1e}");
+
+    // Without rigs, noisy gradients pull its cameras apart.
+    let mut free = Cameras::new(&noisy, vec![4.0; 12], off);
+    fitted(&mut free, &truth, 30);
+    assert!(bend(free.now(), &truth, &numbers).1 > 1e-4);
+}
+
+#[test]
+fn a_prior_of_one_camera_holds_its_rig() {
+    let (told, numbers) = rigs(3);
+    let pushed: Vec<_> = told
+        .iter()
+        .map(|c| {
+            let mut moved = *c;
+            move_by(&mut moved, [0.02, 0.0, 0.0, 0.0, 0.0, 0.0]);
+            moved
+        })
+        .collect();
+    // Only the first camera of each rig is known.
+    let mut priors: Vec<_> = told.iter().map(|camera| known(camera, 0.1)).collect();
+    for (k, prior) in priors.iter_mut().enumerate() {
+        if k % 3 != 0 {
+            (prior.pose, prior.log_focal) = ([[0.0; POSE]; POSE], 0.0);
+        }
+    }
+    let off = CameraConfig { anchored: false, ..config() };
+    let mut cameras = Cameras::new(&told, vec![4.0; 9], off);
+    cameras.set_rigs(&numbers).unwrap();
+    cameras.set_pose_priors(priors).unwrap();
+    fitted(&mut cameras, &pushed, 100);
+    let moved = worst_angle(cameras.now(), &told);
+    assert!(moved < 0.002, "known rigs turned by {moved:.2e}");
+    let (turns, centres) = bend(cameras.now(), &told, &numbers);
+    assert!(turns < 1e-9 && centres < 1e-9);
+}
+
+#[test]
+fn rigs_of_cameras_that_stand_apart_are_refused() {
+    let mut cameras = Cameras::new(&ring(3), vec![4.0; 3], config());
+    assert!(cameras.set_rigs(&[0, 1]).unwrap_err().to_string().contains("one number for each"));
+    assert!(cameras.set_rigs(&[0, 1, 0]).unwrap_err().to_string().contains("share a centre"));
+    cameras.set_rigs(&[0, 1, 2]).unwrap();
+}

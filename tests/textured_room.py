@@ -1,0 +1,166 @@
+"""A room with boxes, all painted with noise, and what any camera in it sees: traced, not rendered.
+
+World axes are x right, y down, z forward; the room is ``ROOM`` and its floor is at the largest y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+Rays = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+#: Lowest and highest corners, in metres.
+ROOM = np.array([[-3.0, -1.5, -2.5], [3.0, 1.2, 2.5]])
+BOXES = np.array(
+    [
+        [[1.6, 0.2, 1.2], [2.4, 1.2, 2.0]],
+        [[-2.3, -0.2, 1.3], [-1.5, 1.2, 1.9]],
+        [[-2.6, 0.4, -2.0], [-1.8, 1.2, -1.1]],
+        [[1.5, 0.5, -2.0], [2.5, 1.2, -1.3]],
+        [[-0.5, 0.7, 1.5], [0.4, 1.2, 2.1]],
+        [[0.2, -1.5, -2.3], [0.7, -0.7, -1.8]],
+    ]
+)
+#: Cells of the noise per metre, and how strong each is.
+_OCTAVES = ((0.8, 0.55), (2.5, 0.3), (8.0, 0.15))
+
+
+def _noise(a: np.ndarray, b: np.ndarray, cells: float, seed: np.ndarray) -> np.ndarray:
+    """Smooth noise in 0..1 at places [N] of surfaces with numbers [N]."""
+    a, b = a * cells, b * cells
+    left, up = np.floor(a), np.floor(b)
+    across, below = (np.clip((t - t0) * 1.0, 0, 1) for t, t0 in ((a, left), (b, up)))
+    across, below = (t * t * (3.0 - 2.0 * t) for t in (across, below))
+
+    def at(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        hashed = (
+            i.astype(np.int64) * 73856093 ^ j.astype(np.int64) * 19349663 ^ seed * 83492791
+        ).astype(np.uint64)
+        hashed = (hashed ^ (hashed >> np.uint64(13))) * np.uint64(0x9E3779B97F4A7C15)
+        return ((hashed >> np.uint64(40)) / np.uint64(1 << 24)).astype(np.float64)
+
+    top = at(left, up) * (1 - across) + at(left + 1, up) * across
+    bottom = at(left, up + 1) * (1 - across) + at(left + 1, up + 1) * across
+    return top * (1 - below) + bottom * below
+
+
+def colors(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """RGB in 0..1 [N, 3] of what rays [N, 3] from a place in the room meet first."""
+    boxes = np.concatenate([ROOM[None], BOXES])
+    nearest = np.full(len(rays), np.inf)
+    surface = np.zeros(len(rays), dtype=np.int64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / rays
+        for number, (low, high) in enumerate(boxes):
+            a, b = (low - origin) * inverse, (high - origin) * inverse
+            first, last = np.minimum(a, b), np.maximum(a, b)
+            if number == 0:  # from within
+                axis, distance = last.argmin(axis=1), last.min(axis=1)
+                hit = np.ones(len(rays), dtype=bool)
+            else:
+                axis, distance = first.argmax(axis=1), first.max(axis=1)
+                hit = (distance < last.min(axis=1)) & (distance > 0.0)
+            closer = hit & (distance < nearest)
+            nearest[closer] = distance[closer]
+            side = rays[np.arange(len(rays)), axis] > 0.0
+            surface[closer] = (number * 6 + axis * 2 + side)[closer]
+    places = origin + nearest[:, None] * rays
+    axis = surface // 2 % 3
+    a = np.where(axis == 0, places[:, 1], places[:, 0])
+    b = np.where(axis == 2, places[:, 1], places[:, 2])
+    out = np.zeros((len(rays), 3))
+    for channel in range(3):
+        for octave, (cells, strength) in enumerate(_OCTAVES):
+            seed = surface * 64 + octave * 8 + (channel if octave == 0 else 0)
+            out[:, channel] += strength * _noise(a, b, cells, seed)
+    return np.clip(0.5 + 1.4 * (out - 0.5), 0.0, 1.0)
+
+
+def photo(viewmat: np.ndarray, size: tuple[int, int], rays: Rays, samples: int = 3) -> np.ndarray:
+    """A photo, uint8 [H, W, 3]: the mean of ``samples`` x ``samples`` rays through each pixel.
+
+    Args:
+        viewmat: [4, 4], world to camera.
+        size: width and height, pixels.
+        rays: from pixel coordinates u, v [N] to rays [N, 3] of the camera, and whether it has one.
+        samples: per side of a pixel.
+    """
+    width, height = size
+    total = np.zeros((height * width, 3))
+    origin = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    for down in range(samples):
+        for right in range(samples):
+            u, v = np.meshgrid(
+                np.arange(width) + (right + 0.5) / samples,
+                np.arange(height) + (down + 0.5) / samples,
+            )
+            local, seen = rays(u.ravel(), v.ravel())
+            found = colors(origin, local @ viewmat[:3, :3])
+            total += np.where(seen[:, None], found, 0.0)
+    mean = total.reshape(height, width, 3) / samples**2
+    return np.rint(255.0 * mean).astype(np.uint8)
+
+
+def pinhole(K: np.ndarray) -> Rays:
+    """Rays of a pinhole camera."""
+
+    def rays(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+        return np.stack([x, y, np.ones_like(x)], axis=1), np.ones(len(u), dtype=bool)
+
+    return rays
+
+
+def panorama(width: int) -> Rays:
+    """Rays of an equirectangular camera of width x width / 2 pixels."""
+
+    def rays(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        longitude = (u / width - 0.5) * 2.0 * np.pi
+        latitude = (2.0 * v / width - 0.5) * np.pi
+        across = np.cos(latitude)
+        rays = [across * np.sin(longitude), np.sin(latitude), across * np.cos(longitude)]
+        return np.stack(rays, axis=1), np.ones(len(u), dtype=bool)
+
+    return rays
+
+
+def fisheye(size: int, degrees: float) -> Rays:
+    """Rays of an equidistant fisheye of ``degrees`` across, black beyond that circle."""
+
+    def rays(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = u - 0.5 * size, v - 0.5 * size
+        radius = np.hypot(x, y)
+        angle = radius / fisheye_focal(size, degrees)
+        part = np.sin(angle) / np.maximum(radius, 1e-12)
+        return np.stack([x * part, y * part, np.cos(angle)], axis=1), radius <= 0.5 * size
+
+    return rays
+
+
+def fisheye_focal(size: int, degrees: float) -> float:
+    """Pixels per radian of that lens."""
+    return 0.5 * size / np.radians(0.5 * degrees)
+
+
+def stands(count: int, seed: int = 0) -> list[np.ndarray]:
+    """World-to-camera matrices [4, 4] of places around the middle of the room, turned at random."""
+    random = np.random.default_rng(seed)
+    found = []
+    for k in range(count):
+        angle = 2.0 * np.pi * (k + 0.3 * random.random()) / count
+        place = np.array([1.1 * np.cos(angle), 0.35 * random.normal(), 0.8 * np.sin(angle)])
+        place[1] = np.clip(place[1], -0.6, 0.5)
+        turn, tilt = random.uniform(-np.pi, np.pi), 0.15 * random.normal()
+        yaw = np.array(
+            [[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]]
+        )
+        pitch = np.array(
+            [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
+        )
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = pitch @ yaw
+        viewmat[:3, 3] = -viewmat[:3, :3] @ place
+        found.append(viewmat)
+    return found
