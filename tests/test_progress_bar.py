@@ -30,9 +30,9 @@ def test_scripts_are_not_interactive():
 
 
 def test_prompts_and_notebooks_are_interactive(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ipykernel", sys)
+    monkeypatch.setitem(sys.modules, "ipykernel.kernelapp", sys)
     assert is_interactive()
-    monkeypatch.delitem(sys.modules, "ipykernel")
+    monkeypatch.delitem(sys.modules, "ipykernel.kernelapp")
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
     assert is_interactive()
 

@@ -108,4 +108,5 @@ def is_interactive() -> bool:
     """Whether somebody sits before this Python: in its prompt, in IPython or in a notebook."""
     if multiprocessing.parent_process() is not None:
         return False  # a worker, which inherits what would say so
-    return hasattr(sys, "ps1") or "ipykernel" in sys.modules
+    # What starts a kernel knows ipykernel, too; only the kernel itself has its app.
+    return hasattr(sys, "ps1") or "ipykernel.kernelapp" in sys.modules
