@@ -93,16 +93,23 @@ class Browser:
             self._process.kill()
             self._process.wait()
 
-    def open(self, page: Path, timeout: float = 60.0) -> None:
-        """Open a file, and wait until its script says that it has started or failed."""
+    def open(self, page: Path | str, timeout: float = 60.0) -> None:
+        """Open a file or an address, and wait until its script has started or failed."""
         self.problems.clear()
         self.requests.clear()
+        self._load(page.as_uri() if isinstance(page, Path) else page, timeout)
+        self.run("window.igsr.ready.then(() => true)", timeout)
+
+    def leave(self) -> None:
+        """Leave the page: one that asks a server would go on with it."""
+        self._load("about:blank", 60.0)
+
+    def _load(self, address: str, timeout: float) -> None:
         self._loaded = False
-        self._ask("Page.navigate", url=page.as_uri())
+        self._ask("Page.navigate", url=address)
         end = time.monotonic() + timeout
         while not self._loaded:
             self._receive(end)
-        self.run("window.igsr.ready.then(() => true)", timeout)
 
     def run(self, expression: str, timeout: float = 60.0) -> Any:
         """The value of JavaScript; a promise is waited for."""

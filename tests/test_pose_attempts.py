@@ -68,7 +68,6 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[A
             calls.append(("guided", sorted(missing)))
             return Path("guided.db") if more else None
 
-        monkeypatch.setattr(attempts, "matched", lambda *_: Path("matched.db"))
         monkeypatch.setattr(attempts, "with_focal_lengths", lambda path, seed: path)
         some = sorted(with_any or range(8))
         found = {(image_id(some[0]), image_id(other)): np.zeros((9, 2)) for other in some[1:]}
@@ -77,7 +76,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[A
         monkeypatch.setattr(attempts, "matched_along_lines", look)
         monkeypatch.setattr(attempts, "map_photos", make)
         monkeypatch.setattr(attempts, "extend", add)
-        result = mapped(8, Path("features.db"), 0, silent)
+        result = mapped(8, Path("matched.db"), 0, silent)
         assert result.alike == 0
         return result.model, result.doubtful, calls
 

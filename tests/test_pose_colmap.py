@@ -19,6 +19,7 @@ from igsr.capture.write_transforms import write_transforms
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose import registry
 from igsr.pose.colmap import Colmap, estimator, pairs
+from igsr.pose.colmap.attempts import Mapped
 from igsr.pose.colmap.database import list_photos
 from igsr.pose.colmap.features import find_features
 from igsr.pose.estimate import Estimate
@@ -175,7 +176,8 @@ def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -
 def test_of_many_photos_the_time_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     for step in ("list_photos", "find_features"):
         monkeypatch.setattr(estimator, step, lambda *arguments: None)
-    monkeypatch.setattr(estimator, "mapped", lambda *arguments: (None, False))
+    monkeypatch.setattr(estimator, "matched", lambda *arguments: None)
+    monkeypatch.setattr(estimator, "mapped", lambda *arguments, sift: Mapped(None, False, 0))
     tiny = [Photo(f"{i}.png", np.zeros((2, 2, 3), dtype=np.uint8)) for i in range(500)]
     with (
         pytest.warns(UserWarning, match=r"COLMAP needs about \d+ minutes for 500 photos"),

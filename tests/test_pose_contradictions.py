@@ -143,7 +143,7 @@ def test_two_rooms_with_a_like_piece_are_not_made_one(
         copy = Path(shutil.copyfile(matches, tmp_path / "copy.db"))
         leave_out(copy, across)
         assert links(copy).keys() == links(matches).keys() - across
-        found = mapped(len(photos), features, 0, show)
+        found = mapped(len(photos), matches, 0, show)
     assert found.alike == len(across)
     assert not found.doubtful
     estimate = estimate_of(photos, found)

@@ -13,6 +13,7 @@ from PIL import Image
 from refinements import refine, same, truthful, unsure
 
 import igsr
+from igsr.fitting import followed_run
 from igsr.pose import registry
 from igsr.pose.estimate import Estimate
 from igsr.refinement.report import seconds_so_far
@@ -53,7 +54,7 @@ def test_everything_it_did_is_in_its_folder(helped):
     assert page.count("data:image/jpeg;base64,") == 9 + beside + 3 * sum(
         len(one.selected) for one in refined.rounds
     )
-    assert "http" not in page, "the page needs nothing from elsewhere"
+    assert "://" not in page, "the page needs nothing from elsewhere"
     # Photo, before and after of three test views; after is nearer to the photo.
     sheet = np.asarray(Image.open(out / "views.png"), np.float32)
     views = len(refined.capture.test_views)
@@ -356,3 +357,37 @@ def test_what_it_returns_shows_itself_in_a_notebook(helped):
     assert "<img" in refined._repr_html_()
     assert refined == refined
     assert (refined == "a scene") is False
+
+
+def test_it_says_where_it_stands_while_it_runs(ball_photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(followed_run, "TELL_EVERY", 0.0)
+    out, told = tmp_path / "out", []
+
+    def look(now):
+        told.append(json.loads((out / "view/progress.json").read_text()))
+        return now.stage != "cross_validate"
+
+    with pytest.raises(igsr.IgsrError, match="was stopped"):
+        refine(ball_photos, 1, truthful, out=out, steps=40, progress=look)
+    assert told[0]["text"] == "round 0: fit photos"
+    assert told[-1]["text"] == "round 1: cross-validate"
+    parts = [one["done"] for one in told]
+    assert parts == sorted(parts)
+    assert 0.0 < parts[-1] < 1.0
+    assert not (out / "view/progress.json").exists(), "it has ended, though not well"
+    held_out = [view.name for view in ball_photos.test_views]
+    photos = json.loads((out / "view/cameras.json").read_text())["frames"]
+    assert [one["file_path"] for one in photos] == [
+        f"held-out/{name.removesuffix('.png')}.jpg" for name in held_out
+    ]
+    # White is what the photos' alpha is laid over.
+    corner = np.asarray(Image.open(out / "view" / photos[0]["file_path"]))[0, 0]
+    assert corner.min() > 240
+    assert json.loads((out / "view/run.json").read_text()) == {"background": [1.0, 1.0, 1.0]}
+
+
+def test_a_view_that_cannot_be_written_ends_no_run(ball_photos, tmp_path):
+    (tmp_path / "view").write_text("a file of one's own")
+    refined = refine(ball_photos, 1, truthful, out=tmp_path, steps=40, cross_validate=False)
+    assert len(refined.rounds) == 1
+    assert (tmp_path / "view").read_text() == "a file of one's own"

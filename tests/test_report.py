@@ -17,7 +17,7 @@ from igsr._internal.atomic_write import atomic_write
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Parts, Usage
 from igsr.capture import Capture
-from igsr.evaluation import evaluate, metrics, score_views
+from igsr.evaluation import evaluate, metrics, report_page, score_views
 from igsr.evaluation.contact_sheet import contact_sheet, error_picture, sheet_names
 from igsr.evaluation.quick_scores import MOST_TRAIN, train_photos, train_scores
 from igsr.evaluation.scores import BLACK, ScoredView, over_background
@@ -162,7 +162,7 @@ def test_fitted_photos_are_scored_at_most_ten_evenly_spaced():
         assert quick[name] == pytest.approx(whole[name], abs=1e-12)
 
 
-def test_a_fits_page_escapes_what_it_shows(tmp_path):
+def test_a_fits_page_escapes_what_it_shows(tmp_path, monkeypatch):
     name = '"><script>alert("photo")</script>\udcff.png'
     made = scenes.capture(views=5, size=16)
     views = [replace(view, name=f"{k}{name}") for k, view in enumerate(made.views)]
@@ -180,7 +180,7 @@ def test_a_fits_page_escapes_what_it_shows(tmp_path):
     scored = FitScores(scores, sheet, train, {"psnr": 20.0, "ssim": 0.5, "flip": 0.1})
     report = fit_report(fit, scored, parts)
     assert report["limit"]["camera_gain"] is not None
-    write_fit_page(tmp_path / "report.html", report, capture, sheet)
+    write_fit_page(tmp_path / "report.html", report, splats, capture, sheet)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "alert(" in page
     for unsafe in ('"photo"', "a<b>", "<i>", "<script>alert", "<fit>"):
@@ -188,3 +188,16 @@ def test_a_fits_page_escapes_what_it_shows(tmp_path):
     assert "a&lt;b&gt;&amp;c" in page
     assert "&lt;i&gt;lost&lt;/i&gt;.png" in page
     assert "the same with refined cameras" in page
+    assert "<iframe srcdoc=" in page
+
+    def refuse(*_, **__):
+        raise igsr.IgsrError("no")
+
+    # A scene that is too large, or that pages cannot hold, is linked to.
+    for name, value in (("MOST_COMPARED", 4), ("scene_page", refuse)):
+        with monkeypatch.context() as patch:
+            patch.setattr(report_page, name, value)
+            write_fit_page(tmp_path / "report.html", report, splats, capture, sheet)
+        page = (tmp_path / "report.html").read_text(encoding="utf-8")
+        assert "<iframe" not in page
+        assert '<a href="scene.html">' in page

@@ -210,7 +210,7 @@ def test_an_empty_model_is_said(browser, tmp_path):
 @pytest.mark.parametrize("damage", ["cut", "byte", "base64", "other", "count"])
 def test_a_damaged_page_says_so(browser, tmp_path, damage):
     page, _ = scene_page(model())
-    found = re.search(r'id="model">([^<]+)<', page)
+    found = re.search(r'id="model-0">([^<]+)<', page)
     assert found is not None
     text = found[1]
     if damage == "count":

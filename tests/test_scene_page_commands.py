@@ -30,7 +30,7 @@ def test_splats_that_are_not_finite_are_left_out(browser, tmp_path):
     browser.open(tmp_path / "scene.html")
     write_scene_page(tmp_path / "scene.html", splats, (), BACKGROUND)
     browser.open(tmp_path / "scene.html")
-    assert browser.run("JSON.parse(document.getElementById('scene').textContent).count") == 396
+    assert browser.run("window.igsr.viewer.scene.count") == 396
     check_pictures(browser, splats, three_cameras())
 
 
@@ -96,6 +96,7 @@ def test_a_fit_writes_it(browser, tmp_path):
     assert browser.run("window.igsr.error") is None
     assert browser.run("window.igsr.viewer.scene.cameras.length") == len(made.views)
     splats, camera = igsr.Splats.load(out / "scene.ply"), made.views[0].camera
+    assert "<iframe srcdoc=" in (out / "report.html").read_text(encoding="utf-8")
     expected = render(splats, camera, backend="cpu").to_uint8().astype(int)
     assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
 

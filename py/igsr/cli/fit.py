@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,7 @@ from igsr.cli.pose import (
     EstimatorOption,
     FramesOption,
     GraphOption,
+    MatcherOption,
     capture_to_fit,
 )
 from igsr.cli.scene_page_option import PAGE, HtmlOption, write_page
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
     from igsr.capture.overview import Overview
     from igsr.fitting import Progress
     from igsr.fitting.fit_report import FitScores
+    from igsr.fitting.followed_run import FollowedRun
     from igsr.splats import Splats
 
 
@@ -86,6 +89,7 @@ def fit_command(
     estimator: EstimatorOption = AUTO,
     network: CheckpointOption = None,
     graph: GraphOption = None,
+    matcher: MatcherOption = None,
     frames: FramesOption = FRAMES,
     allow_missing: AllowMissingOption = False,
     background: BackgroundOption = None,
@@ -111,7 +115,7 @@ def fit_command(
             "the same command with --resume continues."
         )
 
-    with error_messages(interrupted), warning_messages():
+    with error_messages(interrupted), warning_messages(), ExitStack() as ending:
         # Check the options, find the cameras, and take what was not given from the preset.
         checked_given(FitSettings, given)
         if config is not None and given_by_hand(ctx, "preset") and _is_complete(given):
@@ -140,7 +144,10 @@ def fit_command(
                 cameras_kept=kept,
             )
 
-        finder = CameraFinder(estimator, network, graph, frames, given["seed"])
+        from igsr.fitting.followed_run import FollowedRun
+
+        followed = ending.enter_context(closing(FollowedRun(out)))
+        finder = CameraFinder(estimator, network, graph, matcher, frames, given["seed"])
         loaded, found = capture_to_fit(
             capture,
             out,
@@ -152,6 +159,7 @@ def fit_command(
             shown=not as_json,
             parts=parts,
             announced=announced,
+            followed=followed,
         )
         color = _background(background, loaded)
         # Photos with alpha are fitted over random colors, so that no background is learned.
@@ -164,10 +172,13 @@ def fit_command(
             background=None if has_alpha else color,
         )
 
-        with parts.measured("fit"):
-            splats, fitted = _fitted(loaded, settings, name, out, resume, last, shown=not as_json)
-
         from igsr.fitting.fit_report import FinishedFit, fit_report, write_fit_report, write_scene
+
+        followed.show(loaded, color)
+        with parts.measured("fit"):
+            splats, fitted = _fitted(
+                loaded, settings, name, out, resume, last, followed, shown=not as_json
+            )
 
         # Write the scene, its scores and everything that it takes to fit it again.
         asked = {
@@ -181,12 +192,14 @@ def fit_command(
             "estimator": estimator,
             "network": None if network is None else str(network),
             "graph": graph,
+            "matcher": matcher,
             "frames": frames,
             "allow_missing": allow_missing,
             "background": background,
         }
         write_scene(out, splats, fitted)
         has_page = html and write_page(out, splats, fitted, color)
+        followed.tell("score photos", 1.0, at_once=True)
         with parts.measured("score"):
             is_refined = bool(fitted.test_views) and (settings.moves_cameras or found)
             scores = _scored(splats, fitted, color, name, is_refined=is_refined, shown=not as_json)
@@ -218,6 +231,7 @@ def _fitted(
     out: Path,
     resume: bool,
     last: list[Progress],
+    followed: FollowedRun,
     *,
     shown: bool,
 ) -> tuple[Splats, Capture]:
@@ -229,7 +243,9 @@ def _fitted(
 
         def progress(now: Progress) -> None:
             last[:] = [now]
-            show(bar_state(now))
+            state = bar_state(now)
+            show(state)
+            followed.tell(f"fit: step {now.step} of {now.steps}, {state.text}", now.work)
 
         keywords: dict[str, Any] = {**settings.plain(), "backend": backend}
         return fit_with_cameras(

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
@@ -37,6 +37,9 @@ from igsr.cli.shared import (
 from igsr.errors import IgsrError
 from igsr.pose import AUTO, find_cameras, has_found, kept_cameras, kept_capture, photos_at
 from igsr.pose.registry import ESTIMATORS
+
+if TYPE_CHECKING:
+    from igsr.fitting.followed_run import FollowedRun
 
 logger = logging.getLogger(__name__)
 
@@ -70,6 +73,17 @@ GraphOption = Annotated[
 ]
 
 
+MatcherOption = Annotated[
+    str | None,
+    typer.Option(
+        "--matcher",
+        metavar="NAME",
+        help="For colmap: what finds and matches features: sift, or loma (a network that matches "
+        "photos from further apart; needs igsr[loma]).",
+    ),
+]
+
+
 AllowMissingOption = Annotated[
     bool,
     typer.Option(
@@ -87,6 +101,7 @@ class CameraFinder:
         estimator: a name of ``igsr.pose.registry.ESTIMATORS``, or "auto".
         checkpoint: weights of the estimator's network, or None.
         graph: which pairs of photos dust3r sees, or None for its default.
+        matcher: of colmap, or None for its default.
         frames: most frames taken from each video.
         seed: of everything random.
     """
@@ -94,13 +109,14 @@ class CameraFinder:
     estimator: str
     checkpoint: Path | None
     graph: str | None
+    matcher: str | None
     frames: int
     seed: int
 
     @property
     def options(self) -> dict[str, Any]:
         """Keywords for the estimator itself: those that were given."""
-        given = {"checkpoint": self.checkpoint, "graph": self.graph}
+        given = {"checkpoint": self.checkpoint, "graph": self.graph, "matcher": self.matcher}
         return {name: value for name, value in given.items() if value is not None}
 
 
@@ -124,6 +140,7 @@ def capture_to_fit(
     splats: int = 0,
     parts: Parts | None = None,
     announced: Callable[[Overview, bool], None] | None = None,
+    followed: FollowedRun | None = None,
 ) -> tuple[Capture, bool]:
     """Load the capture at a path; find the cameras first if it has none.
 
@@ -141,6 +158,7 @@ def capture_to_fit(
         splats: most splats of the fit, for the memory that it needs.
         parts: count what "cameras" and "load" take, or None.
         announced: called before anything slow, with what there is and whether cameras are known.
+        followed: told what finding cameras does, or None.
 
     Returns:
         The capture, and whether its cameras were found here (or by the run that is resumed).
@@ -156,7 +174,8 @@ def capture_to_fit(
     seen.train_photos(holdout)
     if seen.has_cameras and (finder.options or finder.estimator != AUTO):
         raise IgsrError(
-            f"{path} has cameras, or no photos; leave --estimator, --checkpoint and --graph out"
+            f"{path} has cameras, or no photos; leave --estimator, --checkpoint, --graph and "
+            "--matcher out"
         )
     if not seen.has_cameras:
         kept_cameras(path, out)
@@ -167,6 +186,12 @@ def capture_to_fit(
         with parts.measured("load"):
             return load(path, holdout, max_size), False
     with _pose_bar(shown) as show:
+
+        def progress(step: str, done: int, total: int) -> None:
+            show(step, done, total)
+            if followed is not None:
+                followed.tell(f"find cameras: {step}", 0.0)
+
         capture = kept_capture(
             path,
             out,
@@ -177,7 +202,7 @@ def capture_to_fit(
             max_size=max_size,
             resume=resume,
             allow_missing=allow_missing,
-            progress=show,
+            progress=progress,
             say=print_message,
             warn=print_message,
             parts=parts,
@@ -196,6 +221,7 @@ def pose_command(
     estimator: EstimatorOption = AUTO,
     checkpoint: CheckpointOption = None,
     graph: GraphOption = None,
+    matcher: MatcherOption = None,
     max_size: MaxSizeOption = None,
     plot: Annotated[
         bool, typer.Option("--plot", help="Draw cameras and points to --out/poses.png.")
@@ -215,7 +241,7 @@ def pose_command(
                 f"{given} has cameras already; fit it as it is, or name an --estimator to find "
                 "them again"
             )
-        finder = CameraFinder(estimator, checkpoint, graph, frames, seed)
+        finder = CameraFinder(estimator, checkpoint, graph, matcher, frames, seed)
         report = _posed(given, out, finder, max_size=max_size, plot=plot, shown=not as_json)
         report["seconds"] = round(time.monotonic() - started, 3)
     if as_json:

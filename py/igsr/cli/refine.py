@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ from igsr.cli.pose import (
     EstimatorOption,
     FramesOption,
     GraphOption,
+    MatcherOption,
     capture_to_fit,
 )
 from igsr.cli.scene_page_option import PAGE, HtmlOption, write_page
@@ -65,6 +67,7 @@ def refine_command(
     estimator: EstimatorOption = AUTO,
     network: CheckpointOption = None,
     graph: GraphOption = None,
+    matcher: MatcherOption = None,
     frames: FramesOption = FRAMES,
     allow_missing: AllowMissingOption = False,
     config: ConfigOption = None,
@@ -83,6 +86,7 @@ def refine_command(
             _check_photo_count(photos, holdout, frames, photo_count)
 
         from igsr._core import resolve_backend
+        from igsr.fitting.followed_run import FollowedRun
         from igsr.refinement.loop import refine, round_denoiser
         from igsr.refinement.run import bar_state
 
@@ -108,17 +112,18 @@ def refine_command(
             )
 
         denoiser = round_denoiser(weights)
-        with warning_messages():
+        with warning_messages(), closing(FollowedRun(out)) as followed:
             capture, _ = capture_to_fit(
                 photos,
                 out,
                 holdout,
-                CameraFinder(estimator, network, graph, frames, settings.seed),
+                CameraFinder(estimator, network, graph, matcher, frames, settings.seed),
                 max_size=max_size,
                 allow_missing=allow_missing,
                 resume=resume,
                 shown=not as_json,
                 announced=None if as_json else announced,
+                followed=followed,
             )
         if photo_count is not None:
             capture = _some_photos(capture, photo_count)
@@ -132,7 +137,7 @@ def refine_command(
                 **vars(settings),
             )
         with warning_messages():
-            has_page = html and write_page(out, refined.splats, refined.capture)
+            has_page = html and write_page(out, refined.models(), refined.capture)
     if as_json:
         print_json(_summary(refined, out))
     else:

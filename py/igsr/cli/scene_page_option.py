@@ -13,6 +13,7 @@ from igsr.errors import IgsrError
 
 if TYPE_CHECKING:
     from igsr.capture import Capture
+    from igsr.rendering.scene_page import PageModel
     from igsr.splats import Splats
 
 #: The page's name in the folder of a fit or a refinement.
@@ -25,7 +26,10 @@ HtmlOption = Annotated[
 
 
 def write_page(
-    out: Path, splats: Splats, capture: Capture, background: Sequence[float] | None = None
+    out: Path,
+    splats: Splats | Sequence[PageModel],
+    capture: Capture,
+    background: Sequence[float] | None = None,
 ) -> bool:
     """Write ``scene.html`` with the cameras of the train views; whether it was written.
 
@@ -33,18 +37,21 @@ def write_page(
 
     Args:
         out: the folder.
-        splats: the model.
+        splats: the model, or several to compare, the last of which is shown alone where there are
+            too many splats.
         capture: the photos that it was fitted to.
         background: RGB in [0, 1]; None is the default of the photos.
     """
     from igsr.evaluation.scores import default_background
-    from igsr.rendering.scene_page import PageCamera, write_scene_page
+    from igsr.rendering.scene_page import PageCamera, compared, write_scene_page
+    from igsr.splats import Splats
 
+    models = splats if isinstance(splats, Splats) else compared(splats)
     cameras = [PageCamera(view.name, view.camera) for view in capture.train_views]
     color = default_background(capture) if background is None else background
     try:
         title = out.resolve().name or "scene"
-        notes = write_scene_page(out / PAGE, splats, cameras, color, title)
+        notes = write_scene_page(out / PAGE, models, cameras, color, title)
     except IgsrError as error:
         warnings.warn(f"{PAGE} is not written: {error}", stacklevel=2)
         return False

@@ -1,4 +1,4 @@
-"""``igsr view``: a scene in a window.
+"""``igsr view``: a scene in a window, or in the browser.
 
 The viewer ``splat-view`` is a program of its own and reads cameras in one format, the
 ``cameras.json`` that igsr writes. This command reads any other capture for it.
@@ -23,13 +23,18 @@ from igsr.capture import Capture, View, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.write_cameras import write_cameras
 from igsr.capture.write_files import png_names
-from igsr.cli.error_messages import INTERRUPTED, error_messages
+from igsr.cli.error_messages import INTERRUPTED, error_messages, print_message
+from igsr.cli.web_view import serve_web_view
 from igsr.errors import IgsrError
 
 #: The viewer.
 PROGRAM = "splat-view"
 #: The viewer's file of cameras.
 CAMERAS = "cameras.json"
+#: Where the browser view listens: nowhere that other computers reach.
+OWN_HOST = "127.0.0.1"
+#: The folder in that of a run which has photos and cameras for the page.
+VIEW = "view"
 #: Options that this command does not know are the viewer's.
 PASSED_ON = {"ignore_unknown_options": True}
 #: Longest side of the photos that the viewer lays over renders, pixels.
@@ -53,15 +58,49 @@ def view_command(
             help="Capture whose cameras and photos to show. Default: what lies beside SCENE.",
         ),
     ] = None,
+    web: Annotated[
+        bool,
+        typer.Option(
+            "--web",
+            help="Show it in the browser, and follow a fit or a refinement that is running. "
+            "Without splat-view this is the default.",
+        ),
+    ] = False,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            "--host",
+            metavar="ADDRESS",
+            help="For --web: address to listen at; 0.0.0.0 opens it to other computers. "
+            f"Default: {OWN_HOST}, this computer alone.",
+        ),
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            "--port",
+            min=1,
+            max=65535,
+            help="For --web: port to listen at. Default: 8765, or the next free one.",
+        ),
+    ] = None,
 ) -> None:
-    """Show splats in a window, or two scenes side by side. Needs the program splat-view."""
+    """Show splats in a window or in the browser, one scene alone or two beside each other."""
     with error_messages():
-        program = shutil.which(PROGRAM)
+        program = None if web else shutil.which(PROGRAM)
         if program is None:
-            raise IgsrError(
-                f"{PROGRAM} is not installed; in igsr's source, run: "
-                "cargo install --locked --path crates/splat_view"
+            if not web:
+                _say_why_the_browser(scenes)
+            serve_web_view(
+                scenes,
+                lambda folder: _cameras_for_web(cameras, Path(scenes[0]), folder),
+                host or OWN_HOST,
+                port,
             )
+            return
+        for option, value in (("--host", host), ("--port", port)):
+            if value is not None:
+                raise IgsrError(f"{option} is for the browser view; add --web or leave it out")
         with tempfile.TemporaryDirectory(prefix="igsr-view-") as folder:
             words = [program, *scenes]
             readable = _cameras(cameras, Path(scenes[0]), Path(folder))
@@ -72,6 +111,22 @@ def view_command(
             except KeyboardInterrupt:
                 code = INTERRUPTED
     raise typer.Exit(code if code >= 0 else 128 - code)
+
+
+def _say_why_the_browser(scenes: list[str]) -> None:
+    """Say in a line that the browser stands in for the program.
+
+    Raises:
+        IgsrError: options are given that only the program has.
+    """
+    install = "cargo install --locked --path crates/splat_view"
+    options = [word for word in scenes if word.startswith("-")]
+    if options:
+        raise IgsrError(
+            f"{options[0]} needs {PROGRAM}, which is not installed; in igsr's source, run: "
+            f"{install}"
+        )
+    print_message(f"{PROGRAM} is not installed ({install}); the browser shows the scene.")
 
 
 def _cameras(named: str | None, scene: Path, folder: Path) -> Path | None:
@@ -90,6 +145,13 @@ def _cameras(named: str | None, scene: Path, folder: Path) -> Path | None:
         # Nobody asked for them: the scene can be looked at without.
         print(f"{error}; no cameras are shown.", file=sys.stderr)
         return None
+
+
+def _cameras_for_web(named: str | None, scene: Path, folder: Path) -> Path | None:
+    """As ``_cameras``; None, too, where a run has left cameras and photos for the page."""
+    if named is None and (scene / VIEW / CAMERAS).is_file():
+        return None
+    return _cameras(named, scene, folder)
 
 
 def _beside(scene: Path) -> Path | None:

@@ -18,12 +18,23 @@ import numpy.typing as npt
 from PIL import Image
 
 from igsr._internal.atomic_write import atomic_write
-from igsr.capture import Camera
+from igsr.capture import Camera, Capture
+from igsr.errors import IgsrError
 from igsr.evaluation.contact_sheet import ERROR_WHITE, error_picture
 from igsr.evaluation.scores import ScoredView
+from igsr.rendering.notebook_page import framed
+from igsr.rendering.scene_page import (
+    MOST_COMPARED,
+    PageCamera,
+    PageModel,
+    compared,
+    scene_page,
+)
 
 #: Longest side of pictures beside each other, pixels.
 BESIDE = 480
+#: Height of the scene, pixels.
+SCENE_HEIGHT = 560
 #: How the page's script draws cameras, by the first number of each.
 PHOTO, ADDED, REJECTED = 0, 1, 2
 
@@ -71,6 +82,31 @@ def beside(views: Sequence[ScoredView]) -> list[dict[str, Any]]:
         }
         for one in views
     ]
+
+
+def scene_frame(
+    models: Sequence[PageModel], capture: Capture, background: Sequence[float], title: str
+) -> str | None:
+    """The scene to turn, as HTML of a frame; None where it cannot be within a report.
+
+    It cannot where it has more than ``MOST_COMPARED`` splats, which make a page of some 10 MB, or
+    where the page's format cannot hold it: the report stands without.
+
+    Args:
+        models: the last is shown, and compared with the others where there is room for them.
+        capture: the photos; the page jumps to the cameras of those that were fitted.
+        background: RGB in [0, 1] behind the splats.
+        title: of the page, and the name of its screenshots.
+    """
+    shown = compared(models)
+    if sum(len(one.splats) for one in shown) > MOST_COMPARED:
+        return None
+    cameras = [PageCamera(view.name, view.camera) for view in capture.train_views]
+    try:
+        page, _ = scene_page(shown, cameras, background, title, compares=True)
+    except IgsrError:
+        return None
+    return framed(page, SCENE_HEIGHT)
 
 
 def part_rows(

@@ -21,6 +21,7 @@ from igsr._internal.atomic_write import atomic_write, check_writable
 from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
 from igsr.errors import IgsrError
 from igsr.fitting.settings import FitSettings
+from igsr.splats import Splats
 
 #: Raised whenever the arrays' meaning changes; older checkpoints are then refused by number.
 FORMAT = 1
@@ -112,6 +113,26 @@ class CheckpointFile:
                 "resume with the same or leave --resume out."
             )
         return state, (saved["started"][0], saved["started"][1]), saved["seconds"]
+
+
+def checkpoint_splats(path: Path) -> Splats:
+    """The splats of a fit as they were when it saved a checkpoint.
+
+    Raises:
+        IgsrError: there is no checkpoint, it is damaged, or of another format.
+    """
+    state, _ = load_checkpoint(path)
+    try:
+        return Splats(
+            means=state["means"],
+            quats=state["quats"],
+            scales=state["scales"],
+            opacities=state["opacities"],
+            sh=state["sh"],
+            origin=state["origin"],
+        )
+    except (KeyError, IgsrError) as error:
+        raise IgsrError(f"The checkpoint {path} holds no splats: {error}.") from error
 
 
 def save_checkpoint(path: Path, state: State, settings: dict[str, Any]) -> None:

@@ -17,9 +17,12 @@ from igsr.evaluation.report_page import (
     drawn_cameras,
     number,
     part_rows,
+    scene_frame,
     write_template,
 )
 from igsr.evaluation.scores import ScoredView
+from igsr.rendering.scene_page import PageModel
+from igsr.splats import Splats
 
 #: Parts as the page calls them.
 PARTS = {
@@ -31,13 +34,18 @@ PARTS = {
 
 
 def write_fit_page(
-    path: Path, report: dict[str, Any], capture: Capture, shown: Sequence[ScoredView]
+    path: Path,
+    report: dict[str, Any],
+    splats: Splats,
+    capture: Capture,
+    shown: Sequence[ScoredView],
 ) -> None:
     """Write the page, whole or not at all; it needs nothing but a browser.
 
     Args:
         path: where to.
         report: of ``report.json``.
+        splats: the scene.
         capture: the photos, with cameras.
         shown: views that are shown beside their renders.
 
@@ -47,8 +55,10 @@ def write_fit_page(
     train = [view.camera for view in capture.train_views]
     test = [view.camera for view in capture.test_views]
     held_out = report["protocol"]["split"] == "test"
+    name, background = _title(report["capture"]), report["protocol"]["background"]
     variables = {
-        "name": _title(report["capture"]),
+        "name": name,
+        "scene": scene_frame([PageModel(name, splats)], capture, background, name),
         "photos": report["photos"],
         "splats": report["splats"],
         "seconds": report["seconds"],

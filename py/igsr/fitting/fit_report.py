@@ -136,4 +136,4 @@ def write_fit_report(
     """
     save_sheet(out / "views.png", contact_sheet(scored.sheet))
     write_json(out / "report.json", report)
-    write_fit_page(out / "report.html", report, fit.capture, scored.sheet)
+    write_fit_page(out / "report.html", report, fit.splats, fit.capture, scored.sheet)

@@ -60,9 +60,9 @@ def estimate_poses(
             enlarged. None keeps all as they are. The cameras do not depend on it: they are found
             from photos of at most 1600 pixels.
         progress: called with a stage, how much of it is done, and how much there is.
-        options: of the estimator alone: DUSt3R's ``checkpoint``, ``graph`` and ``cameras``; those
-            of Depth Anything 3, ``checkpoint``, ``cameras``, ``cameras_from`` and
-            ``bundle_adjustment``.
+        options: of the estimator alone: COLMAP's ``matcher`` ("sift", "loma" or a ``Matcher``);
+            DUSt3R's ``checkpoint``, ``graph`` and ``cameras``; those of Depth Anything 3,
+            ``checkpoint``, ``cameras``, ``cameras_from`` and ``bundle_adjustment``.
 
     Returns:
         The registered photos, upright and undistorted, in one world frame of unknown scale; all are
@@ -137,7 +137,11 @@ def made_by_of(estimator: str, seed: int, frames: int, options: dict[str, Any]) 
         estimator: the name of the one that ran, not "auto".
         seed, frames, options: as ``estimate_poses``.
     """
-    plain = {name: str(value) for name, value in sorted(options.items())}
+    plain = {
+        # A matcher of the user's own is known by its name.
+        name: str(value if isinstance(value, os.PathLike) else getattr(value, "name", value))
+        for name, value in sorted(options.items())
+    }
     return {"estimator": estimator, "seed": seed, "frames": frames, "options": plain}
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from igsr.capture import Camera
 from igsr.pose.estimate import Estimator
+
+if TYPE_CHECKING:
+    from igsr.pose.colmap.matcher import Matcher
 
 
 @dataclass(frozen=True)
@@ -40,10 +43,10 @@ def _dust3r_is_ready(options: Mapping[str, Any]) -> bool:
     return find_checkpoint(options.get("checkpoint")) is not None
 
 
-def _colmap() -> Estimator:
+def _colmap(matcher: str | Matcher = "sift") -> Estimator:
     from igsr.pose.colmap import Colmap
 
-    return Colmap()
+    return Colmap(matcher)
 
 
 def _da3(

@@ -21,6 +21,7 @@ from igsr.evaluation.report_page import (
     jpeg,
     number,
     part_rows,
+    scene_frame,
     write_template,
 )
 from igsr.evaluation.scores import ScoredView, default_background, over_background
@@ -56,10 +57,12 @@ def write_page(
         IgsrError: the file cannot be written.
     """
     background = default_background(refined.capture)
+    name = refined.capture.path.name or "photos"
     validated = [done for done in refined.rounds if done.validation_after]
     tests = [refined.first_test, *(done.test for done in refined.rounds)]
     variables = {
-        "name": refined.capture.path.name or "photos",
+        "name": name,
+        "scene": scene_frame(refined.models(), refined.capture, background, name),
         "photos": [
             {
                 "name": view.name,

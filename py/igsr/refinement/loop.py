@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -102,8 +103,10 @@ def refine(
     )
     resolved = _core.resolve_backend(settings.backend)  # a missing GPU is found here
     max_size = default_max_size(resolved, quality) if max_size is None else max_size
-    with progress_or_bar(progress, "refine", bar_state) as report:
-        run = RefineRun(settings, out, resume, report)
+    with (
+        progress_or_bar(progress, "refine", bar_state) as report,
+        closing(RefineRun(settings, out, resume, report)) as run,
+    ):
         if isinstance(photos, Capture):
             capture = photos
         else:
@@ -112,7 +115,7 @@ def refine(
         stages = Stages(capture, settings, run, denoiser or round_denoiser(), propose, select)
         validation = CrossValidation(stages, capture.train_views) if cross_validate else None
         fits = 1.0 + (validation.work if validation else 0.0)
-        run.prepare(work=fits * (1.0 + settings.most_rounds * (NOVEL_VIEWS_WORK + 1.0)))
+        run.prepare(capture, work=fits * (1.0 + settings.most_rounds * (NOVEL_VIEWS_WORK + 1.0)))
 
         whole = stages.fit_whole()
         if validation is not None:

@@ -10,7 +10,10 @@ from igsr._internal.array_equality import ArrayEquality
 from igsr._internal.deprecation import renamed_attributes
 from igsr._internal.notebook import NotebookPicture
 from igsr.capture import Capture
+from igsr.evaluation.scores import default_background
 from igsr.refinement.selection import Candidate, Rejected
+from igsr.rendering.notebook_page import NotebookPage, notebook_page
+from igsr.rendering.scene_page import PageModel, compared
 from igsr.splats import Splats
 
 #: What a refinement does, in the order of a round: find cameras; fit the photos; render, denoise
@@ -150,6 +153,34 @@ class Refined(ArrayEquality, NotebookPicture):
     seconds: dict[str, float]
 
     _pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:refined_pictures"
+
+    def models(self) -> list[PageModel]:
+        """The models of the rounds by name: the first fit, and each round that was accepted."""
+        rounds = [
+            PageModel(f"round {number}", done.splats)
+            for number, done in enumerate(self.rounds, 1)
+            if done.splats is not None
+        ]
+        return [PageModel("first fit", self.first), *rounds]
+
+    def show(self, height: int = 480) -> NotebookPage:
+        """A viewer for notebooks: return it from a cell, then drag to orbit.
+
+        It starts at the first photo's camera, with the first fit left of a divider and the last
+        round right of it. Lists choose other rounds. Above 300 000 splats in all it has the last
+        round alone.
+
+        Args:
+            height: of the viewer, pixels.
+
+        Returns:
+            An object that notebooks show (``_repr_html_``).
+
+        Raises:
+            IgsrError: ``height`` is under 1, or the page cannot hold the splats.
+        """
+        background = default_background(self.capture)
+        return notebook_page(compared(self.models()), self.capture, background, height)
 
     def __repr__(self) -> str:
         """The rounds, the scene and why it stopped, in one line."""

@@ -19,6 +19,8 @@ from igsr.capture import Capture, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import FRAMES
 from igsr.errors import IgsrError
+from igsr.evaluation.scores import default_background
+from igsr.fitting.followed_run import FollowedRun
 from igsr.pose import check_enough_placed, find_cameras, kept_capture, photos_at
 from igsr.pose.cache import read_usage
 from igsr.refinement.report import parts_so_far, write_refinement
@@ -71,6 +73,7 @@ class RefineRun:
         self.round = 0
         self._settings, self._resume, self._progress = settings, resume, progress
         self._out = None if out is None else Path(out)
+        self._followed = None if self._out is None else FollowedRun(self._out)
         self._started, self._meter = time.monotonic(), Meter()
         self._parts = Parts()
         # In units of a fit to all photos.
@@ -119,10 +122,11 @@ class RefineRun:
         check_enough_placed(found, {}, allow_missing)
         return found.capture(Path(photos), photos_at(photos, FRAMES, max_size, held))
 
-    def prepare(self, work: float) -> None:
+    def prepare(self, capture: Capture, work: float) -> None:
         """Clear the folder of what an earlier run left unfinished, or read what it took to resume.
 
         Args:
+            capture: the photos, some of which are left for who follows the run.
             work: all that there may be to do, in units of a fit to all photos.
         """
         self._work, self._parts = work, Parts()
@@ -135,6 +139,8 @@ class RefineRun:
             self._parts.used = parts_so_far(self._out)
         else:
             self._remove_checkpoints()
+        if self._followed is not None:
+            self._followed.show(capture, default_background(capture))
 
     def checkpoint(self, name: str) -> tuple[Path | None, bool]:
         """Where a fit is saved to, and whether it resumes from there."""
@@ -183,6 +189,11 @@ class RefineRun:
             write_refinement(self._out, refined, self._settings, parts | self._parts.used)
         return refined
 
+    def close(self) -> None:
+        """Tell who follows the run that it has ended, done or not."""
+        if self._followed is not None:
+            self._followed.close()
+
     @property
     def _checkpoints(self) -> Path:
         assert self._out is not None
@@ -191,11 +202,11 @@ class RefineRun:
     def _goes_on(self, stage: Stage, part: float) -> bool:
         if stage != "pose":
             self._parts.add(stage, self._meter.lap())
-        if self._progress is None:
-            return True
         done = min(1.0, (self._work_done + part) / self._work)
-        seconds = time.monotonic() - self._started
-        return self._progress(RefineProgress(self.round, stage, done, seconds)) is not False
+        now = RefineProgress(self.round, stage, done, time.monotonic() - self._started)
+        if self._followed is not None:
+            self._followed.tell(bar_state(now).text, done)
+        return self._progress is None or self._progress(now) is not False
 
     def _remove_checkpoints(self) -> None:
         """Remove fits of an earlier run and its report: a later resume must not use them."""

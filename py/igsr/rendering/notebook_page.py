@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from igsr.capture import Capture
 from igsr.errors import IgsrError
-from igsr.rendering.scene_page import PageCamera, scene_page
+from igsr.rendering.scene_page import PageCamera, PageModel, scene_page
 from igsr.splats import Splats
 
 
@@ -23,19 +23,29 @@ class NotebookPage:
 
     def _repr_html_(self) -> str:
         """The page in a frame."""
-        return (
-            f'<iframe srcdoc="{html.escape(self._page)}" '
-            f'style="width:100%;height:{self._height}px;border:0"></iframe>'
-        )
+        return framed(self._page, self._height)
+
+
+def framed(page: str, height: int) -> str:
+    """A page within another: HTML of a frame as wide as there is room.
+
+    Args:
+        page: its text.
+        height: in pixels.
+    """
+    return (
+        f'<iframe srcdoc="{html.escape(page)}" '
+        f'style="width:100%;height:{height}px;border:0"></iframe>'
+    )
 
 
 def notebook_page(
-    splats: Splats,
+    splats: Splats | Sequence[PageModel],
     capture: Capture | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     height: int = 480,
 ) -> NotebookPage:
-    """What ``Splats.show`` returns.
+    """What ``Splats.show`` and ``Refined.show`` return.
 
     Raises:
         IgsrError: as ``write_scene_page``, or ``height`` is under 1.
@@ -44,4 +54,4 @@ def notebook_page(
         raise IgsrError(f"height must be at least 1 pixel, not {height}")
     views = [] if capture is None else capture.views
     cameras = [PageCamera(view.name, view.camera) for view in views]
-    return NotebookPage(scene_page(splats, cameras, background)[0], height)
+    return NotebookPage(scene_page(splats, cameras, background, compares=True)[0], height)

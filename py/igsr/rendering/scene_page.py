@@ -1,4 +1,4 @@
-"""``scene.html``: a model and a viewer in one file, which needs nothing but a browser.
+"""``scene.html``: models and a viewer in one file, which needs nothing but a browser.
 
 The page's parts are the files of ``web/``, one job each; this module puts them together.
 """
@@ -34,7 +34,10 @@ SCRIPTS = (
     "painter.js",
     "gestures.js",
     "viewer.js",
+    "models.js",
+    "divider.js",
     "panel.js",
+    "live.js",
     "main.js",
 )
 #: Shaders by the names that the painter knows.
@@ -49,6 +52,9 @@ SHADERS = {
 NEAR_PART = 0.05
 #: Up axis of scenes without cameras, as COLMAP's and INRIA's scenes have it.
 UP = (0.0, -1.0, 0.0)
+#: Pages with more splats in all leave out the models that the last is compared with: two or three
+#: times as many bytes would be too many to send.
+MOST_COMPARED = 300_000
 
 
 @dataclass(frozen=True)
@@ -64,9 +70,22 @@ class PageCamera:
     camera: Camera
 
 
+@dataclass(frozen=True, eq=False)
+class PageModel:
+    """One of several models in a page.
+
+    Attributes:
+        label: what the page calls it.
+        splats: the model.
+    """
+
+    label: str
+    splats: Splats
+
+
 def write_scene_page(
     path: str | os.PathLike[str],
-    splats: Splats,
+    splats: Splats | Sequence[PageModel],
     cameras: Sequence[PageCamera] = (),
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "scene",
@@ -78,7 +97,8 @@ def write_scene_page(
 
     Args:
         path: where to; its folder is made if it is missing.
-        splats: the model. Splats that are not finite are left out.
+        splats: the model; or several, of which the last is shown and any two are compared at a
+            divider. Splats that are not finite are left out.
         cameras: cameras to jump to, in the order of the page's list.
         background: RGB in [0, 1] behind the splats.
         title: the page's title, and the name of its screenshots.
@@ -98,46 +118,70 @@ def write_scene_page(
 
 
 def scene_page(
-    splats: Splats,
+    splats: Splats | Sequence[PageModel],
     cameras: Sequence[PageCamera] = (),
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "scene",
+    *,
+    compares: bool = False,
 ) -> tuple[str, list[str]]:
-    """The page of ``write_scene_page`` as text, and its messages."""
-    color = [float(channel) for channel in background]
-    if len(color) != 3 or not all(0.0 <= channel <= 1.0 for channel in color):
-        raise IgsrError("background must be three numbers in [0, 1]")
-    model = embedded_model(splats)
-    script = '"use strict";\n(() => {\n' + "\n".join(map(_part, SCRIPTS)) + "})();\n"
-    style = _part("style.css")
-    values = {
-        "CSP": _content_security_policy(script, style),
-        "VERSION": _core.__version__,
-        "TITLE": html.escape(title),
-        "STYLE": style,
-        "SCENE": _json(_described(model, cameras, color)),
-        "MODEL": base64.b64encode(model.packed).decode("ascii"),
-        "SCRIPT": script,
+    """The page of ``write_scene_page`` as text, and its messages.
+
+    With ``compares`` it starts with the first of several models beside the last.
+    """
+    named = [PageModel(title, splats)] if isinstance(splats, Splats) else list(splats)
+    models = [embedded_model(one.splats) for one in named]
+    described = [
+        {"label": one.label, **described_model(model)}
+        for one, model in zip(named, models, strict=True)
+    ]
+    scene = {
+        "live": False,
+        "compares": compares and len(models) > 1,
+        "models": described,
+        **surroundings(cameras, background),
     }
-    # In one pass: what is put in may itself look like a place.
-    page = re.sub(r"@([A-Z]+)@", lambda place: values[place[1]], _part("page.html"))
-    return page, model.notes
+    return _page(scene, models, title), models[-1].notes
 
 
-def _described(
-    model: EmbeddedModel, cameras: Sequence[PageCamera], background: list[float]
-) -> dict[str, Any]:
-    """What the page's script reads beside the model."""
-    near = min(_core.NEAR_PLANE * model.unit, NEAR_PART * model.radius)
+def live_page(title: str) -> str:
+    """A page without a model, which asks the server that it comes from for all there is to show."""
+    return _page({"live": True, "models": [], **surroundings((), (0.0, 0.0, 0.0))}, [], title)
+
+
+def compared(models: Sequence[PageModel]) -> list[PageModel]:
+    """The models that a page has room for: all, or the last alone."""
+    fits = sum(len(one.splats) for one in models) <= MOST_COMPARED
+    return list(models) if fits else [models[-1]]
+
+
+def described_model(model: EmbeddedModel) -> dict[str, Any]:
+    """What the page's script reads of a model beside its bytes."""
     return {
         "count": model.count,
         "origin": model.origin.tolist(),
         "unit": model.unit,
         "radius": model.radius,
-        "near": near,
-        "up": _up(cameras),
-        "background": background,
-        "cameras": [_camera(one) for one in cameras],
+        "near": min(_core.NEAR_PLANE * model.unit, NEAR_PART * model.radius),
+    }
+
+
+def surroundings(cameras: Sequence[PageCamera], background: Sequence[float]) -> dict[str, Any]:
+    """What the page's script reads that is no model: cameras, up axis, background.
+
+    Raises:
+        IgsrError: ``background`` is not three numbers in [0, 1].
+    """
+    color = [float(channel) for channel in background]
+    if len(color) != 3 or not all(0.0 <= channel <= 1.0 for channel in color):
+        raise IgsrError("background must be three numbers in [0, 1]")
+    return {"up": _up(cameras), "background": color, "cameras": [_camera(one) for one in cameras]}
+
+
+def _page(scene: dict[str, Any], models: Sequence[EmbeddedModel], title: str) -> str:
+    script = '"use strict";\n(() => {\n' + "\n".join(map(_part, SCRIPTS)) + "})();\n"
+    style = _part("style.css")
+    fixed = {
         "constants": {
             "BLUR": _core.EPS2D,
             "ALPHA_MIN": _core.ALPHA_MIN,
@@ -146,6 +190,21 @@ def _described(
         },
         "shaders": {name: _part(file) for name, file in SHADERS.items()},
     }
+    texts = [base64.b64encode(model.packed).decode("ascii") for model in models]
+    values = {
+        "CSP": _content_security_policy(script, style, is_live=scene["live"]),
+        "VERSION": _core.__version__,
+        "TITLE": html.escape(title),
+        "STYLE": style,
+        "SCENE": _json({**scene, **fixed}),
+        "MODELS": "\n".join(
+            f'<script type="text/plain" id="model-{k}">{text}</script>'
+            for k, text in enumerate(texts)
+        ),
+        "SCRIPT": script,
+    }
+    # In one pass: what is put in may itself look like a place.
+    return re.sub(r"@([A-Z]+)@", lambda place: values[place[1]], _part("page.html"))
 
 
 def _camera(one: PageCamera) -> dict[str, Any]:
@@ -169,15 +228,19 @@ def _up(cameras: Sequence[PageCamera]) -> list[float]:
     return [float(number) for number in up]
 
 
-def _content_security_policy(script: str, style: str) -> str:
-    """Allows this script and style alone, a worker made of the script's text, and no request."""
+def _content_security_policy(script: str, style: str, *, is_live: bool) -> str:
+    """Allows this script and style alone, and a worker made of the script's text.
+
+    A live page may ask the server that it comes from; any other may ask nothing.
+    """
     hashes = {
         name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
         for name, text in (("script", script), ("style", style))
     }
+    own = "connect-src 'self'; img-src 'self' data: blob:" if is_live else "img-src data: blob:"
     return (
         f"default-src 'none'; script-src 'sha256-{hashes['script']}'; "
-        f"style-src 'sha256-{hashes['style']}'; worker-src blob:; img-src data: blob:"
+        f"style-src 'sha256-{hashes['style']}'; worker-src blob:; {own}"
     )
 
 

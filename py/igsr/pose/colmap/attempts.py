@@ -23,11 +23,7 @@ from igsr.pose.colmap.contradictions import (
 from igsr.pose.colmap.database import image_id
 from igsr.pose.colmap.evidence import DOUBTFUL, STEPS, Evidence
 from igsr.pose.colmap.mapping import extend, map_photos
-from igsr.pose.colmap.matching import (
-    matched,
-    matched_along_lines,
-    with_focal_lengths,
-)
+from igsr.pose.colmap.matching import matched_along_lines, with_focal_lengths
 from igsr.pose.estimate import Progress
 
 #: Up to this many photos, unregistered ones are tried again.
@@ -53,16 +49,16 @@ class Mapped:
     alike: int
 
 
-def mapped(count: int, features: Path, seed: int, show: Progress) -> Mapped:
-    """Match and place photos.
+def mapped(count: int, matches: Path, seed: int, show: Progress, sift: bool = True) -> Mapped:
+    """Place photos.
 
     Args:
         count: of photos.
-        features: COLMAP's database of them and their features.
+        matches: COLMAP's database of them, their features and matches; it may be changed.
         seed: random seed.
         show: called with "matching" and "mapping", how much is done, and how much there is.
+        sift: whether features are SIFT's: of these, more are matched where photos are missing.
     """
-    matches = matched(count, features, seed, show)
     strengths = {pair: len(found) for pair, found in links(matches).items()}
     all_links = len(strengths)
     hopeless = set(range(count)) - {image - image_id(0) for pair in strengths for image in pair}
@@ -77,7 +73,7 @@ def mapped(count: int, features: Path, seed: int, show: Progress) -> Mapped:
             wanted = _missing(best, count) if extending else set(range(count))
             if not wanted <= looked_for:
                 looked_for = wanted
-                more = matched_along_lines(matches, wanted, show)
+                more = matched_along_lines(matches, wanted, show) if sift else None
                 if more is not None:
                     source, database = more, with_focal_lengths(more, seed)
                 elif _differ_in_matches_alone(STEPS[step - 1], evidence):

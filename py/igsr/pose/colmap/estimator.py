@@ -15,6 +15,10 @@ from igsr.pose.colmap.attempts import mapped
 from igsr.pose.colmap.database import list_photos
 from igsr.pose.colmap.distortion import without_distortion
 from igsr.pose.colmap.features import find_features
+from igsr.pose.colmap.given_matches import matched_by
+from igsr.pose.colmap.matcher import Matcher
+from igsr.pose.colmap.matching import matched
+from igsr.pose.colmap.named_matchers import SIFT, matcher_of
 from igsr.pose.colmap.result import estimate_of
 from igsr.pose.colmap.time_estimate import camera_seconds
 from igsr.pose.estimate import Estimate, Progress
@@ -24,9 +28,20 @@ MANY = 200
 
 
 class Colmap:
-    """Finds cameras with pycolmap; see the package."""
+    """Finds cameras with pycolmap; see the package.
+
+    Args:
+        matcher: what finds and matches features: "sift" (COLMAP's), a name of ``MATCHERS``, or a
+            ``Matcher``.
+
+    Raises:
+        IgsrError: there is no such matcher, or it cannot run here.
+    """
 
     name = "colmap"
+
+    def __init__(self, matcher: str | Matcher = SIFT) -> None:
+        self._matcher = matcher_of(matcher)
 
     def __call__(
         self, photos: Sequence[Photo], *, seed: int = 0, progress: Progress | None = None
@@ -49,8 +64,12 @@ class Colmap:
             workspace = Path(folder)
             database = workspace / "database.db"
             list_photos(photos, database)
-            find_features(photos, workspace, database, show)
-            found = mapped(len(photos), database, seed, show)
+            if self._matcher is None:
+                find_features(photos, workspace, database, show)
+                matches = matched(len(photos), database, seed, show)
+            else:
+                matches = matched_by(self._matcher, photos, database, seed, show)
+            found = mapped(len(photos), matches, seed, show, sift=self._matcher is None)
             if found.model is not None:
                 found = replace(found, model=without_distortion(found.model))
         return estimate_of(photos, found)

@@ -1,50 +1,80 @@
-// Draws the splats with WebGL 2: one quad each, back to front, into half floats where it can.
+// Draws models with WebGL 2: a quad for each splat, back to front, into half floats where it can.
 
 // Texels in a row of the data textures; every WebGL 2 has as many.
 const TEXTURE_WIDTH = 2048;
 
 class Painter {
-  /** Throws an Error that says why if the browser cannot draw the model. */
-  constructor(canvas, model, scene) {
+  /** `page` has shaders, constants and the background. Throws an Error that says why it cannot draw. */
+  constructor(canvas, page) {
     this.canvas = canvas;
-    this.model = model;
-    this.scene = scene;
+    this.page = page;
     const options = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
     const gl = canvas.getContext("webgl2", options);
     if (!gl) throw new Error("this browser has no WebGL 2, or it is turned off");
     this.gl = gl;
     // Without one of these, pictures are blended in 8 bits.
     this.hasFloats = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
-    const constants = { ...scene.constants, NEAR: scene.near, DEGREE: model.degree };
-    const head = [
+    this.programs = new Map();
+    const { presentVertex, presentFragment } = page.shaders;
+    this.presents = this.program(this.head({}) + presentVertex, this.head({}) + presentFragment);
+    this.empty = gl.createVertexArray();
+    this.target = { width: 0, height: 0 };
+  }
+
+  /** Brings a model to the GPU. Throws an Error if it has no room there. */
+  load(model, scene) {
+    const gl = this.gl;
+    const head = this.head({ NEAR: scene.near, DEGREE: model.degree });
+    const { harmonics, splatVertex, splatFragment } = this.page.shaders;
+    const layer = {
+      scene,
+      antialiased: model.antialiased,
+      splats: this.program(head + harmonics + splatVertex, head + splatFragment),
+      splatTexture: this.dataTexture(model.texels),
+      harmonicTexture: this.dataTexture(model.harmonics),
+      order: gl.createBuffer(),
+      array: gl.createVertexArray(),
+      drawn: 0,
+    };
+    gl.bindVertexArray(layer.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, layer.order);
+    const index = gl.getAttribLocation(layer.splats.program, "index");
+    gl.enableVertexAttribArray(index);
+    gl.vertexAttribIPointer(index, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(index, 1);
+    gl.bindVertexArray(null);
+    return layer;
+  }
+
+  /** Takes a model off the GPU. */
+  unload(layer) {
+    const gl = this.gl;
+    gl.deleteTexture(layer.splatTexture);
+    gl.deleteTexture(layer.harmonicTexture);
+    gl.deleteBuffer(layer.order);
+    gl.deleteVertexArray(layer.array);
+  }
+
+  /** The first lines of a shader. */
+  head(more) {
+    const constants = { ...this.page.constants, ...more };
+    return [
       "#version 300 es",
       "precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;",
       ...Object.entries(constants).map(([name, value]) => `#define ${name} ${glslNumber(name, value)}`),
       `#define TEXTURE_WIDTH ${TEXTURE_WIDTH}u`,
       "",
     ].join("\n");
-    const shaders = scene.shaders;
-    this.splats = this.program(head + shaders.harmonics + shaders.splatVertex, head + shaders.splatFragment);
-    this.presents = this.program(head + shaders.presentVertex, head + shaders.presentFragment);
-    this.splatTexture = this.dataTexture(model.texels);
-    this.harmonicTexture = this.dataTexture(model.harmonics);
-    // The GPU has them now.
-    model.texels = model.harmonics = null;
-    this.order = gl.createBuffer();
-    this.drawn = 0;
-    this.array = gl.createVertexArray();
-    gl.bindVertexArray(this.array);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    const index = gl.getAttribLocation(this.splats.program, "index");
-    gl.enableVertexAttribArray(index);
-    gl.vertexAttribIPointer(index, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(index, 1);
-    gl.bindVertexArray(null);
-    this.empty = gl.createVertexArray();
-    this.target = { width: 0, height: 0 };
   }
 
+  /** A program of two shaders; one that was made before is used again. */
   program(vertex, fragment) {
+    const key = vertex + fragment;
+    if (!this.programs.has(key)) this.programs.set(key, this.made(vertex, fragment));
+    return this.programs.get(key);
+  }
+
+  made(vertex, fragment) {
     const gl = this.gl;
     const program = gl.createProgram();
     for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -52,6 +82,8 @@ class Painter {
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
+      // It goes with the program.
+      gl.deleteShader(shader);
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
         throw new Error(`a shader does not compile: ${gl.getShaderInfoLog(shader)}`);
       }
@@ -90,11 +122,11 @@ class Painter {
   }
 
   /** Takes the indices of the splats to draw, farthest first. */
-  setOrder(order) {
+  setOrder(layer, order) {
     const gl = this.gl;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.bindBuffer(gl.ARRAY_BUFFER, layer.order);
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
-    this.drawn = order.length;
+    layer.drawn = order.length;
   }
 
   /** Where splats are blended, as large as the canvas. */
@@ -121,8 +153,8 @@ class Painter {
     }
   }
 
-  /** Blends the splats as a viewpoint and a lens of the canvas's size see them. */
-  blend(view, lens, showsDepth) {
+  /** Blends a model as a viewpoint and a lens of the canvas's size see it. */
+  blend(layer, view, lens, showsDepth) {
     const gl = this.gl;
     this.resize();
     const { width, height } = this.target;
@@ -130,7 +162,7 @@ class Painter {
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    const { program, uniforms } = this.splats;
+    const { program, uniforms } = layer.splats;
     gl.useProgram(program);
     // The file's y and z point the other way. Matrices go column by column.
     const axes = [view.right, view.down, view.forward];
@@ -138,62 +170,67 @@ class Painter {
     gl.uniform3fv(uniforms.translation, view.translation);
     gl.uniform4f(uniforms.lens, lens.fx, lens.fy, lens.cx, lens.cy);
     gl.uniform2f(uniforms.size, width, height);
-    const margin = 0.5 * this.scene.constants.JACOBIAN_MARGIN;
+    const margin = 0.5 * this.page.constants.JACOBIAN_MARGIN;
     const [mx, my] = [margin * width, margin * height];
     gl.uniform4f(uniforms.limits, -(lens.cx + mx) / lens.fx, (width - lens.cx + mx) / lens.fx,
       -(lens.cy + my) / lens.fy, (height - lens.cy + my) / lens.fy);
-    gl.uniform1i(uniforms.antialiased, this.model.antialiased ? 1 : 0);
+    gl.uniform1i(uniforms.antialiased, layer.antialiased ? 1 : 0);
     gl.uniform1i(uniforms.showsDepth, showsDepth ? 1 : 0);
-    gl.uniform1f(uniforms.depthUnit, this.depthUnit(view));
+    gl.uniform1f(uniforms.depthUnit, this.depthUnit(layer, view));
     gl.uniform1i(uniforms.splats, 0);
     gl.uniform1i(uniforms.harmonics, 1);
     gl.activeTexture(gl.TEXTURE1);
-    gl.bindTexture(gl.TEXTURE_2D, this.harmonicTexture);
+    gl.bindTexture(gl.TEXTURE_2D, layer.harmonicTexture);
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.splatTexture);
+    gl.bindTexture(gl.TEXTURE_2D, layer.splatTexture);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.bindVertexArray(this.array);
-    if (this.drawn > 0) gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.drawn);
+    gl.bindVertexArray(layer.array);
+    if (layer.drawn > 0) gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, layer.drawn);
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
   }
 
-  depthUnit(view) {
-    return Math.max(1e-6, Math.hypot(...view.position) + this.scene.radius);
+  depthUnit(layer, view) {
+    return Math.max(1e-6, Math.hypot(...view.position) + layer.scene.radius);
   }
 
-  /** Draws the picture on the canvas. */
-  draw(view, lens, showsDepth) {
+  /** Draws a model on the canvas, between two parts of its width, 0 and 1 for all of it. */
+  draw(layer, view, lens, showsDepth, from = 0, to = 1) {
     const gl = this.gl;
-    this.blend(view, lens, showsDepth);
+    const [left, right] = [from, to].map((part) => Math.round(part * this.canvas.width));
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(left, 0, right - left, this.canvas.height);
+    this.blend(layer, view, lens, showsDepth);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, this.target.width, this.target.height);
     const { program, uniforms } = this.presents;
     gl.useProgram(program);
     gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
     gl.uniform1i(uniforms.picture, 0);
-    gl.uniform3fv(uniforms.background, this.scene.background);
+    gl.uniform3fv(uniforms.background, this.page.background);
     gl.uniform1i(uniforms.showsDepth, showsDepth ? 1 : 0);
-    const unit = this.depthUnit(view);
+    const unit = this.depthUnit(layer, view);
     const middle = -dot(view.forward, view.position);
-    const near = Math.max(this.scene.near, middle - 1.25 * this.scene.radius);
-    const far = Math.max(2 * near, middle + 1.25 * this.scene.radius);
+    const { near: nearest, radius } = layer.scene;
+    const near = Math.max(nearest, middle - 1.25 * radius);
+    const far = Math.max(2 * near, middle + 1.25 * radius);
     gl.uniform2f(uniforms.depthRange, near / unit, far / unit);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
+    gl.disable(gl.SCISSOR_TEST);
   }
 
   /** The expected depth at a pixel of the canvas, counted from the top; null where there is nothing. */
-  depthAt(view, lens, x, y) {
+  depthAt(layer, view, lens, x, y) {
     const gl = this.gl;
-    this.blend(view, lens, true);
+    this.blend(layer, view, lens, true);
     const row = this.target.height - 1 - y;
     const out = this.hasFloats ? new Float32Array(4) : new Uint8Array(4);
     gl.readPixels(x, row, 1, 1, gl.RGBA, this.hasFloats ? gl.FLOAT : gl.UNSIGNED_BYTE, out);
     const alpha = out[3] / (this.hasFloats ? 1 : 255);
-    return alpha < 0.1 ? null : (out[0] / out[3]) * this.depthUnit(view);
+    return alpha < 0.1 ? null : (out[0] / out[3]) * this.depthUnit(layer, view);
   }
 
   /** RGBA of the canvas, the lowest row first. Only right after `draw`. */

@@ -55,7 +55,8 @@ class Sorter {
         postMessage(order, [order.buffer]);
       };`;
     try {
-      this.worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
+      this.address = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
+      this.worker = new Worker(this.address);
       this.worker.onmessage = ({ data }) => this.finish(data);
       this.worker.onerror = () => this.withoutWorker();
       this.worker.postMessage({ positions });
@@ -71,6 +72,13 @@ class Sorter {
     this.last = key;
     this.waiting = { axis, offset, near };
     if (!this.busy) this.start();
+  }
+
+  /** Ends the worker; nothing is sorted after this. */
+  stop() {
+    this.worker?.terminate();
+    URL.revokeObjectURL(this.address);
+    this.onOrder = () => {};
   }
 
   get settled() {

@@ -6,36 +6,82 @@ const FOV = (50 * Math.PI) / 180;
 const PIXEL_RATIO_MAX = 2;
 
 class Viewer {
-  constructor(canvas, model, scene) {
-    Object.assign(this, { canvas, scene, up: scene.up, flies: false, showsDepth: false });
+  /** `page` has shaders, constants, the background, cameras and the up axis. */
+  constructor(canvas, page) {
+    Object.assign(this, { canvas, page, flies: false, showsDepth: false });
     this.camera = -1;
     this.fixedSize = null;
     this.frame = 0;
     this.waiters = [];
     this.onChange = () => {};
-    this.painter = new Painter(canvas, model, scene);
-    this.sorter = new Sorter(model.positions, (order) => {
-      this.painter.setOrder(order);
+    this.painter = new Painter(canvas, page);
+    // What is shown right of the divider, or everywhere; and left of it.
+    this.main = this.other = null;
+    this.divider = 0.5;
+    window.addEventListener("resize", () => this.changed());
+  }
+
+  /** The page and the model that is shown. */
+  get scene() {
+    return { ...this.page, ...this.main.scene };
+  }
+
+  get up() {
+    return this.page.up;
+  }
+
+  /** Makes a model ready to be shown. */
+  load(model, scene) {
+    const shown = { scene, layer: this.painter.load(model, scene) };
+    shown.sorter = new Sorter(model.positions, (order) => {
+      this.painter.setOrder(shown.layer, order);
       this.redraw();
     });
-    window.addEventListener("resize", () => this.redraw());
-    if (scene.cameras.length > 0) this.jump(0);
-    else this.frameScene();
-    this.gestures = new Gestures(this);
+    return shown;
+  }
+
+  unload(shown) {
+    shown.sorter.stop();
+    this.painter.unload(shown.layer);
+  }
+
+  /** Shows a model, and left of the divider another, if there is one. The view stays. */
+  show(main, other = null) {
+    const before = this.main;
+    [this.main, this.other] = [main, other];
+    if (before) this.viewpoint = this.viewpoint.between(before.scene, main.scene);
+    else this.start();
+    this.changed();
+  }
+
+  start() {
+    this.frameScene();
+    if (this.page.cameras.length > 0) this.jump(0);
+    this.gestures ||= new Gestures(this);
+  }
+
+  /** Takes other cameras, background and up axis. The view stays, unless nobody has chosen one yet. */
+  surround({ cameras, background, up }) {
+    const before = this.page.cameras;
+    const name = before[this.camera]?.name;
+    Object.assign(this.page, { cameras, background, up });
+    this.camera = cameras.findIndex((one) => one.name === name);
+    if (this.main && before.length === 0 && !this.wasMoved) this.start();
+    this.changed();
   }
 
   /** Goes to the camera of a photo, by its number; beyond the last follows the first. */
   jump(number) {
-    const count = this.scene.cameras.length;
+    const count = this.page.cameras.length;
     if (count === 0) return;
     this.camera = ((number % count) + count) % count;
-    const { rows, lens } = this.scene.cameras[this.camera];
+    const { rows, lens } = this.page.cameras[this.camera];
     this.look(rows, lens);
   }
 
   /** Takes a world-to-camera matrix, 3 rows of 4, and fx, fy, cx, cy, width, height in pixels. */
   look(rows, [fx, fy, cx, cy, width, height]) {
-    const { origin, unit, radius } = this.scene;
+    const { origin, unit, radius } = this.main.scene;
     // The model's numbers are relative to an origin, and may be in another unit.
     const moved = rows.slice();
     for (let i = 0; i < 3; i++) {
@@ -48,7 +94,7 @@ class Viewer {
 
   /** Shows the whole scene, from a little above. */
   frameScene() {
-    const { radius } = this.scene;
+    const { radius } = this.main.scene;
     const [width, height] = this.size();
     // The narrower side decides.
     const focal = Math.min(width, height) / 2 / Math.tan(FOV / 2);
@@ -60,6 +106,7 @@ class Viewer {
 
   /** The viewpoint was moved by hand. */
   moved() {
+    this.wasMoved = true;
     this.camera = -1;
     this.changed();
   }
@@ -70,7 +117,7 @@ class Viewer {
   }
 
   redraw() {
-    this.frame ||= requestAnimationFrame((now) => this.drawFrame(now));
+    if (this.main) this.frame ||= requestAnimationFrame((now) => this.drawFrame(now));
   }
 
   size() {
@@ -84,18 +131,30 @@ class Viewer {
     const moving = this.gestures.step(now);
     this.draw();
     if (moving) this.moved();
-    if (!this.frame && this.sorter.settled) for (const done of this.waiters.splice(0)) done();
+    if (!this.frame && this.isSettled) for (const done of this.waiters.splice(0)) done();
   }
 
   draw() {
     const [width, height] = this.size();
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
-    const { forward, translation } = this.viewpoint;
+    const lens = fittedLens(this.lens, width, height);
+    if (this.other) {
+      this.drawPart(this.other, this.viewpoint.between(this.main.scene, this.other.scene), lens, 0, this.divider);
+    }
+    this.drawPart(this.main, this.viewpoint, lens, this.other ? this.divider : 0, 1);
+  }
+
+  drawPart({ layer, sorter, scene }, viewpoint, lens, from, to) {
+    const { forward, translation } = viewpoint;
     // As in the painter: the file's y and z point the other way.
     const axis = [forward[0], -forward[1], -forward[2]];
-    this.sorter.request(axis, translation[2], this.scene.near);
-    this.painter.draw(this.viewpoint, fittedLens(this.lens, width, height), this.showsDepth);
+    sorter.request(axis, translation[2], scene.near);
+    this.painter.draw(layer, viewpoint, lens, this.showsDepth, from, to);
+  }
+
+  get isSettled() {
+    return [this.main, this.other].every((shown) => !shown || shown.sorter.settled);
   }
 
   /** World units at the pivot for each pixel of the page. */
@@ -111,7 +170,7 @@ class Viewer {
     const lens = fittedLens(this.lens, width, height);
     const x = Math.min(width - 1, Math.floor((clientX / this.canvas.clientWidth) * width));
     const y = Math.min(height - 1, Math.floor((clientY / this.canvas.clientHeight) * height));
-    const depth = this.painter.depthAt(this.viewpoint, lens, x, y);
+    const depth = this.painter.depthAt(this.main.layer, this.viewpoint, lens, x, y);
     if (depth !== null) {
       const { right, down, forward, position } = this.viewpoint;
       const across = plus(times(right, (x + 0.5 - lens.cx) / lens.fx), down, (y + 0.5 - lens.cy) / lens.fy);

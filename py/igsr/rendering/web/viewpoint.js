@@ -56,6 +56,13 @@ class Viewpoint {
     return new Viewpoint(position, right, down, forward, Math.max(ahead, 0.1 * radius));
   }
 
+  /** The same view in another model's numbers: each is relative to its origin, in its unit. */
+  between(from, to) {
+    const world = plus(times(this.position, 1 / from.unit), from.origin);
+    const position = times(plus(world, to.origin, -1), to.unit);
+    return new Viewpoint(position, this.right, this.down, this.forward, (this.distance * to.unit) / from.unit);
+  }
+
   get pivot() {
     return plus(this.position, this.forward, this.distance);
   }

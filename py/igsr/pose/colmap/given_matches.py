@@ -1,0 +1,117 @@
+"""A matcher's features and matches in COLMAP's database, verified there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from igsr.capture.photo_folder import Photo
+from igsr.errors import IgsrError
+from igsr.pose.colmap.database import image_id, photo_file
+from igsr.pose.colmap.matcher import Matcher, PhotoFeatures
+from igsr.pose.colmap.pairs import EXHAUSTIVE
+from igsr.pose.estimate import Progress
+
+#: Matches of a pair that verification needs at least (COLMAP's number of inliers).
+FEWEST = 15
+
+
+def matched_by(
+    matcher: Matcher, photos: Sequence[Photo], database: Path, seed: int, show: Progress
+) -> Path:
+    """Put a matcher's features and matches of all pairs into a database, and verify them.
+
+    Args:
+        matcher: finds them.
+        photos: those of the database.
+        database: of the photos, without features; it is changed.
+        seed: of the search for the geometry of pairs.
+        show: called with "features" and "matching", how much is done, and how much there is.
+
+    Returns:
+        The database.
+
+    Raises:
+        IgsrError: there are too many photos to compare all, or the matcher's arrays cannot be used.
+    """
+    import pycolmap
+
+    count = len(photos)
+    if count > EXHAUSTIVE:
+        raise IgsrError(
+            f"matcher {matcher.name} compares every pair of photos: give at most {EXHAUSTIVE} of "
+            f"the {count} photos, or use matcher sift"
+        )
+    found = []
+    for index, photo in enumerate(photos):
+        show("features", index, count)
+        found.append(_features(matcher, photo, database.with_name(photo_file(index))))
+    show("features", count, count)
+    pairs = [(a, b) for a in range(count) for b in range(a + 1, count)]
+    listing = database.with_name("pairs.txt")
+    listed = []
+    with pycolmap.Database.open(database) as opened:
+        for index, one in enumerate(found):
+            opened.write_keypoints(image_id(index), one.xy)
+        for done, (a, b) in enumerate(pairs):
+            show("matching", done, len(pairs))
+            matches = _matches(matcher, found[a], found[b])
+            if len(matches) >= FEWEST:
+                opened.write_matches(image_id(a), image_id(b), matches)
+                listed.append(f"{photo_file(a)} {photo_file(b)}\n")
+    show("matching", len(pairs), len(pairs))
+    listing.write_text("".join(listed))
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    if listed:
+        pycolmap.verify_matches(database, listing, verification)
+    return database
+
+
+def _features(matcher: Matcher, photo: Photo, file: Path) -> PhotoFeatures:
+    """The features of a photo's usable pixels; the file is written and removed."""
+    Image.fromarray(np.ascontiguousarray(photo.image[..., :3])).save(file, compress_level=1)
+    try:
+        found = matcher.features(file)
+    finally:
+        file.unlink()
+    xy = np.asarray(found.xy, dtype=np.float32)
+    height, width = photo.image.shape[:2]
+    if xy.ndim != 2 or xy.shape[1] != 2 or len(found.descriptors) != len(xy):
+        raise IgsrError(
+            f"matcher {matcher.name}: features of {photo.name} must be xy [N, 2] with a descriptor "
+            f"each, not {xy.shape} and {len(found.descriptors)}"
+        )
+    inside = np.isfinite(xy).all(axis=1) & (xy >= 0.0).all(axis=1)
+    inside &= (xy[:, 0] < width) & (xy[:, 1] < height)
+    column, row = np.where(inside[:, None], xy, 0.0).astype(np.int64).T
+    usable = np.ones((height, width), np.bool_) if photo.mask is None else photo.mask
+    if photo.image.shape[2] == 4:
+        usable = usable & (photo.image[..., 3] > 0)
+    return PhotoFeatures(xy, found.descriptors, found.size).kept(inside & usable[row, column])
+
+
+def _matches(
+    matcher: Matcher, first: PhotoFeatures, second: PhotoFeatures
+) -> npt.NDArray[np.uint32]:
+    """The matches of two photos, checked: COLMAP would read beyond its arrays."""
+    if not len(first.xy) or not len(second.xy):
+        return np.zeros((0, 2), dtype=np.uint32)
+    matches = np.asarray(matcher.matches(first, second))
+    if (
+        matches.ndim != 2
+        or matches.shape[1] != 2
+        or not np.issubdtype(matches.dtype, np.integer)
+        or (matches < 0).any()
+        or (matches >= [len(first.xy), len(second.xy)]).any()
+        or any(len(np.unique(side)) < len(side) for side in matches.T)
+    ):
+        raise IgsrError(
+            f"matcher {matcher.name}: matches must be whole numbers [M, 2], each an index of a "
+            "feature, none twice"
+        )
+    return matches.astype(np.uint32)

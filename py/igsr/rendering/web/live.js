@@ -1,0 +1,108 @@
+// Follows the server of `igsr view --web`: what there is to show, asked for once a second.
+
+const ASK_EVERY = 1000; // milliseconds
+const NARROW = 700; // pixels
+
+/** Models that the server has. Its addresses are relative to the page's, which has the token. */
+class LiveModels {
+  constructor() {
+    this.subject = "The model";
+    this.entries = [];
+    this.newest = undefined;
+  }
+
+  async read({ id, version }, progress) {
+    const query = new URLSearchParams({ id, version });
+    const answer = await fetch(`model?${query}`);
+    if (!answer.ok) throw new Error(await answer.text());
+    const bytes = new Uint8Array(await answer.arrayBuffer());
+    progress(1);
+    // The length of a JSON text, the text, and the packed model.
+    const end = 4 + new DataView(bytes.buffer).getUint32(0, true);
+    const scene = JSON.parse(new TextDecoder().decode(bytes.subarray(4, end)));
+    return { scene, packed: bytes.subarray(end) };
+  }
+}
+
+async function askServer(path) {
+  const answer = await fetch(path);
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer.json();
+}
+
+/** Shows what the server has, again and again; resolves after the first time. */
+async function follow(viewer, models, source, panel) {
+  const status = new Status();
+  let [surroundings, showing, problem] = ["", "", ""];
+  const bring = async () => {
+    problem = "";
+    if (!viewer.main && models.mainEntry) say(LOADING);
+    try {
+      await models.refresh();
+    } catch (error) {
+      // A damaged file, or one that has just been replaced: what is shown stays.
+      problem = error.message;
+      // Where the connection broke, the same is asked for again.
+      if (error.cause instanceof TypeError) showing = "";
+    }
+  };
+  const step = async () => {
+    const state = await askServer("state");
+    status.show(state);
+    if (state.surroundings !== surroundings) {
+      viewer.surround(await askServer("surroundings"));
+      surroundings = state.surroundings;
+    }
+    Object.assign(source, { entries: state.models, newest: state.newest });
+    const wanted = JSON.stringify([models.mainEntry, models.otherEntry]);
+    if (wanted !== showing) {
+      showing = wanted;
+      await bring();
+    }
+    panel.update();
+    if (viewer.main) panel.show();
+    say(problem || (viewer.main ? "" : "There is no model yet; it is shown as soon as there is one."));
+  };
+  const again = async () => {
+    try {
+      // A page that nobody sees need not know.
+      if (!document.hidden) await step();
+    } catch (error) {
+      status.lost(error instanceof TypeError ? "igsr view does not answer; the page asks again." : error.message);
+    }
+    setTimeout(again, ASK_EVERY);
+  };
+  await again();
+}
+
+/** What is said of a run: how far it is, and its scores. */
+class Status {
+  constructor() {
+    this.box = document.getElementById("status");
+    // There it would hide the scene.
+    this.box.open = window.innerWidth >= NARROW;
+  }
+
+  lost(message) {
+    this.box.hidden = false;
+    document.getElementById("run").textContent = message;
+  }
+
+  show({ title, run, scores }) {
+    document.title = title;
+    document.getElementById("title").textContent = title;
+    const text = document.getElementById("run");
+    const done = document.getElementById("done");
+    text.textContent = run ? run.text : "";
+    done.hidden = !run;
+    if (run) done.value = run.done;
+    const table = document.getElementById("scores");
+    const line = (tag, cells) => {
+      const row = document.createElement("tr");
+      row.append(...cells.map((cell) => Object.assign(document.createElement(tag), { textContent: cell })));
+      return row;
+    };
+    table.replaceChildren(...(scores.rows.length > 0 ? [line("th", scores.head), ...scores.rows.map((row) => line("td", row))] : []));
+    this.box.hidden = false;
+  }
+}

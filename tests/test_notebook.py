@@ -1,0 +1,44 @@
+"""Notebooks that are run as Jupyter runs them: the viewer that a cell returns opens."""
+
+from __future__ import annotations
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from scene_pages import model
+
+SPLATS = """
+import igsr
+splats = igsr.Splats.load("scene.ply")
+splats.show()
+"""
+REFINED = """
+from igsr.refinement.results import Refined, Round
+capture = igsr.Capture("photos", [])
+done = Round([], [], {}, {}, True, splats, None)
+Refined(splats, splats, None, capture, [done], None, [], {}).show(height=300)
+"""
+#: The page in a notebook is a frame; this waits for it.
+WAIT = """<script>window.igsr = { ready: new Promise((resolve) => addEventListener("load", () =>
+    frames[0].igsr.ready.then(resolve))) }</script>"""
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("notebook")
+    model().save(folder / "scene.ply")
+    notebook = nbformat.v4.new_notebook()
+    notebook.cells = [nbformat.v4.new_code_cell(cell) for cell in (SPLATS, REFINED)]
+    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(folder)}}).execute()
+    return [cell.outputs[0]["data"]["text/html"] for cell in notebook.cells]
+
+
+@pytest.mark.parametrize(("cell", "labels"), [(0, ["scene"]), (1, ["first fit", "round 1"])])
+def test_a_cell_shows_the_viewer(browser, tmp_path, outputs, cell, labels):
+    (tmp_path / "book.html").write_text(WAIT + outputs[cell], encoding="utf-8")
+    browser.open(tmp_path / "book.html")
+    assert browser.problems == []
+    assert browser.run("frames[0].igsr.error") is None
+    found = browser.run("frames[0].igsr.models.source.entries.map(({ label }) => label)")
+    assert found == labels
+    assert browser.run("frames[0].igsr.viewer.main.scene.count") == 400

@@ -1,0 +1,394 @@
+"""The server of ``igsr view --web``: who is answered, what is found, and what it survives."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+import urllib.request
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import scenes
+from PIL import Image
+from scene_pages import model
+from web_views import asked, served, state_of, with_token
+
+import igsr
+from igsr.capture.write_cameras import write_cameras
+from igsr.fitting.followed_run import FollowedRun
+from igsr.viewing import run_news, shown
+from igsr.viewing.run_news import run_background, run_progress, run_scores
+from igsr.viewing.server import is_own, open_server
+
+SECRET = b"nobody but the owner reads this"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "scene.ply"
+    model().save(path)
+    return path
+
+
+# ---- who is answered -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["", "state", "surroundings", "model?id=scene", "photo?number=0"])
+def test_without_the_token_nothing_is_answered(scene, name):
+    with served(scene) as server:
+        right = server.token
+        for wrong in (
+            "",
+            right[:-1],
+            right + "x",
+            right.swapcase(),
+            "é",
+            "%00",
+            "/[",
+            f"x/../{right}",
+        ):
+            status, content = asked(server, f"/{wrong}/{name}")
+            assert status == 403
+            assert right.encode() not in content
+        assert asked(server, f"/{name}")[0] == 403
+    with served(scene) as another:
+        assert another.token != right
+        assert asked(another, f"/{right}/{name}")[0] == 403
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../secret.txt",
+        "..%2fsecret.txt",
+        "%2e%2e/secret.txt",
+        "secret.txt",
+        "//secret.txt",
+        "./secret.txt",
+        "model?id=../secret.txt",
+        "model?id=secret.txt",
+        "model?id=%00",
+        "model",
+        "photo?number=../secret.txt",
+        "photo?number=-1",
+        "photo?number=99",
+        "photo",
+        "static/../secret.txt",
+    ],
+)
+def test_names_are_no_paths(tmp_path, scene, name):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "scene.ply").write_bytes(scene.read_bytes())
+    for place in (folder, tmp_path):
+        (place / "secret.txt").write_bytes(SECRET)
+    with served(folder) as server:
+        status, content = with_token(server, name)
+        assert status == 404
+        assert SECRET not in content
+
+
+def test_photos_outside_of_the_folder_are_not_shown(tmp_path):
+    made = scenes.capture(views=4, size=8)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name in ("folder/in.png", "out.png", "folder/scene.txt"):
+        Image.fromarray(made.views[0].image).save(tmp_path / name, format="PNG")
+    (folder / "link.png").symlink_to(tmp_path / "out.png")
+    names = ["../out.png", str(tmp_path / "out.png"), "link.png", "in.png", "scene.txt", "no.png"]
+    views = [igsr.View(name, made.views[0].camera, "train", made.views[0].image) for name in names]
+    write_cameras(folder / "cameras.json", views)
+    model().save(folder / "scene.ply")
+    with served(folder) as server:
+        cameras = json.loads(with_token(server, "surroundings")[1])["cameras"]
+        assert {one["name"] for one in cameras if "photo" in one} == {"in.png"}
+        status, content = with_token(server, cameras[0]["photo"])
+        assert status == 200
+        assert content.startswith(b"\xff\xd8")
+        assert with_token(server, "photo?number=1")[0] == 404
+
+
+def test_a_photo_that_is_damaged_is_said(tmp_path):
+    made = scenes.capture(views=1, size=8)
+    (tmp_path / "in.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
+    view = igsr.View("in.png", made.views[0].camera, "train", made.views[0].image)
+    write_cameras(tmp_path / "cameras.json", [view])
+    with served(tmp_path) as server:
+        status, content = with_token(server, "photo?number=0")
+        assert status == 422
+        assert b"in.png cannot be shown" in content
+
+
+# ---- what it survives ----------------------------------------------------------------------------
+
+
+def test_a_hundred_requests_at_once_pack_a_model_once(scene, monkeypatch):
+    packed = []
+
+    def pack(found):
+        packed.append(found)
+        time.sleep(0.2)
+        return b"x" * 3_000_000
+
+    monkeypatch.setattr(shown, "_packed", pack)
+    with served(scene) as server, ThreadPoolExecutor(100) as pool:
+        answers = list(pool.map(lambda _: with_token(server, "model?id=scene"), range(100)))
+    assert {(status, len(content)) for status, content in answers} == {(200, 3_000_000)}
+    assert len(packed) == 1
+
+
+def test_browsers_that_leave_and_say_nothing_are_survived(scene, monkeypatch, caplog):
+    monkeypatch.setattr(shown, "_packed", lambda found: b"x" * 20_000_000)
+    with served(scene) as server:
+        silent = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(20)]
+        for one in silent:
+            one.sendall(b"GET /")
+        for _ in range(20):
+            leaving = socket.create_connection(("127.0.0.1", server.server_port))
+            leaving.sendall(f"GET /{server.token}/model?id=scene HTTP/1.0\r\n\r\n".encode())
+            leaving.recv(1000)
+            # It goes without a word.
+            leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            leaving.close()
+        assert state_of(server)["newest"] == "scene"
+        for one in silent:
+            one.close()
+    assert caplog.records == []
+
+
+def test_a_port_that_is_taken_is_said(scene):
+    with served(scene) as server:
+        taken = server.server_port
+        with pytest.raises(igsr.IgsrError, match=f"port {taken} .*--port"):
+            open_server(server.shown, "127.0.0.1", taken)
+        with pytest.raises(igsr.IgsrError, match=r"Cannot listen at 192\.0\.2\.1"):
+            open_server(server.shown, "192.0.2.1", 0)
+
+
+def test_addresses_that_other_computers_reach_are_told():
+    assert all(map(is_own, ["127.0.0.1", "127.1.2.3", "::1", "localhost"]))
+    assert not any(map(is_own, ["0.0.0.0", "::", "192.168.1.2", "box", ""]))
+
+
+# ---- what is found -------------------------------------------------------------------------------
+
+
+def test_a_fit_and_its_checkpoint(tmp_path):
+    made = scenes.capture(views=5, size=24)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    with served(folder) as server:
+        assert state_of(server)["models"] == []
+        seen = []
+
+        def look(now):
+            followed.tell(f"step {now.step}", 0.5)
+            if not seen:
+                seen.append(state_of(server))
+
+        followed = FollowedRun(folder)
+        followed.tell("find cameras", 0.0)
+        assert state_of(server)["run"] == {"text": "find cameras", "done": 0.0}
+        followed.show(made, (1.0, 0.5, 0.0))
+        fitted = igsr.fit(
+            made, 6, look, "cpu", remove_floaters=False, checkpoint=folder / "checkpoint.npz"
+        )
+        assert seen[0]["run"] == {"text": "step 1", "done": 0.5}
+        state = state_of(server)
+        assert [one["label"] for one in state["models"]] == ["being fitted"]
+        found = shown.found_models(folder)[0].load()
+        assert found.means.tobytes() == fitted.means.tobytes()
+        around = json.loads(with_token(server, "surroundings")[1])
+        assert around["background"] == [1.0, 0.5, 0.0]
+        assert [one["name"] for one in around["cameras"]] == [
+            "held-out/photos/00.jpg",
+            "held-out/photos/04.jpg",
+        ]
+        status, photo = with_token(server, around["cameras"][1]["photo"])
+        assert status == 200
+        (tmp_path / "photo.jpg").write_bytes(photo)
+        pixels = np.asarray(Image.open(tmp_path / "photo.jpg")).astype(int)
+        assert np.abs(pixels - made.views[4].image).mean() < 12
+        fitted.save(folder / "scene.ply")
+        followed.close()
+        state = state_of(server)
+        assert [one["label"] for one in state["models"]] == ["scene"]
+        assert state["run"] is None
+
+
+def test_a_scene_that_lay_there_before_says_so(tmp_path):
+    model().save(tmp_path / "scene.ply")
+    os.utime(tmp_path / "scene.ply", (1e9, 1e9))
+    followed = FollowedRun(tmp_path)
+    followed.show(scenes.capture(views=2, size=8), (0.0, 0.0, 0.0))
+    followed.tell("begins", 0.0)
+    (tmp_path / "checkpoint.npz").write_bytes(b"damaged")
+    with served(tmp_path) as server:
+        state = state_of(server)
+        assert [one["label"] for one in state["models"]] == [
+            "scene of an earlier run",
+            "being fitted",
+        ]
+        status, content = with_token(server, "model?id=checkpoint")
+        assert status == 422
+        assert b"checkpoint.npz" in content
+
+
+def test_a_refinement_has_rounds_and_their_scores(tmp_path):
+    for number in (0, 1, 10):
+        model(0).save(tmp_path / "rounds" / str(number) / "scene.ply")
+    (tmp_path / "rounds" / "x").mkdir()
+    rounds = [
+        {"splats": 400, "test": {"psnr": 20.0}, "accepted": True},
+        {
+            "splats": None,
+            "test": None,
+            "accepted": False,
+            "cross_validation": {"before": {"psnr": 21.0}, "after": {"psnr": 20.5}},
+        },
+    ]
+    (tmp_path / "report.json").write_text(json.dumps({"rounds": rounds}))
+    checkpoint = tmp_path / "checkpoints" / "whole-round2.npz"
+    checkpoint.parent.mkdir()
+    checkpoint.write_bytes(b"")
+    (tmp_path / "checkpoints" / "fold0.npz").write_bytes(b"")
+    with served(tmp_path) as server:
+        state = state_of(server)
+        assert [one["id"] for one in state["models"]] == [
+            "round-0",
+            "round-1",
+            "round-10",
+            "checkpoint",
+        ]
+        assert [one["label"] for one in state["models"]] == [
+            "first fit, 20.00 dB",
+            "round 1",
+            "round 10",
+            "round 2, being fitted",
+        ]
+        assert state["scores"]["rows"] == [
+            ["first fit", "20.00", "–", "400"],
+            ["round 1: rolled back", "–", "21.00 → 20.50", "–"],
+        ]
+        os.utime(checkpoint, (1e9, 1e9))
+        assert state_of(server)["newest"] == "round-10"
+
+
+def test_two_paths_are_told_apart(tmp_path, scene):
+    model(0).save(tmp_path / "other.spz")
+    with served(scene, tmp_path / "other.spz") as server:
+        models = state_of(server)["models"]
+        assert [one["label"] for one in models] == ["scene.ply", "other.spz"]
+        first, second = (with_token(server, f"model?id={one['id']}")[1] for one in models)
+        assert first != second
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{",
+        '{"rounds": [3, null, {"test": [], "cross_validation": {"before": 1}}]}',
+        '{"rounds": {}, "psnr": "high", "protocol": 7, "train": []}',
+        '{"psnr": NaN, "text": 3, "done": 1, "background": [1, 2]}',
+        '{"psnr": 1' + 400 * "0" + ', "text": "x", "done": 1e999, "background": [1, 2, "3"]}',
+        "[" * 100_000,
+    ],
+)
+def test_files_of_a_run_are_untrusted(tmp_path, text):
+    (tmp_path / "view").mkdir()
+    for name in ("report.json", "view/progress.json", "view/run.json", "view/cameras.json"):
+        (tmp_path / name).write_text(text)
+    with served(tmp_path) as server:
+        state = state_of(server)
+        assert state["run"] is None
+        assert with_token(server, "surroundings")[0] == 200
+    assert run_background(tmp_path) is None
+
+
+def test_a_run_that_is_silent_is_said(tmp_path, monkeypatch):
+    folder = tmp_path / "view"
+    folder.mkdir()
+    (folder / "progress.json").write_text('{"text": "fit", "done": 7}')
+    assert run_progress(tmp_path) == {"text": "fit", "done": 1.0}
+    os.utime(folder / "progress.json", (time.time() - 300, time.time() - 300))
+    assert "no news for 5 min" in run_progress(tmp_path)["text"]
+    (tmp_path / "report.json").write_text('{"psnr": 20, "ssim": 0.5, "protocol": {}}')
+    assert run_scores(tmp_path).rows == [], "it is an earlier run's"
+    (folder / "progress.json").unlink()
+    assert run_scores(tmp_path).rows == [["fitted photos", "20.00", "0.5000", run_news.DASH]]
+
+
+# ---- the command ---------------------------------------------------------------------------------
+
+
+def started(tmp_path, *words):
+    environment = {**os.environ, "PATH": str(tmp_path)}
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION"):
+        environment.pop(name, None)
+    return subprocess.Popen(
+        [sys.executable, "-m", "igsr.cli", "view", *map(str, words)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Ctrl-C is a signal here")
+@pytest.mark.parametrize(
+    ("options", "notices"),
+    [
+        (["--web"], ["Ctrl-C ends it."]),
+        ([], ["splat-view is not installed", "Ctrl-C ends it."]),
+        (["--web", "--host", "0.0.0.0"], ["is open to other computers", "Ctrl-C ends it."]),
+    ],
+)
+def test_the_command_serves_until_ctrl_c(tmp_path, scene, options, notices):
+    process = started(tmp_path, scene, *options)
+    try:
+        url = process.stdout.readline().strip()
+        local = url if "0.0.0.0" not in options else f"http://127.0.0.1:{url.split(':')[2]}"
+        with urllib.request.urlopen(f"{local}state", timeout=30) as answer:
+            assert json.load(answer)["newest"] == "scene"
+        if not options or options == ["--web"]:
+            assert url.startswith("http://127.0.0.1:")
+    finally:
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 0, errors
+    lines = errors.splitlines()
+    assert len(lines) == len(notices), errors
+    for line, notice in zip(lines, notices, strict=True):
+        assert notice in line
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["no.ply", "--web"], "There is no file or folder no.ply"),
+        (["no.ply"], "There is no file or folder no.ply"),
+        (["SCENE", "--web", "--camera", "3"], "--camera is an option of splat-view"),
+        (["SCENE", "--camera", "3"], "cargo install --locked --path crates/splat_view"),
+        (["DAMAGED", "--web"], "damaged.ply"),
+        (["SCENE", "--web", "--host", "192.0.2.1"], "Cannot listen at 192.0.2.1"),
+        (["SCENE", "--web", "--cameras", "no"], "no"),
+    ],
+)
+def test_mistakes_are_said(tmp_path, scene, words, message):
+    (tmp_path / "damaged.ply").write_text("no splats")
+    named = {"SCENE": scene, "DAMAGED": tmp_path / "damaged.ply"}
+    process = started(tmp_path, *(named.get(word, word) for word in words))
+    out, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert out == ""
+    assert message in errors.splitlines()[-1]
+    assert "Traceback" not in errors

@@ -1,0 +1,45 @@
+"""The server of ``igsr view --web`` for tests, and what they ask it."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import socket
+import threading
+
+from igsr.viewing.server import open_server
+from igsr.viewing.shown import Shown
+
+
+@contextlib.contextmanager
+def served(*paths, cameras=None):
+    """A server of paths, at a port that is free."""
+    with open_server(Shown(paths, cameras), "127.0.0.1", 0) as server:
+        # It looks ten times as often as usual whether it shall end.
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def asked(server, target):
+    """Status and content of an address, without what a browser would make of it."""
+    with socket.create_connection(("127.0.0.1", server.server_port), timeout=30) as connection:
+        connection.sendall(f"GET {target} HTTP/1.0\r\n\r\n".encode())
+        answer = http.client.HTTPResponse(connection)
+        answer.begin()
+        return answer.status, answer.read()
+
+
+def with_token(server, name):
+    return asked(server, f"/{server.token}/{name}")
+
+
+def state_of(server):
+    status, content = with_token(server, "state")
+    assert status == 200, content
+    return json.loads(content)
