@@ -31,9 +31,16 @@ MASKS, LOOKED = "transient_masks", "transients_looked"
 MakeFitter: TypeAlias = Callable[[Sequence[View], dict[str, Any]], _core.Fitter]
 
 
-def steps_to_look(settings: FitSettings) -> tuple[int, ...]:
-    """After which steps transient things are looked for."""
-    if settings.transients == "off":
+def steps_to_look(settings: FitSettings, views: Sequence[View]) -> tuple[int, ...]:
+    """After which steps transient things are looked for.
+
+    Photos with alpha show what was cut out of them and nothing else: "auto" is off there.
+    """
+    photos = [view for view in views if view.weights is None]
+    has_alpha = any(view.image.shape[2] == 4 for view in photos)
+    is_off = settings.transients == "auto" and has_alpha
+    # Two photos must see what a third one has alone.
+    if settings.transients == "off" or is_off or len(photos) < 3:
         return ()
     first, all_steps = settings.first_step, settings.steps
     return tuple(sorted({first + round(part * (all_steps - first)) for part in MOMENTS}))
@@ -64,7 +71,7 @@ class TransientSearch:
     def __post_init__(self) -> None:
         """Begin without masks, unless some are given."""
         self.found = self.found or [None] * len(self.views)
-        self._steps = steps_to_look(self.settings)
+        self._steps = steps_to_look(self.settings, self.views)
 
     def next_look(self, step: int) -> int | None:
         """The first step after ``step`` that is to be looked after; None after the last."""
@@ -107,16 +114,14 @@ class TransientSearch:
 
     def kept(self) -> dict[str, npt.NDArray[Any]]:
         """What checkpoints keep of it, by name."""
-        if self.looked < 0:
-            return {}
+        looked = {} if self.looked < 0 else {LOOKED: np.array([self.looked], np.int64)}
+        if not any_of(self.found):
+            return looked
         bits = [
             np.zeros((view.camera.height, view.camera.width), np.bool_) if found is None else found
             for view, found in zip(self.views, self.found, strict=True)
         ]
-        return {
-            MASKS: np.packbits(np.concatenate([one.reshape(-1) for one in bits])),
-            LOOKED: np.array([self.looked], np.int64),
-        }
+        return {**looked, MASKS: np.packbits(np.concatenate([one.reshape(-1) for one in bits]))}
 
     def parts(self) -> dict[str, float]:
         """What part of each photo is masked, by name; without those of which nothing is."""
@@ -167,15 +172,14 @@ def resumed_masks(
     Raises:
         ValueError: the arrays cannot be these views'.
     """
-    bits, looked = state.pop(MASKS, None), state.pop(LOOKED, None)
-    if bits is None and looked is None:
-        return [None] * len(views), -1
-    sizes = [view.camera.width * view.camera.height for view in views]
-    whole = bits is not None and bits.dtype == np.uint8 and bits.shape == (-(-sum(sizes) // 8),)
-    if bits is None or not whole:
-        raise ValueError(f"{MASKS}: must be a bit for each pixel of {len(views)} views")
-    if looked is None or looked.dtype != np.int64 or looked.shape != (1,) or looked[0] < 0:
+    bits, looked = state.pop(MASKS, None), state.pop(LOOKED, np.array([-1], np.int64))
+    if looked.dtype != np.int64 or looked.shape != (1,) or looked[0] < -1:
         raise ValueError(f"{LOOKED}: must be a step")
+    if bits is None:
+        return [None] * len(views), int(looked[0])
+    sizes = [view.camera.width * view.camera.height for view in views]
+    if bits.dtype != np.uint8 or bits.shape != (-(-sum(sizes) // 8),):
+        raise ValueError(f"{MASKS}: must be a bit for each pixel of {len(views)} views")
     each = np.split(np.unpackbits(bits, count=sum(sizes)).astype(np.bool_), np.cumsum(sizes)[:-1])
     shapes = [(view.camera.height, view.camera.width) for view in views]
     masks = [one.reshape(shape) for one, shape in zip(each, shapes, strict=True)]

@@ -12,6 +12,7 @@ from igsr.capture import View
 from igsr.splats import Splats
 from igsr.transients.regions import box_sums, dilated, eroded, labels
 from igsr.transients.witnesses import (
+    SLACK,
     SmallPhoto,
     Testimony,
     shown_at_any_depth,
@@ -25,9 +26,9 @@ Float32 = npt.NDArray[np.float32]
 #: A region begins where a photo's color is further from all that the others show than this, and
 #: than so many deviations of the scene's; it goes on where it differs from theirs by the second.
 SEED, SEED_DEVIATIONS = 0.10, 3.0
-GROW, GROW_DEVIATIONS = 0.06, 2.0
+GROW, GROW_DEVIATIONS = 0.03, 1.0
 #: Least part of the photo that a region, and what it begins with, has.
-LEAST_REGION, LEAST_SEED = 0.002, 0.0005
+LEAST_REGION, LEAST_SEED = 0.004, 0.001
 #: A scene has transient things, beyond doubt, if one photo has a region that begins with so much.
 #: Static scenes that were measured have 0.0055 at most, those with figures 0.018 and more.
 PLAIN = 0.008
@@ -98,19 +99,31 @@ def _deviation(photos: Sequence[SmallPhoto], said: Sequence[Testimony | None]) -
     return 1.4826 * float(np.median(together))
 
 
-def _wide_difference(photo: SmallPhoto, what: Testimony) -> Float32:
-    """How far colors are off what others show there or near, [H, W]; 0 where they show nothing."""
+def _unlike(photo: SmallPhoto, what: Testimony) -> Float32:
+    """How far colors are off all that others show within ``SLACK`` pixels, [H, W].
+
+    Where the others agree on nothing, the mean of what they show near stands for it; 0 where they
+    show nothing near.
+    """
     height, width = photo.usable.shape
     sums = np.zeros((height * width, 4))
     sums[what.pixels[what.agreed]] = np.concatenate(
         [what.color[what.agreed], np.ones((int(what.agreed.sum()), 1))], axis=1
     )
     whole = sums.reshape(height, width, 4)
-    near = box_sums(whole, NEAR)
-    there = np.where(whole[..., 3:] > 0.0, whole, near)
+    there = np.where(whole[..., 3:] > 0.0, whole, box_sums(whole, NEAR))
+    known = there[..., 3] > 0.0
     color = there[..., :3] / np.maximum(there[..., 3:], 1.0)
-    off = np.abs(photo.color - color).max(axis=-1)
-    return np.where(photo.usable & (there[..., 3] > 0.0), off, 0.0).astype(np.float32)
+    low, high = np.full(color.shape, np.inf), np.full(color.shape, -np.inf)
+    around = [(SLACK, SLACK)] * 2 + [(0, 0)]
+    least = np.pad(np.where(known[..., None], color, np.inf), around, constant_values=np.inf)
+    most = np.pad(np.where(known[..., None], color, -np.inf), around, constant_values=-np.inf)
+    for dy, dx in np.ndindex(2 * SLACK + 1, 2 * SLACK + 1):
+        shift = slice(dy, dy + height), slice(dx, dx + width)
+        np.minimum(low, least[shift], out=low)
+        np.maximum(high, most[shift], out=high)
+    off = np.maximum(low - photo.color, photo.color - high).max(axis=-1)
+    return np.where(photo.usable & known, off, 0.0).astype(np.float32)
 
 
 def regions(photo: SmallPhoto, what: Testimony, deviation: float) -> tuple[Bool, float]:
@@ -134,9 +147,8 @@ def regions(photo: SmallPhoto, what: Testimony, deviation: float) -> tuple[Bool,
     unseen &= 2 * box_sums(unseen, VOTE) >= box_sums(seed, VOTE)
     if not unseen.any():
         return unseen, 0.0
-    explained = picture(what.explained)
-    likely = ~explained & (_wide_difference(photo, what) > max(GROW, GROW_DEVIATIONS * deviation))
-    likely |= seed
+    unlike = _unlike(photo, what) > max(GROW, GROW_DEVIATIONS * deviation)
+    likely = seed | (unlike & ~picture(what.explained))
     grown = unseen.copy()
     for _ in range(REACH):
         grown |= dilated(grown, 1) & likely

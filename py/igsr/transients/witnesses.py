@@ -43,6 +43,8 @@ DEPTHS, NEAREST, FARTHEST = 64, 0.3, 8.0
 LEAST_SHARED = 200
 #: Gains are not told by colors darker than this.
 DARK = 0.02
+#: From this color on a pixel may have been cut to white.
+WHITE = 0.98
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +79,8 @@ class Testimony:
         color: float32 [N, 3], that color, with the photo's gain.
         outside: float32 [N], by how much the photo's color lies outside of all colors that the
             photos that agree have within ``SLACK`` pixels, in the channel where most.
-        explained: bool [N], whether one of the photos shows the photo's color at the depth of the
-            photo's own render.
+        explained: bool [N], whether the photo's color is shown at the depth of its own render, by
+            half of the photos that see a surface there.
         others: the K photos.
         gains: float32 [K, 3], what their colors are multiplied by to be the photo's.
     """
@@ -148,21 +150,23 @@ def testimony(index: int, photos: Sequence[SmallPhoto]) -> Testimony | None:
     seen = np.stack([visible for _, visible in sights])
     colors = np.stack([_at(other.color, at) for other, (at, _) in zip(others, sights, strict=True)])
     gains = np.stack([_gain(own, *one) for one in zip(colors, seen, strict=True)])
-    middle = _median(colors * gains[:, None], seen)
+    middle = _median(np.minimum(colors * gains[:, None], np.float32(1.0)), seen)
     # A photo agrees if the color is among those that it shows around there.
     same, outside = np.zeros_like(seen), np.full(len(pixels), np.inf, np.float32)
     for k, (other, (at, visible)) in enumerate(zip(others, sights, strict=True)):
-        low, high = _at(other.low, at) * gains[k], _at(other.high, at) * gains[k]
+        low, high = _range(other, at, gains[k])
         same[k] = visible & (_outside(middle, low, high) <= AGREE)
         outside = np.where(same[k], np.minimum(outside, _outside(own, low, high)), outside)
     count = same.sum(axis=0)
     agreed = (count >= 2) & (3 * count >= 2 * seen.sum(axis=0))
-    explained = np.zeros(len(pixels), np.bool_)
+    looked, shown = np.zeros((2, len(pixels)), np.int64)
     depth = photo.depth.reshape(-1)[pixels]
     for other, gain in zip(others, gains, strict=True):
         at, visible = _sight(photo.camera, other, rays, depth)
-        low, high = _at(other.low, at) * gain, _at(other.high, at) * gain
-        explained |= visible & (_outside(own, low, high) <= AGREE)
+        low, high = _range(other, at, gain)
+        looked += visible
+        shown += visible & (_outside(own, low, high) <= AGREE)
+    explained = (shown > 0) & (2 * shown >= looked)
     outside = np.where(agreed, outside, np.float32(0.0))
     return Testimony(pixels, agreed, middle, outside, explained, others, gains)
 
@@ -189,7 +193,7 @@ def shown_at_any_depth(photo: SmallPhoto, pixels: Int64, said: Testimony) -> Boo
         count = np.zeros(len(pixels), np.int64)
         for other, gain in zip(said.others, said.gains, strict=True):
             at, visible = _sight(photo.camera, other, rays, depth, through=True)
-            low, high = _at(other.low, at) * gain, _at(other.high, at) * gain
+            low, high = _range(other, at, gain)
             count += visible & (_outside(own, low, high) <= AGREE)
         found |= count >= 2
     return found
@@ -205,6 +209,17 @@ def _windows(values: Float32, half: int) -> Float32:
 def _at(picture: Float32, at: Int64) -> Float32:
     """Colors [N, 3] of a picture [H, W, 3] in the pixels of these numbers."""
     return picture.reshape(-1, 3)[at]
+
+
+def _range(other: SmallPhoto, at: Int64, gain: Float32) -> tuple[Float32, Float32]:
+    """Least and most color [N, 3] around pixels of another photo, as the photo has them.
+
+    A photo holds no more than white: what is brighter is white there, and what another has as white
+    may be any color that is as bright or brighter.
+    """
+    low, high = _at(other.low, at), _at(other.high, at)
+    most = np.where(high >= WHITE, np.float32(1.0), np.minimum(high * gain, np.float32(1.0)))
+    return np.minimum(low * gain, np.float32(1.0)), most
 
 
 def _outside(color: Float32, low: Float32, high: Float32) -> Float32:
