@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import refinements
 import scenes
 
 import igsr
@@ -15,6 +16,7 @@ from igsr.capture import Capture, Points, View
 from igsr.capture.write_transforms import write_transforms
 from igsr.fitting import checkpoint as checkpoints
 from igsr.fitting import run as fitting
+from igsr.refinement import loop
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 from igsr.transients import PLAIN, find_transients
@@ -99,7 +101,7 @@ def test_three_photos_are_enough_and_two_are_not():
 
 
 def brighter(view):
-    return replace(view, image=np.clip(1.4 * view.image, 0, 255).astype(np.uint8))
+    return replace(view, image=np.clip(1.8 * view.image, 0, 255).astype(np.uint8))
 
 
 def noisy(view):
@@ -121,9 +123,17 @@ def test_static_photos_are_left_alone(change):
     assert found_in(views) == [None] * len(views)
 
 
+def test_what_others_have_as_white_may_be_any_bright_color():
+    views = photos()
+    cut = [brighter(view) for view in views]
+    assert (cut[0].image == 255).mean() > 0.1
+    cut[2] = views[2]
+    assert found_in(cut)[2] is None
+
+
 def test_a_wrong_surface_is_not_taken_for_a_thing():
     """A board before the wall that the scene does not have yet: the photos show it at one depth."""
-    board = wall(depth=-0.5, count=20, seed=5)
+    board = wall(depth=-1.0, count=20, seed=5)
     board.means[:, :2] *= 0.2
     both = replace(
         WALL,
@@ -326,3 +336,30 @@ def test_the_command_reports_what_it_masked(visited, tmp_path, igsr_here):
     assert "transient things masked in" in ran.stdout
     page = (tmp_path / "out/report.html").read_text()
     assert "Transient things" in page
+
+
+@pytest.mark.usefixtures("small_fits")
+def test_a_refinement_masks_what_its_first_fit_found(ball_photos, monkeypatch):
+    looks, seen = [], []
+    real = loop.Stages.render_and_denoise
+
+    def found(splats, views, before, **_):
+        looks.append(len(views))
+        masks = [None] * len(views)
+        masks[0] = np.zeros(views[0].image.shape[:2], np.bool_)
+        masks[0][:5] = True
+        return masks
+
+    def watched(self, reconstruction):
+        seen.append(reconstruction.photos)
+        return real(self, reconstruction)
+
+    monkeypatch.setattr("igsr.fitting.transient_search.find_transients", found)
+    monkeypatch.setattr(loop.Stages, "render_and_denoise", watched)
+    refinements.refine(ball_photos, 1, refinements.lying, transients="on")
+    name, count = ball_photos.train_views[0].name, len(ball_photos.train_views)
+    assert set(looks) == {count}, "only the first fit looks, at all photos"
+    assert len(seen) >= 2, "all photos, and folds"
+    for view in (view for photos in seen for view in photos):
+        hidden = 0 if view.mask is None else int((~view.mask).sum())
+        assert hidden == (5 * view.camera.width if view.name == name else 0)

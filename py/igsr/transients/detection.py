@@ -29,9 +29,13 @@ SEED, SEED_DEVIATIONS = 0.10, 3.0
 GROW, GROW_DEVIATIONS = 0.03, 1.0
 #: Least part of the photo that a region, and what it begins with, has.
 LEAST_REGION, LEAST_SEED = 0.004, 0.001
-#: A scene has transient things, beyond doubt, if one photo has a region that begins with so much.
-#: Static scenes that were measured have 0.0055 at most, those with figures 0.018 and more.
-PLAIN = 0.008
+#: A scene has transient things, beyond doubt, if one photo has a region with so much, as a part of
+#: the photo, that no other explains. Static scenes that were measured have 0.0005 at most, those
+#: with figures in some photos 0.015 and more.
+PLAIN = 0.003
+#: What is no wider than twice the first, or so near to the picture's edge, is no such proof: edges
+#: of things, and of photos whose undistortion left dark borders.
+THIN, FRAME = 2, 4
 #: Pixels on each side among which most decide; and how far a region goes on from where it begins.
 VOTE, REACH = 4, 24
 #: Where others agree on no color, the mean of those within so many pixels stands for it.
@@ -129,7 +133,13 @@ def _unlike(photo: SmallPhoto, what: Testimony) -> Float32:
 def regions(photo: SmallPhoto, what: Testimony, deviation: float) -> tuple[Bool, float]:
     """The transient regions of a small photo, bool [H, W], and how plain to see they are.
 
-    The latter is the part of the photo that the largest region has of pixels that nothing explains.
+    The latter is the part of the photo that the largest region has of pixels that nothing explains;
+    thin lines and the picture's edge do not count.
+
+    Args:
+        photo: the photo.
+        what: the others say of it.
+        deviation: standard deviation of the scene's colors from what others show.
     """
     height, width = photo.usable.shape
 
@@ -158,7 +168,11 @@ def regions(photo: SmallPhoto, what: Testimony, deviation: float) -> tuple[Bool,
     seeds = np.bincount(number[unseen], minlength=len(size)) / seed.size
     keep = (size >= LEAST_REGION) & (seeds >= LEAST_SEED)
     keep[0] = False
-    plain = float(seeds[keep].max(initial=0.0))
+    core = unseen.copy()
+    core[:FRAME] = core[-FRAME:] = core[:, :FRAME] = core[:, -FRAME:] = False
+    core = dilated(eroded(core, THIN), THIN)
+    cores = np.bincount(number[core], minlength=len(size)) / seed.size
+    plain = float(cores[keep].max(initial=0.0))
     return dilated(keep[number], MARGIN), plain
 
 
