@@ -13,7 +13,7 @@ import rooms
 
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.colmap import attempts
-from igsr.pose.colmap.attempts import mapped
+from igsr.pose.colmap.attempts import Mapped, mapped
 from igsr.pose.colmap.database import image_id, list_photos
 from igsr.pose.colmap.estimator import guarded
 from igsr.pose.colmap.evidence import STEPS
@@ -70,12 +70,16 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[A
 
         monkeypatch.setattr(attempts, "matched", lambda *_: Path("matched.db"))
         monkeypatch.setattr(attempts, "with_focal_lengths", lambda path, seed: path)
-        monkeypatch.setattr(attempts, "with_matches", lambda path: with_any or set(range(8)))
+        some = sorted(with_any or range(8))
+        found = {(image_id(some[0]), image_id(other)): np.zeros((9, 2)) for other in some[1:]}
+        monkeypatch.setattr(attempts, "links", lambda path: found)
+        monkeypatch.setattr(attempts, "contradictions", lambda model, matches: set())
         monkeypatch.setattr(attempts, "matched_along_lines", look)
         monkeypatch.setattr(attempts, "map_photos", make)
         monkeypatch.setattr(attempts, "extend", add)
-        model, doubtful = mapped(8, Path("features.db"), 0, silent)
-        return model, doubtful, calls
+        result = mapped(8, Path("features.db"), 0, silent)
+        assert result.alike == 0
+        return result.model, result.doubtful, calls
 
     return with_models
 
@@ -161,7 +165,7 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
         told: list[tuple[int, int]] = []
         extend(model, 5, database, STEPS[0], 0, lambda stage, done, of: told.append((done, of)))
     assert told == [(4, 5), (5, 5)]
-    found = estimate_of(photos, model, False)
+    found = estimate_of(photos, Mapped(model, doubtful=False, alike=0))
     accuracy = pose_accuracy(found.cameras, CAMERAS)
     assert accuracy["registered"] == 5
     assert accuracy["RTA@5"] == 1.0

@@ -6,6 +6,7 @@ import contextlib
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from igsr.capture.photo_folder import Photo
@@ -49,10 +50,10 @@ class Colmap:
             database = workspace / "database.db"
             list_photos(photos, database)
             find_features(photos, workspace, database, show)
-            model, doubtful = mapped(len(photos), database, seed, show)
-            if model is not None:
-                model = without_distortion(model)
-        return estimate_of(photos, model, doubtful)
+            found = mapped(len(photos), database, seed, show)
+            if found.model is not None:
+                found = replace(found, model=without_distortion(found.model))
+        return estimate_of(photos, found)
 
 
 @contextlib.contextmanager

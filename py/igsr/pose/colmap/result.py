@@ -14,19 +14,20 @@ from igsr.capture.photo_folder import Photo
 from igsr.capture.tracks import straightened, track_confidence
 from igsr.capture.types import Tracks, intrinsic_matrix
 from igsr.capture.undistort import Lens
+from igsr.pose.colmap.attempts import Mapped
 from igsr.pose.estimate import Estimate
 
 Float64 = npt.NDArray[np.float64]
 
 
-def estimate_of(photos: Sequence[Photo], model: Any | None, doubtful: bool) -> Estimate:
+def estimate_of(photos: Sequence[Photo], found: Mapped) -> Estimate:
     """Cameras, points and warnings.
 
     Args:
         photos: all that were given.
-        model: pycolmap's, or None if there is none.
-        doubtful: whether it may be wrong.
+        found: the model of them.
     """
+    model = found.model
     nothing: list[Any] = [None] * len(photos)
     if model is None:
         return Estimate(nothing, None, nothing, nothing, [])
@@ -49,7 +50,12 @@ def estimate_of(photos: Sequence[Photo], model: Any | None, doubtful: bool) -> E
             f"{len(photos) - len(lost)} of {len(photos)} photos are registered; too few "
             f"matches for: {', '.join(lost)}."
         )
-    if doubtful:
+    if found.alike:
+        sentences.append(
+            f"Some photos show places that look alike: matches of {found.alike} pairs contradict "
+            "the others and were left out. Add photos between the sides that are missing."
+        )
+    if found.doubtful:
         sentences.append(
             "The photos have few matches, so cameras were found with lower thresholds and may be "
             "wrong; check the plot, or add photos between those that you have."

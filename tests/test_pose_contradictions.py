@@ -1,0 +1,152 @@
+"""Models that place photos of one side among those of another, since places look alike."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rooms
+
+from igsr.geometry.pose_errors import pose_accuracy
+from igsr.pose.colmap.attempts import mapped
+from igsr.pose.colmap.contradictions import (
+    contradictions,
+    leave_out,
+    links,
+    links_between_parts,
+    parts,
+)
+from igsr.pose.colmap.database import list_photos
+from igsr.pose.colmap.estimator import guarded
+from igsr.pose.colmap.evidence import STEPS
+from igsr.pose.colmap.features import find_features
+from igsr.pose.colmap.mapping import map_photos
+from igsr.pose.colmap.matching import matched, with_focal_lengths
+from igsr.pose.colmap.result import estimate_of
+
+
+class Image:
+    """A photo of a model, at ``centre`` and looking along +z, as far as the check asks it."""
+
+    def __init__(self, centre: tuple[float, float, float], sees: list[int]) -> None:
+        self.centre = np.array(centre)
+        self.camera = SimpleNamespace(
+            mean_focal_length=lambda: 100.0,
+            focal_length_x=100.0,
+            focal_length_y=100.0,
+            principal_point_x=100.0,
+            principal_point_y=100.0,
+            width=200,
+            height=200,
+        )
+        self.points2D = [
+            SimpleNamespace(point3D_id=point, has_point3D=lambda point=point: point >= 0)
+            for point in sees
+        ]
+
+    def projection_center(self) -> np.ndarray:
+        return self.centre
+
+    def cam_from_world(self) -> Any:
+        pose = np.hstack([np.eye(3), -self.centre[:, None]])
+        return SimpleNamespace(matrix=lambda: pose)
+
+
+def model_of(*images: Image) -> Any:
+    """A model of photos 1, 2 ... of 400 points on a wall at z = 4."""
+    random = np.random.default_rng(0)
+    xyz = np.c_[random.uniform(-2.0, 2.0, (400, 2)), np.full(400, 4.0)]
+    return SimpleNamespace(
+        images=dict(enumerate(images, start=1)),
+        points3D={i: SimpleNamespace(xyz=place) for i, place in enumerate(xyz)},
+        reg_image_ids=lambda: range(1, len(images) + 1),
+        point3D_ids=lambda: range(400),
+    )
+
+
+HALF, OTHER = list(range(200)), list(range(180, 380))
+
+
+def test_photos_that_stand_together_must_share_points() -> None:
+    together = Image((0.0, 0.0, 0.0), HALF), Image((0.3, 0.0, 0.0), OTHER)
+    assert contradictions(model_of(*together), {}) == {(1, 2)}
+    sharing = Image((0.3, 0.0, 0.0), list(range(150, 380)))
+    assert contradictions(model_of(together[0], sharing), {}) == set()
+    # Matches count whether they have become points or not.
+    matches = {(1, 2): np.stack([np.arange(50), np.arange(50)], axis=1).astype(np.uint32)}
+    assert contradictions(model_of(*together), matches) == set()
+
+
+@pytest.mark.parametrize(
+    ("centre", "sees"),
+    [
+        ((2.5, 0.0, 0.0), OTHER),  # from another direction
+        ((0.0, 0.0, 2.0), OTHER),  # from nearer
+        ((0.0, 0.0, 5.0), OTHER),  # the wall is behind
+        ((0.3, 0.0, 0.0), []),
+    ],
+)
+def test_photos_that_see_the_wall_otherwise_need_not(
+    centre: tuple[float, float, float], sees: list[int]
+) -> None:
+    few = HALF[:90]
+    assert contradictions(model_of(Image((0.0, 0.0, 0.0), few), Image(centre, sees)), {}) == set()
+    if sees:
+        whole = Image((0.0, 0.0, 0.0), HALF), Image(centre, sees)
+        assert contradictions(model_of(*whole), {}) == set()
+
+
+def test_the_weakest_links_are_left_out() -> None:
+    #   1 = 2 = 3 - 4 = 5, and 6 hangs on 5 alone
+    strengths = {(1, 2): 500, (2, 3): 400, (3, 4): 40, (4, 5): 600, (1, 5): 30, (5, 6): 20}
+    assert links_between_parts(strengths, set()) == set()
+    assert links_between_parts(strengths, {(2, 5)}) == {(3, 4), (1, 5)}
+    assert parts(strengths, {(2, 5)}) == {1: 1, 2: 1, 3: 1, 4: 4, 5: 4, 6: 4}
+    # Where strong links lead from one to the other, something stands between the cameras.
+    assert links_between_parts({**strengths, (3, 4): 200}, {(2, 5)}) == set()
+
+
+def alike(monkeypatch: pytest.MonkeyPatch, patch: int = 64) -> None:
+    """Give the walls of room 1 a piece of those of room 0."""
+    original = rooms.texture
+
+    def texture(seed: int, size: int = 256) -> np.ndarray:
+        walls = original(seed, size)
+        if seed >= 10:
+            walls[:patch, :patch] = original(seed - 10, size)[:patch, :patch]
+        return walls
+
+    monkeypatch.setattr(rooms, "texture", texture)
+
+
+def test_two_rooms_with_a_like_piece_are_not_made_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alike(monkeypatch)
+    cameras = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 5)]
+    photos = [*rooms.photos(cameras), *rooms.photos(cameras[1:], seed=1)]
+    features = tmp_path / "features.db"
+    show = lambda *arguments: None  # noqa: E731
+    with guarded(0):
+        list_photos(photos, features)
+        find_features(photos, tmp_path, features, show)
+        matches = matched(len(photos), features, 0, show)
+        across = {pair for pair in links(matches) if pair[0] <= 5 < pair[1]}
+        assert across
+        wrong = map_photos(9, with_focal_lengths(matches, 0), STEPS[0], 0, show)
+        assert wrong.num_reg_images() > 5
+        assert contradictions(wrong, links(matches))
+        copy = Path(shutil.copyfile(matches, tmp_path / "copy.db"))
+        leave_out(copy, across)
+        assert links(copy).keys() == links(matches).keys() - across
+        found = mapped(len(photos), features, 0, show)
+    assert found.alike == len(across)
+    assert not found.doubtful
+    estimate = estimate_of(photos, found)
+    assert [camera is not None for camera in estimate.cameras] == [True] * 5 + [False] * 4
+    assert pose_accuracy(estimate.cameras[:5], cameras)["rotation"] < 0.5
+    assert "look alike" in estimate.warnings[1]
