@@ -310,6 +310,8 @@ def _fitted(
         splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
         if settings.moves_cameras:
             capture = with_train_cameras(capture, fitted_cameras(views, fitter, origin))
+        if run.is_done:
+            splats = search.without_ghosts(splats, capture.train_views)
         # Without a fit of them, exposures that views have of an earlier one are not these splats'.
         none = [None] * len(views)
         found = none if exposures is None else fitted_exposures(views, fitter)

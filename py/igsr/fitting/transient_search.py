@@ -18,6 +18,7 @@ from igsr._internal.choices import Backend
 from igsr.capture import Capture, View
 from igsr.fitting.fitter import fitted_cameras, fitted_exposures, without_exposures
 from igsr.fitting.settings import FitSettings
+from igsr.floaters.photo_evidence import part_within
 from igsr.splats import Splats
 from igsr.transients import PLAIN, find_transients
 
@@ -25,6 +26,10 @@ Bool = npt.NDArray[np.bool_]
 
 #: Parts of the steps after which transient things are looked for.
 MOMENTS = (0.3, 0.5, 0.7)
+#: A splat is a ghost if so much of what photos show of it is masked.
+GHOST = 0.5
+#: Parameters of splats, each with a row for every splat.
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 #: What checkpoints call the masks, packed bits of all photos, and the step of the last look.
 MASKS, LOOKED = "transient_masks", "transients_looked"
 
@@ -107,10 +112,29 @@ class TransientSearch:
             backend=self.backend,
         )
         if any_of(found) or any_of(self.found):
-            fitter = self.make(_masked(self.views, found), fitter.state())
+            state = _selected(fitter.state(), self._kept(splats, views, found))
+            fitter = self.make(_masked(self.views, found), state)
         # Last: whoever is interrupted before saves a checkpoint of before the look.
         self.found, self.looked = found, int(fitter.steps_done)
         return fitter
+
+    def without_ghosts(self, splats: Splats, views: Sequence[View]) -> Splats:
+        """The splats that a fit has ended with, without those that only masked pixels show.
+
+        Args:
+            splats: of the fit.
+            views: with the cameras that they were fitted to.
+        """
+        if not any_of(self.found):
+            return splats
+        keep = self._kept(splats, views, self.found)
+        return replace(splats, **{name: getattr(splats, name)[keep] for name in PARAMETERS})
+
+    def _kept(self, splats: Splats, views: Sequence[View], found: Sequence[Bool | None]) -> Bool:
+        """Which splats other pixels show, too; what only masked ones show nothing would correct."""
+        cameras = [view.camera for view in views]
+        keep: Bool = part_within(splats, cameras, found, self.backend) < GHOST
+        return keep if keep.any() else ~keep
 
     def kept(self) -> dict[str, npt.NDArray[Any]]:
         """What checkpoints keep of it, by name."""
@@ -134,6 +158,13 @@ class TransientSearch:
 
 def _masked(views: Sequence[View], found: Sequence[Bool | None]) -> list[View]:
     return [with_mask_less(*each) for each in zip(views, found, strict=True)]
+
+
+def _selected(state: dict[str, Any], keep: Bool) -> dict[str, Any]:
+    """A fitter's state with these splats alone."""
+    of_splats = {prefix + name for name in PARAMETERS for prefix in ("", "first_", "second_")}
+    of_splats |= {"stats_grad_sum", "stats_seen"}
+    return {name: array[keep] if name in of_splats else array for name, array in state.items()}
 
 
 def any_of(found: Sequence[Bool | None]) -> bool:

@@ -107,6 +107,41 @@ def sightings(splats: Splats, cameras: Sequence[Camera], backend: str = "auto") 
     return Sightings(area, shown, before)
 
 
+def part_within(
+    splats: Splats,
+    cameras: Sequence[Camera],
+    regions: Sequence[npt.NDArray[np.bool_] | None],
+    backend: str = "auto",
+) -> Float64:
+    """Which part of what photos show of each splat lies within regions of them.
+
+    Args:
+        splats: the scene.
+        cameras: of the photos.
+        regions: bool [H, W] of each, or None for one without a region.
+        backend: "auto", "cpu", "gpu" or "reference".
+
+    Returns:
+        float64 [N] in [0, 1], by blending weight summed over pixels and cameras; 0 for splats that
+        no photo shows.
+
+    Raises:
+        ValueError: the parameters cannot be drawn; the message names the argument.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    backend = _core.resolve_backend(backend)
+    dtype = _core.working_dtype(backend)
+    within, area = np.zeros((2, len(splats)))
+    for camera, region in zip(cameras, regions, strict=True):
+        picture = _Picture(splats, camera, np.zeros(3, dtype), backend)
+        ones = np.ones((camera.height, camera.width), dtype)
+        inside = np.zeros_like(ones) if region is None else region.astype(dtype)
+        v = picture.backward(np.stack([ones, inside, np.zeros_like(ones)], axis=-1))["v_colors"]
+        area += v[:, 0]
+        within += v[:, 1]
+    return np.divide(within, area, out=np.zeros_like(area), where=area > 0.0)
+
+
 def needed_by_others(
     splats: Splats,
     views: Sequence[View],
