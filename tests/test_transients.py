@@ -16,7 +16,7 @@ from igsr.capture import Capture, Points, View
 from igsr.capture.write_transforms import write_transforms
 from igsr.fitting import checkpoint as checkpoints
 from igsr.fitting import run as fitting
-from igsr.fitting.transient_search import GHOST, PARAMETERS
+from igsr.fitting.transient_search import PARAMETERS
 from igsr.floaters.photo_evidence import part_within
 from igsr.refinement import loop
 from igsr.rendering.renders import render
@@ -253,30 +253,38 @@ def test_a_fit_does_not_learn_what_one_photo_shows(static, visited):
     assert on < 0.7 * off
 
 
-def test_what_only_masked_pixels_show_is_told(static):
-    """A splat close before one camera, as the ghost of what that photo showed."""
-    view = static.views[1]
-    start = np.linalg.inv(view.camera.viewmat) @ np.array([0.0, 0.0, 1.0, 1.0])
+def with_ghost(view):
+    """The wall, and first a green splat close before a camera, as it comes of a figure."""
+    at = np.linalg.inv(view.camera.viewmat) @ np.array([0.0, 0.0, 1.0, 1.0])
     ghost = {name: getattr(WALL, name)[:1].copy() for name in PARAMETERS}
-    ghost["means"][0], ghost["scales"][0] = start[:3], np.log(0.02)
-    both = replace(WALL, **{n: np.concatenate([ghost[n], getattr(WALL, n)]) for n in PARAMETERS})
-    cameras = [one.camera for one in static.views]
-    region = np.zeros((SIZE, SIZE), np.bool_)
-    region[36:60, 36:60] = True
-    regions = [region if one is view else None for one in static.views]
+    ghost["means"][0], ghost["scales"][0] = at[:3], np.log(0.02)
+    ghost["sh"][0, 0] = (-1.6, 1.7, -1.2)
+    parts = {name: np.concatenate([ghost[name], getattr(WALL, name)]) for name in PARAMETERS}
+    return replace(WALL, **parts)
+
+
+def test_what_only_masked_pixels_show_is_told(static):
+    both = with_ghost(static.views[1])
+    cameras = [view.camera for view in static.views]
+    regions = [None] * len(cameras)
+    assert (part_within(both, cameras, regions, backend="cpu") == 0.0).all()
+    regions[1] = np.zeros((SIZE, SIZE), np.bool_)
+    regions[1][36:60, 36:60] = True
     part = part_within(both, cameras, regions, backend="cpu")
     assert part[0] > 0.9
     assert (part[1:] < 0.5).all()
-    assert (part_within(both, cameras, [None] * len(cameras), backend="cpu") == 0.0).all()
 
 
-def test_a_look_takes_ghosts_out_of_the_splats(visited):
-    """Splats that masked pixels alone show are gone from the fit and from its result."""
-    splats, found = fitted(visited, steps=240, density="original", max_splats=12000)
-    masks = [None if view.mask is None else ~view.mask for view in found.train_views]
-    assert sum(mask is not None for mask in masks) == 2
-    cameras = [view.camera for view in found.train_views]
-    assert (part_within(splats, cameras, masks, backend="cpu") < GHOST).all()
+@pytest.mark.parametrize("steps", [4, 60])
+def test_a_ghost_is_taken_out_of_the_splats(visited, steps):
+    """At a look, and in the end, too: the last look of four steps is after the third."""
+    both = with_ghost(visited.views[1])
+    given = {"start": both, "sh_degree": 0, "steps": steps}
+    kept, _ = fitted(visited, transients="off", **given)
+    assert len(kept) == len(both)
+    splats, _ = fitted(visited, transients="on", **given)
+    assert len(splats) == len(WALL)
+    assert np.abs(splats.means - WALL.means).max() < 0.1
 
 
 def test_a_resumed_fit_has_the_same_masks_and_bits(visited, tmp_path, monkeypatch):
