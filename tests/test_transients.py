@@ -16,7 +16,7 @@ from igsr.capture import Capture, Points, View
 from igsr.capture.write_transforms import write_transforms
 from igsr.fitting import checkpoint as checkpoints
 from igsr.fitting import run as fitting
-from igsr.fitting.transient_search import PARAMETERS
+from igsr.fitting.transient_search import PARAMETERS, TransientSearch
 from igsr.floaters.photo_evidence import part_within
 from igsr.refinement import loop
 from igsr.rendering.renders import render
@@ -275,16 +275,35 @@ def test_what_only_masked_pixels_show_is_told(static):
     assert (part[1:] < 0.5).all()
 
 
-@pytest.mark.parametrize("steps", [4, 60])
-def test_a_ghost_is_taken_out_of_the_splats(visited, steps):
-    """At a look, and in the end, too: the last look of four steps is after the third."""
+def test_a_look_takes_a_ghost_out_of_the_splats(visited):
     both = with_ghost(visited.views[1])
-    given = {"start": both, "sh_degree": 0, "steps": steps}
+    given = {"start": both, "sh_degree": 0, "steps": 60}
     kept, _ = fitted(visited, transients="off", **given)
     assert len(kept) == len(both)
     splats, _ = fitted(visited, transients="on", **given)
     assert len(splats) == len(WALL)
     assert np.abs(splats.means - WALL.means).max() < 0.1
+
+
+def test_a_ghost_that_comes_after_the_last_look_is_taken_out_in_the_end(visited, monkeypatch):
+    both = with_ghost(visited.views[1])
+    monkeypatch.setattr(TransientSearch, "_kept", lambda _, splats, *__: np.ones(len(splats), bool))
+    given = {"start": both, "sh_degree": 0, "steps": 60, "transients": "on"}
+    whole, _ = fitted(visited, **given)
+    monkeypatch.undo()
+    assert len(whole) == len(both)
+    kept = TransientSearch._kept
+    calls = []
+
+    def last_alone(self, splats, *rest):
+        calls.append(len(splats))
+        all_of_them = np.ones(len(splats), np.bool_)
+        return all_of_them if len(calls) <= 3 else kept(self, splats, *rest)
+
+    monkeypatch.setattr(TransientSearch, "_kept", last_alone)
+    splats, _ = fitted(visited, **given)
+    assert len(calls) == 4
+    assert len(splats) == len(WALL)
 
 
 def test_a_resumed_fit_has_the_same_masks_and_bits(visited, tmp_path, monkeypatch):
