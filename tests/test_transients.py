@@ -17,7 +17,7 @@ from igsr.capture.write_transforms import write_transforms
 from igsr.fitting import checkpoint as checkpoints
 from igsr.fitting import run as fitting
 from igsr.fitting.transient_search import PARAMETERS, TransientSearch
-from igsr.floaters.photo_evidence import part_within
+from igsr.floaters.photo_evidence import behind_masks
 from igsr.refinement import loop
 from igsr.rendering.renders import render
 from igsr.splats import Splats
@@ -267,12 +267,15 @@ def test_what_only_masked_pixels_show_is_told(static):
     both = with_ghost(static.views[1])
     cameras = [view.camera for view in static.views]
     regions = [None] * len(cameras)
-    assert (part_within(both, cameras, regions, backend="cpu") == 0.0).all()
+    assert not behind_masks(both, cameras, regions, backend="cpu").any()
     regions[1] = np.zeros((SIZE, SIZE), np.bool_)
     regions[1][36:60, 36:60] = True
-    part = part_within(both, cameras, regions, backend="cpu")
-    assert part[0] > 0.9
-    assert (part[1:] < 0.5).all()
+    ghosts = behind_masks(both, cameras, regions, backend="cpu")
+    assert ghosts[0]
+    assert not ghosts[1:].any(), "the others show the wall"
+    regions[1][:] = False
+    regions[1][:4] = True
+    assert not behind_masks(both, cameras, regions, backend="cpu").any()
 
 
 def test_a_look_takes_a_ghost_out_of_the_splats(visited):

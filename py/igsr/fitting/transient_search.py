@@ -18,7 +18,7 @@ from igsr._internal.choices import Backend
 from igsr.capture import Capture, View
 from igsr.fitting.fitter import fitted_cameras, fitted_exposures, without_exposures
 from igsr.fitting.settings import FitSettings
-from igsr.floaters.photo_evidence import part_within
+from igsr.floaters.photo_evidence import behind_masks
 from igsr.splats import Splats
 from igsr.transients import PLAIN, find_transients
 
@@ -26,8 +26,6 @@ Bool = npt.NDArray[np.bool_]
 
 #: Parts of the steps after which transient things are looked for.
 MOMENTS = (0.3, 0.5, 0.7)
-#: A splat is a ghost if so much of what photos show of it is masked.
-GHOST = 0.5
 #: Parameters of splats, each with a row for every splat.
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 #: What checkpoints call the masks, packed bits of all photos, and the step of the last look.
@@ -133,7 +131,7 @@ class TransientSearch:
     def _kept(self, splats: Splats, views: Sequence[View], found: Sequence[Bool | None]) -> Bool:
         """Which splats other pixels show, too; what only masked ones show nothing would correct."""
         cameras = [view.camera for view in views]
-        keep: Bool = part_within(splats, cameras, found, self.backend) < GHOST
+        keep: Bool = ~behind_masks(splats, cameras, found, self.backend)
         return keep if keep.any() else ~keep
 
     def kept(self) -> dict[str, npt.NDArray[Any]]:

@@ -22,6 +22,8 @@ Int64 = npt.NDArray[np.int64]
 SHOWN = 0.5
 #: A splat stands before the surface if its depth is below this part of the surface's.
 BEFORE = 2.0 / 3.0
+#: Part of what a photo shows of a splat that must be masked for the splat to be of what is there.
+MASKED = 0.2
 #: Random probes of each photo; their mean estimates a splat's squared change.
 PROBES = 4
 
@@ -107,23 +109,25 @@ def sightings(splats: Splats, cameras: Sequence[Camera], backend: str = "auto") 
     return Sightings(area, shown, before)
 
 
-def part_within(
+def behind_masks(
     splats: Splats,
     cameras: Sequence[Camera],
-    regions: Sequence[npt.NDArray[np.bool_] | None],
+    masked: Sequence[npt.NDArray[np.bool_] | None],
     backend: str = "auto",
-) -> Float64:
-    """Which part of what photos show of each splat lies within regions of them.
+) -> npt.NDArray[np.bool_]:
+    """Which splats one photo shows in masked pixels, and the other photos show less of.
+
+    Such a splat, close before a camera, is made up for what was masked later; nothing corrects it.
 
     Args:
         splats: the scene.
         cameras: of the photos.
-        regions: bool [H, W] of each, or None for one without a region.
+        masked: bool [H, W] of each, True where it is masked; None where nothing is.
         backend: "auto", "cpu", "gpu" or "reference".
 
     Returns:
-        float64 [N] in [0, 1], by blending weight summed over pixels and cameras; 0 for splats that
-        no photo shows.
+        bool [N]: true where a photo has at least ``MASKED`` of what it shows of the splat in masked
+        pixels, and all others together show less than that in pixels that are not masked.
 
     Raises:
         ValueError: the parameters cannot be drawn; the message names the argument.
@@ -131,15 +135,17 @@ def part_within(
     """
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)
-    within, area = np.zeros((2, len(splats)))
-    for camera, region in zip(cameras, regions, strict=True):
+    areas = []
+    for camera, hidden in zip(cameras, masked, strict=True):
         picture = _Picture(splats, camera, np.zeros(3, dtype), backend)
         ones = np.ones((camera.height, camera.width), dtype)
-        inside = np.zeros_like(ones) if region is None else region.astype(dtype)
-        v = picture.backward(np.stack([ones, inside, np.zeros_like(ones)], axis=-1))["v_colors"]
-        area += v[:, 0]
-        within += v[:, 1]
-    return np.divide(within, area, out=np.zeros_like(area), where=area > 0.0)
+        inside = np.zeros_like(ones) if hidden is None else hidden.astype(dtype)
+        v = picture.backward(np.stack([ones - inside, inside, np.zeros_like(ones)], axis=-1))
+        areas.append(v["v_colors"][:, :2].astype(np.float64))
+    open_area, masked_area = np.stack(areas, axis=-1).transpose(1, 0, 2)
+    others = open_area.sum(axis=1, keepdims=True) - open_area
+    made_up = (masked_area > 0.0) & (masked_area >= MASKED * (masked_area + open_area))
+    return np.asarray((made_up & (others < masked_area)).any(axis=1))
 
 
 def needed_by_others(
