@@ -473,6 +473,7 @@ def test_a_checkpoint_of_format_1_goes_on(capture, tmp_path):
         "coarse_to_fine",
         "learning_rate",
         "exposure",
+        "transients",
     }
     with pytest.raises(igsr.IgsrError, match="it is not of format 1"):
         resumed(format=2)

@@ -422,6 +422,7 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
         poses="fixed",
         focal="fixed",
         exposure="off",
+        transients="off",
         remove_floaters=False,
     )
     monkeypatch.setattr(presets, "_default", lambda *_: short)

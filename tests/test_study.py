@@ -37,6 +37,7 @@ SHORT = FitSettings(
     poses="fixed",
     focal="fixed",
     exposure="off",
+    transients="off",
     remove_floaters=False,
 )
 

@@ -39,6 +39,7 @@ from igsr.cli.shared import (
     QualityOption,
     background_color,
     fitted_line,
+    masked_line,
     output_console,
     parts_line,
     print_json,
@@ -314,6 +315,8 @@ def _print_report(report: dict[str, Any], out: Path, pages: list[str]) -> None:
     )
     if report["removed"]:
         console.print(removed_line(report["removed"]), style="dim")
+    if report["masked"]:
+        console.print(masked_line(report["masked"], report["photos"]["train"]), style="dim")
     console.print(score_line(report))
     if "refined" in report:
         console.print(f"with refined cameras: {score_line(report['refined'])}")

@@ -284,6 +284,20 @@ def removed_line(removed: dict[str, int]) -> str:
     return f"removed {sum(removed.values())} splats: {', '.join(kinds)}"
 
 
+def masked_line(masked: dict[str, float], photos: int) -> str:
+    """In how many photos transient things are masked, as one line.
+
+    Args:
+        masked: part of each photo that is masked, by name.
+        photos: number of photos.
+    """
+    most = max(masked, key=lambda name: masked[name])
+    return (
+        f"transient things masked in {len(masked)} of {photos} photos, most in {most} "
+        f"({100.0 * masked[most]:.1f} %)"
+    )
+
+
 def protocol_line(protocol: dict[str, Any]) -> str:
     """How views were scored, in one line; ``protocol`` as ``Scores.protocol``."""
     background = tuple(protocol["background"])

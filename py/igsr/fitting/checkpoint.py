@@ -165,6 +165,7 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
             raise ValueError(f"it is not of format {FORMAT}")
         settings.setdefault("coarse_to_fine", False)  # the first fits had no such setting
         settings.setdefault("exposure", "off")  # nor this one
+        settings.setdefault("transients", "auto")  # nor this one; looks that are left are made
         settings.setdefault("learning_rate", 1.0)
         seconds = settings.get("seconds")
         if not isinstance(seconds, float) or not math.isfinite(seconds):

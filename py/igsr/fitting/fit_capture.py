@@ -5,14 +5,15 @@ from __future__ import annotations
 import inspect
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from igsr._internal.choices import FitBackend
+from igsr import _core
+from igsr._internal.choices import Backend, FitBackend
 from igsr._internal.progress_bar import progress_or_bar
 from igsr.capture import Capture, View
 from igsr.capture.photo_checks import check_photos
@@ -46,8 +47,10 @@ from igsr.fitting.settings import (
     Focal,
     Initialization,
     Poses,
+    TransientMode,
     check_whole_number,
 )
+from igsr.fitting.transient_search import TransientSearch, resumed_masks, with_train_masks
 from igsr.floaters import remove_floaters as without_floaters
 from igsr.splats import Splats
 
@@ -87,6 +90,7 @@ def fit(
     poses: Poses | None = None,
     focal: Focal | None = None,
     exposure: ExposureMode | None = None,
+    transients: TransientMode | None = None,
     remove_floaters: bool | None = None,
     background: tuple[float, float, float] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
@@ -140,6 +144,9 @@ def fit(
         exposure: "on": a gain and an offset per channel of each photo are optimized with the
             splats, which get the colors of the mean photo; "off"; or "auto": on where points that
             photos share, or EXIF, show that exposures differ (``igsr.fitting.exposures``).
+        transients: "on": what one photo shows and the others do not, such as people, is masked
+            after some of the steps (``igsr.transients``); "off"; or "auto": on where such things
+            are large and plain to see, else the fit has the same bits as with "off".
         remove_floaters: whether splats that photos do not support are removed after the last step
             (``igsr.remove_floaters``); the last progress counts them. The checkpoint keeps them.
         background: RGB in [0, 1] behind splats and photos with alpha; None is a new random color in
@@ -180,7 +187,8 @@ def fit_with_cameras(*args: Any, **kwargs: Any) -> tuple[Splats, Capture]:
 
     Returns:
         The splats, and the capture with its train cameras and the exposures of its train views
-        (``View.exposure``) as they were optimized; the capture itself where neither were.
+        (``View.exposure``) as they were optimized, and with masks that leave out transient things;
+        the capture itself where there are none of these.
 
     Raises:
         IgsrError, UserWarning, RuntimeError: as ``fit``.
@@ -261,7 +269,15 @@ def _fitted(
             if origin.shape != (3,) or not np.isfinite(origin).all():
                 raise ValueError("origin: must be three finite numbers")
             values = {**settings.plain(), "first_step": settings.first_step}
-            fitter = fitter_of(views, origin, state, values, device["backend"], priors, exposures)
+            masks, looked = resumed_masks(views, state)
+
+            def make(views: Sequence[View], state: dict[str, Any]) -> _core.Fitter:
+                backend = device["backend"]
+                return fitter_of(views, origin, state, values, backend, priors, exposures)
+
+            name = cast(Backend, device["backend"])
+            search = TransientSearch(views, settings, origin, name, make, masks, looked)
+            fitter = make(search.masked_views(), state)
         except ValueError as error:
             if resume:
                 raise IgsrError(f"The checkpoint {checkpoint} cannot be used: {error}.") from error
@@ -282,16 +298,21 @@ def _fitted(
             size=(float(size[0]), float(size[1])),
             kept=kept,
             seconds_before=seconds,
+            transients=search,
         )
         if rough:
             run.save()  # the cameras that took so long to find are kept from here on
         if not stopped:
             run.optimize()
 
-        # Take over cameras and exposures, and leave out floaters.
+        # Take over masks, cameras and exposures, and leave out floaters.
+        fitter = run.fitter
+        capture = with_train_masks(capture, search.found)
         splats = Splats(**fitter.splats(), origin=origin, antialiased=False)
         if settings.moves_cameras:
             capture = with_train_cameras(capture, fitted_cameras(views, fitter, origin))
+        if run.is_done:
+            splats = search.without_ghosts(splats, capture.train_views)
         # Without a fit of them, exposures that views have of an earlier one are not these splats'.
         none = [None] * len(views)
         found = none if exposures is None else fitted_exposures(views, fitter)

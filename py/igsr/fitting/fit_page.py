@@ -9,12 +9,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from igsr.capture import Capture
 from igsr.evaluation.report_page import (
     ADDED,
+    BESIDE,
     PHOTO,
     beside,
     drawn_cameras,
+    jpeg,
     number,
     part_rows,
     scene_frame,
@@ -24,6 +28,8 @@ from igsr.evaluation.scores import ScoredView
 from igsr.rendering.scene_page import PageModel
 from igsr.splats import Splats
 
+#: Most photos with transient things that are shown, and the color of what is masked in them.
+MOST_MASKED, TINT = 12, (255, 0, 255)
 #: Parts as the page calls them.
 PARTS = {
     "cameras": "find cameras",
@@ -64,6 +70,7 @@ def write_fit_page(
         "seconds": report["seconds"],
         "start": report["start"],
         "start_splats": report["start_splats"],
+        "masked": _masked_photos(report["masked"], capture),
         "limit": report["limit"]["sentence"],
         "score_rows": _score_rows(report),
         "beside_text": "Held-out photos." if held_out else "Fitted photos; none is held out.",
@@ -83,6 +90,22 @@ def write_fit_page(
 def _title(capture: str) -> str:
     path = Path(capture).resolve()
     return (path.parent.name if path.name == "images" else path.name) or "photos"
+
+
+def _masked_photos(masked: dict[str, float], capture: Capture) -> list[dict[str, str]]:
+    """Photos in which most is masked as transient, with what is masked tinted."""
+    views = {view.name: view for view in capture.train_views}
+    most = sorted(masked, key=lambda name: -masked[name])[:MOST_MASKED]
+    rows = []
+    for name in (name for name in most if name in views):
+        view = views[name]
+        picture = view.image[..., :3].copy()
+        if view.mask is not None:
+            hidden = ~view.mask
+            picture[hidden] = (picture[hidden] // 2) + np.array(TINT, np.uint8) // 2
+        caption = f"{name}, {100.0 * masked[name]:.1f} %"
+        rows.append({"picture": jpeg(picture, BESIDE), "caption": caption})
+    return rows
 
 
 def _score_rows(report: dict[str, Any]) -> list[dict[str, str]]:

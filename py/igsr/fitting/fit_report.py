@@ -93,6 +93,7 @@ def fit_report(fit: FinishedFit, scored: FitScores, parts: Parts) -> dict[str, A
         "preset": fit.asked["preset"],
         **preset_keywords(fit.settings),
         "removed": fit.last.removed,
+        "masked": {name: round(part, 5) for name, part in fit.last.transients.items()},
         "start": fit.last.started[0],
         "start_splats": fit.last.started[1],
         "seconds": round(fit.last.seconds, 3),

@@ -72,6 +72,7 @@ _DEFAULT = FitSettings(
     focal="fixed",
     # Gains of photos are found well, but held-out photos of sceaux and museum lose by them.
     exposure="off",
+    transients="auto",
     remove_floaters=True,
 )
 #: As Kerbl et al. 2023 fit, at their shorter number of steps: SfM points where there are some, and
@@ -83,6 +84,7 @@ _3DGS = replace(
     sh_degree=3,
     start="sfm",
     coarse_to_fine=False,
+    transients="off",
     remove_floaters=False,
 )
 #: As InstantSplat (Fan et al. 2024) fits: many splats from dense points, which stay as many, with
@@ -97,6 +99,7 @@ _INSTANTSPLAT = replace(
     coarse_to_fine=False,
     poses="joint",
     focal="shared",
+    transients="off",
     remove_floaters=False,
 )
 #: What a preset says nothing of.

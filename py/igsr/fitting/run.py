@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
-import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
@@ -18,6 +17,7 @@ from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import CheckpointFile
 from igsr.fitting.settings import FitSettings
 from igsr.fitting.time_estimate import work_done
+from igsr.fitting.transient_search import TransientSearch
 
 #: A killed run loses at most this much work.
 CHECKPOINT_STEPS = 500
@@ -44,6 +44,8 @@ class Progress:
         work: part of the fit's time, in [0, 1], that the steps done take of all.
         removed: None before the last progress, which all fits that are not told to end give: how
             many floaters of which kind were removed in the end.
+        transients: which part of the pixels is masked as transient, by name of the photo; only
+            photos that have such pixels.
     """
 
     step: int
@@ -56,6 +58,7 @@ class Progress:
     backend: dict[str, str]
     work: float = 0.0
     removed: Mapping[str, int] | None = None
+    transients: Mapping[str, float] = field(default_factory=dict)
 
 
 def bar_state(now: Progress) -> BarState:
@@ -84,6 +87,7 @@ class FitRun:
         checkpoint: the file to save to.
         size: width and height of the photos, pixels.
         kept: arrays that checkpoints hold beside the fitter's.
+        transients: the search for transient things, if there is one.
         seconds_before: time spent before this run.
     """
 
@@ -94,8 +98,9 @@ class FitRun:
     report: Report | None = None
     checkpoint: CheckpointFile | None = None
     size: tuple[float, float] = (1.0, 1.0)
-    kept: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
+    kept: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     seconds_before: float = 0.0
+    transients: TransientSearch | None = None
 
     def __post_init__(self) -> None:
         """Start the clock."""
@@ -111,7 +116,10 @@ class FitRun:
         """
         if self.checkpoint is not None:
             seconds = self.seconds_before + time.perf_counter() - self._began
-            self.checkpoint.save({**self.fitter.state(), **self.kept}, self.started, seconds)
+            kept = dict(self.kept)
+            if self.transients is not None:
+                kept |= self.transients.kept()
+            self.checkpoint.save({**self.fitter.state(), **kept}, self.started, seconds)
         self._saved_step, self._saved_at = self._step, time.perf_counter()
 
     def optimize(self) -> None:
@@ -126,6 +134,7 @@ class FitRun:
         chunk = 1
         try:
             while not self.is_done:
+                self._look_for_transients()
                 now = self._last = self._stepped(chunk)
                 # A step's time follows the number of splats: follow it, a factor two at a time.
                 chunk = max(1, min(2 * chunk, int(now.steps_per_second * CHUNK_SECONDS)))
@@ -167,14 +176,28 @@ class FitRun:
             steps_per_second=0.0,
             backend=self.backend,
             work=work_done(self.settings, *self.size, self._step),
+            transients={} if self.transients is None else self.transients.parts(),
         )
         self.report(replace(last, splats=splats, removed=removed))
 
+    def _look_for_transients(self) -> None:
+        """Look for transient things where that is due, and go on with what was found."""
+        search = self.transients
+        if search is None or not search.is_due(self._step):
+            return
+        try:
+            self.fitter = search.look(self.fitter)
+        except ValueError as error:
+            raise IgsrError(f"{error}.") from error
+
     def _stepped(self, count: int) -> Progress:
-        """Take ``count`` steps, or as many as are left, and say where the fit stands."""
+        """Take ``count`` steps, or as many as there are before the next look or the end."""
+        until = self.settings.steps
+        if self.transients is not None:
+            until = self.transients.next_look(self._step) or until
         began = time.perf_counter()
         try:
-            done: dict[str, Any] = self.fitter.step(min(count, self.settings.steps - self._step))
+            done: dict[str, Any] = self.fitter.step(min(count, until - self._step))
         except ValueError as error:
             raise IgsrError(f"{error}.") from error
         except RuntimeError as error:  # the renderer's RuntimeErrors are the GPU's
@@ -191,6 +214,7 @@ class FitRun:
             steps_per_second=advanced / max(now - began, 1e-9),
             backend=self.backend,
             work=work_done(self.settings, *self.size, self._step),
+            transients={} if self.transients is None else self.transients.parts(),
         )
 
     def _kept_words(self) -> str:

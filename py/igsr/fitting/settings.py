@@ -20,6 +20,7 @@ Initialization: TypeAlias = Literal[
 Poses: TypeAlias = Literal["fixed", "joint"]
 Focal: TypeAlias = Literal["fixed", "shared", "per-camera"]
 ExposureMode: TypeAlias = Literal["auto", "on", "off"]
+TransientMode: TypeAlias = Literal["auto", "on", "off"]
 
 #: Highest degree of spherical harmonics, as ``igsr.splats.MAX_SH_DEGREE``.
 _MAX_SH_DEGREE = 4
@@ -117,6 +118,12 @@ class FitSettings:
         metadata=about(
             "Gain and offset per channel of each photo, optimized with the splats: on, off, or "
             "auto (on where points that photos share, or EXIF, show other exposures)."
+        ),
+    )
+    transients: TransientMode = field(
+        metadata=about(
+            "Mask what one photo shows and the others do not, such as people and cars: on, off, or "
+            "auto (on where such things are large and plain to see)."
         ),
     )
     remove_floaters: bool = field(

@@ -22,6 +22,8 @@ Int64 = npt.NDArray[np.int64]
 SHOWN = 0.5
 #: A splat stands before the surface if its depth is below this part of the surface's.
 BEFORE = 2.0 / 3.0
+#: Part of what a photo shows of a splat that must be masked for the splat to be of what is there.
+MASKED = 0.2
 #: Random probes of each photo; their mean estimates a splat's squared change.
 PROBES = 4
 
@@ -105,6 +107,45 @@ def sightings(splats: Splats, cameras: Sequence[Camera], backend: str = "auto") 
         shown += is_shown
         before += is_shown & (picture.projected["depths"] * covered < BEFORE * v[:, 1])
     return Sightings(area, shown, before)
+
+
+def behind_masks(
+    splats: Splats,
+    cameras: Sequence[Camera],
+    masked: Sequence[npt.NDArray[np.bool_] | None],
+    backend: str = "auto",
+) -> npt.NDArray[np.bool_]:
+    """Which splats one photo shows in masked pixels, and the other photos show less of.
+
+    Such a splat, close before a camera, is made up for what was masked later; nothing corrects it.
+
+    Args:
+        splats: the scene.
+        cameras: of the photos.
+        masked: bool [H, W] of each, True where it is masked; None where nothing is.
+        backend: "auto", "cpu", "gpu" or "reference".
+
+    Returns:
+        bool [N]: true where a photo has at least ``MASKED`` of what it shows of the splat in masked
+        pixels, and all others together show less than that in pixels that are not masked.
+
+    Raises:
+        ValueError: the parameters cannot be drawn; the message names the argument.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    backend = _core.resolve_backend(backend)
+    dtype = _core.working_dtype(backend)
+    areas = []
+    for camera, hidden in zip(cameras, masked, strict=True):
+        picture = _Picture(splats, camera, np.zeros(3, dtype), backend)
+        ones = np.ones((camera.height, camera.width), dtype)
+        inside = np.zeros_like(ones) if hidden is None else hidden.astype(dtype)
+        v = picture.backward(np.stack([ones - inside, inside, np.zeros_like(ones)], axis=-1))
+        areas.append(v["v_colors"][:, :2].astype(np.float64))
+    open_area, masked_area = np.stack(areas, axis=-1).transpose(1, 0, 2)
+    others = open_area.sum(axis=1, keepdims=True) - open_area
+    made_up = (masked_area > 0.0) & (masked_area >= MASKED * (masked_area + open_area))
+    return np.asarray((made_up & (others < masked_area)).any(axis=1))
 
 
 def needed_by_others(

@@ -24,7 +24,7 @@ from igsr.errors import IgsrError
 from igsr.evaluation.scores import check_masks
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import Quality, default_max_size
-from igsr.fitting.settings import ExposureMode
+from igsr.fitting.settings import ExposureMode, TransientMode
 from igsr.refinement.cross_validation import FEWEST_PHOTOS, CrossValidation, combined_error
 from igsr.refinement.novel_views import novel_views
 from igsr.refinement.results import Refined, RefineProgress, Round, Stop, StopReason
@@ -53,6 +53,7 @@ def refine(
     select: Select = select_views,
     cross_validate: bool = True,
     exposure: ExposureMode = "off",
+    transients: TransientMode = "auto",
     quality: Quality = "normal",
     max_size: int | None = None,
     allow_missing: bool = False,
@@ -81,6 +82,8 @@ def refine(
         cross_validate: whether a round is kept only if it improves the scores of held-out photos.
         exposure: "on", "off" or "auto": whether the first fit finds the photos' exposures, which
             are then taken out of them, as ``igsr.fit``.
+        transients: "on", "off" or "auto": whether what one photo shows and the others do not is
+            masked from the first fit on, as ``igsr.fit``.
         quality: "draft", "normal" or "high": size of photos, steps and splats.
         max_size: longest side, in pixels, of photos as loaded; larger ones are reduced. None is
             ``igsr.fitting.presets.default_max_size``. A ``Capture`` has its size.
@@ -99,6 +102,7 @@ def refine(
         seed=seed,
         cross_validate=cross_validate,
         exposure=exposure,
+        transients=transients,
         quality=quality,
     )
     resolved = _core.resolve_backend(settings.backend)  # a missing GPU is found here

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from igsr._internal.settings import about, validate
 from igsr.errors import IgsrError
 from igsr.fitting.presets import Quality
-from igsr.fitting.settings import ExposureMode
+from igsr.fitting.settings import ExposureMode, TransientMode
 
 #: As many rounds as help, but at most ``MOST_ROUNDS``.
 AUTO = "auto"
@@ -42,6 +42,8 @@ class RefineSettings:
             instruction set and number of threads.
         exposure: whether the first fit finds exposures of photos: "off", "on" or "auto", as
             ``FitSettings.exposure``.
+        transients: whether the first fit finds things that are in one photo alone, which are masked
+            from then on: "off", "on" or "auto", as ``FitSettings.transients``.
         cross_validate: whether a round is kept only if it improves the scores of held-out photos.
 
     Raises:
@@ -81,6 +83,13 @@ class RefineSettings:
             "Gain and offset per channel of each photo, found by the first fit and taken out of "
             "the photos: on, off, or auto (on where points that photos share, or EXIF, show other "
             "exposures)."
+        ),
+    )
+    transients: TransientMode = field(
+        default="auto",
+        metadata=about(
+            "Mask what one photo shows and the others do not, such as people and cars, from the "
+            "first fit on: on, off, or auto (on where such things are large and plain to see)."
         ),
     )
     cross_validate: bool = field(

@@ -20,7 +20,7 @@ from igsr.fitting.fit_capture import Progress, fit_with_cameras
 from igsr.fitting.fitter import with_train_exposures, without_exposures
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import preset_settings
-from igsr.fitting.settings import ExposureMode
+from igsr.fitting.settings import ExposureMode, TransientMode
 from igsr.refinement.near_sources import NearSources
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.results import Scores, Stage
@@ -48,7 +48,7 @@ class Reconstruction:
     Attributes:
         name: "whole" or "fold0", "fold1" ...; checkpoints are named after it.
         photos: that are fitted, with the scene's colors: exposures that the first fit has found are
-            taken out of them.
+            taken out of them, and with masks that leave out what it has found to be transient.
         share: the photos' pixels as a part of all; time and number of splats go by it.
         splats: after the last fit.
         added: novel views that the rounds so far have added.
@@ -121,9 +121,11 @@ class Stages:
         return self._capture
 
     def fit_whole(self) -> Reconstruction:
-        """Fit all photos, and find their exposures where that is asked for."""
-        views, exposure = self._capture.train_views, self._settings.exposure
-        splats, fitted = self._fit("whole", "fit", views, 1.0, exposure)
+        """Fit all photos; find their exposures and what is transient where that is asked for."""
+        views, settings = self._capture.train_views, self._settings
+        splats, fitted = self._fit(
+            "whole", "fit", views, 1.0, settings.exposure, settings.transients
+        )
         exposures = [view.exposure for view in fitted.train_views]
         if any(exposures):
             self._capture = with_train_exposures(self._capture, exposures)
@@ -220,6 +222,7 @@ class Stages:
         views: list[View],
         share: float,
         exposure: ExposureMode = "off",
+        transients: TransientMode = "off",
     ) -> tuple[Splats, Capture]:
         goes_on = True
 
@@ -239,6 +242,7 @@ class Stages:
             checkpoint=checkpoint,
             resume=resume,
             exposure=exposure,
+            transients=transients,
             **self._fit_settings,
         )
         if not goes_on:  # not raised in the callback, so that the fit saves its checkpoint
