@@ -78,20 +78,23 @@ def contradictions(model: Any, matches: Mapping[Pair, npt.NDArray[np.uint32]]) -
     sees = {n: np.zeros(len(rows) + 1, dtype=np.bool_) for n in numbers}
     for n in numbers:
         sees[n][point_of[n]] = True
-    away = {n: model.images[n].projection_center() - xyz for n in numbers}
-    distance = {n: np.linalg.norm(away[n], axis=1) for n in numbers}
+    centre = {n: model.images[n].projection_center() for n in numbers}
     focal = {n: model.images[n].camera.mean_focal_length() for n in numbers}
     found: set[Pair] = set()
     for a in numbers:
         seen = np.flatnonzero(sees[a][:-1])
+        if len(seen) < FEWEST:
+            continue
+        away, distance = _rays(centre[a], xyz[seen])
         for b in numbers:
             pair = (min(a, b), max(a, b))
-            if a == b or pair in found or len(seen) < FEWEST:
+            if a == b or pair in found:
                 continue
-            zoom = distance[a][seen] / distance[b][seen] * (focal[b] / focal[a])
-            cosine = np.einsum("ij,ij->i", away[a][seen], away[b][seen])
-            near = cosine > np.cos(np.radians(ANGLE)) * distance[a][seen] * distance[b][seen]
-            should = seen[near & (zoom < ZOOM) & (zoom * ZOOM > 1.0)]
+            other, other_distance = _rays(centre[b], xyz[seen])
+            near = (away * other).sum(axis=1) > np.cos(np.radians(ANGLE))
+            # Compared without division: a point may lie in a camera's centre.
+            here, there = distance * focal[b], other_distance * focal[a]
+            should = seen[near & (here < ZOOM * there) & (there < ZOOM * here)]
             should = should[_inside(model.images[b], xyz[should])]
             if len(should) < FEWEST:
                 continue
@@ -101,6 +104,16 @@ def contradictions(model: Any, matches: Mapping[Pair, npt.NDArray[np.uint32]]) -
             if shared[should].mean() < SHARED:
                 found.add(pair)
     return found
+
+
+def _rays(
+    centre: npt.NDArray[np.float64], xyz: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Unit directions from points [P, 3] to a camera's centre, and their distances [P]."""
+    away = centre - xyz
+    distance: npt.NDArray[np.float64] = np.linalg.norm(away, axis=1)
+    directions: npt.NDArray[np.float64] = away / np.maximum(distance, 1e-12)[:, None]
+    return directions, distance
 
 
 def _inside(image: Any, xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
