@@ -72,7 +72,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[A
         some = sorted(with_any or range(8))
         found = {(image_id(some[0]), image_id(other)): np.zeros((9, 2)) for other in some[1:]}
         monkeypatch.setattr(attempts, "links", lambda path: found)
-        monkeypatch.setattr(attempts, "contradictions", lambda model, matches: set())
+        monkeypatch.setattr(attempts, "contradictions", lambda model, matches, usable: set())
         monkeypatch.setattr(attempts, "matched_along_lines", look)
         monkeypatch.setattr(attempts, "map_photos", make)
         monkeypatch.setattr(attempts, "extend", add)

@@ -177,7 +177,7 @@ def test_of_many_photos_the_time_is_said(monkeypatch: pytest.MonkeyPatch) -> Non
     for step in ("list_photos", "find_features"):
         monkeypatch.setattr(estimator, step, lambda *arguments: None)
     monkeypatch.setattr(estimator, "matched", lambda *arguments: None)
-    monkeypatch.setattr(estimator, "mapped", lambda *arguments, sift: Mapped(None, False, 0))
+    monkeypatch.setattr(estimator, "mapped", lambda *arguments, **more: Mapped(None, False, 0))
     tiny = [Photo(f"{i}.png", np.zeros((2, 2, 3), dtype=np.uint8)) for i in range(500)]
     with (
         pytest.warns(UserWarning, match=r"COLMAP needs about \d+ minutes for 500 photos"),

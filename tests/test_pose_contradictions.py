@@ -56,15 +56,17 @@ class Image:
         return SimpleNamespace(matrix=lambda: pose)
 
 
-def model_of(*images: Image) -> Any:
-    """A model of photos 1, 2 ... of 400 points on a wall at z = 4."""
+def model_of(*images: Image, frames: int = 0) -> Any:
+    """A model of photos 1, 2 ... of 400 points on a wall at z = 4, 20 of them in its middle."""
     random = np.random.default_rng(0)
     xyz = np.c_[random.uniform(-2.0, 2.0, (400, 2)), np.full(400, 4.0)]
+    xyz[180:200, :2] *= 0.1
     return SimpleNamespace(
         images=dict(enumerate(images, start=1)),
         points3D={i: SimpleNamespace(xyz=place) for i, place in enumerate(xyz)},
         reg_image_ids=lambda: range(1, len(images) + 1),
         point3D_ids=lambda: range(400),
+        num_reg_frames=lambda: frames or len(images),
     )
 
 
@@ -73,12 +75,23 @@ HALF, OTHER = list(range(200)), list(range(180, 380))
 
 def test_photos_that_stand_together_must_share_points() -> None:
     together = Image((0.0, 0.0, 0.0), HALF), Image((0.3, 0.0, 0.0), OTHER)
-    assert contradictions(model_of(*together), {}) == {(1, 2)}
+    assert contradictions(model_of(*together), {}, {}) == {(1, 2)}
     sharing = Image((0.3, 0.0, 0.0), list(range(150, 380)))
-    assert contradictions(model_of(together[0], sharing), {}) == set()
+    assert contradictions(model_of(together[0], sharing), {}, {}) == set()
+    # Photos of other light share few points, but all over.
+    few = Image((0.3, 0.0, 0.0), [*range(0, 180, 9), *range(200, 380)])
+    assert contradictions(model_of(together[0], few), {}, {}) == set()
+    # Photos that were never compared share none; those of a rig move together.
+    strange = Image((0.3, 0.0, 0.0), list(range(200, 380)))
+    assert contradictions(model_of(together[0], strange), {}, {}) == set()
+    assert contradictions(model_of(*together, frames=1), {}, {}) == set()
     # Matches count whether they have become points or not.
     matches = {(1, 2): np.stack([np.arange(50), np.arange(50)], axis=1).astype(np.uint32)}
-    assert contradictions(model_of(*together), matches) == set()
+    assert contradictions(model_of(*together), matches, {}) == set()
+    # What a mask hides need not be shared.
+    hidden = np.zeros((200, 200), dtype=np.bool_)
+    hidden[80:120, 80:120] = True
+    assert contradictions(model_of(*together), {}, {1: hidden, 2: hidden}) == set()
 
 
 @pytest.mark.parametrize(
@@ -94,10 +107,12 @@ def test_photos_that_see_the_wall_otherwise_need_not(
     centre: tuple[float, float, float], sees: list[int]
 ) -> None:
     few = HALF[:90]
-    assert contradictions(model_of(Image((0.0, 0.0, 0.0), few), Image(centre, sees)), {}) == set()
+    assert (
+        contradictions(model_of(Image((0.0, 0.0, 0.0), few), Image(centre, sees)), {}, {}) == set()
+    )
     if sees:
         whole = Image((0.0, 0.0, 0.0), HALF), Image(centre, sees)
-        assert contradictions(model_of(*whole), {}) == set()
+        assert contradictions(model_of(*whole), {}, {}) == set()
 
 
 def test_the_weakest_links_are_left_out() -> None:
@@ -139,7 +154,7 @@ def test_two_rooms_with_a_like_piece_are_not_made_one(
         assert across
         wrong = map_photos(9, with_focal_lengths(matches, 0), STEPS[0], 0, show)
         assert wrong.num_reg_images() > 5
-        assert contradictions(wrong, links(matches))
+        assert contradictions(wrong, links(matches), {})
         copy = Path(shutil.copyfile(matches, tmp_path / "copy.db"))
         leave_out(copy, across)
         assert links(copy).keys() == links(matches).keys() - across
@@ -150,3 +165,27 @@ def test_two_rooms_with_a_like_piece_are_not_made_one(
     assert [camera is not None for camera in estimate.cameras] == [True] * 5 + [False] * 4
     assert pose_accuracy(estimate.cameras[:5], cameras)["rotation"] < 0.5
     assert "look alike" in estimate.warnings[1]
+
+
+def test_photos_of_another_season_stay_in_one_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What they share with the others is little, but all over."""
+    cameras = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 6)]
+    photos = rooms.photos(cameras[::2])
+    original = rooms.texture
+    monkeypatch.setattr(
+        rooms, "texture", lambda seed: 0.6 * original(seed) + 0.4 * original(seed + 100)
+    )
+    photos += rooms.photos(cameras[1::2])
+    features = tmp_path / "features.db"
+    show = lambda *arguments: None  # noqa: E731
+    with guarded(0):
+        list_photos(photos, features)
+        find_features(photos, tmp_path, features, show)
+        found = mapped(6, matched(6, features, 0, show), 0, show)
+    assert found.alike == 0
+    estimate = estimate_of(photos, found)
+    accuracy = pose_accuracy(estimate.cameras, [*cameras[::2], *cameras[1::2]])
+    assert accuracy["registered"] == 6
+    assert accuracy["rotation"] < 0.5

@@ -79,7 +79,7 @@ MatcherOption = Annotated[
         "--matcher",
         metavar="NAME",
         help="For colmap: what finds and matches features: sift, or loma (a network that matches "
-        "photos from further apart; needs igsr[loma]).",
+        "photos from further apart; needs the package lomatch).",
     ),
 ]
 

@@ -210,13 +210,21 @@ def chosen_estimator(estimator: str, options: dict[str, Any]) -> str:
     """
     if estimator == AUTO:
         estimator = next(name for name, entry in ESTIMATORS.items() if entry.ready(options))
+        # COLMAP is always ready, and may know an option that the one before it does not.
+        if _foreign(estimator, options) and not _foreign("colmap", options):
+            estimator = "colmap"
     elif estimator not in ESTIMATORS:
         raise IgsrError(f"estimator must be {AUTO}, {' or '.join(ESTIMATORS)}, not {estimator!r}")
-    known = inspect.signature(ESTIMATORS[estimator].make).parameters
-    foreign = [name for name in options if name not in known]
+    foreign = _foreign(estimator, options)
     if foreign:
         raise IgsrError(f"{foreign[0]} is no option of {estimator}; leave it out")
     return estimator
+
+
+def _foreign(estimator: str, options: dict[str, Any]) -> list[str]:
+    """The options that an estimator does not know."""
+    known = inspect.signature(ESTIMATORS[estimator].make).parameters
+    return [name for name in options if name not in known]
 
 
 def estimate(

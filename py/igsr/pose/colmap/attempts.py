@@ -9,9 +9,13 @@ the matches that cannot all be right (``contradictions``).
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from igsr.pose.colmap.contradictions import (
     Pair,
@@ -19,6 +23,7 @@ from igsr.pose.colmap.contradictions import (
     leave_out,
     links,
     links_between_parts,
+    parts,
 )
 from igsr.pose.colmap.database import image_id
 from igsr.pose.colmap.evidence import DOUBTFUL, STEPS, Evidence
@@ -49,7 +54,15 @@ class Mapped:
     alike: int
 
 
-def mapped(count: int, matches: Path, seed: int, show: Progress, sift: bool = True) -> Mapped:
+def mapped(
+    count: int,
+    matches: Path,
+    seed: int,
+    show: Progress,
+    *,
+    sift: bool = True,
+    usable: Mapping[int, npt.NDArray[np.bool_]] | None = None,
+) -> Mapped:
     """Place photos.
 
     Args:
@@ -58,6 +71,8 @@ def mapped(count: int, matches: Path, seed: int, show: Progress, sift: bool = Tr
         seed: random seed.
         show: called with "matching" and "mapping", how much is done, and how much there is.
         sift: whether features are SIFT's: of these, more are matched where photos are missing.
+        usable: pixels [H, W] that have features, by COLMAP's number of the photo, where some have
+            none.
     """
     strengths = {pair: len(found) for pair, found in links(matches).items()}
     all_links = len(strengths)
@@ -79,27 +94,31 @@ def mapped(count: int, matches: Path, seed: int, show: Progress, sift: bool = Tr
                 elif _differ_in_matches_alone(STEPS[step - 1], evidence):
                     continue
 
-        def model_of(database: Path, base: Any = best if extending else None) -> Any | None:
-            if base is None:
-                return map_photos(count, database, evidence, seed, show)  # noqa: B023
-            model = copy.deepcopy(base)
-            extend(model, count, database, evidence, seed, show)  # noqa: B023
-            return model
-
-        model = model_of(database)
-        for _ in range(MOST_PARTINGS):
-            wrong = _wrong_links(model, source, strengths)
+        if extending:
+            model = copy.deepcopy(best)
+            extend(model, count, database, evidence, seed, show)
+        else:
+            model = map_photos(count, database, evidence, seed, show)
+        for parting in range(MOST_PARTINGS):
+            wrong = _wrong_links(model, source, strengths, usable or {})
             if not wrong:
+                break
+            if step >= DOUBTFUL or parting + 1 == MOST_PARTINGS:
+                # What stands on little is no reason to leave out matches.
+                model = None
                 break
             for pair in wrong:
                 del strengths[pair]
             for file in {matches, source}:
                 leave_out(file, wrong)
             database = with_focal_lengths(source, seed)
-            model = model_of(database)
+            # A model that is extended holds to what it has by these matches.
+            model = map_photos(count, database, evidence, seed, show)
         if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
             best, best_step = model, step
         lost = _missing(best, count)
+        if best is not None and len(strengths) < all_links:
+            hopeless = _unlinked(best, strengths, count)
         if best is not None and (count > FEW or lost <= hopeless):
             break
         if step == 0:
@@ -108,11 +127,23 @@ def mapped(count: int, matches: Path, seed: int, show: Progress, sift: bool = Tr
     return Mapped(best, best_step >= DOUBTFUL, all_links - len(strengths))
 
 
-def _wrong_links(model: Any | None, source: Path, strengths: dict[Pair, int]) -> set[Pair]:
+def _wrong_links(
+    model: Any | None,
+    source: Path,
+    strengths: dict[Pair, int],
+    usable: Mapping[int, npt.NDArray[np.bool_]],
+) -> set[Pair]:
     """Pairs of photos whose matches make a model contradict its photos."""
-    if model is None:
+    if model is None or model.num_reg_images() > FEW:
         return set()
-    return links_between_parts(strengths, contradictions(model, links(source)))
+    return links_between_parts(strengths, contradictions(model, links(source), usable))
+
+
+def _unlinked(model: Any, strengths: dict[Pair, int], count: int) -> set[int]:
+    """Indices of photos that no matches lead to from those of a model."""
+    part = parts(strengths, ())
+    own = {part.get(image) for image in model.reg_image_ids()}
+    return {index for index in range(count) if part.get(image_id(index)) not in own}
 
 
 def _missing(model: Any | None, count: int) -> set[int]:

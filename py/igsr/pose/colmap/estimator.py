@@ -9,10 +9,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.attempts import mapped
-from igsr.pose.colmap.database import list_photos
+from igsr.pose.colmap.database import image_id, list_photos
 from igsr.pose.colmap.distortion import without_distortion
 from igsr.pose.colmap.features import find_features
 from igsr.pose.colmap.given_matches import matched_by
@@ -69,10 +72,26 @@ class Colmap:
                 matches = matched(len(photos), database, seed, show)
             else:
                 matches = matched_by(self._matcher, photos, database, seed, show)
-            found = mapped(len(photos), matches, seed, show, sift=self._matcher is None)
+            sift = self._matcher is None
+            found = mapped(
+                len(photos), matches, seed, show, sift=sift, usable=_usable_pixels(photos)
+            )
             if found.model is not None:
                 found = replace(found, model=without_distortion(found.model))
         return estimate_of(photos, found)
+
+
+def _usable_pixels(photos: Sequence[Photo]) -> dict[int, npt.NDArray[np.bool_]]:
+    """Pixels that have features, by COLMAP's number of the photo, where some have none."""
+    usable = {}
+    for index, photo in enumerate(photos):
+        pixels = photo.mask
+        if photo.image.shape[2] == 4:
+            opaque = photo.image[..., 3] > 0
+            pixels = opaque if pixels is None else pixels & opaque
+        if pixels is not None:
+            usable[image_id(index)] = pixels
+    return usable
 
 
 @contextlib.contextmanager
@@ -92,6 +111,8 @@ def guarded(seed: int) -> Iterator[None]:
     pycolmap.set_random_seed(seed)
     try:
         yield
+    except IgsrError:
+        raise
     except (RuntimeError, ValueError) as error:
         raise IgsrError(
             f"COLMAP failed ({error}); leave out unusual photos and try again"

@@ -1,7 +1,9 @@
 """LoMa's features and matches (Nordstroem et al., "LoMa: Local Feature Matching Revisited", 2026).
 
-The package ``lomatch`` (extra ``loma``) has the network; its code is MIT and Apache-2.0. It fetches
-its weights by torch.hub, whose cache then holds them.
+The package ``lomatch`` has the network; its code is MIT and Apache-2.0. It fetches its weights by
+torch.hub, whose cache then holds them. It is no extra of igsr: it asks for the package
+``dataclasses``, which exists for Python 3.6 only, so pip must be told to take it without what it
+asks for.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ class Loma:
         except ImportError as error:
             raise IgsrError(
                 f"matcher loma needs the package lomatch ({error}); install it with "
-                "pip install 'igsr[loma]'"
+                "pip install einops opencv-python torchvision tqdm tyro and "
+                "pip install --no-deps lomatch==1.0.0"
             ) from error
         with _checked_downloads():
             self._network: Any = LoMa(LoMaB())

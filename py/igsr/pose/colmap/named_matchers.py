@@ -28,6 +28,8 @@ def matcher_of(given: str | Matcher) -> Matcher | None:
         IgsrError: there is none of that name, or it cannot run here.
     """
     if not isinstance(given, str):
+        if not isinstance(getattr(given, "name", None), str):
+            raise IgsrError("a matcher of one's own needs a name, which found cameras are kept by")
         return given
     if given == SIFT:
         return None

@@ -46,14 +46,16 @@ def estimate_of(photos: Sequence[Photo], found: Mapped) -> Estimate:
     sentences = []
     lost = [photo.name for photo, camera in zip(photos, cameras, strict=True) if camera is None]
     if lost:
+        cause = "not registered" if found.alike else "too few matches for"
         sentences.append(
-            f"{len(photos) - len(lost)} of {len(photos)} photos are registered; too few "
-            f"matches for: {', '.join(lost)}."
+            f"{len(photos) - len(lost)} of {len(photos)} photos are registered; {cause}: "
+            f"{', '.join(lost)}."
         )
     if found.alike:
+        mend = " Add photos that lead from these to the others." if lost else ""
         sentences.append(
-            f"Some photos show places that look alike: matches of {found.alike} pairs contradict "
-            "the others and were left out. Add photos between the sides that are missing."
+            "Some photos show places that look alike: matches between them contradict others and "
+            f"were left out (pairs of photos: {found.alike}).{mend}"
         )
     if found.doubtful:
         sentences.append(
