@@ -105,7 +105,7 @@ def test_the_settings_of_a_report_run_again(ball_photos, tmp_path, igsr_here):
         for out in ("first", "again", "other")
     )
     wanted = {"rounds": 0, "steps": 30, "backend": "cpu", "seed": 7, "cross_validate": False}
-    wanted |= {"quality": "normal", "exposure": "off"}
+    wanted |= {"quality": "normal", "exposure": "off", "transients": "auto"}
     assert first == again == wanted
     assert other == wanted | {"seed": 0}, "what is given wins over the report, be it the default"
     models = [igsr.Splats.load(tmp_path / out / "scene.ply") for out in ("first", "again", "other")]

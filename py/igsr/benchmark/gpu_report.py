@@ -83,6 +83,9 @@ def _rows(name: str, backend: str, work: Callable[[], list[dict[str, Any]]]) -> 
 def json_beside(path: Path) -> Path:
     """Where the figures of a page go.
 
+    Args:
+        path: of the page.
+
     Raises:
         IgsrError: the page's name does not end in .html.
     """

@@ -108,6 +108,8 @@ def kept_capture(
         check_enough_placed(found, options, allow_missing)
     else:
         say(f"The cameras found before are used, from {kept}; delete it to find them anew")
+        for sentence in found.estimate.warnings:
+            warn(sentence)
         check_enough_placed(found, options, allow_missing)
         before = read_usage(kept)
         if before is not None:

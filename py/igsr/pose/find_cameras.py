@@ -33,6 +33,10 @@ AUTO = "auto"
 #: Longest side, in pixels, of photos that estimators are given: they look no closer.
 LONGEST = 1600
 
+#: Numbers of estimators' ways to cameras, where they have changed: what was found by another way is
+#: found anew.
+METHODS = {"colmap": 2}
+
 #: What photos are given as.
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str] | Photo]
 
@@ -142,7 +146,8 @@ def made_by_of(estimator: str, seed: int, frames: int, options: dict[str, Any]) 
         name: str(value if isinstance(value, os.PathLike) else getattr(value, "name", value))
         for name, value in sorted(options.items())
     }
-    return {"estimator": estimator, "seed": seed, "frames": frames, "options": plain}
+    made_by = {"estimator": estimator, "seed": seed, "frames": frames, "options": plain}
+    return made_by | ({"method": METHODS[estimator]} if estimator in METHODS else {})
 
 
 def photos_of(photos: Source, frames: int = FRAMES, max_size: int | None = None) -> list[Photo]:

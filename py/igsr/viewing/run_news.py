@@ -15,8 +15,9 @@ from typing import Any
 from igsr.fitting.followed_run import PROGRESS, RUN, VIEW
 from igsr.rendering.scene_surroundings import REPORT, background_beside
 
-#: Seconds without news after which a run may have been interrupted.
-SILENCE = 60.0
+#: Seconds without news after which a run may have been interrupted. Bundle adjustment and scoring
+#: give none for minutes.
+SILENCE = 600.0
 #: Most bytes of a file that is read once a second.
 MOST_BYTES = 20_000_000
 DASH = "–"

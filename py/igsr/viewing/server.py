@@ -104,7 +104,7 @@ class ViewServer(ThreadingHTTPServer):
 
     def handle_error(self, request: object, client_address: object) -> None:
         """A browser that went away is no error."""
-        if not isinstance(sys.exc_info()[1], OSError):
+        if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             logger.exception("a request failed")
 
 
@@ -145,13 +145,13 @@ class _Handler(BaseHTTPRequestHandler):
                 self._answer_json(shown.surroundings())
             elif name == "model":
                 self._answer("application/octet-stream", shown.model(asked["id"]))
-            elif name == "photo":
+            elif name == "photo" and asked["number"].isdecimal():
                 self._answer("image/jpeg", shown.photo(int(asked["number"])))
             else:
                 raise KeyError(name)
         except IgsrError as error:
             self._answer_text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
-        except (KeyError, ValueError):
+        except KeyError:
             self._answer_text(HTTPStatus.NOT_FOUND, "There is no such thing here.")
 
     def _answer_json(self, value: object) -> None:
