@@ -9,15 +9,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.attempts import mapped
 from igsr.pose.colmap.database import image_id, list_photos
 from igsr.pose.colmap.distortion import without_distortion
-from igsr.pose.colmap.features import find_features
+from igsr.pose.colmap.features import find_features, usable_pixels
 from igsr.pose.colmap.given_matches import matched_by
 from igsr.pose.colmap.matcher import Matcher
 from igsr.pose.colmap.matching import matched
@@ -73,25 +70,12 @@ class Colmap:
             else:
                 matches = matched_by(self._matcher, photos, database, seed, show)
             sift = self._matcher is None
-            found = mapped(
-                len(photos), matches, seed, show, sift=sift, usable=_usable_pixels(photos)
-            )
+            pixels = {image_id(i): usable_pixels(photo) for i, photo in enumerate(photos)}
+            usable = {number: mask for number, mask in pixels.items() if mask is not None}
+            found = mapped(len(photos), matches, seed, show, sift=sift, usable=usable)
             if found.model is not None:
                 found = replace(found, model=without_distortion(found.model))
         return estimate_of(photos, found)
-
-
-def _usable_pixels(photos: Sequence[Photo]) -> dict[int, npt.NDArray[np.bool_]]:
-    """Pixels that have features, by COLMAP's number of the photo, where some have none."""
-    usable = {}
-    for index, photo in enumerate(photos):
-        pixels = photo.mask
-        if photo.image.shape[2] == 4:
-            opaque = photo.image[..., 3] > 0
-            pixels = opaque if pixels is None else pixels & opaque
-        if pixels is not None:
-            usable[image_id(index)] = pixels
-    return usable
 
 
 @contextlib.contextmanager

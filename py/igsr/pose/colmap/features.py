@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
 from igsr.capture.photo_folder import Photo
@@ -24,7 +25,7 @@ def find_features(photos: Sequence[Photo], workspace: Path, database: Path, show
     images, masks = workspace / "images", workspace / "masks"
     images.mkdir()
     masks.mkdir()
-    masked = any(_hides(photo) for photo in photos)
+    masked = any(usable_pixels(photo) is not None for photo in photos)
     reader = pycolmap.ImageReaderOptions()
     if masked:
         reader.mask_path = masks
@@ -50,17 +51,20 @@ def find_features(photos: Sequence[Photo], workspace: Path, database: Path, show
     show("features", len(photos), len(photos))
 
 
-def _hides(photo: Photo) -> bool:
-    return photo.mask is not None or photo.image.shape[2] == 4
+def usable_pixels(photo: Photo) -> npt.NDArray[np.bool_] | None:
+    """Pixels [H, W] that have features: neither masked nor transparent; None for all."""
+    if photo.image.shape[2] != 4:
+        return photo.mask
+    opaque: npt.NDArray[np.bool_] = photo.image[..., 3] > 0
+    return opaque if photo.mask is None else opaque & photo.mask
 
 
 def _write(photo: Photo, path: Path, mask_path: Path | None) -> None:
     image = photo.image
     grey = (image[..., :3] @ np.array([0.299, 0.587, 0.114])).round().astype(np.uint8)
     if mask_path is not None:
-        usable = np.ones(grey.shape, dtype=bool) if photo.mask is None else photo.mask
-        if image.shape[2] == 4:
-            usable = usable & (image[..., 3] > 0)
+        usable = usable_pixels(photo)
+        usable = np.ones(grey.shape, dtype=np.bool_) if usable is None else usable
         # Masked pixels must not influence the features next to them.
         grey[~usable] = round(grey[usable].mean()) if usable.any() else 0
         Image.fromarray(255 * usable.astype(np.uint8)).save(mask_path)

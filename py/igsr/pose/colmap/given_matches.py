@@ -12,6 +12,7 @@ from PIL import Image
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.database import image_id, photo_file
+from igsr.pose.colmap.features import usable_pixels
 from igsr.pose.colmap.matcher import Matcher, PhotoFeatures
 from igsr.pose.colmap.pairs import EXHAUSTIVE
 from igsr.pose.estimate import Progress
@@ -89,10 +90,10 @@ def _features(matcher: Matcher, photo: Photo, file: Path) -> PhotoFeatures:
     inside = np.isfinite(xy).all(axis=1) & (xy >= 0.0).all(axis=1)
     inside &= (xy[:, 0] < width) & (xy[:, 1] < height)
     column, row = np.where(inside[:, None], xy, 0.0).astype(np.int64).T
-    usable = np.ones((height, width), np.bool_) if photo.mask is None else photo.mask
-    if photo.image.shape[2] == 4:
-        usable = usable & (photo.image[..., 3] > 0)
-    return PhotoFeatures(xy, found.descriptors, found.size).kept(inside & usable[row, column])
+    usable = usable_pixels(photo)
+    if usable is not None:
+        inside &= usable[row, column]
+    return PhotoFeatures(xy, found.descriptors, found.size).kept(inside)
 
 
 def _matches(
