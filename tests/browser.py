@@ -95,14 +95,18 @@ class Browser:
 
     def open(self, page: Path | str, timeout: float = 60.0) -> None:
         """Open a file or an address, and wait until its script has started or failed."""
-        self.problems.clear()
-        self.requests.clear()
-        self._load(page.as_uri() if isinstance(page, Path) else page, timeout)
+        self.load(page, timeout)
         self.run("window.igsr.ready.then(() => true)", timeout)
 
     def leave(self) -> None:
         """Leave the page: one that asks a server would go on with it."""
         self._load("about:blank", 60.0)
+
+    def load(self, page: Path | str, timeout: float = 60.0) -> None:
+        """Open a file or an address, of any page, and wait until it has loaded."""
+        self.problems.clear()
+        self.requests.clear()
+        self._load(page.as_uri() if isinstance(page, Path) else page, timeout)
 
     def _load(self, address: str, timeout: float) -> None:
         self._loaded = False
