@@ -119,6 +119,9 @@ def test_photos_in_colmap_files_out_fit_score(tmp_path, monkeypatch, igsr_here):
         found.append(Camera(viewmat, image.camera.calibration_matrix(), SIZE, SIZE))
     assert pose_errors(found, scene.cameras)["rotation"] < 0.01
     assert len(written.points3D) > 500
+    # What the network says of depth is what the fit starts from.
+    assert all(view.depth is not None for view in load_capture(tmp_path / "out/capture").views)
+    assert report["start"] == "depths"
     assert report["psnr"] > GOOD, report["psnr"]
     assert report["refined"]["psnr"] > GOOD, report["refined"]["psnr"]
 

@@ -474,6 +474,7 @@ def test_a_checkpoint_of_format_1_goes_on(capture, tmp_path):
         "learning_rate",
         "exposure",
         "transients",
+        "depth_weight",
     }
     with pytest.raises(igsr.IgsrError, match="it is not of format 1"):
         resumed(format=2)

@@ -265,6 +265,7 @@ class Fitter:
         holds: dict[str, Float64] | None = None,
         exposures: dict[str, npt.NDArray[Any]] | None = None,
         rigs: Sequence[int] | None = None,
+        depths: list[npt.NDArray[np.float32] | None] | None = None,
     ) -> None:
         """A fit to V photos.
 
@@ -281,7 +282,8 @@ class Fitter:
             config: steps, first_step (where in the schedule the fit begins), seed, sh_degree,
                 max_splats, density ("mcmc", "original", "fixed"), learning_rate (what the first
                 half of the steps multiplies rates by), dropout, hull, background, coarse_to_fine
-                (the first steps are on photos of a fraction of their size); poses ("fixed",
+                (the first steps are on photos of a fraction of their size), depth_weight (what the
+                loss of depths is multiplied by in the first step); poses ("fixed",
                 "joint"), focal ("fixed", "shared", "per-camera"), camera_rate (pixels per
                 step), camera_decay, camera_warm_up (fraction of the steps), frozen (splats are not
                 changed), exposures (whether gains and offsets of the photos are fitted). An absent
@@ -294,6 +296,9 @@ class Fitter:
             exposures: where the exposures that are fitted start: gains [V, 3], offsets [V, 3],
                 fitted [V], False for photos with the splats' own colors, and pulls [V] back to
                 the start.
+            rigs: [V], the rig of each photo, whose cameras move as one.
+            depths: of each photo float32 [H, W, 2], camera-space z in world units and its
+                confidence in 0..1, 0 where z is not known; or None.
         """
 
     def step(self, count: int) -> dict[str, Any]:
@@ -331,6 +336,12 @@ def write_splats(path: str, splats: dict[str, Any]) -> list[str]:
 
 def morton_order(points: Float32) -> npt.NDArray[np.int64]:
     """Ids of points [N, 3] along Morton's curve, as the writers order splats."""
+
+def read_exr_depth(path: str) -> Float32:
+    """Read channel Z of an EXR file, or its only channel, float32 [H, W].
+
+    Raises OSError or ValueError where the file cannot be read.
+    """
 
 def write_exr(path: str, color: Float32, alpha: Float32, depth: Float32) -> None:
     """Write channels R, G, B, A, Z of [H, W] in 32-bit float.

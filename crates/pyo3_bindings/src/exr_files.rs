@@ -1,5 +1,6 @@
-//! Renders as OpenEXR files in 32-bit float.
+//! Renders as OpenEXR files in 32-bit float, and depth from such files.
 
+use numpy::{PyArray1, PyArray2, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use splat_render::io::{self, ExrPicture};
@@ -33,4 +34,12 @@ pub fn write_exr(
     let bytes = py.detach(|| io::encode_exr(&picture)).map_err(to_python)?;
     // To the name as it is given: callers in Python rename it in the end.
     Ok(py.detach(|| std::fs::write(path, bytes))?)
+}
+
+/// Reads channel Z of an EXR file, or its only channel, [H, W].
+#[pyfunction]
+pub fn read_exr_depth<'py>(py: Python<'py>, path: &str) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    let path = std::path::Path::new(path);
+    let (height, width, depth) = py.detach(|| io::read_exr_depth(path)).map_err(to_python)?;
+    PyArray1::from_vec(py, depth).reshape([height, width])
 }

@@ -20,7 +20,7 @@ use crate::photos::targets_from;
 use crate::splat_arrays::set_splat_arrays;
 
 /// Names of the constructor's arguments, in their order.
-const ARGUMENTS: [&str; 12] = [
+const ARGUMENTS: [&str; 13] = [
     "images",
     "masks",
     "backgrounds",
@@ -33,6 +33,7 @@ const ARGUMENTS: [&str; 12] = [
     "holds",
     "exposures",
     "rigs",
+    "depths",
 ];
 
 /// A fit in progress. Its parameters stay on the device that computes.
@@ -53,7 +54,7 @@ impl Fitter {
     #[new]
     #[pyo3(
         signature = (*positional, **named),
-        text_signature = "(images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, holds=None, exposures=None, rigs=None)"
+        text_signature = "(images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, holds=None, exposures=None, rigs=None, depths=None)"
     )]
     fn new<'py>(
         py: Python<'py>,

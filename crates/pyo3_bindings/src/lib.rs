@@ -51,7 +51,7 @@ mod _core {
     #[pymodule_export]
     use crate::benchmark::{band_pixels, peak_multiply_add, time_pipeline, time_rasterize};
     #[pymodule_export]
-    use crate::exr_files::write_exr;
+    use crate::exr_files::{read_exr_depth, write_exr};
     #[pymodule_export]
     use crate::fit_settings::reduction;
     #[pymodule_export]

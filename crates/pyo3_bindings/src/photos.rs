@@ -4,7 +4,7 @@ use numpy::PyUntypedArrayMethods;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
-use splat_render::fit::Target;
+use splat_render::fit::{Target, TargetDepth};
 
 use crate::arguments::Call;
 use crate::arrays::{array, elements};
@@ -24,7 +24,35 @@ fn weights_from(name: &str, mask: &Bound<'_, PyAny>, size: [usize; 2]) -> PyResu
     Ok(bytes.iter().map(|&counts| if counts == 0 { 0.0 } else { 1.0 }).collect())
 }
 
-/// The photos of a fit: one entry each of `images`, `masks`, `backgrounds` and `schedule`.
+/// The depths of `count` photos, from one entry of `depths` each: None, or z and confidence
+/// `[H, W, 2]`.
+fn depths_from(call: &Call<'_>, count: usize) -> PyResult<Vec<Option<TargetDepth>>> {
+    let Some(depths) = call.optional::<Bound<'_, PyList>>("depths")? else {
+        return Ok(vec![None; count]);
+    };
+    if depths.len() != count {
+        return Err(PyValueError::new_err(format!(
+            "depths: has {} entries for {count} images",
+            depths.len()
+        )));
+    }
+    let depth = |(i, depth): (usize, Bound<'_, PyAny>)| {
+        if depth.is_none() {
+            return Ok(None);
+        }
+        let name = format!("depths[{i}]");
+        let depth = array::<f32>(&name, &depth)?;
+        let values = elements(&name, &depth, &[-1, -1, 2])?;
+        Ok(Some(TargetDepth {
+            depths: values.iter().step_by(2).copied().collect(),
+            confidences: values.iter().skip(1).step_by(2).copied().collect(),
+        }))
+    };
+    depths.iter().enumerate().map(depth).collect()
+}
+
+/// The photos of a fit: one entry each of `images`, `masks`, `backgrounds` and `schedule`,
+/// and of `depths`, where it is given.
 pub fn targets_from(call: &Call<'_>) -> PyResult<Vec<Target>> {
     let (images, masks) =
         (call.take::<Bound<'_, PyList>>("images")?, call.take::<Bound<'_, PyList>>("masks")?);
@@ -40,8 +68,9 @@ pub fn targets_from(call: &Call<'_>) -> PyResult<Vec<Target>> {
             )));
         }
     }
+    let depths = depths_from(call, images.len())?;
     let mut targets = Vec::with_capacity(images.len());
-    for (i, (image, mask)) in images.iter().zip(masks.iter()).enumerate() {
+    for (i, ((image, mask), depth)) in images.iter().zip(masks.iter()).zip(depths).enumerate() {
         let name = format!("images[{i}]");
         let image = array::<u8>(&name, &image)?;
         let pixels = elements(&name, &image, &[-1, -1, -1])?;
@@ -62,6 +91,7 @@ pub fn targets_from(call: &Call<'_>) -> PyResult<Vec<Target>> {
             channels: size(channels)?,
             pixels: pixels.to_vec(),
             weights,
+            depth,
             background: backgrounds[i],
             turns: schedule[i].0,
             until: schedule[i].1,

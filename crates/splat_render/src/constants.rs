@@ -10,6 +10,9 @@ pub const SIDE_MAX: u32 = 16_384;
 /// Pairs fainter than this contribute nothing: below it an 8-bit picture cannot change.
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
 
+/// A clearer pixel of a picture has no depth to compare with a photo's.
+pub const DEPTH_ALPHA: f32 = 0.5;
+
 /// No splat is fully opaque, so that `1 - alpha` stays invertible and gradients pass through it.
 pub const ALPHA_MAX: f32 = 0.99;
 

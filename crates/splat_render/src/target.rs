@@ -16,6 +16,8 @@ pub struct Target {
     /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere. The loss is a mean over
     /// the pixels whose weight is not 0: a photo of small weights counts less than others.
     pub weights: Option<Vec<f32>>,
+    /// Depths of its pixels, where they are known.
+    pub depth: Option<TargetDepth>,
     /// RGB in 0..=1 of the background in a photo without alpha, where it is known: renders are
     /// compared over it.
     pub background: Option<[f32; 3]>,
@@ -23,6 +25,38 @@ pub struct Target {
     pub turns: u32,
     /// The first step that is not of it any more, where there is one.
     pub until: Option<u32>,
+}
+
+/// How far away what a photo shows is, as a sensor or a network found it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TargetDepth {
+    /// `[H * W]` camera-space z, world units, above 0 where its confidence is.
+    pub depths: Vec<f32>,
+    /// `[H * W]` confidence of each, in 0..=1; 0 where the depth is not known.
+    pub confidences: Vec<f32>,
+}
+
+impl TargetDepth {
+    /// Checks sizes and values; what is wrong follows the name of the photo.
+    pub(crate) fn validate(&self, pixels: usize) -> std::result::Result<(), &'static str> {
+        if self.depths.len() != pixels || self.confidences.len() != pixels {
+            return Err("has depths that are not of the image's size");
+        }
+        if !self.confidences.iter().all(|c| (0.0..=1.0).contains(c)) {
+            return Err("has a depth's confidence that does not lie in 0..=1");
+        }
+        let mut known = self.depths.iter().zip(&self.confidences).filter(|(_, c)| **c > 0.0);
+        if !known.all(|(z, _)| z.is_finite() && *z >= f32::MIN_POSITIVE) {
+            return Err("has a depth that is not finite and above 0");
+        }
+        Ok(())
+    }
+
+    /// What a pixel of confidence 1 counts in the loss, a mean; 0 where no depth is known.
+    pub(crate) fn scale(&self) -> f64 {
+        let count = self.confidences.iter().filter(|c| **c > 0.0).count();
+        if count > 0 { 1.0 / count as f64 } else { 0.0 }
+    }
 }
 
 /// What a photo's pixels weigh.
@@ -87,6 +121,9 @@ impl Target {
                 return bad("has a weight that is negative or not finite".into());
             }
         }
+        if let Some(depth) = &self.depth {
+            depth.validate(pixels).or_else(|reason| bad(reason.into()))?;
+        }
         Ok(())
     }
 
@@ -98,7 +135,8 @@ impl Target {
 
     /// The photo with each `by` x `by` pixels averaged into one; rows and columns left over are dropped.
     ///
-    /// Colours are weighted by alpha and by the weights, which are averaged themselves.
+    /// Colours are weighted by alpha and by the weights, which are averaged themselves. The depth is
+    /// that of a pixel in the middle: a mean over an edge is on no surface.
     pub fn reduced(&self, by: u32) -> Self {
         let (width, height) = (self.width / by, self.height / by);
         let (side, channels) = (by as usize, self.channels as usize);
@@ -133,10 +171,18 @@ impl Target {
                 weights[at] = (weight / area) as f32;
             }
         }
-        Self { width, height, pixels, weights, ..self.clone_settings() }
+        let middles = (0..new * height as usize).map(|at| {
+            let (row, column) = (at / new * side + side / 2, at % new * side + side / 2);
+            row * old + column
+        });
+        let depth = self.depth.as_ref().map(|depth| TargetDepth {
+            depths: middles.clone().map(|i| depth.depths[i]).collect(),
+            confidences: middles.map(|i| depth.confidences[i]).collect(),
+        });
+        Self { width, height, pixels, weights, depth, ..self.clone_settings() }
     }
 
-    /// Everything but the pixels and their weights.
+    /// Everything but the pixels, their weights and depths.
     fn clone_settings(&self) -> Self {
         Self {
             width: self.width,
@@ -144,6 +190,7 @@ impl Target {
             channels: self.channels,
             pixels: Vec::new(),
             weights: None,
+            depth: None,
             background: self.background,
             turns: self.turns,
             until: self.until,
@@ -181,6 +228,7 @@ mod tests {
             channels,
             pixels,
             weights,
+            depth: None,
             background: None,
             turns: 2,
             until: Some(7),

@@ -7,7 +7,7 @@ use common::{random_camera, random_scene, rng};
 use splat_render::cpu::{Cpu, CpuFit};
 use splat_render::fit::{
     Background, CameraConfig, CameraState, DensityControl, Exposure, FitConfig, FitDevice,
-    FitState, Fitter, Focal, Rates, StepInput, Target, splats_from_points,
+    FitState, Fitter, Focal, Rates, StepInput, Target, TargetDepth, splats_from_points,
 };
 use splat_render::{Camera, Error, ProjectOptions, Stages};
 
@@ -35,6 +35,7 @@ fn photos() -> (Vec<Target>, Vec<Camera>) {
                 channels: 4,
                 pixels: pixels.collect(),
                 weights: None,
+                depth: None,
                 background: None,
                 turns: 1,
                 until: None,
@@ -250,6 +251,7 @@ fn still_step(device: &mut CpuFit, camera: Camera, step: u32) -> StepInput {
         noise_seed: 3,
         camera_gradient: true,
         exposure: None,
+        depth_weight: 0.0,
     };
     device.step(&input).unwrap();
     input
@@ -324,6 +326,74 @@ fn exposures_have_the_same_bits_on_any_number_of_threads_and_after_a_resume() {
     assert!(ended == whole, "resumed it ends otherwise");
     let plain = fitter(DensityControl::Mcmc, &start(1), 0).exposure_state().unwrap();
     assert!(plain.is_none(), "a fit without exposures has some");
+}
+
+/// A fit to photos of which all but one have depths, from splats that are on their way.
+fn depth_fitter(weight: f32, state: &FitState, step: u32, cameras: Option<CameraConfig>) -> Fitter {
+    let (mut targets, known) = photos();
+    for (k, (target, depth)) in targets.iter_mut().zip(depths()).enumerate() {
+        target.depth = (k != 1).then_some(depth);
+    }
+    let config = FitConfig { depth_weight: weight, cameras, ..config(DensityControl::Mcmc) };
+    let device = Box::new(CpuFit::default());
+    Fitter::new(device, targets, known, state.clone(), step, config).unwrap()
+}
+
+/// Depths of what [`photos`] show, where they are opaque.
+fn depths() -> Vec<TargetDepth> {
+    let mut rng = rng(11);
+    let scene = random_scene(&mut rng, 80, Some(0));
+    let depths_of = |_| {
+        let camera = random_camera(&mut rng, 40, 30);
+        let projected = Cpu.project(&scene.params(), &camera, &ProjectOptions::default()).unwrap();
+        let image = Cpu.rasterize(&projected, [0.0; 3]).unwrap();
+        TargetDepth {
+            depths: image.depth.iter().zip(&image.alpha).map(|(d, a)| d / a.max(1e-6)).collect(),
+            confidences: image.alpha.iter().map(|&a| if a > 0.8 { 1.0 } else { 0.0 }).collect(),
+        }
+    };
+    (0..5).map(depths_of).collect()
+}
+
+#[test]
+fn depths_have_the_same_bits_on_any_number_of_threads_and_after_a_resume() {
+    let joint = config(DensityControl::Mcmc).cameras;
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| run(&mut depth_fitter(0.5, &start(1), 0, joint), 40))
+    };
+    let whole = on(1);
+    assert!(on(3) == whole, "the number of threads changed bits");
+    let mut first = depth_fitter(0.5, &start(1), 0, joint);
+    let state = run(&mut first, 23);
+    let mut resumed = depth_fitter(0.5, &state, 23, joint);
+    resumed.resume_cameras(first.camera_state().unwrap().unwrap()).unwrap();
+    assert!(run(&mut resumed, 40) == whole, "resumed it ends otherwise");
+    let plain = run(&mut fitter(DensityControl::Mcmc, &start(1), 0), 40);
+    assert!(plain != whole, "depths changed nothing");
+    assert!(
+        run(&mut depth_fitter(0.0, &start(1), 0, joint), 40) == plain,
+        "a weight of 0 changed bits"
+    );
+}
+
+#[test]
+fn a_fit_comes_nearer_to_depths_by_them() {
+    let (_, cameras) = photos();
+    let off = |state: &FitState| {
+        let splats = &state.splats;
+        let loss = |(camera, depth): (&Camera, &TargetDepth)| {
+            let projected =
+                Cpu.project(&splats.params(1), camera, &ProjectOptions::default()).unwrap();
+            let image = Cpu.rasterize(&projected, [0.0; 3]).unwrap();
+            Cpu.depth_loss(&image, depth).unwrap().value
+        };
+        cameras.iter().zip(&depths()).map(loss).sum::<f32>() / 5.0
+    };
+    let end = |weight: f32| off(&run(&mut depth_fitter(weight, &start(1), 0, None), 250));
+    let [without, with, more] = [0.0, 1.0, 10.0].map(end);
+    println!("depths off by {without} without, {with} with them, {more} with ten times as much");
+    assert!(with < 0.85 * without && more < with, "{without}, {with}, {more}");
 }
 
 #[test]

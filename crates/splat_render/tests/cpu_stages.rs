@@ -146,6 +146,11 @@ fn a_far_away_scene_renders_as_one_at_the_origin() {
 }
 
 #[test]
+fn depth_loss_matches_the_reference() {
+    common::optimisation::depth_loss_matches_the_reference(&Cpu);
+}
+
+#[test]
 fn exposure_matches_the_reference() {
     common::optimisation::exposure_matches_the_reference(&Cpu);
 }

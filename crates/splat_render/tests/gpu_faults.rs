@@ -89,6 +89,7 @@ impl Fit {
             channels: 3,
             pixels: vec![90; 3 * 128 * 96],
             weights: None,
+            depth: None,
             background: None,
             turns: 1,
             until: None,
@@ -134,6 +135,7 @@ impl Fit {
             noise_seed: step,
             camera_gradient: false,
             exposure: None,
+            depth_weight: 0.0,
         })
     }
 }

@@ -7,7 +7,9 @@ use std::sync::{Arc, OnceLock};
 use common::*;
 use rand::Rng;
 use splat_render::cpu::CpuFit;
-use splat_render::fit::{Exposure, FitDevice, FitState, Rates, SplatArrays, StepInput, Target};
+use splat_render::fit::{
+    Exposure, FitDevice, FitState, Rates, SplatArrays, StepInput, Target, TargetDepth,
+};
 use splat_render::gpu::{Gpu, GpuFit};
 use splat_render::reference::Reference;
 use splat_render::stages::ProjectOptions;
@@ -70,6 +72,7 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
             channels,
             pixels,
             weights,
+            depth: None,
             background: None,
             turns: 1,
             until: None,
@@ -110,6 +113,7 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
         noise_seed: step.wrapping_mul(2_654_435_761),
         camera_gradient: true,
         exposure: None,
+        depth_weight: 0.0,
     }
 }
 
@@ -314,6 +318,62 @@ fn exposures_get_the_gradients_that_they_get_on_the_cpu() {
     }
     for (got, expected) in got.2.iter().zip(&expected.2) {
         assert!((got - expected).abs() < 1e-5, "loss {got} for {expected}");
+    }
+}
+
+/// Gives all photos but the second random depths near what is there; some are not known.
+fn with_depths(mut capture: Capture) -> Capture {
+    let mut rng = rng(77);
+    for (k, target) in capture.targets.iter_mut().enumerate() {
+        let pixels = (target.width * target.height) as usize;
+        target.depth = (k != 1).then(|| TargetDepth {
+            depths: (0..pixels).map(|_| rng.random_range(1.0..8.0)).collect(),
+            confidences: (0..pixels).map(|_| rng.random_range(-0.5f32..1.0).max(0.0)).collect(),
+        });
+    }
+    capture
+}
+
+#[test]
+fn depths_count_as_on_the_cpu_and_repeat_themselves() {
+    // Photos with depths and one without; now and then a step to which depths are nothing.
+    let steps = 40;
+    let mut capture = with_depths(capture(3, &[(64, 64), (50, 70), (64, 64)], 400));
+    // Some pixels opaque enough to have a depth, and some not.
+    capture.start.splats.opacities.iter_mut().for_each(|o| *o += 2.0);
+    let still = |step: u32| StepInput {
+        rates: Rates::ZERO,
+        depth_weight: if step % 5 == 2 { 0.0 } else { 0.7 },
+        ..input(&capture, step, 0.0)
+    };
+    let rows = |device: &mut dyn FitDevice, depths: bool| {
+        let mut targets = capture.targets.clone();
+        targets.iter_mut().filter(|_| !depths).for_each(|target| target.depth = None);
+        device.set_targets(targets).unwrap();
+        device.upload(capture.start.clone()).unwrap();
+        let mut losses = Vec::new();
+        for step in 1..=steps {
+            device.step(&still(step)).unwrap();
+            losses.push(device.loss().unwrap());
+        }
+        (camera_rows(device), losses)
+    };
+    let (expected, got) = (rows(&mut CpuFit::default(), true), rows(&mut gpu_fit(), true));
+    assert!(rows(&mut gpu_fit(), true) == got, "the same twice gave other bits");
+    let without = rows(&mut gpu_fit(), false);
+    for k in 0..steps as usize {
+        let (step, view) = (k as u32 + 1, (k + 1) % 3);
+        let counts = view != 1 && step % 5 != 2;
+        assert_eq!(without.1[k] != got.1[k], counts, "step {step}");
+        assert_eq!(without.0[k] != got.0[k], counts, "step {step}");
+        assert!((got.1[k] - expected.1[k]).abs() < 1e-5, "loss {} for {}", got.1[k], expected.1[k]);
+        for kinds in [0..12, 12..16] {
+            let largest = expected.0[k][kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
+            for entry in kinds {
+                let off = (got.0[k][entry] - expected.0[k][entry]).abs();
+                assert!(off < 2e-3 * largest, "step {step}, entry {entry}: {off:.1e} of {largest}");
+            }
+        }
     }
 }
 

@@ -314,6 +314,11 @@ fn drawn_pictures_match_the_reference() {
 }
 
 #[test]
+fn depth_loss_matches_the_reference() {
+    common::optimisation::depth_loss_matches_the_reference(gpu());
+}
+
+#[test]
 fn exposure_matches_the_reference() {
     common::optimisation::exposure_matches_the_reference(gpu());
 }

@@ -4,10 +4,10 @@
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use splat_render::fit::{Rates, Target};
+use splat_render::fit::{Rates, Target, TargetDepth};
 use splat_render::reference::{Reference, decisions};
 use splat_render::splats::SplatArrays;
-use splat_render::stages::{AdamState, AdamStep, Exposure};
+use splat_render::stages::{AdamState, AdamStep, DepthLoss, Exposure};
 use splat_render::{
     Camera, Colors, Image, ImageGradients, ProjectOptions, SplatGradients, SplatParams, Stages,
 };
@@ -260,6 +260,7 @@ fn photo_and_picture(seed: u64) -> (Target, Image<f64>) {
         weights: seed
             .is_multiple_of(3)
             .then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect()),
+        depth: None,
         background: None,
         turns: 1,
         until: None,
@@ -372,6 +373,104 @@ fn the_exposure_s_gradients_match_central_differences() {
         }
     }
     println!("worst {worst:.1e} of the largest");
+}
+
+#[test]
+fn the_depth_loss_s_gradients_match_central_differences() {
+    let (mut worst, mut samples) = (0.0f64, 0);
+    for seed in 0..40 {
+        let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0xdeb);
+        let (width, height) = (rng.random_range(1..18u32), rng.random_range(1..18u32));
+        let pixels = (width * height) as usize;
+        // World units of any size.
+        let unit = 10.0f64.powi(seed as i32 % 7 - 3);
+        let alpha: Vec<f64> = (0..pixels).map(|_| rng.random_range(0.2..1.0)).collect();
+        let target = TargetDepth {
+            depths: (0..pixels).map(|_| (unit * rng.random_range(0.5..2.0)) as f32).collect(),
+            confidences: (0..pixels).map(|_| rng.random_range(-0.3f32..1.0).max(0.0)).collect(),
+        };
+        let mut image = Image {
+            width,
+            height,
+            color: vec![[0.5; 3]; pixels],
+            depth: alpha.iter().map(|a| a * unit * rng.random_range(0.5..2.0)).collect(),
+            transmittance: alpha.iter().map(|a| 1.0 - a).collect(),
+            alpha,
+        };
+        let loss = |image: &Image<f64>| Reference.depth_loss(image, &target).unwrap();
+        let analytic = loss(&image);
+        for pixel in 0..pixels {
+            let apart = image.depth[pixel] / (image.alpha[pixel] * f64::from(target.depths[pixel]));
+            if (apart - 1.0).abs() < 1e-3 || (image.alpha[pixel] - 0.5).abs() < 1e-3 {
+                continue; // at a kink
+            }
+            for of_depth in [false, true] {
+                let value = if of_depth { image.depth[pixel] } else { image.alpha[pixel] };
+                let h = 1e-6 * value;
+                let mut at = |value: f64| {
+                    let entry = if of_depth { &mut image.depth } else { &mut image.alpha };
+                    entry[pixel] = value;
+                    loss(&image).value
+                };
+                let (high, low, _) = (at(value + h), at(value - h), at(value));
+                let rows = if of_depth { &analytic.v_depth } else { &analytic.v_alpha };
+                // What the loss changes by when the number doubles, of a mean of so many.
+                let error = ((high - low) / (2.0 * h) - rows[pixel]) * value * pixels as f64;
+                assert!(error.abs() <= 1e-5, "seed {seed}, pixel {pixel}: {error:.1e}");
+                worst = worst.max(error.abs());
+                samples += usize::from(rows[pixel] != 0.0);
+            }
+        }
+    }
+    println!("{samples} samples with a slope: worst {worst:.1e}");
+    assert!(samples > 1000);
+}
+
+#[test]
+fn a_depth_loss_has_its_bounds() {
+    let with = |alpha: f64, depth: f64, z: f32, confidence: f32| {
+        let image = Image {
+            width: 1,
+            height: 1,
+            color: vec![[0.0; 3]],
+            alpha: vec![alpha],
+            depth: vec![depth],
+            transmittance: vec![1.0 - alpha],
+        };
+        let target = TargetDepth { depths: vec![z], confidences: vec![confidence] };
+        Reference.depth_loss(&image, &target).unwrap()
+    };
+    // One per cent too far; on it; absurdly wrong; too clear to have a depth; not known.
+    assert!((with(1.0, 2.02, 2.0, 1.0).value - 0.01).abs() < 1e-4);
+    assert_eq!(
+        with(0.8, 1.6, 2.0, 1.0),
+        DepthLoss { value: 0.0, v_alpha: vec![0.0], v_depth: vec![0.0] }
+    );
+    assert!((with(1.0, 1e-9, 1e9, 1.0).value - 2.0).abs() < 1e-9);
+    assert_eq!(with(0.49, 1.0, 1.0, 1.0).value, 0.0);
+    assert_eq!(with(1.0, 1.0, f32::NAN, 0.0), with(0.8, 1.6, 2.0, 1.0));
+    let wrong = [
+        (f32::NAN, 1.0),
+        (0.0, 0.5),
+        (-1.0, 0.5),
+        (f32::INFINITY, 1.0),
+        (1.0, 1.5),
+        (1.0, f32::NAN),
+    ];
+    for (z, confidence) in wrong {
+        let target = TargetDepth { depths: vec![z], confidences: vec![confidence] };
+        let image = photo_and_picture(0).1;
+        let image = Image {
+            width: 1,
+            height: 1,
+            color: image.color[..1].to_vec(),
+            alpha: vec![1.0],
+            depth: vec![1.0],
+            transmittance: vec![0.0],
+        };
+        let error = Reference.depth_loss(&image, &target).unwrap_err().to_string();
+        assert!(error.starts_with("target: has a depth"), "{error}");
+    }
 }
 
 #[test]

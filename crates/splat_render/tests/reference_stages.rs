@@ -48,6 +48,7 @@ fn a_far_away_scene_renders_as_one_at_the_origin() {
 #[test]
 fn exposure_gets_through_what_the_others_must() {
     optimisation::exposure_matches_the_reference(&Narrowed);
+    optimisation::depth_loss_matches_the_reference(&Narrowed);
 }
 
 #[test]

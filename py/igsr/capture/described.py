@@ -45,6 +45,7 @@ class DescribedCapture:
             max_size,
             channels=max((header.channels for header in headers), default=3),
             masked=any(shot.is_resampled or shot.mask_path for shot in self.shots),
+            depths=any(shot.depth_path for shot in self.shots),
             decoded=[header.size for header in headers],
         )
         points = self.points()

@@ -134,9 +134,10 @@ def plane_area_means(plane: np.ndarray, width: int, height: int) -> Float64:
 
 
 def reduced_view(view: View, width: int, height: int) -> View:
-    """A view with a smaller photo; its camera, mask and weights go with it.
+    """A view with a smaller photo; its camera, mask, weights and depth go with it.
 
-    A pixel is masked if all under it were. Weights are averaged.
+    A pixel is masked if all under it were. Weights are averaged. The depth is that of the pixel in
+    the middle: a mean over an edge is on no surface.
 
     Args:
         view: the view.
@@ -149,7 +150,33 @@ def reduced_view(view: View, width: int, height: int) -> View:
     if view.weights is not None:
         weights = plane_area_means(view.weights, width, height).astype(np.float32)
     camera = resized_camera(view.camera, width, height)
-    return replace(view, camera=camera, image=image, mask=mask, weights=weights)
+    return replace(
+        view,
+        camera=camera,
+        image=image,
+        mask=mask,
+        weights=weights,
+        depth=_resampled(view.depth, width, height),
+        depth_confidence=_resampled(view.depth_confidence, width, height),
+    )
+
+
+def _resampled(plane: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
+    return None if plane is None else resampled_plane(plane, width, height)
+
+
+def resampled_plane(plane: np.ndarray, width: int, height: int) -> np.ndarray:
+    """One number per pixel [H, W] at another size [height, width], larger or smaller.
+
+    Each is that of the pixel that its middle lies in: nothing is mixed.
+    """
+    if plane.shape == (height, width):
+        return plane
+    rows, columns = (
+        ((np.arange(count) + 0.5) * size / count).astype(np.int64)
+        for count, size in ((height, plane.shape[0]), (width, plane.shape[1]))
+    )
+    return np.ascontiguousarray(plane[np.ix_(rows, columns)])
 
 
 def halved(view: View) -> View:
@@ -165,6 +192,8 @@ def halved(view: View) -> View:
         image=view.image[even],
         mask=None if view.mask is None else view.mask[even],
         weights=None if view.weights is None else view.weights[even],
+        depth=None if view.depth is None else view.depth[even],
+        depth_confidence=None if view.depth_confidence is None else view.depth_confidence[even],
     )
     return reduced_view(whole, width, height)
 

@@ -62,6 +62,7 @@ def needed_memory(
     *,
     channels: int = 3,
     masked: bool = False,
+    depths: bool = False,
     decoded: Sequence[tuple[int, int]] = (),
 ) -> int:
     """Bytes that photos take at most, at one time.
@@ -72,18 +73,20 @@ def needed_memory(
         splats: most splats of a fit to these photos, or None where they are only loaded.
         channels: of the photos: 3, or 4 with alpha.
         masked: whether pixels are masked, or lens distortion is undone.
+        depths: whether photos come with depths.
         decoded: sizes of the files, where photos are parts of them.
     """
     reduced = [reduced_size(width, height, max_size) for width, height in sizes]
     pixels = sum(width * height for width, height in reduced)
     largest = max((width * height for width, height in reduced), default=0)
-    held = pixels * (channels + masked)
+    held = pixels * (channels + masked + 4 * depths)
     undistorted = UNDISTORTED * largest if masked else 0
     files = decoded or sizes
     loading = held + DECODED * _most_pixels(files) + undistorted
     if splats is None:
         return loading
-    copied = pixels * (channels + 4 * masked)  # a mask becomes float32 weights
+    # A mask becomes float32 weights; depths are stacked with their confidence, and copied.
+    copied = pixels * (channels + 4 * masked + 16 * depths)
     fitting = held + copied + FITTED * largest + OF_A_SPLAT * splats
     scoring = held + SCORED * largest
     return LIBRARIES + max(loading, fitting, scoring)
@@ -95,20 +98,21 @@ def largest_size_that_fits(
     *,
     channels: int = 3,
     masked: bool = False,
+    depths: bool = False,
     decoded: Sequence[tuple[int, int]] = (),
     available: int | None = None,
 ) -> int | None:
     """The longest side in pixels at which photos fit into memory; None where no size does.
 
     Args:
-        sizes, splats, channels, masked, decoded: as ``needed_memory``.
+        sizes, splats, channels, masked, depths, decoded: as ``needed_memory``.
         available: bytes; None is ``available_memory()``.
     """
     usable = USABLE * (available_memory() if available is None else available)
 
     def fits(size: int) -> bool:
         needed = needed_memory(
-            sizes, size, splats, channels=channels, masked=masked, decoded=decoded
+            sizes, size, splats, channels=channels, masked=masked, depths=depths, decoded=decoded
         )
         return needed <= usable
 
@@ -129,12 +133,13 @@ def check_memory(
     *,
     channels: int = 3,
     masked: bool = False,
+    depths: bool = False,
     decoded: Sequence[tuple[int, int]] = (),
 ) -> None:
     """Refuse photos that do not fit into memory, and name the size at which they do.
 
     Args:
-        sizes, max_size, splats, channels, masked, decoded: as ``needed_memory``.
+        sizes, max_size, splats, channels, masked, depths, decoded: as ``needed_memory``.
 
     Raises:
         IgsrError: they do not fit.
@@ -142,7 +147,9 @@ def check_memory(
     available = available_memory()
 
     def needed_at(size: int | None) -> int:
-        return needed_memory(sizes, size, splats, channels=channels, masked=masked, decoded=decoded)
+        return needed_memory(
+            sizes, size, splats, channels=channels, masked=masked, depths=depths, decoded=decoded
+        )
 
     if needed_at(max_size) <= USABLE * available:
         return
@@ -155,7 +162,13 @@ def check_memory(
         f"and {_gigabytes(available)} are free"
     )
     size = largest_size_that_fits(
-        sizes, splats, channels=channels, masked=masked, decoded=decoded, available=available
+        sizes,
+        splats,
+        channels=channels,
+        masked=masked,
+        depths=depths,
+        decoded=decoded,
+        available=available,
     )
     if size is None:
         raise IgsrError(f"{says}: give fewer photos, or free memory; no --max-size would do.")

@@ -30,6 +30,7 @@ class Overview:
         views: how many of ``sizes`` each photo has, in the order of names: panoramas become several
             views. Empty where each is one view.
         decoded: width and height in pixels of the files, where these are not ``sizes``.
+        depths: whether photos come with depths.
     """
 
     path: Path
@@ -41,6 +42,7 @@ class Overview:
     exact: bool
     views: list[int] = field(default_factory=list)
     decoded: list[tuple[int, int]] = field(default_factory=list)
+    depths: bool = False
 
     def train_photos(self, holdout: int | None) -> int:
         """How many photos will be fitted, at most, if every ``holdout``-th is held out.
@@ -75,6 +77,7 @@ class Overview:
             splats,
             channels=self.channels,
             masked=self.masked,
+            depths=self.depths,
             decoded=self.decoded,
         )
 
@@ -108,6 +111,7 @@ def look_at(
             True,
             [number for _, number in sorted(Counter(map(photo_of, shots)).items())],
             [header.size for header in headers],
+            any(shot.depth_path is not None for shot in shots),
         )
     found = photo_headers(path, frames)
     # Whether lenses bend is not known yet: it is counted as if they did.

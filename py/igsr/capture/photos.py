@@ -12,10 +12,12 @@ import numpy as np
 from PIL import Image
 
 from igsr._internal.choices import Split
+from igsr.capture.depth_files import depth_array, depth_of, holds_array, in_world_units
 from igsr.capture.downscaling import (
     area_means,
     plane_area_means,
     reduced_size,
+    resampled_plane,
     resized_camera,
 )
 from igsr.capture.exif import read_exif
@@ -33,6 +35,10 @@ SUFFIXES = (
 
 # Pillow reads more formats, but for some of them (EPS) it runs another program.
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "GIF")
+
+#: Part by which a depth's ratio of sides may differ from its photo's: networks round sides to whole
+#: patches.
+DEPTH_ASPECT = 0.05
 
 # No photo is packed tighter; a file that claims more is a decompression bomb or damaged.
 _MOST_PIXELS_PER_BYTE = 10_000
@@ -54,6 +60,8 @@ class Shot:
         rig: of a view of a wide photo, all views that this becomes; None for other photos.
         side: which of these the shot is.
         photo: the wide photo's name; also of views that were written as such.
+        depth_path: the file of the photo's depth, or None.
+        depth_unit: world units of one of its numbers; None: as ``in_world_units`` has it.
     """
 
     name: str
@@ -67,6 +75,8 @@ class Shot:
     rig: Rig | None = None
     side: int = 0
     photo: str | None = None
+    depth_path: Path | None = None
+    depth_unit: float | None = None
 
     @property
     def photo_size(self) -> tuple[int, int]:
@@ -87,7 +97,15 @@ def rig_shots(shot: Shot, rig: Rig) -> list[Shot]:
     Args:
         shot: the photo; of its camera, only the pose counts.
         rig: its views.
+
+    Raises:
+        IgsrError: the photo comes with depth: distances from its centre are not read.
     """
+    if shot.depth_path is not None:
+        raise IgsrError(
+            f"{shot.depth_path}: depth of a panorama or wide fisheye photo is not read; leave it "
+            "out"
+        )
     return [
         replace(
             shot,
@@ -421,7 +439,10 @@ def load_views(
             if mask.all():
                 mask = None
         view = View(shot.name, camera, shot.split, image, mask, exposure_value=light)
-        return [replace(view, rig=shot.photo)]
+        depth = _depth(shot, camera)
+        if depth is not None and not shot.lens.is_pinhole:
+            depth = undistorters.take(shot, camera).nearest(depth)
+        return [replace(view, rig=shot.photo, depth=depth)]
 
     # The views of a wide photo come from one decoding of it.
     groups: dict[str, tuple[list[Shot], PhotoHeader]] = {}
@@ -477,6 +498,30 @@ def _rig_views(
             )
         )
     return views
+
+
+def _depth(shot: Shot, camera: Camera) -> np.ndarray | None:
+    """The depth of a photo [H, W] in the camera's pixels, each that of the file's pixel there."""
+    if shot.depth_path is None:
+        return None
+    if holds_array(shot.depth_path):
+        stored = depth_array(shot.depth_path)
+    else:
+        with open_image(shot.depth_path) as opened:
+            load_pixels(opened, shot.depth_path)
+            stored = depth_of(opened, shot.depth_path)
+    depth = in_world_units(stored, shot.depth_unit)
+    height, width = depth.shape
+    # Depth cameras have fewer pixels than photos, but see as much.
+    whole = shot.camera
+    apart = abs(width * whole.height - height * whole.width)
+    rounding = max(whole.width, whole.height)
+    if apart > max(DEPTH_ASPECT * height * whole.width, rounding):
+        raise IgsrError(
+            f"{shot.depth_path} is {width}x{height} pixels but its photo {whole.width}x"
+            f"{whole.height}, of another shape; give depth of the whole photo"
+        )
+    return resampled_plane(depth, camera.width, camera.height)
 
 
 def _mask(shot: Shot, size: tuple[int, int]) -> np.ndarray | None:

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from igsr.capture.colmap_rigs import read_frames, shared_centres
+from igsr.capture.depth_files import FOLDER, depth_beside
 from igsr.capture.described import DescribedCapture
 from igsr.capture.image_folders import find_images
 from igsr.capture.photos import Shot, is_file, rig_shots
@@ -162,7 +163,8 @@ def described_colmap(
     Args:
         path: the capture. Its photos are in ``images/``, or reduced in ``images_K/`` (see
             ``igsr.capture.image_folders``) or, if there is none of these, in the capture itself.
-            The mask of a photo, if any, is ``masks/`` + its whole name + ``.png``.
+            The mask of a photo, if any, is ``masks/`` + its whole name + ``.png``; its depth, if
+            any, is in ``depths/``, see ``igsr.capture.depth_files.depth_beside``.
         model: the folder with cameras, images and points3D, all ``.bin`` or all ``.txt``.
         max_size: longest side in pixels of photos as they will be loaded, or None.
         folder: the name of the folder of photos to take, or None.
@@ -216,6 +218,7 @@ def described_colmap(
         except IgsrError as error:
             raise IgsrError(f"{cameras_path}, camera {image.camera_id}: {error}") from error
         shot = Shot(name, photo, camera, lens, "train", mask_path, images_path, found.factor)
+        shot = replace(shot, depth_path=depth_beside(path / FOLDER, image.name))
         taken.append(_Taken(shot, rig))
     plain = {
         image.identity: one.shot

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import posixpath
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -223,6 +224,7 @@ def _shots(
         if not is_file(mask_path):
             raise IgsrError(f"{where}: the mask {mask_path} is missing; put it there")
     fields = {**document, **frame}
+    depth_path, depth_unit = _depth_file(fields, path, where)
     width, height = _size(fields, photo, where)
     viewmat = _viewmat(_required(frame, "transform_matrix", where), where)
     is_sphere = fields.get("camera_model") == _EQUIRECTANGULAR
@@ -237,9 +239,28 @@ def _shots(
             radius = _number(fields, "fisheye_crop_radius", where, math.inf)
             wide = wide_fisheye(K, lens, width, height, radius)
         shot = Shot(name, photo, camera, lens, split, mask_path, path, photo=rig)
+        shot = replace(shot, depth_path=depth_path, depth_unit=depth_unit)
         return [shot] if wide is None else rig_shots(shot, rig_of(wide))
     except IgsrError as error:
         raise IgsrError(f"{where}: {error}") from error
+
+
+def _depth_file(fields: dict[str, Any], path: Path, where: str) -> tuple[Path | None, float | None]:
+    """The file of a frame's depth and the world units of one of its numbers, as nerfstudio's."""
+    if "depth_file_path" not in fields:
+        return None, None
+    depth_path = path.parent / _text(fields, "depth_file_path", where)
+    if not is_file(depth_path):
+        raise IgsrError(f"{where}: the depth {depth_path} is missing; put it there")
+    if "depth_unit_scale_factor" not in fields:
+        return depth_path, None
+    unit = _number(fields, "depth_unit_scale_factor", where)
+    if unit <= 0.0:
+        raise IgsrError(
+            f"{where}: depth_unit_scale_factor is {unit:g}; give the world units of one number of "
+            "the depth's file"
+        )
+    return depth_path, unit
 
 
 def _size(fields: dict[str, Any], photo: Path, where: str) -> tuple[int, int]:

@@ -97,6 +97,10 @@ class View(ArrayEquality, NotebookPicture):
             are not known, or are those of the scene. Scores of the view are of renders with them.
         exposure_value: how much light the photo took by its EXIF, in stops (log2 of seconds times
             ISO / 100 over the f-number squared), or None.
+        depth: float32 [H, W], camera-space z of what each pixel shows, world units, from a sensor
+            or a network; 0 where it is not known. None where it is known nowhere.
+        depth_confidence: float32 [H, W], how far each depth may be trusted, in [0, 1]; None: all as
+            far as any.
         rig: the name that views of one wide photo (a panorama, a fisheye photo of more than 120
             degrees) share: they have one centre, move together and are held out together. None for
             other photos.
@@ -119,6 +123,8 @@ class View(ArrayEquality, NotebookPicture):
     exposure: Exposure | None = None
     exposure_value: float | None = None
     rig: str | None = None
+    depth: np.ndarray | None = None
+    depth_confidence: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Check the pixels against the camera."""
@@ -130,6 +136,16 @@ class View(ArrayEquality, NotebookPicture):
             self._check("weights", self.weights, np.float32, [size])
             if not (np.isfinite(self.weights) & (self.weights >= 0.0)).all():
                 raise IgsrError(f"{self.name}: its weights must be finite and not negative")
+        if self.depth is not None:
+            self._check("depth", self.depth, np.float32, [size])
+            if not (np.isfinite(self.depth) & (self.depth >= 0.0)).all():
+                raise IgsrError(f"{self.name}: its depth must be finite and not negative")
+        if self.depth_confidence is not None:
+            self._check("depth_confidence", self.depth_confidence, np.float32, [size])
+            if self.depth is None:
+                raise IgsrError(f"{self.name}: it has depth_confidence without depth")
+            if not ((self.depth_confidence >= 0.0) & (self.depth_confidence <= 1.0)).all():
+                raise IgsrError(f"{self.name}: its depth_confidence must lie in 0..1")
         if self.background is not None:
             color = np.asarray(self.background, np.float64)
             if color.shape != (3,) or not ((color >= 0.0) & (color <= 1.0)).all():
@@ -145,8 +161,15 @@ class View(ArrayEquality, NotebookPicture):
     def __repr__(self) -> str:
         parts = [repr(self.name), self.split, f"{self.camera.width}x{self.camera.height}"]
         parts += ["alpha"] if self.image.shape[2] == 4 else []
-        parts += [name for name in ("mask", "weights") if getattr(self, name) is not None]
+        parts += [name for name in ("mask", "weights", "depth") if getattr(self, name) is not None]
         return f"View({', '.join(parts)})"
+
+    @property
+    def known_depth(self) -> np.ndarray | None:
+        """``depth``, and 0 also where its confidence is 0; None where there is none."""
+        if self.depth is None or self.depth_confidence is None:
+            return self.depth
+        return np.where(self.depth_confidence > 0.0, self.depth, np.float32(0.0))
 
     def _check(
         self, what: str, array: object, dtype: type[np.generic], shapes: list[tuple[int, ...]]

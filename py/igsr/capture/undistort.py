@@ -243,3 +243,15 @@ class Undistorter:
                 # Less than a thousandth of a pixel is rounding.
                 out[band] &= flat[index] | (weight < 1e-3)
         return out
+
+    def nearest(self, plane: np.ndarray) -> np.ndarray:
+        """Undistort one number per pixel [H, W], each that of the nearest pixel; 0 where not valid.
+
+        For depth: a mean over an edge is on no surface.
+        """
+        height, width = self._shape
+        right = (self._right >= 0.5) if width > 1 else np.zeros_like(self.valid)
+        down = (self._down >= 0.5) if height > 1 else np.zeros_like(self.valid)
+        out = plane.ravel()[self._index + right + width * down]
+        out[~self.valid] = 0
+        return out

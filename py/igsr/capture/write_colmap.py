@@ -1,4 +1,4 @@
-"""Write captures for COLMAP: ``sparse/0``, ``images/`` and ``masks/``.
+"""Write captures for COLMAP: ``sparse/0``, ``images/``, ``masks/`` and ``depths/``.
 
 Cameras are PINHOLE. Where views are of wide photos, the model has rigs and frames (COLMAP 3.12).
 Of an image's features, only those of points are written. A point with a track gets the error that
@@ -23,7 +23,7 @@ import numpy.typing as npt
 from igsr._internal.atomic_write import atomic_folder
 from igsr.capture.colmap_rigs import Rigs, pose_numbers
 from igsr.capture.types import Camera, Capture, Points
-from igsr.capture.write_files import png_names, save_png, write_pictures
+from igsr.capture.write_files import png_names, save_png, write_depths, write_pictures
 
 Float64 = npt.NDArray[np.float64]
 
@@ -36,6 +36,7 @@ def write_colmap(
     *,
     text: bool = False,
     replace: bool = False,
+    depths: Sequence[np.ndarray | None] | None = None,
     further_masks: Mapping[str, Sequence[np.ndarray | None]] | None = None,
     notes: Mapping[str, str | bytes] | None = None,
 ) -> None:
@@ -46,6 +47,8 @@ def write_colmap(
         out: the folder; it must be new or empty.
         text: write ``.txt`` files instead of ``.bin``.
         replace: replace an existing folder, once the new one is complete.
+        depths: per view camera-space z [h, w] in world units, of any size, or None; the default is
+            the views' own. They are written as float32 ``.npy``, which ``load_capture`` reads.
         further_masks: more masks, by the name of their folder: per view bool [h, w] of any size,
             which is resized to the photo's, or None. ``load_capture`` does not read them.
         notes: contents of further files, by file name.
@@ -56,6 +59,7 @@ def write_colmap(
     names = png_names(capture.views)
     with atomic_folder(out, replace=replace) as folder:
         write_pictures(folder, capture.views, names, lambda name: f"{name}.png")
+        write_depths(folder, names, depths or [view.known_depth for view in capture.views])
         for kind, masks in (further_masks or {}).items():
             for view, name, mask in zip(capture.views, names, masks, strict=True):
                 if mask is not None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
 
+from igsr.capture.depth_files import FOLDER, write_depth
 from igsr.capture.types import View
 
 
@@ -58,6 +59,28 @@ def write_pictures(
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         list(pool.map(write, views, names))
+
+
+def write_depths(
+    folder: Path, names: list[str], depths: Sequence[np.ndarray | None]
+) -> dict[str, str]:
+    """Write the depths of photos into ``depths/`` of a folder, if there are any.
+
+    Args:
+        folder: folder of the capture.
+        names: the photos' file names, from ``png_names``.
+        depths: per photo camera-space z [h, w] in world units, of any size; what is not above 0 is
+            not known. Or None.
+
+    Returns:
+        The name of each file in the folder, by the name of its photo.
+    """
+    written = {}
+    for name, depth in zip(names, depths, strict=True):
+        if depth is not None:
+            written[name] = f"{FOLDER}/{name}.npy"
+            write_depth(folder / written[name], depth)
+    return written
 
 
 def save_png(path: Path, pixels: np.ndarray) -> None:

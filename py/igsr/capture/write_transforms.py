@@ -11,13 +11,16 @@ import numpy as np
 from igsr._internal.atomic_write import atomic_folder
 from igsr.capture.point_cloud import write_point_cloud
 from igsr.capture.types import Camera, Capture
-from igsr.capture.write_files import png_names, write_pictures
+from igsr.capture.write_files import png_names, write_depths, write_pictures
 
 
 def write_transforms(
     capture: Capture, out: str | os.PathLike[str], *, replace: bool = False
 ) -> None:
-    """Write ``transforms.json``, ``images/``, ``masks/`` and ``points.ply`` into a folder.
+    """Write ``transforms.json``, ``images/``, ``masks/``, ``depths/`` and ``points.ply``.
+
+    Depths are float32 ``.npy`` in world units, 0 where they are not known or have a confidence of
+    0; other confidences are not written.
 
     Views of one wide photo have its name as ``rig``, which ``load_capture`` reads back.
 
@@ -48,6 +51,10 @@ def write_transforms(
             ]
     with atomic_folder(out, replace=replace) as folder:
         write_pictures(folder, capture.views, names, str)
+        written = write_depths(folder, names, [view.known_depth for view in capture.views])
+        for frame, name in zip(frames, names, strict=True):
+            if name in written:
+                frame |= {"depth_file_path": written[name], "depth_unit_scale_factor": 1.0}
         if capture.points is not None:
             document["ply_file_path"] = "points.ply"
             write_point_cloud(folder / "points.ply", capture.points)

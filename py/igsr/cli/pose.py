@@ -285,7 +285,7 @@ def _posed(
         photos if isinstance(photos, Path) else Path("photos"),
         photos_at(photos, finder.frames, max_size, held),
     )
-    write_colmap(capture, out, further_masks={"trusted": found.trusted})
+    write_colmap(capture, out, depths=found.depths, further_masks={"trusted": found.trusted})
     if plot:
         plot_poses(out / "poses.png", capture)
     return {

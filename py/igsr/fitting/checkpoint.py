@@ -167,6 +167,7 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         settings.setdefault("exposure", "off")  # nor this one
         settings.setdefault("transients", "auto")  # nor this one; looks that are left are made
         settings.setdefault("learning_rate", 1.0)
+        settings.setdefault("depth_weight", 0.0)  # photos had no depths
         seconds = settings.get("seconds")
         if not isinstance(seconds, float) or not math.isfinite(seconds):
             raise ValueError(f"its seconds are {seconds!r} where a finite number belongs")

@@ -14,11 +14,12 @@ from igsr.capture.types import Tracks
 
 
 def fingerprint(views: list[View], tracks: Tracks | None = None) -> str:
-    """SHA-256 of photos, masks, weights, backgrounds, cameras, rigs and tracks, in hexadecimal."""
+    """SHA-256 of all that a fit has of its photos, of cameras, rigs and tracks, in hexadecimal."""
     arrays: list[npt.NDArray[Any] | None] = []
     for view in views:
         camera = view.camera
         arrays += [camera.viewmat, camera.K, view.image, view.mask, view.weights]
+        arrays += [view.depth, view.depth_confidence]
         arrays.append(None if view.background is None else np.asarray(view.background))
         arrays.append(None if view.rig is None else np.frombuffer(view.rig.encode(), np.uint8))
     if tracks is not None:

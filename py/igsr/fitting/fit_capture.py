@@ -19,6 +19,7 @@ from igsr.capture import Capture, View
 from igsr.capture.photo_checks import check_photos
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import CheckpointFile, recorded_settings
+from igsr.fitting.depth_scales import with_scaled_depths
 from igsr.fitting.exposures import StartingExposures, starting_exposures
 from igsr.fitting.fingerprint import fingerprint, hash_of
 from igsr.fitting.fitter import (
@@ -85,6 +86,7 @@ def fit(
     learning_rate: float | None = None,
     dropout: float | None = None,
     coarse_to_fine: bool | None = None,
+    depth_weight: float | None = None,
     hull: bool | None = None,
     start: Initialization | Splats | None = None,
     poses: Poses | None = None,
@@ -131,6 +133,11 @@ def fit(
         coarse_to_fine: whether the first steps are on photos of an eighth to half of their size,
             which costs less and loses nothing (Chen et al., "DashGaussian", 2025); the last seven
             tenths of the steps have their whole size.
+        depth_weight: what the relative difference to the depths that photos came with
+            (``View.depth``, of a depth camera or a network) counts in the first step, beside the
+            difference to the photos; each step it falls by the same factor, to a hundredth. They
+            are brought to the unit of the capture's points where tracks say how far these are. 0:
+            such depths are not used at all. Else fits start from them, too.
         hull: whether splats are removed whose center a photo with alpha shows empty.
         start: the initialization: "auto", "points", "depths", "hull", "sift", "rays", "random" or
             "sfm"; see ``igsr.fitting.initialization``. Or splats that a fit to some of the photos
@@ -227,6 +234,9 @@ def _fitted(
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
     check_photos(views)
+    if settings.depth_weight > 0.0:
+        capture = replace(capture, views=with_scaled_depths(capture.views, capture.points))
+        views = capture.train_views
     _check_focal(views, settings)
     device = check_fits(backend)
     exposures = starting_exposures(views, capture.points, settings.exposure)
@@ -243,6 +253,8 @@ def _fitted(
         splats_hash = None if initial is None else hash_of(splat_arrays(initial).values())
         # What "auto" came to.
         decided = replace(settings, exposure="off" if exposures is None else "on")
+        if all(view.depth is None for view in views):
+            decided = replace(decided, depth_weight=0.0)
         recorded = recorded_settings(decided, device, fingerprint(views, tracks), splats_hash)
         file = CheckpointFile(Path(checkpoint), recorded)
 

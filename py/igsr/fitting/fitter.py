@@ -67,6 +67,7 @@ def fitter_of(
         None if priors is None else _prior_arrays(priors, origin),
         None if exposures is None else _exposure_arrays(exposures),
         _rigs(views) if settings.get("poses") == "joint" else None,
+        [_depth(view) for view in views] if settings.get("depth_weight") else None,
     )
 
 
@@ -104,8 +105,11 @@ def initial_state(
     """
     if given is not None:
         return splat_arrays(given), (GIVEN, len(given))
+    views = photos_among(capture.train_views)
+    if settings.depth_weight == 0.0:
+        views = [replace(view, depth=None, depth_confidence=None) for view in views]
     splats, made_from = initial_splats(
-        replace(capture, views=photos_among(capture.train_views)),
+        replace(capture, views=views),
         settings.seed,
         settings.max_splats,
         settings.sh_degree,
@@ -150,6 +154,17 @@ def _counting(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | N
     if view.weights is None:
         return None if view.mask is None else np.ascontiguousarray(view.mask)
     return np.ascontiguousarray(view.weights if view.mask is None else view.weights * view.mask)
+
+
+def _depth(view: View) -> npt.NDArray[np.float32] | None:
+    """What the fitter takes as a view's depth [H, W, 2]: z and confidence, 0 where not known."""
+    if view.depth is None:
+        return None
+    known = (view.depth > 0.0).astype(np.float32)
+    confidence = known if view.depth_confidence is None else known * view.depth_confidence
+    if view.mask is not None:
+        confidence = confidence * view.mask
+    return np.stack([view.depth, confidence], axis=-1)
 
 
 def _arrays(

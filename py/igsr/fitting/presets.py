@@ -48,6 +48,9 @@ FEW, SPLATS_POWER = 8.0, 0.4
 MOST_SPLATS = 1_000_000
 #: Small photos may have this many, or so many per pixel: they cost little there.
 SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL = 30_000, 0.3
+#: What depths of photos count at first, where there are any. Their relative difference is compared
+#: with differences of colors in 0..1.
+DEPTH_WEIGHT = 1.0
 #: Steps of the paper's fits to photos whose cameras have noise.
 PAPER_STEPS = 5000
 
@@ -68,6 +71,7 @@ _DEFAULT = FitSettings(
     hull=False,
     start="auto",
     coarse_to_fine=True,
+    depth_weight=DEPTH_WEIGHT,
     poses="fixed",
     focal="fixed",
     # Gains of photos are found well, but held-out photos of sceaux and museum lose by them.
@@ -84,6 +88,7 @@ _3DGS = replace(
     sh_degree=3,
     start="sfm",
     coarse_to_fine=False,
+    depth_weight=0.0,
     transients="off",
     remove_floaters=False,
 )
@@ -97,6 +102,7 @@ _INSTANTSPLAT = replace(
     sh_degree=1,
     density="fixed",
     coarse_to_fine=False,
+    depth_weight=0.0,
     poses="joint",
     focal="shared",
     transients="off",

@@ -107,6 +107,13 @@ class FitSettings:
             "the steps have their whole size."
         )
     )
+    depth_weight: float = field(
+        metadata=about(
+            "What the difference to the depths that photos came with counts in the first step, "
+            "beside that to the photos; it falls to a hundredth. 0 does not use these depths.",
+            limits=(0.0, 100.0),
+        ),
+    )
     poses: Poses = field(metadata=about("joint: optimize the cameras' poses with the splats."))
     focal: Focal = field(
         metadata=about(

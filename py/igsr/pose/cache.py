@@ -174,6 +174,7 @@ def _write(
         capture,
         kept,
         replace=True,
+        depths=found.depths,
         further_masks={"trusted": found.trusted},
         notes={**photos_note(photos), **used, FOUND: found.to_bytes()},
     )

@@ -11,6 +11,7 @@ import numpy as np
 from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
 from igsr.capture.undistort import Lens
+from igsr.pose.alignment.predictions import Grid
 
 #: Called with the stage, how much of it is done, and how much there is.
 Progress = Callable[[str, int, int], None]
@@ -25,12 +26,14 @@ class Estimate:
             photo is not registered.
         points: in the world frame, with confidence, or None.
         depths: per photo float32 [h, w], z-depth along the camera's axis in world units, NaN where
-            it is not known, at any resolution of the photo's aspect; or None.
+            it is not known, at any resolution; or None.
         trusted: per photo bool of the shape of its depth, True where the depth is confident; or
             None.
         warnings: messages for the user: which photos are not registered, and why.
         lenses: per photo the distortion that ``cameras`` leave out, None for none; an empty list
             says none for all. ``igsr.estimate_poses`` undoes it.
+        grids: per photo where its depth lies in the photo, None for depths of the whole photo; an
+            empty list says that all are.
         weights: of the network that was used: its "name", the "licence" that the publisher states
             for weights of that name, and the "sha256" of its file, which tells whether it is those;
             None where there is none.
@@ -42,6 +45,7 @@ class Estimate:
     trusted: list[np.ndarray | None]
     warnings: list[str]
     lenses: list[Lens | None] = field(default_factory=list)
+    grids: list[Grid | None] = field(default_factory=list)
     weights: dict[str, str] | None = None
 
 

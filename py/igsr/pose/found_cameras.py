@@ -13,7 +13,7 @@ import numpy as np
 
 from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
 from igsr.capture import Camera, Capture, Points, View
-from igsr.capture.downscaling import resized_camera
+from igsr.capture.downscaling import resampled_plane, resized_camera
 from igsr.capture.photo_folder import Photo
 from igsr.capture.tracks import resized
 from igsr.capture.types import Tracks
@@ -33,7 +33,7 @@ class FoundCameras:
     Attributes:
         names: of all photos, in the estimator's order.
         estimate: cameras and tracks are in pixels of the upright photos as they were taken; depths
-            are not kept.
+            are at the resolution that they were found at, 0 where they are not trusted.
         made_by: what the cameras depend on beside the photos, as plain values.
     """
 
@@ -61,7 +61,8 @@ class FoundCameras:
             estimate,
             cameras=[after.get(photo.name) for photo in photos],
             points=resized(estimate.points, before, after),
-            depths=[None] * len(photos),
+            depths=_trusted_depths(photos, estimate),
+            grids=[],
             lenses=list(estimate.lenses) or [None] * len(photos),
         )
         return FoundCameras([photo.name for photo in photos], whole, made_by)
@@ -83,6 +84,12 @@ class FoundCameras:
         """Per registered photo, where its depth is confident; see ``Estimate``."""
         pairs = zip(self.estimate.trusted, self.estimate.cameras, strict=True)
         return [mask for mask, camera in pairs if camera is not None]
+
+    @property
+    def depths(self) -> list[np.ndarray | None]:
+        """Per registered photo its depth, 0 where it is not trusted; see ``Estimate``."""
+        pairs = zip(self.estimate.depths, self.estimate.cameras, strict=True)
+        return [depth for depth, camera in pairs if camera is not None]
 
     def capture(self, path: Path, photos: Iterable[Photo]) -> Capture:
         """The registered photos as a capture, with lens distortion undone at the photos' size.
@@ -109,9 +116,14 @@ class FoundCameras:
                     f"{photo.name} is {photo.full_size[0]}x{photo.full_size[1]} pixels and was "
                     f"{camera.width}x{camera.height} when its camera was found; find it anew"
                 )
-            views[photo.name] = _undistorted(
-                photo, camera, self.estimate.lenses[index], undistorters
-            )
+            lens = self.estimate.lenses[index]
+            view = _undistorted(photo, camera, lens, undistorters)
+            depth = self.estimate.depths[index]
+            # Networks know pinhole cameras only.
+            if depth is not None and (lens is None or lens.is_pinhole):
+                size = view.camera.width, view.camera.height
+                view = replace(view, depth=resampled_plane(depth, *size))
+            views[photo.name] = view
         lost = [name for name in self.placed if name not in views]
         if lost:
             raise IgsrError(f"The photo {lost[0]} is gone or cannot be read; put it back")
@@ -132,6 +144,9 @@ class FoundCameras:
                 arrays[f"viewmat_{index}"], arrays[f"K_{index}"] = camera.viewmat, camera.K
             if trusted is not None:
                 arrays[f"trusted_{index}"] = trusted
+            depth = found.depths[index]
+            if depth is not None:
+                arrays[f"depth_{index}"] = depth
         if points is not None:
             arrays |= {"xyz": points.xyz, "rgb": points.rgb}
             if points.confidence is not None:
@@ -175,10 +190,9 @@ def read_found(path: Path) -> FoundCameras:
         cameras = [_camera(arrays, index, about["sizes"][index]) for index in range(count)]
         lenses = [_lens(about["lenses"][index]) for index in range(count)]
         trusted = [arrays.get(f"trusted_{index}") for index in range(count)]
+        depths = [_depth(arrays.get(f"depth_{index}")) for index in range(count)]
         points = _points(arrays, _texts(about["track_names"]))
-        estimate = Estimate(
-            cameras, points, [None] * count, trusted, _texts(about["warnings"]), lenses
-        )
+        estimate = Estimate(cameras, points, depths, trusted, _texts(about["warnings"]), lenses)
         estimate.weights = _weights(about.get("weights"))
         if len(set(names)) < count or not isinstance(about["made_by"], dict):
             raise ValueError("its names or settings are wrong")
@@ -187,6 +201,36 @@ def read_found(path: Path) -> FoundCameras:
         raise IgsrError(
             f"{path} cannot be read ({error}); delete {path.parent} to find the cameras anew"
         ) from error
+
+
+def _trusted_depths(photos: Sequence[Photo], estimate: Estimate) -> list[np.ndarray | None]:
+    """Depths of whole photos, as they are kept: 0 where they are not known or not trusted."""
+    kept: list[np.ndarray | None] = []
+    grids = estimate.grids or [None] * len(photos)
+    found = zip(photos, estimate.depths, estimate.trusted, grids, strict=True)
+    for photo, depth, sure, grid in found:
+        if depth is None:
+            kept.append(None)
+            continue
+        known = np.isfinite(depth) & (depth > 0.0)
+        if sure is not None:
+            known &= sure
+        plane = np.where(known, depth, 0.0).astype(np.float32)
+        if grid is not None:
+            height, width = photo.image.shape[:2]
+            plane = grid.over_photo(plane, width, height)
+        kept.append(plane if plane.any() else None)
+    return kept
+
+
+def _depth(stored: np.ndarray | None) -> np.ndarray | None:
+    if stored is None:
+        return None
+    if stored.ndim != 2 or 0 in stored.shape or stored.dtype != np.float32:
+        raise ValueError("it has a depth of another shape or type than depths")
+    if not (np.isfinite(stored) & (stored >= 0.0)).all():
+        raise ValueError("a depth is negative or not finite")
+    return stored
 
 
 def _texts(value: Any) -> list[str]:

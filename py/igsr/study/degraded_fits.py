@@ -164,6 +164,8 @@ def run_fit(out: Path, data: str, one: DegradedFit) -> dict[str, Any]:
         steps=_steps(one.kind),
         # Silhouettes of wrong cameras take away what is there.
         hull=None if one.kind in FEW else False,
+        # Few photos have depths; those of rendered captures would tell a fit too much.
+        depth_weight=0.0,
         progress=progress,
     )
     background = known_background(capture.views)

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::adam::{BlockGradients, BlockStep};
 use super::bin::{Bins, CHUNK, ChunkTiles};
 use super::block::{BLOCK, Ids};
+use super::depth_loss::DepthLoss;
 use super::explore::ExploreBlock;
 use super::exposure::Exposed;
 use super::loss::Loss;
@@ -13,7 +14,7 @@ use super::project::{ProjectBlock, View};
 use super::project_backward::{Backward, BackwardBlock, VCamera};
 use super::rasterize::{Planes, rasterize_tiles};
 use super::rasterize_backward::{
-    COLOR_SUMS, PairSums, PictureGradients, gather, rasterize_backward_tiles,
+    COLOR_SUMS, DEPTH_SUMS, PairSums, PictureGradients, gather, rasterize_backward_tiles,
 };
 use super::tile::TileSplat;
 use crate::constants::TILE;
@@ -39,7 +40,10 @@ pub struct CpuFit {
     image: Planes,
     exposed: Exposed,
     loss: Loss,
+    depth_loss: DepthLoss,
     sums: Vec<PairSums<COLOR_SUMS>>,
+    /// As `sums`, of steps whose photo has a depth.
+    depth_sums: Vec<PairSums<DEPTH_SUMS>>,
     /// The camera's gradient by block of splats, so that its sum does not depend on the threads.
     block_cameras: Vec<VCamera>,
 }
@@ -106,7 +110,12 @@ impl FitDevice for CpuFit {
         self.bins.fill(&self.chunks, tiles as usize, |i| splats[i].depth)?;
 
         self.image.resize(width, height);
-        rasterize_tiles::<false>(&self.splats, &self.bins, input.background, &mut self.image);
+        let depth = target.depth.as_ref().filter(|_| input.depth_weight > 0.0);
+        let (splats, bins) = (&self.splats, &self.bins);
+        match depth {
+            None => rasterize_tiles::<false>(splats, bins, input.background, &mut self.image),
+            Some(_) => rasterize_tiles::<true>(splats, bins, input.background, &mut self.image),
+        }
         if let Some(exposure) = &input.exposure {
             self.exposed.run(&self.image, exposure);
         }
@@ -129,18 +138,32 @@ impl FitDevice for CpuFit {
             self.exposure_gradients.push(gradient);
             v_alpha = exposure.background.map(|_| self.exposed.v_alpha.as_slice());
         }
-        rasterize_backward_tiles(
-            &self.splats,
-            &self.bins,
-            PictureGradients {
-                image: &self.image,
-                v_color: &self.loss.v_color,
-                v_alpha,
-                v_depth: None,
-            },
-            &mut self.sums,
-        );
-        self.update(&view, input, [width as f32, height as f32]);
+        let mut picture = PictureGradients {
+            image: &self.image,
+            v_color: &self.loss.v_color,
+            v_alpha,
+            v_depth: None,
+        };
+        let size = [width as f32, height as f32];
+        let Some(depth) = depth else {
+            rasterize_backward_tiles(&self.splats, &self.bins, picture, &mut self.sums);
+            let sums = std::mem::take(&mut self.sums);
+            self.update(&view, input, size, &sums);
+            self.sums = sums;
+            return Ok(());
+        };
+        let [.., accumulated, transmittance] = &self.image.planes;
+        let weight = input.depth_weight;
+        self.loss_value += self.depth_loss.run(accumulated, transmittance, depth, weight);
+        if let Some(v_alpha) = v_alpha {
+            self.depth_loss.v_alpha.iter_mut().zip(v_alpha).for_each(|(sum, v)| *sum += v);
+        }
+        picture.v_alpha = Some(&self.depth_loss.v_alpha);
+        picture.v_depth = Some(&self.depth_loss.v_depth);
+        rasterize_backward_tiles(&self.splats, &self.bins, picture, &mut self.depth_sums);
+        let sums = std::mem::take(&mut self.depth_sums);
+        self.update(&view, input, size, &sums);
+        self.depth_sums = sums;
         Ok(())
     }
 
@@ -187,8 +210,8 @@ impl Dropout {
 }
 
 /// One task's scratch: a block's gradients on their way from its pairs to its parameters.
-struct Scratch {
-    pairs: Vec<PairSums<COLOR_SUMS>>,
+struct Scratch<const N: usize> {
+    pairs: Vec<PairSums<N>>,
     backward: Box<BackwardBlock>,
     v: BlockGradients,
     explore: Box<ExploreBlock>,
@@ -196,12 +219,18 @@ struct Scratch {
 
 impl CpuFit {
     /// project_backward, adam and density statistics.
-    fn update(&mut self, view: &View, input: &StepInput, size: [f32; 2]) {
+    fn update<const N: usize>(
+        &mut self,
+        view: &View,
+        input: &StepInput,
+        size: [f32; 2],
+        sums: &[PairSums<N>],
+    ) {
         let FitState { splats: values, first, second, stats } = &mut self.state;
         let n = values.len();
         let stride = values.stride();
         let degree = input.sh_degree.min(values.sh_degree);
-        let (bins, tile_splats, sums) = (&self.bins, &self.splats, &self.sums);
+        let (bins, tile_splats) = (&self.bins, &self.splats);
         let dropout = Dropout::new(input);
         let plan = BlockStep::new(&input.adam(), n, values.sh_degree);
         self.block_cameras.clear();

@@ -524,6 +524,7 @@ mod tests {
             channels: 3,
             weights: weighted.then(|| (0..pixels).map(|_| weight()).collect()),
             pixels: (0..3 * pixels).map(|_| rng.random()).collect(),
+            depth: None,
             background: None,
             turns: 1,
             until: None,

@@ -5,6 +5,7 @@
 mod adam;
 mod bin;
 mod block;
+mod depth_loss;
 mod elementary;
 mod explore;
 mod exposure;
@@ -28,10 +29,10 @@ pub use simd::instruction_set;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
-    AdamState, AdamStep, Exposure, ExposureGradients, Image, ImageGradients, Loss, ProjectOptions,
-    Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
+    AdamState, AdamStep, DepthLoss, Exposure, ExposureGradients, Image, ImageGradients, Loss,
+    ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
 };
-use crate::target::Target;
+use crate::target::{Target, TargetDepth};
 
 /// The CPU implementation.
 #[derive(Debug, Clone, Copy, Default)]
@@ -101,6 +102,11 @@ impl Stages<f32> for Cpu {
     ) -> Result<Loss<f32>> {
         check::loss(image, target, ssim_weight)?;
         Ok(loss::loss(image, target, background, ssim_weight))
+    }
+
+    fn depth_loss(&self, image: &Image<f32>, target: &TargetDepth) -> Result<DepthLoss<f32>> {
+        check::depth_loss(image, target)?;
+        Ok(depth_loss::depth_loss(image, target))
     }
 
     fn adam(

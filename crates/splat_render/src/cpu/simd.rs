@@ -128,6 +128,7 @@ mod tests {
             channels: 3,
             pixels: image.color.as_flattened().iter().map(|v| (255.0 * (1.0 - v)) as u8).collect(),
             weights: Some(r.clone()),
+            depth: None,
             background: None,
             turns: 1,
             until: None,

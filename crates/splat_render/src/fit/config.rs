@@ -69,6 +69,9 @@ pub struct FitConfig {
     /// Whether the first steps are on photos of a fraction of their size; see
     /// [`FitConfig::reduction`].
     pub coarse_to_fine: bool,
+    /// What the loss of photos' depths is multiplied by in the first step; see
+    /// [`FitConfig::depth_weight_at`].
+    pub depth_weight: f32,
     /// What the centres' rate has decayed to at the end, as a part of the start's.
     pub means_decay: f32,
 }
@@ -99,6 +102,7 @@ impl Default for FitConfig {
             cameras: None,
             exposures: false,
             coarse_to_fine: false,
+            depth_weight: 0.0,
             means_decay: 0.01,
         }
     }
@@ -110,6 +114,9 @@ const COARSE_SIDE: u32 = 96;
 const MOST_HALVINGS: u32 = 3;
 /// Part of the steps after which photos have their whole size.
 const COARSE_UNTIL: f64 = 0.3;
+
+/// What the weight of photos' depths falls to, as a part of the first step's.
+const DEPTH_DECAY: f64 = 0.01;
 
 /// Steps until density control first runs, and from one run to the next, at most.
 const REFINE: (u32, u32) = (300, 100);
@@ -165,6 +172,14 @@ impl FitConfig {
         }
     }
 
+    /// What the loss of photos' depths is multiplied by in a step, from 0: it falls to a hundredth,
+    /// each step by the same factor. Depths say where to begin, and are less exact than photos
+    /// (Kerbl et al., "A Hierarchical 3D Gaussian Representation", 2024).
+    pub fn depth_weight_at(&self, step: u32) -> f32 {
+        let progress = f64::from(step) / f64::from(self.steps);
+        self.depth_weight * DEPTH_DECAY.powf(progress) as f32
+    }
+
     /// Degree of SH in use in a step, from 0.
     pub fn sh_degree_at(&self, step: u32) -> u32 {
         if self.rates == Rates::ZERO {
@@ -218,6 +233,9 @@ impl FitConfig {
         }
         if !(self.means_decay > 0.0 && self.means_decay <= 1.0) {
             return Err(Error::argument("means_decay", "must lie above 0 and at most at 1"));
+        }
+        if !(self.depth_weight.is_finite() && self.depth_weight >= 0.0) {
+            return Err(Error::argument("depth_weight", "must be finite and not negative"));
         }
         if let Some(cameras) = &self.cameras {
             cameras.validate()?;

@@ -279,6 +279,7 @@ mod tests {
             channels: 3,
             pixels: vec![level, level, level, level / 2, level / 2, level / 2],
             weights: None,
+            depth: None,
             background: None,
             turns: 1,
             until: None,

@@ -374,6 +374,7 @@ impl Fitter {
             noise: config.noise_at(step, self.extent),
             dropout: config.dropout * progress as f32,
             noise_seed,
+            depth_weight: config.depth_weight_at(step),
             exposure: self
                 .exposures
                 .as_ref()

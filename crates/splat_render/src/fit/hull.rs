@@ -101,6 +101,7 @@ mod tests {
             channels: 4,
             pixels,
             weights: None,
+            depth: None,
             background: None,
             turns: 1,
             until: None,

@@ -25,7 +25,7 @@ pub use crate::fit_device::{
 };
 pub use crate::splats::SplatArrays;
 pub use crate::stages::{Exposure, Rates};
-pub use crate::target::{Target, Weight};
+pub use crate::target::{Target, TargetDepth, Weight};
 
 /// [`PosePrior`] under its first name.
 pub use cameras::PosePrior as Hold;

@@ -66,6 +66,9 @@ pub struct StepInput {
     pub noise_seed: u32,
     /// Whether [`FitDevice::camera_gradients`] will ask for this step's.
     pub camera_gradient: bool,
+    /// What the loss of the depth, where the photo has one, is multiplied by; see
+    /// [`Stages::depth_loss`](crate::stages::Stages::depth_loss).
+    pub depth_weight: f32,
     /// What the picture is corrected by before the loss; [`FitDevice::exposure_gradients`] then has
     /// this step's. None compares the picture as it is.
     pub exposure: Option<Exposure<f32>>,
@@ -107,6 +110,12 @@ impl StepInput {
                 format!("must lie in 0..=1, got {}", self.ssim_weight),
             ));
         }
+        if !(self.depth_weight.is_finite() && self.depth_weight >= 0.0) {
+            return Err(Error::argument(
+                "depth_weight",
+                format!("must be finite and not negative, got {}", self.depth_weight),
+            ));
+        }
         if let Some(exposure) = &self.exposure {
             exposure.validate()?;
         }
@@ -130,7 +139,8 @@ impl StepInput {
 /// A backend that keeps splats, optimiser state and photos where its kernels run.
 ///
 /// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p
-/// and channels c, with s the SSIM weight, zero padding in the window, plus the two regularisers.
+/// and channels c, with s the SSIM weight, zero padding in the window, plus the loss of the depth,
+/// where the photo has one, and the two regularisers.
 /// Every parameter takes an Adam step in every step, seen or not. With [`Rates::ZERO`] nothing moves
 /// ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss, the density statistics and
 /// the cameras' gradients are as ever.
@@ -151,8 +161,8 @@ pub trait FitDevice: Send {
         self.upload(state)
     }
 
-    /// One step: project, bin, rasterize, exposure, loss, exposure_backward, rasterize_backward,
-    /// project_backward, Adam, noise, density statistics.
+    /// One step: project, bin, rasterize, exposure, loss, exposure_backward, depth_loss,
+    /// rasterize_backward, project_backward, Adam, noise, density statistics.
     fn step(&mut self, input: &StepInput) -> Result<()>;
 
     /// Gradients of the cameras of all steps since the last call that were to have them, in order.

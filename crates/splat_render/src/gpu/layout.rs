@@ -33,6 +33,9 @@ pub(super) const SPLATS_PER_GROUP: u32 = 64;
 /// Workgroups of the exposure kernels, each with sums of its own.
 pub(super) const EXPOSURE_GROUPS: u32 = 64;
 
+/// Workgroups of the depth loss, each with a sum of its own.
+pub(super) const DEPTH_GROUPS: u32 = 64;
+
 /// Camera, background and how colours and parameters are stored.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
@@ -191,6 +194,14 @@ pub(super) struct StatusHead {
     pub step: u32,
     pub overflow: u32,
     pub unused: u32,
+}
+
+/// What the depth of a photo counts in a step.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(super) struct DepthStep {
+    pub scale: f32,
+    pub unused: [f32; 3],
 }
 
 /// What a photo's exposure does to a picture.

@@ -7,6 +7,7 @@
 
 mod adam;
 mod bin;
+mod depth_loss;
 mod desktop;
 mod device;
 mod exposure;
@@ -30,10 +31,10 @@ pub use shaders::{ShaderVariant, shader_variants, shared_wgsl};
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
-    AdamState, AdamStep, Exposure, ExposureGradients, Image, ImageGradients, Loss, ProjectOptions,
-    Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
+    AdamState, AdamStep, DepthLoss, Exposure, ExposureGradients, Image, ImageGradients, Loss,
+    ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
 };
-use crate::target::Target;
+use crate::target::{Target, TargetDepth};
 
 impl Stages<f32> for Gpu {
     fn project(
@@ -101,6 +102,11 @@ impl Stages<f32> for Gpu {
     ) -> Result<Loss<f32>> {
         check::loss(image, target, ssim_weight)?;
         loss::loss(self, image, target, background, ssim_weight)
+    }
+
+    fn depth_loss(&self, image: &Image<f32>, target: &TargetDepth) -> Result<DepthLoss<f32>> {
+        check::depth_loss(image, target)?;
+        depth_loss::depth_loss(self, image, target)
     }
 
     fn adam(

@@ -2,9 +2,12 @@
 
 use std::fmt::Write;
 
-use super::layout::{CAMERA, EXPOSURE_GROUPS, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS};
+use super::layout::{
+    CAMERA, DEPTH_GROUPS, EXPOSURE_GROUPS, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS,
+};
 use crate::constants::{
-    ADAM, ALPHA_MAX, ALPHA_MIN, QUAT_NORM2_MIN, SSIM_C, SSIM_WINDOW, TILE, TRANSMITTANCE_MIN,
+    ADAM, ALPHA_MAX, ALPHA_MIN, DEPTH_ALPHA, QUAT_NORM2_MIN, SSIM_C, SSIM_WINDOW, TILE,
+    TRANSMITTANCE_MIN,
 };
 use crate::sh;
 
@@ -84,7 +87,7 @@ const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 15] = [
+pub(super) static SOURCES: [Source; 16] = [
     Source {
         name: "project",
         shared_work: None,
@@ -177,6 +180,13 @@ pub(super) static SOURCES: [Source; 15] = [
         segmented: false,
     },
     Source {
+        name: "depth_loss",
+        shared_work: None,
+        parts: &[SHARED, include_str!("shaders/depth_loss.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
         name: "loss",
         shared_work: None,
         parts: &[SHARED, include_str!("shaders/loss.wgsl")],
@@ -218,13 +228,14 @@ pub(super) enum Kernel {
     ExposureBackward,
     LossSlopes,
     LossGradient,
+    DepthLoss,
     AdamGeometry,
     AdamColors,
 }
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 22] = [
+    pub const ALL: [Self; 23] = [
         Self::Project,
         Self::ProjectBackward,
         Self::DepthKeys,
@@ -245,6 +256,7 @@ impl Kernel {
         Self::ExposureBackward,
         Self::LossSlopes,
         Self::LossGradient,
+        Self::DepthLoss,
         Self::AdamGeometry,
         Self::AdamColors,
     ];
@@ -276,6 +288,7 @@ impl Kernel {
             Self::ExposureBackward => ("exposure", "exposure_backward"),
             Self::LossSlopes => ("loss", "loss_slopes"),
             Self::LossGradient => ("loss", "loss_gradient"),
+            Self::DepthLoss => ("depth_loss", "depth_loss"),
             Self::AdamGeometry => ("adam", "adam_geometry"),
             Self::AdamColors => ("adam", "adam_colors"),
         }
@@ -292,11 +305,13 @@ fn constants(rows: u32) -> String {
         ("CAMERA", CAMERA as u32),
         ("STATS", STATS as u32),
         ("EXPOSURE_GROUPS", EXPOSURE_GROUPS),
+        ("DEPTH_GROUPS", DEPTH_GROUPS),
     ]) {
         let _ = writeln!(out, "const {name} = {value}u;");
     }
     let floats = [
         ("ALPHA_MIN", ALPHA_MIN),
+        ("DEPTH_ALPHA", DEPTH_ALPHA),
         ("ALPHA_MAX", ALPHA_MAX),
         ("TRANSMITTANCE_MIN", TRANSMITTANCE_MIN),
         ("QUAT_NORM2_MIN", QUAT_NORM2_MIN),
@@ -411,7 +426,8 @@ mod tests {
 
     use super::*;
     use crate::gpu::layout::{
-        Chunk, ChunkCount, ExposureUniform, SortPass, Splat2d, StatusHead, Step, View, Window,
+        Chunk, ChunkCount, DepthStep, ExposureUniform, SortPass, Splat2d, StatusHead, Step, View,
+        Window,
     };
 
     fn parse(source: &Source) -> naga::Module {
@@ -512,6 +528,7 @@ mod tests {
             compensation
         );
         layout!("project", Window, first, count);
+        layout!("depth_loss", DepthStep, scale);
         assert_layout(
             "exposure",
             "Exposure",

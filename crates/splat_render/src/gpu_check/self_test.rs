@@ -114,6 +114,7 @@ fn photo() -> Target {
             .map(|k| (255.0 * draw(k)) as u8)
             .collect(),
         weights: None,
+        depth: None,
         background: None,
         turns: 1,
         until: None,

@@ -9,6 +9,7 @@ mod atomic;
 mod bytes;
 mod compressed_ply;
 mod exr;
+mod exr_depth;
 mod format;
 mod frame;
 mod gltf;
@@ -27,6 +28,7 @@ mod spz;
 pub use crate::morton::morton_order;
 pub use atomic::write_atomically;
 pub use exr::{ExrPicture, encode_exr, write_exr};
+pub use exr_depth::read_exr_depth;
 pub use format::Format;
 pub use splat_file::{Loaded, SplatFile};
 

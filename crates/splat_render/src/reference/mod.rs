@@ -2,6 +2,7 @@
 //! against it, stage by stage.
 
 mod adam;
+mod depth_loss;
 mod exposure;
 mod kinks;
 mod loss;
@@ -16,10 +17,10 @@ pub use rasterize::band_pixels;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
-    AdamState, AdamStep, Exposure, ExposureGradients, Image, ImageGradients, Loss, ProjectOptions,
-    Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
+    AdamState, AdamStep, DepthLoss, Exposure, ExposureGradients, Image, ImageGradients, Loss,
+    ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
 };
-use crate::target::Target;
+use crate::target::{Target, TargetDepth};
 
 /// The f64 reference implementation.
 #[derive(Debug, Clone, Copy, Default)]
@@ -89,6 +90,11 @@ impl Stages<f64> for Reference {
     ) -> Result<Loss<f64>> {
         check::loss(image, target, ssim_weight)?;
         Ok(loss::loss(image, target, background, ssim_weight))
+    }
+
+    fn depth_loss(&self, image: &Image<f64>, target: &TargetDepth) -> Result<DepthLoss<f64>> {
+        check::depth_loss(image, target)?;
+        Ok(depth_loss::depth_loss(image, target))
     }
 
     fn adam(

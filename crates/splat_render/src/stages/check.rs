@@ -9,7 +9,7 @@ use num_traits::Float;
 use crate::camera::{Camera, check_size};
 use crate::error::{Error, Result};
 use crate::splats::SplatParams;
-use crate::target::Target;
+use crate::target::{Target, TargetDepth};
 
 pub fn project<T>(
     splats: &SplatParams<'_, T>,
@@ -78,6 +78,17 @@ pub fn loss<T>(image: &Image<T>, target: &Target, ssim_weight: f32) -> Result<()
         ));
     }
     Ok(())
+}
+
+pub fn depth_loss<T>(image: &Image<T>, target: &TargetDepth) -> Result<()> {
+    let pixels = image.width as usize * image.height as usize;
+    target.validate(pixels).map_err(|reason| Error::argument("target", reason))?;
+    let lengths = [
+        ("image", image.alpha.len()),
+        ("image", image.depth.len()),
+        ("image", image.transmittance.len()),
+    ];
+    check_lengths(&lengths, pixels, "pixels where its size asks for")
 }
 
 pub fn adam<T>(state: &AdamState<T>, gradients: &SplatGradients<T>, step: &AdamStep) -> Result<()> {

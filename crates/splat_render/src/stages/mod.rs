@@ -4,6 +4,7 @@
 //! `T` is f64 in the reference and f32 elsewhere.
 
 pub(crate) mod check;
+mod depth_loss;
 mod exposure;
 
 use num_traits::Float;
@@ -12,9 +13,11 @@ use crate::camera::{Camera, check_size};
 use crate::constants::{ADAM, BLUR, FAR, NEAR};
 use crate::error::{Error, Result};
 use crate::splats::SplatArrays;
-use crate::target::Target;
+use crate::target::{Target, TargetDepth};
 
 pub use crate::splats::{Colors, SplatParams};
+pub use depth_loss::DepthLoss;
+pub(crate) use depth_loss::pixel as depth_pixel;
 pub use exposure::{Exposure, ExposureGradients};
 
 /// Checks that every named length is `expected`; `unit` goes between the two numbers of the error.
@@ -479,6 +482,15 @@ pub trait Stages<T> {
         background: [T; 3],
         ssim_weight: f32,
     ) -> Result<Loss<T>>;
+
+    /// Loss of a picture's depth against a photo's, with its gradients:
+    /// `sum_p c_p 2 |D_p - A_p z_p| / (D_p + A_p z_p) / count` over pixels p with A the picture's
+    /// alpha, D its accumulated depth, z the photo's depth, c its confidence, and `count` the pixels
+    /// whose confidence is not 0. Where the two nearly agree, a pixel's term is their relative
+    /// difference; it is at most 2, so that single wrong depths have little say. Pixels with A less
+    /// than [`DEPTH_ALPHA`](crate::constants::DEPTH_ALPHA) do not count. Of the image, alpha, depth
+    /// and transmittance are read.
+    fn depth_loss(&self, image: &Image<T>, target: &TargetDepth) -> Result<DepthLoss<T>>;
 
     /// One optimiser step of all parameters (Kingma and Ba, 2015, algorithm 1), with the pull of the
     /// regularisers and, after it, the exploration noise. `gradients` are those of

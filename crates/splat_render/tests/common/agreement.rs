@@ -138,6 +138,7 @@ fn fitted(device: &mut dyn FitDevice) -> (FitState, StepInput) {
         noise_seed: 9,
         camera_gradient: true,
         exposure: None,
+        depth_weight: 0.0,
     };
     (state, input)
 }

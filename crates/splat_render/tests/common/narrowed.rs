@@ -1,9 +1,9 @@
 //! The reference behind the f32 interface, so that what every implementation must get through is
 //! also asked of the oracle.
 
-use splat_render::fit::Target;
+use splat_render::fit::{Target, TargetDepth};
 use splat_render::reference::Reference;
-use splat_render::stages::{AdamState, AdamStep, Exposure, ExposureGradients, Loss};
+use splat_render::stages::{AdamState, AdamStep, DepthLoss, Exposure, ExposureGradients, Loss};
 use splat_render::{
     Camera, Colors, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, Result,
     SplatGradients, SplatParams, Stages,
@@ -122,6 +122,15 @@ impl Stages<f32> for Narrowed {
             v_alpha: narrow1(&v.v_alpha),
             v_gain: v.v_gain,
             v_offset: v.v_offset,
+        })
+    }
+
+    fn depth_loss(&self, image: &Image<f32>, target: &TargetDepth) -> Result<DepthLoss<f32>> {
+        let loss = Reference.depth_loss(&widen_image(image), target)?;
+        Ok(DepthLoss {
+            value: loss.value as f32,
+            v_alpha: narrow1(&loss.v_alpha),
+            v_depth: narrow1(&loss.v_depth),
         })
     }
 

@@ -1,7 +1,7 @@
 //! What exposure, loss and adam must show against the f64 reference. Each check prints its figures.
 
 use rand::Rng;
-use splat_render::fit::{Rates, Target};
+use splat_render::fit::{Rates, Target, TargetDepth};
 use splat_render::reference::Reference;
 use splat_render::splats::SplatArrays;
 use splat_render::stages::{AdamState, AdamStep, Exposure, Image};
@@ -34,6 +34,7 @@ pub fn random_target(
         channels,
         pixels: (0..pixels * channels as usize).map(|_| rng.random()).collect(),
         weights: weighted.then(|| (0..pixels).map(|_| weight(rng)).collect()),
+        depth: None,
         background: None,
         turns: 1,
         until: None,
@@ -136,6 +137,53 @@ pub fn exposure_matches_the_reference(stages: &dyn Stages<f32>) {
     assert!(stages.exposure(&image, &bad).map_err(named).unwrap_err().starts_with("gain"));
     let short = stages.exposure_backward(&image, &exposure, &v[1..]).map_err(named).unwrap_err();
     assert!(short.starts_with("v_corrected"), "{short}");
+}
+
+/// A picture that is clear in places, and depths near its own, of which some are not known.
+pub fn random_depth(rng: &mut Pcg64, (width, height): (u32, u32)) -> (Image<f32>, TargetDepth) {
+    let mut image = random_picture(rng, width, height);
+    let mut target = TargetDepth { depths: Vec::new(), confidences: Vec::new() };
+    // World units of any size.
+    let unit = 10.0f32.powi(rng.random_range(-3..4));
+    for k in 0..image.alpha.len() {
+        let transmittance = rng.random::<f32>().powi(3);
+        let alpha = 1.0 - transmittance;
+        let z = unit * rng.random_range(0.5f32..2.0);
+        // Apart, where rounding does not turn the slope's sign, or equal to the bit.
+        let apart = if rng.random::<f32>() < 0.5 { 0.7 } else { 1.2 };
+        image.transmittance[k] = transmittance;
+        image.alpha[k] = alpha;
+        image.depth[k] = alpha * z * apart;
+        let known = rng.random::<f32>() > 0.3;
+        target.depths.push(if known { z } else { f32::NAN });
+        target.confidences.push(if known { rng.random::<f32>() } else { 0.0 });
+    }
+    (image, target)
+}
+
+/// The loss of depths with its gradients, which are summed with others' in a fit.
+pub fn depth_loss_matches_the_reference(stages: &dyn Stages<f32>) {
+    let mut rng = rng(62);
+    for size in [(23, 37), (1, 1), (130, 7), (300, 200)] {
+        let (image, target) = random_depth(&mut rng, size);
+        let got = stages.depth_loss(&image, &target).unwrap();
+        let expected = Reference.depth_loss(&widen_image(&image), &target).unwrap();
+        let off = (f64::from(got.value) - expected.value).abs();
+        let of_alpha = difference1(&got.v_alpha, &expected.v_alpha, &[]).relative();
+        let of_depth = difference1(&got.v_depth, &expected.v_depth, &[]).relative();
+        println!("{size:?}: off by {off:.1e}, gradients by {of_alpha:.1e} and {of_depth:.1e}");
+        assert!(off <= 2e-6, "{size:?}: {} where {} is right", got.value, expected.value);
+        assert!(of_alpha <= 1e-5 && of_depth <= 1e-5, "{size:?}: {of_alpha:.1e}, {of_depth:.1e}");
+        assert!(stages.depth_loss(&image, &target).unwrap() == got, "twice gave other bits");
+    }
+    let (image, target) = random_depth(&mut rng, (4, 3));
+    let unknown = TargetDepth { confidences: vec![0.0; 12], ..target.clone() };
+    let none = stages.depth_loss(&image, &unknown).unwrap();
+    assert_eq!(none.value, 0.0, "a photo without depths asks for nothing");
+    assert!(none.v_alpha.iter().chain(&none.v_depth).all(|&v| v == 0.0));
+    let short = TargetDepth { depths: target.depths[1..].to_vec(), ..target };
+    let error = stages.depth_loss(&image, &short).unwrap_err().to_string();
+    assert!(error.starts_with("target: has depths"), "{error}");
 }
 
 /// Splats under optimisation, with moments of earlier steps, and gradients.

@@ -207,6 +207,8 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
         seed=one.seed + one.number,
         steps=plan.steps,
         hull=_hull(one),
+        # Exact depths of rendered captures would make these fits better than those of photos.
+        depth_weight=0.0,
     )
     has_alpha = plan.train[0].image.shape[2] == 4
     background: tuple[float, ...] | None = None

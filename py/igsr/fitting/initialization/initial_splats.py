@@ -3,16 +3,18 @@
 There is one splat for each of some points. These are
 
 * "points": the capture's own (COLMAP);
-* "depths": these, and points of the photos' depth maps that other photos confirm (``plane_sweep``);
+* "depths": these, and points of the depths that photos came with (``given_depths``), or else of
+  depth maps by plane sweep that other photos confirm (``plane_sweep``);
 * "hull": inside the visual hull of photos with alpha (``visual_hull``);
 * "rays": on rays of photo pixels, at the depth where other photos agree best (``ray_depths``);
 * "sift": triangulated features, and points between them (``sift_points``);
 * "random": anywhere in the box that the cameras look at;
 * "sfm": points where the capture has some, else random, as 3DGS starts.
 
-"auto" is points where the capture has as many as splats are wanted; hull where photos have alpha
-and there are no points; depths where most photos have another from a similar direction; else points
-where there are some, else sift, and rays where there are too few features.
+"auto" is depths where half of the photos came with depths; points where the capture has as many as
+splats are wanted; hull where photos have alpha and there are no points; depths where most photos
+have another from a similar direction; else points where there are some, else sift, and rays where
+there are too few features.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from igsr import _core
 from igsr.capture import Capture, Points, View
 from igsr.errors import IgsrError
 from igsr.fitting.initialization.camera_coverage import looked_at_box
+from igsr.fitting.initialization.given_depths import given_points, have_depths
 from igsr.fitting.initialization.plane_sweep import can_sweep, looked_at, swept_points
 from igsr.fitting.initialization.ray_depths import ray_points
 from igsr.fitting.initialization.sift_points import sift_points, with_points_between
@@ -89,6 +92,8 @@ def chosen_start(capture: Capture, start: str = "auto", wanted: int = MADE_UP_SP
         return "points" if points >= MIN_POINTS else "random"
     if start != "auto":
         return start
+    if have_depths(capture.train_views):
+        return "depths"
     if points >= wanted:
         return "points"
     if has_alpha:
@@ -157,9 +162,9 @@ def _placed_splats(
     random = np.random.default_rng([seed, 0x1617])
     points, views = capture.points, capture.train_views
     if start == "depths":
-        xyz, colors = _with_depths(views, points, wanted, random)
+        xyz, colors, confidence = _with_depths(views, points, wanted, random)
         if len(xyz) >= MIN_POINTS:
-            return _splats_at(xyz, colors, None, sh_degree), start
+            return _splats_at(xyz, colors, confidence, sh_degree), start
         if asked != "auto":
             raise IgsrError(
                 f"{capture.path}: the photos' depth maps agree in {len(xyz)} points only, too few "
@@ -201,14 +206,27 @@ def _placed_splats(
 
 def _with_depths(
     views: list[View], points: Points | None, wanted: int, random: Generator
-) -> tuple[Float64, Float64]:
-    """Points of depth maps and, where there are some, the capture's, ``wanted`` in all."""
+) -> tuple[Float64, Float64, Float64 | None]:
+    """Points of depths and, where there are some, the capture's, ``wanted`` in all.
+
+    With their colors and, where photos came with depths that have a confidence, theirs.
+    """
     known, rgb = np.zeros((0, 3)), np.zeros((0, 3))
     if points is not None:
-        chosen = _at_most(wanted, len(points.xyz), random)
+        # Depths that came with the photos show all of the scene; half of the room is theirs.
+        most = wanted // 2 if have_depths(views) else wanted
+        chosen = _at_most(most, len(points.xyz), random)
         known, rgb = points.xyz[chosen], points.rgb[chosen] / 255.0
-    swept, colors = swept_points(views, known if len(known) else None, wanted - len(known), random)
-    return np.concatenate([known, swept]), np.concatenate([rgb, colors])
+    confidence = None
+    if have_depths(views):
+        dense, colors, confidence = given_points(views, wanted - len(known), random)
+        if confidence is not None:
+            # Points of a capture are triangulated from several photos.
+            confidence = np.concatenate([np.ones(len(known)), confidence])
+    else:
+        places = known if len(known) else None
+        dense, colors = swept_points(views, places, wanted - len(known), random)
+    return np.concatenate([known, dense]), np.concatenate([rgb, colors]), confidence
 
 
 def _splats_at(xyz: Float64, colors: Float64, confidence: Float64 | None, sh_degree: int) -> Splats:

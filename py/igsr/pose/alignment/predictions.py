@@ -81,6 +81,30 @@ class Grid:
             if not np.isfinite(getattr(self, name)):
                 raise IgsrError(f"a grid's {name} is {getattr(self, name)!r}; give a finite one")
 
+    def over_photo(self, plane: np.ndarray, width: int, height: int) -> np.ndarray:
+        """One number per pixel of the grid [h, w] as such numbers of the whole photo [H, W].
+
+        Args:
+            plane: of the grid's size.
+            width, height: of the photo, pixels.
+
+        Returns:
+            At about the grid's resolution, each number that of the pixel which its middle lies in,
+            and 0 where the grid does not reach.
+        """
+        rows, columns = (
+            np.floor((((np.arange(count) + 0.5) * size / count) - offset) / scale).astype(np.int64)
+            for count, size, offset, scale in (
+                (max(1, round(height / self.scale_y)), height, self.offset_y, self.scale_y),
+                (max(1, round(width / self.scale_x)), width, self.offset_x, self.scale_x),
+            )
+        )
+        inside = np.outer(
+            (rows >= 0) & (rows < self.height), (columns >= 0) & (columns < self.width)
+        )
+        found = plane[np.ix_(rows.clip(0, self.height - 1), columns.clip(0, self.width - 1))]
+        return np.where(inside, found, np.zeros_like(found))
+
     def photo_pixels(self, stride: int = 1) -> Float64:
         """Photo coordinates [P, 2] (x, y) of the pixels that ``kept`` keeps, row by row."""
         rows, columns = (

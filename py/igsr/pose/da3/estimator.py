@@ -158,6 +158,7 @@ class Da3:
             depths=[None if one is None else one.depth for one in places],
             trusted=[trusted[i] for i in same_as],
             warnings=self._warnings(photos, shown, aligned, lost),
+            grids=[None if one is None else one.grid for one in places],
         )
 
     def _warnings(

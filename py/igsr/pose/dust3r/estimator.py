@@ -87,6 +87,7 @@ class Dust3r:
             depths=[None if photo is None else photo.depth for photo in aligned],
             trusted=list(trusted),
             warnings=alignment.warnings,
+            grids=[None if photo is None else photo.grid for photo in aligned],
         )
 
     def _any_known(self, photos: Sequence[Photo], aligned: Sequence[AlignedPhoto | None]) -> bool:

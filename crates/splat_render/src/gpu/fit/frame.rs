@@ -6,6 +6,7 @@ use super::scene::Scene;
 use crate::error::Result;
 use crate::gpu::adam::AdamInput;
 use crate::gpu::bin::{TileChunk, tile_count};
+use crate::gpu::depth_loss::{Compared, DepthBuffers};
 use crate::gpu::device::{Gpu, Op};
 use crate::gpu::exposure::{Exposed, ExposureBuffers};
 use crate::gpu::layout::Chunk;
@@ -25,12 +26,23 @@ pub(super) struct Frame {
     pub loss: LossBuffers,
     /// Made for the first step that has an exposure.
     pub exposure: Option<ExposureBuffers>,
+    /// Made for the first step whose photo has a depth.
+    pub depth: Option<DepthBuffers>,
     /// Tiles of each chunk; more than one only where the pairs of all do not fit one binding.
     pub chunks: Vec<Range<u32>>,
     /// Empty until needed, and again whenever a buffer was replaced.
     pub ops: Vec<Op>,
-    /// Whether they correct the picture by an exposure.
-    pub is_exposed: bool,
+    /// Whether they correct the picture by an exposure, and whether they compare its depth.
+    parts: [bool; 2],
+}
+
+/// The uniforms of what only some steps have.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Parts<'a> {
+    /// An `ExposureUniform`.
+    pub exposure: Option<&'a wgpu::Buffer>,
+    /// A `DepthStep`.
+    pub depth: Option<&'a wgpu::Buffer>,
 }
 
 impl Frame {
@@ -43,31 +55,35 @@ impl Frame {
             transmittances: gpu.transmittances(pixels)?,
             loss: LossBuffers::new(gpu, width, height)?,
             exposure: None,
+            depth: None,
             chunks: std::iter::once(0..tile_count(width, height)).collect(),
             ops: Vec::new(),
-            is_exposed: false,
+            parts: [false; 2],
         })
     }
 
-    /// Makes the commands of a whole step, unless they are there already; `exposure` is the uniform
-    /// of a step that has one.
+    /// Makes the commands of a whole step, unless they are there already.
     pub fn prepare(
         &mut self,
         gpu: &Gpu,
         view: &wgpu::Buffer,
         step: &wgpu::Buffer,
-        exposure: Option<&wgpu::Buffer>,
+        parts: Parts<'_>,
         scene: &Scene,
     ) -> Result<()> {
-        if !self.ops.is_empty() && self.is_exposed == exposure.is_some() {
+        let wanted = [parts.exposure.is_some(), parts.depth.is_some()];
+        if !self.ops.is_empty() && self.parts == wanted {
             return Ok(());
         }
-        if exposure.is_some() && self.exposure.is_none() {
-            let pixels = u64::from(self.width) * u64::from(self.height);
+        let pixels = u64::from(self.width) * u64::from(self.height);
+        if parts.exposure.is_some() && self.exposure.is_none() {
             self.exposure = Some(ExposureBuffers::new(gpu, pixels)?);
         }
-        self.is_exposed = exposure.is_some();
-        self.ops = self.step_ops(gpu, view, step, exposure, scene);
+        if parts.depth.is_some() && self.depth.is_none() {
+            self.depth = Some(DepthBuffers::new(gpu, pixels)?);
+        }
+        self.parts = wanted;
+        self.ops = self.step_ops(gpu, view, step, parts, scene);
         Ok(())
     }
 
@@ -76,14 +92,14 @@ impl Frame {
         gpu: &Gpu,
         view: &wgpu::Buffer,
         step: &wgpu::Buffer,
-        exposure: Option<&wgpu::Buffer>,
+        parts: Parts<'_>,
         scene: &Scene,
     ) -> Vec<Op> {
         let n = scene.len();
         let whole = Chunk::whole(tile_count(self.width, self.height), n, scene.capacity);
-        let parts = whole.parts(&self.chunks).zip(0..);
+        let numbered = whole.parts(&self.chunks).zip(0..);
         let chunks: Vec<TileChunk> =
-            parts.map(|(part, index)| TileChunk::new(gpu, Chunk { index, ..part })).collect();
+            numbered.map(|(part, index)| TileChunk::new(gpu, Chunk { index, ..part })).collect();
         let (bins, pairs) = (&scene.bins, &scene.pairs);
         let drawn = Projection { view, splats2d: &scene.splats2d };
         let bin = |ops: &mut Vec<Op>, chunk: &TileChunk| {
@@ -103,7 +119,7 @@ impl Frame {
             bin(&mut ops, chunk);
             ops.extend(rasterize_ops(gpu, drawn, chunk, pairs, &self.picture));
         }
-        let exposed = exposure.zip(self.exposure.as_ref()).map(|(uniform, buffers)| {
+        let exposed = parts.exposure.zip(self.exposure.as_ref()).map(|(uniform, buffers)| {
             let of = Exposed {
                 view,
                 uniform,
@@ -117,6 +133,17 @@ impl Frame {
         let compared = exposed.map_or(&self.picture.picture, |(buffers, _)| &buffers.corrected);
         ops.extend(self.loss.ops(gpu, view, step, compared));
         ops.extend(exposed.map(|(buffers, of)| buffers.backward(gpu, of)));
+        ops.extend(parts.depth.zip(self.depth.as_ref()).map(|(uniform, buffers)| {
+            let of = Compared {
+                view,
+                uniform,
+                picture: &self.picture.picture,
+                depths: &self.picture.depths,
+                v_picture: &self.loss.v_picture,
+                totals: &self.loss.totals,
+            };
+            buffers.op(gpu, of)
+        }));
         for chunk in &chunks {
             // Chunks share the pair buffers, so that the lists of all but one are gone by now.
             if chunks.len() > 1 {

@@ -9,7 +9,9 @@
 //! gradient and two moments make 4 P, statistics, 2D splats, their gradients and the depth order 120
 //! bytes. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
 //! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
-//! slopes of SSIM, and 16 more where exposures are fitted; a photo 4 per pixel, and 4 more for weights. A test holds the sum per splat.
+//! slopes of SSIM, 16 more where exposures are fitted and
+//! 8 more where photos have depths; a photo 4 per pixel, 4 more for weights and 8 more for depths. A
+//! test holds the sum per splat.
 
 mod frame;
 mod scene;
@@ -17,9 +19,10 @@ mod scene;
 use std::sync::Arc;
 
 use super::bin::{SplatBins, pair_limit, tile_count};
+use super::depth_loss::{DepthBuffers, depth_rows};
 use super::device::{Gpu, Op};
 use super::exposure::ExposureBuffers;
-use super::layout::{ChunkCount, ExposureUniform, GRADIENT, StatusHead, Step, View};
+use super::layout::{ChunkCount, DepthStep, ExposureUniform, GRADIENT, StatusHead, Step, View};
 use super::loss::{LossBuffers, rgba};
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
@@ -29,7 +32,7 @@ use crate::fit_device::{
 use crate::sh;
 use crate::stages::ProjectOptions;
 use crate::target::{Target, Weight};
-use frame::Frame;
+use frame::{Frame, Parts};
 use scene::{Scene, pair_buffers};
 
 /// Steps that may be under way before the host looks whether all pairs fitted.
@@ -46,6 +49,7 @@ pub struct GpuFit {
     view: wgpu::Buffer,
     step: wgpu::Buffer,
     exposure: wgpu::Buffer,
+    depth: wgpu::Buffer,
     scene: Option<Scene>,
     /// Steps not known to have been done.
     pending: Vec<StepInput>,
@@ -53,8 +57,8 @@ pub struct GpuFit {
     exposure_gradients: Vec<ExposureGradient>,
     /// The exposure sums of each pending step; None until a step has them.
     pending_exposures: Option<wgpu::Buffer>,
-    /// The last step: its photo and SSIM weight.
-    last: Option<(usize, f32)>,
+    /// The last step: its photo, SSIM weight, and whether it compared depths.
+    last: Option<(usize, f32, bool)>,
 }
 
 /// A photo on the device.
@@ -64,6 +68,15 @@ struct Photo {
     rgba: wgpu::Buffer,
     weights: Option<wgpu::Buffer>,
     weight: Weight,
+    depth: Option<PhotoDepth>,
+}
+
+/// A photo's depths on the device.
+#[derive(Debug)]
+struct PhotoDepth {
+    rows: wgpu::Buffer,
+    /// What one counts, times the step's weight.
+    scale: f64,
 }
 
 impl GpuFit {
@@ -73,6 +86,7 @@ impl GpuFit {
             view: gpu.uniform(&View::of_picture(1, 1, [0.0; 3])),
             step: gpu.uniform(&<Step as bytemuck::Zeroable>::zeroed()),
             exposure: gpu.uniform(&<ExposureUniform as bytemuck::Zeroable>::zeroed()),
+            depth: gpu.uniform(&<DepthStep as bytemuck::Zeroable>::zeroed()),
             gpu,
             photos: Vec::new(),
             frames: Vec::new(),
@@ -100,8 +114,12 @@ impl GpuFit {
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))?;
         let photo = &self.photos[input.view];
         let frame = &mut self.frames[photo.frame];
-        let exposure = input.exposure.map(|_| &self.exposure);
-        frame.prepare(&self.gpu, &self.view, &self.step, exposure, scene)?;
+        let depth = photo.depth.as_ref().filter(|_| input.depth_weight > 0.0);
+        let parts = Parts {
+            exposure: input.exposure.map(|_| &self.exposure),
+            depth: depth.map(|_| &self.depth),
+        };
+        frame.prepare(&self.gpu, &self.view, &self.step, parts, scene)?;
         let view = View {
             sh_degree: input.sh_degree.min(scene.sh_degree),
             sh_stride: sh::coeffs(scene.sh_degree) as u32,
@@ -130,6 +148,12 @@ impl GpuFit {
         if let Some(weights) = &photo.weights {
             copies.push(Op::Copy(weights.clone(), frame.loss.weights.clone(), 0, bytes));
         }
+        if let (Some(depth), Some(buffers)) = (depth, &frame.depth) {
+            let scale = (f64::from(input.depth_weight) * depth.scale) as f32;
+            let uniform = DepthStep { scale, unused: [0.0; 3] };
+            queue.write_buffer(&self.depth, 0, bytemuck::bytes_of(&uniform));
+            copies.push(Op::Copy(depth.rows.clone(), buffers.photo.clone(), 0, 2 * bytes));
+        }
         let mut sums = Vec::new();
         if let (Some(_), Some(buffers)) = (input.exposure, &frame.exposure) {
             let bytes = ExposureBuffers::SUM_BYTES;
@@ -154,7 +178,7 @@ impl GpuFit {
             let (from, to) = (scene.gradients.camera.clone(), log.clone());
             sums.push(Op::Copy(from, to, at as u64 * bytes, bytes));
         }
-        self.last = Some((input.view, input.ssim_weight));
+        self.last = Some((input.view, input.ssim_weight, depth.is_some()));
         self.gpu.submit(&[&copies, &frame.ops, &sums])
     }
 
@@ -323,7 +347,14 @@ impl FitDevice for GpuFit {
                 target.weights.as_ref().map(|w| self.gpu.upload("weights", w)).transpose()?;
             self.tiles = self.tiles.max(tile_count(width, height));
             let rgba = self.gpu.upload("photo", &rgba(&target))?;
-            self.photos.push(Photo { frame, rgba, weights, weight });
+            let depth = match &target.depth {
+                None => None,
+                Some(depth) => Some(PhotoDepth {
+                    rows: self.gpu.upload("depths of a photo", &depth_rows(depth))?,
+                    scale: depth.scale(),
+                }),
+            };
+            self.photos.push(Photo { frame, rgba, weights, weight, depth });
         }
         // Pair buffers are laid out for the largest photo.
         if self.scene.is_some() {
@@ -372,11 +403,15 @@ impl FitDevice for GpuFit {
 
     fn loss(&mut self) -> Result<f32> {
         self.settle()?;
-        let Some((view, ssim_weight)) = self.last else { return Ok(0.0) };
+        let Some((view, ssim_weight, has_depth)) = self.last else { return Ok(0.0) };
         let photo = &self.photos[view];
-        let loss = &self.frames[photo.frame].loss;
-        let data = self.gpu.download(&[], &[(&loss.sums, loss.sum_bytes())])?;
+        let frame = &self.frames[photo.frame];
+        let mut wanted = vec![(&frame.loss.sums, frame.loss.sum_bytes())];
+        let depth = frame.depth.as_ref().filter(|_| has_depth);
+        wanted.extend(depth.map(|buffers| (&buffers.sums, DepthBuffers::SUM_BYTES)));
+        let data = self.gpu.download(&[], &wanted)?;
         let [ssim, l1] = LossBuffers::total(&data[0]);
-        Ok(photo.weight.loss(f64::from(ssim_weight), l1, ssim) as f32)
+        let depth = data.get(1).map_or(0.0, |bytes| DepthBuffers::total(bytes));
+        Ok((photo.weight.loss(f64::from(ssim_weight), l1, ssim) + depth) as f32)
     }
 }

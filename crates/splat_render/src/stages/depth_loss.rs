@@ -1,0 +1,38 @@
+//! How far a picture's depth is from that of a photo.
+
+use num_traits::Float;
+
+use crate::constants::DEPTH_ALPHA;
+
+/// Loss of a picture's depth against that of a photo, and its gradients.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct DepthLoss<T> {
+    /// The loss; 0 where no depth is known.
+    pub value: T,
+    /// `[H * W]` with respect to the picture's alpha.
+    pub v_alpha: Vec<T>,
+    /// `[H * W]` with respect to the picture's accumulated depth.
+    pub v_depth: Vec<T>,
+}
+
+/// A pixel's loss `2 |D - A z| / (D + A z)` with its gradients with respect to A and D, for the
+/// picture's alpha A, its accumulated depth D and the photo's depth z; 0 where the picture is too
+/// clear to have a depth.
+#[inline(always)]
+pub(crate) fn pixel<T: Float>(alpha: T, depth: T, z: T) -> [T; 3] {
+    let (zero, two) = (T::zero(), T::one() + T::one());
+    let opaque = alpha >= T::from(DEPTH_ALPHA).unwrap_or_else(T::one);
+    let expected = alpha * z;
+    let inverse = T::one() / (depth + expected);
+    let difference = (depth - expected) * inverse;
+    // |x| has no slope at 0.
+    let sign = if difference > zero {
+        T::one()
+    } else if difference < zero {
+        -T::one()
+    } else {
+        zero
+    };
+    let slope = two * two * sign * inverse * inverse;
+    if opaque { [two * difference.abs(), -slope * depth * z, slope * expected] } else { [zero; 3] }
+}

@@ -1,0 +1,124 @@
+"""Points from the depths that photos came with, of a sensor or a network."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.capture import View
+from igsr.capture.downscaling import reduced_size, reduced_view
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+#: Part of the photos that must have depths for a fit to start from these.
+PART = 0.5
+#: Pixels of the longer side at which depths are compared; bounds time and memory.
+LONGEST = 512
+#: Photos that look past a point see it stand before their surface by this part of its depth.
+BEFORE = 0.1
+#: Photos compared with, the nearest.
+COMPARED = 8
+
+
+def have_depths(views: list[View]) -> bool:
+    """Whether enough of the photos have depths to start from."""
+    return bool(views) and sum(view.depth is not None for view in views) >= PART * len(views)
+
+
+def given_points(
+    views: list[View], count: int, random: np.random.Generator
+) -> tuple[Float64, Float64, Float64 | None]:
+    """Points of photos' depths that not more photos look past than see.
+
+    A wrong depth map shows things where other photos see through.
+
+    Args:
+        views: the photos; masked and transparent pixels and those without depth have no points.
+        count: number of points, at most.
+        random: what chooses among them; each photo has its share.
+
+    Returns:
+        Points [P, 3] in the world frame, their photos' colors [P, 3] in 0..1, and the depths'
+        confidence [P], or None where no photo has one.
+    """
+    small = [_reduced(view) for view in views if view.depth is not None]
+    points, colors, confidences = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
+    for k, view in enumerate(small):
+        rows, columns = np.nonzero(_known(view))
+        # More than the photo's share, since some are left out.
+        share = min(len(rows), 2 * count // len(small) + 1)
+        chosen = np.sort(random.choice(len(rows), size=share, replace=False))
+        rows, columns = rows[chosen], columns[chosen]
+        world = _world(view, rows, columns)
+        stays = ~_looked_past(world, _nearest(k, small))
+        rows, columns = rows[stays], columns[stays]
+        points.append(world[stays])
+        colors.append(view.image[rows, columns, :3] / 255.0)
+        given = view.depth_confidence
+        confidences.append(np.ones(len(rows)) if given is None else given[rows, columns])
+    xyz, rgb, confidence = (np.concatenate(one) for one in (points, colors, confidences))
+    if len(xyz) > count:
+        chosen = np.sort(random.choice(len(xyz), size=count, replace=False))
+        xyz, rgb, confidence = xyz[chosen], rgb[chosen], confidence[chosen]
+    rated = any(view.depth_confidence is not None for view in small)
+    return xyz, rgb, confidence if rated else None
+
+
+def _reduced(view: View) -> View:
+    camera = view.camera
+    return reduced_view(view, *reduced_size(camera.width, camera.height, LONGEST))
+
+
+def _known(view: View) -> Bool:
+    """Which pixels [H, W] have a depth and are neither masked nor transparent in part."""
+    assert view.depth is not None  # callers leave out views without
+    known: Bool = view.depth > 0.0
+    if view.depth_confidence is not None:
+        known &= view.depth_confidence > 0.0
+    if view.mask is not None:
+        known &= view.mask
+    return known & (view.image[..., 3] == 255) if view.image.shape[2] == 4 else known
+
+
+def _world(view: View, rows: Int64, columns: Int64) -> Float64:
+    """The world points [P, 3] of pixels."""
+    assert view.depth is not None
+    camera, depth = view.camera, view.depth[rows, columns].astype(np.float64)
+    local = np.stack(
+        [
+            (columns + 0.5 - camera.K[0, 2]) / camera.K[0, 0] * depth,
+            (rows + 0.5 - camera.K[1, 2]) / camera.K[1, 1] * depth,
+            depth,
+        ],
+        axis=1,
+    )
+    world: Float64 = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    return world
+
+
+def _nearest(k: int, views: list[View]) -> list[View]:
+    centres = np.stack([view.camera.centre for view in views])
+    order = np.argsort(np.linalg.norm(centres - centres[k], axis=1), kind="stable")
+    return [views[int(i)] for i in order if i != k][:COMPARED]
+
+
+def _looked_past(world: Float64, others: list[View]) -> Bool:
+    """Which points [P, 3] more of the other photos look past than see on their surface."""
+    past, seen = np.zeros(len(world), np.int64), np.zeros(len(world), np.int64)
+    for view in others:
+        camera = view.camera
+        local = world @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        depth = np.maximum(local[:, 2], 1e-9)
+        x = camera.K[0, 0] * local[:, 0] / depth + camera.K[0, 2]
+        y = camera.K[1, 1] * local[:, 1] / depth + camera.K[1, 2]
+        inside = (local[:, 2] > 1e-9) & (x >= 0) & (y >= 0)
+        inside &= (x < camera.width) & (y < camera.height)
+        row, column = (np.where(inside, at, 0.0).astype(np.int64) for at in (y, x))
+        assert view.depth is not None
+        inside &= _known(view)[row, column]
+        surface = view.depth[row, column]
+        past += inside & (depth < (1.0 - BEFORE) * surface)
+        seen += inside & (np.abs(depth - surface) <= BEFORE * surface)
+    return past > seen

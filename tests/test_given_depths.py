@@ -1,0 +1,322 @@
+"""Depths that photos came with: a fit starts from them and stays near them, if they are right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rooms
+import scenes
+
+import igsr
+from igsr.capture import Capture, Points, View
+from igsr.capture.photo_folder import Photo
+from igsr.capture.types import Tracks
+from igsr.fitting.depth_scales import with_scaled_depths
+from igsr.fitting.initialization import initial_splats
+from igsr.fitting.initialization.given_depths import given_points, have_depths
+from igsr.fitting.initialization.initial_splats import chosen_start
+from igsr.pose import FoundCameras, read_found
+from igsr.pose.alignment import Grid
+from igsr.pose.estimate import Estimate
+from igsr.rendering.renders import render
+
+
+def depth_of(camera):
+    """The depth of every pixel of the textured room, float32 [H, W]."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    K = camera.K
+    local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    rays = local @ camera.viewmat[:3, :3]
+    depth = np.full(x.shape, np.inf)
+    for normal, offset, _, _ in rooms.WALLS:
+        along = rays @ np.array(normal)
+        with np.errstate(divide="ignore"):
+            far = (offset - camera.centre @ np.array(normal)) / along
+        depth = np.where((far > 0.0) & (far < depth), far, depth)
+    return depth.astype(np.float32)
+
+
+def room(angles, held_out, width=96, height=72):
+    """Photos of the textured room with exact depths, and photos to score without."""
+    views = []
+    for k, angle in enumerate(angles):
+        camera = rooms.camera(angle, 80.0, width, height)
+        test = k in held_out
+        depth = None if test else depth_of(camera)
+        split = "test" if test else "train"
+        views.append(View(f"{k}.png", camera, split, rooms.picture(camera), depth=depth))
+    return Capture(Path("room"), views)
+
+
+def with_views(capture, change):
+    views = [
+        change(k, view) if view.split == "train" else view for k, view in enumerate(capture.views)
+    ]
+    return replace(capture, views=views)
+
+
+def off_walls(xyz):
+    """How far points are from the nearest wall."""
+    normals = np.array([wall[0] for wall in rooms.WALLS])
+    offsets = np.array([wall[1] for wall in rooms.WALLS])
+    lengths = np.linalg.norm(normals, axis=1)
+    return np.abs((xyz @ normals.T - offsets) / lengths).min(axis=1)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return room(np.linspace(-0.5, 0.5, 6), (1, 4))
+
+
+def test_the_depths_of_the_room_are_right(made):
+    for view in made.train_views:
+        world, colors, confidence = given_points([view], 500, np.random.default_rng(0))
+        assert off_walls(world).max() < 1e-5
+        assert len(world) == len(colors) == 500
+        assert confidence is None
+
+
+def test_a_fit_starts_from_depths(made):
+    assert have_depths(made.train_views)
+    assert chosen_start(made) == "depths"
+    splats, start = initial_splats(made, 0, 2000, 0)
+    assert start == "depths"
+    assert len(splats) == 1000  # growth has room for as many
+    assert off_walls(splats.means + splats.origin).max() < 1e-3
+
+
+def test_half_of_the_photos_must_have_depths(made):
+    def without(count):
+        return with_views(made, lambda k, v: v if k >= count else replace(v, depth=None))
+
+    # Of the photos 0, 2, 3 and 5 two are left, and one.
+    assert have_depths(without(3).train_views)
+    assert not have_depths(without(4).train_views)
+
+
+def test_masked_transparent_and_unsure_pixels_have_no_points(made):
+    def spoiled(k, view):
+        depth = view.depth.copy()
+        depth[:, :40] = 0.01
+        mask = np.ones(depth.shape, bool)
+        mask[:, :20] = False
+        confidence = np.ones(depth.shape, np.float32)
+        confidence[:, 20:30] = 0.0
+        alpha = np.full((*depth.shape, 1), 255, np.uint8)
+        alpha[:, 30:40] = 254
+        image = np.concatenate([view.image, alpha], -1)
+        return replace(view, depth=depth, mask=mask, depth_confidence=confidence, image=image)
+
+    world, _, confidence = given_points(
+        with_views(made, spoiled).train_views, 3000, np.random.default_rng(0)
+    )
+    assert len(world) == 3000
+    assert off_walls(world).max() < 1e-5
+    assert (confidence == 1.0).all()
+
+
+def test_points_of_a_wrong_depth_map_are_left_out(made):
+    def wrong(k, view):
+        return replace(view, depth=np.float32(0.5) * view.depth) if k == 2 else view
+
+    world, *_ = given_points(with_views(made, wrong).train_views, 4000, np.random.default_rng(0))
+    # All points of three photos; of the fourth, only what no other photo looks past.
+    assert np.mean(off_walls(world) > 0.1) < 0.06
+    whole, *_ = given_points(made.train_views, 4000, np.random.default_rng(0))
+    assert len(whole) == 4000
+
+
+def fitted(capture, **options):
+    arguments = {"steps": 300, "backend": "cpu", "max_splats": 1500, "sh_degree": 0, **options}
+    return igsr.fit(capture, **arguments)
+
+
+def score(splats, capture):
+    return igsr.evaluate(splats, capture, backend="cpu")["psnr"]
+
+
+def test_held_out_photos_gain_by_depths_also_where_one_is_wrong():
+    # So far apart that features and patches tell little.
+    capture = room(np.linspace(-1.2, 1.2, 5), (1, 3))
+    bare = with_views(capture, lambda k, v: replace(v, depth=None))
+    wrong = with_views(
+        capture, lambda k, v: replace(v, depth=np.float32(1.5) * v.depth) if k == 0 else v
+    )
+    without, given, one_wrong = (score(fitted(c), capture) for c in (bare, capture, wrong))
+    assert given > without + 1.0, (without, given)
+    assert one_wrong > without + 0.5, (without, one_wrong)
+
+
+def test_the_loss_alone_brings_renders_nearer_to_depths(made):
+    def error(splats):
+        errors = []
+        for view in made.train_views:
+            drawn = render(splats, view.camera, (0.0, 0.0, 0.0), backend="cpu")
+            there = drawn.alpha > 0.9
+            errors.append(np.abs(drawn.expected_depth / view.depth - 1.0)[there].mean())
+        return np.mean(errors)
+
+    start, _ = initial_splats(made, 0, 1500, 0, "rays")
+    loose, near = (error(fitted(made, start=start, depth_weight=w)) for w in (0.0, 1.0))
+    assert near < 0.7 * loose, (near, loose)
+
+
+def test_a_weight_of_0_uses_no_depths(made):
+    bare = with_views(made, lambda k, v: replace(v, depth=None))
+    options = {"steps": 40, "depth_weight": 0.0}
+    first, second = fitted(made, **options), fitted(bare, **options)
+    assert np.array_equal(first.means, second.means)
+    assert np.array_equal(first.sh, second.sh)
+
+
+def test_cpu_and_gpu_fit_alike(made):
+    cpu, gpu = (score(fitted(made, steps=60, backend=name), made) for name in ("cpu", "gpu"))
+    assert cpu == pytest.approx(gpu, abs=0.1)
+
+
+def test_a_resumed_fit_ends_with_the_same_bits(made, tmp_path):
+    whole = fitted(made, steps=60)
+    file = tmp_path / "checkpoint.npz"
+    fitted(made, steps=60, checkpoint=file, progress=lambda now: now.step < 20)
+    again = fitted(made, steps=60, checkpoint=file, resume=True)
+    assert np.array_equal(whole.means, again.means)
+    assert np.array_equal(whole.sh, again.sh)
+    fitted(made, steps=60, checkpoint=file, progress=lambda now: now.step < 20)
+    other = with_views(made, lambda k, v: replace(v, depth=v.depth + np.float32(k == 2)))
+    with pytest.raises(igsr.IgsrError, match="other photos"):
+        fitted(other, steps=60, checkpoint=file, resume=True)
+
+
+def test_presets_that_are_baselines_use_no_depths(made):
+    for preset in ("3dgs", "instantsplat"):
+        assert igsr.fitting.presets.settings_for(preset, 4).depth_weight == 0.0
+
+
+@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf"), 1e9, "much"])
+def test_a_senseless_weight_is_named(made, weight):
+    with pytest.raises(igsr.IgsrError, match="depth_weight"):
+        fitted(made, depth_weight=weight)
+
+
+# ---- depths in the unit of the cameras -----------------------------------------------------------
+
+
+def points_of(capture, per_photo=60):
+    """Points on the walls with tracks, as a structure-from-motion program has them."""
+    random = np.random.default_rng(4)
+    xyz, view, xy = [], [], []
+    for k, one in enumerate(capture.views):
+        if one.depth is None:
+            continue
+        place = random.uniform(
+            [2.0, 2.0], [one.camera.width - 2, one.camera.height - 2], (per_photo, 2)
+        )
+        column, row = np.floor(place).astype(int).T
+        local = np.concatenate([place, np.ones((per_photo, 1))], 1) @ np.linalg.inv(one.camera.K).T
+        local *= depth_of(one.camera)[row, column, None]
+        xyz.append((local - one.camera.viewmat[:3, 3]) @ one.camera.viewmat[:3, :3])
+        view += [k] * per_photo
+        xy.append(place)
+    count = len(view)
+    tracks = Tracks(
+        [one.name for one in capture.views], np.array(view), np.arange(count), np.concatenate(xy)
+    )
+    return Points(np.concatenate(xyz), np.full((count, 3), 128, np.uint8), None, tracks)
+
+
+def test_each_photos_depths_get_the_unit_of_the_points(made):
+    points = points_of(made)
+    factors = [0.001, 1.0, 250.0, 0.2, 0.5, 3.0]
+    scaled = with_views(made, lambda k, v: replace(v, depth=v.depth * np.float32(factors[k])))
+    for view, truth in zip(with_scaled_depths(scaled.views, points), made.views, strict=True):
+        if truth.depth is None:
+            assert view.depth is None
+        else:
+            assert view.depth == pytest.approx(truth.depth, rel=0.02)
+    # Without tracks, or with few, they stay.
+    for few in (None, replace(points, tracks=None), points_of(made, 10)):
+        same = with_scaled_depths(scaled.views, few)
+        assert all(a is b for a, b in zip(same, scaled.views, strict=True))
+
+
+def test_depths_of_something_else_are_left_out(made):
+    noise = np.random.default_rng(0).uniform(0.1, 9.0, made.views[2].depth.shape)
+    spoiled = with_views(
+        made, lambda k, v: replace(v, depth=noise.astype(np.float32)) if k == 2 else v
+    )
+    with pytest.warns(UserWarning, match=r"The depth of 2\.png does not fit to the points"):
+        views = with_scaled_depths(spoiled.views, points_of(made))
+    assert [view.depth is None for view in views] == [False, True, True, False, True, False]
+
+
+def test_a_fit_scales_depths(made):
+    points = points_of(made)
+    scaled = with_views(made, lambda k, v: replace(v, depth=v.depth * np.float32(0.1)))
+    splats = fitted(replace(scaled, points=points), steps=30)
+    assert np.median(off_walls(splats.means + splats.origin)) < 0.1
+
+
+# ---- depths of networks --------------------------------------------------------------------------
+
+
+def test_depths_that_an_estimator_trusts_come_with_the_photos(made, tmp_path):
+    photos = [Photo(view.name, view.image, None, None, "phone") for view in made.views]
+    grid = Grid(34, 44, 2.0, 2.0, 6.0, 2.0)
+    column, row = grid.photo_pixels().astype(int).T
+    depths = [depth_of(view.camera)[row, column].reshape(34, 44) for view in made.views]
+    depths[1] = np.full((34, 44), np.nan, np.float32)
+    sure = [np.ones((34, 44), bool) for _ in depths]
+    sure[2][:20] = False
+    nothing = [None] * len(photos)
+    estimate = Estimate(
+        [view.camera for view in made.views],
+        None,
+        [*depths[:5], None],
+        [*sure[:5], None],
+        [],
+        grids=[*[grid] * 5, None],
+    )
+    found = FoundCameras.of(photos, estimate, {"estimator": "stand-in"})
+    (tmp_path / "found.npz").write_bytes(found.to_bytes())
+    for one in (found, read_found(tmp_path / "found.npz")):
+        capture = one.capture(Path("room"), photos)
+        assert [view.depth is None for view in capture.views] == [
+            False,
+            True,
+            False,
+            False,
+            False,
+            True,
+        ]
+        for k in (0, 2, 3, 4):
+            depth, truth = capture.views[k].depth, depth_of(made.views[k].camera)
+            known = depth > 0.0
+            # Within a pixel of the grid; the border that the grid leaves out is not known.
+            assert not known[:, :6].any()
+            assert not known[:2].any()
+            assert np.median(np.abs(depth[known] / truth[known] - 1.0)) < 0.01
+            assert known.mean() == pytest.approx(
+                (14 if k == 2 else 34) * 44 * 4 / known.size, rel=0.05
+            )
+    old = FoundCameras.of(photos, replace(estimate, depths=nothing, trusted=nothing, grids=[]), {})
+    assert all(view.depth is None for view in old.capture(Path("room"), photos).views)
+
+
+def test_damaged_kept_depths_are_refused(made, tmp_path):
+    photos = [Photo(view.name, view.image, None, None, "phone") for view in made.views]
+    cameras, nothing = [view.camera for view in made.views], [None] * len(photos)
+    for bad in (np.full((3, 4), np.nan, np.float32), np.ones((3, 4)), np.ones(7, np.float32)):
+        estimate = Estimate(cameras, None, list(nothing), nothing, [])
+        found = FoundCameras.of(photos, estimate, {})
+        found.estimate.depths[0] = bad
+        (tmp_path / "found.npz").write_bytes(found.to_bytes())
+        with pytest.raises(igsr.IgsrError, match=r"delete .* to find the cameras anew"):
+            read_found(tmp_path / "found.npz")
+
+
+def test_scenes_without_depths_start_as_before():
+    capture = scenes.capture(views=8, size=24)
+    assert chosen_start(capture) != "depths" or not have_depths(capture.train_views)
