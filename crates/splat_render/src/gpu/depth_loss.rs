@@ -89,7 +89,7 @@ pub(super) fn depth_loss(
         gpu,
         Compared {
             view: &gpu.uniform(&View::of_picture(image.width, image.height, [0.0; 3])),
-            uniform: &gpu.uniform(&DepthStep { scale: target.scale() as f32, unused: [0.0; 3] }),
+            uniform: &gpu.uniform(&DepthStep { scale: target.scale() as f32 }),
             picture: &gpu.upload("picture", &picture)?,
             depths: &gpu.upload("depths", &image.depth)?,
             v_picture: &v_picture,

@@ -201,7 +201,6 @@ pub(super) struct StatusHead {
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct DepthStep {
     pub scale: f32,
-    pub unused: [f32; 3],
 }
 
 /// What a photo's exposure does to a picture.

@@ -6,8 +6,8 @@ use super::layout::{
     CAMERA, DEPTH_GROUPS, EXPOSURE_GROUPS, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS,
 };
 use crate::constants::{
-    ADAM, ALPHA_MAX, ALPHA_MIN, DEPTH_ALPHA, QUAT_NORM2_MIN, SSIM_C, SSIM_WINDOW, TILE,
-    TRANSMITTANCE_MIN,
+    ADAM, ALPHA_MAX, ALPHA_MIN, DEPTH_ALPHA, QUAT_NORM2_MIN, SH_COEFFS_MAX, SSIM_C, SSIM_WINDOW,
+    TILE, TRANSMITTANCE_MIN,
 };
 use crate::sh;
 
@@ -306,6 +306,7 @@ fn constants(rows: u32) -> String {
         ("STATS", STATS as u32),
         ("EXPOSURE_GROUPS", EXPOSURE_GROUPS),
         ("DEPTH_GROUPS", DEPTH_GROUPS),
+        ("SH_COEFFS_MAX", SH_COEFFS_MAX as u32),
     ]) {
         let _ = writeln!(out, "const {name} = {value}u;");
     }

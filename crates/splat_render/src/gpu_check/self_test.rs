@@ -6,6 +6,7 @@ use glam::{DMat4, DVec3};
 use num_traits::Float;
 
 use crate::camera::Camera;
+use crate::constants::DEPTH_ALPHA;
 use crate::error::{Error, Result};
 use crate::fit_device::noise_draw;
 use crate::gpu::Gpu;
@@ -14,7 +15,7 @@ use crate::splats::SplatArrays;
 use crate::stages::{
     AdamState, AdamStep, Exposure, ImageGradients, ProjectOptions, Rates, SplatGradients, Stages,
 };
-use crate::target::Target;
+use crate::target::{Target, TargetDepth};
 
 /// Largest difference from the reference, as a part of the largest value: f32 rounds to a hundredth of
 /// it, and a compiler's mistake is no matter of digits.
@@ -121,6 +122,23 @@ fn photo() -> Target {
     }
 }
 
+/// Depths a third before and behind those of the scene, where its alpha is clearly above or below
+/// what has a depth.
+fn depths() -> Result<TargetDepth> {
+    let options = ProjectOptions { antialiased: true, ..ProjectOptions::default() };
+    let projected = Reference.project(&scene::<f64>().params(2), &camera(), &options)?;
+    let image = Reference.rasterize(&projected, BACKGROUND)?;
+    let pixels = image.alpha.iter().zip(&image.depth).enumerate();
+    let (depths, confidences) = pixels
+        .map(|(k, (&alpha, &depth))| {
+            let z = if draw(k) < 0.5 { 0.67 } else { 1.5 } * depth / alpha.max(0.01);
+            let clear = (alpha - f64::from(DEPTH_ALPHA)).abs() > 0.02 && z > 0.0;
+            (z.max(1e-3) as f32, if clear { 0.1 + 0.9 * draw(k + 1) as f32 } else { 0.0 })
+        })
+        .unzip();
+    Ok(TargetDepth { depths, confidences })
+}
+
 fn flat<T: Float, const N: usize>(rows: &[[T; N]]) -> Vec<f64> {
     rows.iter().flatten().map(|x| x.to_f64().unwrap_or(f64::NAN)).collect()
 }
@@ -144,6 +162,7 @@ fn all_stages<T: Float>(stages: &impl Stages<T>) -> Result<Outputs> {
     let image = stages.rasterize(&projected, background)?;
     let corrected = stages.exposure(&image, &exposure)?;
     let loss = stages.loss(&image, &photo, background, 0.2)?;
+    let deep = stages.depth_loss(&image, &depths()?)?;
     let exposed = stages.exposure_backward(&image, &exposure, &loss.v_color)?;
     let v_image = ImageGradients {
         v_color: exposed.v_color.clone(),
@@ -175,6 +194,9 @@ fn all_stages<T: Float>(stages: &impl Stages<T>) -> Result<Outputs> {
         ("exposure", flat(&corrected)),
         ("loss", plain(&[loss.value])),
         ("loss", flat(&loss.v_color)),
+        ("depth_loss", plain(&[deep.value])),
+        ("depth_loss", plain(&deep.v_alpha)),
+        ("depth_loss", plain(&deep.v_depth)),
         ("exposure_backward", flat(&exposed.v_color)),
         ("exposure_backward", flat(&[exposed.v_gain, exposed.v_offset])),
         ("rasterize_backward", flat(&std::mem::take(&mut signed.v_means2d))),

@@ -150,7 +150,7 @@ impl GpuFit {
         }
         if let (Some(depth), Some(buffers)) = (depth, &frame.depth) {
             let scale = (f64::from(input.depth_weight) * depth.scale) as f32;
-            let uniform = DepthStep { scale, unused: [0.0; 3] };
+            let uniform = DepthStep { scale };
             queue.write_buffer(&self.depth, 0, bytemuck::bytes_of(&uniform));
             copies.push(Op::Copy(depth.rows.clone(), buffers.photo.clone(), 0, 2 * bytes));
         }

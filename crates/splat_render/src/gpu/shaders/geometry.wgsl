@@ -7,6 +7,26 @@
 // 3 floats per coefficient, `sh_stride` coefficients per splat (1 for direct colours).
 @group(0) @binding(3) var<storage, read> colors: array<f32>;
 
+// How colours and parameters are stored, as `look_up_mode` has it from the view.
+struct Mode {
+    sh_degree: u32,
+    sh_stride: u32,
+    raw: bool,
+    antialiased: bool,
+}
+
+var<private> mode: Mode;
+
+// Mesa's lavapipe compiles a kernel anew at every dispatch, and frees nothing, where branches on
+// uniforms alone may leave much of it out. So these depend on the workgroup, too: it changes none.
+fn look_up_mode(workgroup: vec3<u32>) {
+    let most = SH_COEFFS_MAX + workgroup.x;
+    mode.sh_degree = min(view.sh_degree, most);
+    mode.sh_stride = min(view.sh_stride, most);
+    mode.raw = min(view.raw, most) == 1u;
+    mode.antialiased = min(view.antialiased, most) == 1u;
+}
+
 struct Geometry {
     visible: bool,
     // Camera-space centre.
@@ -98,7 +118,7 @@ fn load_geometry(local: u32) -> Geometry {
         vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
         vec3(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
     );
-    if view.raw == 1u {
+    if mode.raw {
         // Beyond, the squares below would leave f32.
         if any(given > vec3(40.0)) {
             return g;
@@ -278,15 +298,15 @@ fn sh_degree_four(d: vec3<f32>) -> array<Term, 9> {
 
 // SH colour before the cut at zero.
 fn sh_color(local: u32, direction: vec3<f32>) -> vec3<f32> {
-    let row = local * view.sh_stride;
+    let row = local * mode.sh_stride;
     var color = SH_C0 * coefficient(row);
-    if view.sh_degree >= 1u {
+    if mode.sh_degree >= 1u {
         let terms = sh_degree_one(direction);
         color += terms[0].value * coefficient(row + 1u);
         color += terms[1].value * coefficient(row + 2u);
         color += terms[2].value * coefficient(row + 3u);
     }
-    if view.sh_degree >= 2u {
+    if mode.sh_degree >= 2u {
         let terms = sh_degree_two(direction);
         color += terms[0].value * coefficient(row + 4u);
         color += terms[1].value * coefficient(row + 5u);
@@ -294,7 +314,7 @@ fn sh_color(local: u32, direction: vec3<f32>) -> vec3<f32> {
         color += terms[3].value * coefficient(row + 7u);
         color += terms[4].value * coefficient(row + 8u);
     }
-    if view.sh_degree >= 3u {
+    if mode.sh_degree >= 3u {
         let terms = sh_degree_three(direction);
         color += terms[0].value * coefficient(row + 9u);
         color += terms[1].value * coefficient(row + 10u);
@@ -304,7 +324,7 @@ fn sh_color(local: u32, direction: vec3<f32>) -> vec3<f32> {
         color += terms[5].value * coefficient(row + 14u);
         color += terms[6].value * coefficient(row + 15u);
     }
-    if view.sh_degree >= 4u {
+    if mode.sh_degree >= 4u {
         let terms = sh_degree_four(direction);
         color += terms[0].value * coefficient(row + 16u);
         color += terms[1].value * coefficient(row + 17u);

@@ -8,6 +8,7 @@ fn project(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
+    look_up_mode(workgroup);
     let i = linear_index(workgroup, groups, local, 64u);
     if i >= window.count {
         return;
@@ -24,7 +25,7 @@ fn project(
         let dets = root_dets(g);
         let root_det = dets.y;
         var opacity = g.opacity;
-        if view.antialiased == 1u {
+        if mode.antialiased {
             opacity *= dets.x / dets.y;
         }
         let root_cyy = sqrt(cyy);
@@ -37,7 +38,7 @@ fn project(
         let center = view.focal * (g.t.xy / g.t.z) + view.principal;
         let size = vec2(f32(view.width), f32(view.height));
         var color = vec3(0.0);
-        if view.sh_stride == 0u {
+        if mode.sh_stride == 0u {
             color = coefficient(i);
         } else {
             color = sh_color(i, view_direction(g.t).xyz);
@@ -48,7 +49,7 @@ fn project(
             && is_finite(r) && is_finite(root_det) && is_finite(sxy);
         let in_picture = all(center + radii >= vec2(0.0)) && all(center - radii <= size);
         if finite && in_picture && all(radii > vec2(0.0)) {
-            if view.sh_stride != 0u {
+            if mode.sh_stride != 0u {
                 color = max(color, vec3(0.0));
             }
             out.mean = center;

@@ -37,7 +37,7 @@ fn write_zeros(i: u32) {
     for (var k = 0u; k < GEOMETRY; k++) {
         v_geometry[i * GEOMETRY + k] = 0.0;
     }
-    let rows = max(view.sh_stride, 1u);
+    let rows = max(mode.sh_stride, 1u);
     for (var k = 0u; k < 3u * rows; k++) {
         v_colors[3u * i * rows + k] = 0.0;
     }
@@ -53,15 +53,15 @@ fn coefficient_backward(row: u32, term: Term, v_color: vec3<f32>) -> vec3<f32> {
 
 // Gradients of all coefficients of a splat; returns that of the direction.
 fn sh_backward(i: u32, direction: vec3<f32>, v_color: vec3<f32>) -> vec3<f32> {
-    let row = i * view.sh_stride;
+    let row = i * mode.sh_stride;
     var v_direction = coefficient_backward(row, Term(SH_C0, vec3(0.0)), v_color);
-    if view.sh_degree >= 1u {
+    if mode.sh_degree >= 1u {
         let terms = sh_degree_one(direction);
         v_direction += coefficient_backward(row + 1u, terms[0], v_color);
         v_direction += coefficient_backward(row + 2u, terms[1], v_color);
         v_direction += coefficient_backward(row + 3u, terms[2], v_color);
     }
-    if view.sh_degree >= 2u {
+    if mode.sh_degree >= 2u {
         let terms = sh_degree_two(direction);
         v_direction += coefficient_backward(row + 4u, terms[0], v_color);
         v_direction += coefficient_backward(row + 5u, terms[1], v_color);
@@ -69,7 +69,7 @@ fn sh_backward(i: u32, direction: vec3<f32>, v_color: vec3<f32>) -> vec3<f32> {
         v_direction += coefficient_backward(row + 7u, terms[3], v_color);
         v_direction += coefficient_backward(row + 8u, terms[4], v_color);
     }
-    if view.sh_degree >= 3u {
+    if mode.sh_degree >= 3u {
         let terms = sh_degree_three(direction);
         v_direction += coefficient_backward(row + 9u, terms[0], v_color);
         v_direction += coefficient_backward(row + 10u, terms[1], v_color);
@@ -79,7 +79,7 @@ fn sh_backward(i: u32, direction: vec3<f32>, v_color: vec3<f32>) -> vec3<f32> {
         v_direction += coefficient_backward(row + 14u, terms[5], v_color);
         v_direction += coefficient_backward(row + 15u, terms[6], v_color);
     }
-    if view.sh_degree >= 4u {
+    if mode.sh_degree >= 4u {
         let terms = sh_degree_four(direction);
         v_direction += coefficient_backward(row + 16u, terms[0], v_color);
         v_direction += coefficient_backward(row + 17u, terms[1], v_color);
@@ -92,8 +92,8 @@ fn sh_backward(i: u32, direction: vec3<f32>, v_color: vec3<f32>) -> vec3<f32> {
         v_direction += coefficient_backward(row + 24u, terms[8], v_color);
     }
     // Coefficients of degrees that are not in use yet.
-    let used = (view.sh_degree + 1u) * (view.sh_degree + 1u);
-    for (var k = 3u * used; k < 3u * view.sh_stride; k++) {
+    let used = (mode.sh_degree + 1u) * (mode.sh_degree + 1u);
+    for (var k = 3u * used; k < 3u * mode.sh_stride; k++) {
         v_colors[3u * row + k] = 0.0;
     }
     return v_direction;
@@ -125,7 +125,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     var finite = true;
 
     // Colour and, through the view direction, t and the rotation.
-    if view.sh_stride == 0u {
+    if mode.sh_stride == 0u {
         v_colors[3u * i] = v_color.x;
         v_colors[3u * i + 1u] = v_color.y;
         v_colors[3u * i + 2u] = v_color.z;
@@ -148,7 +148,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     let v_vv = -0.5 * r * v_factor.z;
     var compensation = 1.0;
     var v_log = 0.0;
-    if view.antialiased == 1u {
+    if mode.antialiased {
         let dets = root_dets(g);
         compensation = dets.x / dets.y;
         v_log = v_opacity * g.opacity * compensation;
@@ -162,7 +162,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     var v_scales = v_fm_u * fb_u + v_fm_v * fb_v;
     var v_m0 = p * v_fm_u;
     var v_m1 = q * v_fm_u + r * v_fm_v;
-    if view.antialiased == 1u {
+    if mode.antialiased {
         // With S = M M^T and C = S + blur I, ln compensation = (ln det S - ln det C) / 2 has the
         // gradient S^-1 M - C^-1 M, whose terms cancel for large splats; it is blur C^-1 S^-1 M.
         // The rows of S^-1 M are m1 x n / n^2 and n x m0 / n^2 with n = m0 x m1; divided by the
@@ -231,7 +231,7 @@ fn splat_backward(i: u32) -> array<f32, CAMERA> {
     v_rotation += outer(v_t, mean);
 
     var v_given_opacity = v_opacity * compensation * view.compensation;
-    if view.raw == 1u {
+    if mode.raw {
         v_scales *= g.scales;
         // o (1 - o), without the cancellation at saturated logits.
         let tail = exp_accurate(-abs(geometry[base + 10u]));
@@ -276,6 +276,7 @@ fn project_backward(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
+    look_up_mode(workgroup);
     let i = linear_index(workgroup, groups, local, 64u);
     var camera: array<f32, CAMERA>;
     if i < window.count {

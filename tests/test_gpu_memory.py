@@ -1,0 +1,40 @@
+"""Fits on a GPU hold no more memory after many steps than after a few."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAM = """
+import sys
+sys.path.insert(0, {tests!r})
+import igsr, scenes
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6
+
+def fitted(steps):
+    igsr.fit(
+        capture, steps=steps, backend="gpu", max_splats=300, sh_degree=1, density="fixed",
+        start="random", transients="off", remove_floaters=False,
+    )
+
+capture = scenes.capture(views=4, size=32)
+fitted(20)
+before = resident()
+fitted(80)
+print(resident() - before)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory is read from Linux")
+def test_steps_hold_no_memory():
+    # A process of its own: others' tests take and free memory meanwhile.
+    program = PROGRAM.format(tests=str(Path(__file__).parent))
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    # Kernels that the driver compiled anew took 2 MB a step.
+    assert float(done.stdout.split()[-1]) < 16.0, done.stdout
