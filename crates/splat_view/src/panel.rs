@@ -49,9 +49,9 @@ pub fn panel(
         ui.separator();
         statistics(viewer, ui, times);
         ui.collapsing("Keys", |ui| ui.small(KEYS));
-        if !viewer.message.is_empty() {
+        for note in viewer.notes.texts() {
             ui.separator();
-            ui.label(&viewer.message);
+            ui.label(note);
         }
     });
 }
