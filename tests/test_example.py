@@ -46,7 +46,7 @@ def test_files_that_are_there_stay_and_damaged_ones_are_mended(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "example").write_text("a file")
-    with pytest.raises(igsr.IgsrError, match="Cannot write .*example"):
+    with pytest.raises(igsr.IgsrError, match=r"Cannot write .*example"):
         write_example(tmp_path / "example")
 
 
@@ -64,22 +64,19 @@ def test_photos_or_the_example_must_be_given_and_not_both(tmp_path, igsr_here, c
     assert not (tmp_path / "out").exists()
 
 
-def test_a_fit_of_the_example_goes_on_and_is_run_again_from_its_report(tmp_path, igsr_here):
+def test_a_fit_of_the_example_is_run_again_from_its_report_and_scored_again(tmp_path, igsr_here):
     options = ["--steps", "4", "--backend", "cpu", "--no-html", "--json"]
     first = igsr_here("fit", "--example", "--out", tmp_path / "a", *options)
     assert first.returncode == 0, first.stderr
     report = json.loads(first.stdout)
     assert report["settings"]["capture"] == str(tmp_path / "a" / "example")
-    again = igsr_here(
-        "fit", "--example", "--config", tmp_path / "a" / "report.json", "--out", tmp_path / "b",
-        "--no-html", "--json",
-    )  # fmt: skip
+    # The report names its photos, too.
+    recorded = ["--config", tmp_path / "a" / "report.json"]
+    again = igsr_here("fit", *recorded, "--out", tmp_path / "b", "--no-html", "--json")
     assert again.returncode == 0, again.stderr
     assert json.loads(again.stdout)["psnr"] == report["psnr"]
-    scored = igsr_here(
-        "eval", tmp_path / "a" / "scene.ply", tmp_path / "a" / "example", "--backend", "cpu",
-        "--json",
-    )  # fmt: skip
+    of_first = [tmp_path / "a" / "scene.ply", tmp_path / "a" / "example"]
+    scored = igsr_here("eval", *of_first, "--backend", "cpu", "--json")
     assert json.loads(scored.stdout)["psnr"] == pytest.approx(report["psnr"])
 
 

@@ -1,4 +1,4 @@
-"""The recipes of wheels stand in the form that hosting sites run, and name what is in this repository."""
+"""The recipes of wheels stand in the form that hosting sites run, and name what is there."""
 
 from __future__ import annotations
 

@@ -11,7 +11,6 @@ from typer.core import TyperCommand, TyperGroup
 
 from igsr._internal.extras import naming_extra
 from igsr.cli.error_messages import error_messages
-from igsr.errors import MissingExtraError
 
 
 class LazyCommand(NamedTuple):
@@ -53,12 +52,10 @@ class LazyGroup(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for; a missing extra is named. See ``TyperGroup``."""
-        command = " ".join(["igsr", *ctx.command_path.split()[1:], ctx.invoked_subcommand or ""])
         try:
-            with naming_extra(command.strip()):
-                return super().invoke(ctx)
-        except MissingExtraError as error:
-            with error_messages():
+            return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            with error_messages(), naming_extra(f"igsr {ctx.invoked_subcommand}"):
                 raise error
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

@@ -130,8 +130,8 @@ def _say_why_the_browser(scenes: list[str]) -> None:
     options = [word for word in scenes if word.startswith("-")]
     if options:
         raise IgsrError(
-            f"{options[0]} is for the window, and there is no display; set DISPLAY, or leave it out "
-            "for the browser view"
+            f"{options[0]} is for the window, and there is no display; set DISPLAY, or leave it "
+            "out for the browser view"
         )
     print_message("There is no display to open a window on; the browser shows the scene.")
 

@@ -99,9 +99,7 @@ def _planes(picture: Image) -> Planes:
     return np.asarray(np.ascontiguousarray(picture.transpose(2, 0, 1)) / 255.0)
 
 
-def _windowed(
-    x: Planes, y: Planes
-) -> Iterator[tuple[slice, Planes, Planes, Planes, Planes]]:
+def _windowed(x: Planes, y: Planes) -> Iterator[tuple[slice, Planes, Planes, Planes, Planes]]:
     """The terms of SSIM at each place that the whole window fits at, in strips of rows.
 
     Strips whose planes stay in the cache take a third of the time.
@@ -148,8 +146,8 @@ def _windowed(
 def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float | None:
     """Multi-scale SSIM (Wang et al. 2003) in the convention of torchmetrics, on [0, 1].
 
-    Five scales, 11 x 11 Gaussian window with sigma 1.5, negative terms as 0. It has no per-pixel map, so a mask only
-    blackens both pictures outside; the black part counts as equal.
+    Five scales, 11 x 11 Gaussian window with sigma 1.5, negative terms as 0. It has no per-pixel
+    map, so a mask only blackens both pictures outside; the black part counts as equal.
 
     Returns:
         The score, or None where the shorter side is under 176 pixels: the smallest scale would
