@@ -577,15 +577,15 @@ fn a_scene_without_cameras_is_seen_from_above_its_ground() {
         }
     }
     for x in 1..=9 {
-        add([0.05 * x as f32, 0.0, 0.0], [-3.0; 3], [0.0, 1.0, 0.0]);
+        add([0.05 * x as f32, 0.0, 0.0], [-2.6; 3], [0.0, 1.0, 0.0]);
     }
     write(&scene, &file);
-    run(&[&scene, &"--screenshot", &out, &"--size", &"90x90", &"--backend", &"cpu"]);
+    run(&[&scene, &"--screenshot", &out, &"--size", &"180x180", &"--backend", &"cpu"]);
     let picture = read_png(&out);
     let middle = |channel: usize| {
         let is_it =
             |i: &usize| picture.rgb[3 * i + channel] > 128 && picture.rgb[3 * i + 1 - channel] < 90;
-        let rows: Vec<usize> = (0..90 * 90).filter(is_it).map(|i| i / 90).collect();
+        let rows: Vec<usize> = (0..180 * 180).filter(is_it).map(|i| i / 180).collect();
         assert!(rows.len() > 20, "channel {channel} is seen at {} pixels", rows.len());
         rows.iter().sum::<usize>() as f64 / rows.len() as f64
     };
@@ -608,7 +608,8 @@ fn frames_go_into_no_folder_that_is_used() {
     assert_eq!(std::fs::read(frames.join("0000.png")).expect("a picture"), first);
     std::fs::write(folder.join("file"), "x").expect("file");
     let mut command = program();
-    command.arg(&scene).arg("--frames").arg(folder.join("file")).args(["--orbit", "2"]);
+    command.arg(&scene).arg("--frames").arg(folder.join("file"));
+    command.args(["--orbit", "2", "--backend", "cpu"]);
     refused(&command.output().expect("start"), &["file", "cannot be made"]);
 }
 
