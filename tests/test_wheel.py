@@ -91,7 +91,7 @@ def test_one_wheel_serves_every_python_and_is_small(wheel):
     print(f"{wheel.stat().st_size / 1e6:.1f} MB  {wheel.name}")
     assert "-cp310-abi3-" in wheel.name
     if sys.platform == "linux":
-        assert wheel.name.endswith(f"manylinux2014_{platform.machine()}.whl")
+        assert f"manylinux2014_{platform.machine()}" in wheel.name
     assert wheel.stat().st_size < LARGEST
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
@@ -128,9 +128,11 @@ def test_the_scene_is_converted(clean, fitted, target):
 
 
 def test_the_scene_is_rendered(clean, fitted):
-    words = ["out/scene.ply", "--orbit", "2", "--out", "turn", "--backend", "cpu"]
+    words = ["out/scene.ply", "--cameras", "out/example", "--out", "views", "--backend", "cpu"]
     clean.run("igsr", "render", *words)
-    assert len(list((clean.folder / "turn").iterdir())) == 2
+    assert len(list((clean.folder / "views").glob("**/*.png"))) >= 8
+    clean.run("igsr", "render", "out/scene.ply", "--orbit", "2", "--out", "turn.mp4")
+    assert (clean.folder / "turn.mp4").stat().st_size > 1000
 
 
 def test_the_viewer_draws_what_a_photo_shows(clean, fitted):
