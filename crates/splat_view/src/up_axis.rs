@@ -27,9 +27,10 @@ const BONUS: f64 = 1.0;
 const CLEAR: f64 = 4.0;
 const FEWEST: usize = 20;
 
-/// A flat splat.
+/// A splat that is seen.
 struct Flake {
     at: DVec3,
+    /// Its shortest axis, or zero if it is not flat.
     normal: DVec3,
     weight: f64,
 }
@@ -39,7 +40,7 @@ pub fn up_of_splats(file: &SplatFile, center: DVec3, radius: f64) -> DVec3 {
     estimated(&flakes(file, center, radius)).unwrap_or(USUAL)
 }
 
-/// Flat splats near the middle; places are relative to it, in radii.
+/// Splats near the middle; places are relative to it, in radii.
 fn flakes(file: &SplatFile, center: DVec3, radius: f64) -> Vec<Flake> {
     let splats = &file.splats;
     let step = splats.len().div_ceil(SAMPLES).max(1);
@@ -55,15 +56,17 @@ fn flakes(file: &SplatFile, center: DVec3, radius: f64) -> Vec<Flake> {
         let normal = rotation.col(order[0]);
         // One huge splat does not outweigh a surface of many.
         let area = (middle * long / (radius * radius)).min(1e-3);
-        let is_flat = short < FLAT * middle && splats.opacities[i] > FAINT_LOGIT;
         let is_known = at.is_finite() && normal.is_finite() && area.is_finite() && area > 0.0;
-        (is_flat && is_known && at.length() < 3.0).then_some(Flake { at, normal, weight: area })
+        let is_seen = is_known && at.length() < 3.0 && splats.opacities[i] > FAINT_LOGIT;
+        let normal = if short < FLAT * middle { normal } else { DVec3::ZERO };
+        is_seen.then_some(Flake { at, normal, weight: area })
     };
     (0..splats.len()).step_by(step).filter_map(flake).collect()
 }
 
 fn estimated(flakes: &[Flake]) -> Option<DVec3> {
-    let total: f64 = flakes.iter().map(|flake| flake.weight).sum();
+    let flat = flakes.iter().filter(|flake| flake.normal != DVec3::ZERO);
+    let total: f64 = flat.map(|flake| flake.weight).sum();
     if total <= 0.0 {
         return None;
     }

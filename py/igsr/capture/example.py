@@ -13,7 +13,7 @@ from igsr._internal.atomic_write import atomic_write
 def write_example(folder: str | os.PathLike[str]) -> Path:
     """Write the example capture into a folder, in the layout of NeRF Synthetic.
 
-    It has eight photos to fit, 400 x 400 pixels with alpha, and eight held-out ones. They are
+    It has eight photos to fit, 256 x 256 pixels with alpha, and eight held-out ones. They are
     photos of ``examples/tea_table`` in igsr's source: those that ``igsr refine --photos 8`` takes.
 
     Args:
