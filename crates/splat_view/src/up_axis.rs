@@ -92,22 +92,19 @@ fn estimated(flakes: &[Flake]) -> Option<DVec3> {
     let mean: DVec3 =
         along(best).map(|f| f.normal * (f.weight * f.normal.dot(best).signum())).sum();
     let up = mean.try_normalize()?;
-    // The scene stands on the plane: what is not in it is above.
-    let height = |flake: &Flake| flake.at.dot(up);
-    let ground = mean_of(along(best).map(|flake| (height(flake), flake.weight)));
-    let rest = mean_of(
-        flakes
-            .iter()
-            .filter(|flake| flake.normal.dot(best).abs() <= ALIKE)
-            .map(|flake| (height(flake), flake.weight)),
-    );
-    Some(if rest < ground { -up } else { up })
+    // The scene stands on the plane: what is not in it is above. Medians, since few photos leave
+    // large splats below that nothing in them tells the place of.
+    let height = |is_ground: bool| {
+        let there = |flake: &&Flake| (flake.normal.dot(best).abs() > ALIKE) == is_ground;
+        median(flakes.iter().filter(there).map(|flake| flake.at.dot(up)).collect())
+    };
+    Some(if height(false) < height(true) { -up } else { up })
 }
 
-fn mean_of(values: impl Iterator<Item = (f64, f64)>) -> f64 {
-    let (sum, weights) =
-        values.fold((0.0, 0.0), |(sum, weights), (value, w)| (sum + value * w, weights + w));
-    if weights > 0.0 { sum / weights } else { 0.0 }
+/// The value that half of the values are below; 0 of none.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// Directions over half a sphere, evenly (a Fibonacci lattice).
