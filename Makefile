@@ -1,6 +1,7 @@
 # make demo   sets everything up and makes a scene of eight photos of the example capture
 # make test   sets everything up and runs the checks: about ten minutes on two cores once built
 # make test-long   runs the tests that take longer
+# make wheel  builds the wheel for this platform into dist: it has all, the viewer and the example too
 # make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
 # make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
 # make bench-check  compares this build's speed with a commit's: [BASE=HEAD~1]; fails at 10 % slower
@@ -8,7 +9,7 @@
 #             along with a problem: [GARDEN=test_garden.npz] [CAPTURE=DIR] [SECONDS=2]
 # make docs   builds the documentation site into out/docs
 #
-# Needs a Python (3.10 or newer), a Rust toolchain, a C linker and a package manager. Everything
+# Needs a Python (3.10 or newer), a Rust toolchain (1.95 or newer), a C linker and a package manager. Everything
 # Python goes into .venv; what a rerun need not repeat is remembered in .venv/.*-ready.
 
 PYTHON ?= python3
@@ -86,8 +87,12 @@ profile: build
 
 build: $(VENV)/.build-ready
 
+# On Linux for every distribution since 2014: zig links against their glibc.
+MANYLINUX := $(if $(filter Linux,$(shell uname -s)),--zig --compatibility manylinux2014)
+
 wheel: $(VENV)/.venv-ready
-	$(BIN)/maturin build $(PROFILE) --locked --out dist
+	$(BIN)/python -m pip install --quiet "$$(grep '^ziglang==' requirements-dev.txt)"
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/maturin build $(PROFILE) --locked $(MANYLINUX) --out dist
 
 clean:
 	rm -rf $(VENV) target dist out py/igsr/_core*.so py/igsr/_core*.pyd
@@ -178,7 +183,7 @@ $(VENV)/.venv-ready: requirements-dev.txt
 
 $(VENV)/.build-ready: $(VENV)/.venv-ready pyproject.toml $(RUST_SOURCES)
 	@# Another environment that is active is not the one to install into.
-	env -u CONDA_PREFIX VIRTUAL_ENV="$(CURDIR)/$(VENV)" $(BIN)/maturin develop $(PROFILE) --locked
+	env -u CONDA_PREFIX VIRTUAL_ENV="$(CURDIR)/$(VENV)" $(BIN)/maturin develop $(PROFILE) --locked --extras refine
 	@touch $@
 
 $(VENV)/.dev-ready: $(VENV)/.venv-ready requirements-dev.txt

@@ -59,8 +59,10 @@ def test_importing_igsr_imports_neither_numpy_nor_torch():
     assert not modules & {*SLOW, "numpy", "rich", "typer", "PIL"}
     assert rooms == {
         "igsr._internal",
+        "igsr._internal.extras",
         "igsr._internal.lazy_exports",
         "igsr._internal.moved_modules",
+        "igsr.errors",
     }
 
 

@@ -1,9 +1,11 @@
-"""``igsr view``: starts splat-view with cameras that it can read. Without it: test_web_server."""
+"""``igsr view``: starts splat-view with cameras it can read. Without a display: test_web_server."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -46,7 +48,8 @@ def stand_in(tmp_path, monkeypatch):
     program = folder / "splat-view"
     program.write_text(STAND_IN)
     program.chmod(0o755)
-    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.setattr("igsr.cli.view.PROGRAM", (str(program),))
+    monkeypatch.setenv("DISPLAY", ":none")
     return folder
 
 
@@ -150,3 +153,39 @@ def test_igsr_writes_the_cameras_that_the_viewer_s_tests_read(tmp_path):
     matrix = written["frames"][0].pop("transform_matrix")
     np.testing.assert_allclose(matrix, frame.pop("transform_matrix"), atol=1e-12)
     assert written == {"camera_model": "PINHOLE", "frames": [frame]}
+
+
+def test_the_viewer_of_the_package_is_started_and_nothing_beside_takes_its_place(tmp_path):
+    scenes.splats().save(tmp_path / "scene.ply")
+    (tmp_path / "igsr.py").write_text("raise SystemExit('the folder was searched for modules')")
+    environment = {**os.environ, "PYTHONSAFEPATH": "1"}
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        environment.pop(name, None)
+    options = ["--screenshot", "seen.png", "--size", "40x30", "--backend", "cpu"]
+    result = subprocess.run(
+        [sys.executable, "-m", "igsr.cli", "view", "scene.ply", *options],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert result.returncode == 0, result.stderr
+    assert Image.open(tmp_path / "seen.png").size == (40, 30)
+
+
+def test_the_package_has_the_program_splat_view():
+    found = importlib.metadata.entry_points(group="console_scripts", name="splat-view")
+    assert [entry.value for entry in found] == ["igsr.viewing.window:main"]
+    for words, status, text in (
+        (["--version"], 0, f"splat-view {igsr.__version__}"),
+        (["--nonsense"], 1, "--nonsense"),
+    ):
+        result = subprocess.run(
+            [sys.executable, "-m", "igsr.viewing.window", *words],
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+        assert result.returncode == status
+        assert text in result.stdout + result.stderr

@@ -7,7 +7,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from torchmetrics.functional.image import structural_similarity_index_measure
+from torchmetrics.functional.image import (
+    multiscale_structural_similarity_index_measure,
+    structural_similarity_index_measure,
+)
 
 from igsr.evaluation import metrics
 from igsr.evaluation.left_half import left_half_scores
@@ -83,6 +86,23 @@ def test_masked_out_pixels_do_not_count():
     spoiled[:, 90:] = 255 - spoiled[:, 90:]
     assert metrics.score(spoiled, photo, mask) == metrics.score(render, photo, mask)
     assert metrics.psnr(spoiled, photo) < metrics.psnr(spoiled, photo, mask) - 5
+
+
+@pytest.mark.parametrize(
+    ("size", "amount"), [((176, 176), 25), ((200, 331), 5), ((189, 257), 120), ((400, 300), 60)]
+)
+def test_ms_ssim_matches_torchmetrics(size, amount):
+    photo = picture(amount, *size)
+    for render in (noisy(photo, amount), picture(99, *size), 255 - photo):
+        expected = multiscale_structural_similarity_index_measure(
+            *(
+                torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None] / 255.0
+                for image in (render, photo)
+            ),
+            data_range=1.0,
+            normalize="relu",
+        )
+        assert metrics.ms_ssim(render, photo) == pytest.approx(float(expected), abs=1e-5)
 
 
 def test_ms_ssim_needs_176_pixels():

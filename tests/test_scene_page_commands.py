@@ -14,7 +14,7 @@ from igsr.cli import app
 from igsr.cli.scene_page_option import write_page
 from igsr.rendering.renders import render
 from igsr.rendering.scene_page import write_scene_page
-from igsr.rendering.scene_surroundings import background_beside
+from igsr.rendering.scene_surroundings import background_beside, cameras_beside
 
 
 def convert(*words):
@@ -80,6 +80,19 @@ def test_convert_finds_cameras_and_background(browser, tmp_path):
 def test_the_background_is_that_of_the_report(tmp_path, report, background):
     (tmp_path / "report.json").write_text(report)
     assert background_beside(tmp_path / "scene.ply") == background
+
+
+@pytest.mark.parametrize("place", ["", "rounds/0", "checkpoints"])
+def test_cameras_and_background_are_those_of_the_run_that_a_scene_is_of(tmp_path, place):
+    made = scenes.capture(views=2, size=16)
+    write_cameras(tmp_path / "cameras.json", made.views)
+    (tmp_path / "report.json").write_text('{"protocol": {"background": [1, 0, 1]}}')
+    scene = tmp_path / place / "scene.ply"
+    assert background_beside(scene) == (1.0, 0.0, 1.0)
+    assert [one.name for one in cameras_beside(scene)] == [view.name for view in made.views]
+    elsewhere = tmp_path / "else" / "scene.ply"
+    assert background_beside(elsewhere) is None
+    assert cameras_beside(elsewhere) == []
 
 
 def test_a_fit_writes_it(browser, tmp_path):

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -117,3 +121,39 @@ def test_bounds_and_orbit_leave_out_what_is_not_finite():
     assert splats.bounds() is None
     with pytest.raises(igsr.IgsrError, match="no finite splats"):
         orbit(splats, None, 3)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_pipes_and_devices_are_refused_at_once(tmp_path):
+    """Whoever opened a pipe that nobody writes to would wait for ever."""
+    os.mkfifo(tmp_path / "pipe.ply")
+    os.mkfifo(tmp_path / "pipe.bin")
+    (tmp_path / "scene.gltf").write_text(
+        json.dumps(
+            {
+                "asset": {"version": "2.0"},
+                "extensionsUsed": ["KHR_gaussian_splatting"],
+                "buffers": [{"byteLength": 4, "uri": "pipe.bin"}],
+            }
+        )
+    )
+    code = """
+import sys, igsr
+for path in sys.argv[1:]:
+    try:
+        igsr.Splats.load(path)
+    except igsr.IgsrError as error:
+        print(error)
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code, "pipe.ply", "scene.gltf", "/dev/zero"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert result.returncode == 0, result.stderr
+    lines = result.stdout.splitlines()
+    for name, line in zip(("pipe.ply", "pipe.bin", "/dev/zero"), lines, strict=True):
+        assert name in line
+        assert "is a pipe or a device" in line

@@ -350,7 +350,7 @@ def started(tmp_path, *words):
     ("options", "notices"),
     [
         (["--web"], ["Ctrl-C ends it."]),
-        ([], ["splat-view is not installed", "Ctrl-C ends it."]),
+        ([], ["There is no display", "Ctrl-C ends it."]),
         (["--web", "--host", "0.0.0.0"], ["is open to other computers", "Ctrl-C ends it."]),
     ],
 )
@@ -379,7 +379,7 @@ def test_the_command_serves_until_ctrl_c(tmp_path, scene, options, notices):
         (["no.ply", "--web"], "There is no file or folder no.ply"),
         (["no.ply"], "There is no file or folder no.ply"),
         (["SCENE", "--web", "--camera", "3"], "--camera is an option of splat-view"),
-        (["SCENE", "--camera", "3"], "cargo install --locked --path crates/splat_view"),
+        (["SCENE", "--camera", "3"], "--camera is for the window, and there is no display"),
         (["DAMAGED", "--web"], "damaged.ply"),
         (["SCENE", "--web", "--host", "192.0.2.1"], "Cannot listen at 192.0.2.1"),
         (["SCENE", "--web", "--cameras", "no"], "no"),

@@ -6,7 +6,8 @@
 >>> igsr.evaluate(splats, capture).psnr
 >>> splats.save("scene.ply")
 
-Names are imported when they are first used (PEP 562): ``import igsr`` alone imports no torch.
+Names are imported when they are first used (PEP 562): ``import igsr`` alone imports no torch, which
+only the extra ``igsr[refine]`` installs.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from igsr.capture import Camera, Capture, Exposure, Points, View, load_capture
     from igsr.compaction import Compaction, compact
     from igsr.denoiser import denoise
-    from igsr.errors import IgsrError
+    from igsr.errors import IgsrError, MissingExtraError
     from igsr.evaluation import Scores, evaluate
     from igsr.fitting import Progress, fit, fit_with_cameras, refine_cameras
     from igsr.floaters import remove_floaters
@@ -38,6 +39,7 @@ __all__ = [
     "Compaction",
     "Exposure",
     "IgsrError",
+    "MissingExtraError",
     "Points",
     "Progress",
     "Refined",
@@ -69,7 +71,7 @@ if not TYPE_CHECKING:
             "igsr.capture": ("Camera", "Capture", "Exposure", "Points", "View", "load_capture"),
             "igsr.compaction": ("Compaction", "compact"),
             "igsr.denoiser": ("denoise",),
-            "igsr.errors": ("IgsrError",),
+            "igsr.errors": ("IgsrError", "MissingExtraError"),
             "igsr.evaluation": ("Scores", "evaluate"),
             "igsr.fitting": ("Progress", "fit", "fit_with_cameras", "refine_cameras"),
             "igsr.floaters": ("remove_floaters",),

@@ -44,6 +44,16 @@ def backend_info(name: str) -> dict[str, str]:
 def gpu_report() -> dict[str, Any]:
     """Driver and limits of the backend "gpu"'s device."""
 
+def run_viewer(words: list[str]) -> int:
+    """Do what a command line of splat-view asks for; its exit status.
+
+    A window is opened by the process's first thread only. Ctrl-C ends it only where SIGINT has the
+    system's own handler.
+    """
+
+def example_files() -> dict[str, bytes]:
+    """The files of the example capture, by their names in its folder."""
+
 def time_gpu_start() -> tuple[float, float, float]:
     """Milliseconds to open the best adapter, compile all kernels, and test them."""
 

@@ -1,4 +1,4 @@
-"""The exception that igsr raises for input that it cannot use."""
+"""The exceptions that igsr raises for input that it cannot use."""
 
 from __future__ import annotations
 
@@ -22,3 +22,21 @@ class IgsrError(ValueError):
                 for letter in message
             )
         )
+
+
+class MissingExtraError(IgsrError, ImportError):
+    """A package is not installed that comes with one of igsr's extras.
+
+    Attributes:
+        extra: the name of the extra, as in ``pip install 'igsr[refine]'``.
+
+    Args:
+        user: what needs the package, such as "igsr refine".
+        package: its import name.
+        extra: the extra that brings it.
+    """
+
+    def __init__(self, user: str, package: str, extra: str) -> None:
+        """Say what is missing, and how to install it."""
+        super().__init__(f"{user} needs {package}: pip install 'igsr[{extra}]'.")
+        self.extra = extra

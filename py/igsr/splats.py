@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.array_equality import ArrayEquality
+from igsr._internal.extras import naming_extra
 from igsr._internal.notebook import NotebookPicture, numbers
 from igsr.errors import IgsrError
 
@@ -152,8 +153,10 @@ class Splats(ArrayEquality, NotebookPicture):
 
         Raises:
             IgsrError: ``origin`` is not three finite numbers.
+            MissingExtraError: torch is not installed.
         """
-        import torch
+        with naming_extra("Splats.to_torch"):
+            import torch
 
         try:
             shift = self.origin - np.asarray(origin, dtype=np.float64)
@@ -239,6 +242,8 @@ class Splats(ArrayEquality, NotebookPicture):
         Raises:
             IgsrError: there is no such file, or it is not a splat file; the message says why.
         """
+        if Path(path).exists() and not Path(path).is_file() and not Path(path).is_dir():
+            raise IgsrError(f"{path} is a pipe or a device; save what it gives to a file first.")
         if not Path(path).is_file():
             raise IgsrError(f"There is no splat file {path}.")
         try:

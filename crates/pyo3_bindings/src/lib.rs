@@ -10,6 +10,7 @@ mod backend;
 mod benchmark;
 mod camera;
 mod error;
+mod example_files;
 mod exr_files;
 mod fit_settings;
 mod fit_state;
@@ -19,6 +20,7 @@ mod plane_sweep;
 mod splat_arrays;
 mod splat_files;
 mod stages;
+mod viewer;
 
 use pyo3::prelude::*;
 
@@ -51,6 +53,8 @@ mod _core {
     #[pymodule_export]
     use crate::benchmark::{band_pixels, peak_multiply_add, time_pipeline, time_rasterize};
     #[pymodule_export]
+    use crate::example_files::example_files;
+    #[pymodule_export]
     use crate::exr_files::{read_exr_depth, write_exr};
     #[pymodule_export]
     use crate::fit_settings::reduction;
@@ -62,4 +66,6 @@ mod _core {
     use crate::splat_files::{morton_order, read_splats, write_splats};
     #[pymodule_export]
     use crate::stages::{project, project_backward, rasterize, rasterize_backward};
+    #[pymodule_export]
+    use crate::viewer::run_viewer;
 }

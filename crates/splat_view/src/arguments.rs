@@ -20,7 +20,7 @@ compared side by side.
 
 Pictures without a window:
   --screenshot FILE    draw one picture: .png, or .exr with alpha and depth
-  --frames DIR         draw --orbit N pictures of a full turn: DIR/0000.png, ...
+  --frames DIR         draw --orbit N pictures of a full turn: DIR/0000.png, ...; DIR is new or empty
   --time N             draw N frames as the window does, and print the time of each stage
   --size WxH           size of the pictures or the window; default 1280x720, or the camera's size
   --backend NAME       auto: a real GPU if there is one, else cpu; gpu: also a software GPU; cpu
@@ -30,14 +30,14 @@ In the window and for --time:
                        auto (default): rasterize on software GPUs, else blend
 
 View:
-  --cameras PATH       cameras.json of igsr, or a folder with one; default: the one in SCENE's
-                       folder. For COLMAP and transforms.json use: igsr view SCENE --cameras PATH
-  --camera N           start at camera N of the capture, from 0
+  --cameras PATH       cameras.json of igsr, or a folder with one; default: that of the fit which
+                       SCENE is of. For COLMAP and transforms.json use: igsr view SCENE --cameras PATH
+  --camera N           start at camera N of the capture, from 0; default: 0, where there are cameras
   --orbit DEG          turn about the scene's centre; with --frames: the number of pictures
-  --up AXIS            up axis: x, y, z, -x, -y or -z; default: from the cameras, else -y
+  --up AXIS            up axis: x, y, z, -x, -y or -z; default: from the cameras, else estimated
   --fov DEG            vertical field of view, 5 to 150; default 50
   --near DISTANCE      near plane; default 0.01, or a 20th of a smaller scene's radius
-  --background COLOR   white, black, grey or R,G,B in 0..1; default black
+  --background COLOR   white, black, grey or R,G,B in 0..1; default: the fit's, else black
 
   --help, --version";
 
@@ -82,7 +82,7 @@ pub struct Arguments {
     /// Near plane in world units.
     pub near: Option<f32>,
     /// Behind the splats, RGB in 0..1.
-    pub background: [f32; 3],
+    pub background: Option<[f32; 3]>,
 }
 
 /// What the command line asks for.
@@ -116,7 +116,7 @@ impl Arguments {
             up: None,
             fov: None,
             near: None,
-            background: [0.0; 3],
+            background: None,
         };
         let mut parser = lexopt::Parser::from_args(words);
         let wrong = |error: lexopt::Error| {
@@ -156,7 +156,7 @@ impl Arguments {
                 "near" => {
                     out.near = Some(number("--near", &value()?, 1e-6, 1e9, false)? as f32);
                 }
-                "background" => out.background = color(&value()?)?,
+                "background" => out.background = Some(color(&value()?)?),
                 _ => return Err(wrong(Long(&name).unexpected())),
             }
         }

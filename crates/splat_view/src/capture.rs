@@ -20,18 +20,18 @@
 //! focal lengths and principal points are in pixels. `transform_matrix` is camera-to-world, row by row,
 //! in OpenGL axes (x right, y up, z backward). Other fields are ignored.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DVec3};
 use serde::Deserialize;
+use splat_render::io::open_file;
 use splat_render::{Camera, Error, Result};
 
 /// The file's name in a folder.
 const NAME: &str = "cameras.json";
-/// Largest file that is read, in bytes.
-const FILE_MAX: u64 = 256 << 20;
+/// Largest file that is read, in bytes: some 100,000 cameras as igsr writes them.
+const FILE_MAX: u64 = 64 << 20;
 /// What to do about cameras in another format.
 const OTHERS: &str = "igsr view shows other captures too (COLMAP, transforms.json), and igsr export \
                       --format transforms rewrites them for splat-view";
@@ -101,8 +101,14 @@ pub fn read_cameras(path: &Path) -> Result<Vec<CaptureCamera>> {
         return Err(Error::file(path, reason));
     };
     let unreadable = |e: std::io::Error| Error::file(&file, format!("cannot be read ({e})"));
+    let opened = open_file(&file)?;
+    let size = opened.metadata().map_err(unreadable)?.len();
+    if size > FILE_MAX {
+        let reason =
+            format!("is {size} bytes, more than the {FILE_MAX} that are read; name fewer cameras");
+        return Err(Error::file(&file, reason));
+    }
     let mut bytes = Vec::new();
-    let opened = File::open(&file).map_err(unreadable)?;
     opened.take(FILE_MAX).read_to_end(&mut bytes).map_err(unreadable)?;
     let cameras: Cameras = serde_json::from_slice(&bytes).map_err(|e| {
         Error::file(&file, format!("is not a cameras.json of igsr ({e}); {OTHERS}"))
@@ -124,5 +130,6 @@ pub fn read_cameras(path: &Path) -> Result<Vec<CaptureCamera>> {
 
 /// The file of cameras that a path names: itself, or the `cameras.json` in a folder.
 pub fn find_cameras(path: &Path) -> Option<PathBuf> {
-    [path.to_owned(), path.join(NAME)].into_iter().find(|file| file.is_file())
+    let is_there = |file: &PathBuf| file.metadata().is_ok_and(|kind| !kind.is_dir());
+    [path.to_owned(), path.join(NAME)].into_iter().find(is_there)
 }

@@ -4,13 +4,12 @@
 //! The file is untrusted: nothing compressed is read, and no memory is allocated that the file's own
 //! size does not justify.
 
-use std::fs::File;
 use std::io::{Read, Seek};
 use std::path::Path;
 
 use splat_render::constants::SH_DEGREE_MAX;
 use splat_render::fit::SplatArrays;
-use splat_render::io::SplatFile;
+use splat_render::io::{SplatFile, open_file};
 use splat_render::{Error, Result, sh};
 use zip::{CompressionMethod, ZipArchive};
 
@@ -22,8 +21,7 @@ pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     let bad = |what: String| {
         Error::file(path, format!("is no checkpoint of igsr fit ({what}); give its scene.ply"))
     };
-    let file =
-        File::open(path).map_err(|e| Error::file(path, format!("cannot be opened ({e})")))?;
+    let file = open_file(path)?;
     let mut archive = ZipArchive::new(file).map_err(|e| bad(e.to_string()))?;
     let mut read = |name: &str| read_floats(&mut archive, name).map_err(&bad);
     let (shape, means) = read("means")?;

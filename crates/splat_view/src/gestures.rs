@@ -133,7 +133,8 @@ pub fn keys(viewer: &mut Viewer, ui: &Ui, size: [u32; 2], actions: &mut Vec<Acti
     if pressed(Key::V) {
         let at = Moving::ALL.iter().position(|(moving, _)| *moving == viewer.moving).unwrap_or(0);
         let (moving, name) = Moving::ALL[(at + 1) % Moving::ALL.len()];
-        (viewer.moving, viewer.message) = (moving, name.to_owned());
+        viewer.moving = moving;
+        viewer.notes.tell_state(name);
     }
     if pressed(Key::H) {
         viewer.shows_panel = !viewer.shows_panel;

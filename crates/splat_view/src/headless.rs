@@ -14,7 +14,7 @@ use crate::display::Settings;
 use crate::model::Model;
 use crate::painter::{Painter, Shot, check_size};
 use crate::picture_files::{to_bytes, write_exr, write_png};
-use crate::scene_view::{cameras_of, first_view, near, numbered, up};
+use crate::scene_view::{background, cameras_of, first_camera, first_view, near, up};
 use crate::sources::find_sources;
 use crate::stage_times::STAGES;
 use crate::viewpoint::{Viewpoint, fitted, relative_to};
@@ -47,14 +47,23 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         return write(path, &image);
     }
     if let Some(folder) = &arguments.frames {
-        let unwritable = |e| Error::file(folder, format!("cannot be made ({e}); name another"));
-        std::fs::create_dir_all(folder).map_err(unwritable)?;
+        make_empty(folder)?;
         let count = arguments.orbit.unwrap_or(1.0) as u32;
         for i in 0..count {
             let camera = scene.turned(360.0 * f64::from(i) / f64::from(count));
             let image = scene.draw(&*stages, &camera)?;
             write(&folder.join(format!("{i:04}.png")), &image)?;
         }
+    }
+    Ok(())
+}
+
+/// Makes a folder for pictures; one that holds anything is refused: those of two turns would mix.
+fn make_empty(folder: &Path) -> Result<()> {
+    let unwritable = |e| Error::file(folder, format!("cannot be made ({e}); name another"));
+    std::fs::create_dir_all(folder).map_err(unwritable)?;
+    if std::fs::read_dir(folder).map_err(unwritable)?.next().is_some() {
+        return Err(Error::file(folder, "is not empty; name a new folder for --frames"));
     }
     Ok(())
 }
@@ -86,17 +95,21 @@ impl Scene {
         for note in model.notes.iter().chain(&note) {
             eprintln!("{note}");
         }
-        let up = up(arguments, &cameras);
+        let up = up(arguments, &cameras, &model);
         let fov = arguments.fov.map(f64::to_radians);
-        let mut settings = Settings { background: arguments.background, ..Settings::default() };
+        let background = background(arguments, Some(path));
+        let mut settings = Settings { background, ..Settings::default() };
         settings.near = arguments.near.unwrap_or_else(|| near(&model));
         settings.drawing = arguments.drawing;
         settings.fov = fov.unwrap_or(settings.fov);
         let mut viewpoint = first_view(&model, &cameras, up, settings.fov);
         let mut camera = viewpoint.camera(arguments.size.unwrap_or(SIZE), settings.fov);
-        if let Some(number) = arguments.camera {
-            let found = numbered(&cameras, number)?;
-            let own = [found.camera.width, found.camera.height];
+        if let Some(number) = first_camera(arguments, &cameras)? {
+            let found = &cameras[number];
+            let own = match arguments.camera {
+                Some(_) => [found.camera.width, found.camera.height],
+                None => SIZE,
+            };
             camera = fitted(&found.camera, arguments.size.unwrap_or(own));
             viewpoint = Viewpoint::of_camera(&found.camera, model.center, model.radius);
         }

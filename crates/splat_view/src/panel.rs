@@ -1,6 +1,6 @@
 //! The panel beside the scene: settings, cameras, files, statistics.
 
-use egui::{ComboBox, ScrollArea, Slider, SliderClamping, Ui};
+use egui::{ComboBox, Panel, ScrollArea, Slider, SliderClamping, Ui};
 use glam::DVec3;
 
 use crate::display::{Display, Drawing};
@@ -17,6 +17,8 @@ const AXES: [(DVec3, &str); 6] = [
     (DVec3::X, "x"),
     (DVec3::NEG_X, "-x"),
 ];
+/// Most that notes take of the panel, in points.
+const NOTES_HEIGHT: f32 = 200.0;
 /// Keys and gestures, as the panel lists them.
 const KEYS: &str = "\
 drag: orbit; right drag or Shift: pan; wheel: zoom
@@ -34,6 +36,7 @@ pub fn panel(
     times: Option<[f32; STAGES.len()]>,
     actions: &mut Vec<Action>,
 ) {
+    notes(viewer, ui);
     ScrollArea::vertical().show(ui, |ui| {
         models(viewer, ui, actions);
         ui.separator();
@@ -49,10 +52,25 @@ pub fn panel(
         ui.separator();
         statistics(viewer, ui, times);
         ui.collapsing("Keys", |ui| ui.small(KEYS));
-        if !viewer.message.is_empty() {
-            ui.separator();
-            ui.label(&viewer.message);
-        }
+    });
+}
+
+/// Notes at the panel's foot, where no list pushes them out of sight.
+fn notes(viewer: &Viewer, ui: &mut Ui) {
+    if viewer.notes.texts().next().is_none() {
+        return;
+    }
+    Panel::bottom("notes").show(ui, |ui| {
+        let area =
+            ScrollArea::vertical().max_height(NOTES_HEIGHT).min_scrolled_height(NOTES_HEIGHT);
+        area.stick_to_bottom(true).show(ui, |ui| {
+            for (i, note) in viewer.notes.texts().enumerate() {
+                if i > 0 {
+                    ui.separator();
+                }
+                ui.label(note);
+            }
+        });
     });
 }
 
@@ -138,7 +156,8 @@ fn camera(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
     ui.add(near.clamping(SliderClamping::Edits).text("near plane"));
     ui.horizontal(|ui| {
         let found = AXES.iter().find(|(axis, _)| axis.dot(viewer.up) > 0.999);
-        let text = found.map_or("cameras", |(_, name)| name);
+        let other = if viewer.cameras.is_empty() { "estimated" } else { "cameras" };
+        let text = found.map_or(other, |(_, name)| name);
         ComboBox::from_label("up axis").width(60.0).selected_text(text).show_ui(ui, |ui| {
             for (axis, name) in AXES {
                 if ui.selectable_label(viewer.up == axis, name).clicked() {

@@ -1,9 +1,9 @@
 //! Reads photos of a capture, PNG and JPEG. The files are untrusted.
 
-use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
 use std::path::Path;
 
+use splat_render::io::open_file;
 use splat_render::{Error, Result};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
@@ -67,7 +67,7 @@ impl Photo {
 
 fn bytes(path: &Path) -> Result<Vec<u8>> {
     let unreadable = |e: std::io::Error| Error::file(path, format!("cannot be read ({e})"));
-    let file = File::open(path).map_err(unreadable)?;
+    let file = open_file(path)?;
     let mut bytes = Vec::new();
     BufReader::new(file).take(FILE_MAX).read_to_end(&mut bytes).map_err(unreadable)?;
     Ok(bytes)

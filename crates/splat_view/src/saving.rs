@@ -15,7 +15,8 @@ use crate::viewpoint::relative_to;
 pub fn screenshot(viewer: &mut Viewer, painter: &mut Painter, size: [u32; 2]) -> Result<()> {
     let rgba = painter.picture(&viewer.shot(size))?;
     let path = free_name("splat-view", ".png");
-    viewer.message = saved(&path, write_png(&path, size, &without_alpha(&rgba)));
+    let written = write_png(&path, size, &without_alpha(&rgba));
+    viewer.notes.tell(saved(&path, written));
     Ok(())
 }
 
@@ -35,13 +36,13 @@ pub fn exr(viewer: &mut Viewer, gpu: &Gpu, size: [u32; 2]) {
         .and_then(|projected| gpu.rasterize(&projected, settings.background));
     let path = free_name("splat-view", ".exr");
     let written = image.and_then(|image| write_exr(&path, &image));
-    viewer.message = saved(&path, written);
+    viewer.notes.tell(saved(&path, written));
 }
 
 /// Begins to record the camera path through the marked places.
 pub fn start_recording(viewer: &mut Viewer) {
     if viewer.path.keys.len() < 2 {
-        viewer.message = "Mark at least two places with K, then record.".to_owned();
+        viewer.notes.tell("Mark at least two places with K, then record.");
         return;
     }
     let folder = free_name("splat-view-path", "");
@@ -51,7 +52,7 @@ pub fn start_recording(viewer: &mut Viewer) {
             viewer.recording = Some(recording);
         }
         Err(error) => {
-            viewer.message = format!("{}: cannot be made ({error})", folder.display());
+            viewer.notes.tell(format!("{}: cannot be made ({error})", folder.display()));
         }
     }
 }
@@ -70,7 +71,8 @@ pub fn record_picture(viewer: &mut Viewer, painter: &mut Painter, size: [u32; 2]
     if recording.next < total {
         viewer.recording = Some(recording);
     } else {
-        viewer.message = format!("Saved {total} pictures in {}", recording.folder.display());
+        let folder = recording.folder.display();
+        viewer.notes.tell(format!("Saved {total} pictures in {folder}"));
     }
     Ok(())
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use splat_render::Result;
 
 use crate::loader::Loaded;
-use crate::scene_view::{cameras_of, first_view, near, numbered, up};
+use crate::scene_view::{background, cameras_of, first_camera, first_view, near, up};
 use crate::session::{Session, Wake};
 use crate::sources::{Source, find_sources, stamp};
 use crate::start::Start;
@@ -18,21 +18,20 @@ impl Session {
         self.viewer.folder = start.folder;
         let scene = self.arguments.scenes.first().cloned();
         let (cameras, note) = cameras_of(self.arguments.cameras.as_deref(), scene.as_deref())?;
-        self.viewer.up = up(&self.arguments, &cameras);
+        self.viewer.settings.background = background(&self.arguments, scene.as_deref());
+        let first = first_camera(&self.arguments, &cameras)?;
         self.viewer.cameras = cameras;
+        self.viewer.notes.tell(note.unwrap_or_default());
         for (side, (source, model)) in start.models.into_iter().enumerate() {
             self.viewer.chosen[side] = Some(source.path.clone());
             let stamp = stamp(&source.path);
             self.show(Loaded { side, path: source.path, stamp, model: Ok(model) });
         }
-        if let Some(note) = note {
-            self.viewer.message = note;
-        }
-        if let Some(number) = self.arguments.camera {
-            numbered(&self.viewer.cameras, number)?;
+        if let Some(number) = first {
             self.viewer.jump(number);
         }
         if let Some(degrees) = self.arguments.orbit {
+            self.viewer.leave_camera(self.screen.size());
             self.viewer.viewpoint.orbit(degrees.to_radians(), 0.0, self.viewer.up);
         }
         Ok(())
@@ -46,22 +45,28 @@ impl Session {
         let (drawable, model) = match drawable {
             Ok(both) => both,
             Err(error) => {
-                viewer.message = error.to_string();
+                viewer.notes.tell(error.to_string());
                 return;
             }
         };
-        viewer.message = model.notes.join(" ");
+        for note in &model.notes {
+            viewer.notes.tell(note);
+        }
         if let Some((_, cameras)) = self.dropped.take_if(|(dropped, _)| *dropped == path) {
             // A dropped scene replaces the cameras, too, unless it is compared and has none.
             viewer.is_placed &= viewer.compares();
             if !viewer.compares() || !cameras.is_empty() {
-                viewer.up = up(&self.arguments, &cameras);
+                viewer.up = up(&self.arguments, &cameras, &model);
                 viewer.cameras = cameras;
                 viewer.at_camera = None;
                 self.photo = None;
             }
+            if !viewer.compares() {
+                viewer.settings.background = background(&self.arguments, Some(&path));
+            }
         }
         if !viewer.is_placed {
+            viewer.up = up(&self.arguments, &viewer.cameras, &model);
             viewer.viewpoint = first_view(&model, &viewer.cameras, viewer.up, viewer.settings.fov);
             viewer.is_placed = true;
             if self.arguments.near.is_none() {
@@ -142,7 +147,7 @@ impl Session {
                 self.dropped = Some((first.clone(), cameras));
                 self.choose(0, Some(first));
             }
-            Err(error) => self.viewer.message = error.to_string(),
+            Err(error) => self.viewer.notes.tell(error.to_string()),
         }
         self.screen.window.request_redraw();
     }

@@ -1,22 +1,22 @@
 //! The view of a scene that the command line asks for, and what holds where it says nothing.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use glam::DVec3;
 use splat_render::constants::NEAR;
 use splat_render::{Error, Result};
 
 use crate::arguments::Arguments;
-use crate::capture::{CaptureCamera, find_cameras, read_cameras};
+use crate::capture::{CaptureCamera, read_cameras};
 use crate::model::Model;
+use crate::surroundings::{background_beside, cameras_beside};
+use crate::up_axis::up_of_splats;
 use crate::viewpoint::{Viewpoint, up_of};
 
-/// Up axis without cameras: in COLMAP's scenes, and so in most captures, y points down.
-const UP: DVec3 = DVec3::NEG_Y;
 /// Near plane of small scenes, as a fraction of their radius.
 const NEAR_PART: f64 = 0.05;
 
-/// A capture's cameras: those that were named, else those in a scene's folder. Cameras that nobody
+/// A capture's cameras: those that were named, else those of the fit that a scene is of. Cameras that nobody
 /// named and that cannot be read are left out, and the note says so.
 pub fn cameras_of(
     named: Option<&Path>,
@@ -25,7 +25,7 @@ pub fn cameras_of(
     if let Some(path) = named {
         return Ok((read_cameras(path)?, None));
     }
-    match scene.and_then(beside) {
+    match scene.and_then(cameras_beside) {
         None => Ok((Vec::new(), None)),
         Some(path) => Ok(match read_cameras(&path) {
             Ok(cameras) => (cameras, None),
@@ -34,14 +34,10 @@ pub fn cameras_of(
     }
 }
 
-/// The cameras in a scene's folder.
-fn beside(scene: &Path) -> Option<PathBuf> {
-    if scene.is_dir() {
-        return find_cameras(scene);
-    }
-    let folder = scene.parent()?;
-    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-    find_cameras(folder)
+/// Behind the splats: what the command line says, else what the scene was fitted over, else black.
+pub fn background(arguments: &Arguments, scene: Option<&Path>) -> [f32; 3] {
+    let said = arguments.background;
+    said.or_else(|| scene.and_then(background_beside)).unwrap_or_default()
 }
 
 /// The camera that `--camera` names.
@@ -57,10 +53,21 @@ pub fn numbered(cameras: &[CaptureCamera], number: usize) -> Result<&CaptureCame
     })
 }
 
-/// The up axis: of the command line, else the cameras', else that of most captures.
-pub fn up(arguments: &Arguments, cameras: &[CaptureCamera]) -> DVec3 {
+/// The up axis: of the command line, else the cameras', else estimated from the splats.
+pub fn up(arguments: &Arguments, cameras: &[CaptureCamera], model: &Model) -> DVec3 {
     let said = arguments.up.map(DVec3::from);
-    said.or_else(|| up_of(cameras.iter().map(|c| &c.camera))).unwrap_or(UP)
+    said.or_else(|| up_of(cameras.iter().map(|c| &c.camera)))
+        .unwrap_or_else(|| up_of_splats(&model.file, model.center, model.radius))
+}
+
+/// The camera that the first picture is taken by: the one that is named, else the capture's first
+/// unless another field of view is asked for.
+pub fn first_camera(arguments: &Arguments, cameras: &[CaptureCamera]) -> Result<Option<usize>> {
+    if let Some(number) = arguments.camera {
+        return numbered(cameras, number).map(|_| Some(number));
+    }
+    let is_photo = arguments.fov.is_none() && !cameras.is_empty();
+    Ok(is_photo.then_some(0))
 }
 
 /// Near plane of a scene: the renderer's, or less for scenes so small that it would cut them off. A whole

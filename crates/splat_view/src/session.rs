@@ -56,7 +56,7 @@ impl Session {
     /// A window that shows nothing yet.
     pub fn new(screen: Screen, arguments: Arguments, proxy: EventLoopProxy<Wake>) -> Result<Self> {
         let painter = Painter::new(Arc::clone(&screen.gpu), screen.format())?;
-        let mut settings = Settings { background: arguments.background, ..Settings::default() };
+        let mut settings = Settings::default();
         settings.near = arguments.near.unwrap_or(settings.near);
         settings.drawing = arguments.drawing;
         settings.fov = arguments.fov.map_or(settings.fov, f64::to_radians);
@@ -160,7 +160,7 @@ impl Session {
             Action::Jump(number) => viewer.jump(number),
             Action::Focus(pixel) => {
                 if !viewer.focus(&mut self.painter, size, pixel)? {
-                    viewer.message = "There is nothing at this point.".to_owned();
+                    viewer.notes.tell("There is nothing at this point.");
                 }
             }
             Action::Screenshot => saving::screenshot(viewer, &mut self.painter, size)?,
@@ -178,8 +178,8 @@ impl Session {
             Err(error) if !self.screen.gpu.is_lost() => {
                 let text = error.to_string();
                 // An error of every frame is shown once.
-                if self.viewer.message != text {
-                    self.viewer.message = text;
+                if !self.viewer.notes.has(&text) {
+                    self.viewer.notes.tell(text);
                     self.screen.window.request_redraw();
                 }
                 Ok(())
@@ -230,7 +230,7 @@ impl Session {
         let recorded = match self.painter.record(encoder, &self.viewer.shot(size), target) {
             // The way that was asked for lacks memory here: another is taken, and the panel says why.
             Err(error) if self.viewer.settings.drawing == Drawing::Rasterizer => {
-                self.viewer.message = error.to_string();
+                self.viewer.notes.tell(error.to_string());
                 self.viewer.settings.drawing = Drawing::Auto;
                 self.screen.window.request_redraw();
                 self.painter.record(encoder, &self.viewer.shot(size), target)
@@ -269,7 +269,7 @@ impl Session {
                 self.photo = Some((number, texture));
             }
             Err(error) => {
-                viewer.message = error.to_string();
+                viewer.notes.tell(error.to_string());
                 viewer.photo_strength = 0.0;
             }
         }

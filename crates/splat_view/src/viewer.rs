@@ -10,6 +10,7 @@ use crate::camera_path::{CameraPath, Recording};
 use crate::capture::CaptureCamera;
 use crate::display::Settings;
 use crate::model::Model;
+use crate::notes::Notes;
 use crate::painter::{Painter, Shot};
 use crate::sources::{Source, Stamp, label};
 use crate::viewpoint::{Viewpoint, fitted};
@@ -105,8 +106,8 @@ pub struct Viewer {
     pub pictures_between: u32,
     /// The recording under way.
     pub recording: Option<Recording>,
-    /// The last result or error.
-    pub message: String,
+    /// Results and errors.
+    pub notes: Notes,
     /// Whether the panel is shown.
     pub shows_panel: bool,
     /// Name of the device.
@@ -137,7 +138,7 @@ impl Viewer {
             path: CameraPath::default(),
             pictures_between: 30,
             recording: None,
-            message: String::new(),
+            notes: Notes::default(),
             shows_panel: true,
             device,
             frame_ms: 0.0,
@@ -164,7 +165,7 @@ impl Viewer {
         let (center, radius) = self.extent();
         self.viewpoint = Viewpoint::of_camera(&at.camera, center, radius);
         self.at_camera = Some(number);
-        self.message = format!("Camera {number}: {}", at.name);
+        self.notes.tell_state(format!("Camera {number}: {}", at.name));
     }
 
     /// Leaves the capture's camera and keeps its field of view.

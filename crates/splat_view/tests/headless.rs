@@ -26,9 +26,13 @@ fn camera() -> Camera {
 }
 
 fn drawn(file: &SplatFile, camera: &Camera) -> Image<f32> {
+    drawn_over(file, camera, [0.0; 3])
+}
+
+fn drawn_over(file: &SplatFile, camera: &Camera, background: [f32; 3]) -> Image<f32> {
     let params = file.splats.params(4);
     let projected = Cpu.project(&params, camera, &ProjectOptions::default()).expect("project");
-    Cpu.rasterize(&projected, [0.0; 3]).expect("rasterize")
+    Cpu.rasterize(&projected, background).expect("rasterize")
 }
 
 fn bytes(image: &Image<f32>) -> Vec<u8> {
@@ -510,4 +514,152 @@ fn both_ways_to_draw_agree_with_the_rasterizer_and_are_timed() {
         assert_eq!(stages, expected, "{way}");
         assert!(times.iter().all(|&ms| ms >= 0.0), "stages take more than the whole: {text}");
     }
+}
+
+#[test]
+fn every_model_of_a_run_is_first_seen_as_a_photo_over_the_fit_s_background() {
+    let folder = Folder::new();
+    let file = ball(300, 18, [0.6, 0.4, 0.3]);
+    let scenes = ["out/scene.ply", "out/rounds/0/scene.ply", "out/checkpoints/whole.npz"];
+    write(&folder.join(scenes[0]), &file);
+    write(&folder.join(scenes[1]), &file);
+    std::fs::create_dir_all(folder.join("out/checkpoints")).expect("folder");
+    write_checkpoint(&folder.join(scenes[2]), &file);
+    let other = Camera { viewmat: DMat4::from_translation(DVec3::Z * 6.0), ..camera() };
+    write_cameras(&folder.join("out/cameras.json"), &[camera(), other]);
+    let report = r#"{"test": {"protocol": {"background": [1.0, 0.5, 0.25]}}}"#;
+    std::fs::write(folder.join("out/report.json"), report).expect("report");
+    let draw = |scene: &Path, more: &[&str]| {
+        let out = folder.join("out.png");
+        let mut arguments: Vec<&dyn AsRef<std::ffi::OsStr>> =
+            vec![&scene, &"--screenshot", &out, &"--size", &"120x80", &"--backend", &"cpu"];
+        arguments.extend(more.iter().map(|word| word as &dyn AsRef<std::ffi::OsStr>));
+        run(&arguments);
+        read_png(&out)
+    };
+    let expected = bytes(&drawn_over(&file, &camera(), [1.0, 0.5, 0.25]));
+    for scene in scenes.iter().chain(&["out"]) {
+        let off = draw(&folder.join(scene), &[])
+            .rgb
+            .iter()
+            .zip(&expected)
+            .map(|(a, b)| a.abs_diff(*b))
+            .max();
+        assert!(off <= Some(1), "{scene} is off by {off:?}");
+    }
+    // What is asked for goes before.
+    let black = bytes(&drawn(&file, &other));
+    let asked = draw(&folder.join(scenes[1]), &["--camera", "1", "--background", "black"]);
+    let off = asked.rgb.iter().zip(&black).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(off <= Some(1), "off by {off:?}");
+    let wide = draw(&folder.join(scenes[1]), &["--fov", "120"]);
+    assert!(wide.rgb.iter().zip(&expected).any(|(a, b)| a.abs_diff(*b) > 30), "--fov does nothing");
+}
+
+#[test]
+fn a_scene_without_cameras_is_seen_from_above_its_ground() {
+    let folder = Folder::new();
+    let (scene, out) = (folder.join("scene.ply"), folder.join("out.png"));
+    // A red floor that faces +x, and a green pole on it.
+    let mut file = ball(0, 0, [0.0; 3]);
+    let mut add = |at: [f32; 3], scales: [f32; 3], color: [f32; 3]| {
+        file.splats.means.push(at);
+        file.splats.quats.push([1.0, 0.0, 0.0, 0.0]);
+        file.splats.scales.push(scales);
+        file.splats.opacities.push(5.0);
+        file.splats.sh.push(color.map(|v| (v - 0.5) / 0.282));
+        file.splats.sh.extend([[0.0; 3]; 3]);
+    };
+    for y in -8..=8 {
+        for z in -8..=8 {
+            let at = [0.0, 0.1 * y as f32, 0.1 * z as f32];
+            add(at, [-6.0, -2.5, -2.5], [1.0, 0.0, 0.0]);
+        }
+    }
+    for x in 1..=9 {
+        add([0.05 * x as f32, 0.0, 0.0], [-2.6; 3], [0.0, 1.0, 0.0]);
+    }
+    write(&scene, &file);
+    run(&[&scene, &"--screenshot", &out, &"--size", &"180x180", &"--backend", &"cpu"]);
+    let picture = read_png(&out);
+    let middle = |channel: usize| {
+        let is_it =
+            |i: &usize| picture.rgb[3 * i + channel] > 128 && picture.rgb[3 * i + 1 - channel] < 90;
+        let rows: Vec<usize> = (0..180 * 180).filter(is_it).map(|i| i / 180).collect();
+        assert!(rows.len() > 20, "channel {channel} is seen at {} pixels", rows.len());
+        rows.iter().sum::<usize>() as f64 / rows.len() as f64
+    };
+    assert!(middle(1) + 5.0 < middle(0), "the pole is not above the floor");
+}
+
+#[test]
+fn frames_go_into_no_folder_that_is_used() {
+    let folder = Folder::new();
+    let (scene, frames) = (folder.join("scene.ply"), folder.join("frames"));
+    write(&scene, &ball(20, 19, [0.5; 3]));
+    std::fs::create_dir_all(&frames).expect("folder");
+    let mut command = program();
+    command.arg(&scene).arg("--frames").arg(&frames).args(["--orbit", "2", "--size", "20x20"]);
+    command.args(["--backend", "cpu"]);
+    // An empty one is as good as a new one.
+    assert!(command.output().expect("start").status.success());
+    let first = std::fs::read(frames.join("0000.png")).expect("a picture");
+    refused(&command.output().expect("start"), &["frames", "is not empty", "--frames"]);
+    assert_eq!(std::fs::read(frames.join("0000.png")).expect("a picture"), first);
+    std::fs::write(folder.join("file"), "x").expect("file");
+    let mut command = program();
+    command.arg(&scene).arg("--frames").arg(folder.join("file"));
+    command.args(["--orbit", "2", "--backend", "cpu"]);
+    refused(&command.output().expect("start"), &["file", "cannot be made"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn pipes_and_devices_are_refused_at_once() {
+    use std::time::{Duration, Instant};
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, &ball(20, 20, [0.5; 3]));
+    let pipes = ["pipe.ply", "pipe.npz", "cameras.json"].map(|name| folder.join(name));
+    for pipe in &pipes {
+        let made = std::process::Command::new("mkfifo").arg(pipe).status().expect("mkfifo");
+        assert!(made.success());
+    }
+    let refuse = |arguments: &[&dyn AsRef<std::ffi::OsStr>], name: &str| {
+        let mut command = program();
+        command.args(arguments).args(["--screenshot", "x.png", "--backend", "cpu"]);
+        command.stderr(std::process::Stdio::piped());
+        let mut running = command.spawn().expect("start");
+        let started = Instant::now();
+        while running.try_wait().expect("wait").is_none() {
+            if started.elapsed() > Duration::from_secs(20) {
+                running.kill().expect("kill");
+                panic!("{name} is waited for");
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        refused(&running.wait_with_output().expect("output"), &[name, "is a pipe or a device"]);
+    };
+    for pipe in &pipes[..2] {
+        refuse(&[pipe], &pipe.file_name().expect("a name").to_string_lossy());
+    }
+    refuse(&[&scene, &"--cameras", &pipes[2]], "cameras.json");
+    refuse(&[&"/dev/zero"], "/dev/zero");
+    // Cameras that nobody named are left out.
+    let out = folder.join("out.png");
+    let output = run(&[&scene, &"--screenshot", &out, &"--size", &"20x20", &"--backend", &"cpu"]);
+    assert!(said(&output).contains("no cameras are shown"), "{}", said(&output));
+}
+
+#[test]
+fn a_file_of_cameras_that_is_too_large_is_not_read() {
+    let folder = Folder::new();
+    let (scene, cameras) = (folder.join("scene.ply"), folder.join("cameras.json"));
+    write(&scene, &ball(20, 21, [0.5; 3]));
+    write_cameras(&cameras, &[camera()]);
+    let file = std::fs::File::options().append(true).open(&cameras).expect("open");
+    file.set_len((64 << 20) + 1).expect("size");
+    let mut command = program();
+    command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(&cameras);
+    refused(&command.output().expect("start"), &["cameras.json", "67108865 bytes"]);
 }

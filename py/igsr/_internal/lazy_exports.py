@@ -6,11 +6,14 @@ of it.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+from igsr._internal.extras import naming_extra
 
 
 def lazy_exports(
@@ -25,13 +28,18 @@ def lazy_exports(
         homes: public names by the module that defines them.
         moved: names of igsr 0.1 by the module that has them now; each use of one gives a
             ``DeprecationWarning``.
+
+    The ``__getattr__`` of ``igsr`` itself raises a ``MissingExtraError`` for a name whose module
+    needs an extra that is not installed.
     """
     home_of = {name: module for module, names in homes.items() for name in names}
     moved_to = {name: module for module, names in (moved or {}).items() for name in names}
 
     def find(name: str) -> Any:
         if name in home_of:
-            value = getattr(importlib.import_module(home_of[name]), name)
+            # Rooms within let the error through: who asked the package itself is named.
+            with naming_extra(f"igsr.{name}") if package == "igsr" else contextlib.nullcontext():
+                value = getattr(importlib.import_module(home_of[name]), name)
             setattr(sys.modules[package], name, value)
             return value
         if name in moved_to:

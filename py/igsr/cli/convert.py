@@ -40,7 +40,7 @@ def convert_command(
             "--cameras",
             metavar="CAPTURE",
             help="For .html: the capture, or cameras.json, whose cameras to jump to. "
-            "Default: the cameras.json beside SCENE, if there is one.",
+            "Default: the cameras.json of the fit that SCENE is of.",
         ),
     ] = None,
     background: Annotated[
@@ -49,7 +49,7 @@ def convert_command(
             "--background",
             metavar="COLOR",
             help="For .html: color behind the splats: white, black, grey, or R,G,B from 0 to 1. "
-            "Default: as in the report.json beside SCENE, else black.",
+            "Default: as in the report.json of its fit, else black.",
         ),
     ] = None,
     as_json: JsonOption = False,

@@ -28,7 +28,7 @@ from igsr.cli.scene_page_option import PAGE, HtmlOption, write_page
 from igsr.cli.settings_options import ConfigOption, given_by_hand, settings_options
 from igsr.cli.shared import (
     BackgroundOption,
-    CaptureArgument,
+    ExampleOption,
     FitBackendChoice,
     FitBackendOption,
     FitSizeOption,
@@ -42,6 +42,7 @@ from igsr.cli.shared import (
     masked_line,
     output_console,
     parts_line,
+    photos_or_example,
     print_json,
     protocol_line,
     removed_line,
@@ -68,12 +69,20 @@ if TYPE_CHECKING:
 @settings_options(FitSettings, leave_out=("background",))
 def fit_command(
     ctx: typer.Context,
-    capture: CaptureArgument,
+    *,
+    capture: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="CAPTURE",
+            help="Folder or file with photos, with cameras or without.",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[
         Path,
         typer.Option("--out", help="Folder for scene.ply, scene.html, report.html, report.json."),
     ],
-    *,
+    example: ExampleOption = False,
     holdout: HoldoutOption = None,
     max_size: FitSizeOption = None,
     quality: QualityOption = QualityChoice.normal,
@@ -124,6 +133,7 @@ def fit_command(
                 f"--preset changes nothing: {config} names every setting. Leave one of them out."
             )
         name = resolved(backend)
+        photos = photos_or_example(capture, example, out, "CAPTURE")
         if max_size is None:
             max_size = default_max_size(name, quality.value)
 
@@ -131,7 +141,7 @@ def fit_command(
             from igsr.cli.announcement import announce
 
             if given.get("start") == "hull" and seen.channels < 4:
-                raise IgsrError(f"{capture} has photos without alpha; --start hull needs it in all")
+                raise IgsrError(f"{photos} has photos without alpha; --start hull needs it in all")
             if as_json:
                 return
             announce(
@@ -150,7 +160,7 @@ def fit_command(
         followed = ending.enter_context(closing(FollowedRun(out)))
         finder = CameraFinder(estimator, network, graph, matcher, frames, given["seed"])
         loaded, found = capture_to_fit(
-            capture,
+            photos,
             out,
             holdout,
             finder,
@@ -183,7 +193,7 @@ def fit_command(
 
         # Write the scene, its scores and everything that it takes to fit it again.
         asked = {
-            "capture": str(capture),
+            "capture": str(photos),
             "holdout": holdout,
             "max_size": max_size,
             "preset": preset.value,

@@ -9,6 +9,9 @@ from typing import Any, ClassVar, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from igsr._internal.extras import naming_extra
+from igsr.cli.error_messages import error_messages
+
 
 class LazyCommand(NamedTuple):
     """Where a command is defined, and its line in the group's help.
@@ -46,6 +49,14 @@ class LazyGroup(TyperGroup):
     def loaded(self) -> dict[str, Any]:
         """Import all commands; by name, in the order of the table."""
         return {name: load_command(name, entry) for name, entry in self.table.items()}
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that was asked for; a missing extra is named. See ``TyperGroup``."""
+        try:
+            return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            with error_messages(), naming_extra(f"igsr {ctx.invoked_subcommand}"):
+                raise error
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that ``args`` names and import it; see ``TyperGroup``."""

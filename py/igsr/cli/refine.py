@@ -25,12 +25,14 @@ from igsr.cli.pose import (
 from igsr.cli.scene_page_option import PAGE, HtmlOption, write_page
 from igsr.cli.settings_options import ConfigOption, settings_options
 from igsr.cli.shared import (
+    ExampleOption,
     FitSizeOption,
     HoldoutOption,
     JsonOption,
     fitted_line,
     output_console,
     parts_line,
+    photos_or_example,
     print_json,
 )
 from igsr.errors import IgsrError
@@ -46,14 +48,19 @@ if TYPE_CHECKING:
 
 @settings_options(RefineSettings)
 def refine_command(
+    *,
     photos: Annotated[
-        Path, typer.Argument(metavar="PHOTOS", help="A folder of photos, or a capture.")
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="PHOTOS", help="A folder of photos, or a capture.", show_default=False
+        ),
+    ] = None,
     out: Annotated[
         Path,
         typer.Option("--out", help="Folder for scene.ply, scene.html, report.html and rounds/."),
     ],
     given: dict[str, Any],
+    example: ExampleOption = False,
     holdout: HoldoutOption = None,
     max_size: FitSizeOption = None,
     photo_count: Annotated[
@@ -82,7 +89,7 @@ def refine_command(
         lambda: f"Interrupted; what is done is in {out}, the same command with --resume goes on."
     ):
         settings = RefineSettings(**given)
-        if photo_count is not None:
+        if photo_count is not None and photos is not None:
             _check_photo_count(photos, holdout, frames, photo_count)
 
         from igsr._core import resolve_backend
@@ -90,6 +97,7 @@ def refine_command(
         from igsr.refinement.loop import refine, round_denoiser
         from igsr.refinement.run import bar_state
 
+        path = photos_or_example(photos, example, out, "PHOTOS")
         # A missing GPU is found before cameras are looked for.
         backend = resolve_backend(settings.backend)
         if max_size is None:
@@ -114,7 +122,7 @@ def refine_command(
         denoiser = round_denoiser(weights)
         with warning_messages(), closing(FollowedRun(out)) as followed:
             capture, _ = capture_to_fit(
-                photos,
+                path,
                 out,
                 holdout,
                 CameraFinder(estimator, network, graph, matcher, frames, settings.seed),

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+#: Folder of the example capture, in that of the run that asked for it.
+EXAMPLE = "example"
 NAMED_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
 
 
@@ -133,6 +135,14 @@ JobsOption = Annotated[
 ]
 RayOption = Annotated[
     bool, typer.Option("--ray", help="Run fits on a Ray cluster (pip install 'igsr\\[ray]').")
+]
+ExampleOption = Annotated[
+    bool,
+    typer.Option(
+        "--example",
+        help=f"Take igsr's example capture: eight photos of a tea table, and eight held-out ones. "
+        f"They are written to --out/{EXAMPLE}.",
+    ),
 ]
 CaptureArgument = Annotated[
     Path, typer.Argument(metavar="CAPTURE", help="Folder or file with photos and cameras.")
@@ -373,3 +383,26 @@ def picture_name(view_name: str, suffix: str) -> Path:
     from igsr.capture.write_files import relative_name
 
     return Path(relative_name(view_name)).with_suffix(suffix)
+
+
+def photos_or_example(named: Path | None, is_example: bool, out: Path, argument: str) -> Path:
+    """The photos that a command line names, or the example capture, which is written into ``out``.
+
+    Args:
+        named: path of photos, or None.
+        is_example: whether --example was given.
+        out: the folder of the run.
+        argument: what the help calls the path.
+
+    Raises:
+        IgsrError: neither or both were given, or the example cannot be written.
+    """
+    if named is None and not is_example:
+        raise IgsrError(f"{argument} is missing; name a folder of photos, or give --example")
+    if named is None:
+        from igsr.capture.example import write_example
+
+        return write_example(out / EXAMPLE)
+    if is_example:
+        raise IgsrError(f"--example takes the place of {argument}; leave {named} or --example out")
+    return named

@@ -1,13 +1,12 @@
 """``igsr view``: a scene in a window, or in the browser.
 
-The viewer ``splat-view`` is a program of its own and reads cameras in one format, the
+The viewer ``splat-view`` is a process of its own and reads cameras in one format, the
 ``cameras.json`` that igsr writes. This command reads any other capture for it.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -24,11 +23,15 @@ from igsr.capture.load import holds_cameras
 from igsr.capture.write_cameras import write_cameras
 from igsr.capture.write_files import png_names
 from igsr.cli.error_messages import INTERRUPTED, error_messages, print_message
-from igsr.cli.web_view import serve_web_view
+from igsr.cli.web_view import has_display, serve_web_view
 from igsr.errors import IgsrError
 
 #: The viewer.
-PROGRAM = "splat-view"
+PROGRAM = (sys.executable, "-m", "igsr.viewing.window")
+#: Nothing in the folder that the command was typed in takes the place of a module.
+ENVIRONMENT = {"PYTHONSAFEPATH": "1"}
+#: Options of the viewer that open no window.
+WITHOUT_WINDOW = ("--screenshot", "--frames", "--time", "--help", "-h", "--version")
 #: The viewer's file of cameras.
 CAMERAS = "cameras.json"
 #: Where the browser view listens: nowhere that other computers reach.
@@ -63,7 +66,7 @@ def view_command(
         typer.Option(
             "--web",
             help="Show it in the browser, and follow a fit or a refinement that is running. "
-            "Without splat-view this is the default.",
+            "Where there is no display this is the default.",
         ),
     ] = False,
     host: Annotated[
@@ -87,8 +90,7 @@ def view_command(
 ) -> None:
     """Show splats in a window or in the browser, one scene alone or two beside each other."""
     with error_messages():
-        program = None if web else shutil.which(PROGRAM)
-        if program is None:
+        if web or (not has_display() and not _asks_for_no_window(scenes)):
             if not web:
                 _say_why_the_browser(scenes)
             serve_web_view(
@@ -102,31 +104,36 @@ def view_command(
             if value is not None:
                 raise IgsrError(f"{option} is for the browser view; add --web or leave it out")
         with tempfile.TemporaryDirectory(prefix="igsr-view-") as folder:
-            words = [program, *scenes]
+            words = [*PROGRAM, *scenes]
             readable = _cameras(cameras, Path(scenes[0]), Path(folder))
             if readable is not None:
                 words += ["--cameras", str(readable)]
             try:
-                code = subprocess.run(words, check=False).returncode
+                code = subprocess.run(
+                    words, check=False, env={**os.environ, **ENVIRONMENT}
+                ).returncode
             except KeyboardInterrupt:
                 code = INTERRUPTED
     raise typer.Exit(code if code >= 0 else 128 - code)
 
 
+def _asks_for_no_window(scenes: list[str]) -> bool:
+    return any(word.partition("=")[0] in WITHOUT_WINDOW for word in scenes)
+
+
 def _say_why_the_browser(scenes: list[str]) -> None:
-    """Say in a line that the browser stands in for the program.
+    """Say in a line that the browser stands in for a window.
 
     Raises:
-        IgsrError: options are given that only the program has.
+        IgsrError: options are given that only the window has.
     """
-    install = "cargo install --locked --path crates/splat_view"
     options = [word for word in scenes if word.startswith("-")]
     if options:
         raise IgsrError(
-            f"{options[0]} needs {PROGRAM}, which is not installed; in igsr's source, run: "
-            f"{install}"
+            f"{options[0]} is for the window, and there is no display; set DISPLAY, or leave it "
+            "out for the browser view"
         )
-    print_message(f"{PROGRAM} is not installed ({install}); the browser shows the scene.")
+    print_message("There is no display to open a window on; the browser shows the scene.")
 
 
 def _cameras(named: str | None, scene: Path, folder: Path) -> Path | None:

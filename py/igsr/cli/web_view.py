@@ -67,8 +67,12 @@ def _announce(url: str, port: int, *, is_open: bool) -> None:
             "then open the address above there."
         )
     print_message("Ctrl-C ends it.")
-    has_display = sys.platform in ("win32", "darwin") or bool(
+    if has_display() and not is_remote:
+        webbrowser.open(url)
+
+
+def has_display() -> bool:
+    """Whether windows can be opened here, as far as the environment says."""
+    return sys.platform in ("win32", "darwin") or bool(
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     )
-    if has_display and not is_remote:
-        webbrowser.open(url)

@@ -9,8 +9,7 @@ see the same in both.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +26,8 @@ SSIM_ROWS = 16
 #: The five scales of MS-SSIM (Wang et al. 2003) halve the picture four times, and the window must
 #: still fit into the smallest.
 MS_SSIM_MIN_SIDE = SSIM_WINDOW * 2**4
+#: Exponents of the scales, from full size on.
+MS_SSIM_EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 #: PSNR of identical 8-bit pictures is infinite, which JSON cannot hold and a mean cannot use.
 PSNR_CAP = 100.0
 #: Color correction: repetitions, and how far from 0 and 1 a channel counts as not clipped.
@@ -81,70 +82,104 @@ def ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
     border padded with zeros, the map averaged over channels and the pixels that count.
     """
     render, photo, mask = _checked(render, photo, mask)
-    offset = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
-    window = np.exp(-(offset**2) / (2.0 * SSIM_SIGMA**2))
-    window /= window.sum()
     height, width = photo.shape[:2]
     pad = SSIM_WINDOW // 2
 
-    def blur(x: Planes) -> Planes:
-        columns = np.zeros((len(x), x.shape[1] - 2 * pad, width + 2 * pad))
+    def padded(picture: Image) -> Planes:
+        return np.pad(_planes(picture), ((0, 0), (pad, pad), (pad, pad)))
+
+    per_pixel = np.empty((height, width))
+    for rows, light, lights, shared, spread in _windowed(padded(render), padded(photo)):
+        per_pixel[rows] = ((light * shared) / (lights * spread)).mean(axis=0)
+    return float(per_pixel.mean() if mask is None else per_pixel[mask].mean())
+
+
+def _planes(picture: Image) -> Planes:
+    """uint8 [H, W, 3] as float64 [3, H, W] in [0, 1]."""
+    return np.asarray(np.ascontiguousarray(picture.transpose(2, 0, 1)) / 255.0)
+
+
+def _windowed(x: Planes, y: Planes) -> Iterator[tuple[slice, Planes, Planes, Planes, Planes]]:
+    """The terms of SSIM at each place that the whole window fits at, in strips of rows.
+
+    Strips whose planes stay in the cache take a third of the time.
+
+    Args:
+        x, y: float64 [C, H + 10, W + 10] in [0, 1].
+
+    Yields:
+        The strip of the H rows, and numerator and denominator of luminance, then of contrast and
+        structure, float64 [C, strip, W] each.
+    """
+    offset = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    window = np.exp(-(offset**2) / (2.0 * SSIM_SIGMA**2))
+    window /= window.sum()
+    margin = SSIM_WINDOW - 1
+    height, width = x.shape[1] - margin, x.shape[2] - margin
+
+    def blur(z: Planes) -> Planes:
+        columns = np.zeros((len(z), z.shape[1] - margin, width + margin))
         for k, weight in enumerate(window):
-            columns += weight * x[:, k : k + columns.shape[1]]
+            columns += weight * z[:, k : k + columns.shape[1]]
         blurred = np.zeros((*columns.shape[:2], width))
         for k, weight in enumerate(window):
             blurred += weight * columns[:, :, k : k + width]
         return blurred
 
-    def padded(picture: Image) -> Planes:
-        planes = np.ascontiguousarray(picture.transpose(2, 0, 1)) / 255.0
-        return np.pad(planes, ((0, 0), (pad, pad), (pad, pad)))
-
     c1, c2 = 0.01**2, 0.03**2
-    padded_x, padded_y = padded(render), padded(photo)
-    per_pixel = np.empty((height, width))
-    # Strips of rows whose planes stay in the cache take a third of the time.
     for top in range(0, height, SSIM_ROWS):
-        rows = slice(top, min(height, top + SSIM_ROWS) + 2 * pad)
-        x, y = padded_x[:, rows], padded_y[:, rows]
-        mean_x, mean_y = blur(x), blur(y)
-        variance_x = blur(x * x) - mean_x**2
-        variance_y = blur(y * y) - mean_y**2
-        covariance = blur(x * y) - mean_x * mean_y
-        similarity = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)) / (
-            (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
+        bottom = min(height, top + SSIM_ROWS)
+        here_x, here_y = x[:, top : bottom + margin], y[:, top : bottom + margin]
+        mean_x, mean_y = blur(here_x), blur(here_y)
+        variance_x = blur(here_x * here_x) - mean_x**2
+        variance_y = blur(here_y * here_y) - mean_y**2
+        covariance = blur(here_x * here_y) - mean_x * mean_y
+        yield (
+            slice(top, bottom),
+            2 * mean_x * mean_y + c1,
+            mean_x**2 + mean_y**2 + c1,
+            2 * covariance + c2,
+            variance_x + variance_y + c2,
         )
-        per_pixel[top : top + SSIM_ROWS] = similarity.mean(axis=0)
-    return float(per_pixel.mean() if mask is None else per_pixel[mask].mean())
 
 
 def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float | None:
-    """Multi-scale SSIM (Wang et al. 2003) with torchmetrics' defaults on [0, 1].
+    """Multi-scale SSIM (Wang et al. 2003) in the convention of torchmetrics, on [0, 1].
 
-    Five scales, 11 x 11 Gaussian window with sigma 1.5. It has no per-pixel map, so a mask only
-    blackens both pictures outside; the black part counts as equal.
+    Five scales, 11 x 11 Gaussian window with sigma 1.5, negative terms as 0. It has no per-pixel
+    map, so a mask only blackens both pictures outside; the black part counts as equal.
 
     Returns:
         The score, or None where the shorter side is under 176 pixels: the smallest scale would
         no longer hold the window.
     """
-    import torch
-    from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
-
     render, photo, _ = _checked(render, photo, mask)
     if min(photo.shape[:2]) < MS_SSIM_MIN_SIDE:
         return None
+    x, y = _planes(render), _planes(photo)
+    product = 1.0
+    for scale, exponent in enumerate(MS_SSIM_EXPONENTS):
+        # Contrast where the whole window is inside; at the last scale SSIM, with mirrored borders.
+        is_last = scale == len(MS_SSIM_EXPONENTS) - 1
+        if is_last:
+            pad = SSIM_WINDOW // 2
+            x, y = (np.pad(z, ((0, 0), (pad, pad), (pad, pad)), mode="reflect") for z in (x, y))
+        total, count = 0.0, 0
+        for _, light, lights, shared, spread in _windowed(x, y):
+            terms = (light * shared) / (lights * spread) if is_last else shared / spread
+            total += float(terms.sum())
+            count += terms.size
+        # Far-off renders reach negative terms, which have no fractional power.
+        product *= max(0.0, total / count) ** exponent
+        x, y = _halved(x), _halved(y)
+    return product
 
-    def batch(picture: Image) -> torch.Tensor:
-        channels_first = np.ascontiguousarray(picture.transpose(2, 0, 1))[None]
-        # float32: the convolutions are twenty times faster and the score moves by under 1e-6.
-        return torch.from_numpy(channels_first).to(torch.float32) / 255.0
 
-    # relu: far-off renders reach negative contrast terms, whose fractional power is NaN.
-    score: Any = multiscale_structural_similarity_index_measure(
-        batch(render), batch(photo), data_range=1.0, normalize="relu"
-    )
-    return float(score)
+def _halved(planes: Planes) -> Planes:
+    """Means of 2 x 2 pixels; an odd last row or column is left out."""
+    channels, height, width = planes.shape
+    even = planes[:, : height // 2 * 2, : width // 2 * 2]
+    return np.asarray(even.reshape(channels, height // 2, 2, width // 2, 2).mean(axis=(2, 4)))
 
 
 def flip_map(render: Image, photo: Image, mask: Mask | None = None) -> npt.NDArray[np.float32]:

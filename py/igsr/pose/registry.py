@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from igsr._internal.extras import is_installed, naming_extra
 from igsr.capture import Camera
 from igsr.pose.estimate import Estimator
 
@@ -20,7 +21,9 @@ class Entry:
 
     Attributes:
         make: makes it; its parameters are the options of the estimator.
-        ready: whether it can run here with these options; "auto" takes the first that can.
+        ready: whether it can run here with these options; "auto" takes the first that can. A
+            network without torch is ready only where its checkpoint was named, for the message that
+            says what is missing.
     """
 
     make: Callable[..., Estimator]
@@ -32,12 +35,15 @@ def _dust3r(
     graph: str | None = None,
     cameras: Mapping[str, Camera] | None = None,
 ) -> Estimator:
-    from igsr.pose.dust3r.estimator import Dust3r
+    with naming_extra("estimator dust3r"):
+        from igsr.pose.dust3r.estimator import Dust3r
 
     return Dust3r(checkpoint=checkpoint, graph=graph, cameras=cameras)
 
 
 def _dust3r_is_ready(options: Mapping[str, Any]) -> bool:
+    if not is_installed("torch"):
+        return options.get("checkpoint") is not None
     from igsr.pose.dust3r.checkpoint import find_checkpoint
 
     return find_checkpoint(options.get("checkpoint")) is not None
@@ -55,7 +61,8 @@ def _da3(
     cameras_from: str = "decoder",
     bundle_adjustment: bool = True,
 ) -> Estimator:
-    from igsr.pose.da3.estimator import Da3
+    with naming_extra("estimator da3"):
+        from igsr.pose.da3.estimator import Da3
 
     return Da3(
         checkpoint=checkpoint,
@@ -66,6 +73,8 @@ def _da3(
 
 
 def _da3_is_ready(options: Mapping[str, Any]) -> bool:
+    if not is_installed("torch"):
+        return options.get("checkpoint") is not None
     from igsr.pose.da3.checkpoint import find_checkpoint
 
     return find_checkpoint(options.get("checkpoint")) is not None

@@ -33,12 +33,13 @@ def cameras_of(capture: Path) -> list[PageCamera]:
 
 
 def cameras_beside(scene: Path) -> list[PageCamera]:
-    """The cameras in the ``cameras.json`` beside a scene; none where there is no such file.
+    """The cameras in the ``cameras.json`` of a scene's fit; none where there is no such file.
 
     A file that cannot be read is named in a ``UserWarning``: nobody asked for it.
     """
-    path = scene.parent / CAMERAS
-    if not path.is_file():
+    paths = (folder / CAMERAS for folder in _folders_of(scene))
+    path = next((path for path in paths if path.is_file()), None)
+    if path is None:
         return []
     try:
         return cameras_of(path)
@@ -48,12 +49,26 @@ def cameras_beside(scene: Path) -> list[PageCamera]:
 
 
 def background_beside(scene: Path) -> tuple[float, float, float] | None:
-    """The background, RGB in [0, 1], that the ``report.json`` beside a scene records.
+    """The background, RGB in [0, 1], that the ``report.json`` of a scene's fit records.
 
     None where there is no such file, or it records none.
     """
+    found = (_background_in(folder) for folder in _folders_of(scene))
+    return next((color for color in found if color is not None), None)
+
+
+def _folders_of(scene: Path) -> list[Path]:
+    """A scene's own folder, and that of the refinement whose round or checkpoint it is."""
+    own = scene.parent
+    whole = own.resolve()
+    if whole.parent.name == "rounds":
+        return [own, whole.parent.parent]
+    return [own, whole.parent] if whole.name == "checkpoints" else [own]
+
+
+def _background_in(folder: Path) -> tuple[float, float, float] | None:
     try:
-        report = json.loads((scene.parent / REPORT).read_bytes())
+        report = json.loads((folder / REPORT).read_bytes())
         # A refinement's report has the protocol of its last scores alone.
         protocol = report.get("protocol") or report["test"]["protocol"]
         red, green, blue = (float(channel) for channel in protocol["background"])

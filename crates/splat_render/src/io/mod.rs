@@ -15,6 +15,7 @@ mod frame;
 mod gltf;
 mod ksplat;
 mod limits;
+mod open;
 mod ply;
 mod ply_header;
 mod prepare;
@@ -30,9 +31,9 @@ pub use atomic::write_atomically;
 pub use exr::{ExrPicture, encode_exr, write_exr};
 pub use exr_depth::read_exr_depth;
 pub use format::Format;
+pub use open::open_file;
 pub use splat_file::{Loaded, SplatFile};
 
-use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
 
@@ -48,7 +49,7 @@ use ply_header::Header;
 /// of an unknown format.
 pub fn read_splats(path: &Path) -> Result<Loaded> {
     let named = Named(path);
-    let file = File::open(path).map_err(|e| named.bad(format!("cannot be opened ({e})")))?;
+    let file = open_file(path)?;
     let unreadable = |e| named.bad(format!("cannot be read ({e})"));
     let size = file.metadata().map_err(unreadable)?.len();
     let mut reader = BufReader::new(file);
@@ -128,7 +129,7 @@ pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
 /// Those of [`read_splats`].
 pub fn read_ply(path: &Path) -> Result<SplatFile> {
     let named = Named(path);
-    let file = File::open(path).map_err(|e| named.bad(format!("cannot be opened ({e})")))?;
+    let file = open_file(path)?;
     let size = file.metadata().map_err(|e| named.bad(format!("cannot be read ({e})")))?.len();
     Ok(read_any_ply(&mut BufReader::new(file), size, &named)?.file)
 }

@@ -10,9 +10,8 @@ use serde_json::Value;
 
 use super::{CHUNK_BINARY, CHUNK_JSON, MAGIC, TEXT_MAX};
 use crate::error::Result;
-use crate::io::Format;
 use crate::io::bytes::{Bytes, Named, u32_at};
-use crate::io::limits;
+use crate::io::{Format, limits, open_file};
 
 /// Most values in the JSON. In memory each may take 80 times its text; splats take a few hundred.
 const VALUES_MAX: usize = 1 << 18;
@@ -140,8 +139,9 @@ impl<'a> Document<'a> {
         }
         let path = self.named.0.with_file_name(name);
         let mut bytes = Vec::new();
-        std::fs::File::open(&path)
-            .and_then(|file| file.take(limits::FILE_MAX).read_to_end(&mut bytes))
+        open_file(&path)?
+            .take(limits::FILE_MAX)
+            .read_to_end(&mut bytes)
             .map_err(|e| self.bad(format!("refers to {uri:?}, which cannot be read ({e})")))?;
         Ok(bytes)
     }

@@ -1,0 +1,22 @@
+//! Opens files that a user names.
+
+use std::fs::File;
+use std::path::Path;
+
+use super::bytes::Named;
+use crate::error::Result;
+
+/// Opens a file to read. Pipes, sockets and devices are refused: to open or to read one may take
+/// forever, and what they give has no size that a claim could be held against.
+///
+/// # Errors
+/// [`crate::Error::File`] that names the file.
+pub fn open_file(path: &Path) -> Result<File> {
+    let named = Named(path);
+    let closed = |e: std::io::Error| named.bad(format!("cannot be opened ({e})"));
+    let kind = std::fs::metadata(path).map_err(closed)?;
+    if !kind.is_file() && !kind.is_dir() {
+        return Err(named.bad("is a pipe or a device; save what it gives to a file, and name that"));
+    }
+    File::open(path).map_err(closed)
+}

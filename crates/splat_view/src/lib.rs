@@ -1,0 +1,65 @@
+//! `splat-view` shows Gaussian splats in a window, or draws pictures of them without one.
+//!
+//! A library, so that the program and the Python package have the same viewer.
+
+mod arguments;
+mod blending;
+mod camera_path;
+mod capture;
+mod checkpoint;
+mod composing;
+mod display;
+mod gestures;
+mod headless;
+mod loader;
+mod model;
+mod notes;
+mod overlay;
+mod painter;
+mod panel;
+mod photo;
+mod picture_files;
+mod pipelines;
+mod rasterizing;
+mod saving;
+mod scene_changes;
+mod scene_view;
+mod screen;
+mod session;
+mod sources;
+mod stage_times;
+mod start;
+mod surroundings;
+mod up_axis;
+mod viewer;
+mod viewpoint;
+mod window;
+
+use std::ffi::OsString;
+
+use arguments::{Arguments, Asked, HELP};
+use splat_render::Result;
+
+/// Does what a command line asks for, the program's name left out, and prints errors.
+///
+/// Returns the exit status. A window must be opened by the process's first thread.
+pub fn run(words: impl IntoIterator<Item = OsString>) -> u8 {
+    match asked(words) {
+        Ok(()) => 0,
+        Err(error) => {
+            let message = error.to_string();
+            eprintln!("{}.", message.trim_end_matches('.'));
+            1
+        }
+    }
+}
+
+fn asked(words: impl IntoIterator<Item = OsString>) -> Result<()> {
+    match Arguments::parse(words)? {
+        Asked::Help => println!("{HELP}"),
+        Asked::Version => println!("splat-view {}", env!("CARGO_PKG_VERSION")),
+        Asked::Run(arguments) if arguments.is_headless() => headless::run(&arguments)?,
+        Asked::Run(arguments) => window::run(*arguments)?,
+    }
+    Ok(())
+}

@@ -1,0 +1,190 @@
+"""igsr without torch: what works, and what says which extra it lacks."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+import scenes
+import without_torch
+from PIL import Image
+
+import igsr
+from igsr.errors import MissingExtraError
+
+#: Modules that need torch, or that only make sense beside one that does.
+OF_REFINE = (
+    "igsr.benchmark",
+    "igsr.denoiser",
+    "igsr.pose.alignment",
+    "igsr.pose.da3",
+    "igsr.pose.dust3r",
+    "igsr.pose.fused_points",
+    "igsr.pose.network_arrays",
+    "igsr.pose.transformer_layers",
+    "igsr.refinement",
+    "igsr.rendering.exposure",
+    "igsr.rendering.normals",
+    "igsr.rendering.rasterization",
+    "igsr.rendering.rasterization_arguments",
+    "igsr.study",
+)
+
+#: Imports every module, and prints those that cannot be for want of torch.
+IMPORT_ALL = """
+import importlib, pkgutil, sys, igsr
+for module in pkgutil.walk_packages(igsr.__path__, "igsr.", onerror=lambda name: None):
+    if module.name.endswith("__main__"):
+        continue
+    try:
+        importlib.import_module(module.name)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in ("torch", "torchmetrics"):
+            print(module.name)
+"""
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """The folder of a short fit to the example capture, and what the command printed."""
+    folder = tmp_path_factory.mktemp("fitted")
+    words = ["fit", "--example", "--out", "out", "--steps", "12", "--backend", "cpu", "--json"]
+    result = without_torch.igsr(folder, *words)
+    assert result.returncode == 0, result.stderr
+    return folder, json.loads(result.stdout)
+
+
+def test_torch_is_really_missing(tmp_path):
+    result = without_torch.python(tmp_path, "-c", "import torch")
+    assert result.returncode == 1
+    assert "No module named 'torch'" in result.stderr
+
+
+def test_a_fit_is_scored_and_reported(fitted):
+    folder, printed = fitted
+    out = folder / "out"
+    for name in ("scene.ply", "scene.html", "report.html", "report.json", "views.png"):
+        assert (out / name).stat().st_size > 1000, name
+    report = json.loads((out / "report.json").read_text())
+    assert report["photos"] == printed["photos"]
+    assert (report["photos"]["train"], report["photos"]["test"]) == (8, 8)
+    for metric in ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr"):
+        assert report[metric] > 0.0
+    assert "<iframe" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "made"),
+    [
+        (["eval", "out/scene.ply", "out/example", "--backend", "cpu", "--json"], None),
+        (["render", "out/scene.ply", "--cameras", "out/example", "--out", "seen"], "seen"),
+        (["convert", "out/scene.ply", "small.sog"], "small.sog"),
+        (["convert", "out/scene.ply", "page.html"], "page.html"),
+        (["info", "out/scene.ply"], None),
+        (["clean", "out/scene.ply", "--out", "clean.ply"], "clean.ply"),
+        (["view", "out", "--screenshot", "window.png", "--backend", "cpu"], "window.png"),
+        (["export", "out/example", "--out", "colmap"], "colmap"),
+    ],
+)
+def test_commands_on_the_scene_work(fitted, words, made):
+    folder, _ = fitted
+    result = without_torch.igsr(folder, *words)
+    assert result.returncode == 0, result.stderr
+    assert "torch" not in result.stderr
+    assert made is None or (folder / made).exists()
+
+
+def test_the_browser_view_shows_it(fitted):
+    folder, _ = fitted
+    process = subprocess.Popen(
+        [sys.executable, "-m", "igsr.cli", "view", "--web", "out"],
+        cwd=folder,
+        env={**without_torch.environment(folder / "site"), "DISPLAY": ""},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        url = process.stdout.readline().strip()
+        with urllib.request.urlopen(f"{url}state", timeout=30) as answer:
+            assert json.load(answer)["newest"] == "scene"
+    finally:
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("words", "user"),
+    [
+        (["refine", "--example", "--out", "refined"], "igsr refine"),
+        (["bench", "--workload", "W1"], "igsr bench"),
+        (["denoise", "apply", "a.ply", "--capture", "x", "--out", "y"], "igsr denoise"),
+        (["denoise", "train", "--pairs", "x", "--out", "y"], "igsr denoise"),
+        (["denoise", "pairs", "x", "--out", "y"], "igsr denoise"),
+        (["study", "table2", "x", "--out", "y"], "igsr study"),
+        (
+            ["fit", "photos", "--out", "y", "--estimator", "dust3r", "--checkpoint", "x.pth"],
+            "estimator dust3r",
+        ),
+        (["pose", "photos", "--out", "y", "--estimator", "da3"], "estimator da3"),
+    ],
+)
+def test_commands_that_need_torch_name_the_extra_and_write_nothing(tmp_path, words, user):
+    (tmp_path / "photos").mkdir()
+    for number, view in enumerate(scenes.capture(views=3, size=32).views):
+        Image.fromarray(view.image).save(tmp_path / "photos" / f"{number}.png")
+    before = {path.name for path in tmp_path.iterdir()} | {"site"}
+    result = without_torch.igsr(tmp_path, *words)
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[-1] == f"{user} needs torch: pip install 'igsr[refine]'."
+    assert "Traceback" not in result.stderr
+    assert {path.name for path in tmp_path.iterdir()} - before <= {"y"}
+
+
+def test_public_names_that_need_torch_name_the_extra(tmp_path):
+    code = """
+import igsr
+for name in igsr.__all__:
+    try:
+        getattr(igsr, name)
+    except igsr.MissingExtraError as error:
+        assert isinstance(error, ImportError) and error.extra == "refine"
+        print(error)
+"""
+    result = without_torch.python(tmp_path, "-c", code)
+    assert result.returncode == 0, result.stderr
+    names = ("apply_exposure", "denoise", "rasterization", "refine", "Refined")
+    assert sorted(result.stdout.splitlines()) == sorted(
+        f"igsr.{name} needs torch: pip install 'igsr[refine]'." for name in names
+    )
+
+
+def test_splats_as_tensors_name_the_extra(tmp_path):
+    scenes.splats().save(tmp_path / "a.ply")
+    code = "import igsr; igsr.Splats.load('a.ply').to_torch()"
+    result = without_torch.python(tmp_path, "-c", code, cwd=tmp_path)
+    assert result.stderr.splitlines()[-1] == (
+        "igsr.errors.MissingExtraError: Splats.to_torch needs torch: pip install 'igsr[refine]'."
+    )
+
+
+def test_only_the_rooms_of_the_extra_need_torch(tmp_path):
+    result = without_torch.python(tmp_path, "-c", IMPORT_ALL)
+    assert result.returncode == 0, result.stderr
+    needing = result.stdout.split()
+    assert "igsr.denoiser.network" in needing
+    outside = [name for name in needing if not name.startswith(OF_REFINE)]
+    assert outside == []
+
+
+def test_a_missing_extra_is_an_import_error_and_one_of_igsr():
+    error = MissingExtraError("igsr refine", "torch", "refine")
+    assert isinstance(error, igsr.IgsrError)
+    assert isinstance(error, ImportError)
+    assert str(error) == "igsr refine needs torch: pip install 'igsr[refine]'."

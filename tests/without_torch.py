@@ -1,0 +1,47 @@
+"""Python processes in which torch is not installed, as after ``pip install igsr``."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+#: Packages of the extra ``refine``, and what comes with them.
+BLOCKED = ("torch", "torchmetrics", "torchvision")
+
+#: Python runs it at its start, in child processes too.
+SITE = f"""
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {BLOCKED!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Blocked())
+"""
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Variables of a process without torch; a file that blocks it goes into the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "sitecustomize.py").write_text(SITE)
+    return {**os.environ, "PYTHONPATH": str(folder)}
+
+
+def python(folder: Path, *arguments: object, **options) -> subprocess.CompletedProcess[str]:
+    """Run Python without torch."""
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        env=environment(folder / "site"),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        **options,
+    )
+
+
+def igsr(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run an ``igsr`` command without torch, in the folder."""
+    return python(folder, "-m", "igsr.cli", *arguments, cwd=folder)
