@@ -418,6 +418,7 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
         hull=True,
         start="auto",
         coarse_to_fine=False,
+        depth_weight=0.0,
         learning_rate=1.0,
         poses="fixed",
         focal="fixed",

@@ -146,10 +146,11 @@ def test_hands_and_keys_move_the_camera(browser, tmp_path):
     assert panned["forward"] == pytest.approx(zoomed["forward"])
     assert np.linalg.norm(np.subtract(panned["position"], zoomed["position"])) > 0.01
 
-    # A key walks with the page's frames, which may be slow to come.
+    # A key walks with the page's frames, which may be slow to come. Nothing settles until it is up.
     browser.key("w", "KeyW")
     end = time.monotonic() + 60
-    while state()["position"] == panned["position"] and time.monotonic() < end:
+    while browser.run("window.igsr.state()")["position"] == panned["position"]:
+        assert time.monotonic() < end, "the key moves nothing"
         time.sleep(0.05)
     browser.key("w", "KeyW", "keyUp")
     walked = np.subtract(state()["position"], panned["position"])

@@ -33,6 +33,7 @@ SHORT = FitSettings(
     hull=False,
     start="random",
     coarse_to_fine=False,
+    depth_weight=0.0,
     learning_rate=1.0,
     poses="fixed",
     focal="fixed",

@@ -234,7 +234,7 @@ def _fitted(
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
     check_photos(views)
-    if settings.depth_weight > 0.0:
+    if settings.depth_weight > 0.0 and any(view.depth is not None for view in views):
         capture = replace(capture, views=with_scaled_depths(capture.views, capture.points))
         views = capture.train_views
     _check_focal(views, settings)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
 from igsr.capture.undistort import Lens
-from igsr.pose.alignment.predictions import Grid
+
+# The alignment needs torch, which an estimator may do without.
+if TYPE_CHECKING:
+    from igsr.pose.alignment.predictions import Grid
 
 #: Called with the stage, how much of it is done, and how much there is.
 Progress = Callable[[str, int, int], None]
