@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from igsr.capture import Camera
-from igsr.pose.alignment import Grid, PairPrediction, PhotoToAlign
+from igsr.pose.alignment import PairPrediction, PhotoToAlign
+from igsr.pose.grid import Grid
 
 CONFIDENCE = 8.0
 

@@ -11,7 +11,7 @@ from pointmaps import CONFIDENCE, PointmapScene, all_pairs
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, apply, similarity_between, similarity_of_points
-from igsr.pose.alignment import AlignedPhoto, Grid, PairPrediction, PhotoToAlign, align
+from igsr.pose.alignment import AlignedPhoto, PairPrediction, PhotoToAlign, align
 from igsr.pose.alignment import observations as observations_module
 from igsr.pose.alignment.absolute_pose import searched_focal
 from igsr.pose.alignment.confidence import trusted_pixels
@@ -20,6 +20,7 @@ from igsr.pose.alignment.initial_alignment import start
 from igsr.pose.alignment.objective import Objective
 from igsr.pose.alignment.observations import observe, strong_edges
 from igsr.pose.alignment.spanning_tree import components, spanning_tree
+from igsr.pose.grid import Grid
 
 
 def depth_noise(part, seed=0):

@@ -19,11 +19,12 @@ from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
 from igsr.pose import fused_points as fused_points_module
 from igsr.pose import registry
-from igsr.pose.alignment import TRUSTED, Grid, PairPrediction
+from igsr.pose.alignment import TRUSTED, PairPrediction
 from igsr.pose.dust3r import estimator as estimator_module
 from igsr.pose.dust3r.dense_depth import with_dense_depth
 from igsr.pose.dust3r.estimator import Dust3r
 from igsr.pose.dust3r.prediction import DenseGrid, DensePrediction, DustPredictor
+from igsr.pose.grid import Grid
 from igsr.rendering.renders import render
 
 COUNT, SIZE, STEP = 4, 48, 2

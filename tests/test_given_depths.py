@@ -19,8 +19,8 @@ from igsr.fitting.initialization import initial_splats
 from igsr.fitting.initialization.given_depths import given_points, have_depths
 from igsr.fitting.initialization.initial_splats import chosen_start
 from igsr.pose import FoundCameras, read_found
-from igsr.pose.alignment import Grid
 from igsr.pose.estimate import Estimate
+from igsr.pose.grid import Grid
 from igsr.rendering.renders import render
 
 

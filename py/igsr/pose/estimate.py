@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
 from igsr.capture.undistort import Lens
-
-# The alignment needs torch, which an estimator may do without.
-if TYPE_CHECKING:
-    from igsr.pose.alignment.predictions import Grid
+from igsr.pose.grid import Grid
 
 #: Called with the stage, how much of it is done, and how much there is.
 Progress = Callable[[str, int, int], None]

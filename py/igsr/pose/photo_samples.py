@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture.photo_folder import Photo
-from igsr.pose.alignment.predictions import Grid
+from igsr.pose.grid import Grid
 
 
 def usable(photo: Photo, grid: Grid) -> npt.NDArray[np.bool_]:

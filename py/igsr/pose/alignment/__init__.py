@@ -5,13 +5,12 @@ from __future__ import annotations
 from igsr.pose.alignment.aligned_photo import AlignedPhoto
 from igsr.pose.alignment.confidence import TRUSTED, trusted_pixels
 from igsr.pose.alignment.global_alignment import Alignment, align
-from igsr.pose.alignment.predictions import Grid, PairPrediction, PhotoToAlign, Predictor
+from igsr.pose.alignment.predictions import PairPrediction, PhotoToAlign, Predictor
 
 __all__ = [
     "TRUSTED",
     "AlignedPhoto",
     "Alignment",
-    "Grid",
     "PairPrediction",
     "PhotoToAlign",
     "Predictor",

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import Camera
-from igsr.pose.alignment.predictions import Grid
+from igsr.pose.grid import Grid
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -29,8 +29,9 @@ from igsr.pose.alignment.observations import (
     usable_confidence,
 )
 from igsr.pose.alignment.placement import Placement, inverse, joined
-from igsr.pose.alignment.predictions import Grid, PairPrediction, PhotoToAlign, checked_predictions
+from igsr.pose.alignment.predictions import PairPrediction, PhotoToAlign, checked_predictions
 from igsr.pose.alignment.spanning_tree import components
+from igsr.pose.grid import Grid
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.geometry.similarity import is_spread
-from igsr.pose.alignment.predictions import PairPrediction, PhotoToAlign, kept
+from igsr.pose.alignment.predictions import PairPrediction, PhotoToAlign
+from igsr.pose.grid import kept
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

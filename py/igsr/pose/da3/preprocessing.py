@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.errors import IgsrError
-from igsr.pose.alignment import Grid
 from igsr.pose.da3.config import PATCH
+from igsr.pose.grid import Grid
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]

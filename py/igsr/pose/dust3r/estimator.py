@@ -11,11 +11,12 @@ import numpy as np
 from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
-from igsr.pose.alignment import AlignedPhoto, Grid, PhotoToAlign, Predictor, align, trusted_pixels
+from igsr.pose.alignment import AlignedPhoto, PhotoToAlign, Predictor, align, trusted_pixels
 from igsr.pose.dust3r.pairs import pair_graph, usual_graph
 from igsr.pose.estimate import Estimate
 from igsr.pose.fused_points import fused_points
 from igsr.pose.given_cameras import check_given_cameras
+from igsr.pose.grid import Grid
 from igsr.pose.photo_samples import usable
 
 

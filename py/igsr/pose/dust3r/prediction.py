@@ -18,10 +18,11 @@ import torch
 
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
-from igsr.pose.alignment.predictions import Grid, PairPrediction
+from igsr.pose.alignment.predictions import PairPrediction
 from igsr.pose.dust3r.heads import PATCH
 from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig, Tokens
 from igsr.pose.dust3r.preprocessing import Crop, crop_of, network_input
+from igsr.pose.grid import Grid
 from igsr.pose.network_arrays import float32_array, half_precision
 from igsr.pose.photo_samples import usable
 

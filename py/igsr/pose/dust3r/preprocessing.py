@@ -14,8 +14,8 @@ from PIL import Image
 
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
-from igsr.pose.alignment.predictions import Grid
 from igsr.pose.dust3r.heads import PATCH
+from igsr.pose.grid import Grid
 from igsr.pose.photo_samples import over_white
 
 Float32 = npt.NDArray[np.float32]
