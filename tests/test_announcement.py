@@ -119,3 +119,16 @@ def test_few_of_many_photos_are_counted(monkeypatch):
     few = said(monkeypatch, seen, cameras_kept=True, given=given, photos=8)[1]
     assert many.endswith("2500 steps.")
     assert few.endswith("1672 steps.")
+
+
+def test_photos_that_need_no_depth_maps_take_less(monkeypatch):
+    seen = Overview(Path("photos"), True, [(100, 100)] * 30, 30, 3, False, True)
+
+    def seconds(changed, **given):
+        given = {"steps": 10, **given}
+        return said(monkeypatch, changed, cameras_kept=True, given=given)[2]
+
+    assert "about 10 s" in seconds(seen)
+    for without in (replace(seen, channels=4), replace(seen, depths=True)):
+        assert "about 5 s" in seconds(without)
+    assert "about 5 s" in seconds(seen, start="points")

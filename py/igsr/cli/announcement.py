@@ -58,7 +58,10 @@ def announce(
         settings, width, height, timed_steps(backend, settings.sh_degree, seen.channels == 4)
     )
     held_out = len(seen.sizes) - train
-    fit += other_seconds(photos, held_out + min(photos, MOST_TRAIN), pixels)
+    # Photos with alpha are fitted from their hull, and those with depths from these.
+    swept = settings.start in ("auto", "depths") and seen.channels < 4 and not seen.depths
+    scored = held_out + min(photos, MOST_TRAIN)
+    fit += other_seconds(photos if swept else 0, scored, pixels)
     print_message(
         f"Found {len(seen.sizes)} photos of {_range_of(seen.sizes)}"
         + (f", {held_out} of them held out" if held_out else "")
@@ -89,6 +92,8 @@ def _words(seconds: float) -> str:
     """A time in words that are as exact as the estimate."""
     if seconds < 90.0:
         return f"{max(5, 5 * round(seconds / 5.0))} s"
+    if seconds < 285.0:
+        return f"{round(seconds / 30.0) / 2:g} min"
     if seconds < 5400.0:
         return f"{round(seconds / 60.0)} min"
     return f"{seconds / 3600.0:.1f} h"

@@ -125,7 +125,7 @@ def other_seconds(photos: int, scored: int, pixels: float) -> float:
     """Seconds that a run takes beside the steps: depth maps before them, and scores after.
 
     Args:
-        photos: number of photos fitted.
+        photos: number of photos that depth maps are found for.
         scored: number of photos scored.
         pixels: of a photo.
     """
