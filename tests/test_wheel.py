@@ -6,16 +6,15 @@ import json
 import os
 import platform
 import shutil
-import signal
 import subprocess
 import sys
 import time
-import urllib.request
 import zipfile
 from pathlib import Path
 
 import pytest
 from PIL import Image
+from web_views import view_until_ctrl_c
 
 pytestmark = [
     pytest.mark.long,
@@ -152,24 +151,12 @@ def test_the_viewer_draws_what_a_photo_shows(clean, fitted):
 
 def test_the_browser_view_answers_until_ctrl_c(clean, fitted):
     started = time.perf_counter()
-    process = subprocess.Popen(
-        [str(clean.bin / "igsr"), "view", "out"],  # no display: the browser view
-        cwd=clean.folder,
-        env=clean.variables,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    try:
-        url = process.stdout.readline().strip()
-        with urllib.request.urlopen(f"{url}state", timeout=30) as answer:
-            assert json.load(answer)["newest"] == "scene"
-        print(f"{time.perf_counter() - started:6.1f} s  igsr view out, until it answers")
-    finally:
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
-    assert process.returncode == 0, errors
+    # Without a display it is the browser view.
+    command = [str(clean.bin / "igsr"), "view", "out"]
+    state, status, errors = view_until_ctrl_c(command, clean.folder, clean.variables)
+    assert state["newest"] == "scene"
+    print(f"{time.perf_counter() - started:6.1f} s  igsr view out, answer and end")
+    assert status == 0, errors
     assert "There is no display" in errors
 
 

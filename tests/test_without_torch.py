@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
 import sys
-import urllib.request
 
 import pytest
 import scenes
 import without_torch
 from PIL import Image
+from web_views import view_until_ctrl_c
 
 import igsr
 from igsr.errors import MissingExtraError
@@ -34,7 +32,7 @@ OF_REFINE = (
     "igsr.study",
 )
 
-#: Imports every module, and prints those that cannot be for want of torch.
+#: Imports every module, and prints those that cannot be imported without torch.
 IMPORT_ALL = """
 import importlib, pkgutil, sys, igsr
 for module in pkgutil.walk_packages(igsr.__path__, "igsr.", onerror=lambda name: None):
@@ -100,22 +98,10 @@ def test_commands_on_the_scene_work(fitted, words, made):
 
 def test_the_browser_view_shows_it(fitted):
     folder, _ = fitted
-    process = subprocess.Popen(
-        [sys.executable, "-m", "igsr.cli", "view", "--web", "out"],
-        cwd=folder,
-        env={**without_torch.environment(folder / "site"), "DISPLAY": ""},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    try:
-        url = process.stdout.readline().strip()
-        with urllib.request.urlopen(f"{url}state", timeout=30) as answer:
-            assert json.load(answer)["newest"] == "scene"
-    finally:
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
+    command = [sys.executable, "-m", "igsr.cli", "view", "--web", "out"]
+    variables = {**without_torch.environment(folder / "site"), "DISPLAY": ""}
+    state, _, errors = view_until_ctrl_c(command, folder, variables)
+    assert state["newest"] == "scene"
     assert "Traceback" not in errors
 
 

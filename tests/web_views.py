@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import signal
 import socket
+import subprocess
 import threading
+import urllib.request
 
 from igsr.viewing.server import open_server
 from igsr.viewing.shown import Shown
@@ -43,3 +46,28 @@ def state_of(server):
     status, content = with_token(server, "state")
     assert status == 200, content
     return json.loads(content)
+
+
+def view_until_ctrl_c(command, folder, variables):
+    """What the browser view that a command starts says of its state; then it gets Ctrl-C.
+
+    Returns:
+        The state, the exit status and what the command wrote to stderr.
+    """
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        env=variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        url = process.stdout.readline().strip()
+        with urllib.request.urlopen(f"{url}state", timeout=30) as answer:
+            state = json.load(answer)
+    finally:
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    return state, process.returncode, errors

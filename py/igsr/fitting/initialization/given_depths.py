@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from igsr.capture import View
 from igsr.capture.downscaling import reduced_size, reduced_view
+from igsr.fitting.initialization.photo_pixels import pixels_of, usable_pixels
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -74,12 +75,10 @@ def _reduced(view: View) -> View:
 def _known(view: View) -> Bool:
     """Which pixels [H, W] have a depth and are neither masked nor transparent in part."""
     assert view.depth is not None  # callers leave out views without
-    known: Bool = view.depth > 0.0
+    known: Bool = usable_pixels(view) & (view.depth > 0.0)
     if view.depth_confidence is not None:
         known &= view.depth_confidence > 0.0
-    if view.mask is not None:
-        known &= view.mask
-    return known & (view.image[..., 3] == 255) if view.image.shape[2] == 4 else known
+    return known
 
 
 def _world(view: View, rows: Int64, columns: Int64) -> Float64:
@@ -108,14 +107,7 @@ def _looked_past(world: Float64, others: list[View]) -> Bool:
     """Which points [P, 3] more of the other photos look past than see on their surface."""
     past, seen = np.zeros(len(world), np.int64), np.zeros(len(world), np.int64)
     for view in others:
-        camera = view.camera
-        local = world @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        depth = np.maximum(local[:, 2], 1e-9)
-        x = camera.K[0, 0] * local[:, 0] / depth + camera.K[0, 2]
-        y = camera.K[1, 1] * local[:, 1] / depth + camera.K[1, 2]
-        inside = (local[:, 2] > 1e-9) & (x >= 0) & (y >= 0)
-        inside &= (x < camera.width) & (y < camera.height)
-        row, column = (np.where(inside, at, 0.0).astype(np.int64) for at in (y, x))
+        row, column, depth, inside = pixels_of(view, world)
         assert view.depth is not None
         inside &= _known(view)[row, column]
         surface = view.depth[row, column]

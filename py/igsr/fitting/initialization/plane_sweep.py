@@ -16,6 +16,7 @@ import numpy.typing as npt
 from igsr import _core
 from igsr.capture import View
 from igsr.capture.downscaling import reduced_size, reduced_view
+from igsr.fitting.initialization.photo_pixels import pixels_of, usable_pixels
 from igsr.geometry.focus_point import focus_point
 
 Float64 = npt.NDArray[np.float64]
@@ -124,7 +125,7 @@ def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap
         nearest, farthest = _depth_range(view, target, known)
         sweeps.append((k, others, (1.0 / nearest, 1.0 / farthest), DEPTHS))
     sweeps = [sweep for sweep in sweeps if sweep[1]]
-    usable = [_usable(view) for view in small]
+    usable = [usable_pixels(view) for view in small]
     found = _core.plane_sweep(
         [_grey(view, mask) for view, mask in zip(small, usable, strict=True)],
         [None if mask.all() else mask.astype(np.uint8) for mask in usable],
@@ -183,12 +184,6 @@ def _grey(view: View, usable: Bool) -> Float32:
     return np.ascontiguousarray(np.clip(grey, 0.0, 1.0), dtype=np.float32)
 
 
-def _usable(view: View) -> Bool:
-    """Which pixels [H, W] are neither masked nor transparent in part."""
-    usable = np.ones(view.image.shape[:2], dtype=np.bool_) if view.mask is None else view.mask
-    return usable & (view.image[..., 3] == 255) if view.image.shape[2] == 4 else usable
-
-
 def _angles(views: list[View], target: Float64) -> Float64:
     """Degrees [V, V] between the directions that photos see the target from."""
     rays = np.stack([view.camera.centre - target for view in views])
@@ -208,7 +203,7 @@ def _compared(k: int, angles: Float64, distances: Float64) -> list[int]:
 def _depth_range(view: View, target: Float64, known: Float64 | None) -> tuple[float, float]:
     """The nearest and farthest depth to try."""
     if known is not None:
-        _, _, depth, inside = _pixels(view, known)
+        _, _, depth, inside = pixels_of(view, known)
         if inside.sum() >= POINTS_SEEN:
             low, high = np.percentile(depth[inside], [1.0, 99.0])
             return POINTS_NEAREST * float(low), POINTS_FARTHEST * float(high)
@@ -220,23 +215,9 @@ def _is_confirmed(world: Float64, others: list[DepthMap]) -> Bool:
     """Which world points [P, 3] lie on the surface of another depth map."""
     confirmed = np.zeros(len(world), dtype=np.bool_)
     for other in others:
-        row, column, depth, inside = _pixels(other.view, world)
+        row, column, depth, inside = pixels_of(other.view, world)
         surface = 1.0 / other.inverse_depth[row, column].astype(np.float64)
         same = np.maximum(SAME_PLANES * other.gap * depth, SAME_DEPTH)
         seen = other.score[row, column] > -1.0
         confirmed |= inside & seen & (np.abs(1.0 - depth / surface) < same)
     return confirmed
-
-
-def _pixels(
-    view: View, world: Float64
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Float64, Bool]:
-    """Row, column and depth [P] of world points [P, 3], and which fall into the photo."""
-    camera = view.camera
-    local = world @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    depth = np.maximum(local[:, 2], 1e-9)
-    x = camera.K[0, 0] * local[:, 0] / depth + camera.K[0, 2]
-    y = camera.K[1, 1] * local[:, 1] / depth + camera.K[1, 2]
-    inside = (local[:, 2] > 1e-9) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-    row, column = np.where(inside, y, 0.0), np.where(inside, x, 0.0)
-    return row.astype(np.int64), column.astype(np.int64), depth, inside
