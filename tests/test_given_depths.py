@@ -14,6 +14,7 @@ import igsr
 from igsr.capture import Capture, Points, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import Tracks
+from igsr.fitting.depth_agreement import with_agreeing_depths
 from igsr.fitting.depth_scales import with_scaled_depths
 from igsr.fitting.initialization import initial_splats
 from igsr.fitting.initialization.given_depths import given_points, have_depths
@@ -185,7 +186,7 @@ def test_a_resumed_fit_ends_with_the_same_bits(made, tmp_path):
     assert np.array_equal(whole.means, again.means)
     assert np.array_equal(whole.sh, again.sh)
     fitted(made, steps=60, checkpoint=file, progress=lambda now: now.step < 20)
-    other = with_views(made, lambda k, v: replace(v, depth=v.depth + np.float32(k == 2)))
+    other = with_views(made, lambda k, v: replace(v, depth=v.depth + np.float32(0.01 * (k == 2))))
     with pytest.raises(igsr.IgsrError, match="other photos"):
         fitted(other, steps=60, checkpoint=file, resume=True)
 
@@ -256,6 +257,60 @@ def test_a_fit_scales_depths(made):
     points = points_of(made)
     scaled = with_views(made, lambda k, v: replace(v, depth=v.depth * np.float32(0.1)))
     splats = fitted(replace(scaled, points=points), steps=30)
+    assert np.median(off_walls(splats.means + splats.origin)) < 0.1
+
+
+def depths_left_out(capture):
+    """Numbers of the train photos without depth."""
+    views = with_agreeing_depths(capture.views)
+    return [k for k, view in enumerate(views) if view.split == "train" and view.depth is None]
+
+
+def times(capture, factors):
+    """The capture with some photos' depths multiplied."""
+    return with_views(
+        capture,
+        lambda k, v: replace(v, depth=v.depth * np.float32(factors[k])) if k in factors else v,
+    )
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.3, 2.0])
+def test_a_photo_whose_depths_the_others_contradict_loses_them(made, factor):
+    with pytest.warns(UserWarning, match=r"The depth of 2\.png contradicts that of the other"):
+        assert depths_left_out(times(made, {2: factor})) == [2]
+
+
+def test_depths_stay_where_most_do_not_contradict_them(made):
+    assert depths_left_out(made) == []
+    # Two photos that disagree: nobody knows which is right.
+    two = with_views(made, lambda k, v: v if k in (0, 2) else replace(v, depth=None))
+    assert depths_left_out(times(two, {2: 2.0})) == depths_left_out(two)
+    # A unit that all share is not seen.
+    assert depths_left_out(times(made, dict.fromkeys(range(6), 1.5))) == []
+    # Photos without depths, and none at all.
+    none = with_views(made, lambda k, v: replace(v, depth=None))
+    assert all(a is b for a, b in zip(with_agreeing_depths(none.views), none.views, strict=True))
+    assert with_agreeing_depths([]) == []
+
+
+def test_what_stands_behind_an_object_contradicts_nothing():
+    """Two photos of a wall's two sides: each sees the other's points behind its own surface."""
+    behind = np.diag([-1.0, 1.0, -1.0, 1.0])
+    behind[2, 3] = 6.0  # the other camera stands 6 units away and looks back
+    views = []
+    for k, viewmat in enumerate([np.eye(4), np.eye(4), behind, behind]):
+        moved = viewmat.copy()
+        moved[0, 3] += 0.1 * k
+        camera = igsr.Camera(moved, np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), 40, 30)
+        image = np.zeros((30, 40, 3), np.uint8)
+        # Walls at z = 2 and z = 4 of the first camera: what is between is not seen.
+        views.append(View(f"{k}.png", camera, "train", image, depth=np.full((30, 40), 2.0, "f4")))
+    assert all(a is b for a, b in zip(with_agreeing_depths(views), views, strict=True))
+
+
+def test_a_fit_leaves_out_a_photos_wrong_depths(made):
+    with pytest.warns(UserWarning, match="contradicts"):
+        splats = fitted(times(made, {2: 1.6}), steps=30)
     assert np.median(off_walls(splats.means + splats.origin)) < 0.1
 
 

@@ -19,6 +19,7 @@ from igsr.capture import Capture, View
 from igsr.capture.photo_checks import check_photos
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import CheckpointFile, recorded_settings
+from igsr.fitting.depth_agreement import with_agreeing_depths
 from igsr.fitting.depth_scales import with_scaled_depths
 from igsr.fitting.exposures import StartingExposures, starting_exposures
 from igsr.fitting.fingerprint import fingerprint, hash_of
@@ -235,7 +236,8 @@ def _fitted(
         raise IgsrError("resume needs checkpoint, the file to continue from.")
     check_photos(views)
     if settings.depth_weight > 0.0 and any(view.depth is not None for view in views):
-        capture = replace(capture, views=with_scaled_depths(capture.views, capture.points))
+        scaled = with_scaled_depths(capture.views, capture.points)
+        capture = replace(capture, views=with_agreeing_depths(scaled))
         views = capture.train_views
     _check_focal(views, settings)
     device = check_fits(backend)

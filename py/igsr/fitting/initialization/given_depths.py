@@ -6,8 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import View
-from igsr.capture.downscaling import reduced_size, reduced_view
-from igsr.fitting.initialization.photo_pixels import pixels_of, usable_pixels
+from igsr.fitting.initialization.photo_pixels import known_pixels, pixels_of, reduced, world_points
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -15,8 +14,6 @@ Bool = npt.NDArray[np.bool_]
 
 #: Part of the photos that must have depths for a fit to start from these.
 PART = 0.5
-#: Pixels of the longer side at which depths are compared; bounds time and memory.
-LONGEST = 512
 #: Photos that look past a point see it stand before their surface by this part of its depth.
 BEFORE = 0.1
 #: Photos compared with, the nearest.
@@ -44,15 +41,15 @@ def given_points(
         Points [P, 3] in the world frame, their photos' colors [P, 3] in 0..1, and the depths'
         confidence [P], or None where no photo has one.
     """
-    small = [_reduced(view) for view in views if view.depth is not None]
+    small = [reduced(view) for view in views if view.depth is not None]
     points, colors, confidences = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
     for k, view in enumerate(small):
-        rows, columns = np.nonzero(_known(view))
+        rows, columns = np.nonzero(known_pixels(view))
         # More than the photo's share, since some are left out.
         share = min(len(rows), 2 * count // len(small) + 1)
         chosen = np.sort(random.choice(len(rows), size=share, replace=False))
         rows, columns = rows[chosen], columns[chosen]
-        world = _world(view, rows, columns)
+        world = world_points(view, rows, columns)
         stays = ~_looked_past(world, _nearest(k, small))
         rows, columns = rows[stays], columns[stays]
         points.append(world[stays])
@@ -67,36 +64,6 @@ def given_points(
     return xyz, rgb, confidence if rated else None
 
 
-def _reduced(view: View) -> View:
-    camera = view.camera
-    return reduced_view(view, *reduced_size(camera.width, camera.height, LONGEST))
-
-
-def _known(view: View) -> Bool:
-    """Which pixels [H, W] have a depth and are neither masked nor transparent in part."""
-    assert view.depth is not None  # callers leave out views without
-    known: Bool = usable_pixels(view) & (view.depth > 0.0)
-    if view.depth_confidence is not None:
-        known &= view.depth_confidence > 0.0
-    return known
-
-
-def _world(view: View, rows: Int64, columns: Int64) -> Float64:
-    """The world points [P, 3] of pixels."""
-    assert view.depth is not None
-    camera, depth = view.camera, view.depth[rows, columns].astype(np.float64)
-    local = np.stack(
-        [
-            (columns + 0.5 - camera.K[0, 2]) / camera.K[0, 0] * depth,
-            (rows + 0.5 - camera.K[1, 2]) / camera.K[1, 1] * depth,
-            depth,
-        ],
-        axis=1,
-    )
-    world: Float64 = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-    return world
-
-
 def _nearest(k: int, views: list[View]) -> list[View]:
     centres = np.stack([view.camera.centre for view in views])
     order = np.argsort(np.linalg.norm(centres - centres[k], axis=1), kind="stable")
@@ -109,7 +76,7 @@ def _looked_past(world: Float64, others: list[View]) -> Bool:
     for view in others:
         row, column, depth, inside = pixels_of(view, world)
         assert view.depth is not None
-        inside &= _known(view)[row, column]
+        inside &= known_pixels(view)[row, column]
         surface = view.depth[row, column]
         past += inside & (depth < (1.0 - BEFORE) * surface)
         seen += inside & (np.abs(depth - surface) <= BEFORE * surface)

@@ -1,4 +1,4 @@
-"""Which pixels of a photo count, and which of them show a point."""
+"""Which pixels of a photo count, which points they show, and which of them show a point."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import View
+from igsr.capture.downscaling import reduced_size, reduced_view
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
+
+#: Pixels of the longer side at which depths are compared; bounds time and memory.
+LONGEST = 512
 
 
 def usable_pixels(view: View) -> Bool:
@@ -28,3 +32,34 @@ def pixels_of(view: View, world: Float64) -> tuple[Int64, Int64, Float64, Bool]:
     inside = (local[:, 2] > 1e-9) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
     row, column = np.where(inside, y, 0.0), np.where(inside, x, 0.0)
     return row.astype(np.int64), column.astype(np.int64), depth, inside
+
+
+def reduced(view: View) -> View:
+    """The view at the size at which depths are compared."""
+    camera = view.camera
+    return reduced_view(view, *reduced_size(camera.width, camera.height, LONGEST))
+
+
+def known_pixels(view: View) -> Bool:
+    """Which pixels [H, W] have a depth and are neither masked nor transparent in part."""
+    assert view.depth is not None  # callers leave out views without
+    known: Bool = usable_pixels(view) & (view.depth > 0.0)
+    if view.depth_confidence is not None:
+        known &= view.depth_confidence > 0.0
+    return known
+
+
+def world_points(view: View, rows: Int64, columns: Int64) -> Float64:
+    """The world points [P, 3] of pixels."""
+    assert view.depth is not None
+    camera, depth = view.camera, view.depth[rows, columns].astype(np.float64)
+    local = np.stack(
+        [
+            (columns + 0.5 - camera.K[0, 2]) / camera.K[0, 0] * depth,
+            (rows + 0.5 - camera.K[1, 2]) / camera.K[1, 1] * depth,
+            depth,
+        ],
+        axis=1,
+    )
+    world: Float64 = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    return world
