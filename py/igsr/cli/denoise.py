@@ -12,6 +12,7 @@ import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
+from igsr.cli.denoiser_option import DenoiserOption, chosen_denoiser
 from igsr.cli.error_messages import error_messages
 from igsr.cli.settings_options import settings_options
 from igsr.cli.shared import (
@@ -274,6 +275,7 @@ def apply_command(
         Path | None,
         typer.Option("--weights", metavar="FILE", help="A denoiser. Default: igsr's own."),
     ] = None,
+    denoiser_name: DenoiserOption = None,
     backend: BackendOption = BackendChoice.auto,
     as_json: JsonOption = False,
 ) -> None:
@@ -283,6 +285,7 @@ def apply_command(
 
     from igsr._internal.atomic_write import atomic_write
     from igsr.denoiser import (
+        Denoiser,
         NetworkDenoiser,
         denoise,
         load_network,
@@ -299,7 +302,10 @@ def apply_command(
     from igsr.splats import Splats
 
     with error_messages():
-        denoiser = NetworkDenoiser(load_network(weights))
+        if denoiser_name is not None:
+            denoiser: Denoiser = chosen_denoiser(denoiser_name, weights)
+        else:
+            denoiser = NetworkDenoiser(load_network(weights))
         splats = Splats.load(scene)
         capture = load(capture_path, holdout)
         background, behind = default_background(capture), known_background(capture.views)

@@ -11,6 +11,7 @@ import typer
 
 from igsr._internal.progress_bar import progress_bar
 from igsr.capture.photo_folder import FRAMES
+from igsr.cli.denoiser_option import DenoiserOption, chosen_denoiser
 from igsr.cli.error_messages import error_messages, warning_messages
 from igsr.cli.pose import (
     AllowMissingOption,
@@ -43,6 +44,7 @@ from igsr.refinement.settings import AUTO, RefineSettings
 if TYPE_CHECKING:
     from igsr.capture import Capture
     from igsr.capture.overview import Overview
+    from igsr.denoiser import Denoiser
     from igsr.refinement.results import Refined
 
 
@@ -71,6 +73,7 @@ def refine_command(
         Path | None,
         typer.Option("--weights", metavar="FILE", help="The denoiser. Default: igsr's own."),
     ] = None,
+    denoiser_name: DenoiserOption = None,
     estimator: EstimatorOption = AUTO,
     network: CheckpointOption = None,
     graph: GraphOption = None,
@@ -119,7 +122,10 @@ def refine_command(
                 rounds=settings.most_rounds,
             )
 
-        denoiser = round_denoiser(weights)
+        if denoiser_name is not None:
+            denoiser: Denoiser = chosen_denoiser(denoiser_name, weights)
+        else:
+            denoiser = round_denoiser(weights)
         with warning_messages(), closing(FollowedRun(out)) as followed:
             capture, _ = capture_to_fit(
                 path,

@@ -16,6 +16,8 @@ from igsr._internal.lazy_exports import lazy_exports
 if TYPE_CHECKING:
     from igsr.denoiser.buffers import Buffers, photo_support, render_buffers
     from igsr.denoiser.cleaning import Denoiser, NetworkDenoiser, denoise
+    from igsr.denoiser.named import named_denoiser
+    from igsr.denoiser.single_step import SingleStepDenoiser
     from igsr.denoiser.warping import Source, Warped, photo_sources, warp_photos
     from igsr.denoiser.weights import load_network, save_network
 
@@ -23,10 +25,12 @@ __all__ = [
     "Buffers",
     "Denoiser",
     "NetworkDenoiser",
+    "SingleStepDenoiser",
     "Source",
     "Warped",
     "denoise",
     "load_network",
+    "named_denoiser",
     "photo_sources",
     "photo_support",
     "render_buffers",
@@ -40,6 +44,8 @@ if not TYPE_CHECKING:
         {
             "igsr.denoiser.buffers": ("Buffers", "photo_support", "render_buffers"),
             "igsr.denoiser.cleaning": ("Denoiser", "NetworkDenoiser", "denoise"),
+            "igsr.denoiser.named": ("named_denoiser",),
+            "igsr.denoiser.single_step": ("SingleStepDenoiser",),
             "igsr.denoiser.warping": ("Source", "Warped", "photo_sources", "warp_photos"),
             "igsr.denoiser.weights": ("load_network", "save_network"),
         },

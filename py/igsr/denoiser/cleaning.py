@@ -13,6 +13,7 @@ from torch import Tensor
 
 from igsr.denoiser.architecture import MULTIPLE
 from igsr.denoiser.buffers import Buffers
+from igsr.denoiser.calibration import claimed_by_change, confidence_of
 from igsr.denoiser.inputs import COLOR, PHOTOS, network_inputs
 from igsr.denoiser.network import REACH, DenoiserNetwork
 from igsr.denoiser.warping import Source, Warped, warp_photos
@@ -22,8 +23,6 @@ from igsr.rendering.renders import Render
 
 Float32 = npt.NDArray[np.float32]
 
-#: Expected error, in units of the colours' range, at which the confidence is a half.
-HALF_CONFIDENCE_ERROR = 0.05
 #: Only half of a change is made if it is this many times as large as the error that is expected to
 #: remain: it is as likely wrong. On scenes unlike those of the training, unsure changes go wrong.
 DOUBT = 1.0
@@ -39,7 +38,9 @@ assert REACH % MULTIPLE == 0
 class Denoiser(Protocol):
     """Anything that denoises renders; see ``denoise``."""
 
-    def __call__(self, render: Buffers, photos: Sequence[Source]) -> tuple[Float32, Float32]:
+    def __call__(
+        self, render: Buffers, photos: Sequence[Source]
+    ) -> tuple[Float32, Float32] | Float32:
         """Denoise one render.
 
         Args:
@@ -48,6 +49,7 @@ class Denoiser(Protocol):
 
         Returns:
             The picture, float32 [H, W, 3] in [0, 1], and the confidence, float32 [H, W] in [0, 1].
+            Or the picture alone: ``denoise`` then trusts it the less, the more it changes.
         """
 
 
@@ -89,8 +91,7 @@ class NetworkDenoiser:
         cleaned = torch.where(seen, render + change, render)
         picture = cleaned.clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
         error: Float32 = expected.numpy()
-        confidence: Float32 = HALF_CONFIDENCE_ERROR / (HALF_CONFIDENCE_ERROR + error)
-        return picture, confidence
+        return picture, confidence_of(error)
 
     def _in_tiles(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         height, width = inputs.shape[-2:]
@@ -145,13 +146,20 @@ def denoise(
             "igsr.denoiser.render_buffers, or no photos"
         )
     given = _buffers(render)
-    picture, confidence = (denoiser or _shipped())(given, photos)
+    made = (denoiser or _shipped())(given, photos)
+    if isinstance(made, tuple):
+        picture, confidence = made
+    else:
+        picture, confidence = made, None
     size = given.color.shape[:2]
-    if picture.shape != (*size, 3) or confidence.shape != size:
+    if picture.shape != (*size, 3) or (confidence is not None and confidence.shape != size):
         raise IgsrError(
-            f"the denoiser made a picture {list(picture.shape)} and a confidence "
-            f"{list(confidence.shape)} of a render of {list(size)} pixels"
+            f"the denoiser made a picture {list(picture.shape)}"
+            + ("" if confidence is None else f" and a confidence {list(confidence.shape)}")
+            + f" of a render of {list(size)} pixels"
         )
+    if confidence is None:
+        confidence = confidence_of(claimed_by_change(given.color, picture))
     return picture, confidence
 
 

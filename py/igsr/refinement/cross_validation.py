@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from igsr.capture import View
 from igsr.capture.downscaling import halved
-from igsr.refinement.stages import VALIDATED, Reconstruction, Stages
+from igsr.denoiser.calibration import Calibration, calibrate
+from igsr.refinement.stages import VALIDATED, DenoisingErrors, Reconstruction, Stages
 
 #: Fewest photos: each fold needs two to fit.
 FEWEST_PHOTOS = 3
@@ -23,11 +24,17 @@ LEAST_FOLD_SIDE = 64
 
 @dataclass(eq=False)
 class Fold:
-    """A reconstruction of some of the photos, the photos held out of it, and their scores by it."""
+    """A reconstruction of some of the photos, and the photos held out of it.
+
+    Attributes:
+        scores: of each held-out photo.
+        errors: of each held-out photo's denoised render.
+    """
 
     reconstruction: Reconstruction
     held_out: list[View]
     scores: list[dict[str, float]]
+    errors: list[DenoisingErrors] = field(default_factory=list)
 
 
 class CrossValidation:
@@ -52,14 +59,25 @@ class CrossValidation:
         """What fitting all folds takes, in units of a fit to all photos."""
         return self._share * FOLDS
 
-    def validate(self) -> tuple[dict[str, float], dict[str, float]]:
-        """Mean scores of the held-out photos, before each fold's own round and after it."""
+    def calibration(self) -> Calibration:
+        """What the denoiser's claims mean, by the held-out photos of all folds as they are now."""
         self._folds = self._folds or self._fitted()
+        for fold in self._folds:
+            fold.errors = self._stages.denoising_errors(fold.reconstruction, fold.held_out)
+        return _calibrated([fold.errors for fold in self._folds])
+
+    def validate(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Mean scores of the held-out photos, before each fold's own round and after it.
+
+        Each fold's round is calibrated by the other one's photos: its own are for scores.
+        """
         before: list[dict[str, float]] = []
         after: list[dict[str, float]] = []
-        for fold in self._folds:
+        errors = [fold.errors for fold in self._folds]
+        for k, fold in enumerate(self._folds):
             before += fold.scores
             views = self._stages.render_and_denoise(fold.reconstruction)
+            views = views.calibrated(_calibrated(errors[:k] + errors[k + 1 :]))
             selected, _ = self._stages.select(views)
             self._stages.refit(fold.reconstruction, selected, views.added_before, "cross_validate")
             fold.scores = self._scores(fold.reconstruction, fold.held_out)
@@ -91,6 +109,11 @@ def combined_error(scores: dict[str, float]) -> float:
     """
     errors = (10.0 ** (-scores["psnr"] / 20.0), 1.0 - scores["ssim"], scores["flip"])
     return float(np.cbrt(np.prod(errors)))
+
+
+def _calibrated(errors: Sequence[list[DenoisingErrors]]) -> Calibration:
+    pictures = [one for of_fold in errors for one in of_fold]
+    return calibrate([one.claimed for one in pictures], [one.measured for one in pictures])
 
 
 def _means(scores: Sequence[dict[str, float]]) -> dict[str, float]:

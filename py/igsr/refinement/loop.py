@@ -159,7 +159,15 @@ def _round(
         stop = Stop(StopReason.NONE_SELECTED, len(rejected))
         return replace(refined, stop=stop, rejected=rejected)
 
-    before, after = validation.validate() if validation else ({}, {})
+    before: dict[str, float] = {}
+    after: dict[str, float] = {}
+    if validation is not None:
+        views = views.calibrated(validation.calibration())
+        selected, rejected = stages.select(views)
+        if not selected:
+            stop = Stop(StopReason.NONE_SELECTED, len(rejected))
+            return replace(refined, stop=stop, rejected=rejected)
+        before, after = validation.validate()
     accepted = validation is None or combined_error(after) < combined_error(before)
     if accepted:
         stages.refit(whole, selected, views.added_before, "refit")

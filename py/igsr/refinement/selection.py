@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from igsr._internal.deprecation import renamed_attributes, renamed_names
 from igsr.denoiser import Buffers, Denoiser, Source, denoise
-from igsr.denoiser.cleaning import HALF_CONFIDENCE_ERROR
+from igsr.denoiser.calibration import Calibration, error_of
 from igsr.refinement.novel_views import NovelView
 
 Float32 = npt.NDArray[np.float32]
@@ -45,6 +45,10 @@ class Candidate:
             has 1.
         gain: mean over the pixels of confidence weight times absolute change by denoising, in
             units of the colours' range.
+        claimed: float32 [H, W], the absolute error that the denoiser expects of each pixel, in
+            units of the colours' range; None where it is not known.
+        wanted: float32 [H, W] in [0, 1], how much of what a pixel shows belongs to the scene; None
+            where all does.
     """
 
     view: NovelView
@@ -52,6 +56,8 @@ class Candidate:
     denoised: npt.NDArray[np.uint8]
     confidence: Float32
     gain: float
+    claimed: Float32 | None = None
+    wanted: Float32 | None = None
 
     @property
     def mean_confidence(self) -> float:
@@ -92,13 +98,43 @@ def denoised_candidate(
         IgsrError: as ``igsr.denoise``.
     """
     denoised, certainty = denoise(buffers, photos, denoiser)
-    confidence = confidence_weights(certainty)
+    wanted = None
     if buffers.support is not None and not all(photo.usable.all() for photo in photos):
-        confidence *= np.clip(buffers.support, 0.0, 1.0)
+        wanted = np.clip(buffers.support, 0.0, 1.0)
     render = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
-    change = np.abs(denoised - render).mean(axis=-1)
+    return _weighted(
+        view, _to_uint8(render), _to_uint8(denoised), error_of(certainty), wanted, certainty
+    )
+
+
+def calibrated_candidate(candidate: Candidate, calibration: Calibration) -> Candidate:
+    """A candidate with the confidence weights and the gain that its denoiser's claims mean."""
+    if candidate.claimed is None:
+        return candidate
+    return _weighted(
+        candidate.view,
+        candidate.render,
+        candidate.denoised,
+        candidate.claimed,
+        candidate.wanted,
+        calibration.confidence(candidate.claimed),
+    )
+
+
+def _weighted(
+    view: NovelView,
+    render: npt.NDArray[np.uint8],
+    denoised: npt.NDArray[np.uint8],
+    claimed: Float32,
+    wanted: Float32 | None,
+    certainty: Float32,
+) -> Candidate:
+    confidence = confidence_weights(certainty)
+    if wanted is not None:
+        confidence = confidence * wanted
+    change = np.abs(denoised.astype(np.float32) - render).mean(axis=-1) / np.float32(255.0)
     gain = float((confidence * change).mean())
-    return Candidate(view, _to_uint8(render), _to_uint8(denoised), confidence, gain)
+    return Candidate(view, render, denoised, confidence, gain, claimed, wanted)
 
 
 def confidence_weights(certainty: Float32) -> Float32:
@@ -107,8 +143,7 @@ def confidence_weights(certainty: Float32) -> Float32:
     Least squares weights measurements by their inverse variance. With the expected error e and the
     photos' own error s, that is s^2 / (s^2 + e^2).
     """
-    certain = np.clip(certainty, 1e-6, 1.0)
-    error = HALF_CONFIDENCE_ERROR * (1.0 / certain - 1.0)
+    error = error_of(certainty)
     return (PHOTO_ERROR**2 / (PHOTO_ERROR**2 + error**2)).astype(np.float32)
 
 

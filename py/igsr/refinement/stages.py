@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+import numpy.typing as npt
+
 from igsr._internal.choices import FitBackend
 from igsr.capture import Camera, Capture, View
-from igsr.denoiser import Denoiser, photo_support, render_buffers
+from igsr.denoiser import Denoiser, denoise, photo_support, render_buffers
+from igsr.denoiser.calibration import Calibration, error_of
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import (
     METRICS,
     default_background,
     evaluate,
     known_background,
+    over_background,
     score_views,
 )
 from igsr.fitting.fit_capture import Progress, fit_with_cameras
@@ -25,9 +30,17 @@ from igsr.refinement.near_sources import NearSources
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.results import Scores, Stage
 from igsr.refinement.run import STOPPED, RefineRun
-from igsr.refinement.selection import Candidate, Rejected, denoised_candidate, rejected
+from igsr.refinement.selection import (
+    Candidate,
+    Rejected,
+    calibrated_candidate,
+    denoised_candidate,
+    rejected,
+)
 from igsr.refinement.settings import RefineSettings
 from igsr.splats import Splats
+
+Float32 = npt.NDArray[np.float32]
 
 #: Novel views rendered in a round, and how many of them are added at most.
 CANDIDATES, SELECTED = 24, 16
@@ -72,6 +85,26 @@ class DenoisedViews:
 
     candidates: list[Candidate]
     added_before: list[Candidate]
+
+    def calibrated(self, calibration: Calibration) -> DenoisedViews:
+        """The same views with the confidence that the denoiser's claims mean."""
+        return DenoisedViews(
+            [calibrated_candidate(one, calibration) for one in self.candidates],
+            [calibrated_candidate(one, calibration) for one in self.added_before],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DenoisingErrors:
+    """Errors of the denoised render of a photo, in units of the colours' range.
+
+    Attributes:
+        claimed: float32 [H, W], absolute error that the denoiser expects of each pixel.
+        measured: float32 [H, W], its absolute error against the photo; NaN where a mask hides it.
+    """
+
+    claimed: Float32
+    measured: Float32
 
 
 class Stages:
@@ -156,6 +189,31 @@ class Stages:
             self._run.tell("novel_views")
         self._run.work_done(NOVEL_VIEWS_WORK * reconstruction.share)
         return DenoisedViews(denoised[: len(novel)], denoised[len(novel) :])
+
+    def denoising_errors(
+        self, reconstruction: Reconstruction, photos: Sequence[View]
+    ) -> list[DenoisingErrors]:
+        """How wrong denoised renders are from where photos were taken that were not fitted."""
+        splats, fitted, backend = (
+            reconstruction.splats,
+            reconstruction.photos,
+            self._settings.backend,
+        )
+        support = photo_support(splats, fitted, backend)
+        sources = NearSources(splats, fitted, self._background, backend)
+        found = []
+        for photo in photos:
+            buffers = render_buffers(
+                splats, photo.camera, support, self._background_of_views, backend
+            )
+            picture, certainty = denoise(buffers, sources.of(photo.camera), self._denoiser)
+            truth = over_background(photo.image, self._background).astype(np.float32) / 255.0
+            measured = np.abs(picture - truth).mean(axis=-1)
+            if photo.mask is not None:
+                measured = np.where(photo.mask, measured, np.float32(np.nan))
+            found.append(DenoisingErrors(error_of(certainty), measured))
+            self._run.tell("cross_validate")
+        return found
 
     def select(self, views: DenoisedViews) -> tuple[list[Candidate], list[Rejected]]:
         """The candidates to add, and the others."""
