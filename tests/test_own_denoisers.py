@@ -148,9 +148,7 @@ def module(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-@pytest.mark.parametrize(
-    "name", ["my_denoiser:make", "my_denoiser.py:make", "./my_denoiser.py:make"]
-)
+@pytest.mark.parametrize("module_name", ["my_denoiser", "my_denoiser.py", "./my_denoiser.py"])
 def test_a_factory_is_found_by_module_or_file(module, module_name):
     color = np.full((4, 5, 3), 0.25, np.float32)
     picture, _ = denoise(color, denoiser=named_denoiser(f"{module_name}:make"))
@@ -223,7 +221,7 @@ def test_refine_takes_a_name(module, scene):
     assert done.exit_code == 0, done.output
     report = json.loads((scene / "out/report.json").read_text())
     # A negative of the scene improves nothing: there is the fit alone.
-    assert report["rounds"][-1]["accepted"] is False or len(report["rounds"]) == 1
+    assert not any(one.get("accepted", False) for one in report["rounds"])
 
 
 # ---- single-step networks ------------------------------------------------------------------------

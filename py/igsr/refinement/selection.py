@@ -8,7 +8,7 @@ it would change, where its weights are high.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,6 +47,8 @@ class Candidate:
             units of the colours' range.
         claimed: float32 [H, W], the absolute error that the denoiser expects of each pixel, in
             units of the colours' range; None where it is not known.
+        change: float32 [H, W], mean absolute change of each pixel's colours by denoising, in units
+            of their range; None where ``claimed`` is.
         wanted: float32 [H, W] in [0, 1], how much of what a pixel shows belongs to the scene; None
             where all does.
     """
@@ -57,6 +59,7 @@ class Candidate:
     confidence: Float32
     gain: float
     claimed: Float32 | None = None
+    change: Float32 | None = None
     wanted: Float32 | None = None
 
     @property
@@ -102,39 +105,29 @@ def denoised_candidate(
     if buffers.support is not None and not all(photo.usable.all() for photo in photos):
         wanted = np.clip(buffers.support, 0.0, 1.0)
     render = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
-    return _weighted(
-        view, _to_uint8(render), _to_uint8(denoised), error_of(certainty), wanted, certainty
-    )
+    change = np.abs(denoised - render).mean(axis=-1)
+    confidence, gain = _weights_and_gain(certainty, change, wanted)
+    pictures = _to_uint8(render), _to_uint8(denoised)
+    return Candidate(view, *pictures, confidence, gain, error_of(certainty), change, wanted)
 
 
 def calibrated_candidate(candidate: Candidate, calibration: Calibration) -> Candidate:
     """A candidate with the confidence weights and the gain that its denoiser's claims mean."""
-    if candidate.claimed is None:
+    if candidate.claimed is None or candidate.change is None:
         return candidate
-    return _weighted(
-        candidate.view,
-        candidate.render,
-        candidate.denoised,
-        candidate.claimed,
-        candidate.wanted,
-        calibration.confidence(candidate.claimed),
+    confidence, gain = _weights_and_gain(
+        calibration.confidence(candidate.claimed), candidate.change, candidate.wanted
     )
+    return replace(candidate, confidence=confidence, gain=gain)
 
 
-def _weighted(
-    view: NovelView,
-    render: npt.NDArray[np.uint8],
-    denoised: npt.NDArray[np.uint8],
-    claimed: Float32,
-    wanted: Float32 | None,
-    certainty: Float32,
-) -> Candidate:
+def _weights_and_gain(
+    certainty: Float32, change: Float32, wanted: Float32 | None
+) -> tuple[Float32, float]:
     confidence = confidence_weights(certainty)
     if wanted is not None:
         confidence = confidence * wanted
-    change = np.abs(denoised.astype(np.float32) - render).mean(axis=-1) / np.float32(255.0)
-    gain = float((confidence * change).mean())
-    return Candidate(view, render, denoised, confidence, gain, claimed, wanted)
+    return confidence, float((confidence * change).mean())
 
 
 def confidence_weights(certainty: Float32) -> Float32:
