@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
+from PIL import Image
 
-from igsr.capture.overview import Overview
+from igsr.capture.overview import Overview, look_at
 from igsr.cli import announcement
 from igsr.cli.announcement import announce
 from igsr.fitting.presets import settings_for
@@ -119,6 +121,29 @@ def test_few_of_many_photos_are_counted(monkeypatch):
     few = said(monkeypatch, seen, cameras_kept=True, given=given, photos=8)[1]
     assert many.endswith("2500 steps.")
     assert few.endswith("1672 steps.")
+
+
+def test_detailed_photos_have_more_splats(monkeypatch, tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (200, 304, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "0.png")
+    seen = Overview(Path("photos"), True, [(304, 200)] * 30, 30, 3, False, True)
+    plain = said(monkeypatch, seen, cameras_kept=True)[1]
+    detailed = said(monkeypatch, replace(seen, plain=[tmp_path / "0.png"]), cameras_kept=True)[1]
+    most = [int(line.split("up to ")[1].split()[0]) for line in (plain, detailed)]
+    assert most == [18_240, round(0.4 * 304 * 200)]
+
+
+def test_the_files_of_photos_are_named(tmp_path):
+    made = scenes.capture(views=3, size=32)
+    scenes.write_capture(tmp_path / "capture", made)
+    assert [path.name for path in look_at(tmp_path / "capture").plain] == [
+        "00.png",
+        "01.png",
+        "02.png",
+    ]
+    assert sorted(look_at(tmp_path / "capture" / "photos").plain) == sorted(
+        (tmp_path / "capture" / "photos").glob("*.png")
+    )
 
 
 def test_photos_that_need_no_depth_maps_take_less(monkeypatch):

@@ -10,13 +10,19 @@ import numpy as np
 import pytest
 import scenes
 from made_up_tracks import tracked
+from PIL import Image
 
 import igsr
 from igsr.capture import Points
 from igsr.capture.types import Tracks
 from igsr.fitting import presets
 from igsr.fitting.initialization.initial_splats import chosen_start, initial_splats
-from igsr.fitting.photo_support import PhotoSupport, support_of
+from igsr.fitting.photo_support import (
+    PhotoSupport,
+    detail_of_files,
+    squares_of_one_tone,
+    support_of,
+)
 from igsr.fitting.presets import preset_settings, settings_for
 from igsr.fitting.settings import FitSettings
 
@@ -48,6 +54,12 @@ def test_default_follows_what_photos_tell_and_gives_way_to_the_caller():
     )
     assert (few.max_splats, many.max_splats) == (30_000, 30_210)
     assert settings_for("default", support(8, pixels=1e9)).max_splats == presets.MOST_SPLATS
+    detailed = replace(support(8), detail=35_000.0)
+    assert settings_for("default", detailed).max_splats == 35_000
+    assert settings_for("default", replace(detailed, detail=20_000.0)).max_splats == 30_000
+    noise = replace(detailed, detail=90_000.0)
+    assert settings_for("default", noise).max_splats == 40_000
+    assert settings_for("default", noise, "high").max_splats == 100_000
     given = preset_settings("default", 8, dropout=0.0, hull=True, steps=None)
     assert (given["dropout"], given["hull"]) == (0.0, True)
     assert given["steps"] == settings_for("default", 8).steps
@@ -110,7 +122,45 @@ def test_support_is_what_cameras_show():
     assert half.seen_by < all_round.seen_by
     masked = [replace(view, mask=np.arange(1600).reshape(40, 40) < 400) for view in ring]
     assert support_of(masked).pixels == 400.0
-    assert support_of(ring[:1]) == PhotoSupport(1, 1600.0, 1.0, 180.0)
+    assert support_of(ring[:1]) == replace(
+        PhotoSupport(1, 1600.0, 1.0, 180.0), detail=support_of(ring[:1]).detail
+    )
+
+
+def test_squares_of_one_tone_are_counted():
+    plain = np.full((40, 72, 3), 77, np.uint8)
+    # Whole squares of 16 pixels; what is left over at the edges does not count.
+    assert squares_of_one_tone(plain) == 2 * 4
+    half = plain.copy()
+    half[:, 24:] = 200  # an edge amid a square: two columns of four squares of 8 pixels each
+    assert squares_of_one_tone(half) == 2 * 3 + 2 * 4
+    faint = half // 20
+    assert squares_of_one_tone(faint) == 2 * 4
+    noise = np.random.default_rng(0).choice(np.uint8([0, 255]), (32, 64, 1)).repeat(3, axis=2)
+    assert 0.8 * 32 * 64 < squares_of_one_tone(noise) <= 32 * 64
+    # By a mask, its part of each square.
+    mask = np.zeros((32, 64), bool)
+    mask[:, :8] = True
+    assert squares_of_one_tone(plain[:32, :64], mask) == 1.0
+    # Transparent pixels are white, whatever lies under them.
+    hidden = np.concatenate([noise, np.zeros((32, 64, 1), np.uint8)], axis=2)
+    assert squares_of_one_tone(hidden) == 2 * 4
+    assert squares_of_one_tone(plain[:10]) == 0.0
+
+
+def test_detail_is_of_a_few_photos_and_the_same_from_files(tmp_path):
+    views = scenes.capture(views=20, size=48, alpha=True).views
+    counts = [squares_of_one_tone(view.image) for view in views]
+    assert support_of(views).detail == pytest.approx(np.mean(counts[::2]))
+    files = []
+    for view in views:
+        files.append(tmp_path / f"{len(files)}.png")
+        Image.fromarray(view.image).save(files[-1])
+    assert detail_of_files(files, None) == pytest.approx(np.mean(counts[::5]))
+    assert 0.0 < detail_of_files(files, 24) < detail_of_files(files, None)
+    files[5].write_text("no photo")
+    assert detail_of_files(files, None) == pytest.approx(np.mean([counts[k] for k in (0, 10, 15)]))
+    assert detail_of_files([], None) == 0.0
 
 
 def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):

@@ -31,6 +31,7 @@ class Overview:
             views. Empty where each is one view.
         decoded: width and height in pixels of the files, where these are not ``sizes``.
         depths: whether photos come with depths.
+        plain: the files that are one photo each, all of whose pixels count.
     """
 
     path: Path
@@ -43,6 +44,7 @@ class Overview:
     views: list[int] = field(default_factory=list)
     decoded: list[tuple[int, int]] = field(default_factory=list)
     depths: bool = False
+    plain: list[Path] = field(default_factory=list)
 
     def train_photos(self, holdout: int | None) -> int:
         """How many photos will be fitted, at most, if every ``holdout``-th is held out.
@@ -112,6 +114,7 @@ def look_at(
             [number for _, number in sorted(Counter(map(photo_of, shots)).items())],
             [header.size for header in headers],
             any(shot.depth_path is not None for shot in shots),
+            [shot.path for shot in shots if shot.rig is None and shot.mask_path is None],
         )
     found = photo_headers(path, frames)
     # Whether lenses bend is not known yet: it is counted as if they did.
@@ -125,4 +128,5 @@ def look_at(
         found.exact,
         found.views,
         found.decoded,
+        plain=found.plain,
     )

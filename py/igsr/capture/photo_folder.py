@@ -262,6 +262,7 @@ class PhotoHeaders:
         exact: whether there are just as many photos.
         views: how many of ``sizes`` are of each photo.
         decoded: width and height in pixels of the files.
+        plain: the files that are one photo each.
     """
 
     sizes: list[tuple[int, int]]
@@ -269,6 +270,7 @@ class PhotoHeaders:
     exact: bool
     views: list[int]
     decoded: list[tuple[int, int]]
+    plain: list[Path]
 
 
 def photo_headers(path: str | os.PathLike[str], frames: int = FRAMES) -> PhotoHeaders:
@@ -288,7 +290,7 @@ def photo_headers(path: str | os.PathLike[str], frames: int = FRAMES) -> PhotoHe
 
 def _headers(files: list[Path], frames: int, lens: WideFisheye | None) -> PhotoHeaders:
     """See ``photo_headers``; files that loading will name as broken are passed over."""
-    found = PhotoHeaders([], 3, True, [], [])
+    found = PhotoHeaders([], 3, True, [], [], [])
     channels, exact = 3, True
     for file in files:
         try:
@@ -305,6 +307,8 @@ def _headers(files: list[Path], frames: int, lens: WideFisheye | None) -> PhotoH
                     cameras = [side.camera for side in rig_of(wide).sides]
                     sizes = [(camera.width, camera.height) for camera in cameras]
                     views = [len(sizes)]
+                else:
+                    found.plain.append(file)
         except IgsrError:
             continue
         found.sizes.extend(sizes)

@@ -9,7 +9,7 @@ from igsr.capture.downscaling import reduced_size
 from igsr.capture.overview import Overview
 from igsr.cli.error_messages import print_message
 from igsr.evaluation.quick_scores import MOST_TRAIN
-from igsr.fitting.photo_support import PhotoSupport
+from igsr.fitting.photo_support import PhotoSupport, detail_of_files
 from igsr.fitting.presets import Quality, settings_for
 from igsr.fitting.time_estimate import fit_seconds, other_seconds, timed_steps
 from igsr.pose.colmap.time_estimate import camera_seconds
@@ -51,7 +51,8 @@ def announce(
     sizes = [reduced_size(width, height, max_size) for width, height in seen.sizes]
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     pixels = sum(w * h for w, h in sizes) / len(sizes)
-    support = PhotoSupport(photos, pixels, float(photos), USUALLY_APART)
+    detail = detail_of_files(seen.plain, max_size)
+    support = PhotoSupport(photos, pixels, float(photos), USUALLY_APART, detail)
     settings = settings_for(preset, support, quality, **given)
     cameras = 0.0 if cameras_kept else camera_seconds(seen.sizes)
     fit = (1.0 + ROUND * rounds) * fit_seconds(
