@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import scenes
 import igsr
 from igsr.refinement.html_page import write_page
 from igsr.refinement.report import report_of
-from igsr.refinement.results import Refined, Stop, StopReason
+from igsr.refinement.results import HeldOutView, Refined, Round, Stop, StopReason
 from igsr.refinement.settings import RefineSettings
 
 #: As the page's script draws photos' cameras and those of added views.
@@ -53,6 +54,58 @@ def test_a_browser_shows_it(browser, report, tmp_path):
     without = cameras_drawn(browser, broken)
     for color in (PHOTOS, ADDED):
         assert near(without, color) == 0
+
+
+def test_held_out_photos_are_compared_by_a_line_to_drag(browser, tmp_path):
+    capture = scenes.capture(views=8, size=40, alpha=True)
+
+    def sure(buffers, photos):
+        picture = np.clip(buffers.color + 0.05, 0.0, 1.0)
+        return picture, np.full(picture.shape[:2], 0.95, np.float32)
+
+    refined = igsr.refine(capture, 1, steps=30, backend="cpu", denoiser=sure, out=tmp_path)
+    (done,) = refined.rounds
+    assert len(done.held_out) == 2
+    assert done.verdict == "2 held-out photos are too few to tell gain from chance."
+    report = json.loads((tmp_path / "report.json").read_text())
+    rows = report["rounds"][1]["cross_validation"]["held_out"]
+    assert [row["name"] for row in rows] == [view.name for view in done.held_out]
+    assert np.mean([row["psnr_after"] for row in rows]) == pytest.approx(
+        done.validation_after["psnr"]
+    )
+    browser.load(tmp_path / "report.html")
+    sliders = "document.querySelectorAll('.slider')"
+    assert browser.run(f"{sliders}.length") == 2
+    shown = "[...document.querySelectorAll('.slider img')].map(one => one.naturalWidth)"
+    assert browser.run(shown) == [40] * 4
+    over = f"{sliders}[1].querySelector('.over')"
+    assert browser.run(f"getComputedStyle({over}).clipPath") == "inset(0px 0px 0px 50%)"
+    moved = f"(() => {{ const bar = {sliders}[1].querySelector('input'); bar.value = 20; "
+    moved += "bar.dispatchEvent(new Event('input')); "
+    moved += f"return getComputedStyle({over}).clipPath; }})()"
+    assert browser.run(moved) == "inset(0px 0px 0px 20%)"
+
+
+def held_out(gains):
+    """A round whose held-out photos gained so many dB."""
+    picture = np.zeros((2, 2, 3), np.uint8)
+    views = [HeldOutView(f"{g}", picture, picture, picture, 20.0, 20.0 + g) for g in gains]
+    return Round([], [], {}, {}, True, None, None, views)
+
+
+@pytest.mark.parametrize(
+    ("gains", "verdict"),
+    [
+        ([], ""),
+        ([0.5, 0.6], "2 held-out photos are too few to tell gain from chance."),
+        ([0.5, 0.6, 0.4], "3 held-out photos change by +0.50 ± 0.06 dB: more than chance."),
+        ([0.5, -0.6, 0.4], "3 held-out photos change by +0.10 ± 0.35 dB: it may be chance."),
+        ([-0.5, -0.6, -0.4], "3 held-out photos change by -0.50 ± 0.06 dB: more than chance."),
+        ([0.5, 0.6, float("inf")], ""),
+    ],
+)
+def test_gain_is_told_from_chance(gains, verdict):
+    assert held_out(gains).verdict == verdict
 
 
 def test_text_is_escaped(tmp_path):

@@ -221,6 +221,9 @@ def _print_summary(refined: Refined, out: Path, pages: list[str]) -> None:
         f"{len(accepted)} of {len(refined.rounds)} rounds accepted; stopped: {refined.stop}",
         markup=False,
     )
+    for number, done in enumerate(refined.rounds, 1):
+        if done.verdict:
+            console.print(f"Round {number}: {done.verdict}", markup=False)
     if refined.first_test:
         tests = [refined.first_test, *(done.test for done in accepted)]
         by_round = " -> ".join(f"{scores['psnr']:.2f}" for scores in tests if scores)

@@ -10,6 +10,8 @@ import numpy as np
 from igsr.capture import View
 from igsr.capture.downscaling import halved
 from igsr.denoiser.calibration import Calibration, calibrate
+from igsr.evaluation.scores import ScoredView
+from igsr.refinement.results import HeldOutView
 from igsr.refinement.stages import VALIDATED, DenoisingErrors, Reconstruction, Stages
 
 #: Fewest photos: each fold needs two to fit.
@@ -27,14 +29,23 @@ class Fold:
     """A reconstruction of some of the photos, and the photos held out of it.
 
     Attributes:
-        scores: of each held-out photo.
+        scored: each held-out photo and its render, with its scores.
         errors: of each held-out photo's denoised render.
     """
 
     reconstruction: Reconstruction
     held_out: list[View]
-    scores: list[dict[str, float]]
+    scored: list[ScoredView]
     errors: list[DenoisingErrors] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Mean scores of held-out photos before a round and after it, and the photos themselves."""
+
+    before: dict[str, float]
+    after: dict[str, float]
+    held_out: list[HeldOutView]
 
 
 class CrossValidation:
@@ -66,23 +77,23 @@ class CrossValidation:
             fold.errors = self._stages.denoising_errors(fold.reconstruction, fold.held_out)
         return _calibrated([fold.errors for fold in self._folds])
 
-    def validate(self) -> tuple[dict[str, float], dict[str, float]]:
-        """Mean scores of the held-out photos, before each fold's own round and after it.
+    def validate(self) -> Validation:
+        """Held-out photos before each fold's own round and after it.
 
         Each fold's round is calibrated by the other one's photos: its own are for scores.
         """
-        before: list[dict[str, float]] = []
-        after: list[dict[str, float]] = []
+        before: list[ScoredView] = []
+        after: list[ScoredView] = []
         errors = [fold.errors for fold in self._folds]
         for k, fold in enumerate(self._folds):
-            before += fold.scores
+            before += fold.scored
             views = self._stages.render_and_denoise(fold.reconstruction)
             views = views.calibrated(_calibrated(errors[:k] + errors[k + 1 :]))
             selected, _ = self._stages.select(views)
             self._stages.refit(fold.reconstruction, selected, views.added_before, "cross_validate")
-            fold.scores = self._scores(fold.reconstruction, fold.held_out)
-            after += fold.scores
-        return _means(before), _means(after)
+            fold.scored = self._scored(fold.reconstruction, fold.held_out)
+            after += fold.scored
+        return Validation(_means(before), _means(after), _beside(before, after))
 
     def _fitted(self) -> list[Fold]:
         """Fit the folds: no photo is held out of two, and at least one of each."""
@@ -95,11 +106,11 @@ class CrossValidation:
             held_out = [photo for photo in self._photos if photo.photo in out]
             kept = [photo for photo in self._photos if photo.photo not in out]
             fitted = self._stages.fit(f"fold{number}", kept, self._share)
-            folds.append(Fold(fitted, held_out, self._scores(fitted, held_out)))
+            folds.append(Fold(fitted, held_out, self._scored(fitted, held_out)))
         return folds
 
-    def _scores(self, fitted: Reconstruction, held_out: list[View]) -> list[dict[str, float]]:
-        return self._stages.validation_scores(fitted.splats, held_out)
+    def _scored(self, fitted: Reconstruction, held_out: list[View]) -> list[ScoredView]:
+        return self._stages.validated(fitted.splats, held_out)
 
 
 def combined_error(scores: dict[str, float]) -> float:
@@ -116,8 +127,25 @@ def _calibrated(errors: Sequence[list[DenoisingErrors]]) -> Calibration:
     return calibrate([one.claimed for one in pictures], [one.measured for one in pictures])
 
 
-def _means(scores: Sequence[dict[str, float]]) -> dict[str, float]:
-    return {name: float(np.mean([one[name] for one in scores])) for name in VALIDATED}
+def _means(views: Sequence[ScoredView]) -> dict[str, float]:
+    return {
+        name: float(np.mean([float(one.scores[name] or 0.0) for one in views]))
+        for name in VALIDATED
+    }
+
+
+def _beside(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> list[HeldOutView]:
+    return [
+        HeldOutView(
+            one.name,
+            one.photo,
+            one.render,
+            other.render,
+            float(one.scores["psnr"] or 0.0),
+            float(other.scores["psnr"] or 0.0),
+        )
+        for one, other in zip(before, after, strict=True)
+    ]
 
 
 def _fold_photos(photos: Sequence[View]) -> tuple[list[View], float]:

@@ -26,7 +26,7 @@ from igsr.evaluation.report_page import (
 )
 from igsr.evaluation.scores import ScoredView, default_background, over_background
 from igsr.refinement.novel_views import NovelView
-from igsr.refinement.results import Refined, Round
+from igsr.refinement.results import HELD_OUT_SIDE, HeldOutView, Refined, Round
 from igsr.refinement.selection import LEAST_CONFIDENCE, LEAST_GAIN, Candidate, Rejected
 
 #: Longest side of pictures on the page, pixels.
@@ -83,6 +83,8 @@ def write_page(
         "rounds": [
             {
                 "accepted": done.accepted,
+                "verdict": done.verdict,
+                "held_out": [_held_out(view) for view in done.held_out],
                 "selected": [_selected(candidate) for candidate in done.selected],
                 "rejected": _rejected(done.rejected),
             }
@@ -142,6 +144,17 @@ def _selected(candidate: Candidate) -> dict[str, Any]:
         "render": jpeg(candidate.render, PICTURE),
         "denoised": jpeg(candidate.denoised, PICTURE),
         "confidence": jpeg(confidence, PICTURE),
+    }
+
+
+def _held_out(view: HeldOutView) -> dict[str, Any]:
+    return {
+        "name": view.name,
+        "psnr_before": view.psnr_before,
+        "psnr_after": view.psnr_after,
+        "photo": jpeg(view.photo, HELD_OUT_SIDE),
+        "before": jpeg(view.before, HELD_OUT_SIDE),
+        "after": jpeg(view.after, HELD_OUT_SIDE),
     }
 
 

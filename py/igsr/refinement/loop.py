@@ -25,7 +25,12 @@ from igsr.evaluation.scores import check_masks
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import Quality, default_max_size
 from igsr.fitting.settings import ExposureMode, TransientMode
-from igsr.refinement.cross_validation import FEWEST_PHOTOS, CrossValidation, combined_error
+from igsr.refinement.cross_validation import (
+    FEWEST_PHOTOS,
+    CrossValidation,
+    Validation,
+    combined_error,
+)
 from igsr.refinement.novel_views import novel_views
 from igsr.refinement.results import Refined, RefineProgress, Round, Stop, StopReason
 from igsr.refinement.run import RefineRun, bar_state
@@ -159,22 +164,22 @@ def _round(
         stop = Stop(StopReason.NONE_SELECTED, len(rejected))
         return replace(refined, stop=stop, rejected=rejected)
 
-    before: dict[str, float] = {}
-    after: dict[str, float] = {}
+    validated = Validation({}, {}, [])
     if validation is not None:
         views = views.calibrated(validation.calibration())
         selected, rejected = stages.select(views)
         if not selected:
             stop = Stop(StopReason.NONE_SELECTED, len(rejected))
             return replace(refined, stop=stop, rejected=rejected)
-        before, after = validation.validate()
+        validated = validation.validate()
+    before, after = validated.before, validated.after
     accepted = validation is None or combined_error(after) < combined_error(before)
     if accepted:
         stages.refit(whole, selected, views.added_before, "refit")
     splats = whole.splats if accepted else None
     test = stages.test_scores(splats)
 
-    done = Round(selected, rejected, before, after, accepted, splats, test)
+    done = Round(selected, rejected, before, after, accepted, splats, test, validated.held_out)
     rolled_back = None if accepted else Stop(StopReason.NOT_ACCEPTED, number)
     return replace(refined, splats=whole.splats, rounds=[*refined.rounds, done], stop=rolled_back)
 

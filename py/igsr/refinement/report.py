@@ -154,7 +154,20 @@ def _round_row(done: Round) -> dict[str, Any]:
         "test": done.test,
         "accepted": done.accepted,
         "candidates": len(done.selected) + len(done.rejected),
-        "cross_validation": {"before": done.validation_before, "after": done.validation_after},
+        "cross_validation": {
+            "before": done.validation_before,
+            "after": done.validation_after,
+            "psnr_gain": None if done.gain is None else done.gain[0],
+            "psnr_gain_standard_error": None if done.gain is None else done.gain[1],
+            "held_out": [
+                {
+                    "name": view.name,
+                    "psnr_before": view.psnr_before,
+                    "psnr_after": view.psnr_after,
+                }
+                for view in done.held_out
+            ],
+        },
         "selected": _view_rows(done.selected),
         "rejected": _view_rows(done.rejected),
     }

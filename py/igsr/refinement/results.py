@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from igsr._internal.array_equality import ArrayEquality
 from igsr._internal.deprecation import renamed_attributes
@@ -24,6 +27,11 @@ OLD_STAGES: dict[str, Stage] = {"look": "novel_views", "judge": "cross_validate"
 #: Mean scores by name ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim"); None where a score
 #: is not defined.
 Scores = dict[str, float | None]
+
+#: With fewer held-out photos, no standard error is told.
+FEWEST_FOR_ERROR = 3
+#: Longest side of the pictures of held-out photos, pixels.
+HELD_OUT_SIDE = 480
 
 
 class StopReason(enum.Enum):
@@ -89,6 +97,25 @@ class RefineProgress:
     seconds: float
 
 
+@dataclass(frozen=True, eq=False)
+class HeldOutView:
+    """A photo that was held out of a fold, and the fold's renders of it.
+
+    Attributes:
+        name: of the photo.
+        photo: uint8 [H, W, 3], reduced to at most ``HELD_OUT_SIDE`` pixels, as are the renders.
+        before, after: uint8 [H, W, 3], before the fold's round and after it.
+        psnr_before, psnr_after: dB, at the size that the fold has.
+    """
+
+    name: str
+    photo: npt.NDArray[np.uint8]
+    before: npt.NDArray[np.uint8]
+    after: npt.NDArray[np.uint8]
+    psnr_before: float
+    psnr_after: float
+
+
 @renamed_attributes(
     chosen="selected",
     passed="rejected",
@@ -111,6 +138,7 @@ class Round:
         splats: after the round; None where it was rolled back.
         test: mean scores of the capture's test views; they decide nothing. None where the round
             was rolled back or there are no test views.
+        held_out: the held-out photos of all folds; empty without cross-validation.
     """
 
     selected: list[Candidate]
@@ -120,6 +148,27 @@ class Round:
     accepted: bool
     splats: Splats | None
     test: Scores | None
+    held_out: list[HeldOutView] = field(default_factory=list)
+
+    @property
+    def gain(self) -> tuple[float, float] | None:
+        """Mean gain of held-out photos' PSNR, dB, and its standard error; None of fewer than 3."""
+        gains = [view.psnr_after - view.psnr_before for view in self.held_out]
+        if len(gains) < FEWEST_FOR_ERROR or not np.isfinite(gains).all():
+            return None
+        return float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
+
+    @property
+    def verdict(self) -> str:
+        """Whether the gain is more than chance, as a sentence; empty where that is not known."""
+        count = len(self.held_out)
+        if 0 < count < FEWEST_FOR_ERROR:
+            return f"{count} held-out photos are too few to tell gain from chance."
+        if self.gain is None:
+            return ""
+        mean, error = self.gain
+        text = f"{count} held-out photos change by {mean:+.2f} ± {error:.2f} dB: "
+        return text + ("more than chance." if abs(mean) > 2.0 * error else "it may be chance.")
 
 
 def _old_message(stop: Stop | None) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from igsr._internal.choices import FitBackend
 from igsr.capture import Camera, Capture, View
@@ -15,6 +16,7 @@ from igsr.denoiser.calibration import Calibration, error_of
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import (
     METRICS,
+    ScoredView,
     default_background,
     evaluate,
     known_background,
@@ -28,7 +30,7 @@ from igsr.fitting.presets import preset_settings
 from igsr.fitting.settings import ExposureMode, TransientMode
 from igsr.refinement.near_sources import NearSources
 from igsr.refinement.novel_views import NovelView
-from igsr.refinement.results import Scores, Stage
+from igsr.refinement.results import HELD_OUT_SIDE, Scores, Stage
 from igsr.refinement.run import STOPPED, RefineRun
 from igsr.refinement.selection import (
     Candidate,
@@ -254,15 +256,15 @@ class Stages:
         reconstruction.splats, _ = self._fit(name, stage, pictures, reconstruction.share)
         reconstruction.added += [candidate.view for candidate in selected]
 
-    def validation_scores(self, splats: Splats, photos: list[View]) -> list[dict[str, float]]:
-        """Scores of each held-out photo."""
+    def validated(self, splats: Splats, photos: list[View]) -> list[ScoredView]:
+        """Held-out photos and their renders with ``VALIDATED`` scores, in small pictures."""
         backend = self._settings.backend
-        scores = [
-            {name: float(one.scores[name] or 0.0) for name in VALIDATED}
+        scored = [
+            replace(one, photo=_small(one.photo), render=_small(one.render), mask=None)
             for one in score_views(splats, photos, self._background, backend, VALIDATED)
         ]
         self._run.tell("cross_validate")
-        return scores
+        return scored
 
     def test_scores(self, splats: Splats | None) -> Scores | None:
         """Mean scores of the test views, if there are any."""
@@ -307,3 +309,10 @@ class Stages:
             raise IgsrError(STOPPED)
         self._run.work_done(share)
         return fitted
+
+
+def _small(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """A picture, uint8 [H, W, 3], of at most ``HELD_OUT_SIDE`` pixels."""
+    image = Image.fromarray(picture)
+    image.thumbnail((HELD_OUT_SIDE, HELD_OUT_SIDE), Image.Resampling.BOX)
+    return np.asarray(image)
