@@ -25,6 +25,7 @@ from igsr.fitting.fingerprint import fingerprint, hash_of
 from igsr.fitting.fitter import (
     camera_rows,
     check_fits,
+    first_splats,
     fitted_cameras,
     fitted_exposures,
     fitter_of,
@@ -32,6 +33,7 @@ from igsr.fitting.fitter import (
     photos_among,
     splat_arrays,
     with_camera_rows,
+    with_splats_after,
     with_train_cameras,
     with_train_exposures,
     without_exposures,
@@ -95,6 +97,7 @@ def fit(
     transients: TransientMode | None = None,
     remove_floaters: bool | None = None,
     background: tuple[float, float, float] | None = None,
+    frozen: Splats | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
 ) -> Splats:
@@ -158,6 +161,9 @@ def fit(
             (``igsr.remove_floaters``); the last progress counts them. The checkpoint keeps them.
         background: RGB in [0, 1] behind splats and photos with alpha; None is a new random color in
             every step for photos with alpha and black for photos without.
+        frozen: splats that renders show beside those that are fitted, and that stay as they are:
+            what is round a part of a scene whose other parts are known. They need ``start`` with
+            splats of the same origin and SH degree, and do not count to ``max_splats``.
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
             Ctrl-C (KeyboardInterrupt, which is raised again); where cameras are optimized, from
             when they have been found roughly.
@@ -193,7 +199,7 @@ def fit_with_cameras(*args: Any, **kwargs: Any) -> tuple[Splats, Capture]:
     """As ``fit``, with the same arguments; also returns cameras and exposures.
 
     Returns:
-        The splats, and the capture with its train cameras and the exposures of its train views
+        The splats, without those that were frozen, and the capture with its train cameras and the exposures of its train views
         (``View.exposure``) as they were optimized, and with masks that leave out transient things;
         the capture itself where there are none of these.
 
@@ -212,6 +218,7 @@ def _fitted(
     start: str | Splats | None,
     backend: str,
     progress: Report | None,
+    frozen: Splats | None,
     checkpoint: str | os.PathLike[str] | None,
     resume: bool,
     **given: Any,
@@ -231,6 +238,9 @@ def _fitted(
         settings = _settings_from_splats(
             preset, support_of(photos_among(views)), quality, initial, given
         )
+    if frozen is not None:
+        _check_frozen(frozen, initial)
+    still = 0 if frozen is None else len(frozen)
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
     check_photos(views)
@@ -250,7 +260,9 @@ def _fitted(
         priors = pose_priors(views, capture.points, poses=poses, focal=settings.focal)
     file = None
     if checkpoint is not None:
-        splats_hash = None if initial is None else hash_of(splat_arrays(initial).values())
+        given_splats = [one for one in (initial, frozen) if one is not None]
+        arrays = [array for one in given_splats for array in splat_arrays(one).values()]
+        splats_hash = hash_of(arrays) if arrays else None
         # What "auto" came to.
         decided = replace(settings, exposure="off" if exposures is None else "on")
         if all(view.depth is None for view in views):
@@ -273,6 +285,8 @@ def _fitted(
                 )
                 seconds = time.perf_counter() - began
             state, started = initial_state(_seen_alike(capture, exposures), settings, initial)
+            if frozen is not None:
+                state |= with_splats_after(state, frozen)
 
         # Make the fitter of views, splats and settings.
         origin = state.pop("origin", np.zeros(0))
@@ -280,7 +294,7 @@ def _fitted(
             views = with_camera_rows(capture.train_views, state.pop(ROUGH, None))
             if origin.shape != (3,) or not np.isfinite(origin).all():
                 raise ValueError("origin: must be three finite numbers")
-            values = {**settings.plain(), "first_step": settings.first_step}
+            values = {**settings.plain(), "first_step": settings.first_step, "frozen_splats": still}
             masks, looked = resumed_masks(views, state)
 
             def make(views: Sequence[View], state: dict[str, Any]) -> _core.Fitter:
@@ -288,7 +302,7 @@ def _fitted(
                 return fitter_of(views, origin, state, values, backend, priors, exposures)
 
             name = cast(Backend, device["backend"])
-            search = TransientSearch(views, settings, origin, name, make, masks, looked)
+            search = TransientSearch(views, settings, origin, name, make, masks, looked, still)
             fitter = make(search.masked_views(), state)
         except ValueError as error:
             if resume:
@@ -336,8 +350,10 @@ def _fitted(
                 background=settings.background,
                 seed=settings.seed,
                 backend=device["backend"],
+                frozen=still,
             )
             splats, removed = cleaned.splats, cleaned.removed
+        splats = first_splats(splats, len(splats) - still)
         if not stopped:
             run.end(len(splats), removed)
     return splats, with_train_exposures(capture, found)
@@ -359,6 +375,20 @@ def _check_capture(capture: object) -> None:
             f"capture must be a Capture, not {type(capture).__name__}; igsr.load_capture(path) "
             "makes one."
         )
+
+
+def _check_frozen(frozen: Splats, initial: Splats | None) -> None:
+    if initial is None:
+        raise IgsrError("frozen needs start, the splats that are fitted beside the frozen ones.")
+    if frozen.antialiased:
+        raise IgsrError("frozen has antialiased splats, which igsr does not fit; give others.")
+    if frozen.sh_degree != initial.sh_degree:
+        raise IgsrError(
+            f"frozen has splats of SH degree {frozen.sh_degree} where start has degree "
+            f"{initial.sh_degree}; give the same."
+        )
+    if not np.array_equal(frozen.origin, initial.origin):
+        raise IgsrError("frozen and start have other origins; give splats of one scene.")
 
 
 def _check_focal(views: list[View], settings: FitSettings) -> None:
