@@ -1,4 +1,4 @@
-"""The one place that knows Ray: work on the machines of a cluster, each piece of it retried alone."""
+"""The one place that knows Ray: work on the machines of a cluster, each piece retried alone."""
 
 from __future__ import annotations
 

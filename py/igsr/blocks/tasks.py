@@ -130,7 +130,8 @@ def load_splats(path: Path) -> Splats:
         IgsrError: the file is missing or damaged.
     """
     try:
-        return Splats(**stored_arrays(path))
+        arrays: dict[str, Any] = stored_arrays(path)
+        return Splats(**arrays)
     except (*DAMAGE, IgsrError) as error:
         raise IgsrError(
             f"{path} cannot be read ({error}); delete its folder to fit it again."

@@ -9,12 +9,13 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
+from igsr._internal.choices import Backend, FitBackend
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Meter
 from igsr._internal.worker_processes import in_a_process
@@ -116,12 +117,12 @@ def _block(task: FitTask, block: BlockPart, views: list[View]) -> dict[str, Any]
     whole = splats if still is None else joined([splats, still])
     color = task.settings.get("background") or default_background(Capture(task.capture, views))
     across = [view for view in views if view.name in block.across]
-    scored = score_views(whole, across, color, task.backend, ("psnr",)) if across else ()
-    psnr = {one.name: one.scores["psnr"] for one in scored}
-    kept = subset(
-        splats,
-        block.cell.holds(block.ground.places(splats.means.astype(np.float64) + splats.origin)),
+    scored = (
+        score_views(whole, across, color, cast(Backend, task.backend), ("psnr",)) if across else ()
     )
+    psnr = {one.name: one.scores["psnr"] for one in scored}
+    places = block.ground.places(splats.means.astype(np.float64) + splats.origin)
+    kept = subset(splats, block.cell.holds(places))
     save_splats(task.folder / SPLATS, kept)
     return {
         "splats": len(kept),
@@ -150,7 +151,7 @@ def _fit(
         return fit_with_cameras(
             capture,
             progress=progress,
-            backend=task.backend,
+            backend=cast(FitBackend, task.backend),
             checkpoint=checkpoint,
             resume=resume,
             **keywords,
@@ -229,5 +230,7 @@ def subset(splats: Splats, keep: Bool) -> Splats:
 
 def joined(parts: list[Splats]) -> Splats:
     """Splats of one origin and SH degree as one scene, in this order."""
-    arrays = {name: np.concatenate([getattr(p, name) for p in parts]) for name in PARAMETERS}
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(p, name) for p in parts]) for name in PARAMETERS
+    }
     return replace(parts[0], **arrays)
