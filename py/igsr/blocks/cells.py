@@ -88,7 +88,7 @@ def ground_of(cameras: Sequence[Camera]) -> Ground:
     spread, axes = np.linalg.eigh(np.cov((centres - centres.mean(axis=0)).T, bias=True))
     axes = axes.T[::-1]  # the largest first
     largest, lesser, least = np.sqrt(np.maximum(spread[::-1], 0.0))
-    if least < FLAT * lesser or largest == 0.0:
+    if least < FLAT * lesser:
         return Ground(axes[:2])
     up = -np.mean([camera.viewmat[1, :3] for camera in cameras], axis=0)
     along = axes[0] if lesser < FLAT * largest else np.cross(up, axes[2])
@@ -138,18 +138,13 @@ def _split(places: Float64, bounds: Float64, count: int) -> list[Cell]:
     if not below < above:
         # Cameras at one place (views of a panorama) stay together.
         values = np.unique(places[:, axis])
-        if len(values) < 2:
-            raise IgsrError(
-                f"{len(places)} photos stand at one place and cannot be split into {count} blocks; "
-                "give fewer --blocks."
-            )
         cuts = 0.5 * (values[:-1] + values[1:])
         ranks = np.searchsorted(np.sort(places[:, axis]), cuts)
         allowed = (ranks >= first) & (ranks <= len(places) - (count - first))
         if not allowed.any():
             raise IgsrError(
-                f"{len(places)} photos stand at too few places to be split into {count} blocks; "
-                "give fewer --blocks."
+                f"{len(places)} photos at {len(values)} places across cannot be split into {count} "
+                "blocks; give fewer --blocks."
             )
         cuts, ranks = cuts[allowed], ranks[allowed]
         cut = float(cuts[np.argmin(np.abs(ranks - middle))])

@@ -59,12 +59,14 @@ def watched(
     """
     ended = threading.Event()
 
+    def tell() -> None:
+        over = done()
+        told([standing_of(name, folder, name in over) for name, folder in folders])
+
     def look() -> None:
-        while True:
-            over = done()
-            told([standing_of(name, folder, name in over) for name, folder in folders])
-            if ended.wait(LOOK_EVERY):
-                return
+        tell()
+        while not ended.wait(LOOK_EVERY):
+            tell()
 
     thread = threading.Thread(target=look, daemon=True)
     thread.start()
@@ -73,6 +75,7 @@ def watched(
     finally:
         ended.set()
         thread.join()
+        tell()
 
 
 @contextlib.contextmanager

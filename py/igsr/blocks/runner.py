@@ -45,6 +45,7 @@ class Runner:
         self._told = told
         self._done: set[str] = set()
         self._all: list[tuple[str, Path]] = []
+        self._lost: set[str] = set()
         self._less: dict[str, int] = {}
 
     def rows(
@@ -101,8 +102,18 @@ class Runner:
         return rows
 
     def _with_less(self, run: Run, error: Exception) -> FitTask:
-        """The task again, with fewer splats; where that has been tried, an error that names it."""
+        """The task again, after its process ended without a result or memory ran out.
+
+        First as it was, from its checkpoint: any process may be killed. Then with fewer splats.
+
+        Raises:
+            IgsrError: that has been tried; the message names the task.
+        """
         task = cast(FitTask, run.what)
+        if not isinstance(error, MemoryError) and task.name not in self._lost:
+            self._lost.add(task.name)
+            warnings.warn(f"{task.name} was lost and is begun again: {error}", stacklevel=2)
+            return task
         self._less[task.name] = self._less.get(task.name, 0) + 1
         if self._less[task.name] > LESS_OFTEN:
             raise IgsrError(

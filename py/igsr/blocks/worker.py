@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import socket
 import time
@@ -112,7 +113,7 @@ def _block(task: FitTask, block: BlockPart, views: list[View]) -> dict[str, Any]
     # What none of the photos shows takes memory and does nothing.
     background = ~moving & shown_by(scene, views, task.backend)
     still = subset(scene, background) if background.any() else None
-    settings = {"start": subset(scene, moving), "frozen": still}
+    settings = {"start": subset(scene, moving), "frozen": still, "whole_schedule": True}
     splats, _, last = _fit(task, Capture(task.capture, views), settings)
     whole = splats if still is None else joined([splats, still])
     color = task.settings.get("background") or default_background(Capture(task.capture, views))
@@ -140,7 +141,8 @@ def _fit(
     """Fit, from the task's checkpoint where that can be used."""
     checkpoint = task.folder / CHECKPOINT
     seen: list[Progress] = []
-    tell = _teller(task.folder / PROGRESS)
+    attempt = 1 + attempts(task.folder)
+    tell = _teller(task.folder / PROGRESS, attempt)
 
     def progress(now: Progress) -> None:
         seen[:] = [now]
@@ -176,6 +178,7 @@ def _fit(
         "removed": dict(last.removed or {}),
         "masked": {name: round(part, 5) for name, part in last.transients.items()},
         "resumed_from": resumed_from,
+        "attempts": attempt,
     }
     return splats, fitted, about
 
@@ -199,18 +202,30 @@ def _step_of(checkpoint: Path) -> int | None:
         return None
 
 
-def _teller(path: Path) -> Callable[[Progress], None]:
-    """Writes where a fit stands, for the view of all blocks; the run counts and not the file."""
-    told = [-TELL_EVERY]
+def attempts(folder: Path) -> int:
+    """How often a task has been begun and not ended, by what that left in its folder."""
+    try:
+        return int(json.loads((folder / PROGRESS).read_text(encoding="utf-8"))["attempt"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
 
-    def tell(now: Progress) -> None:
-        if time.monotonic() - told[0] < TELL_EVERY:
+
+def _teller(path: Path, attempt: int) -> Callable[[Progress | None], None]:
+    """Writes where a fit stands, for the view of all blocks; the run counts and not the file."""
+    told = [time.monotonic()]
+    about = {"attempt": attempt, "host": socket.gethostname(), "process": os.getpid()}
+
+    def tell(now: Progress | None) -> None:
+        if now is not None and time.monotonic() - told[0] < TELL_EVERY:
             return
         told[0] = time.monotonic()
-        news = {"step": now.step, "steps": now.steps, "splats": now.splats, "work": now.work}
+        news: dict[str, Any] = {"step": 0, "steps": 0, "splats": 0, "work": 0.0}
+        if now is not None:
+            news = {"step": now.step, "steps": now.steps, "splats": now.splats, "work": now.work}
         with contextlib.suppress(OSError, IgsrError):
-            write_json(path, {**news, "host": socket.gethostname()})
+            write_json(path, {**news, **about})
 
+    tell(None)
     return tell
 
 

@@ -98,6 +98,7 @@ def fit(
     remove_floaters: bool | None = None,
     background: tuple[float, float, float] | None = None,
     frozen: Splats | None = None,
+    whole_schedule: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
 ) -> Splats:
@@ -164,6 +165,8 @@ def fit(
         frozen: splats that renders show beside those that are fitted, and that stay as they are:
             what is round a part of a scene whose other parts are known. They need ``start`` with
             splats of the same origin and SH degree, and do not count to ``max_splats``.
+        whole_schedule: where ``start`` has splats, whether the fit takes the rates and the density
+            control of all steps of a fit, as from points, and not those of its last ones.
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
             Ctrl-C (KeyboardInterrupt, which is raised again); where cameras are optimized, from
             when they have been found roughly.
@@ -219,6 +222,7 @@ def _fitted(
     backend: str,
     progress: Report | None,
     frozen: Splats | None,
+    whole_schedule: bool,
     checkpoint: str | os.PathLike[str] | None,
     resume: bool,
     **given: Any,
@@ -236,7 +240,7 @@ def _fitted(
         )
     else:
         settings = _settings_from_splats(
-            preset, support_of(photos_among(views)), quality, initial, given
+            preset, support_of(photos_among(views)), quality, initial, given, whole_schedule
         )
     if frozen is not None:
         _check_frozen(frozen, initial)
@@ -401,9 +405,16 @@ def _check_focal(views: list[View], settings: FitSettings) -> None:
 
 
 def _settings_from_splats(
-    preset: str, photos: PhotoSupport, quality: Quality, splats: Splats, given: dict[str, Any]
+    preset: str,
+    photos: PhotoSupport,
+    quality: Quality,
+    splats: Splats,
+    given: dict[str, Any],
+    whole_schedule: bool,
 ) -> FitSettings:
     """The settings of a fit that goes on from splats: the last steps of the preset's schedule.
+
+    With ``whole_schedule``, all of them.
 
     Raises:
         IgsrError: the splats and the settings do not go together.
@@ -423,6 +434,8 @@ def _settings_from_splats(
         )
     if splats.antialiased:
         raise IgsrError("start has antialiased splats, which igsr does not fit; give others.")
+    if whole_schedule:
+        return settings
     usual = settings_for(preset, photos, quality, **(given | {"steps": None}))
     whole = max(settings.steps, usual.steps)
     schedule = settings_for(preset, photos, quality, **(given | {"steps": whole}))
