@@ -273,6 +273,4 @@ def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
         ({"frozen": replace(frozen, antialiased=True)}, "frozen has antialiased splats"),
     ):
         with pytest.raises(igsr.IgsrError, match=message):
-            igsr.fit(
-                capture, steps=5, backend="cpu", **({"start": start, "frozen": frozen} | changed)
-            )
+            igsr.fit(capture, steps=5, backend="cpu", **(usual | changed))

@@ -68,9 +68,9 @@ class RayCluster:
             named = {} if self.address is None else {"address": self.address}
             try:
                 self._ray.init(log_to_driver=False, logging_level="warning", **named)
-            except Exception as error:  # what it raises depends on what is wrong with the cluster
+            except (Exception, SystemExit) as error:  # by what is wrong with the cluster
                 where = "" if self.address is None else f" at {self.address}"
-                reason = str(error).strip().splitlines()[0].rstrip(".")
+                reason = "none answers" if isinstance(error, SystemExit) else _first_line(error)
                 raise IgsrError(
                     f"Cannot join the Ray cluster{where}: {reason}. Start one with "
                     "'ray start --head' and the same version of Ray on all machines."
@@ -106,9 +106,8 @@ class RayCluster:
             try:
                 node = Node(*ray.get(reference, timeout=ANSWERS_WITHIN))
             except Exception as error:
-                reason = str(error).strip().splitlines()[-1]
                 raise IgsrError(
-                    f"The machine {name} of the Ray cluster cannot run igsr ({reason}); install "
+                    f"The machine {name} of the Ray cluster cannot run igsr ({_first_line(error)}); install "
                     f"igsr {_core.__version__} there."
                 ) from error
             if node.igsr != _core.__version__:
@@ -230,6 +229,13 @@ def _imported() -> Any:
             "pip install 'igsr[ray]'."
         )
     return ray
+
+
+def _first_line(error: BaseException) -> str:
+    """What an error says first: Ray's go on with tracebacks of other machines."""
+    cause = getattr(error, "cause", None) or error
+    lines = str(cause).strip().splitlines() or [type(cause).__name__]
+    return lines[0].rstrip(".")
 
 
 def _what_it_is(folder: str | None) -> tuple[str, str, str, bool]:

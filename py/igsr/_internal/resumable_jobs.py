@@ -65,6 +65,7 @@ def finished_runs(
     *,
     again: Callable[[Run, Exception], Any] | None = None,
     spread: bool = False,
+    shared: Path | None = None,
 ) -> list[dict[str, Any]]:
     """The row of every run, in order: read where its file is there, else done and written.
 
@@ -85,6 +86,7 @@ def finished_runs(
         again: called with a run and the exception where memory ran out or its process ended without
             a result; what it returns, if not None, is given to ``work`` once more.
         spread: over Ray, whether a run takes its share of a machine's cores, not one.
+        shared: over Ray, a folder that all machines must see.
 
     Raises:
         IgsrError: a run fails, its file cannot be read or written, or Ray is not installed.
@@ -117,7 +119,7 @@ def finished_runs(
             on_run(len(rows), len(runs), row)
 
     if ray and missing:
-        _over_ray(missing, work, data, keep, ray, again, spread)
+        _over_ray(missing, work, data, keep, ray, again, spread, shared)
     elif jobs == 1:
         for run in missing:
             keep(run, _done(work, data, run, again))
@@ -164,6 +166,7 @@ def _over_ray(
     ray: bool | str,
     again: Callable[[Run, Exception], Any] | None,
     spread: bool,
+    shared: Path | None,
 ) -> None:
     """``keep`` is called with each run as it is done; after a failure, those under way are kept."""
 
@@ -171,6 +174,7 @@ def _over_ray(
         return None if again is None else again(runs[number], error)
 
     with RayCluster(ray if isinstance(ray, str) else None) as cluster:
+        cluster.check(shared)
         failed: Exception | None = None
         pieces = [run.what for run in runs]
         memory = [run.memory for run in runs]

@@ -96,10 +96,16 @@ class Runner:
                 self._ray or False,
                 again=self._with_less,
                 spread=True,
+                shared=self._shared(),
             )
         self._done |= {task.name for task in tasks}
         self._tell_of_other_bits(instruction_set, rows)
         return rows
+
+    def _shared(self) -> Path:
+        """The folder that workers write to, which all machines must see."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        return self._folder.resolve()
 
     def _with_less(self, run: Run, error: Exception) -> FitTask:
         """The task again, after its process ended without a result or memory ran out.

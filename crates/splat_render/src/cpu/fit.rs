@@ -282,6 +282,9 @@ impl CpuFit {
                         camera: input.camera_gradient,
                     };
                     *v_camera = backward.run(&stage, 0, v.zeroed(n));
+                    if moving == 0 {
+                        return;
+                    }
                     let [mut values, first, second] =
                         [values, first, second].map(|arrays| arrays.first(moving));
                     plan.pull(&values, v);
