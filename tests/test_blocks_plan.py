@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
+import struct
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import towns
@@ -181,3 +187,99 @@ def test_less_memory_asks_for_more_blocks(town):
     assert blocks_for_memory(manifest, None, 1000, available=64 << 30) == 1
     assert blocks_for_memory(manifest, None, 1_000_000, available=2 << 30) > 1
     assert blocks_for_memory(manifest, None, 1_000_000, available=1) == 12
+
+
+def made_up_capture(folder, count, points):
+    """A COLMAP model of so many 12-megapixel photos along a street; all files are one JPEG."""
+    random = np.random.default_rng(5)
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse/0").mkdir(parents=True)
+    Image.new("RGB", (4000, 3000), (90, 120, 60)).save(folder / "one.jpg")
+    for number in range(count):
+        os.link(folder / "one.jpg", folder / f"images/{number:05d}.jpg")
+    with open(folder / "sparse/0/cameras.bin", "wb") as file:
+        file.write(struct.pack("<QIiQQ", 1, 1, 1, 4000, 3000))
+        file.write(struct.pack("<4d", 3000.0, 3000.0, 2000.0, 1500.0))
+    centres = np.stack(
+        [np.linspace(0.0, count / 10.0, count), np.full(count, -1.6), random.uniform(-4, 4, count)],
+        axis=1,
+    )
+    xyz = random.uniform([0.0, -6.0, 4.0], [count / 10.0, 0.0, 8.0], (points, 3))
+    # Each photo sees the points that lie ahead.
+    seen = [
+        np.flatnonzero(np.abs(xyz[:, 0] - centre[0]) < 0.4 * (xyz[:, 2] - centre[2]))[:150]
+        for centre in centres
+    ]
+    with open(folder / "sparse/0/images.bin", "wb") as file:
+        file.write(struct.pack("<Q", count))
+        for number, (centre, ids) in enumerate(zip(centres, seen, strict=True)):
+            file.write(struct.pack("<I7dI", number + 1, 1.0, 0.0, 0.0, 0.0, *-centre, 1))
+            file.write(f"{number:05d}.jpg".encode() + b"\0")
+            local = xyz[ids] - centre
+            rows = np.zeros(len(ids), [("xy", "<f8", 2), ("id", "<i8")])
+            rows["xy"] = 3000.0 * local[:, :2] / local[:, 2:] + [2000.0, 1500.0]
+            rows["id"] = ids + 1
+            file.write(struct.pack("<Q", len(ids)) + rows.tobytes())
+    with open(folder / "sparse/0/points3D.bin", "wb") as file:
+        file.write(struct.pack("<Q", points))
+        for number, place in enumerate(xyz):
+            file.write(struct.pack("<Q3d3BdQ", number + 1, *place, 90, 90, 90, 0.5, 0))
+    return folder
+
+
+PLAN = """
+import json, sys, time
+import numpy as np
+import igsr
+from pathlib import Path
+from PIL import Image
+from igsr._internal.peak_memory import peak_bytes
+from igsr.blocks.manifest import read_manifest
+from igsr.blocks.plan import blocks_for_memory, cells_of, plan_blocks
+
+def never(image):
+    raise RuntimeError("a photo was decoded")
+
+Image.init()
+Image.Image.load = Image.Image.draft = never
+began = time.process_time()
+manifest = read_manifest(Path(sys.argv[1]), 1000, 8)
+points = manifest.points()
+count = blocks_for_memory(manifest, 1000, None, available=16 << 30)
+ground, cells = cells_of(manifest, count)
+random = np.random.default_rng(0)
+n = 20000
+low, high = points.xyz.min(axis=0), points.xyz.max(axis=0)
+splats = igsr.Splats(
+    random.uniform(low, high, (n, 3)).astype(np.float32),
+    np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+    np.full((n, 3), -2.0, np.float32),
+    np.full(n, 2.0, np.float32),
+    np.zeros((n, 4, 3), np.float32),
+)
+plan = plan_blocks(manifest, ground, cells, splats, points, "cpu")
+print(json.dumps({
+    "seconds": time.process_time() - began,
+    "peak": peak_bytes(),
+    "blocks": len(cells),
+    "photos": plan.photos.sum(axis=0).tolist(),
+    "none": int((~plan.photos.any(axis=1)).sum()),
+    "test": len(manifest.of_split("test")),
+}))
+"""
+
+
+@pytest.mark.parametrize("count", [pytest.param(500), pytest.param(5000, marks=pytest.mark.long)])
+def test_thousands_of_photos_are_planned_in_seconds(tmp_path, count):
+    """5 000 photos of 12 megapixels: in 30 s of one processor and 1 GB, and none is decoded."""
+    folder = made_up_capture(tmp_path / "capture", count, 20 * count)
+    done = subprocess.run(
+        [sys.executable, "-c", PLAN, str(folder)], capture_output=True, text=True, check=True
+    )
+    found = json.loads(done.stdout)
+    print(found)
+    assert found["seconds"] < 30.0 * count / 5000 + 5.0
+    assert found["peak"] < 1e9
+    assert found["none"] == found["test"], "a photo to fit is in no block"
+    # Blocks have their own photos and few of their neighbours'.
+    assert max(found["photos"]) < 2.0 * count / found["blocks"]

@@ -106,8 +106,9 @@ class RayCluster:
             try:
                 node = Node(*ray.get(reference, timeout=ANSWERS_WITHIN))
             except Exception as error:
+                reason = _first_line(error)
                 raise IgsrError(
-                    f"The machine {name} of the Ray cluster cannot run igsr ({_first_line(error)}); install "
+                    f"The machine {name} of the Ray cluster cannot run igsr ({reason}); install "
                     f"igsr {_core.__version__} there."
                 ) from error
             if node.igsr != _core.__version__:

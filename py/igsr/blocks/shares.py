@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,31 +39,40 @@ def shown_shares(
         float64 [P, C] in [0, 1]; 0 for a camera that shows nothing.
     """
     places = ground.places(splats.means.astype(np.float64) + splats.origin)
-    inside = np.stack([cell.holds(places) for cell in cells], axis=1).astype(np.float32)
-    channels = np.zeros((len(splats), -(-len(cells) // 3) * 3), np.float32)
-    channels[:, : len(cells)] = inside
-    # Geometry alone: what colors splats have counts for nothing here.
-    plain = replace(splats, sh=np.ascontiguousarray(splats.sh[:, :1]))
-    dtype = _core.working_dtype(backend)
+    inside = np.stack([cell.holds(places) for cell in cells], axis=1).astype(np.float64)
     shares = np.zeros((len(cameras), len(cells)))
     for row, camera in zip(shares, cameras, strict=True):
         small = resized_camera(camera, *reduced_size(camera.width, camera.height, ASKED_SIZE))
-        drawn: dict[str, Any] = project(plain, small, backend)
-        culled = (drawn["radii"] == 0).all(axis=1)
-        for first in range(0, channels.shape[1], 3):
-            colors = channels[:, first : first + 3].astype(dtype)
-            colors[culled] = 0.0
-            picture = _core.rasterize(
-                {**drawn, "colors": np.ascontiguousarray(colors)},
-                width=small.width,
-                height=small.height,
-                background=np.zeros(3, dtype),
-                backend=backend,
-            )
-            shown = max(float(picture["alpha"].sum(dtype=np.float64)), 1e-9)
-            sums = picture["color"].reshape(-1, 3).sum(axis=0, dtype=np.float64) / shown
-            row[first : first + 3] = sums[: len(cells) - first]
+        weights = shown_weights(splats, small, backend)
+        row[:] = weights @ inside / max(float(weights.sum()), 1e-9)
     return np.clip(shares, 0.0, 1.0)
+
+
+def shown_weights(splats: Splats, camera: Camera, backend: str) -> Float64:
+    """What each splat counts for in a picture, float64 [N]: its part of each pixel, summed up.
+
+    That is the slope of the picture's sum by the splat's color: one pass back, for any number of
+    splats.
+    """
+    # Geometry alone: what colors splats have counts for nothing here.
+    plain = replace(splats, sh=np.ascontiguousarray(splats.sh[:, :1]))
+    dtype = _core.working_dtype(backend)
+    drawn = project(plain, camera, backend)
+    size = {"width": camera.width, "height": camera.height}
+    black = np.zeros(3, dtype)
+    picture = _core.rasterize(drawn, **size, background=black, backend=backend)
+    planes = (camera.height, camera.width)
+    slopes = _core.rasterize_backward(
+        drawn,
+        picture,
+        v_color=np.ones((*planes, 3), dtype),
+        v_alpha=np.zeros(planes, dtype),
+        v_depth=np.zeros(planes, dtype),
+        background=black,
+        absolute=False,
+        backend=backend,
+    )
+    return np.maximum(slopes["v_colors"][:, 0].astype(np.float64), 0.0)
 
 
 def tracked_shares(

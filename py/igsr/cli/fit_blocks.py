@@ -1,4 +1,4 @@
-"""``igsr fit --blocks``: fit a capture in blocks, with a bar for each, and print what came of it."""
+"""``igsr fit --blocks``: fit a capture in blocks, with a bar for each, and print the report."""
 
 from __future__ import annotations
 

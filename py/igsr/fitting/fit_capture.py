@@ -202,9 +202,9 @@ def fit_with_cameras(*args: Any, **kwargs: Any) -> tuple[Splats, Capture]:
     """As ``fit``, with the same arguments; also returns cameras and exposures.
 
     Returns:
-        The splats, without those that were frozen, and the capture with its train cameras and the exposures of its train views
-        (``View.exposure``) as they were optimized, and with masks that leave out transient things;
-        the capture itself where there are none of these.
+        The splats, without those that were frozen, and the capture with its train cameras and the
+        exposures of its train views (``View.exposure``) as they were optimized, and with masks that
+        leave out transient things; the capture itself where there are none of these.
 
     Raises:
         IgsrError, UserWarning, RuntimeError: as ``fit``.

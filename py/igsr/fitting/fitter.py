@@ -49,7 +49,8 @@ def fitter_of(
         state: float32 arrays of N splats ("means" [N, 3] ...), and where a fit goes on, those of
             the optimizer, as ``Fitter.state`` returns them.
         settings: fields of ``FitSettings``, and what else the fitter knows: "frozen" (splats stay
-            as they are), "frozen_splats" (so many, the last ones, do) and "camera_warm_up" (fraction of the steps before cameras move).
+            as they are), "frozen_splats" (so many, the last ones, do) and "camera_warm_up"
+            (fraction of the steps before cameras move).
         backend: "cpu" or "gpu".
         priors: of the V cameras, where these are optimized and something is known of them.
         exposures: where those of the V views start; None where none is optimized.
