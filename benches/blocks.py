@@ -55,6 +55,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--blocks", default="2,4")
     parser.add_argument("--steps", type=int, default=None)
+    parser.add_argument("--max-splats", type=int, default=None)
     parser.add_argument("--skip-whole", action="store_true")
     asked = parser.parse_args()
 
@@ -65,7 +66,8 @@ def main() -> None:
     if not folder.is_dir():
         size = asked.size, 3 * asked.size // 4
         towns.written(towns.town(columns, rows, asked.each, *size), folder)
-    settings: dict[str, Any] = {} if asked.steps is None else {"steps": asked.steps}
+    given = {"steps": asked.steps, "max_splats": asked.max_splats}
+    settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     found = []
     whole: dict[str, Any] = {"views": {}}
     if not asked.skip_whole:

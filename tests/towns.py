@@ -15,9 +15,9 @@ from igsr.capture.types import Tracks, intrinsic_matrix
 from igsr.capture.write_colmap import write_colmap
 
 #: Units from the middle of one house to the next one's, and half the length of a house's wall.
-APART, HALF = 6.0, 1.0
+APART, HALF = 5.0, 1.0
 #: Texels per unit, and the color of the sky.
-TEXELS, SKY = 8.0, (150.0, 190.0, 235.0)
+TEXELS, SKY = 2.5, (150.0, 190.0, 235.0)
 
 
 def houses(columns: int, rows: int) -> np.ndarray:

@@ -14,7 +14,7 @@ SHOWN = 0.25
 #: Photos that were taken in the block need only show this part of it.
 SHOWN_NEAR = 0.05
 #: A photo lies across a seam if two cells are at least this part of it each.
-ACROSS = 0.2
+ACROSS = 0.1
 
 
 def photos_of_blocks(shown: Float64, tracked: Float64, near: Bool) -> Bool:

@@ -75,6 +75,18 @@ class Cell:
         return {"low": finite(self.low), "high": finite(self.high), "side": list(self.side)}
 
 
+#: A cell that is the whole plane.
+EVERYWHERE = Cell((-math.inf, -math.inf), (math.inf, math.inf), (0.0, 0.0))
+
+
+def near_borders(cells: Sequence[Cell], places: Float64, part: float) -> npt.NDArray[np.bool_]:
+    """Which places [N, 2] lie within a part of a cell's sides of its border to another cell."""
+    near: npt.NDArray[np.bool_] = np.zeros(len(places), np.bool_)
+    for cell in cells:
+        near |= cell.near_border(places, part)
+    return near
+
+
 def ground_of(cameras: Sequence[Camera]) -> Ground:
     """The plane that cameras stand on.
 

@@ -13,6 +13,7 @@ from igsr._internal.choices import Backend
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Parts
 from igsr.blocks.manifest import Manifest, read_manifest
+from igsr.blocks.mending import mending_task, near_seams
 from igsr.blocks.options import BlockOptions
 from igsr.blocks.plan import BlockPlan, blocks_for_memory, cells_of, memory_of, plan_blocks
 from igsr.blocks.progress import Standing
@@ -24,6 +25,7 @@ from igsr.blocks.tasks import SPLATS, FitTask, key_of, load_splats
 from igsr.blocks.worker import joined, subset
 from igsr.capture.exposure import Exposure
 from igsr.errors import IgsrError
+from igsr.evaluation.scores import BLACK, WHITE
 from igsr.fitting.fingerprint import hash_of
 from igsr.fitting.fitter import splat_arrays
 from igsr.splats import Splats
@@ -68,6 +70,11 @@ def fit_in_blocks(
         count = options.blocks or blocks_for_memory(manifest, options.max_size, given)
         ground, cells = cells_of(manifest, count)
         write_json(out / "manifest.json", {"photos": manifest.plain()})
+    has_alpha = any(manifest.headers[index].channels == 4 for index in train)
+    if options.background is not None and not has_alpha:
+        # As igsr fit: what is behind photos with alpha is a new color in each step.
+        background = {"background": list(options.background)}
+        options = replace(options, settings={**options.settings, **background})
     runner = Runner(out, str(path), options.backend, options.ray, told)
 
     first = coarse_task(manifest, points, out, options)
@@ -95,9 +102,17 @@ def fit_in_blocks(
 
     with parts.measured("join"):
         splats = _joined(plan, coarse, tasks)
-        splats.save(out / "scene.ply")
+    with parts.measured("score seams"):
+        own = [row["across"] for row in rows]
+        seams = _seams(manifest, own, splats, exposures, options)
+    if seams is not None and seams["visible"]:
+        with parts.measured("mend seams"):
+            mended = _mended(manifest, plan, splats, exposures, out, options, runner)
+            after = _seams(manifest, own, mended, exposures, options)
+        if after is not None and after["loss_db"] < seams["loss_db"]:
+            splats, seams = mended, {**after, "before_mending": seams}
     with parts.measured("score"):
-        seams = _seams(manifest, plan, rows, splats, exposures, options)
+        splats.save(out / "scene.ply")
         scores = held_out_scores(manifest, plan, splats, exposures, options)
     report = block_report(
         path, options, plan, coarse_row, {row["name"]: row for row in rows}, splats
@@ -140,18 +155,37 @@ def _with_degree(splats: Splats, degree: int) -> Splats:
     return replace(splats, sh=np.pad(splats.sh, ((0, 0), (0, rows), (0, 0)))) if rows else splats
 
 
-def _seams(
+def _mended(
     manifest: Manifest,
     plan: BlockPlan,
-    rows: Sequence[dict[str, Any]],
+    splats: Splats,
+    exposures: Mapping[str, Exposure],
+    out: Path,
+    options: BlockOptions,
+    runner: Runner,
+) -> Splats:
+    """The scene with splats near seams fitted together."""
+    made = mending_task(manifest, plan, splats, exposures, out, options)
+    if made is None:
+        return splats
+    task, key = made
+    runner.rows([task], [key])
+    near = near_seams(plan, splats)
+    return joined([subset(splats, ~near), load_splats(task.folder / SPLATS)])
+
+
+def _seams(
+    manifest: Manifest,
+    own: Sequence[Mapping[str, float]],
     splats: Splats,
     exposures: Mapping[str, Exposure],
     options: BlockOptions,
 ) -> dict[str, Any] | None:
-    own = [row["across"] for row in rows]
+    """What photos across seams lose by joining; see ``seam_scores``."""
     names = {name for scores in own for name in scores}
     photos = [i for i, shot in enumerate(manifest.shots) if shot.name in names]
     parts = loaded_in_parts(manifest, photos, options.max_size, exposures)
-    color = options.background or (0.0, 0.0, 0.0)
+    has_alpha = any(manifest.headers[index].channels == 4 for index in photos)
+    color = options.background or (WHITE if has_alpha else BLACK)
     by_joined = psnr_by_name(splats, parts, color, cast(Backend, options.backend))
     return seam_scores(own, by_joined)

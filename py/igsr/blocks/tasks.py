@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
-from igsr.blocks.cells import Cell, Ground
+from igsr.blocks.cells import Cell, Ground, near_borders
 from igsr.capture.exposure import Exposure
 from igsr.capture.photos import Shot
 from igsr.capture.types import Points
@@ -35,13 +36,24 @@ class BlockPart:
         cell: whose splats, once fitted, are the block's.
         fitted: the cell whose splats are fitted, which is wider.
         across: names of photos that show a seam: the block scores those of them that it has.
+        borders_of: cells; where there are some, splats are fitted that lie near their borders, and
+            no others.
+        band: how near, as a part of the cells' sides.
     """
 
     scene: Path
     ground: Ground
     cell: Cell
     fitted: Cell
-    across: frozenset[str]
+    across: frozenset[str] = frozenset()
+    borders_of: tuple[Cell, ...] = ()
+    band: float = 0.0
+
+    def moving(self, places: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        """Which splats at these places [N, 2] are fitted."""
+        if self.borders_of:
+            return near_borders(self.borders_of, places, self.band)
+        return self.fitted.holds(places)
 
     def plain(self) -> dict[str, Any]:
         """As JSON has it, without the scene."""
@@ -50,6 +62,8 @@ class BlockPart:
             "cell": self.cell.plain(),
             "fitted": self.fitted.plain(),
             "across": sorted(self.across),
+            "borders_of": [cell.plain() for cell in self.borders_of],
+            "band": self.band,
         }
 
 

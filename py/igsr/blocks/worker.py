@@ -109,11 +109,15 @@ def _coarse(task: FitTask, views: list[View]) -> dict[str, Any]:
 def _block(task: FitTask, block: BlockPart, views: list[View]) -> dict[str, Any]:
     scene = load_splats(block.scene)
     places = block.ground.places(scene.means.astype(np.float64) + scene.origin)
-    moving = block.fitted.holds(places)
+    moving = block.moving(places)
     # What none of the photos shows takes memory and does nothing.
     background = ~moving & shown_by(scene, views, task.backend)
     still = subset(scene, background) if background.any() else None
-    settings = {"start": subset(scene, moving), "frozen": still, "whole_schedule": True}
+    settings = {
+        "start": subset(scene, moving),
+        "frozen": still,
+        "whole_schedule": not block.borders_of,
+    }
     splats, _, last = _fit(task, Capture(task.capture, views), settings)
     whole = splats if still is None else joined([splats, still])
     color = task.settings.get("background") or default_background(Capture(task.capture, views))
