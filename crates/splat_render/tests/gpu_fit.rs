@@ -460,6 +460,11 @@ fn frozen_steps_keep_the_moments() {
 }
 
 #[test]
+fn the_last_splats_stay() {
+    common::agreement::the_last_splats_stay(&mut GpuFit::new(shared()));
+}
+
+#[test]
 fn senseless_steps_are_refused() {
     common::agreement::senseless_steps_are_refused(&mut GpuFit::new(shared()));
 }

@@ -226,13 +226,14 @@ impl CpuFit {
         size: [f32; 2],
         sums: &[PairSums<N>],
     ) {
-        let FitState { splats: values, first, second, stats } = &mut self.state;
+        let moving = self.state.moving();
+        let FitState { splats: values, first, second, stats, .. } = &mut self.state;
         let n = values.len();
         let stride = values.stride();
         let degree = input.sh_degree.min(values.sh_degree);
         let (bins, tile_splats) = (&self.bins, &self.splats);
         let dropout = Dropout::new(input);
-        let plan = BlockStep::new(&input.adam(), n, values.sh_degree);
+        let plan = BlockStep::new(&input.adam(), moving, values.sh_degree);
         self.block_cameras.clear();
         self.block_cameras.resize(n.div_ceil(BLOCK), VCamera::default());
 
@@ -252,9 +253,14 @@ impl CpuFit {
                     v: BlockGradients::new(stride),
                     explore: ExploreBlock::new(),
                 },
-                |scratch, (block, (mut values, first, second, grad_sum, v_camera))| {
+                |scratch, (block, (values, first, second, grad_sum, v_camera))| {
                     let first_id = block * BLOCK;
                     let n = values.means.len();
+                    let moving = moving.saturating_sub(first_id).min(n);
+                    // Of splats that stay as they are, only the camera's gradient is of use.
+                    if moving == 0 && !input.camera_gradient {
+                        return;
+                    }
                     let Scratch { pairs, backward, v, explore } = scratch;
                     bins.take_pairs(first_id..first_id + n, sums, pairs);
                     backward.clear();
@@ -276,6 +282,11 @@ impl CpuFit {
                         camera: input.camera_gradient,
                     };
                     *v_camera = backward.run(&stage, 0, v.zeroed(n));
+                    if moving == 0 {
+                        return;
+                    }
+                    let [mut values, first, second] =
+                        [values, first, second].map(|arrays| arrays.first(moving));
                     plan.pull(&values, v);
                     plan.apply(&mut values, [first, second], v);
                     plan.explore(&mut values, explore, first_id);

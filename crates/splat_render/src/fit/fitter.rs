@@ -134,7 +134,7 @@ impl Fitter {
         let schedule = targets.iter().map(|target| (target.turns, target.until)).collect();
         let hull = config.hull.then(|| Hull::new(&targets));
         let longest = targets.iter().map(|t| t.width.max(t.height)).max().unwrap_or(1);
-        let splats = state.splats.len();
+        let splats = state.moving();
         let moving = config.cameras.map(|moving| {
             let means = &state.splats.means;
             let distances = cameras.iter().map(|camera| scene_distance(camera, means)).collect();
@@ -224,7 +224,7 @@ impl Fitter {
         self.step
     }
 
-    /// Splats there are.
+    /// Splats that steps change.
     pub fn splat_count(&self) -> usize {
         self.splats
     }
@@ -427,7 +427,7 @@ impl Fitter {
         let mut rng = self.rng(Draw::Density, u64::from(step));
         let (extent, splats, hull) = (self.extent, &mut self.splats, &self.hull);
         let cameras = &self.cameras;
-        self.device.edit(&mut |state| {
+        let mut change = |state: &mut FitState| {
             if let Some(hull) = hull.as_ref().filter(|_| leaving) {
                 let inside = hull.inside(&state.splats, cameras);
                 if inside.len() < state.splats.len() {
@@ -454,6 +454,7 @@ impl Fitter {
                 state.select(&morton_order(&state.splats.means));
             }
             *splats = state.splats.len();
-        })
+        };
+        self.device.edit(&mut |state| state.edit_moving(&mut change))
     }
 }

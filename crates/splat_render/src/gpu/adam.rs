@@ -26,6 +26,8 @@ pub(super) struct AdamBuffers {
     pub second: SplatBuffers,
     /// `[N * STATS]`
     pub stats: wgpu::Buffer,
+    /// So many splats, the first ones, are moved.
+    pub moving: u32,
 }
 
 /// What a step reads besides [`AdamBuffers`].
@@ -60,13 +62,16 @@ fn arrays_from_bytes(geometry: &[u8], colors: &[u8], sh_degree: u32) -> SplatArr
 }
 
 impl AdamBuffers {
-    /// Copies parameters, first and second moments, and statistics to the device.
+    /// Copies parameters, first and second moments, and statistics to the device, of splats of which
+    /// the first `moving` are moved.
     pub fn upload(
         gpu: &Gpu,
         [splats, first, second]: [SplatParams<'_, f32>; 3],
         stats: &[[f32; STATS]],
+        moving: u32,
     ) -> Result<Self> {
         Ok(Self {
+            moving,
             splats: SplatBuffers::upload(gpu, &splats)?,
             first: SplatBuffers::upload(gpu, &first)?,
             second: SplatBuffers::upload(gpu, &second)?,
@@ -96,10 +101,14 @@ impl AdamBuffers {
 
     /// The commands of a step.
     pub fn ops(&self, gpu: &Gpu, input: &AdamInput<'_>) -> Vec<Op> {
-        let Self { splats, first, second, stats } = self;
+        let Self { splats, first, second, stats, moving } = self;
         let (geometry, colors) = (GEOMETRY as u64, splats.color_floats);
         let mut ops = Vec::new();
         for window in splats.windows(gpu) {
+            let window = window.start..window.end.min(*moving);
+            if window.is_empty() {
+                break;
+            }
             let count = window.len() as u32;
             let uniform = gpu.uniform(&Window { first: window.start, count });
             let op = |kernel, floats, arrays: [&wgpu::Buffer; 4], groups| {
@@ -146,7 +155,7 @@ pub(super) fn adam(
     let n = state.splats.len();
     let degree = state.splats.sh_degree;
     let params = [&state.splats, &state.first, &state.second].map(|a| a.params(degree));
-    let buffers = AdamBuffers::upload(gpu, params, &vec![[0.0; STATS]; n])?;
+    let buffers = AdamBuffers::upload(gpu, params, &vec![[0.0; STATS]; n], n as u32)?;
     let given = GradientBuffers::upload(gpu, gradients)?;
     let count = buffers.splats.splats;
     let view = gpu.uniform(&View {

@@ -129,7 +129,7 @@ impl GpuFit {
             compensation: 1.0 / (1.0 - input.dropout),
             ..View::of_view(&input.camera, &ProjectOptions::default(), input.background)
         };
-        let step = Step::of_adam(&input.adam(), scene.len()).with_loss(
+        let step = Step::of_adam(&input.adam(), scene.adam.moving).with_loss(
             input.ssim_weight,
             photo.weight,
             photo.weights.is_some(),

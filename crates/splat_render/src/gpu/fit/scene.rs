@@ -58,6 +58,7 @@ impl Scene {
             gpu,
             [&state.splats, &state.first, &state.second].map(|a| a.params(a.sh_degree)),
             &stats_rows(&state.stats),
+            state.moving() as u32,
         )?;
         let n = adam.splats.splats;
         let first_guess = n.saturating_mul(PAIRS_PER_SPLAT).max(4096);
@@ -101,6 +102,7 @@ impl Scene {
                 grad_sum: stats.iter().map(|s| s[0]).collect(),
                 seen: stats.iter().map(|s| s[1]).collect(),
             },
+            frozen: (self.len() - self.adam.moving) as usize,
         })
     }
 }
