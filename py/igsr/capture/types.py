@@ -73,6 +73,22 @@ class Camera(ArrayEquality):
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
 
+@dataclass(frozen=True)
+class PoseEvidence:
+    """What a camera that was found rests on, and how well it is known.
+
+    Attributes:
+        rests_on: "features" (places that photos share), "network" (what a network predicts) or
+            "both".
+        rotation: standard deviation about each axis, degrees.
+        centre: standard deviation along each axis, world units.
+    """
+
+    rests_on: str
+    rotation: float
+    centre: float
+
+
 @dataclass(eq=False, repr=False)
 class View(ArrayEquality, NotebookPicture):
     """One photo with its camera.
@@ -104,6 +120,7 @@ class View(ArrayEquality, NotebookPicture):
         rig: the name that views of one wide photo (a panorama, a fisheye photo of more than 120
             degrees) share: they have one centre, move together and are held out together. None for
             other photos.
+        pose_evidence: what the camera rests on, where igsr found it; or None.
 
     Raises:
         IgsrError: the image, mask or weights have another dtype or shape than the camera's size
@@ -125,6 +142,7 @@ class View(ArrayEquality, NotebookPicture):
     rig: str | None = None
     depth: np.ndarray | None = None
     depth_confidence: np.ndarray | None = None
+    pose_evidence: PoseEvidence | None = None
 
     def __post_init__(self) -> None:
         """Check the pixels against the camera."""

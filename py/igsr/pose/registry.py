@@ -60,6 +60,7 @@ def _da3(
     cameras: Mapping[str, Camera] | None = None,
     cameras_from: str = "decoder",
     bundle_adjustment: bool = True,
+    matcher: str | Matcher = "sift",
 ) -> Estimator:
     with naming_extra("estimator da3"):
         from igsr.pose.da3.estimator import Da3
@@ -69,6 +70,7 @@ def _da3(
         cameras=cameras,
         cameras_from=cameras_from,
         bundle_adjustment=bundle_adjustment,
+        matcher=matcher,
     )
 
 

@@ -13,7 +13,6 @@ from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.geometry.similarity import Similarity
 from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.da3.chunks import mapped
 from igsr.pose.da3.preprocessing import resampling_of
 
 Float64 = npt.NDArray[np.float64]
@@ -79,7 +78,7 @@ class NoisyNetwork:
         turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
         turn *= np.sign(np.linalg.det(turn))
         world = Similarity(float(random.uniform(0.2, 5.0)), turn, random.normal(size=3))
-        return [mapped(self._noisy(photo, random), world) for photo in photos]
+        return [self._noisy(photo, random).mapped(world) for photo in photos]
 
     def _noisy(self, photo: Photo, random: np.random.Generator) -> AlignedPhoto:
         camera, whole = self.cameras[photo.name], self.depths[photo.name]

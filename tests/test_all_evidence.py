@@ -12,8 +12,6 @@ from igsr.capture import Camera
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
 from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.da3 import bundle_adjustment
-from igsr.pose.da3.bundle_adjustment import with_adjusted_cameras
 from igsr.pose.da3.estimator import Da3
 from igsr.pose.da3.preprocessing import resampling_of
 
