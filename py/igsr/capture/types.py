@@ -82,11 +82,25 @@ class PoseEvidence:
             "both".
         rotation: standard deviation about each axis, degrees.
         centre: standard deviation along each axis, world units.
+
+    Raises:
+        IgsrError: it rests on something else, or a deviation is negative or not finite.
     """
 
     rests_on: str
     rotation: float
     centre: float
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        if self.rests_on not in ("features", "network", "both"):
+            raise IgsrError(f"rests_on is {self.rests_on!r}; give 'features', 'network' or 'both'")
+        for name in ("rotation", "centre"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise IgsrError(
+                    f"the {name} of pose_evidence is {getattr(self, name)!r}; give a finite number "
+                    "of at least 0"
+                )
 
 
 @dataclass(eq=False, repr=False)

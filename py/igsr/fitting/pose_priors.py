@@ -62,6 +62,35 @@ class PosePriors:
 def pose_priors(
     views: Sequence[View], points: Points | None, *, poses: bool, focal: str
 ) -> PosePriors | None:
+    """What is known of the cameras that are to be optimized.
+
+    A camera with tracks is known by these, another by its ``pose_evidence``.
+
+    Args:
+        views, points, poses, focal: as ``priors_of_tracks``.
+
+    Returns:
+        None where nothing is known.
+    """
+    priors = priors_of_tracks(views, points, poses=poses, focal=focal)
+    if not poses or all(view.pose_evidence is None for view in views):
+        return priors
+    if priors is None:
+        priors = PosePriors(views, np.zeros((len(views), 6, 6)), np.zeros(len(views)))
+    information = priors.information.copy()
+    for k, view in enumerate(views):
+        known = view.pose_evidence
+        if known is None or information[k].any() or not min(known.rotation, known.centre) > 0.0:
+            continue
+        # Not ``LEFT_OPEN`` of it: a prediction is wrong by all of it, and colors may mend it.
+        deviations = np.repeat([np.radians(known.rotation), known.centre], 3)
+        information[k] = np.diag(1.0 / deviations**2)
+    return PosePriors(views, information, priors.focal_information)
+
+
+def priors_of_tracks(
+    views: Sequence[View], points: Points | None, *, poses: bool, focal: str
+) -> PosePriors | None:
     """What the tracks of a capture say about the cameras that are to be optimized.
 
     Args:

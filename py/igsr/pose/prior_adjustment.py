@@ -274,7 +274,9 @@ class _Problem:
         local += viewmats[:, :3, 3]
         with np.errstate(all="ignore"):
             place = local[:, :2] / local[:, 2:] * K[:, [0, 1], [0, 1]] + K[:, :2, 2]
-            depth = (np.log(local[:, 2] / seen.depth) - bundle.scales[seen.view]) / self.depth_deviations
+            depth = (
+                np.log(local[:, 2] / seen.depth) - bundle.scales[seen.view]
+            ) / self.depth_deviations
         place[local[:, 2] <= 0.0] = np.inf
         return place - seen.xy, np.where(np.isfinite(seen.depth), depth, 0.0), local
 

@@ -82,10 +82,10 @@ def _da3_is_ready(options: Mapping[str, Any]) -> bool:
     return find_checkpoint(options.get("checkpoint")) is not None
 
 
-#: In the order that "auto" tries them. COLMAP is always ready: what stands behind it is taken by
-#: name only, as Depth Anything 3, of which nobody measured that it finds better cameras.
+#: In the order that "auto" tries them. A network comes before COLMAP: where COLMAP places all photos,
+#: its cameras stand with a network, too. COLMAP is always ready, and is last.
 ESTIMATORS = {
     "dust3r": Entry(_dust3r, _dust3r_is_ready),
-    "colmap": Entry(_colmap, lambda options: True),
     "da3": Entry(_da3, _da3_is_ready),
+    "colmap": Entry(_colmap, lambda options: True),
 }
