@@ -26,7 +26,7 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
     """
     frames = []
     for view in views:
-        camera = view.camera
+        camera, known = view.camera, view.pose_evidence
         to_world = np.linalg.inv(camera.viewmat)
         to_world[:3, 1:3] *= -1.0
         frames.append(
@@ -40,11 +40,7 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
                 "cy": float(camera.K[1, 2]),
                 "transform_matrix": to_world.tolist(),
                 **({} if view.rig is None else {"rig": view.rig}),
-                **(
-                    {}
-                    if view.pose_evidence is None
-                    else {"pose_evidence": vars(view.pose_evidence)}
-                ),
+                **({} if known is None else {"pose_evidence": vars(known)}),
                 **({} if view.exposure is None else {"exposure": view.exposure.plain()}),
             }
         )

@@ -78,8 +78,8 @@ MatcherOption = Annotated[
     typer.Option(
         "--matcher",
         metavar="NAME",
-        help="For colmap and da3: what finds and matches features: sift, or loma (a network that matches "
-        "photos from further apart; needs the package lomatch).",
+        help="For colmap and da3: what finds and matches features: sift, or loma (a network that "
+        "matches photos from further apart; needs the package lomatch).",
     ),
 ]
 

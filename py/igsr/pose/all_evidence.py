@@ -192,7 +192,9 @@ def _adjusted(
             camera = found.model.images[image].camera
             lenses[camera.camera_id] = camera.params
     confident = [
-        None if one is None else replace(one, depth=np.where(known, one.depth, np.float32(np.nan)))
+        None
+        if one is None or known is None
+        else replace(one, depth=np.where(known, one.depth, np.float32(np.nan)))
         for one, known in zip(world, sure, strict=True)
     ]
     return adjusted(photos, starts, confident, usual_spread(world), matches, lenses, seed, show)
@@ -260,15 +262,15 @@ def _by_both(
 
 def _far_off(predicted: Sequence[Camera | None], result: Adjusted) -> bool:
     """Whether adjusted cameras are so far from the predicted ones that they must be wrong."""
-    pairs = [
-        (camera, before)
-        for i, camera in result.cameras.items()
-        if (before := predicted[i]) is not None and result.observed[i] >= FEWEST_POINTS
-    ]
-    if len(pairs) < 2:
+    after, before = [], []
+    for i, camera in result.cameras.items():
+        wanted = predicted[i]
+        if wanted is not None and result.observed[i] >= FEWEST_POINTS:
+            after.append(camera)
+            before.append(wanted)
+    if len(after) < 2:
         return False
-    after, before = (list(side) for side in zip(*pairs, strict=True))
-    changes = [a.K[0, 0] / b.K[0, 0] for a, b in pairs]
+    changes = [a.K[0, 0] / b.K[0, 0] for a, b in zip(after, before, strict=True)]
     turned = pose_errors(after, before)["rotation"]
     return turned > FARTHEST or max(max(c, 1.0 / c) for c in changes) > STRETCHED
 

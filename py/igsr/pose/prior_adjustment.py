@@ -288,8 +288,8 @@ def _stepped(bundle: Bundle, equations: Equations, prior: Float64, damping: floa
     information = normal[:size, :size]
     information = information + np.diag(damping * np.diagonal(information) + RIDGE)
     try:
-        step = np.linalg.solve(information, -normal[:size, size])
-        points = bundle.points + steps_of_points(equations, step, RIDGE + damping)
+        step: Float64 = np.linalg.solve(information, -normal[:size, size])
+        points: Float64 = bundle.points + steps_of_points(equations, step, RIDGE + damping)
     except np.linalg.LinAlgError:
         return None
     count, lenses = len(bundle.cameras), int(bundle.lenses.max()) + 1

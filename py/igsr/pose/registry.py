@@ -82,8 +82,8 @@ def _da3_is_ready(options: Mapping[str, Any]) -> bool:
     return find_checkpoint(options.get("checkpoint")) is not None
 
 
-#: In the order that "auto" tries them. A network comes before COLMAP: where COLMAP places all photos,
-#: its cameras stand with a network, too. COLMAP is always ready, and is last.
+#: In the order that "auto" tries them. Depth Anything 3 comes before COLMAP, whose cameras stand
+#: there, too, where it places all photos. COLMAP is always ready, and is last.
 ESTIMATORS = {
     "dust3r": Entry(_dust3r, _dust3r_is_ready),
     "da3": Entry(_da3, _da3_is_ready),
