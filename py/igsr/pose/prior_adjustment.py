@@ -130,6 +130,9 @@ def covariances(
     """
     problem = _Problem(seen, predicted, spread, 1.0, _focals(bundle))
     equations, prior = problem.linearised(bundle)
+    # Observations are as exact as they turn out to be, the prediction is as given.
+    for rows in (equations.value[:, :2], equations.of_point[:, :2]):
+        rows /= problem.deviation(bundle)
     normal = (without_points(equations) + prior)[:-1, :-1]
     count = len(bundle.cameras)
     known = np.diagonal(normal)
@@ -139,7 +142,7 @@ def covariances(
     unseen[: 6 * count] = gauge(bundle.cameras)
     unseen = np.linalg.qr(unseen * scale[:, None])[0]
     covariance = np.linalg.inv(scaled + unseen @ unseen.T) - unseen @ unseen.T
-    covariance *= problem.variance(bundle) / np.outer(scale, scale)
+    covariance /= np.outer(scale, scale)
     return np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
 
 
@@ -190,11 +193,11 @@ class _Problem:
         cost += (((_focals(bundle) - self.focals) / FOCAL) ** 2).sum()
         return float(cost + ((bundle.scales / SCALE) ** 2).sum())
 
-    def variance(self, bundle: Bundle) -> float:
-        """Of observations, in units of what is expected; wrong ones do not count."""
+    def deviation(self, bundle: Bundle) -> float:
+        """Of observations, pixels; wrong ones do not count."""
         errors = np.linalg.norm(self._errors(bundle)[0], axis=1)
         # The median of distances in the plane is 1.18 standard deviations.
-        return max(LEAST_ERROR, float(np.median(errors)) / 1.18) ** 2
+        return max(LEAST_ERROR, float(np.median(errors)) / 1.18)
 
     def linearised(self, bundle: Bundle) -> tuple[Equations, Float64]:
         """Equations of observations, and normal equations of what needs no point."""
