@@ -260,7 +260,7 @@ def _fitted(
     if settings.moves_cameras and capture.points is not None:
         tracks = capture.points.tracks
     priors = None
-    if tracks is not None:
+    if settings.moves_cameras:
         # By the cameras as they were given, also where the fit goes on from others.
         poses = settings.poses != "fixed"
         priors = pose_priors(views, capture.points, poses=poses, focal=settings.focal)
