@@ -74,6 +74,17 @@ impl AdamBuffers {
         })
     }
 
+    /// Room for so many splats, of which nothing is known yet.
+    pub fn new(gpu: &Gpu, splats: u32, color_floats: u64) -> Result<Self> {
+        let arrays = || SplatBuffers::new(gpu, splats, color_floats);
+        Ok(Self {
+            splats: arrays()?,
+            first: arrays()?,
+            second: arrays()?,
+            stats: gpu.buffer("stats", u64::from(splats) * STATS as u64 * 4)?,
+        })
+    }
+
     /// Runs commands and brings back parameters, first and second moments, and statistics.
     pub fn download(
         &self,

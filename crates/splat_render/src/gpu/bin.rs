@@ -90,7 +90,7 @@ impl SplatBins {
         };
         let status = gpu.bindable("status", Self::status_bytes(chunks))?;
         let head = StatusHead { splats, step: 1, overflow: 0, unused: 0 };
-        gpu.queue.write_buffer(&status, 0, bytemuck::bytes_of(&head));
+        gpu.write(&status, 0, bytemuck::bytes_of(&head));
         Ok(Self {
             splats,
             keys: pair("depth keys")?,

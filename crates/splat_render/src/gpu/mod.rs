@@ -21,9 +21,10 @@ mod rasterize_backward;
 mod resident;
 mod resident_picture;
 mod shaders;
+mod traffic;
 
 pub use device::{Gpu, Injected, needed_limits};
-pub use fit::GpuFit;
+pub use fit::{GpuFit, PlannedFit, StepWork};
 pub use resident::{ResidentSplats, ResidentView};
 pub use resident_picture::ResidentPicture;
 pub use shaders::{ShaderVariant, shader_variants, shared_wgsl};

@@ -71,6 +71,17 @@ impl SplatBuffers {
         })
     }
 
+    /// Room for so many splats, of which nothing is known yet.
+    pub fn new(gpu: &Gpu, splats: u32, color_floats: u64) -> Result<Self> {
+        let rows = |floats: u64| u64::from(splats) * floats * 4;
+        Ok(Self {
+            splats,
+            color_floats,
+            geometry: gpu.buffer("geometry", rows(GEOMETRY as u64))?,
+            colors: gpu.buffer("colors", rows(color_floats))?,
+        })
+    }
+
     /// Windows of splats whose widest rows can be bound at once.
     pub fn windows(&self, gpu: &Gpu) -> Vec<Range<u32>> {
         let floats = self.color_floats.max((GEOMETRY.max(GRADIENT).max(SPLAT_2D)) as u64);

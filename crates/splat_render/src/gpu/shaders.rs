@@ -30,6 +30,8 @@ pub(super) struct Build {
     pub rows: u32,
     /// Whether a tile's threads are one subgroup and may share through it.
     pub subgroups: bool,
+    /// Whether the loss goes along whole rows and columns, a thread each.
+    pub loss_by_lines: bool,
     /// Workgroups that scans and sorts are cut into: a few per core keep a CPU busy; a GPU needs many.
     pub segments: u32,
 }
@@ -37,9 +39,9 @@ pub(super) struct Build {
 impl Build {
     /// For GPUs, for software adapters with subgroups of a tile's threads, and for others.
     pub const ALL: [Self; 3] = [
-        Self { rows: 2, subgroups: false, segments: 256 },
-        Self { rows: 8, subgroups: true, segments: 16 },
-        Self { rows: 8, subgroups: false, segments: 16 },
+        Self { rows: 2, subgroups: false, loss_by_lines: false, segments: 256 },
+        Self { rows: 8, subgroups: true, loss_by_lines: true, segments: 16 },
+        Self { rows: 8, subgroups: false, loss_by_lines: true, segments: 16 },
     ];
 
     /// Threads of a tile.
@@ -69,6 +71,9 @@ const BACKWARD_BINDINGS: [Access; 10] =
     [Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BACKWARD_SUM: &str = include_str!("shaders/rasterize_backward_sum.wgsl");
 const BACKWARD_SUM_BINDINGS: [Access; 7] = [Uniform, Read, Read, Read, Read, Read, ReadWrite];
+const LOSS_PIXELS: &str = include_str!("shaders/loss_pixels.wgsl");
+const LOSS_BINDINGS: [Access; 9] =
+    [Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite];
 const TILE_WORK: [&str; 2] =
     [include_str!("shaders/tile_memory.wgsl"), include_str!("shaders/tile_subgroup.wgsl")];
 const TILE_SUMS: [&str; 2] = [
@@ -87,7 +92,7 @@ const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 16] = [
+pub(super) static SOURCES: [Source; 17] = [
     Source {
         name: "project",
         shared_work: None,
@@ -189,8 +194,15 @@ pub(super) static SOURCES: [Source; 16] = [
     Source {
         name: "loss",
         shared_work: None,
-        parts: &[SHARED, include_str!("shaders/loss.wgsl")],
-        bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+        parts: &[SHARED, LOSS_PIXELS, include_str!("shaders/loss.wgsl")],
+        bindings: &LOSS_BINDINGS,
+        segmented: false,
+    },
+    Source {
+        name: "loss_lines",
+        shared_work: None,
+        parts: &[SHARED, LOSS_PIXELS, include_str!("shaders/loss_lines.wgsl")],
+        bindings: &LOSS_BINDINGS,
         segmented: false,
     },
     Source {
@@ -228,6 +240,9 @@ pub(super) enum Kernel {
     ExposureBackward,
     LossSlopes,
     LossGradient,
+    LossColumns,
+    LossRows,
+    LossColumnsGradient,
     DepthLoss,
     AdamGeometry,
     AdamColors,
@@ -235,7 +250,7 @@ pub(super) enum Kernel {
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 23] = [
+    pub const ALL: [Self; 26] = [
         Self::Project,
         Self::ProjectBackward,
         Self::DepthKeys,
@@ -256,6 +271,9 @@ impl Kernel {
         Self::ExposureBackward,
         Self::LossSlopes,
         Self::LossGradient,
+        Self::LossColumns,
+        Self::LossRows,
+        Self::LossColumnsGradient,
         Self::DepthLoss,
         Self::AdamGeometry,
         Self::AdamColors,
@@ -288,6 +306,9 @@ impl Kernel {
             Self::ExposureBackward => ("exposure", "exposure_backward"),
             Self::LossSlopes => ("loss", "loss_slopes"),
             Self::LossGradient => ("loss", "loss_gradient"),
+            Self::LossColumns => ("loss_lines", "loss_columns"),
+            Self::LossRows => ("loss_lines", "loss_rows"),
+            Self::LossColumnsGradient => ("loss_lines", "loss_columns_gradient"),
             Self::DepthLoss => ("depth_loss", "depth_loss"),
             Self::AdamGeometry => ("adam", "adam_geometry"),
             Self::AdamColors => ("adam", "adam_colors"),
@@ -334,6 +355,10 @@ fn constants(rows: u32) -> String {
         for (i, value) in values.iter().enumerate() {
             let _ = writeln!(out, "const {name}_{i} = {:e}f;", *value as f32);
         }
+    }
+    // SSIM's window is symmetric.
+    for (i, tap) in SSIM_WINDOW.iter().take(SSIM_WINDOW.len() / 2 + 1).enumerate() {
+        let _ = writeln!(out, "const SSIM_TAP_{i} = {tap:e}f;");
     }
     // Weights of each of the 14 values that four neighbouring outputs of SSIM's filter need.
     let tap = |k: usize, output: usize| {

@@ -183,6 +183,7 @@ impl Gpu {
             failure,
             lost,
             injected: injected.clone(),
+            planned: None,
             made: Default::default(),
             binding_limit,
             groups_max,

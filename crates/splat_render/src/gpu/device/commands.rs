@@ -2,6 +2,7 @@
 
 use std::num::NonZeroU64;
 use std::ops::Range;
+use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -28,13 +29,25 @@ impl<'a> Bound<'a> {
     pub fn part(buffer: &'a wgpu::Buffer, bytes: Range<u64>) -> Self {
         Self { buffer, bytes: Some(bytes) }
     }
+
+    /// Bytes that are bound.
+    fn size(&self, gpu: &Gpu) -> u64 {
+        self.bytes.as_ref().map_or_else(|| gpu.size_of(self.buffer), |b| b.end - b.start)
+    }
 }
 
 /// One prepared command.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) enum Op {
     /// Runs a kernel.
-    Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2] },
+    Dispatch {
+        kernel: Kernel,
+        /// Bytes of each binding, in the order of their numbers.
+        bound: Arc<[u64]>,
+        /// None where work is only planned.
+        run: Option<(wgpu::ComputePipeline, wgpu::BindGroup)>,
+        groups: [u32; 2],
+    },
     /// Fills a buffer with zeros.
     Clear(wgpu::Buffer),
     /// Copies so many bytes (the last) from the start of the first buffer to an offset in the second.
@@ -96,6 +109,10 @@ impl Gpu {
         bindings: &[Bound<'_>],
         groups: [u32; 2],
     ) -> Op {
+        let bound = bindings.iter().map(|bound| bound.size(self)).collect();
+        if self.planned.is_some() {
+            return Op::Dispatch { kernel, bound, run: None, groups };
+        }
         let entries: Vec<_> = bindings
             .iter()
             .enumerate()
@@ -115,7 +132,7 @@ impl Gpu {
             layout: self.layout(kernel.entry().0),
             entries: &entries,
         });
-        Op::Dispatch { pipeline, bind_group, groups }
+        Op::Dispatch { kernel, bound, run: Some((pipeline, bind_group)), groups }
     }
 
     /// Workgroups for `count` invocations or tiles, spilling into y past the limit of x.
@@ -164,7 +181,7 @@ impl Gpu {
         let mut pass = encoder
             .begin_compute_pass(&wgpu::ComputePassDescriptor { label: None, timestamp_writes });
         for op in ops {
-            if let Op::Dispatch { pipeline, bind_group, groups } = op {
+            if let Op::Dispatch { run: Some((pipeline, bind_group)), groups, .. } = op {
                 pass.set_pipeline(pipeline);
                 pass.set_bind_group(0, bind_group, &[]);
                 pass.dispatch_workgroups(groups[0], groups[1], 1);

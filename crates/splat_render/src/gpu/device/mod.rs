@@ -6,6 +6,7 @@ mod buffers;
 mod commands;
 mod injected;
 mod limits;
+mod planned;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -31,6 +32,8 @@ pub struct Gpu {
     lost: Arc<OnceLock<String>>,
     /// What tests make it do.
     injected: Injected,
+    /// Where work is planned and not done.
+    planned: Option<planned::Planned>,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
     /// Most bytes that a storage binding may have.
@@ -85,9 +88,25 @@ impl Gpu {
         self
     }
 
+    /// Plans work for a discrete GPU that binds `binding_limit` bytes at once, and does none of it.
+    #[must_use]
+    pub(super) fn planning(mut self, binding_limit: u64) -> Self {
+        self.build = Build::ALL[0];
+        self.list_limit = list_limit(false, false);
+        self.binding_limit = binding_limit;
+        self.groups_max = GROUPS_MAX;
+        self.planned = Some(planned::Planned::default());
+        self
+    }
+
     /// Workgroups that scans and sorts are cut into.
     pub(super) fn segments(&self) -> u32 {
         self.build.segments
+    }
+
+    /// Whether the loss goes along whole rows and columns.
+    pub(super) fn loss_by_lines(&self) -> bool {
+        self.build.loss_by_lines
     }
 
     /// Name of the adapter and its driver.

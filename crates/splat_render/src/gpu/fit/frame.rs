@@ -62,6 +62,12 @@ impl Frame {
         })
     }
 
+    /// Brings a photo to where the loss reads it.
+    pub fn copy_photo(&self, rgba: &wgpu::Buffer) -> Op {
+        let bytes = u64::from(self.width) * u64::from(self.height) * 4;
+        Op::Copy(rgba.clone(), self.loss.photo.clone(), 0, bytes)
+    }
+
     /// Makes the commands of a whole step, unless they are there already.
     pub fn prepare(
         &mut self,

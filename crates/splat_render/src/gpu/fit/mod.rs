@@ -14,6 +14,7 @@
 //! test holds the sum per splat.
 
 mod frame;
+mod plan;
 mod scene;
 
 use std::sync::Arc;
@@ -33,6 +34,7 @@ use crate::sh;
 use crate::stages::ProjectOptions;
 use crate::target::{Target, Weight};
 use frame::{Frame, Parts};
+pub use plan::{PlannedFit, StepWork};
 use scene::{Scene, pair_buffers};
 
 /// Steps that may be under way before the host looks whether all pairs fitted.
@@ -144,7 +146,7 @@ impl GpuFit {
         let step_at = std::mem::offset_of!(StatusHead, step) as u64;
         queue.write_buffer(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
         let bytes = u64::from(frame.width) * u64::from(frame.height) * 4;
-        let mut copies = vec![Op::Copy(photo.rgba.clone(), frame.loss.photo.clone(), 0, bytes)];
+        let mut copies = vec![frame.copy_photo(&photo.rgba)];
         if let Some(weights) = &photo.weights {
             copies.push(Op::Copy(weights.clone(), frame.loss.weights.clone(), 0, bytes));
         }
@@ -372,7 +374,7 @@ impl FitDevice for GpuFit {
         for frame in &mut self.frames {
             frame.ops.clear();
         }
-        self.scene = Some(Scene::new(&self.gpu, &state, self.tiles, capacity, chunks)?);
+        self.scene = Some(Scene::upload(&self.gpu, &state, self.tiles, capacity, chunks)?);
         Ok(())
     }
 

@@ -47,7 +47,8 @@ pub(super) fn pair_buffers(
 }
 
 impl Scene {
-    pub fn new(
+    /// Of this state, with room for `capacity` pairs at least.
+    pub fn upload(
         gpu: &Gpu,
         state: &FitState,
         tiles: u32,
@@ -59,13 +60,25 @@ impl Scene {
             [&state.splats, &state.first, &state.second].map(|a| a.params(a.sh_degree)),
             &stats_rows(&state.stats),
         )?;
+        Self::new(gpu, adam, state.splats.sh_degree, tiles, capacity, chunks)
+    }
+
+    /// Around these splats.
+    pub fn new(
+        gpu: &Gpu,
+        adam: AdamBuffers,
+        sh_degree: u32,
+        tiles: u32,
+        capacity: u32,
+        chunks: u32,
+    ) -> Result<Self> {
         let n = adam.splats.splats;
         let first_guess = n.saturating_mul(PAIRS_PER_SPLAT).max(4096);
         let capacity = capacity.max(first_guess).min(pair_limit(gpu, GRADIENT));
         let (pairs, slots) = pair_buffers(gpu, capacity, tiles)?;
         let row = |floats: usize| u64::from(n) * floats as u64 * 4;
         Ok(Self {
-            sh_degree: state.splats.sh_degree,
+            sh_degree,
             splats2d: gpu.bindable("splats2d", row(SPLAT_2D))?,
             v_splats2d: gpu.bindable("v_splats2d", row(GRADIENT))?,
             gradients: GradientBuffers::new(gpu, &adam.splats)?,
