@@ -6,6 +6,7 @@ use std::ops::Range;
 use bytemuck::{Pod, Zeroable};
 
 use crate::camera::Camera;
+use super::device::Gpu;
 use crate::constants::TILE;
 use crate::stages::{AdamStep, Colors, Exposure, ProjectOptions, Rates, SplatParams};
 use crate::target::Weight;
@@ -108,6 +109,14 @@ impl View {
 pub(super) struct Window {
     pub first: u32,
     pub count: u32,
+    pub groups_max: u32,
+}
+
+impl Window {
+    /// These splats.
+    pub fn of(gpu: &Gpu, splats: &Range<u32>) -> Self {
+        Self { first: splats.start, count: splats.len() as u32, groups_max: gpu.groups_max }
+    }
 }
 
 /// The tiles of one dispatch and where their pairs are counted.
@@ -123,6 +132,7 @@ pub(super) struct Chunk {
     pub is_last: u32,
     pub list_begin: u32,
     pub list_end: u32,
+    pub groups_max: u32,
 }
 
 impl Chunk {
@@ -138,6 +148,7 @@ impl Chunk {
             is_last: 1,
             list_begin: 0,
             list_end: u32::MAX,
+            groups_max: u32::MAX,
         }
     }
 
@@ -160,6 +171,8 @@ impl Chunk {
 pub(super) struct SortPass {
     pub shift: u32,
     pub chunk: u32,
+    pub is_first: u32,
+    pub keeps_culled: u32,
 }
 
 /// `SortPass::chunk` for the sort of all splats by depth.
@@ -193,7 +206,7 @@ pub(super) struct StatusHead {
     pub splats: u32,
     pub step: u32,
     pub overflow: u32,
-    pub unused: u32,
+    pub visible: u32,
 }
 
 /// What the depth of a photo counts in a step.

@@ -95,12 +95,17 @@ pub(super) fn rows<'a>(buffer: &'a wgpu::Buffer, window: &Range<u32>, floats: u6
     Bound::part(buffer, bytes)
 }
 
-/// Projects all splats.
-pub(super) fn project_ops(gpu: &Gpu, to: Projection<'_>, splats: &SplatBuffers) -> Vec<Op> {
+/// Projects all splats; their depth keys go to `[N]` `keys`.
+pub(super) fn project_ops(
+    gpu: &Gpu,
+    to: Projection<'_>,
+    splats: &SplatBuffers,
+    keys: &wgpu::Buffer,
+) -> Vec<Op> {
     let mut ops = Vec::new();
     for window in splats.windows(gpu) {
         let count = window.len() as u32;
-        let uniform = gpu.uniform(&Window { first: window.start, count });
+        let uniform = gpu.uniform(&Window::of(gpu, &window));
         ops.push(gpu.op(
             Kernel::Project,
             &[
@@ -109,6 +114,7 @@ pub(super) fn project_ops(gpu: &Gpu, to: Projection<'_>, splats: &SplatBuffers) 
                 rows(&splats.geometry, &window, GEOMETRY as u64),
                 rows(&splats.colors, &window, splats.color_floats),
                 rows(to.splats2d, &window, SPLAT_2D as u64),
+                rows(keys, &window, 1),
             ],
             gpu.groups(count, SPLATS_PER_GROUP),
         ));
@@ -128,11 +134,15 @@ pub(super) fn project(
     let bytes = (n * size_of::<Splat2d>()) as u64;
     let splats2d = gpu.buffer("splats2d", bytes)?;
     let to = Projection { view: &view, splats2d: &splats2d };
-    let ops = project_ops(gpu, to, &buffers);
+    let keys = gpu.buffer("depth keys", 4 * n as u64)?;
+    let ops = project_ops(gpu, to, &buffers, &keys);
     let data = gpu.download(&ops, &[(&splats2d, bytes)])?;
     let mut out = Projected::culled(n, camera.width, camera.height);
     for (i, bytes) in data[0].chunks_exact(size_of::<Splat2d>()).enumerate() {
         let splat: Splat2d = bytemuck::pod_read_unaligned(bytes);
+        if splat.radii == [0.0; 2] {
+            continue;
+        }
         out.means2d[i] = splat.mean;
         out.factors[i] = [splat.pq[0], splat.pq[1], splat.r];
         out.depths[i] = splat.depth;

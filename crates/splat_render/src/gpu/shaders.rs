@@ -30,6 +30,8 @@ pub(super) struct Build {
     pub rows: u32,
     /// Whether a tile's threads are one subgroup and may share through it.
     pub subgroups: bool,
+    /// Bits that one pass of the radix sort takes.
+    pub digit_bits: u32,
     /// Whether the loss goes along whole rows and columns, a thread each.
     pub loss_by_lines: bool,
     /// Workgroups that scans and sorts are cut into: a few per core keep a CPU busy; a GPU needs many.
@@ -39,9 +41,9 @@ pub(super) struct Build {
 impl Build {
     /// For GPUs, for software adapters with subgroups of a tile's threads, and for others.
     pub const ALL: [Self; 3] = [
-        Self { rows: 2, subgroups: false, loss_by_lines: false, segments: 256 },
-        Self { rows: 8, subgroups: true, loss_by_lines: true, segments: 16 },
-        Self { rows: 8, subgroups: false, loss_by_lines: true, segments: 16 },
+        Self { rows: 2, subgroups: false, digit_bits: 8, loss_by_lines: false, segments: 256 },
+        Self { rows: 8, subgroups: true, digit_bits: 4, loss_by_lines: true, segments: 16 },
+        Self { rows: 8, subgroups: false, digit_bits: 4, loss_by_lines: true, segments: 16 },
     ];
 
     /// Threads of a tile.
@@ -65,6 +67,15 @@ pub(super) struct Source {
 
 const SHARED: &str = include_str!("shaders/shared.wgsl");
 const GEOMETRY_WGSL: &str = include_str!("shaders/geometry.wgsl");
+/// Declared before [`GEOMETRY_WGSL`], by what a kernel does with it.
+const GEOMETRY_READ: &str = "@group(0) @binding(2) var<storage, read> geometry: array<f32>;\n";
+const GEOMETRY_UPDATED: &str =
+    "@group(0) @binding(2) var<storage, read_write> geometry: array<f32>;\n";
+const SPLAT_BACKWARD: &str = include_str!("shaders/splat_backward.wgsl");
+const ADAM_UPDATE: &str = include_str!("shaders/adam_update.wgsl");
+const ADAM_GEOMETRY: &str = include_str!("shaders/adam_geometry.wgsl");
+const SORT_KEYS: &str = include_str!("shaders/bin_sort_keys.wgsl");
+const SORT_BINDINGS: [Access; 7] = [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BIN_TILES: &str = include_str!("shaders/bin_tiles.wgsl");
 const BACKWARD: &str = include_str!("shaders/rasterize_backward.wgsl");
 const BACKWARD_BINDINGS: [Access; 10] =
@@ -92,33 +103,57 @@ const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 17] = [
+pub(super) static SOURCES: [Source; 20] = [
     Source {
         name: "project",
         shared_work: None,
-        parts: &[SHARED, GEOMETRY_WGSL, include_str!("shaders/project.wgsl")],
-        bindings: &[Uniform, Uniform, Read, Read, ReadWrite],
+        parts: &[SHARED, GEOMETRY_READ, GEOMETRY_WGSL, include_str!("shaders/project.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "project_backward",
         shared_work: None,
-        parts: &[SHARED, GEOMETRY_WGSL, include_str!("shaders/project_backward.wgsl")],
+        parts: &[
+            SHARED,
+            GEOMETRY_READ,
+            GEOMETRY_WGSL,
+            SPLAT_BACKWARD,
+            include_str!("shaders/project_backward.wgsl"),
+        ],
         bindings: &[Uniform, Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "fit_geometry",
+        shared_work: None,
+        parts: &[
+            SHARED,
+            GEOMETRY_UPDATED,
+            GEOMETRY_WGSL,
+            SPLAT_BACKWARD,
+            ADAM_UPDATE,
+            ADAM_GEOMETRY,
+            include_str!("shaders/fit_geometry.wgsl"),
+        ],
+        bindings: &[
+            Uniform, Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite,
+            Uniform,
+        ],
         segmented: false,
     },
     Source {
         name: "bin_count",
         shared_work: None,
         parts: &[SHARED, BIN_TILES, include_str!("shaders/bin_count.wgsl")],
-        bindings: &[Uniform, Uniform, Read, ReadWrite, ReadWrite, ReadWrite],
+        bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_scan",
         shared_work: None,
         parts: &[SHARED, include_str!("shaders/bin_scan.wgsl")],
-        bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite],
+        bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
         segmented: true,
     },
     Source {
@@ -131,8 +166,15 @@ pub(super) static SOURCES: [Source; 17] = [
     Source {
         name: "bin_sort",
         shared_work: None,
-        parts: &[SHARED, include_str!("shaders/bin_sort.wgsl")],
-        bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+        parts: &[SHARED, SORT_KEYS, include_str!("shaders/bin_sort.wgsl")],
+        bindings: &SORT_BINDINGS,
+        segmented: true,
+    },
+    Source {
+        name: "bin_sort_wide",
+        shared_work: None,
+        parts: &[SHARED, SORT_KEYS, include_str!("shaders/bin_sort_wide.wgsl")],
+        bindings: &SORT_BINDINGS,
         segmented: true,
     },
     Source {
@@ -206,9 +248,16 @@ pub(super) static SOURCES: [Source; 17] = [
         segmented: false,
     },
     Source {
-        name: "adam",
+        name: "adam_geometry",
         shared_work: None,
-        parts: &[SHARED, include_str!("shaders/adam.wgsl")],
+        parts: &[SHARED, ADAM_UPDATE, ADAM_GEOMETRY, include_str!("shaders/adam_plain.wgsl")],
+        bindings: &[Uniform, Uniform, ReadWrite, Read, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "adam_colors",
+        shared_work: None,
+        parts: &[SHARED, ADAM_UPDATE, include_str!("shaders/adam_colors.wgsl")],
         bindings: &[
             Uniform, Uniform, Uniform, Read, ReadWrite, Read, ReadWrite, ReadWrite, Read, Read,
             ReadWrite,
@@ -222,6 +271,7 @@ pub(super) static SOURCES: [Source; 17] = [
 pub(super) enum Kernel {
     Project,
     ProjectBackward,
+    FitGeometry,
     DepthKeys,
     TileCounts,
     ScanSums,
@@ -230,6 +280,8 @@ pub(super) enum Kernel {
     SortHistogram,
     SortScan,
     SortScatter,
+    SortCount,
+    SortPlace,
     Ranges,
     Rasterize,
     RasterizeBackward,
@@ -250,9 +302,10 @@ pub(super) enum Kernel {
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 26] = [
+    pub const ALL: [Self; 29] = [
         Self::Project,
         Self::ProjectBackward,
+        Self::FitGeometry,
         Self::DepthKeys,
         Self::TileCounts,
         Self::ScanSums,
@@ -261,6 +314,8 @@ impl Kernel {
         Self::SortHistogram,
         Self::SortScan,
         Self::SortScatter,
+        Self::SortCount,
+        Self::SortPlace,
         Self::Ranges,
         Self::Rasterize,
         Self::RasterizeBackward,
@@ -284,6 +339,7 @@ impl Kernel {
         match self {
             Self::Project => ("project", "project"),
             Self::ProjectBackward => ("project_backward", "project_backward"),
+            Self::FitGeometry => ("fit_geometry", "fit_geometry"),
             Self::DepthKeys => ("bin_count", "depth_keys"),
             Self::TileCounts => ("bin_count", "tile_counts"),
             Self::ScanSums => ("bin_scan", "scan_sums"),
@@ -292,6 +348,8 @@ impl Kernel {
             Self::SortHistogram => ("bin_sort", "sort_histogram"),
             Self::SortScan => ("bin_sort", "sort_scan"),
             Self::SortScatter => ("bin_sort", "sort_scatter"),
+            Self::SortCount => ("bin_sort_wide", "sort_count"),
+            Self::SortPlace => ("bin_sort_wide", "sort_place"),
             Self::Ranges => ("bin_ranges", "ranges"),
             Self::Rasterize => ("rasterize", "rasterize"),
             Self::RasterizeBackward => ("rasterize_backward", "rasterize_backward"),
@@ -310,8 +368,8 @@ impl Kernel {
             Self::LossRows => ("loss_lines", "loss_rows"),
             Self::LossColumnsGradient => ("loss_lines", "loss_columns_gradient"),
             Self::DepthLoss => ("depth_loss", "depth_loss"),
-            Self::AdamGeometry => ("adam", "adam_geometry"),
-            Self::AdamColors => ("adam", "adam_colors"),
+            Self::AdamGeometry => ("adam_geometry", "adam_geometry"),
+            Self::AdamColors => ("adam_colors", "adam_colors"),
         }
     }
 }
@@ -553,7 +611,7 @@ mod tests {
             dropout_seed,
             compensation
         );
-        layout!("project", Window, first, count);
+        layout!("project", Window, first, count, groups_max);
         layout!("depth_loss", DepthStep, scale);
         assert_layout(
             "exposure",
@@ -577,13 +635,14 @@ mod tests {
             is_first,
             is_last,
             list_begin,
-            list_end
+            list_end,
+            groups_max
         );
-        layout!("bin_sort", SortPass, shift, chunk);
+        layout!("bin_sort", SortPass, shift, chunk, is_first, keeps_culled);
         layout!("project", Splat2d, mean, pq, color, r, depth, opacity, radii);
         layout!("bin_scan", ChunkCount, pairs, total);
         layout!(
-            "adam",
+            "adam_colors",
             Step,
             means,
             quats,
@@ -611,7 +670,7 @@ mod tests {
                 ("splats", offset_of!(StatusHead, splats)),
                 ("step", offset_of!(StatusHead, step)),
                 ("overflow", offset_of!(StatusHead, overflow)),
-                ("unused", offset_of!(StatusHead, unused)),
+                ("visible", offset_of!(StatusHead, visible)),
                 ("chunks", size_of::<StatusHead>()),
             ],
         );

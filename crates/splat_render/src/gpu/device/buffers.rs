@@ -31,6 +31,7 @@ impl Gpu {
             label: Some(label),
             size,
             usage: wgpu::BufferUsages::STORAGE
+                | wgpu::BufferUsages::INDIRECT
                 | wgpu::BufferUsages::COPY_SRC
                 | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: cfg!(debug_assertions),

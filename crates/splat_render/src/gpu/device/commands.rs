@@ -36,6 +36,21 @@ impl<'a> Bound<'a> {
     }
 }
 
+/// How many workgroups a dispatch has.
+#[derive(Debug, Clone)]
+pub(in crate::gpu) enum Groups {
+    /// So many, known when it is prepared.
+    Direct([u32; 2]),
+    /// As three numbers at an offset in a buffer say, bytes.
+    Indirect(wgpu::Buffer, u64),
+}
+
+impl From<[u32; 2]> for Groups {
+    fn from(groups: [u32; 2]) -> Self {
+        Self::Direct(groups)
+    }
+}
+
 /// One prepared command.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) enum Op {
@@ -46,7 +61,7 @@ pub(in crate::gpu) enum Op {
         bound: Arc<[u64]>,
         /// None where work is only planned.
         run: Option<(wgpu::ComputePipeline, wgpu::BindGroup)>,
-        groups: [u32; 2],
+        groups: Groups,
     },
     /// Fills a buffer with zeros.
     Clear(wgpu::Buffer),
@@ -107,8 +122,9 @@ impl Gpu {
         &self,
         kernel: Kernel,
         bindings: &[Bound<'_>],
-        groups: [u32; 2],
+        groups: impl Into<Groups>,
     ) -> Op {
+        let groups = groups.into();
         let bound = bindings.iter().map(|bound| bound.size(self)).collect();
         if self.planned.is_some() {
             return Op::Dispatch { kernel, bound, run: None, groups };
@@ -145,8 +161,7 @@ impl Gpu {
     /// Splats `begin..end` of each dispatch, so that `bytes_per_splat` times their number can be
     /// bound at once.
     pub(in crate::gpu) fn windows(&self, splats: u32, bytes_per_splat: u64) -> Vec<Range<u32>> {
-        let fit =
-            (self.binding_limit / bytes_per_splat).min(u64::from(self.groups_max) * 64) as u32;
+        let fit = (self.binding_limit / bytes_per_splat).min(u64::from(u32::MAX / 2)) as u32;
         let step = (fit / SPLATS_PER_GROUP).max(1) * SPLATS_PER_GROUP;
         (0..splats).step_by(step as usize).map(|b| b..(b + step).min(splats)).collect()
     }
@@ -184,7 +199,10 @@ impl Gpu {
             if let Op::Dispatch { run: Some((pipeline, bind_group)), groups, .. } = op {
                 pass.set_pipeline(pipeline);
                 pass.set_bind_group(0, bind_group, &[]);
-                pass.dispatch_workgroups(groups[0], groups[1], 1);
+                match groups {
+                    Groups::Direct([x, y]) => pass.dispatch_workgroups(*x, *y, 1),
+                    Groups::Indirect(buffer, at) => pass.dispatch_workgroups_indirect(buffer, *at),
+                }
             }
         }
     }

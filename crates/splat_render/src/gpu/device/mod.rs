@@ -11,7 +11,7 @@ mod planned;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
-pub(super) use commands::{Bound, Op};
+pub(super) use commands::{Bound, Groups, Op};
 pub use injected::Injected;
 pub use limits::needed_limits;
 
@@ -39,7 +39,7 @@ pub struct Gpu {
     /// Most bytes that a storage binding may have.
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
-    groups_max: u32,
+    pub(super) groups_max: u32,
     /// What the shaders are built for.
     build: Build,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
@@ -102,6 +102,11 @@ impl Gpu {
     /// Workgroups that scans and sorts are cut into.
     pub(super) fn segments(&self) -> u32 {
         self.build.segments
+    }
+
+    /// Bits that one pass of the radix sort takes.
+    pub(super) fn digit_bits(&self) -> u32 {
+        self.build.digit_bits
     }
 
     /// Whether the loss goes along whole rows and columns.

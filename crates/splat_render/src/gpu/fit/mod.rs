@@ -177,7 +177,7 @@ impl GpuFit {
                     scene.pending_cameras.insert(log)
                 }
             };
-            let (from, to) = (scene.gradients.camera.clone(), log.clone());
+            let (from, to) = (scene.v_camera.clone(), log.clone());
             sums.push(Op::Copy(from, to, at as u64 * bytes, bytes));
         }
         self.last = Some((input.view, input.ssim_weight, depth.is_some()));

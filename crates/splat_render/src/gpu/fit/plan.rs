@@ -71,8 +71,8 @@ impl PlannedFit {
             capacity: f64::from(self.scene.capacity),
         };
         let mut work = StepWork { dispatches: 0, bytes: 0.0, kernels: Vec::new() };
-        for op in &self.ops {
-            let bytes = bytes(&self.gpu, op, u64::from(self.scene.capacity) * 4, &counts);
+        let moved = bytes(&self.gpu, &self.ops, u64::from(self.scene.capacity) * 4, &counts);
+        for (op, bytes) in self.ops.iter().zip(moved) {
             let (name, runs) = match op {
                 Op::Dispatch { kernel, .. } => (kernel.entry().1, 1),
                 Op::Clear(_) => ("clear", 0),

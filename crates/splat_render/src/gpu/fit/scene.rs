@@ -7,7 +7,7 @@ use crate::gpu::bin::{PairBins, SplatBins, pair_limit};
 use crate::gpu::device::Gpu;
 use crate::gpu::layout::{CAMERA, GRADIENT, STATS};
 use crate::gpu::project::SPLAT_2D;
-use crate::gpu::project_backward::{GradientBuffers, camera_sums};
+use crate::gpu::project_backward::{camera_buffer, camera_sums};
 
 /// Pairs per splat that buffers have room for at first; they grow by what a step needs.
 const PAIRS_PER_SPLAT: u32 = 4;
@@ -19,7 +19,10 @@ pub(super) struct Scene {
     pub sh_degree: u32,
     pub splats2d: wgpu::Buffer,
     pub v_splats2d: wgpu::Buffer,
-    pub gradients: GradientBuffers,
+    /// `[N * color_floats]`
+    pub v_colors: wgpu::Buffer,
+    /// Sums of the camera's gradients.
+    pub v_camera: wgpu::Buffer,
     /// The camera sums of each pending step; None until a step is to have them.
     pub pending_cameras: Option<wgpu::Buffer>,
     pub bins: SplatBins,
@@ -81,7 +84,8 @@ impl Scene {
             sh_degree,
             splats2d: gpu.bindable("splats2d", row(SPLAT_2D))?,
             v_splats2d: gpu.bindable("v_splats2d", row(GRADIENT))?,
-            gradients: GradientBuffers::new(gpu, &adam.splats)?,
+            v_colors: gpu.buffer("v_colors", row(adam.splats.color_floats as usize))?,
+            v_camera: camera_buffer(gpu, n)?,
             pending_cameras: None,
             bins: SplatBins::new(gpu, n, chunks)?,
             status_copy: gpu.readable(SplatBins::status_bytes(chunks)),
