@@ -400,7 +400,7 @@ fn running_out_of_room_for_pairs_changes_nothing() {
         *scale += 2.6;
     }
     let (whole, losses) = run(&mut gpu_fit(), &capture, 20, 100.0);
-    let small = gpu().with_binding_limit(128 * 96 * 36);
+    let small = gpu().with_binding_limit(128 * 96 * 48);
     let (parts, losses_parts) = run(&mut GpuFit::new(Arc::new(small)), &capture, 20, 100.0);
     assert!(whole == parts && losses == losses_parts, "a smaller device gave other bits");
 }

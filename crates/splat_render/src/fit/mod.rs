@@ -6,7 +6,6 @@ mod config;
 mod density;
 mod exposures;
 mod fitter;
-mod fog;
 mod hull;
 mod initial;
 mod plane_sweep;
@@ -20,7 +19,7 @@ pub use plane_sweep::{DepthMap, GreyPhoto, Sweep, plane_sweep};
 
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
 pub use crate::fit_device::{
-    CameraGradient, DensityStats, ExposureGradient, FitDevice, FitState, StepInput, is_dropped,
+    CameraGradient, DensityStats, ExposureGradient, FitDevice, FitState, McmcRun, StepInput, is_dropped,
     noise_normal,
 };
 pub use crate::splats::SplatArrays;
