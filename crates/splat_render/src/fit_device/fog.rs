@@ -26,13 +26,13 @@ const REACH: f32 = 3.0;
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct FogCamera {
     /// Rows of the world-to-camera matrix.
-    rows: [[f32; 4]; 3],
-    focal: [f32; 2],
-    principal: [f32; 2],
+    pub rows: [[f32; 4]; 3],
+    pub focal: [f32; 2],
+    pub principal: [f32; 2],
     /// Width and height, pixels.
-    size: [f32; 2],
-    nearest: f32,
-    unused: f32,
+    pub size: [f32; 2],
+    pub nearest: f32,
+    pub unused: f32,
 }
 
 /// Every so many splats are sampled.

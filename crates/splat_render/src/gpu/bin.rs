@@ -146,6 +146,12 @@ impl SplatBins {
         self.sort_ops(gpu, first, passes, &self.keys, &self.order)
     }
 
+    /// Sorts what [`Self::depth_ops`] has left with all splats by other keys; equal ones keep their order.
+    pub fn resort_ops(&self, gpu: &Gpu) -> Vec<Op> {
+        let first = SortPass { chunk: ALL_SPLATS, ..SortPass::zeroed() };
+        self.sort_ops(gpu, first, u32::BITS / gpu.digit_bits(), &self.keys, &self.order)
+    }
+
     /// A dispatch of workgroups of 64 splats in the depth order each, once pairs were counted.
     pub fn of_order(&self) -> Groups {
         Groups::Indirect(self.dispatches.clone(), 0)

@@ -14,6 +14,7 @@ mod exposure;
 mod fit;
 mod layout;
 mod loss;
+mod mcmc;
 mod project;
 mod project_backward;
 mod rasterize;

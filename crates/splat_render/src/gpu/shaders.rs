@@ -9,6 +9,9 @@ use crate::constants::{
     ADAM, ALPHA_MAX, ALPHA_MIN, DEPTH_ALPHA, QUAT_NORM2_MIN, SH_COEFFS_MAX, SSIM_C, SSIM_WINDOW,
     TILE, TRANSMITTANCE_MIN,
 };
+use crate::fit_device::{
+    BINS, BINS_PER_LOGIT, CELLS, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX,
+};
 use crate::sh;
 
 /// What a binding is to a shader.
@@ -74,6 +77,7 @@ const GEOMETRY_UPDATED: &str =
 const SPLAT_BACKWARD: &str = include_str!("shaders/splat_backward.wgsl");
 const ADAM_UPDATE: &str = include_str!("shaders/adam_update.wgsl");
 const ADAM_GEOMETRY: &str = include_str!("shaders/adam_geometry.wgsl");
+const MCMC_RUN: &str = include_str!("shaders/mcmc_run.wgsl");
 const SORT_KEYS: &str = include_str!("shaders/bin_sort_keys.wgsl");
 const SORT_BINDINGS: [Access; 7] = [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BIN_TILES: &str = include_str!("shaders/bin_tiles.wgsl");
@@ -103,7 +107,7 @@ const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 20] = [
+pub(super) static SOURCES: [Source; 24] = [
     Source {
         name: "project",
         shared_work: None,
@@ -140,6 +144,36 @@ pub(super) static SOURCES: [Source; 20] = [
             Uniform, Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite,
             Uniform,
         ],
+        segmented: false,
+    },
+    Source {
+        name: "mcmc_weigh",
+        shared_work: None,
+        parts: &[SHARED, MCMC_RUN, include_str!("shaders/mcmc_weigh.wgsl")],
+        bindings: &[
+            Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite,
+        ],
+        segmented: false,
+    },
+    Source {
+        name: "mcmc_spread",
+        shared_work: None,
+        parts: &[SHARED, MCMC_RUN, include_str!("shaders/mcmc_spread.wgsl")],
+        bindings: &[Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, Read],
+        segmented: false,
+    },
+    Source {
+        name: "mcmc_order",
+        shared_work: None,
+        parts: &[SHARED, include_str!("shaders/mcmc_order.wgsl")],
+        bindings: &[Uniform, Read, Read, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "mcmc_rows",
+        shared_work: None,
+        parts: &[SHARED, include_str!("shaders/mcmc_rows.wgsl")],
+        bindings: &[Uniform, Read, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {
@@ -298,11 +332,22 @@ pub(super) enum Kernel {
     DepthLoss,
     AdamGeometry,
     AdamColors,
+    McmcSample,
+    McmcWeigh,
+    McmcSums,
+    McmcPrefix,
+    McmcStart,
+    McmcDraw,
+    McmcShare,
+    McmcCopy,
+    McmcBounds,
+    McmcCodes,
+    McmcRows,
 }
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 29] = [
+    pub const ALL: [Self; 40] = [
         Self::Project,
         Self::ProjectBackward,
         Self::FitGeometry,
@@ -332,6 +377,17 @@ impl Kernel {
         Self::DepthLoss,
         Self::AdamGeometry,
         Self::AdamColors,
+        Self::McmcSample,
+        Self::McmcWeigh,
+        Self::McmcSums,
+        Self::McmcPrefix,
+        Self::McmcStart,
+        Self::McmcDraw,
+        Self::McmcShare,
+        Self::McmcCopy,
+        Self::McmcBounds,
+        Self::McmcCodes,
+        Self::McmcRows,
     ];
 
     /// (file, entry point)
@@ -370,6 +426,17 @@ impl Kernel {
             Self::DepthLoss => ("depth_loss", "depth_loss"),
             Self::AdamGeometry => ("adam_geometry", "adam_geometry"),
             Self::AdamColors => ("adam_colors", "adam_colors"),
+            Self::McmcSample => ("mcmc_weigh", "mcmc_sample"),
+            Self::McmcWeigh => ("mcmc_weigh", "mcmc_weigh"),
+            Self::McmcSums => ("mcmc_weigh", "mcmc_sums"),
+            Self::McmcPrefix => ("mcmc_weigh", "mcmc_prefix"),
+            Self::McmcStart => ("mcmc_spread", "mcmc_start"),
+            Self::McmcDraw => ("mcmc_spread", "mcmc_draw"),
+            Self::McmcShare => ("mcmc_spread", "mcmc_share"),
+            Self::McmcCopy => ("mcmc_spread", "mcmc_copy"),
+            Self::McmcBounds => ("mcmc_order", "mcmc_bounds"),
+            Self::McmcCodes => ("mcmc_order", "mcmc_codes"),
+            Self::McmcRows => ("mcmc_rows", "mcmc_rows"),
         }
     }
 }
@@ -386,6 +453,9 @@ fn constants(rows: u32) -> String {
         ("EXPOSURE_GROUPS", EXPOSURE_GROUPS),
         ("DEPTH_GROUPS", DEPTH_GROUPS),
         ("SH_COEFFS_MAX", SH_COEFFS_MAX as u32),
+        ("BINS", BINS as u32),
+        ("SHARES_MAX", SHARES_MAX as u32),
+        ("CELLS", CELLS),
     ]) {
         let _ = writeln!(out, "const {name} = {value}u;");
     }
@@ -401,6 +471,10 @@ fn constants(rows: u32) -> String {
         ("ADAM_BETA1", ADAM.0),
         ("ADAM_BETA2", ADAM.1),
         ("ADAM_EPSILON", ADAM.2),
+        ("LOGIT_DEAD", LOGIT_DEAD),
+        ("LOGIT_FOG", LOGIT_FOG),
+        ("LOGIT_FIRST", LOGIT_FIRST),
+        ("BINS_PER_LOGIT", BINS_PER_LOGIT),
         ("SSIM_C1", SSIM_C.0),
         ("SSIM_C2", SSIM_C.1),
     ];
@@ -513,6 +587,8 @@ mod tests {
         Chunk, ChunkCount, DepthStep, ExposureUniform, SortPass, Splat2d, StatusHead, Step, View,
         Window,
     };
+    use crate::fit_device::FogCamera;
+    use crate::gpu::mcmc::{CellsUniform, Rows, Run};
 
     fn parse(source: &Source) -> naga::Module {
         let text = source.text(Build::ALL[0]);
@@ -612,6 +688,40 @@ mod tests {
             compensation
         );
         layout!("project", Window, first, count, groups_max);
+        layout!(
+            "mcmc_weigh",
+            Run,
+            splats,
+            fresh,
+            seed,
+            round,
+            cameras,
+            every,
+            color_floats,
+            unused
+        );
+        layout!("mcmc_rows", Rows, splats, floats, kind, unused);
+        layout!(
+            "mcmc_weigh",
+            FogCamera,
+            rows,
+            focal,
+            principal,
+            size,
+            nearest,
+            unused
+        );
+        assert_layout(
+            "mcmc_order",
+            "Cells",
+            size_of::<CellsUniform>(),
+            &[
+                ("low", offset_of!(CellsUniform, low)),
+                ("splats", offset_of!(CellsUniform, splats)),
+                ("scale", offset_of!(CellsUniform, scale)),
+                ("upper", offset_of!(CellsUniform, upper)),
+            ],
+        );
         layout!("depth_loss", DepthStep, scale);
         assert_layout(
             "exposure",

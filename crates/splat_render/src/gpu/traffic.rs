@@ -136,6 +136,18 @@ fn touches(kernel: Kernel, sorted: Sorted) -> &'static [Touch] {
             Small, Small, Small, Small, Whole(2), Visible(1), Whole(2), Whole(2), RadiiAlone,
             Visible(1), Visible(2),
         ],
+        // Density control is no part of a step.
+        Kernel::McmcSample
+        | Kernel::McmcWeigh
+        | Kernel::McmcSums
+        | Kernel::McmcPrefix
+        | Kernel::McmcStart
+        | Kernel::McmcDraw
+        | Kernel::McmcShare
+        | Kernel::McmcCopy
+        | Kernel::McmcBounds
+        | Kernel::McmcCodes
+        | Kernel::McmcRows => &[],
     }
 }
 

@@ -97,6 +97,7 @@ impl Gpu {
     /// Overwrites a part of a buffer.
     pub(in crate::gpu) fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
         if self.planned.is_none() {
+            self.count_host(bytes.len() as u64);
             self.queue.write_buffer(buffer, offset, bytes);
         }
     }
@@ -111,6 +112,7 @@ impl Gpu {
             usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
+        self.count_host(size_of::<T>() as u64);
         self.queue.write_buffer(&buffer, 0, bytemuck::bytes_of(contents));
         buffer
     }
@@ -171,6 +173,7 @@ impl Gpu {
         self.check()?;
         let mut out = Vec::new();
         for &(buffer, bytes) in buffers {
+            self.count_host(bytes);
             let view = buffer
                 .get_mapped_range(..)
                 .map_err(|e| self.error(&format!("gave no results back ({e})")))?;

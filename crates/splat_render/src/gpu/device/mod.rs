@@ -36,6 +36,8 @@ pub struct Gpu {
     planned: Option<planned::Planned>,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
+    /// Bytes that went between host and device so far.
+    host_bytes: AtomicU64,
     /// Most bytes that a storage binding may have.
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
@@ -83,6 +85,15 @@ impl Gpu {
     #[must_use]
     pub fn without_subgroups(mut self) -> Self {
         self.build.subgroups = false;
+        self.list_limit = list_limit(self.is_software(), false);
+        self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
+        self
+    }
+
+    /// Builds kernels as for discrete GPUs, wherever they run, so that tests see that way too.
+    #[must_use]
+    pub fn as_discrete(mut self) -> Self {
+        self.build = Build::ALL[0];
         self.list_limit = list_limit(self.is_software(), false);
         self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
         self
@@ -175,6 +186,15 @@ impl Gpu {
     /// have, dropped ones included. A fit's step makes none.
     pub fn made(&self) -> (u64, u64) {
         (self.made[0].load(Ordering::Relaxed), self.made[1].load(Ordering::Relaxed))
+    }
+
+    /// How many bytes went from the host to the device or back so far.
+    pub fn host_bytes(&self) -> u64 {
+        self.host_bytes.load(Ordering::Relaxed)
+    }
+
+    fn count_host(&self, bytes: u64) {
+        self.host_bytes.fetch_add(bytes, Ordering::Relaxed);
     }
 
     fn count(&self, bytes: u64) {

@@ -25,10 +25,12 @@ use super::device::{Gpu, Op};
 use super::exposure::ExposureBuffers;
 use super::layout::{ChunkCount, DepthStep, ExposureUniform, GRADIENT, StatusHead, Step, View};
 use super::loss::{LossBuffers, rgba};
+use super::mcmc::shares;
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
 use crate::fit_device::{
-    CameraGradient, ExposureGradient, FitDevice, FitState, StepInput, dropout_threshold,
+    CameraGradient, ExposureGradient, FitDevice, FitState, McmcRun, StepInput, dropout_threshold,
+    mcmc,
 };
 use crate::sh;
 use crate::stages::ProjectOptions;
@@ -53,6 +55,8 @@ pub struct GpuFit {
     exposure: wgpu::Buffer,
     depth: wgpu::Buffer,
     scene: Option<Scene>,
+    /// MCMC's table of shares; None until density control runs.
+    shares: Option<wgpu::Buffer>,
     /// Steps not known to have been done.
     pending: Vec<StepInput>,
     camera_gradients: Vec<CameraGradient>,
@@ -94,6 +98,7 @@ impl GpuFit {
             frames: Vec::new(),
             tiles: 1,
             scene: None,
+            shares: None,
             pending: Vec::new(),
             camera_gradients: Vec::new(),
             exposure_gradients: Vec::new(),
@@ -136,15 +141,15 @@ impl GpuFit {
             photo.weight,
             photo.weights.is_some(),
         );
-        let queue = &self.gpu.queue;
-        queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view));
-        queue.write_buffer(&self.step, 0, bytemuck::bytes_of(&step));
+        let gpu = &self.gpu;
+        gpu.write(&self.view, 0, bytemuck::bytes_of(&view));
+        gpu.write(&self.step, 0, bytemuck::bytes_of(&step));
         if let Some(exposure) = &input.exposure {
             let uniform = ExposureUniform::from(exposure);
-            queue.write_buffer(&self.exposure, 0, bytemuck::bytes_of(&uniform));
+            gpu.write(&self.exposure, 0, bytemuck::bytes_of(&uniform));
         }
         let step_at = std::mem::offset_of!(StatusHead, step) as u64;
-        queue.write_buffer(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
+        gpu.write(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
         let bytes = u64::from(frame.width) * u64::from(frame.height) * 4;
         let mut copies = vec![frame.copy_photo(&photo.rgba)];
         if let Some(weights) = &photo.weights {
@@ -153,7 +158,7 @@ impl GpuFit {
         if let (Some(depth), Some(buffers)) = (depth, &frame.depth) {
             let scale = (f64::from(input.depth_weight) * depth.scale) as f32;
             let uniform = DepthStep { scale };
-            queue.write_buffer(&self.depth, 0, bytemuck::bytes_of(&uniform));
+            gpu.write(&self.depth, 0, bytemuck::bytes_of(&uniform));
             copies.push(Op::Copy(depth.rows.clone(), buffers.photo.clone(), 0, 2 * bytes));
         }
         let mut sums = Vec::new();
@@ -263,7 +268,7 @@ impl GpuFit {
             loop {
                 let clear = std::mem::offset_of!(StatusHead, overflow) as u64;
                 let status = &self.scene()?.bins.status;
-                self.gpu.queue.write_buffer(status, clear, bytemuck::bytes_of(&0u32));
+                self.gpu.write(status, clear, bytemuck::bytes_of(&0u32));
                 self.enqueue(input, at)?;
                 let (head, counts) = self.status()?;
                 if head.overflow == 0 {
@@ -381,6 +386,29 @@ impl FitDevice for GpuFit {
     fn download(&mut self) -> Result<FitState> {
         self.settle()?;
         self.scene()?.download(&self.gpu)
+    }
+
+    fn mcmc(&mut self, run: &McmcRun) -> Result<usize> {
+        self.settle()?;
+        let gpu = Arc::clone(&self.gpu);
+        let shares = match &self.shares {
+            Some(shares) => shares.clone(),
+            None => self.shares.insert(shares(&gpu)?).clone(),
+        };
+        let Some(next) = self.scene()?.after_mcmc(&gpu, run, self.tiles, &shares)? else {
+            let mut splats = 0;
+            self.edit(&mut |state| {
+                mcmc(state, run);
+                splats = state.splats.len();
+            })?;
+            return Ok(splats);
+        };
+        for frame in &mut self.frames {
+            frame.ops.clear();
+        }
+        let splats = next.len() as usize;
+        self.scene = Some(next);
+        Ok(splats)
     }
 
     fn step(&mut self, input: &StepInput) -> Result<()> {

@@ -1,12 +1,13 @@
 //! What a fit keeps on the device that depends on the number of splats or pairs.
 
 use crate::error::Result;
-use crate::fit_device::{DensityStats, FitState};
+use crate::fit_device::{DensityStats, FitState, McmcRun};
 use crate::gpu::adam::AdamBuffers;
 use crate::gpu::bin::{PairBins, SplatBins, pair_limit};
-use crate::gpu::device::Gpu;
-use crate::gpu::layout::{CAMERA, GRADIENT, STATS};
-use crate::gpu::project::SPLAT_2D;
+use crate::gpu::device::{Gpu, Op};
+use crate::gpu::layout::{CAMERA, GEOMETRY, GRADIENT, STATS};
+use crate::gpu::mcmc::{Drawn, RowKind};
+use crate::gpu::project::{SPLAT_2D, count};
 use crate::gpu::project_backward::{camera_buffer, camera_sums};
 
 /// Pairs per splat that buffers have room for at first; they grow by what a step needs.
@@ -95,6 +96,42 @@ impl Scene {
             capacity,
             adam,
         })
+    }
+
+    /// What a run of MCMC's density control makes of it; None where an array cannot be bound at once.
+    pub fn after_mcmc(
+        &self,
+        gpu: &Gpu,
+        run: &McmcRun,
+        tiles: u32,
+        shares: &wgpu::Buffer,
+    ) -> Result<Option<Self>> {
+        let AdamBuffers { splats, first, second, .. } = &self.adam;
+        let most = count(run.target.max(self.len() as usize))?;
+        let floats = [GEOMETRY as u64, splats.color_floats];
+        if u64::from(most) * 4 * floats[0].max(floats[1]) > gpu.binding_limit {
+            return Ok(None);
+        }
+        let floats = floats.map(|floats| floats as u32);
+        let arrays = (&splats.geometry, &splats.colors);
+        let drawn = Drawn::new(gpu, arrays, (self.len(), floats[1]), run, shares)?;
+        // What is there stays until all that follows has its memory.
+        let adam = AdamBuffers::new(gpu, drawn.splats, splats.color_floats)?;
+        let next = Self::new(gpu, adam, self.sh_degree, tiles, self.capacity, self.chunks)?;
+        let mut ops = drawn.order_ops(gpu, &next.bins);
+        let mut put = |from, to, floats, kind| {
+            ops.push(drawn.row_op(gpu, &next.bins, (from, to), floats, kind));
+        };
+        let to = &next.adam;
+        put(&drawn.geometry, &to.splats.geometry, floats[0], RowKind::Geometry);
+        put(&splats.colors, &to.splats.colors, floats[1], RowKind::Colors);
+        for (from, to) in [(first, &to.first), (second, &to.second)] {
+            put(&from.geometry, &to.geometry, floats[0], RowKind::Moments);
+            put(&from.colors, &to.colors, floats[1], RowKind::Moments);
+        }
+        ops.push(Op::Clear(next.adam.stats.clone()));
+        gpu.submit(&[&ops])?;
+        Ok(Some(next))
     }
 
     /// Number of splats.
