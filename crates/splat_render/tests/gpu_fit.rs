@@ -393,6 +393,22 @@ fn a_fit_ends_as_on_the_cpu_and_repeats_itself() {
 }
 
 #[test]
+fn every_build_of_the_kernels_fits_as_the_cpu_and_repeats_itself() {
+    let capture = capture(2, &[(64, 64), (50, 70)], 300);
+    let (expected, _) = run(&mut CpuFit::default(), &capture, 60, 0.0);
+    let expected = psnr(&capture, &expected);
+    let builds: [fn(Gpu) -> Gpu; 3] = [|gpu| gpu, Gpu::without_subgroups, Gpu::as_discrete];
+    for (k, of) in builds.into_iter().enumerate() {
+        let gpu = Arc::new(of(gpu()));
+        let (got, losses) = run(&mut GpuFit::new(Arc::clone(&gpu)), &capture, 60, 0.0);
+        let reached = psnr(&capture, &got);
+        assert!((expected - reached).abs() <= 0.1, "build {k}: {reached} dB for {expected}");
+        let again = run(&mut GpuFit::new(gpu), &capture, 60, 0.0);
+        assert!((got, losses) == again, "build {k}: the same fit twice gave other bits");
+    }
+}
+
+#[test]
 fn running_out_of_room_for_pairs_changes_nothing() {
     let mut capture = capture(3, &[(128, 96), (90, 100)], 400);
     // Large splats: over 8 pairs each, so that a small device has to grow and to cut into chunks.

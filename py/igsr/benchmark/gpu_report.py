@@ -44,8 +44,9 @@ def device_report(
 ) -> dict[str, Any]:
     """The benchmark with what a reader needs to know of the device; see ``run_benchmark``.
 
-    W2's scene, or W4's ball where no garden is given, is timed by gsplat too. The viewer's frames are
-    timed. Where a software driver stands in for a GPU, scenes are smaller, and W4 says so by its name.
+    W2's scene, or W4's ball where no garden is given, is timed by gsplat too. The viewer's frames
+    are timed. Where a software driver stands in for a GPU, scenes are smaller, and W4 says so by
+    its name.
 
     Args:
         settings: what to run.

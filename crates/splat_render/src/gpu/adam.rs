@@ -7,8 +7,8 @@ use bytemuck::Zeroable;
 
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
-use super::layout::{GEOMETRY, GRADIENT, SPLATS_PER_GROUP, STATS, Splat2d, StatusHead, Step, View, Window};
-use super::project::{Projection, SPLAT_2D, SplatBuffers, rows};
+use super::layout::{GEOMETRY, GRADIENT, SPLATS_PER_GROUP, STATS, Splat2d, StatusHead, Step, View};
+use super::project::{Projection, SPLAT_2D, SplatBuffers, rows, window_uniform};
 use super::project_backward::GradientBuffers;
 use super::shaders::Kernel;
 use crate::error::Result;
@@ -116,7 +116,7 @@ impl AdamBuffers {
         let Self { splats, first, second, .. } = self;
         let (geometry, colors) = (GEOMETRY as u64, splats.color_floats);
         let op = |window: Range<u32>| {
-            let uniform = gpu.uniform(&Window::of(gpu, &window));
+            let uniform = window_uniform(gpu, &window);
             let bindings = [
                 input.drawn.view.into(),
                 (&uniform).into(),
@@ -139,7 +139,7 @@ impl AdamBuffers {
     fn geometry_ops(&self, gpu: &Gpu, step: &wgpu::Buffer, gradient: &wgpu::Buffer) -> Vec<Op> {
         let Self { splats, first, second, .. } = self;
         let op = |window: Range<u32>| {
-            let uniform = gpu.uniform(&Window::of(gpu, &window));
+            let uniform = window_uniform(gpu, &window);
             let rows = |buffer| rows(buffer, &window, GEOMETRY as u64);
             let bindings = [
                 step.into(),
@@ -160,7 +160,7 @@ impl AdamBuffers {
         let Self { splats, first, second, stats } = self;
         let floats = splats.color_floats;
         let op = |window: Range<u32>| {
-            let uniform = gpu.uniform(&Window::of(gpu, &window));
+            let uniform = window_uniform(gpu, &window);
             let bindings = [
                 input.drawn.view.into(),
                 input.step.into(),

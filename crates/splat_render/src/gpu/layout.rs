@@ -6,7 +6,6 @@ use std::ops::Range;
 use bytemuck::{Pod, Zeroable};
 
 use crate::camera::Camera;
-use super::device::Gpu;
 use crate::constants::TILE;
 use crate::stages::{AdamStep, Colors, Exposure, ProjectOptions, Rates, SplatParams};
 use crate::target::Weight;
@@ -110,13 +109,6 @@ pub(super) struct Window {
     pub first: u32,
     pub count: u32,
     pub groups_max: u32,
-}
-
-impl Window {
-    /// These splats.
-    pub fn of(gpu: &Gpu, splats: &Range<u32>) -> Self {
-        Self { first: splats.start, count: splats.len() as u32, groups_max: gpu.groups_max }
-    }
 }
 
 /// The tiles of one dispatch and where their pairs are counted.

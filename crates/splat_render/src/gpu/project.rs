@@ -95,6 +95,12 @@ pub(super) fn rows<'a>(buffer: &'a wgpu::Buffer, window: &Range<u32>, floats: u6
     Bound::part(buffer, bytes)
 }
 
+/// The splats of one dispatch, as the kernels read them.
+pub(super) fn window_uniform(gpu: &Gpu, window: &Range<u32>) -> wgpu::Buffer {
+    let count = window.len() as u32;
+    gpu.uniform(&Window { first: window.start, count, groups_max: gpu.groups_max })
+}
+
 /// Projects all splats; their depth keys go to `[N]` `keys`.
 pub(super) fn project_ops(
     gpu: &Gpu,
@@ -105,7 +111,7 @@ pub(super) fn project_ops(
     let mut ops = Vec::new();
     for window in splats.windows(gpu) {
         let count = window.len() as u32;
-        let uniform = gpu.uniform(&Window::of(gpu, &window));
+        let uniform = window_uniform(gpu, &window);
         ops.push(gpu.op(
             Kernel::Project,
             &[

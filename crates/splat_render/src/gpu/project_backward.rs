@@ -1,8 +1,8 @@
 //! project_backward: gradients of the 2D splats to gradients of the splats and the camera.
 
 use super::device::{Gpu, Op};
-use super::layout::{CAMERA, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, View, Window};
-use super::project::{Projection, SPLAT_2D, SplatBuffers, geometry_rows, rows};
+use super::layout::{CAMERA, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, View};
+use super::project::{Projection, SPLAT_2D, SplatBuffers, geometry_rows, rows, window_uniform};
 use super::rasterize::splats2d;
 use super::shaders::Kernel;
 use crate::camera::Camera;
@@ -90,7 +90,7 @@ pub(super) fn project_backward_ops(
     let mut ops = Vec::new();
     for window in splats.windows(gpu) {
         let count = window.len() as u32;
-        let uniform = gpu.uniform(&Window::of(gpu, &window));
+        let uniform = window_uniform(gpu, &window);
         ops.push(gpu.op(
             Kernel::ProjectBackward,
             &[
