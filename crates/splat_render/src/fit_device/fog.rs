@@ -52,8 +52,7 @@ impl FogCamera {
             nearest: f32::INFINITY,
             unused: 0.0,
         };
-        let mut depths: Vec<f32> =
-            sample.iter().filter_map(|&mean| out.depth(mean, 0.0)).collect();
+        let mut depths: Vec<f32> = sample.iter().filter_map(|&mean| out.depth(mean, 0.0)).collect();
         out.nearest = if depths.len() < SAMPLES.1 {
             0.0
         } else {

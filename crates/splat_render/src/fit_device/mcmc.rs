@@ -84,7 +84,7 @@ fn share(logit: f64, shares: usize) -> [f32; 2] {
 /// The draw `k` of a round, below `total`.
 fn draw(run: &McmcRun, round: u32, k: u32, total: u32) -> u32 {
     let r = hash(k ^ hash(run.seed ^ round));
-    (u64::from(r) * u64::from(total) >> 32) as u32
+    ((u64::from(r) * u64::from(total)) >> 32) as u32
 }
 
 /// Whether all that is looked at is finite; colours only in the first round.
@@ -206,7 +206,8 @@ impl Cells {
         let mut code = (0, 0);
         for k in 0..3 {
             let place = (point[k] - self.low[k]) * self.scale[k];
-            let cell = if place.is_finite() { place.clamp(0.0, (CELLS - 1) as f32) as u32 } else { 0 };
+            let cell =
+                if place.is_finite() { place.clamp(0.0, (CELLS - 1) as f32) as u32 } else { 0 };
             for bit in 0..10 {
                 code.0 |= (cell >> bit & 1) << (3 * bit + k as u32);
                 code.1 |= (cell >> (bit + 10) & 1) << (3 * bit + k as u32);

@@ -14,7 +14,7 @@ pub(super) fn hash(x: u32) -> u32 {
 #[allow(clippy::excessive_precision, reason = "the digits of the shader's")]
 pub(crate) fn exp_accurate(x: f32) -> f32 {
     let y = x.clamp(-87.0, 88.0);
-    let k = (y * 1.442_695_04 + 0.5).floor();
+    let k = (y * std::f32::consts::LOG2_E + 0.5).floor();
     let r = (y - k * 0.693_359_375) + k * 2.121_944_40e-4;
     let poly = [
         1.398_199_950_7e-3_f32,

@@ -10,9 +10,7 @@ use super::device::{Bound, Gpu, Op};
 use super::layout::GEOMETRY;
 use super::shaders::Kernel;
 use crate::error::Result;
-use crate::fit_device::{
-    Cells, FogCamera, McmcRun, sampled_every, share_table, weight_table,
-};
+use crate::fit_device::{Cells, FogCamera, McmcRun, sampled_every, share_table, weight_table};
 
 /// Workgroups of the scan over weights and of the bounding box (mcmc_weigh.wgsl, mcmc_order.wgsl).
 const SEGMENTS: u32 = 256;
@@ -163,9 +161,8 @@ impl Drawn {
         };
         let mut ops = vec![spread(Kernel::McmcStart, 0, n + fresh)];
         for (round, targets) in [n, fresh].into_iter().enumerate() {
-            let weigh = |kernel, groups| {
-                weigh(kernel, (&rounds[round]).into(), &cameras, &weights, groups)
-            };
+            let weigh =
+                |kernel, groups| weigh(kernel, (&rounds[round]).into(), &cameras, &weights, groups);
             ops.extend([
                 weigh(Kernel::McmcWeigh, gpu.groups(n, 64)),
                 weigh(Kernel::McmcSums, [SEGMENTS, 1]),
@@ -179,12 +176,7 @@ impl Drawn {
         let corners = words("corners", 6 * BOUNDS_GROUPS)?;
         let whole = CellsUniform { splats: n, ..CellsUniform::zeroed() };
         let whole = gpu.uniform(&whole);
-        let bounds = [
-            (&whole).into(),
-            (&drawn).into(),
-            (&rows).into(),
-            (&corners).into(),
-        ];
+        let bounds = [(&whole).into(), (&drawn).into(), (&rows).into(), (&corners).into()];
         ops.push(gpu.op(Kernel::McmcBounds, &bounds, [BOUNDS_GROUPS, 1]));
         let wanted = [(&totals, 16), (&corners, 24 * u64::from(BOUNDS_GROUPS))];
         let data = gpu.download(&ops, &wanted)?;
@@ -239,19 +231,10 @@ impl Drawn {
         floats: u32,
         kind: RowKind,
     ) -> Op {
-        let uniform = gpu.uniform(&Rows {
-            splats: self.splats,
-            floats,
-            kind: kind as u32,
-            unused: 0,
-        });
-        let bindings = [
-            (&uniform).into(),
-            bins.order().into(),
-            (&self.rows).into(),
-            from.into(),
-            to.into(),
-        ];
+        let uniform =
+            gpu.uniform(&Rows { splats: self.splats, floats, kind: kind as u32, unused: 0 });
+        let bindings =
+            [(&uniform).into(), bins.order().into(), (&self.rows).into(), from.into(), to.into()];
         let groups = gpu.groups(self.splats * floats, ROW_FLOATS_PER_GROUP);
         gpu.op(Kernel::McmcRows, &bindings, groups)
     }

@@ -79,7 +79,8 @@ const ADAM_UPDATE: &str = include_str!("shaders/adam_update.wgsl");
 const ADAM_GEOMETRY: &str = include_str!("shaders/adam_geometry.wgsl");
 const MCMC_RUN: &str = include_str!("shaders/mcmc_run.wgsl");
 const SORT_KEYS: &str = include_str!("shaders/bin_sort_keys.wgsl");
-const SORT_BINDINGS: [Access; 7] = [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
+const SORT_BINDINGS: [Access; 7] =
+    [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BIN_TILES: &str = include_str!("shaders/bin_tiles.wgsl");
 const BACKWARD: &str = include_str!("shaders/rasterize_backward.wgsl");
 const BACKWARD_BINDINGS: [Access; 10] =
@@ -141,8 +142,8 @@ pub(super) static SOURCES: [Source; 24] = [
             include_str!("shaders/fit_geometry.wgsl"),
         ],
         bindings: &[
-            Uniform, Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite,
-            Uniform,
+            Uniform, Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite,
+            ReadWrite, Uniform,
         ],
         segmented: false,
     },
@@ -583,11 +584,11 @@ mod tests {
     use std::mem::offset_of;
 
     use super::*;
+    use crate::fit_device::FogCamera;
     use crate::gpu::layout::{
         Chunk, ChunkCount, DepthStep, ExposureUniform, SortPass, Splat2d, StatusHead, Step, View,
         Window,
     };
-    use crate::fit_device::FogCamera;
     use crate::gpu::mcmc::{CellsUniform, Rows, Run};
 
     fn parse(source: &Source) -> naga::Module {
@@ -701,16 +702,7 @@ mod tests {
             unused
         );
         layout!("mcmc_rows", Rows, splats, floats, kind, unused);
-        layout!(
-            "mcmc_weigh",
-            FogCamera,
-            rows,
-            focal,
-            principal,
-            size,
-            nearest,
-            unused
-        );
+        layout!("mcmc_weigh", FogCamera, rows, focal, principal, size, nearest, unused);
         assert_layout(
             "mcmc_order",
             "Cells",

@@ -76,9 +76,9 @@ fn touches(kernel: Kernel, sorted: Sorted) -> &'static [Touch] {
         Kernel::TileCounts => &[Small, Small, Visible(1), Small, Visible(1), Visible(1)],
         Kernel::ScanSums => &[Small, Visible(1), Small, Small, Small],
         Kernel::ScanApply => &[Small, Visible(3), Small, Small, Small],
-        Kernel::Emit => &[
-            Small, Small, Visible(1), Small, Visible(1), Visible(1), Pairs(1), Pairs(1), Pairs(1),
-        ],
+        Kernel::Emit => {
+            &[Small, Small, Visible(1), Small, Visible(1), Visible(1), Pairs(1), Pairs(1), Pairs(1)]
+        }
         Kernel::SortHistogram | Kernel::SortCount => match sorted {
             Sorted::All => &[Small, Small, Whole(1), Small, Small, Small, Small],
             Sorted::Visible => &[Small, Small, Visible(1), Small, Small, Small, Small],
@@ -93,19 +93,24 @@ fn touches(kernel: Kernel, sorted: Sorted) -> &'static [Touch] {
             Sorted::Pairs => &[Small, Small, Pairs(1), Pairs(1), Small, Pairs(1), Pairs(1)],
         },
         Kernel::Ranges => &[Small, Small, Pairs(1), Pairs(1), Pairs(1), Pairs(1), Whole(1)],
-        Kernel::Rasterize => {
-            &[Small, Small, PerPair, Whole(1), Pairs(1), Whole(1), Whole(1)]
-        }
+        Kernel::Rasterize => &[Small, Small, PerPair, Whole(1), Pairs(1), Whole(1), Whole(1)],
         Kernel::RasterizeBackward | Kernel::RasterizeBackwardAbsolute => &[
-            Small, Small, PerPair, Whole(1), Pairs(1), Pairs(1), Whole(1), Whole(1), Pairs(1), Small,
+            Small,
+            Small,
+            PerPair,
+            Whole(1),
+            Pairs(1),
+            Pairs(1),
+            Whole(1),
+            Whole(1),
+            Pairs(1),
+            Small,
         ],
         Kernel::RasterizeBackwardSum | Kernel::RasterizeBackwardSumAbsolute => {
             &[Small, Small, Visible(1), Visible(1), Visible(1), Pairs(1), Visible(1)]
         }
         Kernel::Exposure => &[Small, Small, Whole(1), Whole(1), Small, Small, Small],
-        Kernel::ExposureBackward => {
-            &[Small, Small, Whole(1), Small, Whole(2), Whole(2), Small]
-        }
+        Kernel::ExposureBackward => &[Small, Small, Whole(1), Small, Whole(2), Whole(2), Small],
         Kernel::LossSlopes => {
             &[Small, Small, Whole(1), Whole(1), Small, Whole(1), Small, Small, Small]
         }
@@ -115,26 +120,42 @@ fn touches(kernel: Kernel, sorted: Sorted) -> &'static [Touch] {
         Kernel::LossColumns => {
             &[Small, Small, Whole(1), Whole(1), Small, Whole(1), Small, Small, Small]
         }
-        Kernel::LossRows => {
-            &[Small, Small, Small, Small, Small, Whole(2), Small, Small, Small]
-        }
+        Kernel::LossRows => &[Small, Small, Small, Small, Small, Whole(2), Small, Small, Small],
         Kernel::LossColumnsGradient => {
             &[Small, Small, Whole(1), Whole(1), Small, Whole(1), Whole(1), Whole(1), Small]
         }
         Kernel::DepthLoss => {
             &[Small, Small, Whole(1), Whole(1), Whole(1), Whole(2), Whole(2), Small]
         }
-        Kernel::ProjectBackward => &[
-            Small, Small, Visible(1), Visible(1), Radii, Visible(1), Whole(1), Whole(1), Whole(1),
-        ],
+        Kernel::ProjectBackward => {
+            &[Small, Small, Visible(1), Visible(1), Radii, Visible(1), Whole(1), Whole(1), Whole(1)]
+        }
         Kernel::FitGeometry => &[
-            Small, Small, Whole(2), Visible(1), Radii, Visible(1), Visible(1), Whole(1), Whole(2),
-            Whole(2), Small,
+            Small,
+            Small,
+            Whole(2),
+            Visible(1),
+            Radii,
+            Visible(1),
+            Visible(1),
+            Whole(1),
+            Whole(2),
+            Whole(2),
+            Small,
         ],
         Kernel::AdamGeometry => &[Small, Small, Whole(2), Whole(1), Whole(2), Whole(2)],
         Kernel::AdamColors => &[
-            Small, Small, Small, Small, Whole(2), Visible(1), Whole(2), Whole(2), RadiiAlone,
-            Visible(1), Visible(2),
+            Small,
+            Small,
+            Small,
+            Small,
+            Whole(2),
+            Visible(1),
+            Whole(2),
+            Whole(2),
+            RadiiAlone,
+            Visible(1),
+            Visible(2),
         ],
         // Density control is no part of a step.
         Kernel::McmcSample

@@ -9,8 +9,8 @@ use num_traits::Float;
 
 use crate::camera::Camera;
 use crate::constants::DEPTH_ALPHA;
-use crate::error::{Error, Result};
 use crate::cpu::CpuFit;
+use crate::error::{Error, Result};
 use crate::fit_device::{FitDevice, FitState, McmcRun, StepInput, noise_draw};
 use crate::gpu::{Gpu, GpuFit};
 use crate::reference::Reference;

@@ -5,13 +5,13 @@
 //! and leaves the state as it was, as do the steps after it; the host looks at that flag now and
 //! then, makes room and repeats those steps, so that no step waits for a read-back.
 //!
-//! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P, their
-//! gradient and two moments make 4 P, statistics, 2D splats, their gradients and the depth order 120
-//! bytes. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
+//! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P and two moments
+//! make 3 P, and colours have gradients, 12 K bytes; statistics, 2D splats, their gradients and the depth
+//! order take 116. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
 //! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
-//! slopes of SSIM, 16 more where exposures are fitted and
+//! slopes of SSIM (96 and 48 on software adapters), 16 more where exposures are fitted and
 //! 8 more where photos have depths; a photo 4 per pixel, 4 more for weights and 8 more for depths. A
-//! test holds the sum per splat.
+//! test holds the sum per splat. While density control runs, splats and moments are there twice.
 
 mod frame;
 mod plan;
