@@ -1,0 +1,21 @@
+//! What a fit step costs on a GPU, counted where its commands are made.
+
+use splat_render::gpu::{Gpu, PlannedFit};
+
+/// The scene that docs/how-it-works/gpus.md counts: a garden's splats and photos.
+const SPLATS: usize = 5_000_000;
+const SIZE: (u32, u32) = (1297, 840);
+const VISIBLE: usize = SPLATS * 3 / 10;
+/// Four (splat, tile) pairs for each splat that is seen.
+const PAIRS: u32 = 4 * VISIBLE as u32;
+
+#[test]
+fn a_step_of_five_million_splats_costs_what_the_docs_say() {
+    let gpu = Gpu::new(true).unwrap_or_else(|e| panic!("{e}"));
+    let plan = PlannedFit::new(gpu, SPLATS, 3, SIZE, PAIRS).unwrap();
+    let work = plan.step(VISIBLE, PAIRS);
+    for (kernel, runs, bytes) in &work.kernels {
+        println!("| {kernel} | {runs} | {:.2} |", bytes / 1e9);
+    }
+    println!("{} dispatches, {:.2} GB", work.dispatches, work.bytes / 1e9);
+}
