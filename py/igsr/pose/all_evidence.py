@@ -43,7 +43,7 @@ from igsr.pose.prior_adjustment import Spread, spread_of
 
 Float64 = npt.NDArray[np.float64]
 
-#: Part of the photos, at least, that COLMAP has placed for it to be right where the two contradict.
+#: COLMAP is right where the two contradict if it has placed more than this part of the photos.
 MOST_RIGHT = 0.5
 #: Degrees that cameras by features may be from the predicted ones, on average. Beyond, one of the
 #: two is wrong.
@@ -132,7 +132,7 @@ def with_all_evidence(
                 f"Features place {count} of {len(photos)} photos where {network} does not predict "
                 "them"
             )
-            if count >= MOST_RIGHT * len(photos):
+            if count > MOST_RIGHT * len(photos):
                 left_out = _by_features(photos, predicted, found)
                 left_out.warnings.append(f"{contradiction}; the prediction is left out")
                 return left_out
