@@ -22,6 +22,8 @@ from igsr.pose.all_evidence import with_all_evidence
 from igsr.pose.colmap import Colmap
 from igsr.pose.da3.estimator import Da3
 from igsr.pose.da3.preprocessing import resampling_of
+from igsr.pose.find_cameras import chosen_estimator
+from igsr.pose.registry import ESTIMATORS
 
 COUNT = 5
 
@@ -324,6 +326,21 @@ def test_what_cameras_rest_on_is_kept_and_written(truth, photos, tmp_path):
     known = [np.diagonal(one)[:3].min() ** -0.5 for one in priors.information]
     assert np.degrees(known[2]) == pytest.approx(found.evidence[2].rotation)
     assert max(known[:2] + known[3:]) < 0.2 * known[2]
+
+
+def test_auto_takes_the_network_whose_weights_are_there(monkeypatch):
+    for name, there in (("dust3r", True), ("da3", True), ("colmap", True)):
+        entry = replace(ESTIMATORS[name], ready=lambda options, there=there: there)
+        monkeypatch.setitem(ESTIMATORS, name, entry)
+    assert chosen_estimator("auto", {}) == "dust3r"
+    assert chosen_estimator("auto", {"matcher": "sift"}) == "da3"  # which DUSt3R does not know
+    for name in ("dust3r", "da3"):
+        gone = replace(ESTIMATORS[name], ready=lambda options: False)
+        monkeypatch.setitem(ESTIMATORS, name, gone)
+        left = "da3" if name == "dust3r" else "colmap"
+        assert chosen_estimator("auto", {}) == left
+    with pytest.raises(IgsrError, match="graph is no option of colmap"):
+        chosen_estimator("auto", {"graph": "complete"})
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from igsr.pose.colmap.estimator import guarded, matched_photos, usable_by_number
 from igsr.pose.colmap.evidence import DOUBTFUL, STEPS
 from igsr.pose.colmap.matcher import Matcher
 from igsr.pose.colmap.matching import matched_along_lines, with_matches
-from igsr.pose.colmap.predicted_matches import matched_by_prediction
+from igsr.pose.colmap.predicted_matches import matched_by_prediction, without_contradictions
 from igsr.pose.colmap.result import estimate_of
 from igsr.pose.estimate import Progress
 from igsr.pose.name_lists import listed
@@ -194,10 +194,11 @@ def _adjusted(
         else replace(one, depth=np.where(known, one.depth, np.float32(np.nan)))
         for one, known in zip(world, sure, strict=True)
     ]
-    matches = matched_by_prediction(matches, confident, sift, seed, show)
     predicted = {i: one.camera for i, one in enumerate(world) if one is not None}
     if sift:
+        matches = matched_by_prediction(matches, confident, seed, show)
         matches = matched_along_lines(matches, set(predicted), show) or matches
+    matches = without_contradictions(matches, confident)
     starts = predicted | {i: one for i, one in enumerate(placed) if one is not None}
     if len(with_matches(matches) & starts.keys()) < 2:
         return None

@@ -27,8 +27,11 @@ from igsr.pose.estimate import Progress
 BAND = 0.03
 #: Part of a photo's points, at least, that another must show for the two to overlap; points asked.
 OVERLAP, ASKED = 0.1, 500
-#: Part of the longer side that a match may be from where the prediction has it, in the median.
-SAME_PLACE = 0.1
+#: Parts of the longer side that matches may be from where the prediction has them: all together, as
+#: cameras that are turned wrongly have them, in the median; and each by itself.
+TOGETHER, ALONE = 0.15, 0.08
+#: Part of a pair's matches that must agree with the prediction for these to be kept.
+LEAST_LEFT = 0.5
 #: Part that depths may differ by where two photos show one surface.
 SAME_SURFACE = 0.3
 
@@ -63,19 +66,14 @@ def _shown(xyz: npt.NDArray[np.float64], photo: AlignedPhoto | None) -> float:
 def matched_by_prediction(
     matches: Path,
     photos: Sequence[AlignedPhoto | None],
-    sift: bool,
     seed: int,
     show: Progress,
 ) -> Path:
-    """A copy of a database, with the matches that agree with what a network predicts.
-
-    Pairs whose matches contradict it lose them: sides of an object that look alike match, and
-    nothing else tells them apart. Pairs that have none and overlap are matched along the lines.
+    """A copy of a database, with matches of pairs that have none, along the predicted lines.
 
     Args:
-        matches: the database of the photos.
+        matches: the database of the photos, with SIFT features.
         photos: as a network predicts them, in one world; depths that it is not sure of are NaN.
-        sift: whether features are SIFT's: of others, none are matched.
         seed: of the verification.
         show: called with "matching", pairs done and all pairs.
     """
@@ -85,42 +83,71 @@ def matched_by_prediction(
     shutil.copyfile(matches, database)
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
-    known = {i: photo for i, photo in enumerate(photos) if photo is not None}
-    pairs = list(combinations(known, 2))
-    wanted = set(overlapping(photos)) if sift else set()
+    cameras = {i: photo.camera for i, photo in enumerate(photos) if photo is not None}
+    pairs = overlapping(photos)
     features: dict[int, Features] = {}
     with pycolmap.Database.open(database) as opened:
         for done, (a, b) in enumerate(pairs):
             show("matching", done, len(pairs))
-            first, second = image_id(a), image_id(b)
-            places = [opened.read_keypoints(number)[:, :2] for number in (first, second)]
-            if opened.exists_two_view_geometry(first, second):
-                found = opened.read_two_view_geometry(first, second).inlier_matches
-                if len(found) >= FEWEST and _agrees(known[a], known[b], *places, found):
+            if opened.exists_two_view_geometry(image_id(a), image_id(b)):
+                known = opened.read_two_view_geometry(image_id(a), image_id(b))
+                if len(known.inlier_matches) >= FEWEST:
                     continue
-                opened.delete_two_view_geometry(first, second)
-            if (a, b) not in wanted:
-                continue
-            for i, xy in zip((a, b), places, strict=True):
-                if i not in features:
-                    features[i] = comparable(xy, opened.read_descriptors(image_id(i)).data)
-            one, other = known[a].camera, known[b].camera
+                opened.delete_two_view_geometry(image_id(a), image_id(b))
+            for i in {a, b} - features.keys():
+                features[i] = comparable(
+                    opened.read_keypoints(image_id(i))[:, :2],
+                    opened.read_descriptors(image_id(i)).data,
+                )
+            one, other = cameras[a], cameras[b]
             band = BAND * max(one.width, one.height, other.width, other.height)
             found = guided_matches(features[a], features[b], EpipolarLine(_lines(one, other), band))
             if len(found) < FEWEST:
                 continue
+            places = (features[i].xy.astype(np.float64) for i in (a, b))
             geometry = pycolmap.estimate_two_view_geometry(
-                _camera(one),
-                places[0].astype(np.float64),
-                _camera(other),
-                places[1].astype(np.float64),
-                found,
-                options,
+                _camera(one), next(places), _camera(other), next(places), found, options
             )
-            found = geometry.inlier_matches
-            if len(found) >= FEWEST and _agrees(known[a], known[b], *places, found):
-                opened.write_two_view_geometry(first, second, geometry)
+            if len(geometry.inlier_matches) >= FEWEST:
+                opened.write_two_view_geometry(image_id(a), image_id(b), geometry)
     show("matching", len(pairs), len(pairs))
+    return database
+
+
+def without_contradictions(matches: Path, photos: Sequence[AlignedPhoto | None]) -> Path:
+    """A copy of a database, without the matches that contradict what a network predicts.
+
+    Sides of an object that look alike match, and agree with some geometry of their pair. A pair of
+    which fewer than half of the matches are left has none.
+
+    Args:
+        matches: the database of the photos.
+        photos: as for ``matched_by_prediction``.
+    """
+    import pycolmap
+
+    database = matches.with_name("agreeing.db")
+    shutil.copyfile(matches, database)
+    with pycolmap.Database.open(database) as opened:
+        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair)
+            one, other = (photos[number - image_id(0)] for number in (first, second))
+            found = geometry.inlier_matches
+            if one is None or other is None or not len(found):
+                continue
+            places = [opened.read_keypoints(number)[:, :2] for number in (first, second)]
+            ways = (
+                (one, other, places[0][found[:, 0]], places[1][found[:, 1]]),
+                (other, one, places[1][found[:, 1]], places[0][found[:, 0]]),
+            )
+            agrees = np.all([_agrees(*way) for way in ways], axis=0)
+            if agrees.all():
+                continue
+            if np.count_nonzero(agrees) >= max(FEWEST, LEAST_LEFT * len(found)):
+                geometry.inlier_matches = found[agrees]
+                opened.update_two_view_geometry(first, second, geometry)
+            else:
+                opened.delete_two_view_geometry(first, second)
     return database
 
 
@@ -129,15 +156,20 @@ def _agrees(
     other: AlignedPhoto,
     places: npt.NDArray[np.float32],
     other_places: npt.NDArray[np.float32],
-    matches: npt.NDArray[np.uint32],
-) -> bool:
-    """Whether most matches are where the other photo shows the same place, as it is predicted."""
-    ways = (
-        (one, other, places[matches[:, 0]], other_places[matches[:, 1]]),
-        (other, one, other_places[matches[:, 1]], places[matches[:, 0]]),
-    )
-    off = np.concatenate([_off(*way) for way in ways])
-    return not len(off) or bool(np.median(off) <= SAME_PLACE)
+) -> npt.NDArray[np.bool_]:
+    """Which matches [M] are where the other photo shows the same place, as it is predicted.
+
+    A camera that is predicted with a wrong turn shifts all matches alike. Matches of a side that
+    looks like another are off each by itself. What the network is not sure of agrees.
+    """
+    off = _off(one, other, places, other_places)
+    known = ~np.isnan(off[:, 0])
+    if np.count_nonzero(known) < FEWEST:
+        return np.ones(len(off), dtype=bool)
+    shift = np.median(off[known], axis=0)
+    if not np.linalg.norm(shift) <= TOGETHER:
+        return np.zeros(len(off), dtype=bool)
+    return np.asarray(~known | (np.linalg.norm(off - shift, axis=1) <= ALONE))
 
 
 def _off(
@@ -146,23 +178,22 @@ def _off(
     places: npt.NDArray[np.float32],
     other_places: npt.NDArray[np.float32],
 ) -> npt.NDArray[np.float64]:
-    """How far matches are from where the other photo shows the place, as parts of its longer side.
+    """How far matches are from where the other photo shows the place [M, 2], in its longer sides.
 
-    Infinite where the place is behind the other camera; without those of unknown depth.
+    Infinite where the place is behind the other camera, NaN where its depth is unknown.
     """
-    depth = one.depths_at(places.astype(np.float64))
-    known = np.isfinite(depth)
     K, viewmat = one.camera.K, one.camera.viewmat
-    slopes = (places[known] - K[[0, 1], 2]) / K[[0, 1], [0, 1]]
-    local = np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0) * depth[known, None]
-    xyz = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
-    K, viewmat = other.camera.K, other.camera.viewmat
-    seen = xyz @ viewmat[:3, :3].T + viewmat[:3, 3]
-    ahead = seen[:, 2] > 0.0
+    slopes = (places - K[[0, 1], 2]) / K[[0, 1], [0, 1]]
+    local = np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0)
+    local *= one.depths_at(places.astype(np.float64))[:, None]
+    K = other.camera.K
+    seen = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+    seen = seen @ other.camera.viewmat[:3, :3].T + other.camera.viewmat[:3, 3]
     with np.errstate(all="ignore"):
         pixels = seen[:, :2] / seen[:, 2:] * K[[0, 1], [0, 1]] + K[[0, 1], 2]
-        off = np.linalg.norm(pixels - other_places[known], axis=1)
-    return np.where(ahead, off / max(other.camera.width, other.camera.height), np.inf)
+    off = (pixels - other_places) / max(other.camera.width, other.camera.height)
+    off[seen[:, 2] <= 0.0] = np.inf
+    return np.asarray(off)
 
 
 def _lines(one: Camera, other: Camera) -> npt.NDArray[np.float64]:
