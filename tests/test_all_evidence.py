@@ -22,6 +22,8 @@ from igsr.pose.all_evidence import with_all_evidence
 from igsr.pose.colmap import Colmap
 from igsr.pose.da3.estimator import Da3
 from igsr.pose.da3.preprocessing import resampling_of
+from igsr.pose.find_cameras import chosen_estimator
+from igsr.pose.registry import ESTIMATORS
 
 COUNT = 5
 
@@ -214,7 +216,22 @@ def test_a_prediction_that_contradicts_features_is_left_out(truth, photos):
     found = together([*photos[:4], blank], start)
     assert rests_on(found) == ["features"] * 4 + [None]
     assert pose_errors(found.cameras[:4], truth[:4])["rotation"] < 0.2
-    assert found.warnings[-1].startswith("What The network predicts contradicts the features")
+    assert found.warnings[-1] == (
+        "Features place 4 of 5 photos where The network does not predict them; the prediction is "
+        "left out"
+    )
+
+
+def test_features_of_few_photos_that_contradict_the_prediction_are_left_out(truth, photos):
+    # Three photos of one end of the room among others of another: what is alike is another place.
+    noise = np.random.default_rng(1).integers(0, 256, (4, *photos[0].image.shape), dtype=np.uint8)
+    others = [replace(photos[0], name=f"other{i}.png", image=one) for i, one in enumerate(noise)]
+    elsewhere = [rooms.camera(2.0 + 1.5 * i) for i in range(3)]
+    start = predicted([*elsewhere, *(rooms.camera(0.2 * i) for i in range(4))])
+    found = together([*photos[:3], *others], start)
+    assert rests_on(found) == ["network"] * 7
+    assert all(one is other.camera for one, other in zip(found.cameras, start, strict=True))
+    assert found.warnings[0].startswith("Features place 3 of 7 photos where The network does not")
 
 
 def test_what_the_network_places_nowhere_has_the_features_of_others(truth, photos):
@@ -309,6 +326,21 @@ def test_what_cameras_rest_on_is_kept_and_written(truth, photos, tmp_path):
     known = [np.diagonal(one)[:3].min() ** -0.5 for one in priors.information]
     assert np.degrees(known[2]) == pytest.approx(found.evidence[2].rotation)
     assert max(known[:2] + known[3:]) < 0.2 * known[2]
+
+
+def test_auto_takes_the_network_whose_weights_are_there(monkeypatch):
+    for name, there in (("dust3r", True), ("da3", True), ("colmap", True)):
+        entry = replace(ESTIMATORS[name], ready=lambda options, there=there: there)
+        monkeypatch.setitem(ESTIMATORS, name, entry)
+    assert chosen_estimator("auto", {}) == "dust3r"
+    assert chosen_estimator("auto", {"matcher": "sift"}) == "da3"  # which DUSt3R does not know
+    for name in ("dust3r", "da3"):
+        gone = replace(ESTIMATORS[name], ready=lambda options: False)
+        monkeypatch.setitem(ESTIMATORS, name, gone)
+        left = "da3" if name == "dust3r" else "colmap"
+        assert chosen_estimator("auto", {}) == left
+    with pytest.raises(IgsrError, match="graph is no option of colmap"):
+        chosen_estimator("auto", {"graph": "complete"})
 
 
 @pytest.mark.parametrize(

@@ -86,8 +86,7 @@ def steps_of_points(equations: Equations, step: Float64, damping: float = RIDGE)
     np.add.at(own, equations.point, np.einsum("mri,mrj->mij", of_point, of_point))
     np.add.at(slope, equations.point, np.einsum("mri,mr->mi", of_point, errors))
     own += damping * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    steps: Float64 = -np.linalg.solve(own, slope[:, :, None])[:, :, 0]
-    return steps
+    return np.asarray(-np.linalg.solve(own, slope[:, :, None])[:, :, 0])
 
 
 def gauge(cameras: Sequence[Camera]) -> Float64:

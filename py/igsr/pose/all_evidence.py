@@ -35,7 +35,7 @@ from igsr.pose.colmap.estimator import guarded, matched_photos, usable_by_number
 from igsr.pose.colmap.evidence import DOUBTFUL, STEPS
 from igsr.pose.colmap.matcher import Matcher
 from igsr.pose.colmap.matching import matched_along_lines, with_matches
-from igsr.pose.colmap.predicted_lines import matched_along_predicted_lines, overlapping
+from igsr.pose.colmap.predicted_matches import matched_by_prediction, without_contradictions
 from igsr.pose.colmap.result import estimate_of
 from igsr.pose.estimate import Progress
 from igsr.pose.name_lists import listed
@@ -43,6 +43,8 @@ from igsr.pose.prior_adjustment import Spread, spread_of
 
 Float64 = npt.NDArray[np.float64]
 
+#: COLMAP is right where the two contradict if it has placed more than this part of the photos.
+MOST_RIGHT = 0.5
 #: Degrees that cameras by features may be from the predicted ones, on average. Beyond, one of the
 #: two is wrong.
 FARTHEST = 15.0
@@ -123,16 +125,24 @@ def with_all_evidence(
         placed = estimate_of(photos, found).cameras
         if all(placed):
             return _by_features(photos, predicted, found)
-        world = _in_one_world(predicted, placed)
+        world, warnings = _in_one_world(predicted, placed), []
         if world is None:
-            left_out = _by_features(photos, predicted, found)
-            left_out.warnings.append(
-                f"What {network} predicts contradicts the features that photos share, and is left "
-                "out"
+            count = sum(camera is not None for camera in placed)
+            contradiction = (
+                f"Features place {count} of {len(photos)} photos where {network} does not predict "
+                "them"
             )
-            return left_out
+            if count > MOST_RIGHT * len(photos):
+                left_out = _by_features(photos, predicted, found)
+                left_out.warnings.append(f"{contradiction}; the prediction is left out")
+                return left_out
+            # Sides of an object that look alike are seldom more than a part of the photos.
+            found, placed = replace(found, model=None), [None] * len(photos)
+            world = list(predicted)
+            warnings.append(f"{contradiction}; these features are left out")
         result = _adjusted(photos, world, sure, found, placed, matches, sift, seed, show)
-    return _by_both(photos, world, found, result, network)
+    both = _by_both(photos, world, found, result, network)
+    return replace(both, warnings=[*warnings, *both.warnings])
 
 
 def _by_features(
@@ -178,11 +188,17 @@ def _adjusted(
     show: Progress,
 ) -> Adjusted | None:
     """What bundle adjustment says, or None where photos share too few features."""
+    confident = [
+        None
+        if one is None or known is None
+        else replace(one, depth=np.where(known, one.depth, np.float32(np.nan)))
+        for one, known in zip(world, sure, strict=True)
+    ]
     predicted = {i: one.camera for i, one in enumerate(world) if one is not None}
     if sift:
-        pairs = overlapping(world)
-        matches = matched_along_predicted_lines(matches, predicted, pairs, seed, show)
+        matches = matched_by_prediction(matches, confident, seed, show)
         matches = matched_along_lines(matches, set(predicted), show) or matches
+    matches = without_contradictions(matches, confident)
     starts = predicted | {i: one for i, one in enumerate(placed) if one is not None}
     if len(with_matches(matches) & starts.keys()) < 2:
         return None
@@ -191,12 +207,6 @@ def _adjusted(
         for image in found.model.reg_image_ids():
             camera = found.model.images[image].camera
             lenses[camera.camera_id] = camera.params
-    confident = [
-        None
-        if one is None or known is None
-        else replace(one, depth=np.where(known, one.depth, np.float32(np.nan)))
-        for one, known in zip(world, sure, strict=True)
-    ]
     return adjusted(photos, starts, confident, usual_spread(world), matches, lenses, seed, show)
 
 

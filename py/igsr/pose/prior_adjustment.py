@@ -30,7 +30,7 @@ Int64 = npt.NDArray[np.int64]
 
 #: Standard deviations of what a network predicts: the logarithm of a photo's scale of depths, of a
 #: depth, and of a focal length.
-SCALE, DEPTH, FOCAL = 0.1, 0.05, 0.1
+SCALE, DEPTH, FOCAL = 0.1, 0.05, 0.05
 #: Errors of neighbouring depths hang together: those of a photo count as so many.
 INDEPENDENT = 20
 #: Steps at most, and the part of the cost that a step must take off to go on.
@@ -331,5 +331,4 @@ def _rotation_vector(rotation: Float64) -> Float64:
     )
     sine = 0.5 * float(np.linalg.norm(axis))
     angle = float(np.arctan2(sine, 0.5 * (np.trace(rotation) - 1.0)))
-    vector: Float64 = axis * (0.5 * angle / sine if sine > 1e-12 else 0.5)
-    return vector
+    return np.asarray(axis * (0.5 * angle / sine if sine > 1e-12 else 0.5))

@@ -62,7 +62,7 @@ class AlignedPhoto:
         """Depths [M] at pixels [M, 2] of the photo, NaN where they are not known."""
         grid = self.grid
         cells = (pixels - [grid.offset_x, grid.offset_y]) / [grid.scale_x, grid.scale_y]
-        inside = ((cells >= 0.0) & (cells < [grid.width, grid.height])).all(axis=1)
+        inside = np.all((cells >= 0.0) & (cells < [grid.width, grid.height]), axis=1)
         column, row = np.where(inside[:, None], cells, 0.0).astype(np.int64).T
         depth = np.where(inside, self.depth[row, column], np.nan).astype(np.float64)
         return np.where(depth > 0.0, depth, np.nan)
