@@ -61,7 +61,7 @@ def test_one_turned_splat_stays_as_it_is(wall):
     names = ("means", "scales", "opacities", "sh")
     two = replace(wall, quats=quats, **{name: getattr(wall, name)[[0, 0]] for name in names})
     scales = np.log(np.array([[0.5, 0.2, 0.05]] * 2, np.float32))
-    two = replace(two, scales=scales)
+    two = replace(two, scales=scales, opacities=np.full(2, -1.0, np.float32))
     one = merged(two, 1)
     assert len(one) == 1
     single = replace(two, **{n: getattr(two, n)[:1] for n in ("quats", *names)})
