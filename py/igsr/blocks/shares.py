@@ -18,7 +18,7 @@ from igsr.splats import Splats
 Float64 = npt.NDArray[np.float64]
 
 #: Longest side of the pictures that are asked what they show, pixels.
-ASKED_SIZE = 64
+ASKED_SIZE = 40
 
 
 def shown_shares(
