@@ -2,10 +2,13 @@
 
     python benches/scaling.py --out out/scaling [--steps 60]
 
-Each row is a fit in a process of its own, of so many splats that stay as many. The model of
-processor time is ``steps * (a + b pixels + c splats)``, that of memory ``a + b photos pixels + c splats +
-d pixels``; both by least squares of relative errors on all rows but the last two, which it is checked
-on. Then it says what scenes of 100 to 10 000 photos take in blocks.
+Each row is a fit in a process of its own, of so many splats that stay as many. The model:
+
+    processor seconds = steps * (a + b pixels + c splats)
+    bytes = a + b photos pixels + c splats + d pixels
+
+Both by least squares of relative errors on all rows but the last two, which it is checked on. Then
+it says what scenes of 100 to 10 000 photos take in blocks.
 """
 
 from __future__ import annotations
