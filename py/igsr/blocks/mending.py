@@ -20,7 +20,7 @@ from igsr.fitting.fitter import splat_arrays
 from igsr.splats import Splats
 
 #: Splats within this part of a cell's sides of its border are fitted again.
-BAND = 0.05
+BAND = 0.1
 #: Steps of that fit, the last ones of a whole schedule.
 STEPS = 400
 
@@ -57,7 +57,7 @@ def mending_task(
     scene = out / "blocks" / "joined" / SPLATS
     save_splats(scene, joined)
     shots = [manifest.shots[index] for index in across]
-    settings = {
+    settings: dict[str, Any] = {
         name: options.settings[name]
         for name in ("preset", "quality", "seed", "background")
         if name in options.settings

@@ -18,7 +18,7 @@ from igsr.splats import Splats
 Float64 = npt.NDArray[np.float64]
 
 #: Longest side of the pictures that are asked what they show, pixels.
-ASKED_SIZE = 64
+ASKED_SIZE = 32
 
 
 def shown_shares(
@@ -40,11 +40,14 @@ def shown_shares(
     """
     places = ground.places(splats.means.astype(np.float64) + splats.origin)
     inside = np.stack([cell.holds(places) for cell in cells], axis=1).astype(np.float64)
+    # Geometry alone: what colors splats have counts for nothing here.
+    plain = replace(splats, sh=np.ascontiguousarray(splats.sh[:, :1]))
     shares = np.zeros((len(cameras), len(cells)))
     for row, camera in zip(shares, cameras, strict=True):
         small = resized_camera(camera, *reduced_size(camera.width, camera.height, ASKED_SIZE))
-        weights = shown_weights(splats, small, backend)
-        row[:] = weights @ inside / max(float(weights.sum()), 1e-9)
+        weights = shown_weights(plain, small, backend)
+        seen = np.flatnonzero(weights)  # few of a large scene's
+        row[:] = weights[seen] @ inside[seen] / max(float(weights[seen].sum()), 1e-9)
     return np.clip(shares, 0.0, 1.0)
 
 
@@ -54,10 +57,8 @@ def shown_weights(splats: Splats, camera: Camera, backend: str) -> Float64:
     That is the slope of the picture's sum by the splat's color: one pass back, for any number of
     splats.
     """
-    # Geometry alone: what colors splats have counts for nothing here.
-    plain = replace(splats, sh=np.ascontiguousarray(splats.sh[:, :1]))
     dtype = _core.working_dtype(backend)
-    drawn = project(plain, camera, backend)
+    drawn = project(splats, camera, backend)
     size = {"width": camera.width, "height": camera.height}
     black = np.zeros(3, dtype)
     picture = _core.rasterize(drawn, **size, background=black, backend=backend)
