@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicU32;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::bin::{Binned, Bins, CHUNK, bin};
+use super::bin::{Binned, Bins, bin};
 use super::project_backward::V2d;
 use super::rasterize::Planes;
 use super::simd::dispatch;
@@ -105,6 +105,10 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
                 let depth = s.splat_f32s(splat.depth);
                 let mut acc = [zero; N];
                 let first = std::mem::replace(&mut next, reached.ends[i]);
+                if first == next {
+                    *sums = [0.0; N];
+                    continue;
+                }
                 for k in first..next {
                     let at = usize::from(reached.vectors[k]);
                     let (gaussian, u, v) = (gaussians[k], us[k], vs[k]);
@@ -208,13 +212,17 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
     });
 }
 
-/// Adds up a splat's pairs in tile order and turns whitened moments into 2D gradients, with the
-/// absolute gradient of the centre where `N` has it.
+/// Adds up a splat's pairs, at these positions in tile order, and turns whitened moments into 2D
+/// gradients, with the absolute gradient of the centre where `N` has it.
 #[inline(always)]
-pub(super) fn gather<const N: usize>(splat: &TileSplat, pairs: &[PairSums<N>]) -> (V2d, [f32; 2]) {
+pub(super) fn gather<const N: usize>(
+    splat: &TileSplat,
+    sums: &[PairSums<N>],
+    positions: impl Iterator<Item = usize>,
+) -> (V2d, [f32; 2]) {
     let mut total = [0.0f32; N];
-    for pair in pairs {
-        for (sum, value) in total.iter_mut().zip(pair) {
+    for position in positions {
+        for (sum, value) in total.iter_mut().zip(&sums[position]) {
             *sum += value;
         }
     }
@@ -244,15 +252,8 @@ fn gradients<const N: usize>(
 ) -> Vec<(V2d, [f32; 2])> {
     let mut sums: Vec<PairSums<N>> = Vec::new();
     rasterize_backward_tiles(splats, bins, picture, &mut sums);
-    splats
-        .par_chunks(CHUNK)
-        .enumerate()
-        .flat_map_iter(|(chunk, splats)| {
-            let (first, mut pairs) = (chunk * CHUNK, Vec::new());
-            bins.take_pairs(first..first + splats.len(), &sums, &mut pairs);
-            let gather = |(k, splat)| gather(splat, &pairs[bins.pairs_of(first, first + k)]);
-            splats.iter().enumerate().map(gather).collect::<Vec<_>>()
-        })
+    (splats.par_iter().enumerate())
+        .map(|(i, splat)| gather(splat, &sums, bins.positions_of(i..i + 1)))
         .collect()
 }
 

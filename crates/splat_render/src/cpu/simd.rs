@@ -43,6 +43,19 @@ pub fn instruction_set() -> &'static str {
     }
 }
 
+/// Asks for the cache line where a value begins, ahead of its use, where Rust has an instruction for it.
+#[inline(always)]
+pub(super) fn prefetch<T>(value: &T) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: nothing is read: a prefetch is a hint, for any address.
+    unsafe {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast());
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = value;
+}
+
 /// 2^-d for d >= 0, relative error below 1.2e-7 (1.4e-8 of the polynomial, the rest rounding).
 /// Above 126 it returns about 2^-126.
 #[inline(always)]
