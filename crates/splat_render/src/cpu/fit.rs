@@ -256,9 +256,7 @@ impl CpuFit {
                     let n = values.means.len();
                     let Scratch { backward, v, explore } = scratch;
                     for position in bins.positions_of(first_id..first_id + n) {
-                        // They may lie across two cache lines.
-                        prefetch(&sums[position][0]);
-                        prefetch(&sums[position][N - 1]);
+                        prefetch(&sums[position]);
                     }
                     backward.clear();
                     for k in 0..n {

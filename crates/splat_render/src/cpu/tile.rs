@@ -172,10 +172,8 @@ impl Centers {
     }
 }
 
-/// A 2D splat as the inner loops read it; u and v are in units of 1 / [`WHITEN`]. It
-/// fills a cache line, so that one is all that a look at it asks for.
+/// A 2D splat as the inner loops read it; u and v are in units of 1 / [`WHITEN`].
 #[derive(Debug, Clone, Copy, Default)]
-#[repr(align(64))]
 pub(super) struct TileSplat {
     pub mean: [f32; 2],
     pub factor: [f32; 3],
