@@ -82,7 +82,7 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
         let (v_b, v_d) = (S::as_simd_f32s(&v_b.0).0, S::as_simd_f32s(&v_d.0).0);
         let t = S::as_mut_simd_f32s(&mut t.0).0;
         let behind = S::as_mut_simd_f32s(&mut behind.0).0;
-        let zero = s.splat_f32s(0.0);
+        let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
         let centers = Centers::new::<S>(self.left, self.top);
         let (reached, mut live) = (self.reached, Vectors::default());
 
@@ -117,7 +117,8 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
                     let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
                     let alpha = s.select_f32s(seen, alpha, zero);
                     let before = t[at];
-                    let after = s.negate_mul_add_e_f32s(before, alpha, before);
+                    let through = s.sub_f32s(one, alpha);
+                    let after = s.mul_f32s(before, through);
                     let goes_on =
                         s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
                     t[at] = s.select_f32s(goes_on, after, s.or_f32s(before, s.splat_f32s(-0.0)));
@@ -134,9 +135,9 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
                     }
                     let rest = s.negate_mul_add_e_f32s(weight, own, behind[at]);
                     behind[at] = rest;
-                    // v_alpha * gaussian, zero where the cap holds alpha or nothing is added. One
-                    // over (1 - alpha) is before / after.
-                    let v_alpha = s.mul_f32s(before, s.sub_f32s(own, s.div_f32s(rest, after)));
+                    // v_alpha * gaussian, zero where the cap holds alpha or nothing is added.
+                    let inverse = s.div_f32s(one, through);
+                    let v_alpha = s.negate_mul_add_e_f32s(rest, inverse, s.mul_f32s(before, own));
                     let free = s.less_than_or_equal_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
                     let free = s.and_m32s(free, s.and_m32s(seen, goes_on));
                     let g = s.select_f32s(free, s.mul_f32s(v_alpha, gaussian), zero);
