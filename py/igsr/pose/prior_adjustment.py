@@ -289,7 +289,7 @@ def _stepped(bundle: Bundle, equations: Equations, prior: Float64, damping: floa
     normal = without_points(equations, RIDGE + damping) + prior
     size = equations.width - 1
     information = normal[:size, :size]
-    information = information + np.diag(damping * np.diagonal(information) + RIDGE)
+    information += np.diag(damping * np.diagonal(information) + RIDGE)
     try:
         step: Float64 = np.linalg.solve(information, -normal[:size, size])
         points: Float64 = bundle.points + steps_of_points(equations, step, RIDGE + damping)

@@ -16,6 +16,7 @@ use super::rasterize::{Planes, rasterize_tiles};
 use super::rasterize_backward::{
     COLOR_SUMS, DEPTH_SUMS, PairSums, PictureGradients, gather, rasterize_backward_tiles,
 };
+use super::simd::prefetch;
 use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::Result;
@@ -210,8 +211,7 @@ impl Dropout {
 }
 
 /// One task's scratch: a block's gradients on their way from its pairs to its parameters.
-struct Scratch<const N: usize> {
-    pairs: Vec<PairSums<N>>,
+struct Scratch {
     backward: Box<BackwardBlock>,
     v: BlockGradients,
     explore: Box<ExploreBlock>,
@@ -248,7 +248,6 @@ impl CpuFit {
             .enumerate()
             .for_each_init(
                 || Scratch {
-                    pairs: Vec::new(),
                     backward: BackwardBlock::new(),
                     v: BlockGradients::new(stride),
                     explore: ExploreBlock::new(),
@@ -261,14 +260,16 @@ impl CpuFit {
                     if moving == 0 && !input.camera_gradient {
                         return;
                     }
-                    let Scratch { pairs, backward, v, explore } = scratch;
-                    bins.take_pairs(first_id..first_id + n, sums, pairs);
+                    let Scratch { backward, v, explore } = scratch;
+                    for position in bins.positions_of(first_id..first_id + n) {
+                        prefetch(&sums[position]);
+                    }
                     backward.clear();
                     for k in 0..n {
                         let i = first_id + k;
-                        if bins.slots[i + 1] > bins.slots[i] {
-                            let pairs = &pairs[bins.pairs_of(first_id, i)];
-                            let (v2d, _) = gather(&tile_splats[i], pairs);
+                        let mut positions = bins.positions_of(i..i + 1).peekable();
+                        if positions.peek().is_some() {
+                            let (v2d, _) = gather(&tile_splats[i], sums, positions);
                             let [x, y] = v2d.v_mean;
                             let (x, y) = (0.5 * size[0] * x, 0.5 * size[1] * y);
                             grad_sum[k] += (x * x + y * y).sqrt();

@@ -108,7 +108,7 @@ fn blend<S: Simd, const DEPTH: bool>(
     let (r, g) = (S::as_mut_simd_f32s(&mut r.0).0, S::as_mut_simd_f32s(&mut g.0).0);
     let (b, d) = (S::as_mut_simd_f32s(&mut b.0).0, S::as_mut_simd_f32s(&mut d.0).0);
     let t = S::as_mut_simd_f32s(&mut t.0).0;
-    let zero = s.splat_f32s(0.0);
+    let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
     let centers = Centers::new::<S>(tile.left, tile.top);
     let (reached, mut live) = (&mut *tile.reached, Vectors::default());
 
@@ -126,7 +126,7 @@ fn blend<S: Simd, const DEPTH: bool>(
             let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
             let alpha = s.select_f32s(seen, alpha, zero);
             let before = t[at];
-            let after = s.negate_mul_add_e_f32s(before, alpha, before);
+            let after = s.mul_f32s(before, s.sub_f32s(one, alpha));
             // False for pixels that stop here or, negative, have stopped before.
             let goes_on = s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
             t[at] = s.select_f32s(goes_on, after, s.or_f32s(before, s.splat_f32s(-0.0)));

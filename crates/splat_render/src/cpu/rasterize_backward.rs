@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicU32;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::bin::{Binned, Bins, CHUNK, bin};
+use super::bin::{Binned, Bins, bin};
 use super::project_backward::V2d;
 use super::rasterize::Planes;
 use super::simd::dispatch;
@@ -82,7 +82,7 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
         let (v_b, v_d) = (S::as_simd_f32s(&v_b.0).0, S::as_simd_f32s(&v_d.0).0);
         let t = S::as_mut_simd_f32s(&mut t.0).0;
         let behind = S::as_mut_simd_f32s(&mut behind.0).0;
-        let zero = s.splat_f32s(0.0);
+        let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
         let centers = Centers::new::<S>(self.left, self.top);
         let (reached, mut live) = (self.reached, Vectors::default());
 
@@ -105,6 +105,10 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
                 let depth = s.splat_f32s(splat.depth);
                 let mut acc = [zero; N];
                 let first = std::mem::replace(&mut next, reached.ends[i]);
+                if first == next {
+                    *sums = [0.0; N];
+                    continue;
+                }
                 for k in first..next {
                     let at = usize::from(reached.vectors[k]);
                     let (gaussian, u, v) = (gaussians[k], us[k], vs[k]);
@@ -113,7 +117,8 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
                     let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
                     let alpha = s.select_f32s(seen, alpha, zero);
                     let before = t[at];
-                    let after = s.negate_mul_add_e_f32s(before, alpha, before);
+                    let through = s.sub_f32s(one, alpha);
+                    let after = s.mul_f32s(before, through);
                     let goes_on =
                         s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
                     t[at] = s.select_f32s(goes_on, after, s.or_f32s(before, s.splat_f32s(-0.0)));
@@ -130,9 +135,9 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
                     }
                     let rest = s.negate_mul_add_e_f32s(weight, own, behind[at]);
                     behind[at] = rest;
-                    // v_alpha * gaussian, zero where the cap holds alpha or nothing is added. One
-                    // over (1 - alpha) is before / after.
-                    let v_alpha = s.mul_f32s(before, s.sub_f32s(own, s.div_f32s(rest, after)));
+                    // v_alpha * gaussian, zero where the cap holds alpha or nothing is added.
+                    let inverse = s.div_f32s(one, through);
+                    let v_alpha = s.negate_mul_add_e_f32s(rest, inverse, s.mul_f32s(before, own));
                     let free = s.less_than_or_equal_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
                     let free = s.and_m32s(free, s.and_m32s(seen, goes_on));
                     let g = s.select_f32s(free, s.mul_f32s(v_alpha, gaussian), zero);
@@ -208,13 +213,17 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
     });
 }
 
-/// Adds up a splat's pairs in tile order and turns whitened moments into 2D gradients, with the
-/// absolute gradient of the centre where `N` has it.
+/// Adds up a splat's pairs, at these positions in tile order, and turns whitened moments into 2D
+/// gradients, with the absolute gradient of the centre where `N` has it.
 #[inline(always)]
-pub(super) fn gather<const N: usize>(splat: &TileSplat, pairs: &[PairSums<N>]) -> (V2d, [f32; 2]) {
+pub(super) fn gather<const N: usize>(
+    splat: &TileSplat,
+    sums: &[PairSums<N>],
+    positions: impl Iterator<Item = usize>,
+) -> (V2d, [f32; 2]) {
     let mut total = [0.0f32; N];
-    for pair in pairs {
-        for (sum, value) in total.iter_mut().zip(pair) {
+    for position in positions {
+        for (sum, value) in total.iter_mut().zip(&sums[position]) {
             *sum += value;
         }
     }
@@ -244,15 +253,8 @@ fn gradients<const N: usize>(
 ) -> Vec<(V2d, [f32; 2])> {
     let mut sums: Vec<PairSums<N>> = Vec::new();
     rasterize_backward_tiles(splats, bins, picture, &mut sums);
-    splats
-        .par_chunks(CHUNK)
-        .enumerate()
-        .flat_map_iter(|(chunk, splats)| {
-            let (first, mut pairs) = (chunk * CHUNK, Vec::new());
-            bins.take_pairs(first..first + splats.len(), &sums, &mut pairs);
-            let gather = |(k, splat)| gather(splat, &pairs[bins.pairs_of(first, first + k)]);
-            splats.iter().enumerate().map(gather).collect::<Vec<_>>()
-        })
+    (splats.par_iter().enumerate())
+        .map(|(i, splat)| gather(splat, &sums, bins.positions_of(i..i + 1)))
         .collect()
 }
 

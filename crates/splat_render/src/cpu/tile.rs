@@ -8,8 +8,8 @@ use bytemuck::{Pod, Zeroable};
 use pulp::Simd;
 
 use super::project::Splat2d;
-use super::simd::exp2_of_minus;
-use crate::constants::{ALPHA_MIN, TILE};
+use super::simd::{exp2_of_minus, prefetch};
+use crate::constants::TILE;
 
 pub(super) const SIDE: usize = TILE as usize;
 pub(super) const PIXELS: usize = SIDE * SIDE;
@@ -65,10 +65,10 @@ impl Place {
         let width = block_width(S::F32_LANES);
         for row in 0..self.rows {
             let plane = &plane[self.first + row * self.width..][..self.columns];
-            if self.columns == SIDE {
-                for (c, values) in plane.chunks_exact(width).enumerate() {
-                    let at = offset(row, c * width, S::F32_LANES);
-                    pixels.0[at..at + width].copy_from_slice(values);
+            if let Some(plane) = plane.first_chunk::<SIDE>() {
+                for column in (0..SIDE).step_by(width) {
+                    let at = offset(row, column, S::F32_LANES);
+                    pixels.0[at..at + width].copy_from_slice(&plane[column..column + width]);
                 }
             } else {
                 for (column, value) in plane.iter().enumerate() {
@@ -100,10 +100,10 @@ impl Pixels {
     pub fn store<S: Simd>(&self, rows: &mut [&mut [f32]; SIDE]) {
         let width = block_width(S::F32_LANES);
         for (row, out) in rows.iter_mut().enumerate() {
-            if out.len() == SIDE {
-                for (c, values) in out.chunks_exact_mut(width).enumerate() {
-                    let at = offset(row, c * width, S::F32_LANES);
-                    values.copy_from_slice(&self.0[at..at + width]);
+            if let Some(out) = out.first_chunk_mut::<SIDE>() {
+                for column in (0..SIDE).step_by(width) {
+                    let at = offset(row, column, S::F32_LANES);
+                    out[column..column + width].copy_from_slice(&self.0[at..at + width]);
                 }
             } else {
                 for (column, value) in out.iter_mut().enumerate() {
@@ -192,7 +192,7 @@ impl TileSplat {
             opacity: splat.opacity,
             color: splat.color,
             depth: splat.depth,
-            limit: (splat.opacity / ALPHA_MIN).log2() * (1.0 + 1e-5) + 1e-5,
+            limit: splat.reach * (WHITEN * WHITEN) * (1.0 + 1e-5) + 1e-5,
         }
     }
 }
@@ -257,6 +257,10 @@ impl Reached {
         let taken = ids.len().min(BATCH);
         for (copy, id) in self.splats.iter_mut().zip(ids) {
             *copy = splats[id.load(Relaxed) as usize];
+        }
+        // Those of the next batch are on their way while this one is looked at.
+        for id in ids.iter().skip(BATCH).take(BATCH) {
+            prefetch(&splats[id.load(Relaxed) as usize]);
         }
         let mut reached = [Vectors::default(); BATCH];
         for k in 0..taken {
