@@ -49,6 +49,9 @@ fn cameras(seed: u64) -> Vec<Camera> {
     (0..4).map(|_| random_camera(&mut rng, 90, 60)).collect()
 }
 
+/// A name, and what is made of the adapter.
+type Way = (&'static str, fn(Gpu) -> Gpu);
+
 fn after(device: &mut dyn FitDevice, state: &FitState, run: &McmcRun) -> FitState {
     device.upload(state.clone()).unwrap();
     let splats = device.mcmc(run).unwrap();
@@ -59,7 +62,7 @@ fn after(device: &mut dyn FitDevice, state: &FitState, run: &McmcRun) -> FitStat
 
 #[test]
 fn it_gives_the_bits_of_the_host() {
-    let ways: [(&str, fn(Gpu) -> Gpu); 4] = [
+    let ways: [Way; 4] = [
         ("as it is", |gpu| gpu),
         ("without subgroups", Gpu::without_subgroups),
         ("as discrete", Gpu::as_discrete),

@@ -394,16 +394,16 @@ fn a_fit_ends_as_on_the_cpu_and_repeats_itself() {
 
 #[test]
 fn every_build_of_the_kernels_fits_as_the_cpu_and_repeats_itself() {
-    let capture = capture(2, &[(64, 64), (50, 70)], 300);
-    let (expected, _) = run(&mut CpuFit::default(), &capture, 60, 0.0);
+    let capture = capture(2, &[(40, 33), (30, 50)], 120);
+    let (expected, _) = run(&mut CpuFit::default(), &capture, 20, 0.0);
     let expected = psnr(&capture, &expected);
     let builds: [fn(Gpu) -> Gpu; 3] = [|gpu| gpu, Gpu::without_subgroups, Gpu::as_discrete];
     for (k, of) in builds.into_iter().enumerate() {
         let gpu = Arc::new(of(gpu()));
-        let (got, losses) = run(&mut GpuFit::new(Arc::clone(&gpu)), &capture, 60, 0.0);
+        let (got, losses) = run(&mut GpuFit::new(Arc::clone(&gpu)), &capture, 20, 0.0);
         let reached = psnr(&capture, &got);
         assert!((expected - reached).abs() <= 0.1, "build {k}: {reached} dB for {expected}");
-        let again = run(&mut GpuFit::new(gpu), &capture, 60, 0.0);
+        let again = run(&mut GpuFit::new(gpu), &capture, 20, 0.0);
         assert!((got, losses) == again, "build {k}: the same fit twice gave other bits");
     }
 }

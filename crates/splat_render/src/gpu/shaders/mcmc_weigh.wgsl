@@ -63,7 +63,8 @@ fn is_fog(at: u32) -> bool {
     let z = geometry[at + 2u];
     let largest = max(max(geometry[at + 3u], geometry[at + 4u]), geometry[at + 5u]);
     let radius = 3.0 * exp_accurate(largest);
-    for (var k = 0u; k < run.cameras; k++) {
+    var fog = false;
+    for (var k = 0u; k < run.cameras && !fog; k++) {
         let depth = camera_row(k, 2u, x, y, z);
         if depth > 0.0 && depth < cameras[k].nearest {
             let u = camera_row(k, 0u, x, y, z);
@@ -71,13 +72,11 @@ fn is_fog(at: u32) -> bool {
             let focal = cameras[k].focal;
             let principal = cameras[k].principal;
             let size = cameras[k].size;
-            if shows(u, depth, focal.x, principal.x, size.x, radius)
-                && shows(v, depth, focal.y, principal.y, size.y, radius) {
-                return true;
-            }
+            fog = shows(u, depth, focal.x, principal.x, size.x, radius)
+                && shows(v, depth, focal.y, principal.y, size.y, radius);
         }
     }
-    return false;
+    return fog;
 }
 
 @compute @workgroup_size(64)
