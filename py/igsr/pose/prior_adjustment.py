@@ -288,7 +288,7 @@ def _stepped(bundle: Bundle, equations: Equations, prior: Float64, damping: floa
     """The bundle after a damped step of Gauss-Newton; None where there is none."""
     normal = without_points(equations, RIDGE + damping) + prior
     size = equations.width - 1
-    information = normal[:size, :size]
+    information: Float64 = normal[:size, :size].copy()
     information += np.diag(damping * np.diagonal(information) + RIDGE)
     try:
         step: Float64 = np.linalg.solve(information, -normal[:size, size])
