@@ -291,7 +291,8 @@ def _stepped(bundle: Bundle, equations: Equations, prior: Float64, damping: floa
     information: Float64 = normal[:size, :size].copy()
     information += np.diag(damping * np.diagonal(information) + RIDGE)
     try:
-        step: Float64 = np.linalg.solve(information, -normal[:size, size])
+        solved = np.linalg.solve(information, -normal[:size, size])
+        step: Float64 = np.asarray(solved, dtype=np.float64)
         points: Float64 = bundle.points + steps_of_points(equations, step, RIDGE + damping)
     except np.linalg.LinAlgError:
         return None
