@@ -20,7 +20,11 @@ from igsr import benchmark
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMAND = ("cargo", "test", "--release", "--locked", "--package", "splat_render", "--no-fail-fast")
-TESTS = ("--test", "gpu_stages", "--test", "gpu_fit", "--test", "gpu_faults")
+TESTS = tuple(
+    word
+    for name in ("gpu_stages", "gpu_fit", "gpu_density", "gpu_faults")
+    for word in ("--test", name)
+)
 #: Last lines of the compiler that are shown where the tests do not run.
 SHOWN = 20
 

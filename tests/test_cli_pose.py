@@ -56,7 +56,9 @@ def calls(monkeypatch):
 
         return run
 
-    monkeypatch.setitem(registry.ESTIMATORS, "dust3r", registry.Entry(make, lambda options: False))
+    for network in ("dust3r", "da3"):
+        never = registry.Entry(make, lambda options: False)
+        monkeypatch.setitem(registry.ESTIMATORS, network, never)
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
     return calls
 
@@ -95,7 +97,9 @@ def test_mistakes_of_pose(photos, calls, tmp_path, igsr_here):
     refused(igsr_here("pose", photos, "--out", out, "--checkpoint", "x"), "checkpoint", "colmap")
     refused(igsr_here("pose", photos, "--out", out, "--graph", "swin-3"), "graph", "colmap")
     refused(
-        igsr_here("pose", photos, "--out", out, "--estimator", "magic"), "magic", "dust3r or colmap"
+        igsr_here("pose", photos, "--out", out, "--estimator", "magic"),
+        "magic",
+        "dust3r or da3 or colmap",
     )
     refused(igsr_here("pose", photos, "--out", photos / "00.png"), "it is a file")
     given = scenes.write_capture(tmp_path / "given", MADE)
@@ -215,7 +219,9 @@ def test_few_placed_photos_stop_with_advice(photos, tmp_path, igsr_here, monkeyp
 
         return run
 
-    monkeypatch.setitem(registry.ESTIMATORS, "dust3r", registry.Entry(make, lambda options: False))
+    for network in ("dust3r", "da3"):
+        never = registry.Entry(make, lambda options: False)
+        monkeypatch.setitem(registry.ESTIMATORS, network, never)
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
     out = tmp_path / "out"
     arguments = [command, photos, "--out", out, "--steps", "1", "--backend", "cpu"]

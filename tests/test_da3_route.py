@@ -21,7 +21,7 @@ from igsr.geometry.similarity import Similarity, similarity_between
 from igsr.pose import FoundCameras, estimate, read_found
 from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.da3 import passes
-from igsr.pose.da3.chunks import chunks_of, joined, mapped
+from igsr.pose.da3.chunks import chunks_of, joined
 from igsr.pose.da3.confidence import trusted_depths
 from igsr.pose.da3.config import BASE, SIZES
 from igsr.pose.da3.estimator import Da3, with_shared_focals
@@ -85,7 +85,7 @@ class ExactPredictor:
         depth = spheres(camera, grid.photo_pixels()).reshape(grid.height, grid.width)
         sure = np.where(depth < 5.0, 3.0, 1.5) + 0.01 * np.arange(depth.size).reshape(depth.shape)
         exact = AlignedPhoto(camera, grid, depth.astype(np.float32), sure.astype(np.float32))
-        return mapped(exact, world)
+        return exact.mapped(world)
 
 
 def unadjusted(*arguments, **more):

@@ -487,7 +487,8 @@ def test_both_fits_have_the_same_arguments(capture):
     assert ours.parameters == theirs.parameters
     named = set(ours.parameters) - {"capture", "progress", "backend", "preset", "checkpoint"}
     fields = {one.name for one in dataclasses.fields(FitSettings)}
-    assert named - {"resume", "quality"} == fields - {"first_step"}
+    of_runs = {"resume", "quality", "frozen", "whole_schedule"}
+    assert named - of_runs == fields - {"first_step"}
     with pytest.raises(TypeError, match="steps_"):
         igsr.fit_with_cameras(capture, steps_=3)
     alike = (capture, 5, None, "cpu", 4)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from igsr import _core, benchmark
-from igsr.benchmark import gpu_report, gsplat_rows
+from igsr.benchmark import gpu_report, gsplat_rows, run, viewer_rows
 from igsr.benchmark.growth import shot_of
 from igsr.benchmark.scenes import upstream
 from igsr.errors import IgsrError
@@ -22,10 +22,14 @@ def small(monkeypatch):
     """The ball of a report in a second."""
     monkeypatch.setattr(gpu_report, "GROWN_COUNT", 200)
     monkeypatch.setattr(gpu_report, "GROWN_SIDE", 32)
+    monkeypatch.setattr(gpu_report, "SMALL_BALL", (200, 32))
+    monkeypatch.setattr(gpu_report, "SIZES", ((64, 48),))
+    monkeypatch.setattr(viewer_rows, "SPLATS", 300)
+    monkeypatch.setattr(viewer_rows, "SMALL_SPLATS", 300)
 
 
-def report_of(monkeypatch, tmp_path, tests=None):
-    settings = benchmark.Settings(backends=("gpu",), workloads=("W2",), seconds=0.0)
+def report_of(monkeypatch, tmp_path, tests=None, workloads=("W2",)):
+    settings = benchmark.Settings(backends=("gpu",), workloads=workloads, seconds=0.0)
     report = benchmark.device_report(settings)
     path = tmp_path / "report.html"
     benchmark.write_device_report(path, {**report, "tests": tests})
@@ -45,13 +49,48 @@ def test_the_page_has_device_limits_times_and_errors(monkeypatch, tmp_path):
     passes = {row["pass"] for row in figures["rows"] if row["workload"] == "ball" and row["ms"]}
     assert passes == {"forward", "backward"}
     for row in figures["rows"]:
-        if row["ms"] is not None:
+        if row["ms"] is not None and row["workload"] != "viewer":
             assert row["max_error"] < 1e-3
             assert f"{row['max_error']:.1e}" in page
+    (frame,) = (row for row in figures["rows"] if row["workload"] == "viewer")
+    assert frame["ms_median"] >= frame["ms"] > 0.0
+    assert (frame["splats"], frame["width"], frame["height"]) == (300, 64, 48)
+    assert {"project", "sort"} <= frame["stages_ms"].keys()
+    assert frame["off_of_255"] <= 4
     # What did not run says why.
     assert "W2 on gpu not run: it needs gsplat" in page
     if gsplat_rows.why_not():
         assert f"ball on gsplat not run: {gsplat_rows.why_not()}" in page
+
+
+@pytest.mark.usefixtures("small")
+def test_a_software_driver_has_a_small_w4_and_its_name_says_so(monkeypatch, tmp_path):
+    ran = []
+
+    def rows(backend, seed, grid=None, seconds=0.0, name="W4"):
+        ran.append((grid, name))
+        return [run.not_run(name, backend, "only asked")]
+
+    monkeypatch.setattr(run, "growth_rows", rows)
+    monkeypatch.setattr(run, "pair_rows", lambda backend, seed, seconds: [])
+    kind = _core.gpu_report()["kind"]
+    page, _ = report_of(monkeypatch, tmp_path, workloads=("W4",))
+    if kind == gpu_report.SOFTWARE:
+        assert ran == [(run.SMALL_POINTS, "W4 small")]
+        assert "W4 small on gpu not run: only asked" in page
+    monkeypatch.setattr(gpu_report, "SOFTWARE", "none")
+    ran.clear()
+    report_of(monkeypatch, tmp_path, workloads=("W4",))
+    assert ran == [(None, "W4")]
+
+
+def test_a_viewer_that_fails_is_one_message(monkeypatch):
+    monkeypatch.setattr(viewer_rows, "SMALL_SPLATS", 10)
+    with pytest.raises(IgsrError, match=r"size: .*0x48"):
+        viewer_rows.viewer_rows((0, 48), 0, True)
+    monkeypatch.setattr(viewer_rows, "TIMEOUT", 0.0)
+    with pytest.raises(IgsrError, match="took longer than 0 s"):
+        viewer_rows.viewer_rows((64, 48), 0, True)
 
 
 @pytest.mark.usefixtures("small")

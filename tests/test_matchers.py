@@ -136,8 +136,8 @@ def test_too_many_photos_and_unknown_names_are_refused(tmp_path: Path) -> None:
         Colmap("orb")
     with pytest.raises(IgsrError, match="needs a name"):
         Colmap(object())
-    with pytest.raises(IgsrError, match="matcher is no option of da3"):
-        igsr.estimate_poses(photos(2), "da3", matcher="sift")
+    with pytest.raises(IgsrError, match="matcher is no option of dust3r"):
+        igsr.estimate_poses(photos(2), "dust3r", matcher="sift")
 
 
 def test_found_cameras_know_their_matcher() -> None:

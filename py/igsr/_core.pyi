@@ -296,8 +296,9 @@ class Fitter:
                 loss of depths is multiplied by in the first step); poses ("fixed",
                 "joint"), focal ("fixed", "shared", "per-camera"), camera_rate (pixels per
                 step), camera_decay, camera_warm_up (fraction of the steps), frozen (splats are not
-                changed), exposures (whether gains and offsets of the photos are fitted). An absent
-                or None entry takes the default.
+                changed), frozen_splats (so many, the last ones, are drawn and not changed),
+                exposures (whether gains and offsets of the photos are fitted). An absent or None
+                entry takes the default.
             backend: "cpu" or "gpu".
             holds: pose priors of the cameras that are fitted: viewmats and intrinsics as above,
                 information [V, 6, 6] (the inverse covariance of a rotation in radians about, and a

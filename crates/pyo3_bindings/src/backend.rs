@@ -66,7 +66,7 @@ impl Devices {
     /// try again at each call would cost seconds.
     fn opened<'a>(slot: &'a mut Option<Opened>, software: bool, injected: &Injected) -> &'a Opened {
         if slot.as_ref().is_none_or(|opened| opened.as_ref().is_ok_and(|gpu| gpu.is_lost())) {
-            *slot = Some(open_tested_with(software, injected).map(Arc::new));
+            *slot = Some(open_tested_with(software, injected));
         }
         slot.get_or_insert_with(|| unreachable!("it was filled above"))
     }
@@ -214,7 +214,7 @@ pub fn time_gpu_start(py: Python<'_>) -> PyResult<(f64, f64, f64)> {
     py.detach(|| {
         let mut last = Instant::now();
         let mut lap = || 1e3 * std::mem::replace(&mut last, Instant::now()).elapsed().as_secs_f64();
-        let gpu = Gpu::new(true)?;
+        let gpu = Arc::new(Gpu::new(true)?);
         let opened = lap();
         gpu.compile_all()?;
         let compiled = lap();

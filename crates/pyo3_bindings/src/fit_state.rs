@@ -10,11 +10,15 @@ use crate::camera::viewmat;
 use crate::splat_arrays::splat_arrays_from;
 
 /// Reads the state of a fit and the steps done. Without moments, the fit is new and starts at
-/// `first_step`.
-pub fn state_from(dict: &Bound<'_, PyDict>, first_step: u32) -> PyResult<(FitState, u32)> {
+/// `first_step`. The last `frozen` splats stay as they are.
+pub fn state_from(
+    dict: &Bound<'_, PyDict>,
+    first_step: u32,
+    frozen: usize,
+) -> PyResult<(FitState, u32)> {
     let splats = splat_arrays_from(dict, "")?;
     if !dict.contains("step")? {
-        return Ok((FitState::new(splats), first_step));
+        return Ok((FitState { frozen, ..FitState::new(splats) }, first_step));
     }
     let n = splats.len() as isize;
     let stat = |name: &str| -> PyResult<Vec<f32>> {
@@ -26,6 +30,7 @@ pub fn state_from(dict: &Bound<'_, PyDict>, first_step: u32) -> PyResult<(FitSta
         first: splat_arrays_from(dict, "first_")?,
         second: splat_arrays_from(dict, "second_")?,
         stats: DensityStats { grad_sum: stat("stats_grad_sum")?, seen: stat("stats_seen")? },
+        frozen,
     };
     Ok((state, elements("step", &step, &[1])?[0]))
 }

@@ -6,7 +6,7 @@ use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
-use crate::arguments::Call;
+use crate::arguments::{Call, setting};
 use crate::arrays::{array, rows, shaped, shaped_rows};
 use crate::backend::fit_device;
 use crate::camera::cameras;
@@ -62,7 +62,9 @@ impl Fitter {
         named: Option<&Bound<'py, PyDict>>,
     ) -> PyResult<Self> {
         let call = Call::bind("Fitter", &ARGUMENTS, positional, named)?;
-        let config = config_from(&call.dict("config")?)?;
+        let config = call.dict("config")?;
+        let frozen = setting(&config, "frozen_splats")?.unwrap_or(0);
+        let config = config_from(&config)?;
         let targets = targets_from(&call)?;
         let sizes: Vec<(u32, u32)> = targets.iter().map(|t| (t.width, t.height)).collect();
         let cameras = cameras(&call.object("viewmats")?, &call.object("intrinsics")?, &sizes)?;
@@ -74,7 +76,7 @@ impl Fitter {
         let holds = call.optional::<Bound<'_, PyDict>>("holds")?;
         let holds = holds.map(|holds| holds_from(&holds, cameras.len())).transpose()?;
         let rigs = call.optional::<Vec<u32>>("rigs")?;
-        let (state, step) = state_from(&state, config.first_step)?;
+        let (state, step) = state_from(&state, config.first_step, frozen)?;
         let device = fit_device(&call.take::<String>("backend")?)?;
         call.finish()?;
         py.detach(|| {

@@ -185,6 +185,18 @@ pub(crate) struct SplatSlices<'a> {
 }
 
 impl<'a> SplatSlices<'a> {
+    /// The first `n` splats, of equally many rows of colour each.
+    pub fn first(self, n: usize) -> SplatSlices<'a> {
+        let stride = self.sh.len() / self.means.len().max(1);
+        SplatSlices {
+            means: &mut self.means[..n],
+            quats: &mut self.quats[..n],
+            scales: &mut self.scales[..n],
+            opacities: &mut self.opacities[..n],
+            sh: &mut self.sh[..n * stride],
+        }
+    }
+
     /// Borrowed as the stages take them, where they are raw parameters: SH of `degree` of `stride`
     /// rows per splat.
     pub fn params(&self, degree: u32, stride: usize) -> SplatParams<'_, f32> {

@@ -109,6 +109,31 @@ fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
 }
 
 #[test]
+fn a_fit_leaves_frozen_splats_as_they_are_and_resumes() {
+    let given = start(1);
+    for density in [DensityControl::Mcmc, DensityControl::Original] {
+        let begin = FitState { frozen: 40, ..given.clone() };
+        let mut fitter = fitter(density, &begin, 0);
+        assert_eq!(fitter.splat_count(), 110);
+        let cut = run(&mut fitter, 310);
+        let cameras = fitter.camera_state().unwrap().unwrap();
+        let end = run(&mut fitter, STEPS);
+        let tail = |state: &FitState| {
+            let n = state.splats.len();
+            state.splats.select(&(n - 40..n).collect::<Vec<_>>())
+        };
+        assert!(tail(&end) == tail(&given), "{density:?} changed a frozen splat");
+        assert_eq!(fitter.splat_count(), end.splats.len() - 40);
+        assert!(fitter.splat_count() != 110 && fitter.splat_count() <= 260);
+        let (targets, photos) = photos();
+        let device = Box::new(CpuFit::default());
+        let mut resumed = Fitter::new(device, targets, photos, cut, 310, config(density)).unwrap();
+        resumed.resume_cameras(cameras).unwrap();
+        assert!(run(&mut resumed, STEPS) == end, "{density:?} resumed ends otherwise");
+    }
+}
+
+#[test]
 fn a_resumed_fit_ends_with_the_same_bits() {
     let finish = |mut fitter: Fitter| -> (FitState, CameraState) {
         (run(&mut fitter, STEPS), fitter.camera_state().unwrap().unwrap())
@@ -546,6 +571,11 @@ fn bad_arguments_are_named() {
 #[test]
 fn frozen_steps_keep_the_moments() {
     common::agreement::frozen_steps_keep_the_moments(&mut CpuFit::default());
+}
+
+#[test]
+fn the_last_splats_stay() {
+    common::agreement::the_last_splats_stay(&mut CpuFit::default());
 }
 
 #[test]

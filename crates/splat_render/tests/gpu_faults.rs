@@ -6,7 +6,7 @@ mod common;
 use std::sync::Arc;
 
 use common::*;
-use splat_render::fit::{FitDevice, FitState, Rates, SplatArrays, StepInput, Target};
+use splat_render::fit::{FitDevice, FitState, McmcRun, Rates, SplatArrays, StepInput, Target};
 use splat_render::gpu::{Gpu, GpuFit, Injected, needed_limits};
 use splat_render::gpu_check::{open_tested_with, self_test};
 use splat_render::{Camera, Error};
@@ -29,16 +29,16 @@ fn a_sound_device_passes() {
     gpu.compile_all().unwrap_or_else(|e| panic!("{e}"));
     println!("kernels compiled in {:?}", began.elapsed());
     let began = std::time::Instant::now();
-    self_test(&gpu).unwrap_or_else(|e| panic!("{e}"));
+    self_test(&Arc::new(gpu)).unwrap_or_else(|e| panic!("{e}"));
     println!("self-test in {:?}", began.elapsed());
     let plain = Gpu::new(true).unwrap().without_subgroups();
-    self_test(&plain).unwrap_or_else(|e| panic!("{e}"));
+    self_test(&Arc::new(plain)).unwrap_or_else(|e| panic!("{e}"));
 }
 
 #[test]
 fn a_shader_that_does_not_compile_is_found_on_opening() {
     let injected = Injected { bad_shader: true, ..Injected::default() };
-    let found = message(self_test(&faulty(&injected)));
+    let found = message(self_test(&Arc::new(faulty(&injected))));
     assert!(found.contains("backend gpu: ") && found.contains("Shader"), "{found}");
     assert!(!found.contains('\n'), "{found}");
     assert!(matches!(open_tested_with(true, &injected), Err(Error::Device(_))));
@@ -47,7 +47,7 @@ fn a_shader_that_does_not_compile_is_found_on_opening() {
 #[test]
 fn wrong_values_are_found_and_the_stage_is_named() {
     let injected = Injected { wrong_values: true, ..Injected::default() };
-    let gpu = faulty(&injected);
+    let gpu = Arc::new(faulty(&injected));
     let found = message(self_test(&gpu));
     assert!(found.contains("computes wrong values: rasterize is off by"), "{found}");
     assert!(found.contains(&gpu.name()), "{found}");
@@ -66,7 +66,7 @@ fn an_adapter_below_the_limits_is_refused_by_the_limit() {
 #[test]
 fn an_adapter_with_the_smallest_limits_passes() {
     let injected = Injected { limits: Some(needed_limits()), ..Injected::default() };
-    self_test(&faulty(&injected)).unwrap_or_else(|e| panic!("{e}"));
+    self_test(&Arc::new(faulty(&injected))).unwrap_or_else(|e| panic!("{e}"));
     let mut fit = Fit::new(&Arc::new(faulty(&injected)), 200);
     (1..20).for_each(|step| fit.step(step).unwrap());
     assert_eq!(fit.device.download().unwrap().splats.len(), 200);
@@ -180,4 +180,22 @@ fn growth_beyond_the_memory_is_one_message_and_changes_no_step_in_silence() {
     let mut small = Fit::new(&gpu, 50);
     (1..20).for_each(|step| small.step(step).unwrap());
     assert_eq!(small.device.download().unwrap().splats.len(), 50);
+}
+
+#[test]
+fn density_control_beyond_the_memory_is_one_message_and_leaves_the_splats() {
+    let injected = Injected { buffer_bytes: Some(600_000), ..Injected::default() };
+    let gpu = Arc::new(faulty(&injected));
+    let mut fit = Fit::new(&gpu, 2000);
+    (1..20).for_each(|step| fit.step(step).unwrap());
+    let before = fit.device.download().unwrap();
+    let run = McmcRun { cameras: vec![fit.camera], target: 200_000, seed: 1 };
+    let found = message(fit.device.mcmc(&run).map(drop));
+    assert!(found.contains("is out of memory; use fewer splats or smaller images"), "{found}");
+    assert!(fit.device.download().unwrap() == before, "a run that failed changed splats");
+    // The fit itself goes on, and so does density control within the memory.
+    (20..40).for_each(|step| fit.step(step).unwrap());
+    assert_eq!(fit.device.mcmc(&McmcRun { target: 2200, ..run }).unwrap(), 2200);
+    (40..60).for_each(|step| fit.step(step).unwrap());
+    assert!(fit.device.loss().unwrap() > 0.0);
 }

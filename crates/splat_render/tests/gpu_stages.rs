@@ -19,7 +19,14 @@ fn gpu() -> &'static Gpu {
     GPU.get_or_init(|| Gpu::new(true).unwrap_or_else(|e| panic!("{e}")))
 }
 
-/// The same without subgroups, which is how every device but llvmpipe runs.
+/// The same with the kernels that discrete GPUs are given: other tiles, the sort by eight bits, the loss
+/// by tiles.
+fn discrete() -> &'static Gpu {
+    static GPU: OnceLock<Gpu> = OnceLock::new();
+    GPU.get_or_init(|| Gpu::new(true).unwrap_or_else(|e| panic!("{e}")).as_discrete())
+}
+
+/// The same without subgroups, which few software drivers have.
 fn plain() -> &'static Gpu {
     static GPU: OnceLock<Gpu> = OnceLock::new();
     GPU.get_or_init(|| Gpu::new(true).unwrap_or_else(|e| panic!("{e}")).without_subgroups())
@@ -76,7 +83,7 @@ fn rasterizes_like_the_reference() {
         let sigma = [1.0, 3.0, 10.0][round % 3];
         let projected = random_projected(&mut rng, n, width, height, sigma);
         let what = format!("round {round}, {width}x{height}");
-        for gpu in [gpu(), plain()] {
+        for gpu in [gpu(), plain(), discrete()] {
             rasterize_stages(gpu, &projected, round as u64, BOUNDS, &what);
         }
     }
@@ -177,7 +184,7 @@ fn resident_pictures_are_those_of_the_stages() {
     let scene = random_scene(&mut rng, 3000, Some(2));
     let cameras = [(150, 90), (64, 48), (131, 77)].map(|(w, h)| random_camera(&mut rng, w, h));
     let large = random_camera(&mut rng, 151, 90);
-    for gpu in [gpu(), plain()] {
+    for gpu in [gpu(), plain(), discrete()] {
         let splats = ResidentSplats::new(gpu, &scene.params()).unwrap();
         let mut picture = ResidentPicture::new(gpu, 150, 90).unwrap();
         let mut draw = |camera: &Camera, columns: Range<u32>| {
@@ -257,14 +264,14 @@ fn poison_in_any_slot_culls_one_splat_at_most() {
 
 #[test]
 fn hard_splats_2d_agree_with_the_reference() {
-    for gpu in [gpu(), plain()] {
+    for gpu in [gpu(), plain(), discrete()] {
         common::hard_cases::hard_splats_2d_agree_with_the_reference(gpu, BOUNDS);
     }
 }
 
 #[test]
 fn many_splats_in_one_tile_and_one_on_many() {
-    for gpu in [gpu(), plain()] {
+    for gpu in [gpu(), plain(), discrete()] {
         common::hard_cases::many_splats_in_one_tile_and_one_on_many(gpu, BOUNDS);
     }
 }
@@ -286,14 +293,14 @@ fn a_zero_quaternion_culls_its_splat() {
 
 #[test]
 fn thresholds_are_the_same_everywhere() {
-    for gpu in [gpu(), plain()] {
+    for gpu in [gpu(), plain(), discrete()] {
         common::hard_cases::thresholds_are_the_same_everywhere(gpu);
     }
 }
 
 #[test]
 fn tile_edges_show_nothing() {
-    for gpu in [gpu(), plain()] {
+    for gpu in [gpu(), plain(), discrete()] {
         common::hard_cases::tile_edges_show_nothing(gpu, BOUNDS);
     }
 }
@@ -325,7 +332,9 @@ fn exposure_matches_the_reference() {
 
 #[test]
 fn loss_matches_the_reference() {
-    common::optimisation::loss_matches_the_reference(gpu());
+    for gpu in [gpu(), discrete()] {
+        common::optimisation::loss_matches_the_reference(gpu);
+    }
 }
 
 #[test]

@@ -510,7 +510,7 @@ fn both_ways_to_draw_agree_with_the_rasterizer_and_are_timed() {
             .filter_map(|(stage, ms)| Some((stage, ms.trim().parse::<f64>().ok()?)))
             .unzip();
         let own = if way == "blend" { &["blend"][..] } else { &["bin", "rasterize", "canvas"] };
-        let expected = [&["project", "sort"], own, &["compose", "rest", "whole"]].concat();
+        let expected = [&["project", "sort"], own, &["compose", "rest", "whole", "least"]].concat();
         assert_eq!(stages, expected, "{way}");
         assert!(times.iter().all(|&ms| ms >= 0.0), "stages take more than the whole: {text}");
     }

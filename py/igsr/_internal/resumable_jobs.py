@@ -13,7 +13,8 @@ from typing import Any
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
-from igsr._internal.worker_processes import THREADS, worker_processes
+from igsr._internal.ray_jobs import RayCluster
+from igsr._internal.worker_processes import WorkerLostError, worker_processes
 from igsr.errors import IgsrError
 
 
@@ -28,6 +29,7 @@ class Run:
         leaves: a file that it leaves beside its row, if any; without that it is not done.
         scene: its folder in the data; the hash of all its files joins the settings, as "data",
             since photos and cameras may be corrected. None where the settings say all.
+        memory: bytes that it takes, where that is known: Ray starts no more than fit.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Run:
     settings: dict[str, Any]
     leaves: Path | None = None
     scene: str | None = None
+    memory: int | None = None
 
 
 def file_hash(path: Path) -> str:
@@ -58,7 +61,11 @@ def finished_runs(
     data: str,
     jobs: int,
     on_run: Callable[[int, int, dict[str, Any]], None] | None,
-    ray: bool = False,
+    ray: bool | str = False,
+    *,
+    again: Callable[[Run, Exception], Any] | None = None,
+    spread: bool = False,
+    shared: Path | None = None,
 ) -> list[dict[str, Any]]:
     """The row of every run, in order: read where its file is there, else done and written.
 
@@ -74,7 +81,12 @@ def finished_runs(
         jobs: runs at a time on this machine, each in a process of its own with its share of cores.
         on_run: called with (done, all, the run's row) after each run.
         ray: run on the Ray cluster that this machine is part of, or on a local one, as many at a
-            time as it has room for; its machines see ``data`` under the same path.
+            time as it has room for; its machines see ``data`` under the same path. A text is the
+            cluster's address (``igsr._internal.ray_jobs``).
+        again: called with a run and the exception where memory ran out or its process ended without
+            a result; what it returns, if not None, is given to ``work`` once more.
+        spread: over Ray, whether a run takes its share of a machine's cores, not one.
+        shared: over Ray, a folder that all machines must see.
 
     Raises:
         IgsrError: a run fails, its file cannot be read or written, or Ray is not installed.
@@ -107,10 +119,10 @@ def finished_runs(
             on_run(len(rows), len(runs), row)
 
     if ray and missing:
-        _over_ray(missing, work, data, keep)
+        _over_ray(missing, work, data, keep, ray, again, spread, shared)
     elif jobs == 1:
         for run in missing:
-            keep(run, work(data, run.what))
+            keep(run, _done(work, data, run, again))
     elif missing:
         threads = max(1, (os.cpu_count() or 1) // jobs)
         with worker_processes(jobs, threads) as pool:
@@ -128,46 +140,52 @@ def finished_runs(
     return [rows[run.name] for run in runs]
 
 
+def _done(
+    work: Callable[[str, Any], dict[str, Any]],
+    data: str,
+    run: Run,
+    again: Callable[[Run, Exception], Any] | None,
+) -> dict[str, Any]:
+    """The row of a run, done with what ``again`` makes of it as often as memory runs out."""
+    what = run.what
+    while True:
+        try:
+            return work(data, what)
+        except (WorkerLostError, MemoryError) as error:
+            other = None if again is None else again(run, error)
+            if other is None:
+                raise
+            what = other
+
+
 def _over_ray(
     runs: list[Run],
     work: Callable[[str, Any], dict[str, Any]],
     data: str,
     keep: Callable[[Run, dict[str, Any]], None],
+    ray: bool | str,
+    again: Callable[[Run, Exception], Any] | None,
+    spread: bool,
+    shared: Path | None,
 ) -> None:
-    """The one place that knows Ray: ``keep`` is called with each run as it is done."""
-    try:
-        import ray
-    except ImportError as error:
-        raise IgsrError("--ray needs Ray; install it with: pip install 'igsr[ray]'.") from error
+    """``keep`` is called with each run as it is done; after a failure, those under way are kept."""
 
-    started = not ray.is_initialized()
-    if started:
-        ray.init(log_to_driver=False)
+    def other(number: int, error: Exception) -> Any:
+        return None if again is None else again(runs[number], error)
 
-    # A function: Ray takes no partials. A core each, so that no fit waits for another's threads.
-    @ray.remote(num_cpus=1, runtime_env={"env_vars": dict.fromkeys(THREADS, "1")})
-    def remote(folder: str, what: Any) -> dict[str, Any]:
-        return work(folder, what)
-
-    pending = {remote.remote(data, run.what): run for run in runs}
-    try:
-        while pending:
-            for reference in ray.wait(list(pending))[0]:
-                keep(pending.pop(reference), _result(ray.get, reference))
-    finally:
-        for reference in pending:
-            ray.cancel(reference)
-        if started:
-            ray.shutdown()
-
-
-def _result(get: Callable[[Any], dict[str, Any]], reference: Any) -> dict[str, Any]:
-    """What a remote run returned; its IgsrError as such and not inside Ray's."""
-    try:
-        return get(reference)
-    except Exception as error:
-        cause = getattr(error, "cause", None)
-        raise cause if isinstance(cause, IgsrError) else error from None
+    with RayCluster(ray if isinstance(ray, str) else None) as cluster:
+        cluster.check(shared)
+        failed: Exception | None = None
+        pieces = [run.what for run in runs]
+        memory = [run.memory for run in runs]
+        results = cluster.results(work, data, pieces, memory=memory, spread=spread, again=other)
+        for number, result in results:
+            if not isinstance(result, Exception):
+                keep(runs[number], result)
+            elif failed is None:
+                failed = result
+        if failed is not None:
+            raise failed
 
 
 def _read(path: Path) -> dict[str, Any] | None:

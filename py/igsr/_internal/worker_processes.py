@@ -18,6 +18,10 @@ T = TypeVar("T")
 THREADS = ("RAYON_NUM_THREADS", "OMP_NUM_THREADS")
 
 
+class WorkerLostError(IgsrError):
+    """A process that did work ended without a result, for example because memory ran out."""
+
+
 def worker_processes(count: int, threads: int | None = None) -> ProcessPoolExecutor:
     """A pool of ``count`` processes, each with ``threads`` threads (None: as they like).
 
@@ -46,13 +50,13 @@ def in_a_process(work: Callable[..., T], *arguments: Any) -> T:
     """Call a function of a module in a process of its own, which ends with the call.
 
     Raises:
-        IgsrError: the process was ended from outside, for example because memory ran out.
+        WorkerLostError: the process was ended from outside, for example because memory ran out.
         Exception: what the function raises.
     """
     with worker_processes(1) as pool:
         try:
             return pool.submit(work, *arguments).result()
         except BrokenProcessPool as error:
-            raise IgsrError(
+            raise WorkerLostError(
                 "A process ended without a result; the machine may have run out of memory."
             ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,14 @@ from igsr.benchmark.run import COLUMNS, Settings, not_run, run_benchmark
 from igsr.benchmark.scenes import garden, upstream
 from igsr.benchmark.stage_rows import pipeline_rows
 from igsr.benchmark.table import milliseconds, not_run_lines
+from igsr.benchmark.viewer_rows import SIZES, VIEWER, viewer_rows
 from igsr.errors import IgsrError
 from igsr.evaluation.report_page import write_template
 
+#: What wgpu calls an adapter that is a program.
+SOFTWARE = "Cpu"
+#: Splats and side of that scene where such an adapter draws it.
+SMALL_BALL = (10_000, 256)
 #: The scene that is drawn beside gsplat's, where no garden is given: W4's, forward and backward.
 BALL = "ball"
 
@@ -38,7 +44,9 @@ def device_report(
 ) -> dict[str, Any]:
     """The benchmark with what a reader needs to know of the device; see ``run_benchmark``.
 
-    W2's scene, or W4's ball where no garden is given, is timed by gsplat too.
+    W2's scene, or W4's ball where no garden is given, is timed by gsplat too. The viewer's frames
+    are timed. Where a software driver stands in for a GPU, scenes are smaller, and W4 says so by
+    its name.
 
     Args:
         settings: what to run.
@@ -49,10 +57,12 @@ def device_report(
     """
     on_row("the device")
     device = describe_device()
-    report = run_benchmark(settings, on_row)
+    small = device.get("kind") == SOFTWARE and "gpu" in settings.backends
+    report = run_benchmark(replace(settings, small=small), on_row)
+    count, side = SMALL_BALL if small else (GROWN_COUNT, GROWN_SIDE)
     name = BALL if settings.garden is None else "W2"
     scene = (
-        shot_of(settings.seed, GROWN_COUNT, GROWN_SIDE).scene
+        shot_of(settings.seed, count, side).scene
         if settings.garden is None
         else garden(settings.garden, settings.seed)
     )
@@ -61,6 +71,11 @@ def device_report(
             on_row(f"{name} on {backend}")
             work = partial(pipeline_rows, name, scene, backend, settings.seed, settings.seconds)
             report["rows"] += _rows(name, backend, work)
+    if "gpu" in settings.backends:
+        for size in SIZES:
+            on_row(f"the viewer at {size[0]} x {size[1]}")
+            work = partial(viewer_rows, size, settings.seed, small)
+            report["rows"] += _rows(VIEWER, "gpu", work)
     on_row(f"{name} on {NAME}")
     reason = why_not()
     v_image = upstream(settings.seed, scene.width, scene.height)

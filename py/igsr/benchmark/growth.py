@@ -11,6 +11,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from igsr.errors import IgsrError
 COUNTS = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 SIDES = (256, 512, 1024, 2048)
 GROWN_SIDE, GROWN_COUNT = 512, 100_000
+#: The points of a GPU's report where a software driver stands in for the GPU: minutes, not hours.
+SMALL_POINTS = ((10_000, 256), (30_000, 256), (10_000, 512))
 #: Where the loop of one's own is timed beside the built-in fit.
 PAIR = (20_000, 400)
 SH_DEGREE = 2
@@ -125,15 +128,16 @@ def measure_apart(
 def growth_rows(
     backend: str,
     seed: int,
-    grid: list[tuple[int, int]] | None = None,
+    grid: Sequence[tuple[int, int]] | None = None,
     seconds: float = POINT_SECONDS,
+    name: str = "W4",
 ) -> list[dict[str, Any]]:
-    """W4: the rows of all points, with memory where it can be told."""
+    """W4: the rows of all points, with memory where it can be told; ``name`` is what they go by."""
     rows: list[dict[str, Any]] = []
     buffers: dict[int, int] = {}
     too_slow: tuple[int, int] | None = None
     for count, side in points() if grid is None else grid:
-        common = {"workload": "W4", "backend": backend, "splats": count, "width": side}
+        common = {"workload": name, "backend": backend, "splats": count, "width": side}
         common |= {"height": side, "pass": "fit step"}
         if too_slow is not None and count >= too_slow[0] and side >= too_slow[1]:
             rows.append(
@@ -145,7 +149,7 @@ def growth_rows(
             )
             continue
         try:
-            row = measure_apart(seed, count, side, backend, seconds)
+            row = measure_apart(seed, count, side, backend, seconds) | {"workload": name}
             if "peak_bytes" in row:
                 if side not in buffers:
                     buffers[side] = measure_apart(seed, EMPTY, side, backend, 0.0)["peak_bytes"]

@@ -10,7 +10,7 @@ from typing import Any
 from igsr import _core
 from igsr._internal.atomic_write import check_writable
 from igsr.benchmark.fit_rows import capture_rows, model_path
-from igsr.benchmark.growth import PAIR, POINT_SECONDS, growth_rows, pair_rows
+from igsr.benchmark.growth import PAIR, POINT_SECONDS, SMALL_POINTS, growth_rows, pair_rows
 from igsr.benchmark.machine import describe_machine
 from igsr.benchmark.scenes import garden
 from igsr.benchmark.stage_rows import SECONDS, pipeline_rows, rasterize_rows
@@ -24,6 +24,8 @@ Work = tuple[str, int | None, Callable[[], list[Row]]]
 WORKLOADS = ("W1", "W2", "W3", "W4")
 #: Splats of W3's two models.
 MODEL_COUNTS = (20_000, 100_000)
+#: What W4 is called where it is cut down to what a software driver does in minutes.
+SMALL = "W4 small"
 DOES_NOT_FIT = "the reference does not fit"
 #: What every row has, whether it ran or not.
 COLUMNS: dict[str, Any] = {
@@ -51,6 +53,7 @@ class Settings:
         models: folder that keeps W3's fitted models.
         seed: of all that is drawn.
         seconds: how long a row is repeated.
+        small: a few small points in place of W4, by the name of ``SMALL``.
     """
 
     backends: tuple[str, ...]
@@ -60,6 +63,7 @@ class Settings:
     models: Path = Path("out/bench")
     seed: int = 0
     seconds: float = SECONDS
+    small: bool = False
 
 
 def not_run(workload: str, backend: str, reason: str, splats: int | None = None) -> Row:
@@ -125,8 +129,12 @@ def _work(settings: Settings, backend: str, scene: Any, capture: Capture | None)
             yield "W4", None, lambda: [not_run("W4", backend, DOES_NOT_FIT)]
         else:
             of_a_point = min(seconds, POINT_SECONDS)
-            yield "W4", None, lambda: growth_rows(backend, seed, seconds=of_a_point)
-            yield "W4", PAIR[0], lambda: pair_rows(backend, seed, seconds)
+            if settings.small:
+                few = SMALL_POINTS
+                yield SMALL, None, lambda: growth_rows(backend, seed, few, of_a_point, SMALL)
+            else:
+                yield "W4", None, lambda: growth_rows(backend, seed, seconds=of_a_point)
+                yield "W4", PAIR[0], lambda: pair_rows(backend, seed, seconds)
 
 
 def _capture_work(

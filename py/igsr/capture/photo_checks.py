@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from igsr.errors import IgsrError
 
 #: Cameras nearer to each other than this part of the largest distance are at the same place.
 SAME_PLACE = 1e-6
+#: Photos whose distances to all others are held at a time.
+ROWS = 256
 #: Rays of a photo, per side, and depths tried along them in units of the distance between cameras.
 RAYS, DEPTHS = 7, np.geomspace(0.05, 1000.0, 24)
 
@@ -46,9 +49,7 @@ def check_photos(views: list[View]) -> None:
         )
         return
     centres = np.stack([view.camera.centre for view in views])
-    with np.errstate(over="ignore", invalid="ignore"):
-        distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    farthest = float(distances.max())
+    farthest = float(np.max([rows.max() for _, rows in _distances(centres)]))
     if not np.isfinite(farthest):
         return  # what such cameras do to a fit is said where its splats are placed
     if farthest == 0.0:
@@ -57,7 +58,7 @@ def check_photos(views: list[View]) -> None:
             "is right from there alone."
         )
         return
-    twice = _given_twice(views, distances <= SAME_PLACE * farthest)
+    twice = _given_twice(views, centres, SAME_PLACE * farthest)
     if twice:
         _warn(f"{_listed(twice)} have one and the same camera: a view seen twice tells no more.")
     if not _any_two_share(views, farthest):
@@ -84,13 +85,22 @@ def _is_empty(view: View) -> bool:
     return not pixels.any()
 
 
-def _given_twice(views: list[View], near: np.ndarray) -> list[str]:
+def _distances(centres: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Distances between places [N, 3], some rows [n, N] at a time, with the first row's number."""
+    for first in range(0, len(centres), ROWS):
+        with np.errstate(over="ignore", invalid="ignore"):
+            apart = centres[first : first + ROWS, None] - centres[None]
+            yield first, np.linalg.norm(apart, axis=2)
+
+
+def _given_twice(views: list[View], centres: np.ndarray, apart: float) -> list[str]:
     """Names of the first two views with the same place, direction and intrinsics."""
-    for i, j in np.argwhere(np.triu(near, 1)):
-        a, b = views[i].camera, views[j].camera
-        turned = np.abs(a.viewmat[:3, :3] - b.viewmat[:3, :3]).max()
-        if turned < 1e-6 and np.allclose(a.K, b.K):
-            return [views[i].name, views[j].name]
+    for first, rows in _distances(centres):
+        for i, j in np.argwhere(np.triu(rows <= apart, 1 + first)):
+            a, b = views[first + i].camera, views[j].camera
+            turned = np.abs(a.viewmat[:3, :3] - b.viewmat[:3, :3]).max()
+            if turned < 1e-6 and np.allclose(a.K, b.K):
+                return [views[first + i].name, views[j].name]
     return []
 
 

@@ -73,6 +73,36 @@ class Camera(ArrayEquality):
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
 
+@dataclass(frozen=True)
+class PoseEvidence:
+    """What a camera that was found rests on, and how well it is known.
+
+    Attributes:
+        rests_on: "features" (places that photos share), "network" (what a network predicts) or
+            "both".
+        rotation: standard deviation about each axis, degrees.
+        centre: standard deviation along each axis, world units.
+
+    Raises:
+        IgsrError: it rests on something else, or a deviation is negative or not finite.
+    """
+
+    rests_on: str
+    rotation: float
+    centre: float
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        if self.rests_on not in ("features", "network", "both"):
+            raise IgsrError(f"rests_on is {self.rests_on!r}; give 'features', 'network' or 'both'")
+        for name in ("rotation", "centre"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise IgsrError(
+                    f"the {name} of pose_evidence is {getattr(self, name)!r}; give a finite number "
+                    "of at least 0"
+                )
+
+
 @dataclass(eq=False, repr=False)
 class View(ArrayEquality, NotebookPicture):
     """One photo with its camera.
@@ -104,6 +134,7 @@ class View(ArrayEquality, NotebookPicture):
         rig: the name that views of one wide photo (a panorama, a fisheye photo of more than 120
             degrees) share: they have one centre, move together and are held out together. None for
             other photos.
+        pose_evidence: what the camera rests on, where igsr found it; or None.
 
     Raises:
         IgsrError: the image, mask or weights have another dtype or shape than the camera's size
@@ -125,6 +156,7 @@ class View(ArrayEquality, NotebookPicture):
     rig: str | None = None
     depth: np.ndarray | None = None
     depth_confidence: np.ndarray | None = None
+    pose_evidence: PoseEvidence | None = None
 
     def __post_init__(self) -> None:
         """Check the pixels against the camera."""

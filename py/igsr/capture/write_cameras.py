@@ -17,14 +17,16 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
     One frame per photo: ``file_path`` (its name in the capture), ``w``, ``h``, ``fl_x``, ``fl_y``,
     ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes; ``rig``, which
     views of one wide photo share; ``exposure`` where a fit has found it: ``gain`` and ``offset`` of
-    R, G and B (see ``Exposure``).
+    R, G and B (see ``Exposure``); ``pose_evidence`` where the camera was found: what it
+    ``rests_on``, and the standard deviations of ``rotation`` (degrees) and ``centre`` (world units;
+    see ``PoseEvidence``).
 
     Raises:
         IgsrError: the file cannot be written.
     """
     frames = []
     for view in views:
-        camera = view.camera
+        camera, known = view.camera, view.pose_evidence
         to_world = np.linalg.inv(camera.viewmat)
         to_world[:3, 1:3] *= -1.0
         frames.append(
@@ -38,6 +40,7 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
                 "cy": float(camera.K[1, 2]),
                 "transform_matrix": to_world.tolist(),
                 **({} if view.rig is None else {"rig": view.rig}),
+                **({} if known is None else {"pose_evidence": vars(known)}),
                 **({} if view.exposure is None else {"exposure": view.exposure.plain()}),
             }
         )

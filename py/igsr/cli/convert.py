@@ -52,10 +52,24 @@ def convert_command(
             "Default: as in the report.json of its fit, else black.",
         ),
     ] = None,
+    lod: Annotated[
+        int | None,
+        typer.Option(
+            "--lod",
+            metavar="N",
+            help="Write TARGET as a folder of N levels of detail, coarse to fine, each a quarter "
+            "of the next one, in cells; lod.json lists them.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write SCENE in the format of TARGET; name what that format cannot hold."""
     with error_messages(lambda: "Interrupted; nothing is written."), warning_messages():
+        if lod is not None:
+            if cameras is not None or background is not None:
+                raise IgsrError("--cameras and --background are for pages, not for --lod")
+            _write_levels(scene, target, lod, as_json)
+            return
         is_page = target.suffix.lower() == PAGE
         for option, value in (("--cameras", cameras), ("--background", background)):
             if value is not None and not is_page:
@@ -88,6 +102,19 @@ def convert_command(
     output_console().print(
         f"{len(splats)} splats in {target}, {size} bytes ({size / max(before, 1):.2f} of {scene})"
     )
+
+
+def _write_levels(scene: Path, target: Path, levels: int, as_json: bool) -> None:
+    from igsr.blocks.levels import INDEX, write_levels
+
+    index = write_levels(Splats.load(scene), target, levels)
+    if as_json:
+        print_json({"scene": str(scene), "target": str(target), **index})
+        return
+    console = output_console()
+    for number, level in enumerate(index["levels"]):
+        console.print(f"level {number}: {level['splats']} splats in {len(level['cells'])} cells")
+    console.print(str(target / INDEX), style="dim")
 
 
 def _write_page(

@@ -104,6 +104,24 @@ def fit_command(
     allow_missing: AllowMissingOption = False,
     background: BackgroundOption = None,
     config: ConfigOption = None,
+    blocks: Annotated[
+        str | None,
+        typer.Option(
+            "--blocks",
+            metavar="auto|N",
+            help="Fit in N blocks on the ground, one after another or over --ray: for scenes that "
+            "do not fit into memory. CAPTURE needs cameras.",
+        ),
+    ] = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            "--ray",
+            metavar="ADDRESS",
+            help="Fit blocks on the Ray cluster at this address, or that this machine is part of "
+            "(auto); needs igsr\\[ray] and a disk that all machines mount.",
+        ),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")
     ] = False,
@@ -136,6 +154,23 @@ def fit_command(
         photos = photos_or_example(capture, example, out, "CAPTURE")
         if max_size is None:
             max_size = default_max_size(name, quality.value)
+
+        if blocks is not None or ray is not None:
+            from igsr.cli.fit_blocks import fit_blocks
+
+            fit_blocks(
+                photos,
+                out,
+                blocks=blocks or "auto",
+                ray=ray,
+                holdout=holdout,
+                max_size=max_size,
+                backend=name,
+                settings={"preset": preset.value, "quality": quality.value, **given},
+                background=background_color(background),
+                as_json=as_json,
+            )
+            return
 
         def announced(seen: Overview, kept: bool) -> None:
             from igsr.cli.announcement import announce

@@ -52,7 +52,7 @@ EstimatorOption = Annotated[
         "--estimator",
         metavar="NAME",
         help=f"What finds the cameras: {', '.join(ESTIMATORS)}, or auto: dust3r where its weights "
-        "are found, else colmap.",
+        "are found, else da3 where its are, else colmap.",
     ),
 ]
 
@@ -78,8 +78,8 @@ MatcherOption = Annotated[
     typer.Option(
         "--matcher",
         metavar="NAME",
-        help="For colmap: what finds and matches features: sift, or loma (a network that matches "
-        "photos from further apart; needs the package lomatch).",
+        help="For colmap and da3: what finds and matches features: sift, or loma (a network that "
+        "matches photos from further apart; needs the package lomatch).",
     ),
 ]
 
@@ -296,6 +296,7 @@ def _posed(
                 "name": view.name,
                 "centre": view.camera.centre.tolist(),
                 "focal": [float(view.camera.K[0, 0]), float(view.camera.K[1, 1])],
+                "pose_evidence": view.pose_evidence and vars(view.pose_evidence),
             }
             for view in capture.views
         ],

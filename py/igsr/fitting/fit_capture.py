@@ -26,6 +26,7 @@ from igsr.fitting.fingerprint import fingerprint, hash_of
 from igsr.fitting.fitter import (
     camera_rows,
     check_fits,
+    first_splats,
     fitted_cameras,
     fitted_exposures,
     fitter_of,
@@ -33,6 +34,7 @@ from igsr.fitting.fitter import (
     photos_among,
     splat_arrays,
     with_camera_rows,
+    with_splats_after,
     with_train_cameras,
     with_train_exposures,
     without_exposures,
@@ -96,6 +98,8 @@ def fit(
     transients: TransientMode | None = None,
     remove_floaters: bool | None = None,
     background: tuple[float, float, float] | None = None,
+    frozen: Splats | None = None,
+    whole_schedule: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
 ) -> Splats:
@@ -159,6 +163,11 @@ def fit(
             (``igsr.remove_floaters``); the last progress counts them. The checkpoint keeps them.
         background: RGB in [0, 1] behind splats and photos with alpha; None is a new random color in
             every step for photos with alpha and black for photos without.
+        frozen: splats that renders show beside those that are fitted, and that stay as they are:
+            what is round a part of a scene whose other parts are known. They need ``start`` with
+            splats of the same origin and SH degree, and do not count to ``max_splats``.
+        whole_schedule: where ``start`` has splats, whether the fit takes the rates and the density
+            control of all steps of a fit, as from points, and not those of its last ones.
         checkpoint: ``.npz`` file to save to every 500 steps or 20 seconds, at the end, and on
             Ctrl-C (KeyboardInterrupt, which is raised again); where cameras are optimized, from
             when they have been found roughly.
@@ -194,9 +203,9 @@ def fit_with_cameras(*args: Any, **kwargs: Any) -> tuple[Splats, Capture]:
     """As ``fit``, with the same arguments; also returns cameras and exposures.
 
     Returns:
-        The splats, and the capture with its train cameras and the exposures of its train views
-        (``View.exposure``) as they were optimized, and with masks that leave out transient things;
-        the capture itself where there are none of these.
+        The splats, without those that were frozen, and the capture with its train cameras and the
+        exposures of its train views (``View.exposure``) as they were optimized, and with masks that
+        leave out transient things; the capture itself where there are none of these.
 
     Raises:
         IgsrError, UserWarning, RuntimeError: as ``fit``.
@@ -213,6 +222,8 @@ def _fitted(
     start: str | Splats | None,
     backend: str,
     progress: Report | None,
+    frozen: Splats | None,
+    whole_schedule: bool,
     checkpoint: str | os.PathLike[str] | None,
     resume: bool,
     **given: Any,
@@ -230,8 +241,11 @@ def _fitted(
         )
     else:
         settings = _settings_from_splats(
-            preset, support_of(photos_among(views)), quality, initial, given
+            preset, support_of(photos_among(views)), quality, initial, given, whole_schedule
         )
+    if frozen is not None:
+        _check_frozen(frozen, initial)
+    still = 0 if frozen is None else len(frozen)
     if resume and checkpoint is None:
         raise IgsrError("resume needs checkpoint, the file to continue from.")
     check_photos(views)
@@ -246,13 +260,15 @@ def _fitted(
     if settings.moves_cameras and capture.points is not None:
         tracks = capture.points.tracks
     priors = None
-    if tracks is not None:
+    if settings.moves_cameras:
         # By the cameras as they were given, also where the fit goes on from others.
         poses = settings.poses != "fixed"
         priors = pose_priors(views, capture.points, poses=poses, focal=settings.focal)
     file = None
     if checkpoint is not None:
-        splats_hash = None if initial is None else hash_of(splat_arrays(initial).values())
+        given_splats = [one for one in (initial, frozen) if one is not None]
+        arrays = [array for one in given_splats for array in splat_arrays(one).values()]
+        splats_hash = hash_of(arrays) if arrays else None
         # What "auto" came to.
         decided = replace(settings, exposure="off" if exposures is None else "on")
         if all(view.depth is None for view in views):
@@ -275,6 +291,8 @@ def _fitted(
                 )
                 seconds = time.perf_counter() - began
             state, started = initial_state(_seen_alike(capture, exposures), settings, initial)
+            if frozen is not None:
+                state |= with_splats_after(state, frozen)
 
         # Make the fitter of views, splats and settings.
         origin = state.pop("origin", np.zeros(0))
@@ -282,7 +300,7 @@ def _fitted(
             views = with_camera_rows(capture.train_views, state.pop(ROUGH, None))
             if origin.shape != (3,) or not np.isfinite(origin).all():
                 raise ValueError("origin: must be three finite numbers")
-            values = {**settings.plain(), "first_step": settings.first_step}
+            values = {**settings.plain(), "first_step": settings.first_step, "frozen_splats": still}
             masks, looked = resumed_masks(views, state)
 
             def make(views: Sequence[View], state: dict[str, Any]) -> _core.Fitter:
@@ -290,7 +308,7 @@ def _fitted(
                 return fitter_of(views, origin, state, values, backend, priors, exposures)
 
             name = cast(Backend, device["backend"])
-            search = TransientSearch(views, settings, origin, name, make, masks, looked)
+            search = TransientSearch(views, settings, origin, name, make, masks, looked, still)
             fitter = make(search.masked_views(), state)
         except ValueError as error:
             if resume:
@@ -338,8 +356,10 @@ def _fitted(
                 background=settings.background,
                 seed=settings.seed,
                 backend=device["backend"],
+                frozen=still,
             )
             splats, removed = cleaned.splats, cleaned.removed
+        splats = first_splats(splats, len(splats) - still)
         if not stopped:
             run.end(len(splats), removed)
     return splats, with_train_exposures(capture, found)
@@ -363,6 +383,20 @@ def _check_capture(capture: object) -> None:
         )
 
 
+def _check_frozen(frozen: Splats, initial: Splats | None) -> None:
+    if initial is None:
+        raise IgsrError("frozen needs start, the splats that are fitted beside the frozen ones.")
+    if frozen.antialiased:
+        raise IgsrError("frozen has antialiased splats, which igsr does not fit; give others.")
+    if frozen.sh_degree != initial.sh_degree:
+        raise IgsrError(
+            f"frozen has splats of SH degree {frozen.sh_degree} where start has degree "
+            f"{initial.sh_degree}; give the same."
+        )
+    if not np.array_equal(frozen.origin, initial.origin):
+        raise IgsrError("frozen and start have other origins; give splats of one scene.")
+
+
 def _check_focal(views: list[View], settings: FitSettings) -> None:
     rigged = next((view for view in views if view.rig is not None), None)
     if rigged is not None and settings.focal != "fixed":
@@ -373,9 +407,16 @@ def _check_focal(views: list[View], settings: FitSettings) -> None:
 
 
 def _settings_from_splats(
-    preset: str, photos: PhotoSupport, quality: Quality, splats: Splats, given: dict[str, Any]
+    preset: str,
+    photos: PhotoSupport,
+    quality: Quality,
+    splats: Splats,
+    given: dict[str, Any],
+    whole_schedule: bool,
 ) -> FitSettings:
     """The settings of a fit that goes on from splats: the last steps of the preset's schedule.
+
+    With ``whole_schedule``, all of them.
 
     Raises:
         IgsrError: the splats and the settings do not go together.
@@ -395,6 +436,8 @@ def _settings_from_splats(
         )
     if splats.antialiased:
         raise IgsrError("start has antialiased splats, which igsr does not fit; give others.")
+    if whole_schedule:
+        return settings
     usual = settings_for(preset, photos, quality, **(given | {"steps": None}))
     whole = max(settings.steps, usual.steps)
     schedule = settings_for(preset, photos, quality, **(given | {"steps": whole}))

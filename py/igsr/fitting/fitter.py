@@ -22,6 +22,8 @@ from igsr.fitting.settings import FitSettings
 from igsr.rendering.renders import intrinsics_of, viewmat_about
 from igsr.splats import Splats
 
+#: Parameters of splats, each with a row for every splat.
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 #: Steps on photos, at least, for one on a pseudo-view, where there are both: these teach what they
 #: can soon, and what photos show is right.
 PHOTO_STEPS = 5
@@ -47,7 +49,8 @@ def fitter_of(
         state: float32 arrays of N splats ("means" [N, 3] ...), and where a fit goes on, those of
             the optimizer, as ``Fitter.state`` returns them.
         settings: fields of ``FitSettings``, and what else the fitter knows: "frozen" (splats stay
-            as they are) and "camera_warm_up" (fraction of the steps before cameras move).
+            as they are), "frozen_splats" (so many, the last ones, do) and "camera_warm_up"
+            (fraction of the steps before cameras move).
         backend: "cpu" or "gpu".
         priors: of the V cameras, where these are optimized and something is known of them.
         exposures: where those of the V views start; None where none is optimized.
@@ -122,8 +125,21 @@ def initial_state(
 
 def splat_arrays(splats: Splats) -> dict[str, npt.NDArray[Any]]:
     """The arrays of splats by name, with their origin."""
-    names = ("means", "quats", "scales", "opacities", "sh", "origin")
-    return {name: getattr(splats, name) for name in names}
+    return {name: getattr(splats, name) for name in (*PARAMETERS, "origin")}
+
+
+def with_splats_after(
+    state: dict[str, npt.NDArray[Any]], splats: Splats
+) -> dict[str, npt.NDArray[Any]]:
+    """The parameters of a state's splats, followed by those of others of the same origin."""
+    return {name: np.concatenate([state[name], getattr(splats, name)]) for name in PARAMETERS}
+
+
+def first_splats(splats: Splats, count: int) -> Splats:
+    """The first ``count`` splats."""
+    if count == len(splats):
+        return splats
+    return replace(splats, **{name: getattr(splats, name)[:count] for name in PARAMETERS})
 
 
 def photos_among(views: list[View]) -> list[View]:

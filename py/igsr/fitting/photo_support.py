@@ -78,13 +78,21 @@ def support_of(views: Sequence[View]) -> PhotoSupport:
     # What a photo looks at: as far along its axis as the place that all look at.
     reach = np.maximum(((target - centres) * forward).sum(axis=1), 1e-9)
     looked_at = centres + reach[:, None] * forward
+    K = np.stack([view.camera.K for view in views])
+    sizes = np.array([(view.camera.width, view.camera.height) for view in views])
+    rotations = np.stack([view.camera.viewmat[:3, :3] for view in views])
+    shifts = np.stack([view.camera.viewmat[:3, 3] for view in views])
     seen_by, apart = [], []
     for i, place in enumerate(looked_at):
         rays = centres - place
         rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         angles = np.degrees(np.arccos(np.clip(rays @ rays[i], -1.0, 1.0)))
-        near = [view for view, angle in zip(views, angles, strict=True) if angle < SUPPORTS_WITHIN]
-        seen_by.append(sum(_sees(view, place) for view in near))
+        local = rotations @ place + shifts
+        ahead = local[:, 2] > 0.0
+        at = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]
+        pixel = K[:, [0, 1], [0, 1]] * at + K[:, [0, 1], [2, 2]]
+        sees = ahead & ((pixel >= 0.0) & (pixel <= sizes)).all(axis=1)
+        seen_by.append(int((sees & (angles < SUPPORTS_WITHIN)).sum()))
         apart.append(np.delete(angles, i).min(initial=180.0))
     used = [
         view.camera.width * view.camera.height if view.mask is None else int(view.mask.sum())
@@ -148,13 +156,3 @@ def squares_of_one_tone(image: np.ndarray, mask: np.ndarray | None = None) -> fl
         total += float(counted.reshape(squares).mean(axis=(1, 3))[of_one].sum())
         divided = (divided & ~of_one).repeat(2, axis=0).repeat(2, axis=1)
     return total
-
-
-def _sees(view: View, place: np.ndarray) -> bool:
-    camera = view.camera
-    x, y, z = camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3]
-    if z <= 0.0:
-        return False
-    u = camera.K[0, 0] * x / z + camera.K[0, 2]
-    v = camera.K[1, 1] * y / z + camera.K[1, 2]
-    return bool(0.0 <= u <= camera.width and 0.0 <= v <= camera.height)

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import Points, View
+from igsr.geometry.bundle_equations import RIDGE, Equations, gauge, without_points
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -39,10 +40,6 @@ DEEPEST = 1e5
 #: What is known of a camera is limited to this many times what is known least of it (in units of
 #: its own deviations): of only two cameras, one direction is known by definition.
 MOST_KNOWN = 1e7
-#: Points that are eliminated at a time; bounds memory.
-AT_ONCE = 512
-#: Added to the information, as a part of it: along what no track shows, cameras are free.
-RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -62,22 +59,36 @@ class PosePriors:
     focal_information: Float64
 
 
-@dataclass(frozen=True)
-class _Equations:
-    """Linearised reprojection errors of M observations, two rows each.
-
-    The C columns are those of ``normal`` that an observation has to do with; the last one is that
-    of the errors themselves.
-    """
-
-    point: Int64  # [M], from 0 without gaps
-    column: Int64  # [M, C]
-    value: Float64  # [M, 2, C], pixels by unit of the parameter
-    of_point: Float64  # [M, 2, 3], pixels by world unit
-    width: int
-
-
 def pose_priors(
+    views: Sequence[View], points: Points | None, *, poses: bool, focal: str
+) -> PosePriors | None:
+    """What is known of the cameras that are to be optimized.
+
+    A camera with tracks is known by these, another by its ``pose_evidence``.
+
+    Args:
+        views, points, poses, focal: as ``priors_of_tracks``.
+
+    Returns:
+        None where nothing is known.
+    """
+    priors = priors_of_tracks(views, points, poses=poses, focal=focal)
+    if not poses or all(view.pose_evidence is None for view in views):
+        return priors
+    if priors is None:
+        priors = PosePriors(views, np.zeros((len(views), 6, 6)), np.zeros(len(views)))
+    information = priors.information.copy()
+    for k, view in enumerate(views):
+        known = view.pose_evidence
+        if known is None or information[k].any() or not min(known.rotation, known.centre) > 0.0:
+            continue
+        # Not ``LEFT_OPEN`` of it: a prediction is wrong by all of it, and colors may mend it.
+        deviations = np.repeat([np.radians(known.rotation), known.centre], 3)
+        information[k] = np.diag(1.0 / deviations**2)
+    return PosePriors(views, information, priors.focal_information)
+
+
+def priors_of_tracks(
     views: Sequence[View], points: Points | None, *, poses: bool, focal: str
 ) -> PosePriors | None:
     """What the tracks of a capture say about the cameras that are to be optimized.
@@ -116,7 +127,7 @@ def _priors(
 ) -> PosePriors | None:
     count = len(views)
     equations = _linearised(views, xyz, view, point, xy, poses, focal)
-    normal = _without_points(equations)
+    normal = without_points(equations)
     size = equations.width - 1
     slope, error = normal[:size, size], normal[size, size]
     known = np.diagonal(normal)[:size]
@@ -127,7 +138,7 @@ def _priors(
         # Turning, moving and scaling all together is seen by no photo, and is not what is asked.
         unseen = np.zeros((size, 7))
         # Cameras without tracks have no part in it: they would loosen all others.
-        unseen[: 6 * count] = _gauge(views) * np.repeat(enough, 6)[:, None]
+        unseen[: 6 * count] = gauge([view.camera for view in views]) * np.repeat(enough, 6)[:, None]
         unseen = np.linalg.qr(unseen * scale[:, None])[0]
     covariance = np.linalg.inv(scaled + unseen @ unseen.T) - unseen @ unseen.T
     step = -covariance @ (slope / scale) / scale
@@ -206,7 +217,7 @@ def _linearised(
     xy: Float64,
     poses: bool,
     focal: str,
-) -> _Equations:
+) -> Equations:
     """The equations of bundle adjustment at where cameras and points are."""
     count, total = len(views), len(view)
     cameras = [one.camera for one in views]
@@ -234,54 +245,13 @@ def _linearised(
     width = before + focals + 1
     values.append((ray * focal_pixels + K[:, :2, 2] - xy)[:, :, None])
     columns.append(np.full((total, 1), width - 1))
-    return _Equations(
+    return Equations(
         np.unique(point, return_inverse=True)[1],
         np.concatenate(columns, axis=1),
         np.concatenate(values, axis=2),
         of_local @ viewmat[:, :3, :3],
         width,
     )
-
-
-def _without_points(equations: _Equations) -> Float64:
-    """The normal equations [width, width] once each point has gone where it fits best."""
-    normal = np.zeros((equations.width, equations.width))
-    order = np.argsort(equations.point, kind="stable")
-    point = equations.point[order]
-    for first in range(0, int(point[-1]) + 1, AT_ONCE):
-        chunk = order[slice(*np.searchsorted(point, (first, first + AT_ONCE)))]
-        number = equations.point[chunk] - first
-        column, value = equations.column[chunk], equations.value[chunk]
-        of_point = equations.of_point[chunk]
-        np.add.at(
-            normal,
-            (column[:, :, None], column[:, None, :]),
-            np.einsum("mri,mrj->mij", value, value),
-        )
-        count = int(number.max()) + 1
-        own = np.zeros((count, 3, 3))
-        np.add.at(own, number, np.einsum("mri,mrj->mij", of_point, of_point))
-        own += RIDGE * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        mixed = np.zeros((count, equations.width, 3))
-        np.add.at(mixed, (number[:, None], column), np.einsum("mri,mrj->mij", value, of_point))
-        half = np.linalg.solve(np.linalg.cholesky(own), mixed.swapaxes(1, 2))
-        half = half.reshape(3 * count, -1)
-        normal -= half.T @ half
-    return normal
-
-
-def _gauge(views: Sequence[View]) -> Float64:
-    """How turning about, moving along x, y, z and scaling the world moves V cameras [6 V, 7]."""
-    rows = []
-    for view in views:
-        rotation, shift = view.camera.viewmat[:3, :3], view.camera.viewmat[:3, 3]
-        own = np.zeros((6, 7))
-        own[:3, :3] = -rotation
-        own[3:, :3] = np.cross(rotation, shift, axisa=0, axisb=0, axisc=0)
-        own[3:, 3:6] = -rotation
-        own[3:, 6] = shift
-        rows.append(own)
-    return np.concatenate(rows)
 
 
 def _inverse(covariance: Float64) -> Float64:

@@ -16,7 +16,12 @@ import numpy.typing as npt
 from igsr import _core
 from igsr._internal.choices import Backend
 from igsr.capture import Capture, View
-from igsr.fitting.fitter import fitted_cameras, fitted_exposures, without_exposures
+from igsr.fitting.fitter import (
+    PARAMETERS,
+    fitted_cameras,
+    fitted_exposures,
+    without_exposures,
+)
 from igsr.fitting.settings import FitSettings
 from igsr.floaters.photo_evidence import behind_masks
 from igsr.splats import Splats
@@ -26,8 +31,6 @@ Bool = npt.NDArray[np.bool_]
 
 #: Parts of the steps after which transient things are looked for.
 MOMENTS = (0.3, 0.5, 0.7)
-#: Parameters of splats, each with a row for every splat.
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 #: What checkpoints call the masks, packed bits of all photos, and the step of the last look.
 MASKS, LOOKED = "transient_masks", "transients_looked"
 
@@ -61,6 +64,7 @@ class TransientSearch:
         make: makes the fitter of views and a state.
         found: for each view, bool [H, W], the pixels that show transient things; None where none.
         looked: the step of the last look; -1 before the first.
+        frozen: so many splats, the last ones, stay in any case.
     """
 
     views: Sequence[View]
@@ -70,6 +74,7 @@ class TransientSearch:
     make: MakeFitter
     found: list[Bool | None] = field(default_factory=list)
     looked: int = -1
+    frozen: int = 0
 
     def __post_init__(self) -> None:
         """Begin without masks, unless some are given."""
@@ -132,7 +137,8 @@ class TransientSearch:
         """Which splats other pixels show, too; what only masked ones show nothing would correct."""
         cameras = [view.camera for view in views]
         keep: Bool = ~behind_masks(splats, cameras, found, self.backend)
-        return keep if keep.any() else ~keep
+        keep[len(keep) - self.frozen :] = True
+        return keep if keep[: len(keep) - self.frozen].any() else np.ones_like(keep)
 
     def kept(self) -> dict[str, npt.NDArray[Any]]:
         """What checkpoints keep of it, by name."""

@@ -45,6 +45,7 @@ def remove_floaters(
     background: Sequence[float] | None = None,
     seed: int = 0,
     backend: str = "auto",
+    frozen: int = 0,
 ) -> Cleaned:
     """Remove splats that photos do not support, or, without photos, stray ones.
 
@@ -57,6 +58,7 @@ def remove_floaters(
             photos have alpha, else black.
         seed: of the random numbers of the estimate which photos need a splat.
         backend: "auto", "cpu", "gpu" or "reference".
+        frozen: with photos, so many splats, the last ones, stay in any case.
 
     Returns:
         The splats that are left, and how many of which kind were removed. Where none would be left,
@@ -71,7 +73,10 @@ def remove_floaters(
     if not capture.train_views:
         raise IgsrError(f"{capture.path} has no train views to ask about splats.")
     color = default_background(capture) if background is None else background
-    return _without(splats, unsupported_splats(splats, capture.train_views, color, seed, backend))
+    kinds = unsupported_splats(splats, capture.train_views, color, seed, backend)
+    for kind in kinds.values():
+        kind[len(kind) - frozen :] = False
+    return _without(splats, kinds, frozen)
 
 
 def stray_splats(splats: Splats) -> dict[str, Bool]:
@@ -131,10 +136,10 @@ def unsupported_splats(
     return {"unseen": unseen, "floating": floating & ~unseen}
 
 
-def _without(splats: Splats, kinds: dict[str, Bool]) -> Cleaned:
+def _without(splats: Splats, kinds: dict[str, Bool], frozen: int = 0) -> Cleaned:
     """The splats that are of no kind."""
     keep = ~np.logical_or.reduce(list(kinds.values()))
-    if not keep.any():
+    if not keep[: len(keep) - frozen].any():
         return Cleaned(splats, dict.fromkeys(kinds, 0))
     return Cleaned(_subset(splats, keep), {name: int(kind.sum()) for name, kind in kinds.items()})
 

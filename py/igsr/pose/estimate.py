@@ -10,6 +10,7 @@ import numpy as np
 
 from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
+from igsr.capture.types import PoseEvidence
 from igsr.capture.undistort import Lens
 from igsr.pose.grid import Grid
 
@@ -37,6 +38,8 @@ class Estimate:
         weights: of the network that was used: its "name", the "licence" that the publisher states
             for weights of that name, and the "sha256" of its file, which tells whether it is those;
             None where there is none.
+        evidence: per photo what its camera rests on, None where that is not known; an empty list
+            says that of all.
     """
 
     cameras: list[Camera | None]
@@ -47,6 +50,7 @@ class Estimate:
     lenses: list[Lens | None] = field(default_factory=list)
     grids: list[Grid | None] = field(default_factory=list)
     weights: dict[str, str] | None = None
+    evidence: list[PoseEvidence | None] = field(default_factory=list)
 
 
 class Estimator(Protocol):

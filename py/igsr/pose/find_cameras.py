@@ -35,7 +35,7 @@ LONGEST = 1600
 
 #: Numbers of estimators' ways to cameras, where they have changed: what was found by another way is
 #: found anew.
-METHODS = {"colmap": 2}
+METHODS = {"colmap": 2, "da3": 2}
 
 #: What photos are given as.
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str] | Photo]
@@ -57,7 +57,7 @@ def estimate_poses(
         photos: a folder, a video, or a list of files or of ``Photo``.
         estimator: "colmap" (nothing to download), "dust3r" or "da3" (networks, whose checkpoint
             the user has), or "auto": the cameras that the folder already has, else DUSt3R where a
-            checkpoint is found, else COLMAP.
+            checkpoint is found, else Depth Anything 3 where one is, else COLMAP.
         seed: random seed; deterministic for a given seed.
         frames: how many frames are taken of each video.
         max_size: longest side, in pixels, of the capture's photos; larger ones are reduced, none is
@@ -66,7 +66,7 @@ def estimate_poses(
         progress: called with a stage, how much of it is done, and how much there is.
         options: of the estimator alone: COLMAP's ``matcher`` ("sift", "loma" or a ``Matcher``);
             DUSt3R's ``checkpoint``, ``graph`` and ``cameras``; those of Depth Anything 3,
-            ``checkpoint``, ``cameras``, ``cameras_from`` and ``bundle_adjustment``.
+            ``checkpoint``, ``cameras``, ``cameras_from``, ``bundle_adjustment`` and ``matcher``.
 
     Returns:
         The registered photos, upright and undistorted, in one world frame of unknown scale; all are
@@ -214,10 +214,9 @@ def chosen_estimator(estimator: str, options: dict[str, Any]) -> str:
         IgsrError: there is none of that name, or an option is not its own.
     """
     if estimator == AUTO:
-        estimator = next(name for name, entry in ESTIMATORS.items() if entry.ready(options))
-        # COLMAP is always ready, and may know an option that the one before it does not.
-        if _foreign(estimator, options) and not _foreign("colmap", options):
-            estimator = "colmap"
+        # One that stands behind it may know an option that it does not.
+        ready = [name for name, entry in ESTIMATORS.items() if entry.ready(options)]
+        estimator = next((name for name in ready if not _foreign(name, options)), ready[0])
     elif estimator not in ESTIMATORS:
         raise IgsrError(f"estimator must be {AUTO}, {' or '.join(ESTIMATORS)}, not {estimator!r}")
     foreign = _foreign(estimator, options)

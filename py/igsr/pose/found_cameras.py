@@ -16,7 +16,7 @@ from igsr.capture import Camera, Capture, Points, View
 from igsr.capture.downscaling import resampled_plane, resized_camera
 from igsr.capture.photo_folder import Photo
 from igsr.capture.tracks import resized
-from igsr.capture.types import Tracks
+from igsr.capture.types import PoseEvidence, Tracks
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Estimate
@@ -64,6 +64,7 @@ class FoundCameras:
             depths=_trusted_depths(photos, estimate),
             grids=[],
             lenses=list(estimate.lenses) or [None] * len(photos),
+            evidence=list(estimate.evidence) or [None] * len(photos),
         )
         return FoundCameras([photo.name for photo in photos], whole, made_by)
 
@@ -123,7 +124,7 @@ class FoundCameras:
             if depth is not None and (lens is None or lens.is_pinhole):
                 size = view.camera.width, view.camera.height
                 view = replace(view, depth=resampled_plane(depth, *size))
-            views[photo.name] = view
+            views[photo.name] = replace(view, pose_evidence=self.estimate.evidence[index])
         lost = [name for name in self.placed if name not in views]
         if lost:
             raise IgsrError(f"The photo {lost[0]} is gone or cannot be read; put it back")
@@ -163,6 +164,7 @@ class FoundCameras:
             "track_names": points.tracks.names if points and points.tracks else [],
             "made_by": self.made_by,
             "weights": found.weights,
+            "evidence": [one and vars(one) for one in found.evidence],
         }
         arrays[_ABOUT] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
         file = io.BytesIO()
@@ -194,6 +196,9 @@ def read_found(path: Path) -> FoundCameras:
         points = _points(arrays, _texts(about["track_names"]))
         estimate = Estimate(cameras, points, depths, trusted, _texts(about["warnings"]), lenses)
         estimate.weights = _weights(about.get("weights"))
+        estimate.evidence = [_evidence(one) for one in about.get("evidence", [None] * count)]
+        if len(estimate.evidence) != count:
+            raise ValueError("it has not as many reasons for cameras as photos")
         if len(set(names)) < count or not isinstance(about["made_by"], dict):
             raise ValueError("its names or settings are wrong")
         return FoundCameras(names, estimate, about["made_by"])
@@ -245,6 +250,12 @@ def _weights(value: Any) -> dict[str, str] | None:
     if not isinstance(value, dict):
         raise ValueError("it has something else where weights belong")
     return dict(zip(_texts(list(value)), _texts(list(value.values())), strict=True))
+
+
+def _evidence(fields: Any) -> PoseEvidence | None:
+    if fields is None:
+        return None
+    return PoseEvidence(fields["rests_on"], float(fields["rotation"]), float(fields["centre"]))
 
 
 def _camera(arrays: dict[str, np.ndarray], index: int, size: Any) -> Camera | None:

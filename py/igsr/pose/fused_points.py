@@ -46,3 +46,25 @@ def fused_points(
     return Points(
         np.concatenate(xyz)[taken], np.concatenate(rgb)[taken], np.concatenate(confidence)[taken]
     )
+
+
+def joined_points(of_features: Points | None, fused: Points | None) -> Points | None:
+    """Points of features, with their tracks, and points of depths together.
+
+    Only the order of confidences counts: what photos share is surer than any depth.
+
+    Args:
+        of_features: with tracks, or None.
+        fused: with confidence, or None.
+    """
+    if of_features is None or fused is None or fused.confidence is None:
+        return fused if of_features is None else of_features
+    surest = float(fused.confidence.max())
+    own = of_features.confidence
+    own = np.ones(len(of_features.xyz)) if own is None else own / own.max()
+    return Points(
+        np.concatenate([of_features.xyz, fused.xyz]),
+        np.concatenate([of_features.rgb, fused.rgb]),
+        np.concatenate([surest * (1.0 + own), fused.confidence]),
+        of_features.tracks,
+    )

@@ -60,6 +60,7 @@ def _da3(
     cameras: Mapping[str, Camera] | None = None,
     cameras_from: str = "decoder",
     bundle_adjustment: bool = True,
+    matcher: str | Matcher = "sift",
 ) -> Estimator:
     with naming_extra("estimator da3"):
         from igsr.pose.da3.estimator import Da3
@@ -69,6 +70,7 @@ def _da3(
         cameras=cameras,
         cameras_from=cameras_from,
         bundle_adjustment=bundle_adjustment,
+        matcher=matcher,
     )
 
 
@@ -80,10 +82,10 @@ def _da3_is_ready(options: Mapping[str, Any]) -> bool:
     return find_checkpoint(options.get("checkpoint")) is not None
 
 
-#: In the order that "auto" tries them. COLMAP is always ready: what stands behind it is taken by
-#: name only, as Depth Anything 3, of which nobody measured that it finds better cameras.
+#: In the order that "auto" tries them. Depth Anything 3 comes before COLMAP, whose cameras stand
+#: there, too, where it places all photos. COLMAP is always ready, and is last.
 ESTIMATORS = {
     "dust3r": Entry(_dust3r, _dust3r_is_ready),
-    "colmap": Entry(_colmap, lambda options: True),
     "da3": Entry(_da3, _da3_is_ready),
+    "colmap": Entry(_colmap, lambda options: True),
 }

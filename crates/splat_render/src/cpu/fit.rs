@@ -16,6 +16,7 @@ use super::rasterize::{Planes, rasterize_tiles};
 use super::rasterize_backward::{
     COLOR_SUMS, DEPTH_SUMS, PairSums, PictureGradients, gather, rasterize_backward_tiles,
 };
+use super::simd::prefetch;
 use super::tile::TileSplat;
 use crate::constants::TILE;
 use crate::error::Result;
@@ -210,8 +211,7 @@ impl Dropout {
 }
 
 /// One task's scratch: a block's gradients on their way from its pairs to its parameters.
-struct Scratch<const N: usize> {
-    pairs: Vec<PairSums<N>>,
+struct Scratch {
     backward: Box<BackwardBlock>,
     v: BlockGradients,
     explore: Box<ExploreBlock>,
@@ -226,13 +226,14 @@ impl CpuFit {
         size: [f32; 2],
         sums: &[PairSums<N>],
     ) {
-        let FitState { splats: values, first, second, stats } = &mut self.state;
+        let moving = self.state.moving();
+        let FitState { splats: values, first, second, stats, .. } = &mut self.state;
         let n = values.len();
         let stride = values.stride();
         let degree = input.sh_degree.min(values.sh_degree);
         let (bins, tile_splats) = (&self.bins, &self.splats);
         let dropout = Dropout::new(input);
-        let plan = BlockStep::new(&input.adam(), n, values.sh_degree);
+        let plan = BlockStep::new(&input.adam(), moving, values.sh_degree);
         self.block_cameras.clear();
         self.block_cameras.resize(n.div_ceil(BLOCK), VCamera::default());
 
@@ -247,22 +248,28 @@ impl CpuFit {
             .enumerate()
             .for_each_init(
                 || Scratch {
-                    pairs: Vec::new(),
                     backward: BackwardBlock::new(),
                     v: BlockGradients::new(stride),
                     explore: ExploreBlock::new(),
                 },
-                |scratch, (block, (mut values, first, second, grad_sum, v_camera))| {
+                |scratch, (block, (values, first, second, grad_sum, v_camera))| {
                     let first_id = block * BLOCK;
                     let n = values.means.len();
-                    let Scratch { pairs, backward, v, explore } = scratch;
-                    bins.take_pairs(first_id..first_id + n, sums, pairs);
+                    let moving = moving.saturating_sub(first_id).min(n);
+                    // Of splats that stay as they are, only the camera's gradient is of use.
+                    if moving == 0 && !input.camera_gradient {
+                        return;
+                    }
+                    let Scratch { backward, v, explore } = scratch;
+                    for position in bins.positions_of(first_id..first_id + n) {
+                        prefetch(&sums[position]);
+                    }
                     backward.clear();
                     for k in 0..n {
                         let i = first_id + k;
-                        if bins.slots[i + 1] > bins.slots[i] {
-                            let pairs = &pairs[bins.pairs_of(first_id, i)];
-                            let (v2d, _) = gather(&tile_splats[i], pairs);
+                        let mut positions = bins.positions_of(i..i + 1).peekable();
+                        if positions.peek().is_some() {
+                            let (v2d, _) = gather(&tile_splats[i], sums, positions);
                             let [x, y] = v2d.v_mean;
                             let (x, y) = (0.5 * size[0] * x, 0.5 * size[1] * y);
                             grad_sum[k] += (x * x + y * y).sqrt();
@@ -276,6 +283,11 @@ impl CpuFit {
                         camera: input.camera_gradient,
                     };
                     *v_camera = backward.run(&stage, 0, v.zeroed(n));
+                    if moving == 0 {
+                        return;
+                    }
+                    let [mut values, first, second] =
+                        [values, first, second].map(|arrays| arrays.first(moving));
                     plan.pull(&values, v);
                     plan.apply(&mut values, [first, second], v);
                     plan.explore(&mut values, explore, first_id);

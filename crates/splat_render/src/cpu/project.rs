@@ -241,6 +241,9 @@ pub(super) struct Splat2d {
     pub depth: f32,
     pub color: [f32; 3],
     pub opacity: f32,
+    /// The square of the distance from its centre, in standard deviations, where alpha is
+    /// `ALPHA_MIN`.
+    pub reach: f32,
     pub radii: [f32; 2],
 }
 
@@ -255,6 +258,7 @@ pub(super) struct ProjectBlock {
     means2d: [Row; 2],
     factors: [Row; 3],
     opacities: Row,
+    reach: Row,
     radii: [Row; 2],
     /// 1 where a splat is visible as far as its shape goes.
     reaches: Row,
@@ -276,6 +280,7 @@ impl ProjectBlock {
             means2d: [Row::ZERO; 2],
             factors: [Row::ZERO; 3],
             opacities: Row::ZERO,
+            reach: Row::ZERO,
             radii: [Row::ZERO; 2],
             reaches: Row::ZERO,
             visible: Ids::NONE,
@@ -312,6 +317,7 @@ impl ProjectBlock {
                 depth: self.t[2].0[k],
                 color: [red.0[at], green.0[at], blue.0[at]],
                 opacity: self.opacities.0[k],
+                reach: self.reach.0[k],
                 radii: [self.radii[0].0[k], self.radii[1].0[k]],
             };
             (usize::from(self.ids.get()[k]), splat)
@@ -374,6 +380,7 @@ impl ProjectBlock {
         self.means2d[1].set(at, y);
         set3(&mut self.factors, at, Vec3s::new(p, q, r));
         self.opacities.set(at, opacity);
+        self.reach.set(at, reach);
         self.radii[0].set(at, rx);
         self.radii[1].set(at, ry);
         self.reaches.set(at, visible.keep(zero.all(1.0)));

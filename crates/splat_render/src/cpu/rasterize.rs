@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::bin::{Binned, Bins, bin};
 use super::simd::dispatch;
 use super::tile::{
-    LIVE_INTERVAL, PIXELS, Pixels, Reached, SIDE, TileSplat, Vectors, centers, live_vectors, take,
+    BATCH, Centers, PIXELS, Pixels, Reached, SIDE, TileSplat, Vectors, floats, live_vectors,
 };
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
 use crate::error::Result;
@@ -67,12 +67,13 @@ fn tiles(band: [&mut [f32]; 5], width: usize) -> Vec<Rows<'_>> {
 struct Tile<'a, const DEPTH: bool> {
     splats: &'a [TileSplat],
     ids: &'a [AtomicU32],
-    left: f32,
-    top: f32,
+    left: usize,
+    top: usize,
     background: [f32; 3],
     /// Rows and columns that the picture has of it.
     rows: usize,
     columns: usize,
+    reached: &'a mut Reached,
     out: Rows<'a>,
 }
 
@@ -84,7 +85,7 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
         let mut sums = [Pixels([0.0; PIXELS]); 4];
         // Negative once the pixel has stopped.
         let mut t = Pixels::clear(self.rows, self.columns, S::F32_LANES);
-        blend::<S, DEPTH>(s, &self, &mut sums, &mut t);
+        blend::<S, DEPTH>(s, &mut self, &mut sums, &mut t);
         for (t, k) in t.0.iter_mut().zip(0..) {
             *t = t.abs();
             for c in 0..3 {
@@ -100,47 +101,42 @@ impl<const DEPTH: bool> WithSimd for Tile<'_, DEPTH> {
 #[inline(always)]
 fn blend<S: Simd, const DEPTH: bool>(
     s: S,
-    tile: &Tile<'_, DEPTH>,
+    tile: &mut Tile<'_, DEPTH>,
     [r, g, b, d]: &mut [Pixels; 4],
     t: &mut Pixels,
 ) {
-    let (columns, rows) = (centers(tile.left), centers(tile.top));
     let (r, g) = (S::as_mut_simd_f32s(&mut r.0).0, S::as_mut_simd_f32s(&mut g.0).0);
     let (b, d) = (S::as_mut_simd_f32s(&mut b.0).0, S::as_mut_simd_f32s(&mut d.0).0);
     let t = S::as_mut_simd_f32s(&mut t.0).0;
     let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
-    let (mut reached, mut live) = (Reached::new(), Vectors::default());
-    let mut batch = [TileSplat::default(); LIVE_INTERVAL];
+    let centers = Centers::new::<S>(tile.left, tile.top);
+    let (reached, mut live) = (&mut *tile.reached, Vectors::default());
 
-    for start in (0..tile.ids.len()).step_by(LIVE_INTERVAL) {
+    for start in (0..tile.ids.len()).step_by(BATCH) {
         if !live_vectors(s, t, &mut live) {
             break;
         }
-        let taken = take(tile.splats, &tile.ids[start..], &mut batch);
-        for splat in &batch[..taken] {
-            let count = reached.find(s, splat, &columns, &rows, &live);
-            let opacity = s.splat_f32s(splat.opacity);
+        let taken = reached.find::<S, false>(s, tile.splats, &tile.ids[start..], &centers, &live);
+        let gaussians = S::as_simd_f32s(floats(&reached.gaussians)).0;
+        for k in 0..reached.ends[taken - 1] {
+            let at = usize::from(reached.vectors[k]);
+            let splat = &reached.splats[usize::from(reached.owners[k]) % BATCH];
+            let uncapped = s.mul_f32s(s.splat_f32s(splat.opacity), gaussians[k]);
+            let alpha = s.min_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
+            let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
+            let alpha = s.select_f32s(seen, alpha, zero);
+            let before = t[at];
+            let after = s.mul_f32s(before, s.sub_f32s(one, alpha));
+            // False for pixels that stop here or, negative, have stopped before.
+            let goes_on = s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
+            t[at] = s.select_f32s(goes_on, after, s.or_f32s(before, s.splat_f32s(-0.0)));
+            let weight = s.select_f32s(goes_on, s.mul_f32s(before, alpha), zero);
             let [red, green, blue] = splat.color;
-            let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
-            let depth = s.splat_f32s(splat.depth);
-            for k in 0..count {
-                let at = usize::from(reached.vectors[k]);
-                let gaussian = S::as_simd_f32s(&reached.gaussians.0).0[k];
-                let alpha = s.min_f32s(s.mul_f32s(opacity, gaussian), s.splat_f32s(ALPHA_MAX));
-                let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
-                let alpha = s.select_f32s(seen, alpha, zero);
-                let before = t[at];
-                let after = s.mul_f32s(before, s.sub_f32s(one, alpha));
-                // False for pixels that stop here or, negative, have stopped before.
-                let goes_on = s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
-                t[at] = s.select_f32s(goes_on, after, s.or_f32s(before, s.splat_f32s(-0.0)));
-                let weight = s.select_f32s(goes_on, s.mul_f32s(before, alpha), zero);
-                r[at] = s.mul_add_e_f32s(weight, color[0], r[at]);
-                g[at] = s.mul_add_e_f32s(weight, color[1], g[at]);
-                b[at] = s.mul_add_e_f32s(weight, color[2], b[at]);
-                if DEPTH {
-                    d[at] = s.mul_add_e_f32s(weight, depth, d[at]);
-                }
+            r[at] = s.mul_add_e_f32s(weight, s.splat_f32s(red), r[at]);
+            g[at] = s.mul_add_e_f32s(weight, s.splat_f32s(green), g[at]);
+            b[at] = s.mul_add_e_f32s(weight, s.splat_f32s(blue), b[at]);
+            if DEPTH {
+                d[at] = s.mul_add_e_f32s(weight, s.splat_f32s(splat.depth), d[at]);
             }
         }
     }
@@ -162,15 +158,18 @@ pub(super) fn rasterize_tiles<const DEPTH: bool>(
         let rows = band[0].len() / width;
         tiles(band, width).into_par_iter().enumerate().for_each(|(column, out)| {
             let first = column * SIDE;
-            dispatch(Tile::<DEPTH> {
-                splats,
-                ids: &bins.splats[bins.range(tile_row * columns + column)],
-                left: first as f32,
-                top: (tile_row * SIDE) as f32,
-                background,
-                rows,
-                columns: SIDE.min(width - first),
-                out,
+            Reached::lend(|reached| {
+                dispatch(Tile::<DEPTH> {
+                    splats,
+                    ids: &bins.splats[bins.range(tile_row * columns + column)],
+                    left: first,
+                    top: tile_row * SIDE,
+                    background,
+                    rows,
+                    columns: SIDE.min(width - first),
+                    reached,
+                    out,
+                });
             });
         });
     });

@@ -6,13 +6,12 @@ use std::sync::atomic::AtomicU32;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::bin::{Binned, Bins, CHUNK, bin};
+use super::bin::{Binned, Bins, bin};
 use super::project_backward::V2d;
 use super::rasterize::Planes;
 use super::simd::dispatch;
 use super::tile::{
-    LIVE_INTERVAL, PIXELS, Pixels, Place, Reached, SIDE, TileSplat, Vectors, centers, live_vectors,
-    offsets, take,
+    BATCH, Centers, PIXELS, Pixels, Place, Reached, SIDE, TileSplat, Vectors, floats, live_vectors,
 };
 use crate::constants::{ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN};
 use crate::error::Result;
@@ -45,10 +44,11 @@ pub(super) struct PictureGradients<'a> {
 struct Tile<'a, const N: usize> {
     splats: &'a [TileSplat],
     ids: &'a [AtomicU32],
-    left: f32,
-    top: f32,
+    left: usize,
+    top: usize,
     picture: PictureGradients<'a>,
     place: Place,
+    reached: &'a mut Reached,
     sums: &'a mut [PairSums<N>],
 }
 
@@ -57,7 +57,6 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let (columns, rows) = (centers(self.left), centers(self.top));
         let zeros = Pixels([0.0; PIXELS]);
         let PictureGradients { image, v_color, v_alpha, v_depth } = self.picture;
         // What lies behind the splats seen so far, dotted with the gradients.
@@ -84,33 +83,41 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
         let t = S::as_mut_simd_f32s(&mut t.0).0;
         let behind = S::as_mut_simd_f32s(&mut behind.0).0;
         let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
-        let (mut reached, mut live) = (Reached::new(), Vectors::default());
-        let mut batch = [TileSplat::default(); LIVE_INTERVAL];
+        let centers = Centers::new::<S>(self.left, self.top);
+        let (reached, mut live) = (self.reached, Vectors::default());
 
-        for start in (0..self.ids.len()).step_by(LIVE_INTERVAL) {
+        for start in (0..self.ids.len()).step_by(BATCH) {
             if !live_vectors(s, t, &mut live) {
                 self.sums[start..].fill([0.0; N]);
                 break;
             }
-            let taken = take(self.splats, &self.ids[start..], &mut batch);
-            for (splat, sums) in batch[..taken].iter().zip(&mut self.sums[start..]) {
-                let count = reached.find(s, splat, &columns, &rows, &live);
-                let (p, opacity) = (s.splat_f32s(splat.factor[0]), s.splat_f32s(splat.opacity));
-                let dx = offsets(s, splat, &columns);
+            let taken =
+                reached.find::<S, true>(s, self.splats, &self.ids[start..], &centers, &live);
+            let gaussians = S::as_simd_f32s(floats(&reached.gaussians)).0;
+            let us = S::as_simd_f32s(floats(&reached.u)).0;
+            let vs = S::as_simd_f32s(floats(&reached.v)).0;
+            let mut next = 0;
+            for (i, sums) in self.sums[start..][..taken].iter_mut().enumerate() {
+                let splat = &reached.splats[i];
+                let opacity = s.splat_f32s(splat.opacity);
                 let [red, green, blue] = splat.color;
                 let color = [s.splat_f32s(red), s.splat_f32s(green), s.splat_f32s(blue)];
                 let depth = s.splat_f32s(splat.depth);
                 let mut acc = [zero; N];
-                for k in 0..count {
+                let first = std::mem::replace(&mut next, reached.ends[i]);
+                if first == next {
+                    *sums = [0.0; N];
+                    continue;
+                }
+                for k in first..next {
                     let at = usize::from(reached.vectors[k]);
-                    let gaussian = S::as_simd_f32s(&reached.gaussians.0).0[k];
+                    let (gaussian, u, v) = (gaussians[k], us[k], vs[k]);
                     let uncapped = s.mul_f32s(opacity, gaussian);
                     let alpha = s.min_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
                     let seen = s.greater_than_or_equal_f32s(alpha, s.splat_f32s(ALPHA_MIN));
                     let alpha = s.select_f32s(seen, alpha, zero);
-                    let through = s.sub_f32s(one, alpha);
-                    let inverse = s.div_f32s(one, through);
                     let before = t[at];
+                    let through = s.sub_f32s(one, alpha);
                     let after = s.mul_f32s(before, through);
                     let goes_on =
                         s.greater_than_or_equal_f32s(after, s.splat_f32s(TRANSMITTANCE_MIN));
@@ -129,24 +136,22 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
                     let rest = s.negate_mul_add_e_f32s(weight, own, behind[at]);
                     behind[at] = rest;
                     // v_alpha * gaussian, zero where the cap holds alpha or nothing is added.
+                    let inverse = s.div_f32s(one, through);
                     let v_alpha = s.negate_mul_add_e_f32s(rest, inverse, s.mul_f32s(before, own));
                     let free = s.less_than_or_equal_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
                     let free = s.and_m32s(free, s.and_m32s(seen, goes_on));
                     let g = s.select_f32s(free, s.mul_f32s(v_alpha, gaussian), zero);
-                    let row = at % SIDE;
-                    let shift = s.splat_f32s(reached.shift[row]);
-                    let (v, vv) = (s.splat_f32s(reached.v[row]), s.splat_f32s(reached.vv[row]));
-                    let u = s.mul_add_e_f32s(p, dx[at / SIDE % SIDE], shift);
                     let gu = s.mul_f32s(g, u);
+                    let gv = s.mul_f32s(g, v);
                     acc[0] = s.add_f32s(acc[0], g);
                     acc[1] = s.add_f32s(acc[1], gu);
-                    acc[2] = s.mul_add_e_f32s(g, v, acc[2]);
+                    acc[2] = s.add_f32s(acc[2], gv);
                     acc[3] = s.mul_add_e_f32s(gu, u, acc[3]);
                     acc[4] = s.mul_add_e_f32s(gu, v, acc[4]);
-                    acc[5] = s.mul_add_e_f32s(g, vv, acc[5]);
+                    acc[5] = s.mul_add_e_f32s(gv, v, acc[5]);
                     if N >= ABSOLUTE_SUMS {
                         let [_, q, r] = splat.factor;
-                        let along_y = s.mul_f32s(s.splat_f32s(r), s.mul_f32s(g, v));
+                        let along_y = s.mul_f32s(s.splat_f32s(r), gv);
                         let along_y = s.mul_add_e_f32s(s.splat_f32s(q), gu, along_y);
                         acc[10] = s.add_f32s(acc[10], s.abs_f32s(gu));
                         acc[11] = s.add_f32s(acc[11], s.abs_f32s(along_y));
@@ -193,25 +198,32 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
     tiles.into_par_iter().for_each(|(tile, sums)| {
         let (x, y) = (tile % columns * SIDE, tile / columns * SIDE);
         let (rows, columns) = (SIDE.min(height - y), SIDE.min(width - x));
-        dispatch(Tile::<N> {
-            splats,
-            ids: &bins.splats[bins.range(tile)],
-            left: x as f32,
-            top: y as f32,
-            picture,
-            place: Place { first: y * width + x, width, rows, columns },
-            sums,
+        Reached::lend(|reached| {
+            dispatch(Tile::<N> {
+                splats,
+                ids: &bins.splats[bins.range(tile)],
+                left: x,
+                top: y,
+                picture,
+                place: Place { first: y * width + x, width, rows, columns },
+                reached,
+                sums,
+            });
         });
     });
 }
 
-/// Adds up a splat's pairs in tile order and turns whitened moments into 2D gradients, with the
-/// absolute gradient of the centre where `N` has it.
+/// Adds up a splat's pairs, at these positions in tile order, and turns whitened moments into 2D
+/// gradients, with the absolute gradient of the centre where `N` has it.
 #[inline(always)]
-pub(super) fn gather<const N: usize>(splat: &TileSplat, pairs: &[PairSums<N>]) -> (V2d, [f32; 2]) {
+pub(super) fn gather<const N: usize>(
+    splat: &TileSplat,
+    sums: &[PairSums<N>],
+    positions: impl Iterator<Item = usize>,
+) -> (V2d, [f32; 2]) {
     let mut total = [0.0f32; N];
-    for pair in pairs {
-        for (sum, value) in total.iter_mut().zip(pair) {
+    for position in positions {
+        for (sum, value) in total.iter_mut().zip(&sums[position]) {
             *sum += value;
         }
     }
@@ -241,15 +253,8 @@ fn gradients<const N: usize>(
 ) -> Vec<(V2d, [f32; 2])> {
     let mut sums: Vec<PairSums<N>> = Vec::new();
     rasterize_backward_tiles(splats, bins, picture, &mut sums);
-    splats
-        .par_chunks(CHUNK)
-        .enumerate()
-        .flat_map_iter(|(chunk, splats)| {
-            let (first, mut pairs) = (chunk * CHUNK, Vec::new());
-            bins.take_pairs(first..first + splats.len(), &sums, &mut pairs);
-            let gather = |(k, splat)| gather(splat, &pairs[bins.pairs_of(first, first + k)]);
-            splats.iter().enumerate().map(gather).collect::<Vec<_>>()
-        })
+    (splats.par_iter().enumerate())
+        .map(|(i, splat)| gather(splat, &sums, bins.positions_of(i..i + 1)))
         .collect()
 }
 

@@ -43,6 +43,25 @@ pub fn instruction_set() -> &'static str {
     }
 }
 
+/// Asks for a value of up to 64 bytes ahead of its use, where Rust has an instruction for it.
+#[inline(always)]
+pub(super) fn prefetch<T>(value: &T) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let first = std::ptr::from_ref(value).cast::<i8>();
+        // It may lie across two cache lines.
+        let last = first.wrapping_add(size_of::<T>() - 1);
+        // SAFETY: nothing is read: a prefetch is a hint, for any address.
+        unsafe {
+            _mm_prefetch::<_MM_HINT_T0>(first);
+            _mm_prefetch::<_MM_HINT_T0>(last);
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = value;
+}
+
 /// 2^-d for d >= 0, relative error below 1.2e-7 (1.4e-8 of the polynomial, the rest rounding).
 /// Above 126 it returns about 2^-126.
 #[inline(always)]

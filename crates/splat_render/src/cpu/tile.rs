@@ -1,28 +1,49 @@
 //! A tile as the inner loops of rasterize and rasterize_backward see it: how its pixels lie in
 //! memory, what they read of a splat, and which of its vectors a splat reaches.
 
+use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
+use bytemuck::{Pod, Zeroable};
 use pulp::Simd;
 
 use super::project::Splat2d;
-use super::simd::exp2_of_minus;
-use crate::constants::{ALPHA_MIN, TILE};
+use super::simd::{exp2_of_minus, prefetch};
+use crate::constants::TILE;
 
 pub(super) const SIDE: usize = TILE as usize;
 pub(super) const PIXELS: usize = SIDE * SIDE;
 
-/// Splats between two looks at which of a tile's vectors still take light.
-pub(super) const LIVE_INTERVAL: usize = 16;
+/// Splats that are looked up together, and between two looks at which of a tile's vectors still take
+/// light.
+pub(super) const BATCH: usize = 16;
 
 /// sqrt(log2(e) / 2): scales a factor so that exp(-sigma) = 2^-(u^2 + v^2).
 const WHITEN: f32 = 0.849_321_8;
 
-/// One value per pixel of a tile, as vectors of neighbouring columns: all rows of the first column
-/// of vectors, then of the next.
-#[derive(Debug, Clone, Copy)]
-#[repr(align(64))]
+/// One value per pixel of a tile, as blocks of pixels that are nearly square: a splat reaches fewer of
+/// them than of rows. Blocks, and pixels in a block, lie row-major.
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C, align(64))]
 pub(super) struct Pixels(pub [f32; PIXELS]);
+
+/// Pixels along the side of a block, which is a vector: 4 x 4, 4 x 2, 4 x 1 or 1 x 1.
+#[inline(always)]
+const fn block_width(lanes: usize) -> usize {
+    if lanes < 4 { 1 } else { 4 }
+}
+
+/// Rows of a block.
+#[inline(always)]
+const fn block_height(lanes: usize) -> usize {
+    lanes / block_width(lanes)
+}
+
+/// Blocks side by side in a tile.
+#[inline(always)]
+const fn blocks_across(lanes: usize) -> usize {
+    SIDE / block_width(lanes)
+}
 
 /// Where a tile lies in a plane, row-major, of a picture.
 #[derive(Debug, Clone, Copy)]
@@ -41,17 +62,18 @@ impl Place {
     #[inline(always)]
     pub fn load<S: Simd>(&self, plane: &[f32]) -> Pixels {
         let mut pixels = Pixels([0.0; PIXELS]);
-        let vectors = S::as_mut_simd_f32s(&mut pixels.0).0;
+        let width = block_width(S::F32_LANES);
         for row in 0..self.rows {
             let plane = &plane[self.first + row * self.width..][..self.columns];
-            let (whole, rest) = S::as_simd_f32s(plane);
-            for (c, &vector) in whole.iter().enumerate() {
-                vectors[c * SIDE + row] = vector;
-            }
-            let from = (whole.len() * SIDE + row) * S::F32_LANES;
-            let values = bytemuck::cast_slice_mut::<_, f32>(vectors);
-            for (k, &value) in rest.iter().enumerate() {
-                values[from + k] = value;
+            if let Some(plane) = plane.first_chunk::<SIDE>() {
+                for column in (0..SIDE).step_by(width) {
+                    let at = offset(row, column, S::F32_LANES);
+                    pixels.0[at..at + width].copy_from_slice(&plane[column..column + width]);
+                }
+            } else {
+                for (column, value) in plane.iter().enumerate() {
+                    pixels.0[offset(row, column, S::F32_LANES)] = *value;
+                }
             }
         }
         pixels
@@ -76,15 +98,17 @@ impl Pixels {
     /// Writes the values within the picture to its rows; those beyond it are empty.
     #[inline(always)]
     pub fn store<S: Simd>(&self, rows: &mut [&mut [f32]; SIDE]) {
-        let vectors = S::as_simd_f32s(&self.0).0;
+        let width = block_width(S::F32_LANES);
         for (row, out) in rows.iter_mut().enumerate() {
-            let (whole, rest) = S::as_mut_simd_f32s(out);
-            for (c, vector) in whole.iter_mut().enumerate() {
-                *vector = vectors[c * SIDE + row];
-            }
-            let from = (whole.len() * SIDE + row) * S::F32_LANES;
-            for (k, value) in rest.iter_mut().enumerate() {
-                *value = self.0[from + k];
+            if let Some(out) = out.first_chunk_mut::<SIDE>() {
+                for column in (0..SIDE).step_by(width) {
+                    let at = offset(row, column, S::F32_LANES);
+                    out[column..column + width].copy_from_slice(&self.0[at..at + width]);
+                }
+            } else {
+                for (column, value) in out.iter_mut().enumerate() {
+                    *value = self.0[offset(row, column, S::F32_LANES)];
+                }
             }
         }
     }
@@ -93,12 +117,59 @@ impl Pixels {
 /// Where the pixel of a tile's row and column lies in [`Pixels`].
 #[inline(always)]
 fn offset(row: usize, column: usize, lanes: usize) -> usize {
-    (column / lanes * SIDE + row) * lanes + column % lanes
+    let (width, height) = (block_width(lanes), block_height(lanes));
+    let block = row / height * blocks_across(lanes) + column / width;
+    block * lanes + row % height * width + column % width
 }
 
-/// x or y of the centres of the pixels along a tile's side that starts at `start`.
-pub(super) fn centers(start: f32) -> [f32; SIDE] {
-    std::array::from_fn(|k| start + k as f32 + 0.5)
+/// Where a tile's pixels are in the picture.
+#[repr(align(64))]
+pub(super) struct Centers {
+    /// x of the pixel centres of each block of a row of blocks.
+    x: [f32; 4 * WIDEST],
+    /// y of the pixel centres of each block of a column of blocks.
+    y: [f32; 4 * WIDEST],
+    /// y of the rows' pixel centres.
+    rows: [f32; SIDE],
+    /// For each block of a row of blocks, the bits in [`Vectors`] of those blocks below it that hold
+    /// the rows of a vector's lanes.
+    bits: [u32; 4 * WIDEST],
+    /// x of the first pixel centre.
+    left: f32,
+}
+
+/// Lanes of the widest vectors.
+const WIDEST: usize = 16;
+
+impl Centers {
+    /// Of the tile whose first pixel is at (`left`, `top`).
+    #[inline(always)]
+    pub fn new<S: Simd>(left: usize, top: usize) -> Self {
+        let lanes = S::F32_LANES;
+        let (width, height, across) =
+            (block_width(lanes), block_height(lanes), blocks_across(lanes));
+        let (left, top) = (left as f32 + 0.5, top as f32 + 0.5);
+        let mut centers = Self {
+            x: [0.0; 4 * WIDEST],
+            y: [0.0; 4 * WIDEST],
+            rows: [0.0; SIDE],
+            bits: [0; 4 * WIDEST],
+            left,
+        };
+        for k in 0..across * lanes {
+            let (block, lane) = (k / lanes, k % lanes);
+            centers.x[k] = left + (block * width + lane % width) as f32;
+            centers.bits[k] = 1 << (lane / height * across + block);
+        }
+        for k in 0..SIDE / height * lanes {
+            let (block, lane) = (k / lanes, k % lanes);
+            centers.y[k] = top + (block * height + lane / width) as f32;
+        }
+        for k in 0..SIDE {
+            centers.rows[k] = top + k as f32;
+        }
+        centers
+    }
 }
 
 /// A 2D splat as the inner loops read it; u and v are in units of 1 / [`WHITEN`].
@@ -113,20 +184,6 @@ pub(super) struct TileSplat {
     pub limit: f32,
 }
 
-/// Copies of the next splats of a tile's list, since they lie anywhere in memory: asked for together,
-/// they are waited for once. Returns how many there were.
-#[inline(always)]
-pub(super) fn take(
-    splats: &[TileSplat],
-    ids: &[AtomicU32],
-    batch: &mut [TileSplat; LIVE_INTERVAL],
-) -> usize {
-    for (copy, id) in batch.iter_mut().zip(ids) {
-        *copy = splats[id.load(Relaxed) as usize];
-    }
-    ids.len().min(LIVE_INTERVAL)
-}
-
 impl TileSplat {
     pub fn new(splat: &Splat2d) -> Self {
         Self {
@@ -135,7 +192,7 @@ impl TileSplat {
             opacity: splat.opacity,
             color: splat.color,
             depth: splat.depth,
-            limit: (splat.opacity / ALPHA_MIN).log2() * (1.0 + 1e-5) + 1e-5,
+            limit: splat.reach * (WHITEN * WHITEN) * (1.0 + 1e-5) + 1e-5,
         }
     }
 }
@@ -144,141 +201,155 @@ impl TileSplat {
 /// More than one word only where there are no vectors of four lanes.
 pub(super) type Vectors = [u64; PIXELS / 64];
 
-/// Words of [`Vectors`] in use.
-#[inline(always)]
-fn words(lanes: usize) -> usize {
-    (PIXELS / lanes).div_ceil(64)
+/// Where the splats of a batch may be seen in a tile: the first half of both rasterize stages. What
+/// depends on no pixel's state is found for the whole batch, in short loops on purpose: no processor
+/// looks far enough ahead to do it while a pixel waits for the splat before.
+pub(super) struct Reached {
+    /// Copies of the splats, since they lie anywhere in memory: asked for together, they are waited
+    /// for once.
+    pub splats: [TileSplat; BATCH],
+    /// Each splat's vectors end here in what follows.
+    pub ends: [usize; BATCH],
+    /// Numbers of the vectors that splats may reach and whose pixels have not all stopped.
+    pub vectors: [u8; BATCH * PIXELS],
+    /// The splat of each.
+    pub owners: [u8; BATCH * PIXELS],
+    /// exp(-sigma) there.
+    pub gaussians: [Pixels; BATCH],
+    /// u and v there, if asked for.
+    pub u: [Pixels; BATCH],
+    pub v: [Pixels; BATCH],
 }
 
-/// Where one splat may be seen in a tile: the first half of both rasterize stages. They are two short
-/// loops on purpose: in one long loop a vector's exponential would wait for the vector before it,
-/// since no processor looks far enough ahead.
-#[repr(align(64))]
-pub(super) struct Reached {
-    /// q dy of each row.
-    pub shift: [f32; SIDE],
-    /// v of each row.
-    pub v: [f32; SIDE],
-    /// v^2 of each row.
-    pub vv: [f32; SIDE],
-    /// Numbers of the vectors that the splat may reach and whose pixels have not all stopped.
-    pub vectors: [u8; PIXELS],
-    /// exp(-sigma) there, in that order.
-    pub gaussians: Pixels,
+thread_local! {
+    static REACHED: RefCell<Box<Reached>> = RefCell::new(Reached::new());
 }
 
 impl Reached {
-    pub fn new() -> Self {
-        Self {
-            shift: [0.0; SIDE],
-            v: [0.0; SIDE],
-            vv: [0.0; SIDE],
-            vectors: [0; PIXELS],
-            gaussians: Pixels([0.0; PIXELS]),
-        }
+    /// Lends a task its thread's.
+    pub fn lend<T>(task: impl FnOnce(&mut Self) -> T) -> T {
+        REACHED.with_borrow_mut(|reached| task(reached))
     }
 
-    /// Finds the vectors, of those in `live`, and returns how many there are. The tile's pixel
-    /// centres are at `columns` and `rows`.
+    fn new() -> Box<Self> {
+        Box::new(Self {
+            splats: [TileSplat::default(); BATCH],
+            ends: [0; BATCH],
+            vectors: [0; BATCH * PIXELS],
+            owners: [0; BATCH * PIXELS],
+            gaussians: [Pixels([0.0; PIXELS]); BATCH],
+            u: [Pixels([0.0; PIXELS]); BATCH],
+            v: [Pixels([0.0; PIXELS]); BATCH],
+        })
+    }
+
+    /// Takes the next splats of a tile's list and finds their vectors, of those in `live`; returns
+    /// how many splats there were.
     #[inline(always)]
-    pub fn find<S: Simd>(
+    pub fn find<S: Simd, const OFFSETS: bool>(
         &mut self,
         s: S,
-        splat: &TileSplat,
-        columns: &[f32; SIDE],
-        rows: &[f32; SIDE],
+        splats: &[TileSplat],
+        ids: &[AtomicU32],
+        centers: &Centers,
         live: &Vectors,
     ) -> usize {
-        let mut reached = self.reach(s, splat, columns, rows);
-        let p = s.splat_f32s(splat.factor[0]);
-        let dx = offsets(s, splat, columns);
-        let gaussians = S::as_mut_simd_f32s(&mut self.gaussians.0).0;
+        let taken = ids.len().min(BATCH);
+        for (copy, id) in self.splats.iter_mut().zip(ids) {
+            *copy = splats[id.load(Relaxed) as usize];
+        }
+        // Those of the next batch are on their way while this one is looked at.
+        for id in ids.iter().skip(BATCH).take(BATCH) {
+            prefetch(&splats[id.load(Relaxed) as usize]);
+        }
+        let mut reached = [Vectors::default(); BATCH];
+        for k in 0..taken {
+            reached[k] = reach(s, &self.splats[k], centers);
+        }
         let mut count = 0;
-        for word in 0..words(S::F32_LANES) {
-            reached[word] &= live[word];
-            while reached[word] != 0 {
-                let at = word * 64 + reached[word].trailing_zeros() as usize;
-                reached[word] &= reached[word] - 1;
-                let shift = s.splat_f32s(self.shift[at % SIDE]);
-                let vv = s.splat_f32s(self.vv[at % SIDE]);
-                let u = s.mul_add_e_f32s(p, dx[at / SIDE % SIDE], shift);
-                gaussians[count] = exp2_of_minus(s, s.mul_add_e_f32s(u, u, vv));
-                self.vectors[count] = at as u8;
-                count += 1;
+        for k in 0..taken {
+            for word in 0..PIXELS.div_ceil(64 * S::F32_LANES) {
+                let mut bits = reached[k][word] & live[word];
+                while bits != 0 {
+                    self.vectors[count] = (word * 64 + bits.trailing_zeros() as usize) as u8;
+                    self.owners[count] = k as u8;
+                    bits &= bits - 1;
+                    count += 1;
+                }
             }
+            self.ends[k] = count;
         }
-        count
+        self.evaluate::<S, OFFSETS>(s, centers, count);
+        taken
     }
 
-    /// Fills the rows and returns the vectors that the splat may reach.
+    /// Fills in what the first `count` vectors hold.
     #[inline(always)]
-    fn reach<S: Simd>(
-        &mut self,
-        s: S,
-        splat: &TileSplat,
-        columns: &[f32; SIDE],
-        rows: &[f32; SIDE],
-    ) -> Vectors {
-        let lanes = S::F32_LANES;
-        let [p, q, r] = splat.factor;
-        let (p, q, r) = (s.splat_f32s(p), s.splat_f32s(q), s.splat_f32s(r));
-        let (limit, my) = (s.splat_f32s(splat.limit), s.splat_f32s(splat.mean[1]));
-        let zero = s.splat_f32s(0.0);
-        let rows = S::as_simd_f32s(rows).0;
-        let shifts = S::as_mut_simd_f32s(&mut self.shift).0;
-        let vs = S::as_mut_simd_f32s(&mut self.v).0;
-        let vvs = S::as_mut_simd_f32s(&mut self.vv).0;
-        let weights = S::as_simd_f32s(&BITS).0;
-        let mut halves = [zero; SIDE];
-        for block in 0..SIDE / lanes {
-            let dy = s.sub_f32s(rows[block], my);
-            let v = s.mul_f32s(r, dy);
-            (shifts[block], vs[block], vvs[block]) = (s.mul_f32s(q, dy), v, s.mul_f32s(v, v));
-            // Half the span of u in the row; not a number, and so never reached, outside.
-            halves[block] = s.sqrt_f32s(s.sub_f32s(limit, vvs[block]));
-        }
-        let mut reached = Vectors::default();
-        for c in 0..SIDE / lanes {
-            let first = s.splat_f32s(columns[c * lanes] - splat.mean[0]);
-            let last = s.splat_f32s(columns[c * lanes + lanes - 1] - splat.mean[0]);
-            let mut bits = zero;
-            for block in 0..SIDE / lanes {
-                let low = s.mul_add_e_f32s(p, first, shifts[block]);
-                let high = s.mul_add_e_f32s(p, last, shifts[block]);
-                let meets = s.and_m32s(
-                    s.less_than_or_equal_f32s(low, halves[block]),
-                    s.greater_than_or_equal_f32s(high, s.neg_f32s(halves[block])),
-                );
-                bits = s.add_f32s(bits, s.select_f32s(meets, weights[block], zero));
+    fn evaluate<S: Simd, const OFFSETS: bool>(&mut self, s: S, centers: &Centers, count: usize) {
+        let across = blocks_across(S::F32_LANES);
+        let (xs, ys) = (S::as_simd_f32s(&centers.x).0, S::as_simd_f32s(&centers.y).0);
+        let gaussians = S::as_mut_simd_f32s(bytemuck::cast_slice_mut(&mut self.gaussians)).0;
+        let us = S::as_mut_simd_f32s(bytemuck::cast_slice_mut(&mut self.u)).0;
+        let vs = S::as_mut_simd_f32s(bytemuck::cast_slice_mut(&mut self.v)).0;
+        for k in 0..count {
+            let at = usize::from(self.vectors[k]);
+            let splat = &self.splats[usize::from(self.owners[k]) % BATCH];
+            let ([mx, my], [p, q, r]) = (splat.mean, splat.factor);
+            let dx = s.sub_f32s(xs[at % across], s.splat_f32s(mx));
+            let dy = s.sub_f32s(ys[at / across], s.splat_f32s(my));
+            let u = s.mul_add_e_f32s(s.splat_f32s(p), dx, s.mul_f32s(s.splat_f32s(q), dy));
+            let v = s.mul_f32s(s.splat_f32s(r), dy);
+            gaussians[k] = exp2_of_minus(s, s.mul_add_e_f32s(u, u, s.mul_f32s(v, v)));
+            if OFFSETS {
+                (us[k], vs[k]) = (u, v);
             }
-            // A column's 16 bits: exact.
-            let bits = s.reduce_sum_f32s(bits) as i32 as u64;
-            reached[c / 4] |= bits << (c % 4 * SIDE);
         }
-        reached
     }
 }
 
-/// Offsets along x of a tile's columns of vectors from the splat's centre.
+/// The values of a batch's vectors, one after the other.
 #[inline(always)]
-pub(super) fn offsets<S: Simd>(s: S, splat: &TileSplat, columns: &[f32; SIDE]) -> [S::f32s; SIDE] {
-    let mut dx = [s.splat_f32s(0.0); SIDE];
-    for (dx, &x) in dx.iter_mut().zip(S::as_simd_f32s(columns).0) {
-        *dx = s.sub_f32s(x, s.splat_f32s(splat.mean[0]));
-    }
-    dx
+pub(super) fn floats(pixels: &[Pixels; BATCH]) -> &[f32] {
+    bytemuck::cast_slice(pixels)
 }
 
-/// Powers of two.
-const BITS: [f32; SIDE] = {
-    let mut bits = [0.0; SIDE];
-    let mut k = 0;
-    while k < SIDE {
-        bits[k] = (1u32 << k) as f32;
-        k += 1;
+/// The vectors that a splat may reach.
+#[inline(always)]
+fn reach<S: Simd>(s: S, splat: &TileSplat, centers: &Centers) -> Vectors {
+    let lanes = S::F32_LANES;
+    let (width, across) = (block_width(lanes), blocks_across(lanes));
+    let ([mx, my], [p, q, r]) = (splat.mean, splat.factor);
+    let beyond = s.splat_f32s(p * (width - 1) as f32);
+    let rows = S::as_simd_f32s(&centers.rows).0;
+    let bits_of = S::as_simd_u32s(&centers.bits).0;
+    let none = s.splat_u32s(0);
+    let mut reached = Vectors::default();
+    // A vector's lanes are rows, and have 16 blocks in all widths.
+    for k in 0..SIDE / lanes {
+        let dy = s.sub_f32s(rows[k], s.splat_f32s(my));
+        let shift = s.mul_f32s(s.splat_f32s(q), dy);
+        let v = s.mul_f32s(s.splat_f32s(r), dy);
+        // Half the span of u in the row; not a number, and so never reached, outside.
+        let half = s.sqrt_f32s(s.negate_mul_add_e_f32s(v, v, s.splat_f32s(splat.limit)));
+        let least = s.sub_f32s(s.neg_f32s(half), beyond);
+        let mut bits = none;
+        for c in 0..across {
+            let first = s.splat_f32s(centers.left + (c * width) as f32 - mx);
+            let low = s.mul_add_e_f32s(s.splat_f32s(p), first, shift);
+            let meets = s.and_m32s(
+                s.less_than_or_equal_f32s(low, half),
+                s.greater_than_or_equal_f32s(low, least),
+            );
+            bits = s.or_u32s(bits, s.select_u32s(meets, bits_of[c], none));
+        }
+        let mut any = 0;
+        for bits in bytemuck::cast_slice::<S::u32s, u32>(&[bits]) {
+            any |= bits;
+        }
+        reached[k / 4] |= u64::from(any) << (k % 4 * 16);
     }
-    bits
-};
+    reached
+}
 
 /// Sets the bits of the vectors in which some pixel has not stopped (transmittance above zero);
 /// false if there is none.

@@ -1,5 +1,5 @@
-//! Density control: where splats are added, moved and removed. Runs on the host, the same for every
-//! device, so that backends differ only by rounding.
+//! Density control: how many splats there are to be, and the original control, which clones, splits and
+//! prunes on the host. MCMC's runs on the device ([`FitDevice::mcmc`](crate::fit_device::FitDevice::mcmc)).
 
 use glam::{Mat3, Quat, Vec3};
 use rand::Rng;
@@ -10,8 +10,6 @@ use crate::splats::SplatArrays;
 
 /// Splats fainter than this are dead (both papers).
 const OPACITY_DEAD: f32 = 0.005;
-/// Most copies one splat may get in one MCMC run (the binomial table's size in the paper's code).
-const COPIES_MAX: usize = 51;
 /// Mean gradient of the projected centre (units of half the image) above which the original control
 /// adds splats.
 const GRAD_GROW: f32 = 2e-4;
@@ -23,9 +21,6 @@ const SCALE_HUGE: f32 = 0.1;
 const SPLIT_SHRINK: f32 = 1.6;
 /// Opacity that a reset leaves at most.
 const OPACITY_RESET: f32 = 0.01;
-
-/// The logit of an opacity that is dead.
-pub(super) const DEAD: f32 = -10.0;
 
 fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
@@ -41,79 +36,6 @@ fn normal(rng: &mut Pcg64) -> f32 {
     radius * (std::f32::consts::TAU * rng.random::<f32>()).cos()
 }
 
-/// Draws `count` ids with probability proportional to `weights`.
-fn sample(weights: &[f32], count: usize, rng: &mut Pcg64) -> Vec<usize> {
-    let mut sums = Vec::with_capacity(weights.len());
-    let mut sum = 0.0f64;
-    for &weight in weights {
-        sum += f64::from(weight.max(0.0));
-        sums.push(sum);
-    }
-    if !(sum > 0.0 && sum.is_finite()) {
-        return Vec::new();
-    }
-    (0..count)
-        .map(|_| {
-            let at = rng.random::<f64>() * sum;
-            sums.partition_point(|&s| s <= at).min(weights.len() - 1)
-        })
-        .collect()
-}
-
-/// Opacity and scale factor of each of `copies` splats that together look as one of opacity `o` did
-/// (3DGS-MCMC, eq. 9).
-fn share(o: f32, copies: usize) -> (f32, f32) {
-    let o = f64::from(o);
-    let each = 1.0 - (1.0 - o).powf(1.0 / copies as f64);
-    let mut sum = 0.0;
-    for i in 1..=copies {
-        let mut binomial = 1.0f64;
-        for k in 0..i {
-            let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
-            sum += sign * binomial * each.powi(k as i32 + 1) / ((k + 1) as f64).sqrt();
-            binomial *= (i - 1 - k) as f64 / (k + 1) as f64;
-        }
-    }
-    (each as f32, (o / sum) as f32)
-}
-
-/// MCMC: dead splats move to living ones, chosen by opacity, and the number grows by such a factor
-/// that the last of `runs_left` runs, this one included, reaches `max_splats`.
-///
-/// The paper's 5 % a run gets nowhere from few points: 24 runs make three splats of one.
-pub(super) fn mcmc(state: &mut FitState, max_splats: usize, runs_left: u32, rng: &mut Pcg64) {
-    let n = state.splats.len();
-    let opacities: Vec<f32> = state.splats.opacities.iter().map(|&o| sigmoid(o)).collect();
-    let dead: Vec<usize> = (0..n)
-        .filter(|&i| {
-            opacities[i].is_nan() || opacities[i] <= OPACITY_DEAD || !finite(&state.splats, i)
-        })
-        .collect();
-    let mut weights = opacities;
-    for &i in &dead {
-        weights[i] = 0.0;
-    }
-    let sources = sample(&weights, dead.len(), rng);
-    if sources.len() == dead.len() {
-        spread(state, &sources, &dead);
-    }
-
-    let needed = (max_splats as f64 / n as f64).max(1.0);
-    let target = match runs_left {
-        0 => n,
-        left => max_splats.min((n as f64 * needed.powf(1.0 / f64::from(left))).ceil() as usize),
-    };
-    let weights: Vec<f32> = state.splats.opacities.iter().map(|&o| sigmoid(o)).collect();
-    let sources = sample(&weights, target.saturating_sub(n), rng);
-    let fresh: Vec<usize> = (n..n + sources.len()).collect();
-    for arrays in [&mut state.splats, &mut state.first, &mut state.second] {
-        let copies = arrays.select(&sources);
-        arrays.append(&copies);
-    }
-    spread(state, &sources, &fresh);
-    state.stats = DensityStats::zeros(state.splats.len());
-}
-
 fn finite(splats: &SplatArrays, i: usize) -> bool {
     let stride = splats.stride();
     splats.means[i]
@@ -124,36 +46,18 @@ fn finite(splats: &SplatArrays, i: usize) -> bool {
         .all(|v| v.is_finite())
 }
 
-/// Overwrites `targets[k]` with a copy of `sources[k]`, sharing opacity and size among all copies,
-/// and restarts the optimiser's moments of all of them.
-fn spread(state: &mut FitState, sources: &[usize], targets: &[usize]) {
-    let mut copies = vec![1usize; state.splats.len()];
-    for &source in sources {
-        copies[source] += 1;
-    }
-    let stride = state.splats.stride();
-    let mut unique: Vec<usize> = sources.to_vec();
-    unique.sort_unstable();
-    unique.dedup();
-    for &i in &unique {
-        let o = sigmoid(state.splats.opacities[i]);
-        let (each, factor) = share(o, copies[i].min(COPIES_MAX));
-        state.splats.opacities[i] = logit(each.clamp(OPACITY_DEAD, 1.0 - f32::EPSILON));
-        for scale in &mut state.splats.scales[i] {
-            *scale += factor.ln();
+/// How many splats a run of MCMC's control is to leave of `n`: the number grows by such a factor that
+/// the last of `runs_left` runs, this one included, reaches `max_splats`.
+///
+/// The paper's 5 % a run gets nowhere from few points: 24 runs make three splats of one.
+pub(super) fn mcmc_target(n: usize, max_splats: usize, runs_left: u32) -> usize {
+    let needed = (max_splats as f64 / n as f64).max(1.0);
+    match runs_left {
+        0 => n,
+        left => {
+            let grown = (n as f64 * needed.powf(1.0 / f64::from(left))).ceil() as usize;
+            max_splats.min(grown).max(n)
         }
-        state.first.clear(i);
-        state.second.clear(i);
-    }
-    for (&source, &target) in sources.iter().zip(targets) {
-        let splats = &mut state.splats;
-        splats.means[target] = splats.means[source];
-        splats.quats[target] = splats.quats[source];
-        splats.scales[target] = splats.scales[source];
-        splats.opacities[target] = splats.opacities[source];
-        splats.sh.copy_within(source * stride..(source + 1) * stride, target * stride);
-        state.first.clear(target);
-        state.second.clear(target);
     }
 }
 
@@ -249,43 +153,17 @@ mod tests {
     }
 
     #[test]
-    fn sharing_keeps_the_opacity_of_the_stack() {
-        for o in [0.01f32, 0.3, 0.9, 0.99] {
-            for copies in [1, 2, 5] {
-                let (each, factor) = share(o, copies);
-                let stack = 1.0 - (1.0 - each).powi(copies as i32);
-                assert!((stack - o).abs() < 1e-5, "{o} as {copies}: {stack}");
-                assert!(factor.is_finite() && factor > 0.0);
-                if copies == 1 {
-                    assert!((factor - 1.0).abs() < 1e-5);
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn mcmc_moves_the_dead_and_respects_the_cap() {
-        let mut state = some(100);
-        state.splats.opacities[7] = -20.0;
-        state.splats.means[9] = [f32::NAN; 3];
-        mcmc(&mut state, 103, 1, &mut Pcg64::seed_from_u64(2));
-        assert_eq!(state.splats.len(), 103);
-        state.validate().unwrap();
-        assert!(sigmoid(state.splats.opacities[7]) >= OPACITY_DEAD * 0.99);
-        assert!((0..103).all(|i| finite(&state.splats, i)));
-    }
-
-    #[test]
     fn mcmc_reaches_the_cap_from_few_splats() {
-        let mut state = some(100);
+        let mut n = 100;
         let mut counts = Vec::new();
         for left in (0..8).rev() {
-            mcmc(&mut state, 20_000, left, &mut Pcg64::seed_from_u64(2));
-            counts.push(state.splats.len());
+            n = mcmc_target(n, 20_000, left);
+            counts.push(n);
         }
         assert_eq!(counts[6..], [20_000, 20_000]);
         let rates = counts[..7].windows(2).map(|pair| pair[1] as f64 / pair[0] as f64);
         assert!(rates.clone().all(|rate| (rate - 200f64.powf(1.0 / 7.0)).abs() < 0.02));
+        assert_eq!(mcmc_target(50, 40, 3), 50);
     }
 
     #[test]

@@ -14,11 +14,10 @@ use super::cameras::{CameraState, Cameras, PosePrior, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
 use super::exposures::{ExposureState, Exposures};
-use super::fog::fog;
 use super::hull::Hull;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
-use crate::fit_device::{FitDevice, FitState, StepInput};
+use crate::fit_device::{FitDevice, FitState, McmcRun, StepInput};
 use crate::morton::morton_order;
 use crate::stages::Exposure;
 use crate::target::Target;
@@ -134,7 +133,7 @@ impl Fitter {
         let schedule = targets.iter().map(|target| (target.turns, target.until)).collect();
         let hull = config.hull.then(|| Hull::new(&targets));
         let longest = targets.iter().map(|t| t.width.max(t.height)).max().unwrap_or(1);
-        let splats = state.splats.len();
+        let splats = state.moving();
         let moving = config.cameras.map(|moving| {
             let means = &state.splats.means;
             let distances = cameras.iter().map(|camera| scene_distance(camera, means)).collect();
@@ -224,7 +223,7 @@ impl Fitter {
         self.step
     }
 
-    /// Splats there are.
+    /// Splats that steps change.
     pub fn splat_count(&self) -> usize {
         self.splats
     }
@@ -425,35 +424,43 @@ impl Fitter {
             return Ok(());
         }
         let mut rng = self.rng(Draw::Density, u64::from(step));
+        let mcmc = refine && config.density == DensityControl::Mcmc;
+        let original = refine && config.density == DensityControl::Original;
         let (extent, splats, hull) = (self.extent, &mut self.splats, &self.hull);
         let cameras = &self.cameras;
-        self.device.edit(&mut |state| {
-            if let Some(hull) = hull.as_ref().filter(|_| leaving) {
-                let inside = hull.inside(&state.splats, cameras);
-                if inside.len() < state.splats.len() {
-                    state.select(&inside);
+        if leaving || original || reset {
+            let mut change = |state: &mut FitState| {
+                if let Some(hull) = hull.as_ref().filter(|_| leaving) {
+                    let inside = hull.inside(&state.splats, cameras);
+                    if inside.len() < state.splats.len() {
+                        state.select(&inside);
+                    }
                 }
-            }
-            if refine && config.density == DensityControl::Mcmc {
-                for i in fog(&state.splats, cameras) {
-                    state.splats.opacities[i] = density::DEAD;
+                if original {
+                    let huge = step > RESET_EVERY;
+                    density::original(state, config.max_splats, extent, huge, &mut rng);
                 }
-                let until = (MCMC_GROWN * f64::from(config.steps)) as u32;
-                let left = if step > until { 0 } else { (until - step) / every + 1 };
-                density::mcmc(state, config.max_splats, left, &mut rng);
-            } else if refine {
-                let huge = step > RESET_EVERY;
-                density::original(state, config.max_splats, extent, huge, &mut rng);
-            }
-            if reset {
-                density::reset_opacities(state);
-            }
-            if refine {
-                // Neighbours in space are neighbours in memory: tiles and pairs of splats then are
-                // near each other, too.
-                state.select(&morton_order(&state.splats.means));
-            }
-            *splats = state.splats.len();
-        })
+                if reset {
+                    density::reset_opacities(state);
+                }
+                if original {
+                    // Neighbours in space are neighbours in memory: tiles and pairs of splats then
+                    // are near each other, too.
+                    state.select(&morton_order(&state.splats.means));
+                }
+                *splats = state.splats.len();
+            };
+            self.device.edit(&mut |state| state.edit_moving(&mut change))?;
+        }
+        if mcmc {
+            let until = (MCMC_GROWN * f64::from(config.steps)) as u32;
+            let left = if step > until { 0 } else { (until - step) / every + 1 };
+            self.splats = self.device.mcmc(&McmcRun {
+                cameras: self.cameras.clone(),
+                target: density::mcmc_target(self.splats, config.max_splats, left),
+                seed: rng.random(),
+            })?;
+        }
+        Ok(())
     }
 }

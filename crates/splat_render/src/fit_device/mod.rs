@@ -1,9 +1,17 @@
 //! Where a fit's steps run: the seam between the fitting loop and the backends.
 
+mod fog;
+mod mcmc;
 mod random;
 mod state;
 
-pub(crate) use random::{dropout_threshold, noise_draw};
+pub(crate) use fog::{FogCamera, sampled_every};
+pub use mcmc::McmcRun;
+pub(crate) use mcmc::{
+    BINS, BINS_PER_LOGIT, CELLS, Cells, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX, mcmc,
+    share_table, weight_table,
+};
+pub(crate) use random::{dropout_threshold, exp_accurate, noise_draw};
 pub use random::{is_dropped, noise_normal};
 pub use state::{DensityStats, FitState};
 
@@ -159,6 +167,18 @@ pub trait FitDevice: Send {
         let mut state = self.download()?;
         change(&mut state);
         self.upload(state)
+    }
+
+    /// Lets dead splats move to living ones and their number grow (3DGS-MCMC); returns the number of those that move. Bits
+    /// are the same on every device, but for the rounding of whether a splat is fog on GPUs that fuse
+    /// multiplications with additions.
+    fn mcmc(&mut self, run: &McmcRun) -> Result<usize> {
+        let mut splats = 0;
+        self.edit(&mut |state| {
+            state.edit_moving(|state| mcmc(state, run));
+            splats = state.moving();
+        })?;
+        Ok(splats)
     }
 
     /// One step: project, bin, rasterize, exposure, loss, exposure_backward, depth_loss,

@@ -3,10 +3,29 @@
 
 /// PCG's output function on one 32-bit word.
 #[inline(always)]
-fn hash(x: u32) -> u32 {
+pub(super) fn hash(x: u32) -> u32 {
     let state = x.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
     let word = ((state >> ((state >> 28) + 4)) ^ state).wrapping_mul(277_803_737);
     (word >> 22) ^ word
+}
+
+/// exp to about 1e-7 relative, the same bits as `exp_accurate` of shaders/shared.wgsl where that is
+/// computed as it is written.
+#[allow(clippy::excessive_precision, reason = "the digits of the shader's")]
+pub(crate) fn exp_accurate(x: f32) -> f32 {
+    let y = x.clamp(-87.0, 88.0);
+    let k = (y * std::f32::consts::LOG2_E + 0.5).floor();
+    let r = (y - k * 0.693_359_375) + k * 2.121_944_40e-4;
+    let poly = [
+        1.398_199_950_7e-3_f32,
+        8.333_453_190_2e-3,
+        4.166_579_589_4e-2,
+        1.666_666_545_9e-1,
+        5.000_000_120_1e-1,
+    ]
+    .into_iter()
+    .fold(1.987_569_150_0e-4, |poly, next| poly * r + next);
+    ((poly * r * r + r) + 1.0) * f32::from_bits(((k as i32 + 127) << 23) as u32)
 }
 
 /// The hash value below which a splat is dropped.

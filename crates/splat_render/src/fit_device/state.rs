@@ -31,6 +31,8 @@ pub struct FitState {
     pub second: SplatArrays,
     /// Since density control last ran.
     pub stats: DensityStats,
+    /// So many splats, the last ones, are drawn and never changed.
+    pub frozen: usize,
 }
 
 impl FitState {
@@ -42,7 +44,34 @@ impl FitState {
             first: SplatArrays::zeros(n, degree),
             second: SplatArrays::zeros(n, degree),
             stats: DensityStats::zeros(n),
+            frozen: 0,
         }
+    }
+
+    /// Number of splats that steps change; they come first.
+    pub fn moving(&self) -> usize {
+        self.splats.len() - self.frozen
+    }
+
+    /// Lets `change` work on the splats that move alone; they may come and go.
+    pub fn edit_moving(&mut self, change: impl FnOnce(&mut Self)) {
+        if self.frozen == 0 {
+            return change(self);
+        }
+        let moving = self.moving();
+        let frozen: Vec<usize> = (moving..self.splats.len()).collect();
+        let tail = self.splats.select(&frozen);
+        self.select(&(0..moving).collect::<Vec<_>>());
+        self.frozen = 0;
+        change(self);
+        let still = SplatArrays::zeros(frozen.len(), tail.sh_degree);
+        self.splats.append(&tail);
+        self.first.append(&still);
+        self.second.append(&still);
+        let n = self.splats.len();
+        self.stats.grad_sum.resize(n, 0.0);
+        self.stats.seen.resize(n, 0.0);
+        self.frozen = frozen.len();
     }
 
     /// Keeps the splats at `ids`, in that order.
@@ -69,6 +98,12 @@ impl FitState {
         let DensityStats { grad_sum, seen } = &self.stats;
         if [grad_sum.len(), seen.len()] != [n; 2] {
             return Err(Error::argument("stats", "do not belong to the same splats"));
+        }
+        if self.frozen > 0 && self.frozen >= n {
+            return Err(Error::argument(
+                "frozen_splats",
+                format!("must be fewer than the {n} splats there are, got {}", self.frozen),
+            ));
         }
         Ok(())
     }

@@ -5,15 +5,14 @@
 
 use std::ops::Range;
 
-use super::device::{Gpu, Op};
+use bytemuck::Zeroable;
+
+use super::device::{Gpu, Groups, Op};
 use super::layout::{ALL_SPLATS, Chunk, ChunkCount, SortPass, StatusHead};
 use super::project::Projection;
 use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
-
-/// Bits that one pass of the radix sort takes.
-const BITS_PER_PASS: u32 = 4;
 
 /// Buffers that grow with the splats.
 #[derive(Debug)]
@@ -25,6 +24,8 @@ pub(super) struct SplatBins {
     pub offsets: wgpu::Buffer,
     segment_sums: wgpu::Buffer,
     histogram: wgpu::Buffer,
+    /// Workgroups of dispatches whose number only the device knows.
+    dispatches: wgpu::Buffer,
     /// Counts that only the device knows.
     pub status: wgpu::Buffer,
 }
@@ -33,10 +34,11 @@ pub(super) struct SplatBins {
 #[derive(Debug)]
 pub(super) struct PairBins {
     capacity: u32,
+    digit_bits: u32,
     keys: [wgpu::Buffer; 2],
     slots: [wgpu::Buffer; 2],
     splat_from_slot: wgpu::Buffer,
-    /// Where each tile's pairs begin, and their number.
+    /// Where each tile's pairs begin, where those behind all tiles do, and their number.
     pub tile_begin: wgpu::Buffer,
 }
 
@@ -53,6 +55,7 @@ pub(super) struct TileChunk {
 impl TileChunk {
     /// Of the given tiles.
     pub fn new(gpu: &Gpu, chunk: Chunk) -> Self {
+        let chunk = Chunk { groups_max: gpu.groups_max, ..chunk };
         // A splat is in a tile's list once at most.
         let longest = chunk.splats.min(chunk.capacity).max(1);
         let passes = (0..longest)
@@ -89,15 +92,16 @@ impl SplatBins {
             Ok([gpu.bindable(label, words(splats))?, gpu.bindable(label, words(splats))?])
         };
         let status = gpu.bindable("status", Self::status_bytes(chunks))?;
-        let head = StatusHead { splats, step: 1, overflow: 0, unused: 0 };
-        gpu.queue.write_buffer(&status, 0, bytemuck::bytes_of(&head));
+        let head = StatusHead { splats, step: 1, overflow: 0, visible: 0 };
+        gpu.write(&status, 0, bytemuck::bytes_of(&head));
         Ok(Self {
             splats,
             keys: pair("depth keys")?,
             order: pair("depth order")?,
             offsets: gpu.bindable("offsets", words(splats) + 4)?,
             segment_sums: gpu.buffer("segment sums", words(gpu.segments()))?,
-            histogram: gpu.buffer("histogram", words(gpu.segments() << BITS_PER_PASS))?,
+            histogram: gpu.buffer("histogram", words(gpu.segments() << gpu.digit_bits()))?,
+            dispatches: gpu.buffer("dispatches", 24)?,
             status,
         })
     }
@@ -112,24 +116,51 @@ impl SplatBins {
         &self.order[0]
     }
 
-    /// Sorts the splats by depth.
-    pub fn depth_ops(&self, gpu: &Gpu, drawn: Projection<'_>, chunk: &TileChunk) -> Vec<Op> {
-        let keys = gpu.op(
-            Kernel::DepthKeys,
-            &[
-                drawn.view.into(),
-                (&chunk.uniform).into(),
-                drawn.splats2d.into(),
-                (&self.keys[0]).into(),
-                (&self.order[0]).into(),
-                (&self.offsets).into(),
-            ],
-            gpu.groups(self.splats, 256),
-        );
-        let mut ops = vec![keys];
-        let passes = u32::BITS / BITS_PER_PASS;
-        ops.extend(self.sort_ops(gpu, ALL_SPLATS, passes, &self.keys, &self.order));
-        ops
+    /// Where the depth keys are to be before [`Self::depth_ops`].
+    pub fn keys(&self) -> &wgpu::Buffer {
+        &self.keys[0]
+    }
+
+    /// Makes the depth keys of splats that were projected before.
+    pub fn key_op(&self, gpu: &Gpu, drawn: Projection<'_>, chunk: &TileChunk) -> Op {
+        let bindings = [
+            drawn.view.into(),
+            (&chunk.uniform).into(),
+            drawn.splats2d.into(),
+            (&self.status).into(),
+            self.order().into(),
+            self.keys().into(),
+        ];
+        gpu.op(Kernel::DepthKeys, &bindings, gpu.groups(self.splats, 256))
+    }
+
+    /// Sorts the splats by depth; leaves culled ones out or keeps them as the last.
+    pub fn depth_ops(&self, gpu: &Gpu, keeps_culled: bool) -> Vec<Op> {
+        let passes = u32::BITS / gpu.digit_bits();
+        let first = SortPass {
+            chunk: ALL_SPLATS,
+            is_first: 1,
+            keeps_culled: u32::from(keeps_culled),
+            shift: 0,
+        };
+        self.sort_ops(gpu, first, passes, &self.keys, &self.order)
+    }
+
+    /// Sorts what [`Self::depth_ops`] has left with all splats by other keys; equal ones keep their order.
+    pub fn resort_ops(&self, gpu: &Gpu) -> Vec<Op> {
+        let first = SortPass { chunk: ALL_SPLATS, ..SortPass::zeroed() };
+        self.sort_ops(gpu, first, u32::BITS / gpu.digit_bits(), &self.keys, &self.order)
+    }
+
+    /// A dispatch of workgroups of 64 splats in the depth order each, once pairs were counted.
+    pub fn of_order(&self) -> Groups {
+        Groups::Indirect(self.dispatches.clone(), 0)
+    }
+
+    /// A dispatch of workgroups of 64 splats of all each, once pairs were counted; of none where they did
+    /// not fit.
+    pub fn of_all(&self) -> Groups {
+        Groups::Indirect(self.dispatches.clone(), 12)
     }
 
     /// Counts the pairs of a chunk: [`Self::offsets`] and the chunk's entry in [`Self::status`].
@@ -139,6 +170,7 @@ impl SplatBins {
             (&self.offsets).into(),
             (&self.segment_sums).into(),
             (&self.status).into(),
+            (&self.dispatches).into(),
         ];
         vec![
             gpu.op(
@@ -147,7 +179,7 @@ impl SplatBins {
                     drawn.view.into(),
                     (&chunk.uniform).into(),
                     drawn.splats2d.into(),
-                    (&self.keys[0]).into(),
+                    (&self.status).into(),
                     self.order().into(),
                     (&self.offsets).into(),
                 ],
@@ -179,11 +211,11 @@ impl SplatBins {
                 (&pairs.slots[0]).into(),
                 (&pairs.splat_from_slot).into(),
             ],
-            gpu.groups(self.splats, 64),
+            self.of_order(),
         )];
-        let passes = sort_passes(chunk.tiles());
-        let index = chunk.chunk.index;
-        ops.extend(self.sort_ops(gpu, index, passes, &pairs.keys, &pairs.slots));
+        let passes = sort_passes(chunk.tiles(), gpu.digit_bits());
+        let first = SortPass { chunk: chunk.chunk.index, ..SortPass::zeroed() };
+        ops.extend(self.sort_ops(gpu, first, passes, &pairs.keys, &pairs.slots));
         let last = (passes % 2) as usize;
         // Enough workgroups to fill a device; each walks on by the number of all threads.
         let groups = pairs.capacity.div_ceil(64).clamp(1, 4 * gpu.segments());
@@ -206,14 +238,18 @@ impl SplatBins {
     fn sort_ops(
         &self,
         gpu: &Gpu,
-        chunk: u32,
+        first: SortPass,
         passes: u32,
         keys: &[wgpu::Buffer; 2],
         values: &[wgpu::Buffer; 2],
     ) -> Vec<Op> {
         let mut ops = Vec::new();
         for pass in 0..passes {
-            let uniform = gpu.uniform(&SortPass { shift: pass * BITS_PER_PASS, chunk });
+            let uniform = gpu.uniform(&SortPass {
+                shift: pass * gpu.digit_bits(),
+                is_first: if pass == 0 { first.is_first } else { 0 },
+                ..first
+            });
             let (from, to) = ((pass % 2) as usize, ((pass + 1) % 2) as usize);
             let bindings = [
                 (&uniform).into(),
@@ -224,9 +260,15 @@ impl SplatBins {
                 (&keys[to]).into(),
                 (&values[to]).into(),
             ];
-            ops.push(gpu.op(Kernel::SortHistogram, &bindings, [gpu.segments(), 1]));
-            ops.push(gpu.op(Kernel::SortScan, &bindings, [1, 1]));
-            ops.push(gpu.op(Kernel::SortScatter, &bindings, [gpu.segments(), 1]));
+            let all = [gpu.segments(), 1];
+            if gpu.digit_bits() == 8 {
+                ops.push(gpu.op(Kernel::SortCount, &bindings, all));
+                ops.push(gpu.op(Kernel::SortPlace, &bindings, all));
+            } else {
+                ops.push(gpu.op(Kernel::SortHistogram, &bindings, all));
+                ops.push(gpu.op(Kernel::SortScan, &bindings, [1, 1]));
+                ops.push(gpu.op(Kernel::SortScatter, &bindings, all));
+            }
         }
         ops
     }
@@ -274,8 +316,8 @@ impl SplatBins {
 }
 
 /// Passes that order the ids of `tiles` tiles and the one behind them.
-fn sort_passes(tiles: u32) -> u32 {
-    (u32::BITS - tiles.leading_zeros()).div_ceil(BITS_PER_PASS).max(1)
+fn sort_passes(tiles: u32, digit_bits: u32) -> u32 {
+    (u32::BITS - tiles.leading_zeros()).div_ceil(digit_bits).max(1)
 }
 
 impl PairBins {
@@ -285,21 +327,22 @@ impl PairBins {
         let buffer = |label| gpu.bindable(label, words(capacity));
         Ok(Self {
             capacity,
+            digit_bits: gpu.digit_bits(),
             keys: [buffer("tile keys")?, buffer("tile keys")?],
             slots: [buffer("slots")?, buffer("slots")?],
             splat_from_slot: buffer("splat_from_slot")?,
-            tile_begin: gpu.bindable("tile_begin", words(tiles) + 4)?,
+            tile_begin: gpu.bindable("tile_begin", words(tiles) + 8)?,
         })
     }
 
     /// The splat of each pair in tile order, after a chunk of so many tiles was sorted: in the
     /// buffer of keys that the sort's last pass has read and nothing needs any more.
     pub fn splat_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
-        &self.keys[((sort_passes(tiles) + 1) % 2) as usize]
+        &self.keys[((sort_passes(tiles, self.digit_bits) + 1) % 2) as usize]
     }
 
     /// Slots in tile order, after a chunk of so many tiles was sorted.
     pub fn slot_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
-        &self.slots[(sort_passes(tiles) % 2) as usize]
+        &self.slots[(sort_passes(tiles, self.digit_bits) % 2) as usize]
     }
 }

@@ -108,6 +108,7 @@ impl View {
 pub(super) struct Window {
     pub first: u32,
     pub count: u32,
+    pub groups_max: u32,
 }
 
 /// The tiles of one dispatch and where their pairs are counted.
@@ -123,6 +124,7 @@ pub(super) struct Chunk {
     pub is_last: u32,
     pub list_begin: u32,
     pub list_end: u32,
+    pub groups_max: u32,
 }
 
 impl Chunk {
@@ -138,6 +140,7 @@ impl Chunk {
             is_last: 1,
             list_begin: 0,
             list_end: u32::MAX,
+            groups_max: u32::MAX,
         }
     }
 
@@ -160,6 +163,8 @@ impl Chunk {
 pub(super) struct SortPass {
     pub shift: u32,
     pub chunk: u32,
+    pub is_first: u32,
+    pub keeps_culled: u32,
 }
 
 /// `SortPass::chunk` for the sort of all splats by depth.
@@ -193,7 +198,7 @@ pub(super) struct StatusHead {
     pub splats: u32,
     pub step: u32,
     pub overflow: u32,
-    pub unused: u32,
+    pub visible: u32,
 }
 
 /// What the depth of a photo counts in a step.
@@ -245,12 +250,13 @@ pub(super) struct Step {
     pub ssim: f32,
     pub has_weights: u32,
     pub frozen: u32,
+    pub moving: u32,
 }
 
 impl Step {
-    /// What adam is to do to `splats` splats.
-    pub fn of_adam(step: &AdamStep, splats: u32) -> Self {
-        let n = f64::from(splats.max(1));
+    /// What adam is to do to the first `moving` splats.
+    pub fn of_adam(step: &AdamStep, moving: u32) -> Self {
+        let n = f64::from(moving.max(1));
         let Rates { means, quats, scales, opacities, sh0, sh_rest } = step.rates;
         let [bias_first, bias_second] = step.bias().map(|bias| bias as f32);
         Self {
@@ -267,6 +273,7 @@ impl Step {
             noise: step.noise,
             noise_seed: step.noise_seed,
             frozen: u32::from(step.is_frozen()),
+            moving,
             ..Self::zeroed()
         }
     }

@@ -2,6 +2,7 @@
 
 use bytemuck::Zeroable;
 
+use super::bin::tile_count;
 use super::device::{Gpu, Op};
 use super::layout::{Step, View};
 use super::shaders::Kernel;
@@ -9,6 +10,9 @@ use crate::constants::TILE;
 use crate::error::Result;
 use crate::stages::{Image, Loss};
 use crate::target::Target;
+
+/// Rows or columns of a workgroup, where the loss goes along them.
+const LINES_PER_GROUP: u32 = 8;
 
 /// A photo's pixels as the kernels read them: opaque where it has no alpha.
 pub(super) fn rgba(target: &Target) -> Vec<[u8; 4]> {
@@ -23,36 +27,44 @@ pub(super) struct LossBuffers {
     pub photo: wgpu::Buffer,
     /// `[H * W]`
     pub weights: wgpu::Buffer,
-    /// `[9 * H * W]`
+    /// `[9 * H * W]` slopes of SSIM; `[H * W * 12]` what goes from pass to pass where they go along lines.
     slopes: wgpu::Buffer,
     /// `[H * W]` gradients of colour and, 0, accumulated depth.
     pub v_picture: wgpu::Buffer,
     /// `[H * W]` colour . v_color.
     pub totals: wgpu::Buffer,
-    /// `[workgroups * 2]` weighted sums of SSIM and of |x - y|.
+    /// `[parts * 2]` weighted sums of SSIM and of |x - y|.
     pub sums: wgpu::Buffer,
-    groups: [u32; 2],
+    /// Width and height.
+    size: [u32; 2],
+    /// Entries of `sums`.
+    parts: u32,
 }
 
 impl LossBuffers {
     /// For pictures of one size.
     pub fn new(gpu: &Gpu, width: u32, height: u32) -> Result<Self> {
         let pixels = u64::from(width) * u64::from(height);
-        let groups = [width.div_ceil(TILE), height.div_ceil(TILE)];
+        let (parts, planes) = if gpu.loss_by_lines() {
+            (width.max(height), 12)
+        } else {
+            (tile_count(width, height), 9)
+        };
         Ok(Self {
             photo: gpu.bindable("photo", 4 * pixels)?,
             weights: gpu.bindable("weights", 4 * pixels)?,
-            slopes: gpu.bindable("slopes of SSIM", 36 * pixels)?,
+            slopes: gpu.bindable("slopes of SSIM", 4 * planes * pixels)?,
             v_picture: gpu.bindable("v_picture", 16 * pixels)?,
             totals: gpu.bindable("totals", 4 * pixels)?,
-            sums: gpu.bindable("loss sums", 8 * u64::from(groups[0] * groups[1]))?,
-            groups,
+            sums: gpu.bindable("loss sums", 8 * u64::from(parts))?,
+            size: [width, height],
+            parts,
         })
     }
 
     /// Bytes of [`Self::sums`].
     pub fn sum_bytes(&self) -> u64 {
-        8 * u64::from(self.groups[0] * self.groups[1])
+        8 * u64::from(self.parts)
     }
 
     /// Sums of weighted SSIM and |x - y| from downloaded [`Self::sums`].
@@ -66,7 +78,7 @@ impl LossBuffers {
         total
     }
 
-    /// Both passes.
+    /// All passes.
     pub fn ops(
         &self,
         gpu: &Gpu,
@@ -85,9 +97,18 @@ impl LossBuffers {
             (&self.totals).into(),
             (&self.sums).into(),
         ];
+        if gpu.loss_by_lines() {
+            let [columns, rows] = self.size.map(|lines| [lines.div_ceil(LINES_PER_GROUP), 1]);
+            return vec![
+                gpu.op(Kernel::LossColumns, &bindings, columns),
+                gpu.op(Kernel::LossRows, &bindings, rows),
+                gpu.op(Kernel::LossColumnsGradient, &bindings, columns),
+            ];
+        }
+        let tiles = self.size.map(|side| side.div_ceil(TILE));
         vec![
-            gpu.op(Kernel::LossSlopes, &bindings, self.groups),
-            gpu.op(Kernel::LossGradient, &bindings, self.groups),
+            gpu.op(Kernel::LossSlopes, &bindings, tiles),
+            gpu.op(Kernel::LossGradient, &bindings, tiles),
         ]
     }
 }

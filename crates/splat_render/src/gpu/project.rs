@@ -71,6 +71,17 @@ impl SplatBuffers {
         })
     }
 
+    /// Room for so many splats, of which nothing is known yet.
+    pub fn new(gpu: &Gpu, splats: u32, color_floats: u64) -> Result<Self> {
+        let rows = |floats: u64| u64::from(splats) * floats * 4;
+        Ok(Self {
+            splats,
+            color_floats,
+            geometry: gpu.buffer("geometry", rows(GEOMETRY as u64))?,
+            colors: gpu.buffer("colors", rows(color_floats))?,
+        })
+    }
+
     /// Windows of splats whose widest rows can be bound at once.
     pub fn windows(&self, gpu: &Gpu) -> Vec<Range<u32>> {
         let floats = self.color_floats.max((GEOMETRY.max(GRADIENT).max(SPLAT_2D)) as u64);
@@ -84,12 +95,23 @@ pub(super) fn rows<'a>(buffer: &'a wgpu::Buffer, window: &Range<u32>, floats: u6
     Bound::part(buffer, bytes)
 }
 
-/// Projects all splats.
-pub(super) fn project_ops(gpu: &Gpu, to: Projection<'_>, splats: &SplatBuffers) -> Vec<Op> {
+/// The splats of one dispatch, as the kernels read them.
+pub(super) fn window_uniform(gpu: &Gpu, window: &Range<u32>) -> wgpu::Buffer {
+    let count = window.len() as u32;
+    gpu.uniform(&Window { first: window.start, count, groups_max: gpu.groups_max })
+}
+
+/// Projects all splats; their depth keys go to `[N]` `keys`.
+pub(super) fn project_ops(
+    gpu: &Gpu,
+    to: Projection<'_>,
+    splats: &SplatBuffers,
+    keys: &wgpu::Buffer,
+) -> Vec<Op> {
     let mut ops = Vec::new();
     for window in splats.windows(gpu) {
         let count = window.len() as u32;
-        let uniform = gpu.uniform(&Window { first: window.start, count });
+        let uniform = window_uniform(gpu, &window);
         ops.push(gpu.op(
             Kernel::Project,
             &[
@@ -98,6 +120,7 @@ pub(super) fn project_ops(gpu: &Gpu, to: Projection<'_>, splats: &SplatBuffers) 
                 rows(&splats.geometry, &window, GEOMETRY as u64),
                 rows(&splats.colors, &window, splats.color_floats),
                 rows(to.splats2d, &window, SPLAT_2D as u64),
+                rows(keys, &window, 1),
             ],
             gpu.groups(count, SPLATS_PER_GROUP),
         ));
@@ -117,11 +140,15 @@ pub(super) fn project(
     let bytes = (n * size_of::<Splat2d>()) as u64;
     let splats2d = gpu.buffer("splats2d", bytes)?;
     let to = Projection { view: &view, splats2d: &splats2d };
-    let ops = project_ops(gpu, to, &buffers);
+    let keys = gpu.buffer("depth keys", 4 * n as u64)?;
+    let ops = project_ops(gpu, to, &buffers, &keys);
     let data = gpu.download(&ops, &[(&splats2d, bytes)])?;
     let mut out = Projected::culled(n, camera.width, camera.height);
     for (i, bytes) in data[0].chunks_exact(size_of::<Splat2d>()).enumerate() {
         let splat: Splat2d = bytemuck::pod_read_unaligned(bytes);
+        if splat.radii == [0.0; 2] {
+            continue;
+        }
         out.means2d[i] = splat.mean;
         out.factors[i] = [splat.pq[0], splat.pq[1], splat.r];
         out.depths[i] = splat.depth;

@@ -1,8 +1,8 @@
 //! project_backward: gradients of the 2D splats to gradients of the splats and the camera.
 
 use super::device::{Gpu, Op};
-use super::layout::{CAMERA, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, View, Window};
-use super::project::{Projection, SPLAT_2D, SplatBuffers, geometry_rows, rows};
+use super::layout::{CAMERA, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, View};
+use super::project::{Projection, SPLAT_2D, SplatBuffers, geometry_rows, rows, window_uniform};
 use super::rasterize::splats2d;
 use super::shaders::Kernel;
 use crate::camera::Camera;
@@ -43,15 +43,19 @@ pub(super) struct GradientBuffers {
     pub camera: wgpu::Buffer,
 }
 
+/// Sums of the camera's gradients, for so many splats.
+pub(super) fn camera_buffer(gpu: &Gpu, splats: u32) -> Result<wgpu::Buffer> {
+    gpu.bindable("v_camera", u64::from(camera_sums(splats)) * CAMERA as u64 * 4)
+}
+
 impl GradientBuffers {
     /// For these splats.
     pub fn new(gpu: &Gpu, splats: &SplatBuffers) -> Result<Self> {
         let n = u64::from(splats.splats);
-        let sums = u64::from(camera_sums(splats.splats));
         Ok(Self {
             geometry: gpu.buffer("v_geometry", n * GEOMETRY as u64 * 4)?,
             colors: gpu.buffer("v_colors", n * splats.color_floats * 4)?,
-            camera: gpu.bindable("v_camera", sums * CAMERA as u64 * 4)?,
+            camera: camera_buffer(gpu, splats.splats)?,
         })
     }
 }
@@ -86,7 +90,7 @@ pub(super) fn project_backward_ops(
     let mut ops = Vec::new();
     for window in splats.windows(gpu) {
         let count = window.len() as u32;
-        let uniform = gpu.uniform(&Window { first: window.start, count });
+        let uniform = window_uniform(gpu, &window);
         ops.push(gpu.op(
             Kernel::ProjectBackward,
             &[

@@ -38,9 +38,7 @@ pub(super) fn rasterize_backward_ops(
     } else {
         (Kernel::RasterizeBackward, Kernel::RasterizeBackwardSum)
     };
-    // Slots behind a tile's early stop are never written.
-    let mut ops = vec![Op::Clear(buffers.slots.clone())];
-    ops.extend(chunk.passes.iter().map(|pass| {
+    let walk = |pass: &wgpu::Buffer| {
         gpu.op(
             rasterize_backward,
             &[
@@ -57,7 +55,8 @@ pub(super) fn rasterize_backward_ops(
             ],
             gpu.groups(chunk.tiles(), 1),
         )
-    }));
+    };
+    let mut ops: Vec<Op> = chunk.passes.iter().map(walk).collect();
     ops.push(gpu.op(
         sum,
         &[
@@ -69,7 +68,7 @@ pub(super) fn rasterize_backward_ops(
             (&buffers.slots).into(),
             (&buffers.v_splats2d).into(),
         ],
-        gpu.groups(chunk.chunk.splats, 64),
+        bins.of_order(),
     ));
     ops
 }
@@ -110,7 +109,8 @@ pub(super) fn rasterize_backward(
         slots: gpu.bindable("gradient slots", row * u64::from(binned.capacity))?,
         v_splats2d: gpu.bindable("v_splats2d", row * u64::from(binned.splats))?,
     };
-    let mut ops = Vec::new();
+    // Culled splats have no gradient, and no kernel writes theirs.
+    let mut ops = vec![Op::Clear(buffers.v_splats2d.clone())];
     for chunk in &binned.chunks {
         ops.extend(binned.chunk_ops(gpu, chunk));
         ops.extend(rasterize_backward_ops(

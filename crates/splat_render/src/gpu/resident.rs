@@ -1,9 +1,9 @@
 //! Splats that stay on the device and are projected and sorted for one camera after another, to be
 //! drawn by the caller's graphics pipeline or to a `ResidentPicture`.
 
-use super::bin::{SplatBins, TileChunk};
+use super::bin::SplatBins;
 use super::device::{Gpu, Op};
-use super::layout::{Chunk, Splat2d, View};
+use super::layout::{Splat2d, View};
 use super::project::{Projection, SplatBuffers, project_ops};
 use crate::camera::Camera;
 use crate::error::Result;
@@ -50,15 +50,15 @@ impl ResidentSplats {
         let view = gpu.uniform(&View::of_picture(1, 1, [0.0; 3]));
         let splats2d = gpu.bindable("splats2d", u64::from(count) * size_of::<Splat2d>() as u64)?;
         let bins = SplatBins::new(gpu, count, 1)?;
-        let all = TileChunk::new(gpu, Chunk::whole(0, count, 0));
         let drawn = Projection { view: &view, splats2d: &splats2d };
         let (sh_degree, sh_stride) = match splats.colors {
             Colors::Direct(_) => (0, 0),
             Colors::Sh { degree, stride, .. } => (degree, stride as u32),
         };
         Ok(Self {
-            project: project_ops(gpu, drawn, &buffers),
-            sort: bins.depth_ops(gpu, drawn, &all),
+            project: project_ops(gpu, drawn, &buffers, bins.keys()),
+            // Whoever draws by the order does not know how many are culled.
+            sort: bins.depth_ops(gpu, true),
             sh_degree,
             sh_stride,
             raw: splats.raw,

@@ -9,6 +9,9 @@ use crate::constants::{
     ADAM, ALPHA_MAX, ALPHA_MIN, DEPTH_ALPHA, QUAT_NORM2_MIN, SH_COEFFS_MAX, SSIM_C, SSIM_WINDOW,
     TILE, TRANSMITTANCE_MIN,
 };
+use crate::fit_device::{
+    BINS, BINS_PER_LOGIT, CELLS, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX,
+};
 use crate::sh;
 
 /// What a binding is to a shader.
@@ -30,6 +33,10 @@ pub(super) struct Build {
     pub rows: u32,
     /// Whether a tile's threads are one subgroup and may share through it.
     pub subgroups: bool,
+    /// Bits that one pass of the radix sort takes.
+    pub digit_bits: u32,
+    /// Whether the loss goes along whole rows and columns, a thread each.
+    pub loss_by_lines: bool,
     /// Workgroups that scans and sorts are cut into: a few per core keep a CPU busy; a GPU needs many.
     pub segments: u32,
 }
@@ -37,9 +44,9 @@ pub(super) struct Build {
 impl Build {
     /// For GPUs, for software adapters with subgroups of a tile's threads, and for others.
     pub const ALL: [Self; 3] = [
-        Self { rows: 2, subgroups: false, segments: 256 },
-        Self { rows: 8, subgroups: true, segments: 16 },
-        Self { rows: 8, subgroups: false, segments: 16 },
+        Self { rows: 2, subgroups: false, digit_bits: 8, loss_by_lines: false, segments: 256 },
+        Self { rows: 8, subgroups: true, digit_bits: 4, loss_by_lines: true, segments: 16 },
+        Self { rows: 8, subgroups: false, digit_bits: 4, loss_by_lines: true, segments: 16 },
     ];
 
     /// Threads of a tile.
@@ -63,12 +70,26 @@ pub(super) struct Source {
 
 const SHARED: &str = include_str!("shaders/shared.wgsl");
 const GEOMETRY_WGSL: &str = include_str!("shaders/geometry.wgsl");
+/// Declared before [`GEOMETRY_WGSL`], by what a kernel does with it.
+const GEOMETRY_READ: &str = "@group(0) @binding(2) var<storage, read> geometry: array<f32>;\n";
+const GEOMETRY_UPDATED: &str =
+    "@group(0) @binding(2) var<storage, read_write> geometry: array<f32>;\n";
+const SPLAT_BACKWARD: &str = include_str!("shaders/splat_backward.wgsl");
+const ADAM_UPDATE: &str = include_str!("shaders/adam_update.wgsl");
+const ADAM_GEOMETRY: &str = include_str!("shaders/adam_geometry.wgsl");
+const MCMC_RUN: &str = include_str!("shaders/mcmc_run.wgsl");
+const SORT_KEYS: &str = include_str!("shaders/bin_sort_keys.wgsl");
+const SORT_BINDINGS: [Access; 7] =
+    [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BIN_TILES: &str = include_str!("shaders/bin_tiles.wgsl");
 const BACKWARD: &str = include_str!("shaders/rasterize_backward.wgsl");
 const BACKWARD_BINDINGS: [Access; 10] =
     [Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BACKWARD_SUM: &str = include_str!("shaders/rasterize_backward_sum.wgsl");
 const BACKWARD_SUM_BINDINGS: [Access; 7] = [Uniform, Read, Read, Read, Read, Read, ReadWrite];
+const LOSS_PIXELS: &str = include_str!("shaders/loss_pixels.wgsl");
+const LOSS_BINDINGS: [Access; 9] =
+    [Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite];
 const TILE_WORK: [&str; 2] =
     [include_str!("shaders/tile_memory.wgsl"), include_str!("shaders/tile_subgroup.wgsl")];
 const TILE_SUMS: [&str; 2] = [
@@ -87,33 +108,87 @@ const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 16] = [
+pub(super) static SOURCES: [Source; 24] = [
     Source {
         name: "project",
         shared_work: None,
-        parts: &[SHARED, GEOMETRY_WGSL, include_str!("shaders/project.wgsl")],
-        bindings: &[Uniform, Uniform, Read, Read, ReadWrite],
+        parts: &[SHARED, GEOMETRY_READ, GEOMETRY_WGSL, include_str!("shaders/project.wgsl")],
+        bindings: &[Uniform, Uniform, Read, Read, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "project_backward",
         shared_work: None,
-        parts: &[SHARED, GEOMETRY_WGSL, include_str!("shaders/project_backward.wgsl")],
+        parts: &[
+            SHARED,
+            GEOMETRY_READ,
+            GEOMETRY_WGSL,
+            SPLAT_BACKWARD,
+            include_str!("shaders/project_backward.wgsl"),
+        ],
         bindings: &[Uniform, Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "fit_geometry",
+        shared_work: None,
+        parts: &[
+            SHARED,
+            GEOMETRY_UPDATED,
+            GEOMETRY_WGSL,
+            SPLAT_BACKWARD,
+            ADAM_UPDATE,
+            ADAM_GEOMETRY,
+            include_str!("shaders/fit_geometry.wgsl"),
+        ],
+        bindings: &[
+            Uniform, Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite,
+            ReadWrite, Uniform,
+        ],
+        segmented: false,
+    },
+    Source {
+        name: "mcmc_weigh",
+        shared_work: None,
+        parts: &[SHARED, MCMC_RUN, include_str!("shaders/mcmc_weigh.wgsl")],
+        bindings: &[
+            Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite,
+        ],
+        segmented: false,
+    },
+    Source {
+        name: "mcmc_spread",
+        shared_work: None,
+        parts: &[SHARED, MCMC_RUN, include_str!("shaders/mcmc_spread.wgsl")],
+        bindings: &[Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, Read],
+        segmented: false,
+    },
+    Source {
+        name: "mcmc_order",
+        shared_work: None,
+        parts: &[SHARED, include_str!("shaders/mcmc_order.wgsl")],
+        bindings: &[Uniform, Read, Read, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "mcmc_rows",
+        shared_work: None,
+        parts: &[SHARED, include_str!("shaders/mcmc_rows.wgsl")],
+        bindings: &[Uniform, Read, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_count",
         shared_work: None,
         parts: &[SHARED, BIN_TILES, include_str!("shaders/bin_count.wgsl")],
-        bindings: &[Uniform, Uniform, Read, ReadWrite, ReadWrite, ReadWrite],
+        bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {
         name: "bin_scan",
         shared_work: None,
         parts: &[SHARED, include_str!("shaders/bin_scan.wgsl")],
-        bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite],
+        bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
         segmented: true,
     },
     Source {
@@ -126,8 +201,15 @@ pub(super) static SOURCES: [Source; 16] = [
     Source {
         name: "bin_sort",
         shared_work: None,
-        parts: &[SHARED, include_str!("shaders/bin_sort.wgsl")],
-        bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+        parts: &[SHARED, SORT_KEYS, include_str!("shaders/bin_sort.wgsl")],
+        bindings: &SORT_BINDINGS,
+        segmented: true,
+    },
+    Source {
+        name: "bin_sort_wide",
+        shared_work: None,
+        parts: &[SHARED, SORT_KEYS, include_str!("shaders/bin_sort_wide.wgsl")],
+        bindings: &SORT_BINDINGS,
         segmented: true,
     },
     Source {
@@ -189,14 +271,28 @@ pub(super) static SOURCES: [Source; 16] = [
     Source {
         name: "loss",
         shared_work: None,
-        parts: &[SHARED, include_str!("shaders/loss.wgsl")],
-        bindings: &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+        parts: &[SHARED, LOSS_PIXELS, include_str!("shaders/loss.wgsl")],
+        bindings: &LOSS_BINDINGS,
         segmented: false,
     },
     Source {
-        name: "adam",
+        name: "loss_lines",
         shared_work: None,
-        parts: &[SHARED, include_str!("shaders/adam.wgsl")],
+        parts: &[SHARED, LOSS_PIXELS, include_str!("shaders/loss_lines.wgsl")],
+        bindings: &LOSS_BINDINGS,
+        segmented: false,
+    },
+    Source {
+        name: "adam_geometry",
+        shared_work: None,
+        parts: &[SHARED, ADAM_UPDATE, ADAM_GEOMETRY, include_str!("shaders/adam_plain.wgsl")],
+        bindings: &[Uniform, Uniform, ReadWrite, Read, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "adam_colors",
+        shared_work: None,
+        parts: &[SHARED, ADAM_UPDATE, include_str!("shaders/adam_colors.wgsl")],
         bindings: &[
             Uniform, Uniform, Uniform, Read, ReadWrite, Read, ReadWrite, ReadWrite, Read, Read,
             ReadWrite,
@@ -210,6 +306,7 @@ pub(super) static SOURCES: [Source; 16] = [
 pub(super) enum Kernel {
     Project,
     ProjectBackward,
+    FitGeometry,
     DepthKeys,
     TileCounts,
     ScanSums,
@@ -218,6 +315,8 @@ pub(super) enum Kernel {
     SortHistogram,
     SortScan,
     SortScatter,
+    SortCount,
+    SortPlace,
     Ranges,
     Rasterize,
     RasterizeBackward,
@@ -228,16 +327,31 @@ pub(super) enum Kernel {
     ExposureBackward,
     LossSlopes,
     LossGradient,
+    LossColumns,
+    LossRows,
+    LossColumnsGradient,
     DepthLoss,
     AdamGeometry,
     AdamColors,
+    McmcSample,
+    McmcWeigh,
+    McmcSums,
+    McmcPrefix,
+    McmcStart,
+    McmcDraw,
+    McmcShare,
+    McmcCopy,
+    McmcBounds,
+    McmcCodes,
+    McmcRows,
 }
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 23] = [
+    pub const ALL: [Self; 40] = [
         Self::Project,
         Self::ProjectBackward,
+        Self::FitGeometry,
         Self::DepthKeys,
         Self::TileCounts,
         Self::ScanSums,
@@ -246,6 +360,8 @@ impl Kernel {
         Self::SortHistogram,
         Self::SortScan,
         Self::SortScatter,
+        Self::SortCount,
+        Self::SortPlace,
         Self::Ranges,
         Self::Rasterize,
         Self::RasterizeBackward,
@@ -256,9 +372,23 @@ impl Kernel {
         Self::ExposureBackward,
         Self::LossSlopes,
         Self::LossGradient,
+        Self::LossColumns,
+        Self::LossRows,
+        Self::LossColumnsGradient,
         Self::DepthLoss,
         Self::AdamGeometry,
         Self::AdamColors,
+        Self::McmcSample,
+        Self::McmcWeigh,
+        Self::McmcSums,
+        Self::McmcPrefix,
+        Self::McmcStart,
+        Self::McmcDraw,
+        Self::McmcShare,
+        Self::McmcCopy,
+        Self::McmcBounds,
+        Self::McmcCodes,
+        Self::McmcRows,
     ];
 
     /// (file, entry point)
@@ -266,6 +396,7 @@ impl Kernel {
         match self {
             Self::Project => ("project", "project"),
             Self::ProjectBackward => ("project_backward", "project_backward"),
+            Self::FitGeometry => ("fit_geometry", "fit_geometry"),
             Self::DepthKeys => ("bin_count", "depth_keys"),
             Self::TileCounts => ("bin_count", "tile_counts"),
             Self::ScanSums => ("bin_scan", "scan_sums"),
@@ -274,6 +405,8 @@ impl Kernel {
             Self::SortHistogram => ("bin_sort", "sort_histogram"),
             Self::SortScan => ("bin_sort", "sort_scan"),
             Self::SortScatter => ("bin_sort", "sort_scatter"),
+            Self::SortCount => ("bin_sort_wide", "sort_count"),
+            Self::SortPlace => ("bin_sort_wide", "sort_place"),
             Self::Ranges => ("bin_ranges", "ranges"),
             Self::Rasterize => ("rasterize", "rasterize"),
             Self::RasterizeBackward => ("rasterize_backward", "rasterize_backward"),
@@ -288,9 +421,23 @@ impl Kernel {
             Self::ExposureBackward => ("exposure", "exposure_backward"),
             Self::LossSlopes => ("loss", "loss_slopes"),
             Self::LossGradient => ("loss", "loss_gradient"),
+            Self::LossColumns => ("loss_lines", "loss_columns"),
+            Self::LossRows => ("loss_lines", "loss_rows"),
+            Self::LossColumnsGradient => ("loss_lines", "loss_columns_gradient"),
             Self::DepthLoss => ("depth_loss", "depth_loss"),
-            Self::AdamGeometry => ("adam", "adam_geometry"),
-            Self::AdamColors => ("adam", "adam_colors"),
+            Self::AdamGeometry => ("adam_geometry", "adam_geometry"),
+            Self::AdamColors => ("adam_colors", "adam_colors"),
+            Self::McmcSample => ("mcmc_weigh", "mcmc_sample"),
+            Self::McmcWeigh => ("mcmc_weigh", "mcmc_weigh"),
+            Self::McmcSums => ("mcmc_weigh", "mcmc_sums"),
+            Self::McmcPrefix => ("mcmc_weigh", "mcmc_prefix"),
+            Self::McmcStart => ("mcmc_spread", "mcmc_start"),
+            Self::McmcDraw => ("mcmc_spread", "mcmc_draw"),
+            Self::McmcShare => ("mcmc_spread", "mcmc_share"),
+            Self::McmcCopy => ("mcmc_spread", "mcmc_copy"),
+            Self::McmcBounds => ("mcmc_order", "mcmc_bounds"),
+            Self::McmcCodes => ("mcmc_order", "mcmc_codes"),
+            Self::McmcRows => ("mcmc_rows", "mcmc_rows"),
         }
     }
 }
@@ -307,6 +454,9 @@ fn constants(rows: u32) -> String {
         ("EXPOSURE_GROUPS", EXPOSURE_GROUPS),
         ("DEPTH_GROUPS", DEPTH_GROUPS),
         ("SH_COEFFS_MAX", SH_COEFFS_MAX as u32),
+        ("BINS", BINS as u32),
+        ("SHARES_MAX", SHARES_MAX as u32),
+        ("CELLS", CELLS),
     ]) {
         let _ = writeln!(out, "const {name} = {value}u;");
     }
@@ -322,6 +472,10 @@ fn constants(rows: u32) -> String {
         ("ADAM_BETA1", ADAM.0),
         ("ADAM_BETA2", ADAM.1),
         ("ADAM_EPSILON", ADAM.2),
+        ("LOGIT_DEAD", LOGIT_DEAD),
+        ("LOGIT_FOG", LOGIT_FOG),
+        ("LOGIT_FIRST", LOGIT_FIRST),
+        ("BINS_PER_LOGIT", BINS_PER_LOGIT),
         ("SSIM_C1", SSIM_C.0),
         ("SSIM_C2", SSIM_C.1),
     ];
@@ -334,6 +488,10 @@ fn constants(rows: u32) -> String {
         for (i, value) in values.iter().enumerate() {
             let _ = writeln!(out, "const {name}_{i} = {:e}f;", *value as f32);
         }
+    }
+    // SSIM's window is symmetric.
+    for (i, tap) in SSIM_WINDOW.iter().take(SSIM_WINDOW.len() / 2 + 1).enumerate() {
+        let _ = writeln!(out, "const SSIM_TAP_{i} = {tap:e}f;");
     }
     // Weights of each of the 14 values that four neighbouring outputs of SSIM's filter need.
     let tap = |k: usize, output: usize| {
@@ -426,10 +584,12 @@ mod tests {
     use std::mem::offset_of;
 
     use super::*;
+    use crate::fit_device::FogCamera;
     use crate::gpu::layout::{
         Chunk, ChunkCount, DepthStep, ExposureUniform, SortPass, Splat2d, StatusHead, Step, View,
         Window,
     };
+    use crate::gpu::mcmc::{CellsUniform, Rows, Run};
 
     fn parse(source: &Source) -> naga::Module {
         let text = source.text(Build::ALL[0]);
@@ -528,7 +688,32 @@ mod tests {
             dropout_seed,
             compensation
         );
-        layout!("project", Window, first, count);
+        layout!("project", Window, first, count, groups_max);
+        layout!(
+            "mcmc_weigh",
+            Run,
+            splats,
+            fresh,
+            seed,
+            round,
+            cameras,
+            every,
+            color_floats,
+            unused
+        );
+        layout!("mcmc_rows", Rows, splats, floats, kind, unused);
+        layout!("mcmc_weigh", FogCamera, rows, focal, principal, size, nearest, unused);
+        assert_layout(
+            "mcmc_order",
+            "Cells",
+            size_of::<CellsUniform>(),
+            &[
+                ("low", offset_of!(CellsUniform, low)),
+                ("splats", offset_of!(CellsUniform, splats)),
+                ("scale", offset_of!(CellsUniform, scale)),
+                ("upper", offset_of!(CellsUniform, upper)),
+            ],
+        );
         layout!("depth_loss", DepthStep, scale);
         assert_layout(
             "exposure",
@@ -552,13 +737,14 @@ mod tests {
             is_first,
             is_last,
             list_begin,
-            list_end
+            list_end,
+            groups_max
         );
-        layout!("bin_sort", SortPass, shift, chunk);
+        layout!("bin_sort", SortPass, shift, chunk, is_first, keeps_culled);
         layout!("project", Splat2d, mean, pq, color, r, depth, opacity, radii);
         layout!("bin_scan", ChunkCount, pairs, total);
         layout!(
-            "adam",
+            "adam_colors",
             Step,
             means,
             quats,
@@ -586,7 +772,7 @@ mod tests {
                 ("splats", offset_of!(StatusHead, splats)),
                 ("step", offset_of!(StatusHead, step)),
                 ("overflow", offset_of!(StatusHead, overflow)),
-                ("unused", offset_of!(StatusHead, unused)),
+                ("visible", offset_of!(StatusHead, visible)),
                 ("chunks", size_of::<StatusHead>()),
             ],
         );

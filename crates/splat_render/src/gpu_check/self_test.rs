@@ -2,14 +2,17 @@
 //! every stage there and in the reference. A driver's compiler may refuse a kernel or get it wrong, and
 //! a fit that is wrong from the start shows in no message.
 
+use std::sync::Arc;
+
 use glam::{DMat4, DVec3};
 use num_traits::Float;
 
 use crate::camera::Camera;
 use crate::constants::DEPTH_ALPHA;
+use crate::cpu::CpuFit;
 use crate::error::{Error, Result};
-use crate::fit_device::noise_draw;
-use crate::gpu::Gpu;
+use crate::fit_device::{FitDevice, FitState, McmcRun, StepInput, noise_draw};
+use crate::gpu::{Gpu, GpuFit};
 use crate::reference::Reference;
 use crate::splats::SplatArrays;
 use crate::stages::{
@@ -29,14 +32,17 @@ const BACKGROUND: [f64; 3] = [0.25, 0.5, 0.75];
 /// What a stage gives, as plain numbers.
 type Outputs = Vec<(&'static str, Vec<f64>)>;
 
-/// Compiles every kernel and compares what they compute of a small scene with the reference.
+/// Compiles every kernel and compares what they compute of a small scene with the reference, and a step
+/// and a run of density control of a fit with the CPU's.
 ///
 /// # Errors
 /// [`Error::Device`] with what the driver says, or with the first stage that is wrong.
-pub fn self_test(gpu: &Gpu) -> Result<()> {
+pub fn self_test(gpu: &Arc<Gpu>) -> Result<()> {
     gpu.compile_all()?;
-    let outputs = all_stages::<f32>(gpu)?;
-    let expected = all_stages::<f64>(&Reference)?;
+    let mut outputs = all_stages::<f32>(&**gpu)?;
+    let mut expected = all_stages::<f64>(&Reference)?;
+    outputs.extend(a_fit(&mut GpuFit::new(Arc::clone(gpu)))?);
+    expected.extend(a_fit(&mut CpuFit::default())?);
     for ((stage, values), (_, right)) in outputs.iter().zip(&expected) {
         let off = difference(values, right);
         if off.is_nan() || off > TOLERANCE {
@@ -213,6 +219,53 @@ fn all_stages<T: Float>(stages: &impl Stages<T>) -> Result<Outputs> {
         ("adam", flat(&state.splats.means)),
         ("adam", flat(&state.splats.scales)),
         ("adam", flat(&state.splats.sh)),
+    ])
+}
+
+/// A step of a fit, whose kernels join stages, and a run of density control.
+fn a_fit(device: &mut dyn FitDevice) -> Result<Outputs> {
+    let (mut first, mut second) = (scene::<f32>(), scene::<f32>());
+    fill(&mut first, 0.0);
+    // As for the stages: no update is the sign of a gradient.
+    fill(&mut second, 1e-4);
+    device.set_targets(vec![photo()])?;
+    device.upload(FitState { first, second, ..FitState::new(scene()) })?;
+    let AdamStep { rates, sh_degree, opacity_regularizer, scale_regularizer, .. } = adam_step();
+    device.step(&StepInput {
+        view: 0,
+        camera: camera(),
+        background: BACKGROUND.map(|v| v as f32),
+        sh_degree,
+        rates,
+        step: 5,
+        ssim_weight: 0.2,
+        opacity_regularizer,
+        scale_regularizer,
+        noise: 0.0,
+        dropout: 0.0,
+        noise_seed: 0,
+        camera_gradient: true,
+        depth_weight: 0.0,
+        exposure: None,
+    })?;
+    let step = device.download()?;
+    let camera = device.camera_gradients()?;
+    // From values that are equal: a draw says no more of splats that differ in their last bit.
+    device.upload(FitState::new(scene()))?;
+    device.mcmc(&McmcRun { cameras: vec![self::camera()], target: SPLATS + 20, seed: SEED })?;
+    let grown = device.download()?.splats;
+    Ok(vec![
+        ("a fit's step", flat(&step.splats.means)),
+        ("a fit's step", flat(&step.splats.scales)),
+        ("a fit's step", flat(&step.splats.quats)),
+        ("a fit's step", plain(&step.splats.opacities)),
+        ("a fit's step", flat(&step.splats.sh)),
+        ("a fit's step", plain(&step.stats.grad_sum)),
+        ("a fit's step", camera.iter().flat_map(|v| flat(&v.v_viewmat)).collect()),
+        ("density control", flat(&grown.means)),
+        ("density control", flat(&grown.scales)),
+        ("density control", plain(&grown.opacities)),
+        ("density control", flat(&grown.sh)),
     ])
 }
 

@@ -5,6 +5,7 @@ use std::env;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::Write;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use super::self_test::self_test;
 use crate::error::Result;
@@ -19,7 +20,7 @@ const VARIABLE: &str = "IGSR_GPU_CACHE";
 ///
 /// # Errors
 /// Those of both.
-pub fn open_tested(software_allowed: bool) -> Result<Gpu> {
+pub fn open_tested(software_allowed: bool) -> Result<Arc<Gpu>> {
     open_tested_with(software_allowed, &Injected::default())
 }
 
@@ -27,8 +28,8 @@ pub fn open_tested(software_allowed: bool) -> Result<Gpu> {
 ///
 /// # Errors
 /// Those of [`open_tested`].
-pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<Gpu> {
-    let gpu = Gpu::with_faults(software_allowed, injected)?;
+pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<Arc<Gpu>> {
+    let gpu = Arc::new(Gpu::with_faults(software_allowed, injected)?);
     let verdict = verdict_file(&gpu).filter(|_| injected.is_sound());
     if verdict.as_ref().is_some_and(|path| path.is_file()) {
         return Ok(gpu);

@@ -120,7 +120,13 @@ fn fitted(device: &mut dyn FitDevice) -> (FitState, StepInput) {
     let (state, _) = random_adam(&mut rng, 130, 2);
     let camera = random_camera(&mut rng, 40, 30);
     let stats = DensityStats::zeros(130);
-    let state = FitState { splats: state.splats, first: state.first, second: state.second, stats };
+    let state = FitState {
+        splats: state.splats,
+        first: state.first,
+        second: state.second,
+        stats,
+        frozen: 0,
+    };
     device.set_targets(vec![random_target(&mut rng, 40, 30, false, false)]).unwrap();
     device.upload(state.clone()).unwrap();
     let input = StepInput {
@@ -166,6 +172,39 @@ pub fn frozen_steps_keep_the_moments(device: &mut dyn FitDevice) {
         let rests = (0..a.len()).all(|i| a.sh[9 * i + 4..9 * i + 9] == b.sh[9 * i + 4..9 * i + 9]);
         assert!(rests, "a coefficient that is not in use moved");
     }
+}
+
+/// The last splats of a state are drawn and never changed; the others take the step that they take
+/// where all move, and so do loss and camera.
+pub fn the_last_splats_stay(device: &mut dyn FitDevice) {
+    let (before, input) = fitted(device);
+    // The regularisers are means over the splats that move.
+    let input = StepInput { opacity_regularizer: 0.0, scale_regularizer: 0.0, ..input };
+    device.step(&input).unwrap();
+    let all = device.download().unwrap();
+    let (loss, gradients) = (device.loss().unwrap(), device.camera_gradients().unwrap());
+
+    // A whole block of 64 splats, and a part of another, stay.
+    for frozen in [1, 70, 129] {
+        let moving = before.splats.len() - frozen;
+        device.upload(FitState { frozen, ..before.clone() }).unwrap();
+        device.step(&input).unwrap();
+        let after = device.download().unwrap();
+        assert_eq!(after.frozen, frozen);
+        let [head, tail]: [Vec<usize>; 2] = [(0..moving).collect(), (moving..130).collect()];
+        for (after, all, before) in [
+            (&after.splats, &all.splats, &before.splats),
+            (&after.first, &all.first, &before.first),
+            (&after.second, &all.second, &before.second),
+        ] {
+            assert!(after.select(&head) == all.select(&head), "{frozen}: those that move differ");
+            assert!(after.select(&tail) == before.select(&tail), "{frozen}: a frozen one moved");
+        }
+        assert_eq!(device.loss().unwrap(), loss);
+        assert_eq!(device.camera_gradients().unwrap(), gradients);
+    }
+    let none = FitState { frozen: 130, ..before };
+    assert!(none.validate().unwrap_err().to_string().contains("frozen_splats"));
 }
 
 /// Steps that make no sense are refused by every device, and change nothing.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import Camera
+from igsr.geometry.similarity import Similarity
 from igsr.pose.grid import Grid
 
 Float32 = npt.NDArray[np.float32]
@@ -56,3 +57,21 @@ class AlignedPhoto:
             shown &= ((cells >= 0.0) & (cells < [grid.width, grid.height])).all(axis=1)
         column, row = np.where(shown[:, None], cells, 0.0).astype(np.int64).T
         return shown, z, self.depth[row, column], self.confidence[row, column]
+
+    def depths_at(self, pixels: Float64) -> Float64:
+        """Depths [M] at pixels [M, 2] of the photo, NaN where they are not known."""
+        grid = self.grid
+        cells = (pixels - [grid.offset_x, grid.offset_y]) / [grid.scale_x, grid.scale_y]
+        inside = np.all((cells >= 0.0) & (cells < [grid.width, grid.height]), axis=1)
+        column, row = np.where(inside[:, None], cells, 0.0).astype(np.int64).T
+        depth = np.where(inside, self.depth[row, column], np.nan).astype(np.float64)
+        return np.where(depth > 0.0, depth, np.nan)
+
+    def mapped(self, similarity: Similarity) -> AlignedPhoto:
+        """The photo in another world.
+
+        Args:
+            similarity: to the other world.
+        """
+        depth = (self.depth * np.float64(similarity.scale)).astype(np.float32)
+        return replace(self, camera=similarity.camera(self.camera), depth=depth)

@@ -9,7 +9,7 @@ the matches that cannot all be right (``contradictions``).
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,7 @@ def mapped(
     *,
     sift: bool = True,
     usable: Mapping[int, npt.NDArray[np.bool_]] | None = None,
+    steps: Sequence[Evidence] = STEPS,
 ) -> Mapped:
     """Place photos.
 
@@ -73,6 +74,7 @@ def mapped(
         sift: whether features are SIFT's: of these, more are matched where photos are missing.
         usable: pixels [H, W] that have features, by COLMAP's number of the photo, where some have
             none.
+        steps: in which thresholds fall; the first ones of ``STEPS``.
     """
     strengths = {pair: len(found) for pair, found in links(matches).items()}
     all_links = len(strengths)
@@ -82,7 +84,7 @@ def mapped(
     best_step = 0
     looked_for: set[int] = set()
     few = False
-    for step, evidence in enumerate(STEPS):
+    for step, evidence in enumerate(steps):
         extending = few and step < DOUBTFUL
         if evidence.guided_matching:
             wanted = _missing(best, count) if extending else set(range(count))

@@ -9,6 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.attempts import mapped
@@ -62,20 +65,43 @@ class Colmap:
             )
         with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, guarded(seed):
             workspace = Path(folder)
-            database = workspace / "database.db"
-            list_photos(photos, database)
-            if self._matcher is None:
-                find_features(photos, workspace, database, show)
-                matches = matched(len(photos), database, seed, show)
-            else:
-                matches = matched_by(self._matcher, photos, database, seed, show)
+            matches = matched_photos(photos, workspace, self._matcher, seed, show)
             sift = self._matcher is None
-            pixels = {image_id(i): usable_pixels(photo) for i, photo in enumerate(photos)}
-            usable = {number: mask for number, mask in pixels.items() if mask is not None}
-            found = mapped(len(photos), matches, seed, show, sift=sift, usable=usable)
+            found = mapped(
+                len(photos), matches, seed, show, sift=sift, usable=usable_by_number(photos)
+            )
             if found.model is not None:
                 found = replace(found, model=without_distortion(found.model))
         return estimate_of(photos, found)
+
+
+def matched_photos(
+    photos: Sequence[Photo], workspace: Path, matcher: Matcher | None, seed: int, show: Progress
+) -> Path:
+    """A database of photos, their features and verified matches.
+
+    Args:
+        photos: at least two.
+        workspace: the folder that it is made in.
+        matcher: what finds and matches features; None for COLMAP's SIFT.
+        seed: of the verification.
+        show: called with "features" and "matching", how much is done, and how much there is.
+
+    Raises:
+        IgsrError: as ``matched_by``.
+    """
+    database = workspace / "database.db"
+    list_photos(photos, database)
+    if matcher is not None:
+        return matched_by(matcher, photos, database, seed, show)
+    find_features(photos, workspace, database, show)
+    return matched(len(photos), database, seed, show)
+
+
+def usable_by_number(photos: Sequence[Photo]) -> dict[int, npt.NDArray[np.bool_]]:
+    """Pixels [H, W] that have features, by COLMAP's number of the photo, where some have none."""
+    pixels = {image_id(i): usable_pixels(photo) for i, photo in enumerate(photos)}
+    return {number: mask for number, mask in pixels.items() if mask is not None}
 
 
 @contextlib.contextmanager

@@ -110,16 +110,5 @@ def joined(
             lost |= photos.keys() - world.keys()
             continue
         for i in photos.keys() - world.keys():
-            world[i] = mapped(photos[i], similarity)
+            world[i] = photos[i].mapped(similarity)
     return world, sorted(lost - world.keys())
-
-
-def mapped(photo: AlignedPhoto, similarity: Similarity) -> AlignedPhoto:
-    """The photo in another world.
-
-    Args:
-        photo: in the world that is mapped from.
-        similarity: to the other world.
-    """
-    depth = (photo.depth * np.float64(similarity.scale)).astype(np.float32)
-    return AlignedPhoto(similarity.camera(photo.camera), photo.grid, depth, photo.confidence)

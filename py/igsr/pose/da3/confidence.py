@@ -39,7 +39,7 @@ def trusted_depths(photos: Sequence[AlignedPhoto | None]) -> list[Bool | None]:
     for i in known:
         photo = photos[i]
         assert photo is not None
-        sure = _sure(photo) & ~_on_edge(photo.depth)
+        sure = sure_pixels(photo) & ~_on_edge(photo.depth)
         others = sorted(
             (j for j in known if j != i),
             key=lambda j: float(np.linalg.norm(centres[j] - centres[i])),
@@ -58,7 +58,8 @@ def trusted_depths(photos: Sequence[AlignedPhoto | None]) -> list[Bool | None]:
     return trusted
 
 
-def _sure(photo: AlignedPhoto) -> Bool:
+def sure_pixels(photo: AlignedPhoto) -> Bool:
+    """The pixels [h, w] that the network is surer of than of others of the photo."""
     known = np.isfinite(photo.depth) & (photo.depth > 0.0) & (photo.confidence > 1.0)
     if not known.any():
         return known

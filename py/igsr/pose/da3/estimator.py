@@ -15,22 +15,25 @@ from igsr.capture.photo_folder import FEWEST, Photo
 from igsr.errors import IgsrError
 from igsr.geometry.similarity import similarity_between
 from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.da3.bundle_adjustment import with_adjusted_cameras
-from igsr.pose.da3.chunks import chunks_of, joined, mapped
-from igsr.pose.da3.confidence import trusted_depths
+from igsr.pose.all_evidence import Evidence, with_all_evidence
+from igsr.pose.colmap.matcher import Matcher
+from igsr.pose.colmap.named_matchers import SIFT, matcher_of
+from igsr.pose.da3.chunks import chunks_of, joined
+from igsr.pose.da3.confidence import sure_pixels, trusted_depths
 from igsr.pose.da3.passes import SOURCES, Predictor
 from igsr.pose.estimate import Estimate
-from igsr.pose.fused_points import fused_points
+from igsr.pose.fused_points import fused_points, joined_points
 from igsr.pose.given_cameras import check_given_cameras
+from igsr.pose.name_lists import listed
 from igsr.pose.photo_samples import usable
 
+#: What messages call it.
+NETWORK = "Depth Anything 3"
 #: Distance of a principal point from the middle, in units of the side, that is told of: the network
 #: takes it to be in the middle.
 OFF_CENTRE = 0.05
 #: Greatest distance of cameras, in units of the median depth, that is called one place.
 ONE_PLACE = 1e-3
-#: Names shown of a long list.
-_NAMED = 5
 
 
 class Da3:
@@ -44,7 +47,9 @@ class Da3:
             and depths are found for them.
         cameras_from: "decoder", the network's prediction of cameras, or "rays", what fits its
             prediction of every pixel's ray best; that takes longer.
-        bundle_adjustment: whether cameras that are found are adjusted where photos share features.
+        bundle_adjustment: whether cameras that are found rest on features, too, where photos share
+            some (``igsr.pose.all_evidence``).
+        matcher: what finds and matches these features, as for ``Colmap``.
     """
 
     name = "da3"
@@ -56,6 +61,7 @@ class Da3:
         cameras: Mapping[str, Camera] | None = None,
         cameras_from: str = SOURCES[0],
         bundle_adjustment: bool = True,
+        matcher: str | Matcher = SIFT,
     ) -> None:
         """Keep the settings; nothing is loaded yet."""
         self.predictor = predictor
@@ -63,6 +69,7 @@ class Da3:
         self.cameras = dict(cameras or {})
         self.cameras_from = cameras_from
         self.bundle_adjustment = bundle_adjustment
+        self.matcher = matcher_of(matcher)
 
     def __call__(
         self,
@@ -108,31 +115,20 @@ class Da3:
             if progress is not None:
                 progress("passes", done, in_all)
         lost: list[int] = []
-        adjusted: list[int] = []
-        unadjusted = ""
         if self.cameras:
             world = {i: one for each in reversed(passes) for i, one in each.items()}
         else:
             world, lost = joined(passes)
         aligned = [world.get(i) for i in range(len(shown))]
+        evidence = None
         if not self.cameras:
             aligned = with_shared_focals(shown, aligned)
             if self.bundle_adjustment:
-                aligned, adjusted, unadjusted = with_adjusted_cameras(
-                    shown, aligned, seed, progress
+                sure = [None if one is None else sure_pixels(one) for one in aligned]
+                evidence = with_all_evidence(
+                    shown, aligned, sure, NETWORK, self.matcher, seed, progress
                 )
-        found = self._estimate(photos, shown, same_as, aligned, lost)
-        left = [shown[i].name for i, one in enumerate(aligned) if one and i not in adjusted]
-        if unadjusted:
-            found.warnings.append(
-                "Cameras are as Depth Anything 3 predicts them and may be degrees off; bundle "
-                f"adjustment gave none: {unadjusted}"
-            )
-        elif adjusted and left:
-            found.warnings.append(
-                f"Cameras of {_names(left)} are as Depth Anything 3 predicts them and may be "
-                "degrees off: they share too few features with the others"
-            )
+        found = self._estimate(photos, shown, same_as, aligned, lost, evidence)
         found.weights = weights
         return found
 
@@ -143,7 +139,12 @@ class Da3:
         same_as: Sequence[int],
         aligned: Sequence[AlignedPhoto | None],
         lost: Sequence[int],
+        evidence: Evidence | None,
     ) -> Estimate:
+        warnings = self._warnings(photos, shown, aligned, lost, evidence)
+        predicted = [None if one is None else one.camera for one in aligned]
+        cameras = predicted if evidence is None else evidence.cameras
+        aligned = aligned if evidence is None else evidence.photos
         trusted = trusted_depths(aligned)
         for photo, placed, sure in zip(shown, aligned, trusted, strict=True):
             if placed is not None and sure is not None:
@@ -151,14 +152,19 @@ class Da3:
         places = [aligned[i] for i in same_as]
         return Estimate(
             cameras=[
-                self.cameras.get(photo.name) if one is None or self.cameras else one.camera
-                for photo, one in zip(photos, places, strict=True)
+                self.cameras[photo.name] if self.cameras else cameras[i]
+                for photo, i in zip(photos, same_as, strict=True)
             ],
-            points=fused_points(shown, aligned, trusted),
+            points=joined_points(
+                None if evidence is None else evidence.points,
+                fused_points(shown, aligned, trusted),
+            ),
             depths=[None if one is None else one.depth for one in places],
             trusted=[trusted[i] for i in same_as],
-            warnings=self._warnings(photos, shown, aligned, lost),
+            warnings=warnings,
             grids=[None if one is None else one.grid for one in places],
+            lenses=[] if evidence is None else [evidence.lenses[i] for i in same_as],
+            evidence=[] if evidence is None else [evidence.evidence[i] for i in same_as],
         )
 
     def _warnings(
@@ -167,21 +173,24 @@ class Da3:
         shown: Sequence[Photo],
         aligned: Sequence[AlignedPhoto | None],
         lost: Sequence[int],
+        evidence: Evidence | None,
     ) -> list[str]:
         found = []
-        no_camera = [
-            photo.name
-            for i, (photo, one) in enumerate(zip(shown, aligned, strict=True))
-            if one is None and i not in lost
-        ]
+        missing = {i for i, one in enumerate(aligned) if one is None}
+        if evidence is not None:
+            # What the network places nowhere may have features.
+            missing &= {i for i, one in enumerate(evidence.cameras) if one is None}
+            found += evidence.warnings
+        lost = [i for i in lost if i in missing]
+        no_camera = [shown[i].name for i in sorted(missing.difference(lost))]
         if no_camera:
             found.append(
-                f"Not registered: {_names(no_camera)}. What Depth Anything 3 predicts for them is "
+                f"Not registered: {listed(no_camera)}. What Depth Anything 3 predicts for them is "
                 "no camera; leave them out, or take more photos between them and the others"
             )
         if lost:
             found.append(
-                f"Not registered: {_names([shown[i].name for i in lost])}. Their pass shares "
+                f"Not registered: {listed([shown[i].name for i in lost])}. Their pass shares "
                 "nothing with the others that both are sure of; name photos in the order they were "
                 "taken"
             )
@@ -202,7 +211,7 @@ class Da3:
         ]
         if off:
             found.append(
-                f"The principal point is far from the middle of {_names(off)}, where Depth "
+                f"The principal point is far from the middle of {listed(off)}, where Depth "
                 "Anything 3 takes it to be, so depths may be off; give whole photos, not parts"
             )
         return found
@@ -218,7 +227,7 @@ class Da3:
         similarity = similarity_between(
             [placed[i].camera for i in order], [given[i] for i in order]
         )
-        return {i: replace(mapped(placed[i], similarity), camera=given[i]) for i in order}
+        return {i: replace(placed[i].mapped(similarity), camera=given[i]) for i in order}
 
     def _network(self) -> tuple[Predictor, dict[str, str]]:
         from igsr.pose.da3.checkpoint import LICENCE, find_checkpoint, load_network
@@ -242,7 +251,7 @@ class Da3:
         missing = [photo.name for photo in photos if photo.name not in self.cameras]
         if self.cameras and missing:
             raise IgsrError(
-                f"cameras has none for {_names(missing)}; Depth Anything 3 takes the cameras of "
+                f"cameras has none for {listed(missing)}; Depth Anything 3 takes the cameras of "
                 "all photos or of none"
             )
 
@@ -303,8 +312,3 @@ def _different(photos: Sequence[Photo]) -> tuple[list[int], list[int]]:
             different.append(i)
         same_as.append(first[key])
     return different, same_as
-
-
-def _names(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more

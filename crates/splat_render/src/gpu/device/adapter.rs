@@ -2,6 +2,7 @@
 
 use std::future::Future;
 use std::pin::pin;
+use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex, OnceLock};
 use std::task::{Context, Poll, Waker};
 
@@ -183,7 +184,9 @@ impl Gpu {
             failure,
             lost,
             injected: injected.clone(),
+            planned: None,
             made: Default::default(),
+            host_bytes: AtomicU64::new(0),
             binding_limit,
             groups_max,
             build,

@@ -18,16 +18,20 @@ impl Gpu {
     /// A buffer of at least `bytes`, with nothing of use in it.
     pub(in crate::gpu) fn buffer(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
         let size = bytes.max(BUFFER_MIN).next_multiple_of(4);
-        if size > self.device.limits().max_buffer_size {
+        if self.planned.is_none() && size > self.device.limits().max_buffer_size {
             return Err(self.error(&format!("holds no buffer of {size} bytes for {label}")));
         }
         if self.injected.buffer_bytes.is_some_and(|most| size > most) {
             return Err(self.error("is out of memory"));
         }
+        if let Some(planned) = &self.planned {
+            return Ok(planned.buffer(&self.device, size));
+        }
         let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
             size,
             usage: wgpu::BufferUsages::STORAGE
+                | wgpu::BufferUsages::INDIRECT
                 | wgpu::BufferUsages::COPY_SRC
                 | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: cfg!(debug_assertions),
@@ -44,6 +48,11 @@ impl Gpu {
         }
         self.check()?;
         Ok(buffer)
+    }
+
+    /// Size of a buffer, that it would have where it is only planned.
+    pub(in crate::gpu) fn size_of(&self, buffer: &wgpu::Buffer) -> u64 {
+        self.planned.as_ref().and_then(|planned| planned.size(buffer)).unwrap_or(buffer.size())
     }
 
     /// Checks that a buffer can be bound whole.
@@ -79,10 +88,18 @@ impl Gpu {
         let bytes: &[u8] = bytemuck::cast_slice(contents);
         let buffer = self.buffer(label, bytes.len() as u64)?;
         if !bytes.is_empty() {
-            self.queue.write_buffer(&buffer, 0, bytes);
+            self.write(&buffer, 0, bytes);
         }
         self.check()?;
         Ok(buffer)
+    }
+
+    /// Overwrites a part of a buffer.
+    pub(in crate::gpu) fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
+        if self.planned.is_none() {
+            self.count_host(bytes.len() as u64);
+            self.queue.write_buffer(buffer, offset, bytes);
+        }
     }
 
     /// A uniform buffer with the given contents.
@@ -95,6 +112,7 @@ impl Gpu {
             usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
+        self.count_host(size_of::<T>() as u64);
         self.queue.write_buffer(&buffer, 0, bytemuck::bytes_of(contents));
         buffer
     }
@@ -155,6 +173,7 @@ impl Gpu {
         self.check()?;
         let mut out = Vec::new();
         for &(buffer, bytes) in buffers {
+            self.count_host(bytes);
             let view = buffer
                 .get_mapped_range(..)
                 .map_err(|e| self.error(&format!("gave no results back ({e})")))?;

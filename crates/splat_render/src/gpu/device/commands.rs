@@ -2,6 +2,7 @@
 
 use std::num::NonZeroU64;
 use std::ops::Range;
+use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -28,13 +29,40 @@ impl<'a> Bound<'a> {
     pub fn part(buffer: &'a wgpu::Buffer, bytes: Range<u64>) -> Self {
         Self { buffer, bytes: Some(bytes) }
     }
+
+    /// Bytes that are bound.
+    fn size(&self, gpu: &Gpu) -> u64 {
+        self.bytes.as_ref().map_or_else(|| gpu.size_of(self.buffer), |b| b.end - b.start)
+    }
+}
+
+/// How many workgroups a dispatch has.
+#[derive(Debug, Clone)]
+pub(in crate::gpu) enum Groups {
+    /// So many, known when it is prepared.
+    Direct([u32; 2]),
+    /// As three numbers at an offset in a buffer say, bytes.
+    Indirect(wgpu::Buffer, u64),
+}
+
+impl From<[u32; 2]> for Groups {
+    fn from(groups: [u32; 2]) -> Self {
+        Self::Direct(groups)
+    }
 }
 
 /// One prepared command.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) enum Op {
     /// Runs a kernel.
-    Dispatch { pipeline: wgpu::ComputePipeline, bind_group: wgpu::BindGroup, groups: [u32; 2] },
+    Dispatch {
+        kernel: Kernel,
+        /// Bytes of each binding, in the order of their numbers.
+        bound: Arc<[u64]>,
+        /// None where work is only planned.
+        run: Option<(wgpu::ComputePipeline, wgpu::BindGroup)>,
+        groups: Groups,
+    },
     /// Fills a buffer with zeros.
     Clear(wgpu::Buffer),
     /// Copies so many bytes (the last) from the start of the first buffer to an offset in the second.
@@ -94,8 +122,13 @@ impl Gpu {
         &self,
         kernel: Kernel,
         bindings: &[Bound<'_>],
-        groups: [u32; 2],
+        groups: impl Into<Groups>,
     ) -> Op {
+        let groups = groups.into();
+        let bound = bindings.iter().map(|bound| bound.size(self)).collect();
+        if self.planned.is_some() {
+            return Op::Dispatch { kernel, bound, run: None, groups };
+        }
         let entries: Vec<_> = bindings
             .iter()
             .enumerate()
@@ -115,7 +148,7 @@ impl Gpu {
             layout: self.layout(kernel.entry().0),
             entries: &entries,
         });
-        Op::Dispatch { pipeline, bind_group, groups }
+        Op::Dispatch { kernel, bound, run: Some((pipeline, bind_group)), groups }
     }
 
     /// Workgroups for `count` invocations or tiles, spilling into y past the limit of x.
@@ -128,8 +161,7 @@ impl Gpu {
     /// Splats `begin..end` of each dispatch, so that `bytes_per_splat` times their number can be
     /// bound at once.
     pub(in crate::gpu) fn windows(&self, splats: u32, bytes_per_splat: u64) -> Vec<Range<u32>> {
-        let fit =
-            (self.binding_limit / bytes_per_splat).min(u64::from(self.groups_max) * 64) as u32;
+        let fit = (self.binding_limit / bytes_per_splat).min(u64::from(u32::MAX / 2)) as u32;
         let step = (fit / SPLATS_PER_GROUP).max(1) * SPLATS_PER_GROUP;
         (0..splats).step_by(step as usize).map(|b| b..(b + step).min(splats)).collect()
     }
@@ -164,10 +196,13 @@ impl Gpu {
         let mut pass = encoder
             .begin_compute_pass(&wgpu::ComputePassDescriptor { label: None, timestamp_writes });
         for op in ops {
-            if let Op::Dispatch { pipeline, bind_group, groups } = op {
+            if let Op::Dispatch { run: Some((pipeline, bind_group)), groups, .. } = op {
                 pass.set_pipeline(pipeline);
                 pass.set_bind_group(0, bind_group, &[]);
-                pass.dispatch_workgroups(groups[0], groups[1], 1);
+                match groups {
+                    Groups::Direct([x, y]) => pass.dispatch_workgroups(*x, *y, 1),
+                    Groups::Indirect(buffer, at) => pass.dispatch_workgroups_indirect(buffer, *at),
+                }
             }
         }
     }

@@ -6,11 +6,12 @@ mod buffers;
 mod commands;
 mod injected;
 mod limits;
+mod planned;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
-pub(super) use commands::{Bound, Op};
+pub(super) use commands::{Bound, Groups, Op};
 pub use injected::Injected;
 pub use limits::needed_limits;
 
@@ -31,12 +32,16 @@ pub struct Gpu {
     lost: Arc<OnceLock<String>>,
     /// What tests make it do.
     injected: Injected,
+    /// Where work is planned and not done.
+    planned: Option<planned::Planned>,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
+    /// Bytes that went between host and device so far.
+    host_bytes: AtomicU64,
     /// Most bytes that a storage binding may have.
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
-    groups_max: u32,
+    pub(super) groups_max: u32,
     /// What the shaders are built for.
     build: Build,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
@@ -85,9 +90,39 @@ impl Gpu {
         self
     }
 
+    /// Builds kernels as for discrete GPUs, wherever they run, so that tests see that way too.
+    #[must_use]
+    pub fn as_discrete(mut self) -> Self {
+        self.build = Build::ALL[0];
+        self.list_limit = list_limit(self.is_software(), false);
+        self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
+        self
+    }
+
+    /// Plans work for a discrete GPU that binds `binding_limit` bytes at once, and does none of it.
+    #[must_use]
+    pub(super) fn planning(mut self, binding_limit: u64) -> Self {
+        self.build = Build::ALL[0];
+        self.list_limit = list_limit(false, false);
+        self.binding_limit = binding_limit;
+        self.groups_max = GROUPS_MAX;
+        self.planned = Some(planned::Planned::default());
+        self
+    }
+
     /// Workgroups that scans and sorts are cut into.
     pub(super) fn segments(&self) -> u32 {
         self.build.segments
+    }
+
+    /// Bits that one pass of the radix sort takes.
+    pub(super) fn digit_bits(&self) -> u32 {
+        self.build.digit_bits
+    }
+
+    /// Whether the loss goes along whole rows and columns.
+    pub(super) fn loss_by_lines(&self) -> bool {
+        self.build.loss_by_lines
     }
 
     /// Name of the adapter and its driver.
@@ -151,6 +186,15 @@ impl Gpu {
     /// have, dropped ones included. A fit's step makes none.
     pub fn made(&self) -> (u64, u64) {
         (self.made[0].load(Ordering::Relaxed), self.made[1].load(Ordering::Relaxed))
+    }
+
+    /// How many bytes went from the host to the device or back so far.
+    pub fn host_bytes(&self) -> u64 {
+        self.host_bytes.load(Ordering::Relaxed)
+    }
+
+    fn count_host(&self, bytes: u64) {
+        self.host_bytes.fetch_add(bytes, Ordering::Relaxed);
     }
 
     fn count(&self, bytes: u64) {

@@ -12,7 +12,6 @@ use crate::gpu::exposure::{Exposed, ExposureBuffers};
 use crate::gpu::layout::Chunk;
 use crate::gpu::loss::LossBuffers;
 use crate::gpu::project::{Projection, project_ops};
-use crate::gpu::project_backward::project_backward_ops;
 use crate::gpu::rasterize::{PictureBuffers, rasterize_ops};
 use crate::gpu::rasterize_backward::{BackwardBuffers, rasterize_backward_ops};
 
@@ -60,6 +59,12 @@ impl Frame {
             ops: Vec::new(),
             parts: [false; 2],
         })
+    }
+
+    /// Brings a photo to where the loss reads it.
+    pub fn copy_photo(&self, rgba: &wgpu::Buffer) -> Op {
+        let bytes = u64::from(self.width) * u64::from(self.height) * 4;
+        Op::Copy(rgba.clone(), self.loss.photo.clone(), 0, bytes)
     }
 
     /// Makes the commands of a whole step, unless they are there already.
@@ -113,8 +118,8 @@ impl Frame {
             slots: scene.slots.clone(),
             v_splats2d: scene.v_splats2d.clone(),
         };
-        let mut ops = project_ops(gpu, drawn, &scene.adam.splats);
-        ops.extend(bins.depth_ops(gpu, drawn, &chunks[0]));
+        let mut ops = project_ops(gpu, drawn, &scene.adam.splats, bins.keys());
+        ops.extend(bins.depth_ops(gpu, false));
         for chunk in &chunks {
             bin(&mut ops, chunk);
             ops.extend(rasterize_ops(gpu, drawn, chunk, pairs, &self.picture));
@@ -152,21 +157,16 @@ impl Frame {
             let lists = (bins, pairs);
             ops.extend(rasterize_backward_ops(gpu, drawn, chunk, lists, &backward, false));
         }
-        ops.extend(project_backward_ops(
-            gpu,
-            drawn,
-            &scene.adam.splats,
-            &scene.v_splats2d,
-            &scene.gradients,
-        ));
         let moved = AdamInput {
             drawn,
             step,
             status: &bins.status,
-            gradients: &scene.gradients,
+            v_colors: &scene.v_colors,
+            v_camera: &scene.v_camera,
             v_splats2d: &scene.v_splats2d,
         };
-        ops.extend(scene.adam.ops(gpu, &moved));
+        ops.extend(scene.adam.fit_ops(gpu, &moved, bins));
+        ops.extend(scene.adam.color_ops(gpu, &moved));
         ops
     }
 }

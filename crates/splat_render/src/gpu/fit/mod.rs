@@ -5,15 +5,16 @@
 //! and leaves the state as it was, as do the steps after it; the host looks at that flag now and
 //! then, makes room and repeats those steps, so that no step waits for a read-back.
 //!
-//! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P, their
-//! gradient and two moments make 4 P, statistics, 2D splats, their gradients and the depth order 120
-//! bytes. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
+//! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P and two moments
+//! make 3 P, and colours have gradients, 12 K bytes; statistics, 2D splats, their gradients and the depth
+//! order take 116. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
 //! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
-//! slopes of SSIM, 16 more where exposures are fitted and
+//! slopes of SSIM (96 and 48 on software adapters), 16 more where exposures are fitted and
 //! 8 more where photos have depths; a photo 4 per pixel, 4 more for weights and 8 more for depths. A
-//! test holds the sum per splat.
+//! test holds the sum per splat. While density control runs, splats and moments are there twice.
 
 mod frame;
+mod plan;
 mod scene;
 
 use std::sync::Arc;
@@ -24,15 +25,18 @@ use super::device::{Gpu, Op};
 use super::exposure::ExposureBuffers;
 use super::layout::{ChunkCount, DepthStep, ExposureUniform, GRADIENT, StatusHead, Step, View};
 use super::loss::{LossBuffers, rgba};
+use super::mcmc::shares;
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
 use crate::fit_device::{
-    CameraGradient, ExposureGradient, FitDevice, FitState, StepInput, dropout_threshold,
+    CameraGradient, ExposureGradient, FitDevice, FitState, McmcRun, StepInput, dropout_threshold,
+    mcmc,
 };
 use crate::sh;
 use crate::stages::ProjectOptions;
 use crate::target::{Target, Weight};
 use frame::{Frame, Parts};
+pub use plan::{PlannedFit, StepWork};
 use scene::{Scene, pair_buffers};
 
 /// Steps that may be under way before the host looks whether all pairs fitted.
@@ -51,6 +55,8 @@ pub struct GpuFit {
     exposure: wgpu::Buffer,
     depth: wgpu::Buffer,
     scene: Option<Scene>,
+    /// MCMC's table of shares; None until density control runs.
+    shares: Option<wgpu::Buffer>,
     /// Steps not known to have been done.
     pending: Vec<StepInput>,
     camera_gradients: Vec<CameraGradient>,
@@ -92,6 +98,7 @@ impl GpuFit {
             frames: Vec::new(),
             tiles: 1,
             scene: None,
+            shares: None,
             pending: Vec::new(),
             camera_gradients: Vec::new(),
             exposure_gradients: Vec::new(),
@@ -129,29 +136,29 @@ impl GpuFit {
             compensation: 1.0 / (1.0 - input.dropout),
             ..View::of_view(&input.camera, &ProjectOptions::default(), input.background)
         };
-        let step = Step::of_adam(&input.adam(), scene.len()).with_loss(
+        let step = Step::of_adam(&input.adam(), scene.adam.moving).with_loss(
             input.ssim_weight,
             photo.weight,
             photo.weights.is_some(),
         );
-        let queue = &self.gpu.queue;
-        queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view));
-        queue.write_buffer(&self.step, 0, bytemuck::bytes_of(&step));
+        let gpu = &self.gpu;
+        gpu.write(&self.view, 0, bytemuck::bytes_of(&view));
+        gpu.write(&self.step, 0, bytemuck::bytes_of(&step));
         if let Some(exposure) = &input.exposure {
             let uniform = ExposureUniform::from(exposure);
-            queue.write_buffer(&self.exposure, 0, bytemuck::bytes_of(&uniform));
+            gpu.write(&self.exposure, 0, bytemuck::bytes_of(&uniform));
         }
         let step_at = std::mem::offset_of!(StatusHead, step) as u64;
-        queue.write_buffer(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
+        gpu.write(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
         let bytes = u64::from(frame.width) * u64::from(frame.height) * 4;
-        let mut copies = vec![Op::Copy(photo.rgba.clone(), frame.loss.photo.clone(), 0, bytes)];
+        let mut copies = vec![frame.copy_photo(&photo.rgba)];
         if let Some(weights) = &photo.weights {
             copies.push(Op::Copy(weights.clone(), frame.loss.weights.clone(), 0, bytes));
         }
         if let (Some(depth), Some(buffers)) = (depth, &frame.depth) {
             let scale = (f64::from(input.depth_weight) * depth.scale) as f32;
             let uniform = DepthStep { scale };
-            queue.write_buffer(&self.depth, 0, bytemuck::bytes_of(&uniform));
+            gpu.write(&self.depth, 0, bytemuck::bytes_of(&uniform));
             copies.push(Op::Copy(depth.rows.clone(), buffers.photo.clone(), 0, 2 * bytes));
         }
         let mut sums = Vec::new();
@@ -175,7 +182,7 @@ impl GpuFit {
                     scene.pending_cameras.insert(log)
                 }
             };
-            let (from, to) = (scene.gradients.camera.clone(), log.clone());
+            let (from, to) = (scene.v_camera.clone(), log.clone());
             sums.push(Op::Copy(from, to, at as u64 * bytes, bytes));
         }
         self.last = Some((input.view, input.ssim_weight, depth.is_some()));
@@ -261,7 +268,7 @@ impl GpuFit {
             loop {
                 let clear = std::mem::offset_of!(StatusHead, overflow) as u64;
                 let status = &self.scene()?.bins.status;
-                self.gpu.queue.write_buffer(status, clear, bytemuck::bytes_of(&0u32));
+                self.gpu.write(status, clear, bytemuck::bytes_of(&0u32));
                 self.enqueue(input, at)?;
                 let (head, counts) = self.status()?;
                 if head.overflow == 0 {
@@ -372,13 +379,36 @@ impl FitDevice for GpuFit {
         for frame in &mut self.frames {
             frame.ops.clear();
         }
-        self.scene = Some(Scene::new(&self.gpu, &state, self.tiles, capacity, chunks)?);
+        self.scene = Some(Scene::upload(&self.gpu, &state, self.tiles, capacity, chunks)?);
         Ok(())
     }
 
     fn download(&mut self) -> Result<FitState> {
         self.settle()?;
         self.scene()?.download(&self.gpu)
+    }
+
+    fn mcmc(&mut self, run: &McmcRun) -> Result<usize> {
+        self.settle()?;
+        let gpu = Arc::clone(&self.gpu);
+        let shares = match &self.shares {
+            Some(shares) => shares.clone(),
+            None => self.shares.insert(shares(&gpu)?).clone(),
+        };
+        let Some(next) = self.scene()?.after_mcmc(&gpu, run, self.tiles, &shares)? else {
+            let mut splats = 0;
+            self.edit(&mut |state| {
+                state.edit_moving(|state| mcmc(state, run));
+                splats = state.moving();
+            })?;
+            return Ok(splats);
+        };
+        for frame in &mut self.frames {
+            frame.ops.clear();
+        }
+        let splats = next.len() as usize;
+        self.scene = Some(next);
+        Ok(splats)
     }
 
     fn step(&mut self, input: &StepInput) -> Result<()> {

@@ -1,13 +1,14 @@
 //! What a fit keeps on the device that depends on the number of splats or pairs.
 
 use crate::error::Result;
-use crate::fit_device::{DensityStats, FitState};
+use crate::fit_device::{DensityStats, FitState, McmcRun};
 use crate::gpu::adam::AdamBuffers;
 use crate::gpu::bin::{PairBins, SplatBins, pair_limit};
-use crate::gpu::device::Gpu;
-use crate::gpu::layout::{CAMERA, GRADIENT, STATS};
-use crate::gpu::project::SPLAT_2D;
-use crate::gpu::project_backward::{GradientBuffers, camera_sums};
+use crate::gpu::device::{Gpu, Op};
+use crate::gpu::layout::{CAMERA, GEOMETRY, GRADIENT, STATS};
+use crate::gpu::mcmc::{Drawn, RowKind};
+use crate::gpu::project::{SPLAT_2D, count};
+use crate::gpu::project_backward::{camera_buffer, camera_sums};
 
 /// Pairs per splat that buffers have room for at first; they grow by what a step needs.
 const PAIRS_PER_SPLAT: u32 = 4;
@@ -19,7 +20,10 @@ pub(super) struct Scene {
     pub sh_degree: u32,
     pub splats2d: wgpu::Buffer,
     pub v_splats2d: wgpu::Buffer,
-    pub gradients: GradientBuffers,
+    /// `[N * color_floats]`
+    pub v_colors: wgpu::Buffer,
+    /// Sums of the camera's gradients.
+    pub v_camera: wgpu::Buffer,
     /// The camera sums of each pending step; None until a step is to have them.
     pub pending_cameras: Option<wgpu::Buffer>,
     pub bins: SplatBins,
@@ -47,7 +51,8 @@ pub(super) fn pair_buffers(
 }
 
 impl Scene {
-    pub fn new(
+    /// Of this state, with room for `capacity` pairs at least.
+    pub fn upload(
         gpu: &Gpu,
         state: &FitState,
         tiles: u32,
@@ -58,17 +63,31 @@ impl Scene {
             gpu,
             [&state.splats, &state.first, &state.second].map(|a| a.params(a.sh_degree)),
             &stats_rows(&state.stats),
+            state.moving() as u32,
         )?;
+        Self::new(gpu, adam, state.splats.sh_degree, tiles, capacity, chunks)
+    }
+
+    /// Around these splats.
+    pub fn new(
+        gpu: &Gpu,
+        adam: AdamBuffers,
+        sh_degree: u32,
+        tiles: u32,
+        capacity: u32,
+        chunks: u32,
+    ) -> Result<Self> {
         let n = adam.splats.splats;
         let first_guess = n.saturating_mul(PAIRS_PER_SPLAT).max(4096);
         let capacity = capacity.max(first_guess).min(pair_limit(gpu, GRADIENT));
         let (pairs, slots) = pair_buffers(gpu, capacity, tiles)?;
         let row = |floats: usize| u64::from(n) * floats as u64 * 4;
         Ok(Self {
-            sh_degree: state.splats.sh_degree,
+            sh_degree,
             splats2d: gpu.bindable("splats2d", row(SPLAT_2D))?,
             v_splats2d: gpu.bindable("v_splats2d", row(GRADIENT))?,
-            gradients: GradientBuffers::new(gpu, &adam.splats)?,
+            v_colors: gpu.buffer("v_colors", row(adam.splats.color_floats as usize))?,
+            v_camera: camera_buffer(gpu, n)?,
             pending_cameras: None,
             bins: SplatBins::new(gpu, n, chunks)?,
             status_copy: gpu.readable(SplatBins::status_bytes(chunks)),
@@ -78,6 +97,46 @@ impl Scene {
             capacity,
             adam,
         })
+    }
+
+    /// What a run of MCMC's density control makes of it; None where an array cannot be bound at once,
+    /// or some splats are only drawn.
+    pub fn after_mcmc(
+        &self,
+        gpu: &Gpu,
+        run: &McmcRun,
+        tiles: u32,
+        shares: &wgpu::Buffer,
+    ) -> Result<Option<Self>> {
+        let AdamBuffers { splats, first, second, .. } = &self.adam;
+        if self.adam.moving < self.len() {
+            return Ok(None);
+        }
+        let most = count(run.target.max(self.len() as usize))?;
+        let floats = [GEOMETRY as u64, splats.color_floats];
+        if u64::from(most) * 4 * floats[0].max(floats[1]) > gpu.binding_limit {
+            return Ok(None);
+        }
+        let floats = floats.map(|floats| floats as u32);
+        let arrays = (&splats.geometry, &splats.colors);
+        let drawn = Drawn::new(gpu, arrays, (self.len(), floats[1]), run, shares)?;
+        // What is there stays until all that follows has its memory.
+        let adam = AdamBuffers::new(gpu, drawn.splats, splats.color_floats)?;
+        let next = Self::new(gpu, adam, self.sh_degree, tiles, self.capacity, self.chunks)?;
+        let mut ops = drawn.order_ops(gpu, &next.bins);
+        let mut put = |from, to, floats, kind| {
+            ops.push(drawn.row_op(gpu, &next.bins, (from, to), floats, kind));
+        };
+        let to = &next.adam;
+        put(&drawn.geometry, &to.splats.geometry, floats[0], RowKind::Geometry);
+        put(&splats.colors, &to.splats.colors, floats[1], RowKind::Colors);
+        for (from, to) in [(first, &to.first), (second, &to.second)] {
+            put(&from.geometry, &to.geometry, floats[0], RowKind::Moments);
+            put(&from.colors, &to.colors, floats[1], RowKind::Moments);
+        }
+        ops.push(Op::Clear(next.adam.stats.clone()));
+        gpu.submit(&[&ops])?;
+        Ok(Some(next))
     }
 
     /// Number of splats.
@@ -101,6 +160,7 @@ impl Scene {
                 grad_sum: stats.iter().map(|s| s[0]).collect(),
                 seen: stats.iter().map(|s| s[1]).collect(),
             },
+            frozen: (self.len() - self.adam.moving) as usize,
         })
     }
 }

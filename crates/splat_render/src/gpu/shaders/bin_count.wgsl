@@ -1,14 +1,14 @@
-// bin_count: depth keys of the splats, and the number of tiles that each touches. Follows
-// shared.wgsl and bin_tiles.wgsl.
+// bin_count: depth keys of splats that were projected before, and the number of tiles that each
+// touches. Follows shared.wgsl and bin_tiles.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;
 @group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
-@group(0) @binding(3) var<storage, read_write> keys: array<u32>;
-@group(0) @binding(4) var<storage, read_write> order: array<u32>;
-@group(0) @binding(5) var<storage, read_write> counts: array<u32>;
+@group(0) @binding(3) var<storage, read> status: Status;
+@group(0) @binding(4) var<storage, read> order: array<u32>;
+// Keys in depth_keys, counts in tile_counts.
+@group(0) @binding(5) var<storage, read_write> words: array<u32>;
 
-// Culled splats go last.
 @compute @workgroup_size(256)
 fn depth_keys(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -19,14 +19,10 @@ fn depth_keys(
     if i >= chunk.splats {
         return;
     }
-    let bits = bitcast<u32>(splats2d[i].depth);
-    // Order of the bits as that of the floats, negative ones included.
-    let ordered = bits ^ select(0x80000000u, 0xffffffffu, (bits >> 31u) == 1u);
-    keys[i] = select(ordered, 0xffffffffu, all(splats2d[i].radii == vec2(0.0)));
-    order[i] = i;
+    words[i] = select(depth_key(splats2d[i].depth), CULLED_KEY, all(splats2d[i].radii == vec2(0.0)));
 }
 
-// counts[rank] for the splat at that rank of the depth order.
+// words[rank] for the splat at that rank of the depth order.
 @compute @workgroup_size(256)
 fn tile_counts(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -34,7 +30,7 @@ fn tile_counts(
     @builtin(local_invocation_index) local: u32,
 ) {
     let rank = linear_index(workgroup, groups, local, 256u);
-    if rank >= chunk.splats {
+    if rank >= status.visible {
         return;
     }
     let f = footprint(splats2d[order[rank]]);
@@ -46,5 +42,5 @@ fn tile_counts(
             count += span.y - span.x;
         }
     }
-    counts[rank] = count;
+    words[rank] = count;
 }

@@ -7,7 +7,7 @@
 @group(0) @binding(3) var<storage, read> slot_from_pair: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_slot: array<u32>;
 @group(0) @binding(5) var<storage, read_write> splat_from_pair: array<u32>;
-// Tiles of the chunk + 1.
+// Tiles of the chunk + 2; the last is the number of pairs, some of which may be behind all tiles.
 @group(0) @binding(6) var<storage, read_write> tile_begin: array<u32>;
 
 @compute @workgroup_size(64)
@@ -22,6 +22,9 @@ fn ranges(
         var previous = 0u;
         if i > 0u {
             previous = keys[i - 1u] + 1u;
+        }
+        if i == pairs {
+            tile_begin[tiles + 1u] = pairs;
         }
         var last = tiles;
         if i < pairs {

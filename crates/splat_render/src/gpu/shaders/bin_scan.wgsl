@@ -2,10 +2,13 @@
 // contiguous segments, so that no workgroup waits for another. Follows shared.wgsl.
 
 @group(0) @binding(0) var<uniform> chunk: Chunk;
-// splats + 1 entries; the last becomes the total.
+// An entry for each splat in the depth order, and one more that becomes the total.
 @group(0) @binding(1) var<storage, read_write> offsets: array<u32>;
 @group(0) @binding(2) var<storage, read_write> segment_sums: array<u32>;
 @group(0) @binding(3) var<storage, read_write> status: Status;
+// Workgroups of the dispatches that follow: of 64 splats in the depth order each, and of 64 splats of
+// all each, none once a chunk's pairs did not fit.
+@group(0) @binding(4) var<storage, read_write> dispatches: array<u32, 6>;
 
 override SEGMENTS: u32 = 64u;
 const THREADS = 64u;
@@ -19,9 +22,16 @@ fn add(a: u32, b: u32) -> u32 {
 
 // The part of the segment that a thread owns.
 fn own_range(segment: u32, local: u32) -> vec2<u32> {
-    let per_thread = (chunk.splats + SEGMENTS * THREADS - 1u) / (SEGMENTS * THREADS);
-    let begin = min((segment * THREADS + local) * per_thread, chunk.splats);
-    return vec2(begin, min(begin + per_thread, chunk.splats));
+    let per_thread = (status.visible + SEGMENTS * THREADS - 1u) / (SEGMENTS * THREADS);
+    let begin = min((segment * THREADS + local) * per_thread, status.visible);
+    return vec2(begin, min(begin + per_thread, status.visible));
+}
+
+// Workgroups for so many splats; they spill into y past the limit of x.
+fn groups_of(splats: u32) -> vec3<u32> {
+    let groups = max((splats + 63u) / 64u, 1u);
+    let x = min(groups, chunk.groups_max);
+    return vec3(x, (groups + x - 1u) / x, 1u);
 }
 
 fn own_sum(range: vec2<u32>) -> u32 {
@@ -69,12 +79,20 @@ fn scan_apply(
         sum = add(sum, count);
     }
     if workgroup.x == SEGMENTS - 1u && local == THREADS - 1u {
-        offsets[chunk.splats] = sum;
+        offsets[status.visible] = sum;
         let fits = sum <= chunk.capacity;
         status.chunks[chunk.index].total = sum;
         status.chunks[chunk.index].pairs = select(0u, sum, fits);
         if !fits && status.overflow == 0u {
             status.overflow = status.step;
         }
+        let seen = groups_of(status.visible);
+        let all = select(vec3(0u), groups_of(chunk.splats), status.overflow == 0u);
+        dispatches[0] = seen.x;
+        dispatches[1] = seen.y;
+        dispatches[2] = seen.z;
+        dispatches[3] = all.x;
+        dispatches[4] = all.y;
+        dispatches[5] = all.z;
     }
 }

@@ -1,18 +1,7 @@
-// bin_sort: one pass of a stable radix sort by four bits. Every workgroup owns a contiguous
+// bin_sort: one pass of a stable radix sort by four bits, for software adapters. Every workgroup owns a contiguous
 // segment: histogram per segment, one scan over all, scatter in order. No workgroup waits for
-// another, and the result depends on nothing but the keys. Follows shared.wgsl.
+// another, and the result depends on nothing but the keys. Follows shared.wgsl and bin_sort_keys.wgsl.
 
-struct SortPass {
-    // Lowest of the four bits.
-    shift: u32,
-    // The chunk whose pairs are sorted, or ALL_SPLATS.
-    chunk: u32,
-}
-
-const ALL_SPLATS = 0xffffffffu;
-
-@group(0) @binding(0) var<uniform> pass_: SortPass;
-@group(0) @binding(1) var<storage, read> status: Status;
 @group(0) @binding(2) var<storage, read> keys_in: array<u32>;
 @group(0) @binding(3) var<storage, read> values_in: array<u32>;
 // [digit][segment]
@@ -31,16 +20,8 @@ var<workgroup> counts: array<u32, 2048>;
 var<workgroup> group_sums: array<u32, THREADS>;
 var<workgroup> bases: array<u32, DIGITS>;
 
-fn key_count() -> u32 {
-    if pass_.chunk == ALL_SPLATS {
-        return status.splats;
-    }
-    return status.chunks[pass_.chunk].pairs;
-}
-
 // Whole blocks, so that only the last segment has a ragged end.
-fn segment_range(segment: u32) -> vec2<u32> {
-    let count = key_count();
+fn segment_range(count: u32, segment: u32) -> vec2<u32> {
     let blocks = (count + BLOCK - 1u) / BLOCK;
     let size = (blocks + SEGMENTS - 1u) / SEGMENTS * BLOCK;
     return vec2(min(segment * size, count), min((segment + 1u) * size, count));
@@ -61,10 +42,13 @@ fn sort_histogram(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let range = segment_range(workgroup.x);
+    let range = segment_range(same_for_all(local), workgroup.x);
     clear_counts(local);
     for (var i = range.x + local; i < range.y; i += THREADS) {
-        counts[digit(keys_in[i]) * THREADS + local] += 1u;
+        let key = keys_in[i];
+        if is_sorted(key) {
+            counts[digit(key) * THREADS + local] += 1u;
+        }
     }
     workgroupBarrier();
     if local < DIGITS {
@@ -97,6 +81,9 @@ fn sort_scan(@builtin(local_invocation_index) local: u32) {
         histogram[i] = prefix;
         prefix += count;
     }
+    if local == THREADS - 1u {
+        note_count(prefix);
+    }
 }
 
 @compute @workgroup_size(THREADS)
@@ -104,7 +91,7 @@ fn sort_scatter(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let range = segment_range(workgroup.x);
+    let range = segment_range(same_for_all(local), workgroup.x);
     if local < DIGITS {
         bases[local] = histogram[local * SEGMENTS + workgroup.x];
     }
@@ -114,7 +101,10 @@ fn sort_scatter(
         let end = min(begin + KEYS_PER_THREAD, range.y);
         clear_counts(local);
         for (var i = begin; i < end; i++) {
-            counts[digit(keys_in[i]) * THREADS + local] += 1u;
+            let key = keys_in[i];
+            if is_sorted(key) {
+                counts[digit(key) * THREADS + local] += 1u;
+            }
         }
         workgroupBarrier();
         // Exclusive prefix over the threads, digit by digit: eight threads per digit, sixteen
@@ -138,12 +128,14 @@ fn sort_scatter(
         workgroupBarrier();
         for (var i = begin; i < end; i++) {
             let key = keys_in[i];
-            let d = digit(key);
-            let own = d * THREADS + local;
-            let at = bases[d] + group_sums[own / 16u] + counts[own];
-            counts[own] += 1u;
-            keys_out[at] = key;
-            values_out[at] = values_in[i];
+            if is_sorted(key) {
+                let d = digit(key);
+                let own = d * THREADS + local;
+                let at = bases[d] + group_sums[own / 16u] + counts[own];
+                counts[own] += 1u;
+                keys_out[at] = key;
+                values_out[at] = value_of(i, values_in[i]);
+            }
         }
         workgroupBarrier();
         if local < DIGITS {

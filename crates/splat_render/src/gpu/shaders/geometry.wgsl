@@ -1,9 +1,8 @@
-// What both directions of the project stage need of one splat, and its spherical harmonics.
+// What both directions of the project stage need of one splat, and its spherical harmonics. `geometry` is
+// declared before: GEOMETRY floats per splat, mean 3, scales 3, quaternion 4 (wxyz), opacity 1.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> window: Window;
-// GEOMETRY floats per splat: mean 3, scales 3, quaternion 4 (wxyz), opacity 1.
-@group(0) @binding(2) var<storage, read> geometry: array<f32>;
 // 3 floats per coefficient, `sh_stride` coefficients per splat (1 for direct colours).
 @group(0) @binding(3) var<storage, read> colors: array<f32>;
 

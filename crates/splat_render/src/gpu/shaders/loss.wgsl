@@ -1,20 +1,9 @@
 // loss: L1 and D-SSIM of the picture against a photo, with the picture's gradient. Two passes with
 // the window's filter, which is separable: first to the slopes of SSIM by the filtered maps, then
 // back through the same filter. A thread filters four neighbours at once, so that each value is read
-// once for the four. Follows shared.wgsl.
-
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> step: Step;
-@group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
-// RGBA, 8 bits each, straight alpha.
-@group(0) @binding(3) var<storage, read> photo: array<u32>;
-@group(0) @binding(4) var<storage, read> weights: array<f32>;
-// Derivatives of the weighted SSIM sum by the filtered x, xx and xy: nine planes, by channel first.
-@group(0) @binding(5) var<storage, read_write> slopes: array<f32>;
-@group(0) @binding(6) var<storage, read_write> v_picture: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read_write> totals: array<f32>;
-// Per workgroup: weighted sums of SSIM and of |x - y|.
-@group(0) @binding(8) var<storage, read_write> sums: array<vec2<f32>>;
+// once for the four. The first pass hands on
+// derivatives of the weighted SSIM sum by the filtered x, xx and xy: nine planes, by channel first.
+// Follows loss_pixels.wgsl.
 
 const THREADS = 64u;
 // Taps on each side of the window's centre.
@@ -28,18 +17,6 @@ const STRIP = 416u; // ROWS_FILTERED * TILE
 // Maps filtered along rows.
 var<workgroup> filtered: array<f32, 2080>; // 5 STRIP
 var<workgroup> partial_sums: array<f32, THREADS>;
-
-fn photo_color(pixel: u32) -> vec3<f32> {
-    let rgba = unpack4x8unorm(photo[pixel]);
-    return rgba.xyz * rgba.w + view.background * (1.0 - rgba.w);
-}
-
-fn weight(pixel: u32) -> f32 {
-    if step.has_weights == 1u {
-        return weights[pixel];
-    }
-    return 1.0;
-}
 
 fn exists(x: i32, y: i32) -> bool {
     return x >= 0 && y >= 0 && x < i32(view.width) && y < i32(view.height);

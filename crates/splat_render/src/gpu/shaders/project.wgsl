@@ -1,6 +1,8 @@
 // project: splats and camera to 2D splats. Follows shared.wgsl and geometry.wgsl.
 
+// Of culled splats, the radii alone.
 @group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;
+@group(0) @binding(5) var<storage, read_write> keys: array<u32>;
 
 @compute @workgroup_size(64)
 fn project(
@@ -61,5 +63,11 @@ fn project(
             out.radii = radii;
         }
     }
-    splats2d[i] = out;
+    if all(out.radii == vec2(0.0)) {
+        splats2d[i].radii = vec2(0.0);
+        keys[i] = CULLED_KEY;
+    } else {
+        splats2d[i] = out;
+        keys[i] = depth_key(out.depth);
+    }
 }

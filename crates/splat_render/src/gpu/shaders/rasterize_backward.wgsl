@@ -164,6 +164,16 @@ fn keep(quad: Quad, x: u32, y: u32) {
     }
 }
 
+// Empties the slots of these pairs.
+fn write_zeros(begin: u32, end: u32, thread: u32) {
+    for (var pair = begin + thread; pair < end; pair += THREADS) {
+        let slot = slot_from_pair[pair] * SUMS;
+        for (var entry = 0u; entry < SUMS; entry++) {
+            slots[slot + entry] = 0.0;
+        }
+    }
+}
+
 fn total(x: vec4<f32>) -> f32 {
     return (x.x + x.y) + (x.z + x.w);
 }
@@ -190,6 +200,7 @@ fn rasterize_backward(
     let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     // A line with {row} stands once for each of the thread's rows, as in rasterize.
     var quad{row} = load_quad(x, y + {row}u);
+    var written = begin;
     for (var batch = begin; batch < end; batch += BATCH) {
         let count = min(BATCH, end - batch);
         var ahead = read_ahead(batch, end, thread);
@@ -217,9 +228,15 @@ fn rasterize_backward(
         }
         var live = vec4(false);
         live = live | quad{row}.live;
+        written = batch + count;
         if !write_sums(batch, count, any(live), thread) {
             break;
         }
+    }
+    // What lies behind the tile's early stop, and, for the last tile, behind all tiles.
+    write_zeros(written, end, thread);
+    if tile + 1u == chunk.tile_end && chunk.list_begin == 0u {
+        write_zeros(tile_begin[relative + 1u], tile_begin[relative + 2u], thread);
     }
     if length > chunk.list_end {
         keep(quad{row}, x, y + {row}u);

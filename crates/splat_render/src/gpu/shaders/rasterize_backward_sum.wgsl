@@ -14,11 +14,10 @@
 @compute @workgroup_size(64)
 fn rasterize_backward_sum(
     @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let rank = linear_index(workgroup, groups, local, 64u);
-    if rank >= chunk.splats || status.overflow != 0u {
+    let rank = indirect_index(workgroup, chunk.groups_max, local, 64u);
+    if rank >= status.visible || status.overflow != 0u {
         return;
     }
     let i = order[rank];

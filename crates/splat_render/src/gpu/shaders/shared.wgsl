@@ -34,6 +34,8 @@ struct View {
 struct Window {
     first: u32,
     count: u32,
+    // Workgroups in a row of the dispatch, at most.
+    groups_max: u32,
 }
 
 // The tiles of one dispatch (ids in row-major order) and where their pairs are counted.
@@ -51,6 +53,8 @@ struct Chunk {
     // The part of every tile's list that a dispatch of the rasterize kernels walks.
     list_begin: u32,
     list_end: u32,
+    // Workgroups in a row of a dispatch, at most.
+    groups_max: u32,
 }
 
 // Counts that only the device knows.
@@ -67,7 +71,8 @@ struct Status {
     step: u32,
     // The first step at which a chunk's pairs did not fit; stops every later update. 0 for none.
     overflow: u32,
-    unused: u32,
+    // Splats in the depth order: those that are not culled, or all.
+    visible: u32,
     chunks: array<ChunkCount>,
 }
 
@@ -93,6 +98,8 @@ struct Step {
     has_weights: u32,
     // 1 where no parameter and no moment moves.
     frozen: u32,
+    // So many splats, the first ones, are moved; the others are only drawn.
+    moving: u32,
 }
 
 struct Splat2d {
@@ -105,6 +112,15 @@ struct Splat2d {
     opacity: f32,
     // (0, 0) where culled.
     radii: vec2<f32>,
+}
+
+// What culled splats have as key: they go last, or are left out.
+const CULLED_KEY = 0xffffffffu;
+
+// Order of the keys as that of the depths, negative ones included.
+fn depth_key(depth: f32) -> u32 {
+    let bits = bitcast<u32>(depth);
+    return bits ^ select(0x80000000u, 0xffffffffu, (bits >> 31u) == 1u);
 }
 
 // WGSL lets a compiler assume that no float is NaN or infinite, so only the bits tell.
@@ -147,6 +163,12 @@ fn exp_accurate4(x: vec4<f32>) -> vec4<f32> {
 // The index of an invocation in a dispatch whose workgroups may spill into y.
 fn linear_index(workgroup: vec3<u32>, groups: vec3<u32>, local: u32, size: u32) -> u32 {
     return (workgroup.y * groups.x + workgroup.x) * size + local;
+}
+
+// The same where the number of workgroups is on the device only (DX12 does not tell it there): rows of a
+// dispatch have `groups_max` wherever there is more than one.
+fn indirect_index(workgroup: vec3<u32>, groups_max: u32, local: u32, size: u32) -> u32 {
+    return (workgroup.y * groups_max + workgroup.x) * size + local;
 }
 
 // PCG's output function on one word.

@@ -1,0 +1,93 @@
+//! What a step costs on scenes that no device at hand could hold: the commands of a fit, made and counted
+//! without being run.
+
+use bytemuck::Zeroable;
+
+use super::frame::{Frame, Parts};
+use super::scene::Scene;
+use crate::error::Result;
+use crate::gpu::adam::AdamBuffers;
+use crate::gpu::device::{Gpu, Op};
+use crate::gpu::layout::{Step, View};
+use crate::gpu::project::count;
+use crate::gpu::traffic::{Counts, bytes};
+use crate::sh;
+
+/// Bytes that the device of a plan binds at once: all that a signed 32-bit number counts, as the common
+/// drivers of discrete GPUs.
+const BINDING_LIMIT: u64 = (1 << 31) - 4;
+
+/// A fit on a discrete GPU of which nothing is run.
+#[derive(Debug)]
+pub struct PlannedFit {
+    gpu: Gpu,
+    scene: Scene,
+    ops: Vec<Op>,
+}
+
+/// What a step is made of.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepWork {
+    /// Kernels that are started.
+    pub dispatches: usize,
+    /// Bytes of buffers that are read and written.
+    pub bytes: f64,
+    /// The same by kernel, in the order of their first dispatches; buffers that are cleared and copied by
+    /// those names.
+    pub kernels: Vec<(&'static str, usize, f64)>,
+}
+
+impl PlannedFit {
+    /// The commands of a step with one photo, without exposure and depth, at room for `pairs` pairs.
+    ///
+    /// # Errors
+    /// [`Error::Device`](crate::Error::Device) if a buffer could not be bound at once.
+    pub fn new(
+        gpu: Gpu,
+        splats: usize,
+        sh_degree: u32,
+        (width, height): (u32, u32),
+        pairs: u32,
+    ) -> Result<Self> {
+        let gpu = gpu.planning(BINDING_LIMIT);
+        let adam = AdamBuffers::new(&gpu, count(splats)?, 3 * sh::coeffs(sh_degree) as u64)?;
+        let mut frame = Frame::new(&gpu, width, height)?;
+        let tiles = crate::gpu::bin::tile_count(width, height);
+        let scene = Scene::new(&gpu, adam, sh_degree, tiles, pairs, 1)?;
+        let (view, step) = (gpu.uniform(&View::zeroed()), gpu.uniform(&Step::zeroed()));
+        frame.prepare(&gpu, &view, &step, Parts { exposure: None, depth: None }, &scene)?;
+        let photo = gpu.bindable("photo", u64::from(width) * u64::from(height) * 4)?;
+        let mut ops = vec![frame.copy_photo(&photo)];
+        ops.append(&mut frame.ops);
+        Ok(Self { gpu, scene, ops })
+    }
+
+    /// A step in which so many splats are not culled and make so many (splat, tile) pairs.
+    pub fn step(&self, visible: usize, pairs: u32) -> StepWork {
+        let counts = Counts {
+            splats: f64::from(self.scene.len()),
+            visible: visible as f64,
+            pairs: f64::from(pairs),
+            capacity: f64::from(self.scene.capacity),
+        };
+        let mut work = StepWork { dispatches: 0, bytes: 0.0, kernels: Vec::new() };
+        let moved = bytes(&self.gpu, &self.ops, u64::from(self.scene.capacity) * 4, &counts);
+        for (op, bytes) in self.ops.iter().zip(moved) {
+            let (name, runs) = match op {
+                Op::Dispatch { kernel, .. } => (kernel.entry().1, 1),
+                Op::Clear(_) => ("clear", 0),
+                Op::Copy(..) => ("copy", 0),
+            };
+            work.dispatches += runs;
+            work.bytes += bytes;
+            match work.kernels.iter_mut().find(|(known, ..)| *known == name) {
+                Some((_, count, sum)) => {
+                    *count += 1;
+                    *sum += bytes;
+                }
+                None => work.kernels.push((name, 1, bytes)),
+            }
+        }
+        work
+    }
+}

@@ -1,0 +1,172 @@
+// MCMC's density control, first part: what is fog or dead, what the others weigh, and the sums of that.
+// As fit_device/mcmc.rs and fit_device/fog.rs, bit for bit. Follows shared.wgsl and mcmc_run.wgsl.
+
+@group(0) @binding(1) var<storage, read_write> geometry: array<f32>;
+// SH coefficients, 3 floats each.
+@group(0) @binding(2) var<storage, read> colors: array<f32>;
+@group(0) @binding(3) var<storage, read> cameras: array<FogCamera>;
+// What a living splat weighs, by the bin of its logit.
+@group(0) @binding(4) var<storage, read> table: array<u32>;
+// Weights, 0 of the dead, then their inclusive sums. In `sample`, centres of the sampled splats.
+@group(0) @binding(5) var<storage, read_write> words: array<u32>;
+// Of each segment: sum of weights, number of dead.
+@group(0) @binding(6) var<storage, read_write> segment_sums: array<vec2<u32>, SEGMENTS>;
+@group(0) @binding(7) var<storage, read_write> dead: array<u32>;
+// Sum of weights, number of dead, of each round.
+@group(0) @binding(8) var<storage, read_write> totals: array<vec2<u32>, 2>;
+
+const SEGMENTS = 256u;
+const THREADS = 64u;
+
+struct FogCamera {
+    rows: array<vec4<f32>, 3>,
+    focal: vec2<f32>,
+    principal: vec2<f32>,
+    size: vec2<f32>,
+    nearest: f32,
+    unused: f32,
+}
+
+var<workgroup> sums: array<vec2<u32>, THREADS>;
+
+// Centres of every `run.every` splats.
+@compute @workgroup_size(64)
+fn mcmc_sample(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let k = linear_index(workgroup, groups, local, 64u);
+    let i = k * run.every;
+    if i >= run.splats {
+        return;
+    }
+    words[3u * k] = bitcast<u32>(geometry[i * GEOMETRY]);
+    words[3u * k + 1u] = bitcast<u32>(geometry[i * GEOMETRY + 1u]);
+    words[3u * k + 2u] = bitcast<u32>(geometry[i * GEOMETRY + 2u]);
+}
+
+fn camera_row(camera: u32, row: u32, x: f32, y: f32, z: f32) -> f32 {
+    let r = cameras[camera].rows[row];
+    return ((r.x * x + r.y * y) + r.z * z) + r.w;
+}
+
+fn shows(u: f32, depth: f32, focal: f32, principal: f32, size: f32, radius: f32) -> bool {
+    let middle = focal * u + principal * depth;
+    let wide = focal * radius;
+    return middle + wide >= 0.0 && middle - wide <= size * depth;
+}
+
+fn is_fog(at: u32) -> bool {
+    let x = geometry[at];
+    let y = geometry[at + 1u];
+    let z = geometry[at + 2u];
+    let largest = max(max(geometry[at + 3u], geometry[at + 4u]), geometry[at + 5u]);
+    let radius = 3.0 * exp_accurate(largest);
+    var fog = false;
+    for (var k = 0u; k < run.cameras && !fog; k++) {
+        let depth = camera_row(k, 2u, x, y, z);
+        if depth > 0.0 && depth < cameras[k].nearest {
+            let u = camera_row(k, 0u, x, y, z);
+            let v = camera_row(k, 1u, x, y, z);
+            let focal = cameras[k].focal;
+            let principal = cameras[k].principal;
+            let size = cameras[k].size;
+            fog = shows(u, depth, focal.x, principal.x, size.x, radius)
+                && shows(v, depth, focal.y, principal.y, size.y, radius);
+        }
+    }
+    return fog;
+}
+
+@compute @workgroup_size(64)
+fn mcmc_weigh(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let i = linear_index(workgroup, groups, local, 64u);
+    if i >= run.splats {
+        return;
+    }
+    let at = i * GEOMETRY;
+    var finite = true;
+    for (var k = 0u; k < GEOMETRY; k++) {
+        finite = finite && is_finite(geometry[at + k]);
+    }
+    // What is not finite dies anyway.
+    if run.round == 0u && finite {
+        if is_fog(at) {
+            geometry[at + 10u] = LOGIT_FOG;
+        }
+        for (var k = 0u; k < run.color_floats; k++) {
+            finite = finite && is_finite(colors[i * run.color_floats + k]);
+        }
+    }
+    let logit = geometry[at + 10u];
+    var weight = 0u;
+    if finite && logit > LOGIT_DEAD {
+        weight = table[logit_bin(logit)];
+    }
+    words[i] = weight;
+}
+
+// The part of the segment that a thread owns.
+fn own_range(segment: u32, local: u32) -> vec2<u32> {
+    let per_thread = (run.splats + SEGMENTS * THREADS - 1u) / (SEGMENTS * THREADS);
+    let begin = min((segment * THREADS + local) * per_thread, run.splats);
+    return vec2(begin, min(begin + per_thread, run.splats));
+}
+
+fn own_sum(range: vec2<u32>) -> vec2<u32> {
+    var sum = vec2(0u);
+    for (var i = range.x; i < range.y; i++) {
+        sum += vec2(words[i], u32(words[i] == 0u));
+    }
+    return sum;
+}
+
+@compute @workgroup_size(THREADS)
+fn mcmc_sums(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    sums[local] = own_sum(own_range(workgroup.x, local));
+    workgroupBarrier();
+    if local == 0u {
+        var sum = vec2(0u);
+        for (var k = 0u; k < THREADS; k++) {
+            sum += sums[k];
+        }
+        segment_sums[workgroup.x] = sum;
+    }
+}
+
+@compute @workgroup_size(THREADS)
+fn mcmc_prefix(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let range = own_range(workgroup.x, local);
+    sums[local] = own_sum(range);
+    workgroupBarrier();
+    var sum = vec2(0u);
+    for (var k = 0u; k < workgroup.x; k++) {
+        sum += segment_sums[k];
+    }
+    for (var k = 0u; k < local; k++) {
+        sum += sums[k];
+    }
+    for (var i = range.x; i < range.y; i++) {
+        let weight = words[i];
+        if weight == 0u {
+            dead[sum.y] = i;
+            sum.y += 1u;
+        }
+        sum.x += weight;
+        words[i] = sum.x;
+    }
+    if workgroup.x == SEGMENTS - 1u && local == THREADS - 1u {
+        totals[run.round] = sum;
+    }
+}

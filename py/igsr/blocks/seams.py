@@ -1,0 +1,98 @@
+"""Whether seams between blocks show: photos across them, by the joined scene and by the blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from igsr._internal.choices import Backend
+from igsr.blocks.manifest import Manifest
+from igsr.capture import View
+from igsr.capture.described import DescribedCapture
+from igsr.capture.exposure import Exposure
+from igsr.evaluation.scores import score_views
+from igsr.fitting.fitter import without_exposures
+from igsr.splats import Splats
+
+#: Photos that are held in memory at a time while they are scored.
+AT_A_TIME = 8
+#: Seams are visible where photos across them lose more than this by joining, dB in the mean.
+VISIBLE = 0.2
+
+
+def loaded_in_parts(
+    manifest: Manifest,
+    photos: Sequence[int],
+    max_size: int | None,
+    exposures: Mapping[str, Exposure],
+    *,
+    as_taken: bool = False,
+) -> Iterator[list[View]]:
+    """Decode photos of a capture, a few at a time.
+
+    Args:
+        manifest: the capture's photos.
+        photos: their numbers in it.
+        max_size: longest side in pixels of photos as loaded, or None.
+        exposures: of photos, by name.
+        as_taken: photos keep the exposures that are known, and views tell them; else they have the
+            scene's colors.
+
+    Raises:
+        IgsrError: a photo cannot be decoded.
+    """
+    for first in range(0, len(photos), AT_A_TIME):
+        shots = [manifest.shots[index] for index in photos[first : first + AT_A_TIME]]
+        described = DescribedCapture(manifest.path, shots, lambda: None)
+        views = described.loaded(max_size).views
+        known = [exposures.get(view.name) for view in views]
+        if as_taken:
+            yield [replace(v, exposure=one) for v, one in zip(views, known, strict=True)]
+        else:
+            yield without_exposures(views, known)
+
+
+def seam_scores(
+    own: Sequence[Mapping[str, float]], by_joined: Mapping[str, float]
+) -> dict[str, Any] | None:
+    """What photos across seams lose by joining; None where there are none.
+
+    Args:
+        own: of each block, the PSNR in dB of its photos across seams, by its splats before those
+            beyond its cell were left out, with the coarse splats around them.
+        by_joined: their PSNR by the joined scene.
+    """
+    best: dict[str, float] = {}
+    for scores in own:
+        for name, psnr in scores.items():
+            best[name] = max(psnr, best.get(name, -np.inf))
+    names = [name for name in by_joined if name in best]
+    if not names:
+        return None
+    joined = float(np.mean([by_joined[name] for name in names]))
+    alone = float(np.mean([best[name] for name in names]))
+    loss = alone - joined
+    return {
+        "photos": len(names),
+        "psnr_joined": round(joined, 3),
+        "psnr_best_block": round(alone, 3),
+        "loss_db": round(loss, 3),
+        "visible": loss > VISIBLE,
+    }
+
+
+def psnr_by_name(
+    splats: Splats,
+    parts: Iterator[list[View]],
+    background: Sequence[float],
+    backend: Backend,
+) -> dict[str, float]:
+    """PSNR in dB of photos, by name."""
+    found = {}
+    for views in parts:
+        for one in score_views(splats, views, background, backend, ("psnr",)):
+            found[one.name] = float(one.scores["psnr"] or 0.0)
+    return found

@@ -1,0 +1,255 @@
+"""What workers do: the coarse fit, and the fit of a block. Each loads the photos that it needs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr import _core
+from igsr._internal.choices import Backend, FitBackend
+from igsr._internal.json_file import write_json
+from igsr._internal.part_usage import Meter
+from igsr._internal.worker_processes import in_a_process
+from igsr.blocks.manifest import shot_mark
+from igsr.blocks.tasks import (
+    CHECKPOINT,
+    PROGRESS,
+    SPLATS,
+    BlockPart,
+    FitTask,
+    load_splats,
+    save_splats,
+)
+from igsr.capture import Capture, View
+from igsr.capture.described import DescribedCapture
+from igsr.errors import IgsrError
+from igsr.evaluation.scores import default_background, score_views
+from igsr.fitting.checkpoint import load_checkpoint
+from igsr.fitting.fit_capture import fit_with_cameras
+from igsr.fitting.fitter import PARAMETERS, without_exposures
+from igsr.fitting.photo_support import support_of
+from igsr.fitting.presets import settings_for
+from igsr.fitting.run import Progress
+from igsr.rendering.renders import project
+from igsr.splats import Splats
+
+Bool = npt.NDArray[np.bool_]
+
+#: Seconds between two reports of progress.
+TELL_EVERY = 1.0
+
+
+def in_own_process(capture: str, task: FitTask) -> dict[str, Any]:
+    """Do a task in a process of its own, which gives its memory back when it ends."""
+    return in_a_process(do_task, capture, task)
+
+
+def do_task(capture: str, task: FitTask) -> dict[str, Any]:
+    """Do a task, and leave its splats in its folder.
+
+    Args:
+        capture: the capture, for messages.
+        task: what to do.
+
+    Returns:
+        A row for the report: what the fit took, where, and what it left.
+
+    Raises:
+        IgsrError: the photos cannot be loaded or fitted, or a file not be written; the message
+            names the task.
+    """
+    meter = Meter()
+    try:
+        views = _loaded(task)
+        row = _coarse(task, views) if task.block is None else _block(task, task.block, views)
+    except IgsrError as error:
+        raise IgsrError(f"{task.name} on {socket.gethostname()}: {error}") from error
+    used = meter.lap()
+    return {
+        "name": task.name,
+        **row,
+        "photos": len(views),
+        **used.plain(),
+        "host": socket.gethostname(),
+        "process": os.getpid(),
+        **_core.backend_info(task.backend),
+    }
+
+
+def _loaded(task: FitTask) -> list[View]:
+    """The task's photos, without their exposures; those, and no others, are decoded here."""
+    for shot, mark in zip(task.shots, task.marks, strict=True):
+        if shot_mark(shot) != mark:
+            raise IgsrError(f"{shot.path} was changed since the run began; start it again.")
+    described = DescribedCapture(task.capture, task.shots, lambda: None)
+    views = described.loaded(task.max_size).views
+    return without_exposures(views, [task.exposures.get(view.name) for view in views])
+
+
+def _coarse(task: FitTask, views: list[View]) -> dict[str, Any]:
+    capture = Capture(task.capture, views, task.points)
+    splats, fitted, last = _fit(task, capture, {})
+    exposures = {
+        view.name: view.exposure.plain() for view in fitted.views if view.exposure is not None
+    }
+    save_splats(task.folder / SPLATS, splats)
+    return {"splats": len(splats), "exposures": exposures, **last}
+
+
+def _block(task: FitTask, block: BlockPart, views: list[View]) -> dict[str, Any]:
+    scene = load_splats(block.scene)
+    places = block.ground.places(scene.means.astype(np.float64) + scene.origin)
+    moving = block.moving(places)
+    # What none of the photos shows takes memory and does nothing.
+    background = ~moving & shown_by(scene, views, task.backend)
+    still = subset(scene, background) if background.any() else None
+    settings = {
+        "start": subset(scene, moving),
+        "frozen": still,
+        "whole_schedule": not block.borders_of,
+    }
+    splats, _, last = _fit(task, Capture(task.capture, views), settings)
+    whole = splats if still is None else joined([splats, still])
+    color = task.settings.get("background") or default_background(Capture(task.capture, views))
+    across = [view for view in views if view.name in block.across]
+    scored = (
+        score_views(whole, across, color, cast(Backend, task.backend), ("psnr",)) if across else ()
+    )
+    psnr = {one.name: one.scores["psnr"] for one in scored}
+    places = block.ground.places(splats.means.astype(np.float64) + splats.origin)
+    kept = subset(splats, block.cell.holds(places))
+    save_splats(task.folder / SPLATS, kept)
+    return {
+        "splats": len(kept),
+        "fitted_splats": len(splats),
+        "frozen_splats": 0 if still is None else len(still),
+        "start_splats": int(moving.sum()),
+        "across": psnr,
+        **last,
+    }
+
+
+def _fit(
+    task: FitTask, capture: Capture, more: dict[str, Any]
+) -> tuple[Splats, Capture, dict[str, Any]]:
+    """Fit, from the task's checkpoint where that can be used."""
+    checkpoint = task.folder / CHECKPOINT
+    seen: list[Progress] = []
+    attempt = 1 + attempts(task.folder)
+    tell = _teller(task.folder / PROGRESS, attempt)
+
+    def progress(now: Progress) -> None:
+        seen[:] = [now]
+        tell(now)
+
+    def run(resume: bool) -> tuple[Splats, Capture]:
+        keywords = {**task.settings, **more, "max_splats": most}
+        return fit_with_cameras(
+            capture,
+            progress=progress,
+            backend=cast(FitBackend, task.backend),
+            checkpoint=checkpoint,
+            resume=resume,
+            **keywords,
+        )
+
+    most = _most_splats(task, capture, more.get("start"))
+    resumed_from = _step_of(checkpoint)
+    try:
+        splats, fitted = run(resume=resumed_from is not None)
+    except IgsrError:
+        if resumed_from is None or seen:
+            raise
+        resumed_from = None  # the checkpoint was of another fit, or another instruction set
+        splats, fitted = run(resume=False)
+    last = seen[-1]
+    about = {
+        "max_splats": most,
+        "splats_part": task.splats_part,
+        "steps": last.steps,
+        "loss": last.loss if np.isfinite(last.loss) else None,
+        "start": last.started[0],
+        "removed": dict(last.removed or {}),
+        "masked": {name: round(part, 5) for name, part in last.transients.items()},
+        "resumed_from": resumed_from,
+        "attempts": attempt,
+    }
+    return splats, fitted, about
+
+
+def _most_splats(task: FitTask, capture: Capture, start: Splats | None) -> int:
+    """The task's part of the most splats there may be, but no fewer than there are at first."""
+    given = {k: v for k, v in task.settings.items() if k not in ("preset", "quality", "start")}
+    preset, quality = task.settings.get("preset", "default"), task.settings.get("quality", "normal")
+    usual = settings_for(preset, support_of(capture.train_views), quality, **given).max_splats
+    return max(1 if start is None else len(start), round(task.splats_part * usual))
+
+
+def _step_of(checkpoint: Path) -> int | None:
+    """The step that a checkpoint was saved at; None where there is none that can be read."""
+    if not checkpoint.is_file():
+        return None
+    try:
+        state, _ = load_checkpoint(checkpoint)
+        return int(state["step"][0])
+    except (IgsrError, KeyError, IndexError, ValueError):
+        return None
+
+
+def attempts(folder: Path) -> int:
+    """How often a task has been begun and not ended, by what that left in its folder."""
+    try:
+        return int(json.loads((folder / PROGRESS).read_text(encoding="utf-8"))["attempt"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
+
+
+def _teller(path: Path, attempt: int) -> Callable[[Progress | None], None]:
+    """Writes where a fit stands, for the view of all blocks; the run counts and not the file."""
+    told = [time.monotonic()]
+    about = {"attempt": attempt, "host": socket.gethostname(), "process": os.getpid()}
+
+    def tell(now: Progress | None) -> None:
+        if now is not None and time.monotonic() - told[0] < TELL_EVERY:
+            return
+        told[0] = time.monotonic()
+        news: dict[str, Any] = {"step": 0, "steps": 0, "splats": 0, "work": 0.0}
+        if now is not None:
+            news = {"step": now.step, "steps": now.steps, "splats": now.splats, "work": now.work}
+        with contextlib.suppress(OSError, IgsrError):
+            write_json(path, {**news, **about})
+
+    tell(None)
+    return tell
+
+
+def shown_by(splats: Splats, views: list[View], backend: str) -> Bool:
+    """Which splats some photo has in its picture, hidden or not."""
+    shown = np.zeros(len(splats), np.bool_)
+    plain = replace(splats, sh=np.ascontiguousarray(splats.sh[:, :1]))
+    for view in views:
+        shown |= (project(plain, view.camera, backend)["radii"] > 0).any(axis=1)
+    return shown
+
+
+def subset(splats: Splats, keep: Bool) -> Splats:
+    """The splats that are kept, in their order."""
+    return replace(splats, **{name: getattr(splats, name)[keep] for name in PARAMETERS})
+
+
+def joined(parts: list[Splats]) -> Splats:
+    """Splats of one origin and SH degree as one scene, in this order."""
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(p, name) for p in parts]) for name in PARAMETERS
+    }
+    return replace(parts[0], **arrays)

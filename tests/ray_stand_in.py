@@ -1,0 +1,77 @@
+"""A stand-in for Ray: what igsr uses of it, in this process (the real: test_blocks_ray.py)."""
+
+from __future__ import annotations
+
+import sys
+import types
+
+
+class StandInRay(types.ModuleType):
+    """Calls run when they are waited for, the last one first."""
+
+    __version__ = "2.50.0"
+
+    def __init__(self):
+        super().__init__("ray")
+        self.environments = []
+        self.running = False
+        self.refuses = None
+        self.addresses = []
+        lost = ("OutOfMemoryError", "WorkerCrashedError", "NodeDiedError")
+        self.exceptions = types.SimpleNamespace(**{n: type(n, (Exception,), {}) for n in lost})
+
+    def is_initialized(self):
+        return self.running
+
+    def init(self, log_to_driver, logging_level, address=None):
+        self.addresses.append(address)
+        if self.refuses is not None:
+            raise self.refuses
+        self.running = True
+
+    def shutdown(self):
+        self.running = False
+
+    def nodes(self):
+        resources = {"CPU": 2.0, "memory": 4e9}
+        return [{"Alive": True, "NodeID": "head", "Resources": resources}]
+
+    def remote(self, num_cpus, max_retries, runtime_env=None):
+        self.environments.append((num_cpus, (runtime_env or {}).get("env_vars")))
+
+        def decorate(function):
+            class Remote:
+                remote = staticmethod(lambda *arguments: (function, arguments))
+                options = staticmethod(lambda **_: Remote)
+
+            return Remote
+
+        return decorate
+
+    def wait(self, references):
+        return references[-1:], references[:-1]
+
+    def get(self, reference, timeout=None):
+        function, arguments = reference
+        try:
+            return function(*arguments)
+        except tuple(vars(self.exceptions).values()):
+            raise
+        except Exception as error:
+            wrapped = RuntimeError("a worker's traceback")
+            wrapped.cause = error
+            raise wrapped from None
+
+    def cancel(self, reference, force=False):
+        pass
+
+
+def stand_in_ray(monkeypatch) -> StandInRay:
+    """Takes the place of the module ray."""
+    ray = StandInRay()
+    strategies = types.ModuleType("ray.util.scheduling_strategies")
+    strategies.NodeAffinitySchedulingStrategy = lambda node, soft: node
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setitem(sys.modules, "ray.util", types.ModuleType("ray.util"))
+    monkeypatch.setitem(sys.modules, "ray.util.scheduling_strategies", strategies)
+    return ray

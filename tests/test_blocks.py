@@ -1,0 +1,307 @@
+"""Fits in blocks: one scene, the same bits however often a part of the run was lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import towns
+
+import igsr
+from igsr._internal.worker_processes import WorkerLostError
+from igsr.blocks import BlockOptions, fit_in_blocks, run, runner, seams, task_making, worker
+from igsr.blocks.tasks import load_splats, save_splats
+
+#: Fits of seconds.
+SETTINGS = {"steps": 120, "max_splats": 1200}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def coarse_photos():
+    """Photos of 48 pixels are made smaller for the coarse fit, too."""
+    usual = task_making.COARSE_SIZES
+    task_making.COARSE_SIZES = (12, 400)
+    yield
+    task_making.COARSE_SIZES = usual
+
+
+def options(**changed):
+    return replace(BlockOptions(blocks=2, holdout=6, settings=SETTINGS), **changed)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    capture = towns.town(2, 1, 8, 48, 36, points=150, sharp=1)
+    return towns.written(capture, tmp_path_factory.mktemp("town") / "capture")
+
+
+@pytest.fixture(scope="module")
+def whole(folder, tmp_path_factory):
+    """A run that nothing happens to."""
+    out = tmp_path_factory.mktemp("whole")
+    seen = []
+    splats, report = fit_in_blocks(folder, out, options(), seen.append)
+    return splats, report, out, seen
+
+
+def test_a_scene_in_blocks_is_one_scene(whole, folder):
+    splats, report, out, seen = whole
+    assert igsr.Splats.load(out / "scene.ply") == splats
+    assert json.loads((out / "report.json").read_text()) == report
+    assert len(splats) == report["splats"] == sum(block["splats"] for block in report["blocks"])
+    assert [block["name"] for block in report["blocks"]] == ["block-000", "block-001"]
+    # Each block has its own process and its own photos, and is rid of what lies beyond its cell.
+    assert len({block["process"] for block in report["blocks"]} | {os.getpid()}) == 3
+    for block in report["blocks"]:
+        assert 0 < block["photos"] < 16
+        assert 0 < block["splats"] <= block["fitted_splats"]
+        assert block["frozen_splats"] > 0
+        assert block["attempts"] == 1
+    assert report["protocol"]["views"] == 3
+    # What the coarse scene shows worse, the joined one shows better.
+    capture = igsr.load_capture(folder).with_holdout(6)
+    coarse = igsr.evaluate(load_splats(out / "blocks/coarse/splats.npz"), capture, "train")
+    assert igsr.evaluate(splats, capture, "train").psnr > coarse.psnr + 1.0
+    assert report["seams"]["photos"] > 0
+    assert {one.name for one in seen[-1]} == {"coarse", "block-000", "block-001"}
+    assert all(one.work == 1.0 and one.text == "done" for one in seen[-1])
+    assert not list((out / "blocks").rglob("checkpoint.npz"))
+
+
+def test_what_is_done_is_not_done_again(whole, folder, monkeypatch):
+    splats, _, out, _ = whole
+    monkeypatch.setattr(runner, "in_own_process", lambda *_: pytest.fail("a task was done again"))
+    again, _ = fit_in_blocks(folder, out, options())
+    assert again == splats
+
+
+def test_a_block_that_is_lost_is_done_alone_with_the_same_bits(whole, folder, tmp_path):
+    """Its files are gone, or damaged; nothing else is done again."""
+    splats, report, out, _ = whole
+    copy = tmp_path / "copy"
+    shutil.copytree(out, copy)
+    (copy / "blocks/block-001/splats.npz").unlink()
+    again, other = fit_in_blocks(folder, copy, options())
+    assert again == splats
+    assert other["blocks"][0]["process"] == report["blocks"][0]["process"]
+    assert other["blocks"][1]["process"] != report["blocks"][1]["process"]
+
+
+def command(folder, out):
+    # The command, with coarse photos as small as here.
+    small = "from igsr.blocks import task_making; task_making.COARSE_SIZES = (12, 400)"
+    words = [sys.executable, "-c", f"{small}; from igsr.cli import main; main()"]
+    words += ["fit", str(folder), "--out", str(out)]
+    words += ["--blocks", "2", "--holdout", "6", "--backend", "cpu", "--quality", "normal"]
+    return [*words, "--steps", "120", "--max-splats", "1200", "--json"]
+
+
+def test_a_driver_that_is_killed_goes_on_with_the_same_bits(whole, folder, tmp_path):
+    out = tmp_path / "out"
+    process = subprocess.Popen(command(folder, out), stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120.0
+    while not (out / "blocks/block-001/progress.json").is_file():
+        assert process.poll() is None, "it ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    worker_id = json.loads((out / "blocks/block-001/progress.json").read_text())["process"]
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    while Path(f"/proc/{worker_id}/stat").exists() and not _is_zombie(worker_id):
+        assert time.monotonic() < deadline, "the worker outlived its driver"
+        time.sleep(0.02)
+    assert (out / "blocks/block-000.json").is_file()
+    assert not (out / "scene.ply").exists()
+    first = json.loads((out / "blocks/block-000.json").read_text())["process"]
+    done = subprocess.run(command(folder, out), capture_output=True, text=True, check=True)
+    report = json.loads(done.stdout)
+    assert report["blocks"][0]["process"] == first
+    assert report["blocks"][1]["attempts"] == 2
+    assert igsr.Splats.load(out / "scene.ply") == whole[0]
+
+
+def _is_zombie(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def dying(monkeypatch, times, name="block-001", error=None):
+    """The task of this name ends so many times without a result."""
+    left = [times]
+
+    def work(capture, task):
+        if task.name == name and left[0]:
+            left[0] -= 1
+            raise error or WorkerLostError("A process ended without a result.")
+        return worker.do_task(capture, task)
+
+    monkeypatch.setattr(runner, "in_own_process", work)
+
+
+def test_a_worker_that_is_killed_once_is_begun_again(whole, folder, tmp_path, monkeypatch):
+    dying(monkeypatch, 1)
+    with pytest.warns(UserWarning, match="block-001 was lost and is begun again"):
+        splats, report = fit_in_blocks(folder, tmp_path, options())
+    assert splats == whole[0]
+    assert report["blocks"][1]["splats_part"] == 1.0
+
+
+def test_a_worker_out_of_memory_gets_fewer_splats(folder, tmp_path, monkeypatch):
+    dying(monkeypatch, 2, error=MemoryError())
+    with pytest.warns(UserWarning, match=r"again with 0\.25 of the splats"):
+        _, report = fit_in_blocks(folder, tmp_path, options())
+    less, more = report["blocks"][1], report["blocks"][0]
+    assert (less["splats_part"], more["splats_part"]) == (0.25, 1.0)
+    assert less["max_splats"] < more["max_splats"]
+    assert less["fitted_splats"] <= less["max_splats"]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_block_that_never_fits_is_named(folder, tmp_path, monkeypatch):
+    dying(monkeypatch, 99)
+    with pytest.raises(igsr.IgsrError, match=r"block-001 \(\d+ photos\) ran out of memory.*--max"):
+        fit_in_blocks(folder, tmp_path, options())
+    assert (tmp_path / "blocks/block-000.json").is_file(), "the other block is kept"
+
+
+def test_a_disk_that_is_full_is_named(folder, tmp_path, monkeypatch):
+    def full(path, splats):
+        save_splats(Path("/dev/full/splats.npz"), splats)
+
+    monkeypatch.setattr(worker, "save_splats", full)
+    monkeypatch.setattr(runner, "in_own_process", worker.do_task)
+    with pytest.raises(igsr.IgsrError, match=r"^coarse on .*: Cannot write /dev/full"):
+        fit_in_blocks(folder, tmp_path, options())
+
+
+def test_a_photo_that_changes_meanwhile_is_named(folder, tmp_path, monkeypatch):
+    def changed(capture, task):
+        return worker.do_task(capture, replace(task, marks=["0" * 64] * len(task.marks)))
+
+    monkeypatch.setattr(runner, "in_own_process", changed)
+    with pytest.raises(igsr.IgsrError, match=r"0001\.png was changed since the run began"):
+        fit_in_blocks(folder, tmp_path, options())
+
+
+def test_a_cell_without_photos_stays_coarse(whole, folder, tmp_path, monkeypatch):
+    plan_blocks = run.plan_blocks
+
+    def without(*arguments):
+        plan = plan_blocks(*arguments)
+        plan.photos[:, 0] = False
+        return plan
+
+    monkeypatch.setattr(run, "plan_blocks", without)
+    with pytest.warns(UserWarning, match="block-000 has no photos; it stays as coarse as it is"):
+        splats, report = fit_in_blocks(folder, tmp_path, options())
+    first, second = report["blocks"]
+    assert not first["fitted"]
+    assert second["fitted"]
+    assert len(splats) > second["splats"], "the cell is empty"
+
+
+def test_a_capture_without_points_is_fitted(folder, tmp_path):
+    capture = igsr.load_capture(folder)
+    capture.points = None
+    bare = towns.written(capture, tmp_path / "bare")
+    _, report = fit_in_blocks(bare, tmp_path / "out", options())
+    assert report["coarse"]["start"] not in ("points", "sfm")
+    assert all(block["fitted"] for block in report["blocks"])
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"blocks": 0}, "blocks must be auto or a number of at least 1, not 0"),
+        ({"blocks": 99}, "99 blocks need at least as many photos to fit, not 13"),
+        ({"settings": {"poses": "joint"}}, "leave poses out"),
+        ({"holdout": 1}, "holdout is 1"),
+    ],
+)
+def test_what_cannot_be_done_is_said(folder, tmp_path, changed, message):
+    with pytest.raises(igsr.IgsrError, match=message):
+        fit_in_blocks(folder, tmp_path, options(**changed))
+    assert not (tmp_path / "blocks").exists()
+
+
+def test_photos_without_cameras_are_refused(folder, tmp_path):
+    shutil.copytree(folder / "images", tmp_path / "photos")
+    with pytest.raises(igsr.IgsrError, match="no cameras"):
+        fit_in_blocks(tmp_path / "photos", tmp_path / "out", options())
+    assert "--blocks must be auto or a whole number" in _stderr(folder, tmp_path, "--blocks", "two")
+
+
+def _stderr(folder, out, *words):
+    done = subprocess.run(
+        [sys.executable, "-m", "igsr.cli", "fit", str(folder), "--out", str(out), *words],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode != 0
+    return " ".join(done.stderr.split())
+
+
+def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
+    capture = igsr.load_capture(folder)
+    splats = igsr.fit(capture, steps=40, max_splats=500, backend="cpu")
+    middle = len(splats) // 2
+    start, frozen = worker.subset(splats, np.arange(len(splats)) < middle), None
+    frozen = worker.subset(splats, np.arange(len(splats)) >= middle)
+    checkpoint = tmp_path / "checkpoint.npz"
+    fitted = igsr.fit(
+        capture,
+        steps=40,
+        max_splats=900,
+        backend="cpu",
+        start=start,
+        frozen=frozen,
+        whole_schedule=True,
+        checkpoint=checkpoint,
+    )
+    kept = np.load(checkpoint)["means"]
+    assert np.array_equal(kept[-len(frozen) :], frozen.means)
+    assert not np.array_equal(kept[:5], start.means[:5])
+    assert len(fitted) <= len(kept) - len(frozen)
+    # Beside what is frozen, photos are shown better than without.
+    alone = igsr.evaluate(start, capture, "train").psnr
+    both = igsr.evaluate(worker.joined([fitted, frozen]), capture, "train").psnr
+    assert both > alone
+    usual = {"start": start, "frozen": frozen}
+    for changed, message in (
+        ({"start": None}, "frozen needs start"),
+        ({"frozen": replace(frozen, sh=frozen.sh[:, :1].copy())}, "frozen has splats of SH degree"),
+        ({"frozen": replace(frozen, origin=np.ones(3))}, "frozen and start have other origins"),
+        ({"frozen": replace(frozen, antialiased=True)}, "frozen has antialiased splats"),
+    ):
+        with pytest.raises(igsr.IgsrError, match=message):
+            igsr.fit(capture, steps=5, backend="cpu", **(usual | changed))
+
+
+def test_seams_that_show_are_mended(tmp_path, monkeypatch):
+    # One house, which the border cuts.
+    capture = towns.town(1, 1, 16, 48, 36, points=200, sharp=1)
+    folder, out = towns.written(capture, tmp_path / "house"), tmp_path / "out"
+    monkeypatch.setattr(seams, "VISIBLE", 100.0)
+    splats, report = fit_in_blocks(folder, out, options(holdout=None))
+    assert report["seams"]["photos"] > 4
+    assert "before_mending" not in report["seams"]
+    # Whatever joining costs is too much.
+    monkeypatch.setattr(seams, "VISIBLE", -100.0)
+    again, mended = fit_in_blocks(folder, out, options(holdout=None))
+    before = mended["seams"]["before_mending"]
+    assert before["psnr_joined"] == report["seams"]["psnr_joined"]
+    assert mended["seams"]["psnr_joined"] > before["psnr_joined"]
+    assert len(again) == len(splats)
+    same = (again.means[:, None] == splats.means[None]).all(axis=2).any(axis=0)
+    assert 0 < same.sum() < len(splats), "splats far from seams moved, or none near them did"

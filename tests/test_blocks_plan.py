@@ -1,0 +1,285 @@
+"""Blocks before anything is fitted: photos by their headers, cells, and which photos each has."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import towns
+from PIL import Image
+
+import igsr
+from igsr.blocks.assignment import photos_across_seams, photos_of_blocks
+from igsr.blocks.cells import Cell, ground_of, split_into_cells
+from igsr.blocks.manifest import file_mark, read_manifest
+from igsr.blocks.plan import blocks_for_memory
+from igsr.blocks.shares import shown_shares, tracked_shares
+from igsr.capture import Camera
+from igsr.capture.types import intrinsic_matrix
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    capture = towns.town(2, 1, 6, 32, 24, points=100, sharp=1)
+    return capture, towns.written(capture, tmp_path_factory.mktemp("town") / "capture")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 9])
+def test_cells_have_equally_many_cameras_and_cover_the_plane(count):
+    random = np.random.default_rng(count)
+    places = random.normal(size=(91, 2)) * [5.0, 1.0]
+    cells = split_into_cells(places, count)
+    assert len(cells) == count
+    held = np.stack([cell.holds(places) for cell in cells])
+    assert (held.sum(axis=0) == 1).all(), "a camera lies in no cell, or in two"
+    counts = held.sum(axis=1)
+    assert counts.max() - counts.min() <= 2
+    far = random.uniform(-1e6, 1e6, (1000, 2))
+    assert (np.stack([cell.holds(far) for cell in cells]).sum(axis=0) == 1).all()
+
+
+def test_the_longer_side_is_split_and_borders_are_widened_by_a_fifth():
+    places = np.stack([np.arange(10.0), np.zeros(10)], axis=1)
+    left, right = split_into_cells(places, 2)
+    assert left.high == (4.5, np.inf)
+    assert right.low == (4.5, -np.inf)
+    assert left.side == (4.5, 0.0)
+    wide = left.widened()
+    assert wide.high[0] == pytest.approx(4.5 + 0.1 * 4.5)
+    assert wide.low == (-np.inf, -np.inf)
+    near = left.near_border(np.array([[4.4, 0.0], [4.6, 9.0], [3.0, 0.0]]), 0.05)
+    assert near.tolist() == [True, True, False]
+    assert left.plain() == {"low": [None, None], "high": [4.5, None], "side": [4.5, 0.0]}
+
+
+def test_photos_at_one_place_are_not_torn_apart():
+    places = np.repeat([[0.0, 0.0], [1.0, 0.0]], [7, 3], axis=0)
+    left, right = split_into_cells(places, 2)
+    assert left.holds(places).sum() == 7
+    assert right.holds(places).sum() == 3
+    with pytest.raises(igsr.IgsrError, match=r"3 photos at 1 places .* fewer --blocks"):
+        split_into_cells(places, 3)
+    with pytest.raises(igsr.IgsrError, match="5 photos at 1 places"):
+        split_into_cells(np.zeros((5, 2)), 2)
+    with pytest.raises(igsr.IgsrError, match="5 blocks need at least as many photos"):
+        split_into_cells(places[:4], 5)
+
+
+def camera(centre, up=(0.0, -1.0, 0.0), forward=(0.0, 0.0, 1.0)):
+    z = np.array(forward)
+    x = np.cross(-np.array(up), z)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    return Camera(viewmat, intrinsic_matrix(50.0, 50.0, 16.0, 12.0), 32, 24)
+
+
+@pytest.mark.parametrize("kind", ["plane", "line", "ball", "place"])
+def test_the_ground_is_level(kind):
+    random = np.random.default_rng(3)
+    spread = {"plane": (5, 0.1, 4), "line": (9, 0.01, 0.01), "ball": (3, 3, 3), "place": (0, 0, 0)}
+    centres = random.normal(size=(60, 3)) * spread[kind]
+    # A drone's photos of the ground have no up of their own; those of a street do.
+    drone = kind == "plane"
+    cameras = [
+        camera(centre, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) if drone else camera(centre)
+        for centre in centres
+    ]
+    axes = ground_of(cameras).axes
+    assert axes @ axes.T == pytest.approx(np.eye(2), abs=1e-9)
+    assert np.abs(axes[:, 1]).max() < 0.1, "the axes rise"
+
+
+def test_photos_go_where_they_show_something():
+    shown = np.array([[0.9, 0.0], [0.3, 0.6], [0.01, 0.1], [0.08, 0.09], [0.0, 0.0]])
+    tracked = np.array([[0.0, 0.3], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    near = np.array([[True, False], [True, False], [True, False], [True, False], [True, True]])
+    assert photos_of_blocks(shown, tracked, near).tolist() == [
+        [True, True],  # the second by its tracks
+        [True, True],
+        [False, True],  # taken in the first, which it does not show: to the one that it shows most
+        [True, False],
+        [False, False],  # it shows nothing
+    ]
+    assert photos_across_seams(shown).tolist() == [False, True, False, False, False]
+
+
+def test_what_is_hidden_is_not_shown():
+    # A wall hides another, which lies in the other cell.
+    grid = np.stack(np.meshgrid(np.linspace(-2, 2, 20), np.linspace(-2, 2, 20)), axis=-1)
+    wall = np.concatenate([grid.reshape(-1, 2), np.full((400, 1), 3.0)], axis=1)
+    means = np.concatenate([wall, wall + [0.0, 0.0, 3.0]]).astype(np.float32)
+    n = len(means)
+    splats = igsr.Splats(
+        means,
+        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        np.full((n, 3), np.log(0.2), np.float32),
+        np.full(n, 6.0, np.float32),
+        np.zeros((n, 4, 3), np.float32),
+    )
+    cameras = [camera([0.0, 0.0, 0.0]), camera([0.0, 0.0, 9.0], forward=(0.0, 0.0, -1.0))]
+    ground = ground_of([camera([x, 0.0, z]) for x in (0, 1, 2) for z in (0, 3)])
+    front = Cell((-np.inf, -np.inf), (np.inf, np.inf), (1.0, 1.0))
+    places = ground.places(np.array([[0.0, 0.0, 4.5]]))[0]
+    axis = int(np.abs(ground.axes[:, 2]).argmax())
+    low, high = [-np.inf, -np.inf], [np.inf, np.inf]
+    low[axis] = places[axis]
+    high[axis] = places[axis]
+    cells = [Cell(tuple(low), (np.inf, np.inf), (1, 1)), front]
+    cells.insert(0, Cell((-np.inf, -np.inf), tuple(high), (1, 1)))
+    shares = shown_shares(splats, cameras, cells, ground, "cpu")
+    nearer = 0 if ground.axes[axis, 2] > 0 else 1
+    assert shares[0, nearer] > 0.95
+    assert shares[0, 1 - nearer] < 0.05
+    assert shares[1, 1 - nearer] > 0.95
+    assert shares[:, 2] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_tracks_tell_what_photos_show(town):
+    capture, _ = town
+    ground = ground_of([view.camera for view in capture.views])
+    places = ground.places(np.stack([view.camera.centre for view in capture.views]))
+    cells = split_into_cells(places, 2)
+    names = [view.name for view in capture.views]
+    shares = tracked_shares(capture.points, names, cells, ground)
+    own = np.stack([cell.holds(places) for cell in cells], axis=1)
+    assert shares.sum(axis=1) == pytest.approx(1.0)
+    assert shares[own].mean() > 0.6
+    assert shares[~own].mean() < 0.4
+    assert tracked_shares(None, names, cells, ground).max() == 0.0
+
+
+def test_a_manifest_decodes_nothing_and_marks_files(town, tmp_path, monkeypatch):
+    capture, folder = town
+    monkeypatch.setattr(Image.Image, "load", lambda image: pytest.fail("a photo was decoded"))
+    manifest = read_manifest(folder, None, 4)
+    assert [shot.name for shot in manifest.shots] == [view.name for view in capture.views]
+    assert manifest.of_split("test") == [0, 4, 8]
+    assert len(manifest.of_split("train")) == 9
+    assert len(manifest.points().xyz) == len(capture.points.xyz)
+    row = manifest.plain()[0]
+    assert (row["width"], row["height"], row["split"]) == (32, 24, "test")
+    assert row["mark"] == file_mark(folder / "images/0000.png")
+    with pytest.raises(igsr.IgsrError, match="holdout is 1"):
+        read_manifest(folder, None, 1)
+
+
+def test_a_mark_sees_the_size_and_both_ends(tmp_path):
+    path = tmp_path / "photo"
+    content = bytearray(300_000)
+    path.write_bytes(content)
+    marks = {file_mark(path)}
+    for changed in (content + b"x", b"x" + content[1:], content[:-1] + b"x"):
+        path.write_bytes(changed)
+        marks.add(file_mark(path))
+    assert len(marks) == 4
+    with pytest.raises(igsr.IgsrError, match="Cannot read"):
+        file_mark(tmp_path / "none")
+
+
+def test_less_memory_asks_for_more_blocks(town):
+    manifest = read_manifest(town[1], None, None)
+    assert blocks_for_memory(manifest, None, 1000, available=64 << 30) == 1
+    assert blocks_for_memory(manifest, None, 1_000_000, available=2 << 30) > 1
+    assert blocks_for_memory(manifest, None, 1_000_000, available=1) == 12
+
+
+def made_up_capture(folder, count, points):
+    """A COLMAP model of so many 12-megapixel photos along a street; all files are one JPEG."""
+    random = np.random.default_rng(5)
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse/0").mkdir(parents=True)
+    Image.new("RGB", (4000, 3000), (90, 120, 60)).save(folder / "one.jpg")
+    for number in range(count):
+        os.link(folder / "one.jpg", folder / f"images/{number:05d}.jpg")
+    with open(folder / "sparse/0/cameras.bin", "wb") as file:
+        file.write(struct.pack("<QIiQQ", 1, 1, 1, 4000, 3000))
+        file.write(struct.pack("<4d", 3000.0, 3000.0, 2000.0, 1500.0))
+    centres = np.stack(
+        [np.linspace(0.0, count / 10.0, count), np.full(count, -1.6), random.uniform(-4, 4, count)],
+        axis=1,
+    )
+    xyz = random.uniform([0.0, -6.0, 4.0], [count / 10.0, 0.0, 8.0], (points, 3))
+    # Each photo sees the points that lie ahead.
+    seen = [
+        np.flatnonzero(np.abs(xyz[:, 0] - centre[0]) < 0.4 * (xyz[:, 2] - centre[2]))[:150]
+        for centre in centres
+    ]
+    with open(folder / "sparse/0/images.bin", "wb") as file:
+        file.write(struct.pack("<Q", count))
+        for number, (centre, ids) in enumerate(zip(centres, seen, strict=True)):
+            file.write(struct.pack("<I7dI", number + 1, 1.0, 0.0, 0.0, 0.0, *-centre, 1))
+            file.write(f"{number:05d}.jpg".encode() + b"\0")
+            local = xyz[ids] - centre
+            rows = np.zeros(len(ids), [("xy", "<f8", 2), ("id", "<i8")])
+            rows["xy"] = 3000.0 * local[:, :2] / local[:, 2:] + [2000.0, 1500.0]
+            rows["id"] = ids + 1
+            file.write(struct.pack("<Q", len(ids)) + rows.tobytes())
+    with open(folder / "sparse/0/points3D.bin", "wb") as file:
+        file.write(struct.pack("<Q", points))
+        for number, place in enumerate(xyz):
+            file.write(struct.pack("<Q3d3BdQ", number + 1, *place, 90, 90, 90, 0.5, 0))
+    return folder
+
+
+PLAN = """
+import json, sys, time
+import numpy as np
+import igsr
+from pathlib import Path
+from PIL import Image
+from igsr._internal.peak_memory import peak_bytes
+from igsr.blocks.manifest import read_manifest
+from igsr.blocks.plan import blocks_for_memory, cells_of, plan_blocks
+
+def never(image):
+    raise RuntimeError("a photo was decoded")
+
+Image.init()
+Image.Image.load = Image.Image.draft = never
+began = time.process_time()
+manifest = read_manifest(Path(sys.argv[1]), 1000, 8)
+points = manifest.points()
+count = blocks_for_memory(manifest, 1000, None, available=16 << 30)
+ground, cells = cells_of(manifest, count)
+random = np.random.default_rng(0)
+n = 20000
+low, high = points.xyz.min(axis=0), points.xyz.max(axis=0)
+splats = igsr.Splats(
+    random.uniform(low, high, (n, 3)).astype(np.float32),
+    np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+    np.full((n, 3), -2.0, np.float32),
+    np.full(n, 2.0, np.float32),
+    np.zeros((n, 4, 3), np.float32),
+)
+plan = plan_blocks(manifest, ground, cells, splats, points, "cpu")
+print(json.dumps({
+    "seconds": time.process_time() - began,
+    "peak": peak_bytes(),
+    "blocks": len(cells),
+    "photos": plan.photos.sum(axis=0).tolist(),
+    "none": int((~plan.photos.any(axis=1)).sum()),
+    "test": len(manifest.of_split("test")),
+}))
+"""
+
+
+@pytest.mark.parametrize("count", [pytest.param(500), pytest.param(5000, marks=pytest.mark.long)])
+def test_thousands_of_photos_are_planned_in_seconds(tmp_path, count):
+    """5 000 photos of 12 megapixels: in 30 s of one processor and 1 GB, and none is decoded."""
+    folder = made_up_capture(tmp_path / "capture", count, 20 * count)
+    done = subprocess.run(
+        [sys.executable, "-c", PLAN, str(folder)], capture_output=True, text=True, check=True
+    )
+    found = json.loads(done.stdout)
+    print(found)
+    assert found["seconds"] < 30.0 * count / 5000 + 5.0
+    assert found["peak"] < 1e9
+    assert found["none"] == found["test"], "a photo to fit is in no block"
+    # Blocks have their own photos and few of their neighbours'.
+    assert max(found["photos"]) < 2.0 * count / found["blocks"]

@@ -1,0 +1,90 @@
+"""Blocks over a real Ray cluster of three nodes, one of which is killed in mid-fit."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import pytest
+import towns
+
+import igsr
+from igsr._internal.ray_jobs import RayCluster
+from igsr.blocks import BlockOptions, fit_in_blocks
+
+pytestmark = pytest.mark.long
+
+ray = pytest.importorskip("ray", reason="Ray is not installed")
+
+#: Long enough for a node to be killed in the middle.
+SETTINGS = {"steps": 800, "max_splats": 2000}
+STORE = 80 * 2**20
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    from ray.cluster_utils import Cluster
+
+    head = {"num_cpus": 1, "object_store_memory": STORE, "include_dashboard": False}
+    cluster = Cluster(initialize_head=True, head_node_args=head)
+    for _ in range(2):
+        cluster.add_node(num_cpus=1, object_store_memory=STORE)
+    yield cluster
+    ray.shutdown()
+    cluster.shutdown()
+
+
+def standings(out):
+    """The news of each block that is being fitted."""
+    found = {}
+    for path in (out / "blocks").glob("block-*/progress.json"):
+        try:
+            found[path.parent.name] = json.loads(path.read_text())
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+def test_a_node_that_is_killed_in_mid_fit_changes_no_bit(cluster, tmp_path):
+    folder = towns.written(towns.town(2, 2, 8, 64, 48, points=150, sharp=1), tmp_path / "town")
+    options = BlockOptions(blocks=4, holdout=8, settings=SETTINGS)
+    whole, _ = fit_in_blocks(folder, tmp_path / "whole", options)
+
+    out, seen, failures = tmp_path / "out", [], []
+
+    def kill() -> None:
+        """Wait until blocks run on all three nodes, and kill one that does not run the driver."""
+        deadline = time.monotonic() + 300.0
+        while sum(0 < one["step"] < 700 for one in standings(out).values()) < 3:
+            if time.monotonic() > deadline:
+                failures.append("no three blocks were under way at one time")
+                return
+            time.sleep(0.05)
+        node = cluster.worker_nodes and next(iter(cluster.worker_nodes))
+        cluster.remove_node(node, allow_graceful=False)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    address = cluster.address
+    over_ray = BlockOptions(blocks=4, holdout=8, settings=SETTINGS, ray=address)
+    splats, report = fit_in_blocks(folder, out, over_ray, seen.append)
+    killer.join()
+    assert not failures
+    assert splats == whole
+    assert max(block["attempts"] for block in report["blocks"]) == 2, "nothing was lost"
+    assert len({block["process"] for block in report["blocks"]}) >= 2
+
+
+def test_a_cluster_that_does_not_answer_is_named(tmp_path):
+    with pytest.raises(igsr.IgsrError, match=r"Cannot join the Ray cluster at 127\.0\.0\.1:9"):
+        RayCluster("127.0.0.1:9").__enter__()
+
+
+def test_every_node_tells_what_it_is(cluster, tmp_path):
+    with RayCluster(cluster.address) as joined:
+        nodes = joined.check(tmp_path)
+        assert len(nodes) == sum(node["Alive"] for node in ray.nodes())
+        assert {node.igsr for node in nodes} == {igsr.__version__}
+        with pytest.raises(igsr.IgsrError, match=r"does not see .*none"):
+            joined.check(tmp_path / "none")

@@ -1,0 +1,199 @@
+"""Bundle adjustment with a prediction as a prior, on made-up points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import ring_camera
+
+from igsr.geometry.bundle_equations import Equations
+from igsr.geometry.pose_errors import pose_accuracy, pose_errors
+from igsr.pose.colmap.adjustment import deviations
+from igsr.pose.prior_adjustment import (
+    Bundle,
+    Observations,
+    Spread,
+    _Problem,
+    _stepped,
+    adjusted_bundle,
+    covariances,
+)
+
+COUNT = 5
+SPREAD = Spread(np.radians(1.5), 0.1)
+TRUTH = [ring_camera(0.6 * k + 0.05 * k**2, 640) for k in range(COUNT)]
+
+
+def scene(shown_by, per_group=30, seed=0):
+    """Exact points and observations; each group of points is seen by some cameras."""
+    random = np.random.default_rng(seed)
+    points = random.normal(scale=0.5, size=(per_group * len(shown_by), 3))
+    view, point, xy, depth = [], [], [], []
+    for group, cameras in enumerate(shown_by):
+        for p in range(group * per_group, (group + 1) * per_group):
+            for k in cameras:
+                local = TRUTH[k].viewmat[:3, :3] @ points[p] + TRUTH[k].viewmat[:3, 3]
+                view.append(k)
+                point.append(p)
+                xy.append(local[:2] / local[2] * TRUTH[k].K[0, 0] + TRUTH[k].K[:2, 2])
+                depth.append(local[2])
+    seen = Observations(np.array(view), np.array(point), np.array(xy), np.array(depth))
+    lenses = np.zeros(COUNT, dtype=np.int64)
+    return Bundle(TRUTH, lenses, points, np.zeros(COUNT)), seen
+
+
+def off(camera, seed, degrees=1.5, moved=0.1):
+    """A camera that is predicted with an error."""
+    random = np.random.default_rng(seed)
+    x, y, z = np.radians(degrees) * random.normal(size=3) / np.sqrt(3.0)
+    turn = np.linalg.qr(np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))[0]
+    turn *= np.sign(np.diag(turn))
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = turn @ camera.viewmat[:3, :3]
+    centre = camera.centre + moved * random.normal(size=3) / np.sqrt(3.0)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    return replace(camera, viewmat=viewmat)
+
+
+def predicted(**more):
+    return [off(camera, k, **more) for k, camera in enumerate(TRUTH)]
+
+
+def started(bundle, cameras, seed=3):
+    noise = np.random.default_rng(seed).normal(scale=0.05, size=bundle.points.shape)
+    return replace(bundle, cameras=cameras, points=bundle.points + noise)
+
+
+def neighbours():
+    return [(k, k + 1) for k in range(COUNT - 1)]
+
+
+def threes():
+    return [(k, k + 1, k + 2) for k in range(COUNT - 2)]
+
+
+def test_derivatives_are_those_of_the_cost():
+    bundle, seen = scene(threes(), per_group=4)
+    depth = seen.depth * np.exp(np.random.default_rng(0).normal(scale=0.1, size=len(seen.depth)))
+    depth[::3] = np.nan
+    seen = replace(seen, depth=depth)
+    cameras = predicted()
+    cameras[1] = None
+    problem = _Problem(seen, cameras, SPREAD, 2.0, np.array([6.0]))
+    bundle = started(bundle, predicted(moved=0.2))
+    bundle = replace(bundle, scales=np.linspace(-0.1, 0.1, COUNT))
+    equations, prior = problem.linearised(bundle)
+    value, errors = equations.value[:, :, :-1], equations.value[:, :, -1]
+    slope = prior[:-1, -1].copy()
+    np.add.at(slope, equations.column[:, :-1], np.einsum("mrc,mr->mc", value, errors))
+    size = equations.width - 1
+    nowhere = Equations(
+        equations.point,
+        equations.column,
+        np.zeros_like(equations.value),
+        equations.of_point,
+        equations.width,
+    )
+    for k in range(size):
+        costs = []
+        for sign in (1.0, -1.0):
+            # A step of 1e-5 along one parameter, with the points where they are.
+            wanted = np.zeros((size + 1, size + 1))
+            wanted[:size, :size] = np.eye(size)
+            wanted[k, size] = -sign * 1e-5
+            costs.append(problem.cost(_stepped(bundle, nowhere, wanted, 0.0)))
+        numeric = (costs[0] - costs[1]) / 2e-5
+        assert numeric == pytest.approx(2.0 * slope[k], rel=2e-3, abs=2e-2)
+
+
+def test_what_three_photos_see_outweighs_the_prediction():
+    bundle, seen = scene(threes())
+    wanted = predicted()
+    found = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
+    before, after = (pose_errors(one, TRUTH) for one in (wanted, found.cameras))
+    assert after["rotation"] < 0.1 * before["rotation"]
+    assert after["centre"] < 0.1 * before["centre"]
+
+
+def test_the_prediction_tells_the_distances_that_two_photos_alone_do_not():
+    bundle, seen = scene(neighbours())
+    noise = np.random.default_rng(1).normal(scale=1.0, size=seen.xy.shape)
+    seen = replace(seen, xy=seen.xy + noise, depth=np.full(len(seen.depth), np.nan))
+    wanted = predicted()
+    nothing = [None] * COUNT
+    found, free = started(bundle, wanted), started(bundle, wanted)
+    for pixels in (20.0, 5.0, 1.0):
+        found = adjusted_bundle(found, seen, wanted, SPREAD, pixels)
+        free = adjusted_bundle(free, seen, nothing, SPREAD, pixels)
+    with_prior, without, before = (
+        pose_accuracy(one, TRUTH) for one in (found.cameras, free.cameras, wanted)
+    )
+    assert with_prior["rotation"] < 0.7 * before["rotation"]
+    assert with_prior["ATE"] < before["ATE"]
+    assert with_prior["ATE"] < without["ATE"]
+
+
+def test_depths_tell_distances_too_and_a_wrong_one_moves_nothing():
+    bundle, seen = scene(neighbours())
+    wanted = predicted(moved=0.3)
+    exact = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
+    none = replace(seen, depth=np.full(len(seen.depth), np.nan))
+    without = adjusted_bundle(started(bundle, wanted), none, wanted, SPREAD, 1.0)
+    errors = [pose_errors(one.cameras, TRUTH)["centre"] for one in (exact, without)]
+    assert errors[0] < 0.8 * errors[1]
+    wrong = np.where(seen.view == 2, seen.depth * 3.0, seen.depth)
+    found = adjusted_bundle(
+        started(bundle, wanted), replace(seen, depth=wrong), wanted, SPREAD, 1.0
+    )
+    assert pose_errors(found.cameras, TRUTH)["centre"] < 2.0 * errors[0]
+
+
+def test_one_wrong_prediction_moves_no_camera():
+    bundle, seen = scene(threes())
+    wanted = predicted()
+    right = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
+    start = started(bundle, list(wanted))
+    wanted[2] = off(TRUTH[2], 9, degrees=40.0, moved=2.0)
+    found = adjusted_bundle(start, seen, wanted, SPREAD, 1.0)
+    a, b = (pose_errors(one.cameras, TRUTH) for one in (right, found))
+    assert b["rotation"] < a["rotation"] + 0.05
+    assert b["centre"] < a["centre"] + 0.01
+
+
+def test_wrong_matches_move_little():
+    bundle, seen = scene(threes())
+    wanted = predicted()
+    xy = seen.xy.copy()
+    xy[::10] += np.random.default_rng(0).normal(scale=15.0, size=xy[::10].shape)
+    found = adjusted_bundle(started(bundle, wanted), replace(seen, xy=xy), wanted, SPREAD, 1.0)
+    assert pose_errors(found.cameras, TRUTH)["rotation"] < 0.3
+
+
+def test_uncertainties_are_as_large_as_errors():
+    bundle, seen = scene(threes(), per_group=20)
+    errors, told = [], []
+    for seed in range(6):
+        random = np.random.default_rng(seed)
+        noisy = replace(seen, xy=seen.xy + random.normal(scale=0.5, size=seen.xy.shape))
+        none = replace(noisy, depth=np.full(len(seen.depth), np.nan))
+        nothing = [None] * COUNT
+        found = adjusted_bundle(bundle, none, nothing, SPREAD, 3.0)
+        errors.append(pose_errors(found.cameras, TRUTH)["rotation"])
+        told.append([deviations(one)[0] for one in covariances(found, none, nothing, SPREAD)])
+    # Rotations about three axes.
+    expected = np.degrees(np.mean(told)) * np.sqrt(3.0)
+    assert 0.5 < np.mean(errors) / expected < 2.0
+
+
+def test_a_camera_that_sees_nothing_is_known_as_the_prediction_is():
+    bundle, seen = scene([(0, 1, 2), (1, 2, 3)])
+    turn, move = zip(
+        *(deviations(one) for one in covariances(bundle, seen, TRUTH, SPREAD)), strict=True
+    )
+    assert turn[4] > 10.0 * turn[1]
+    assert move[4] > 10.0 * move[1]
+    assert turn[4] == pytest.approx(SPREAD.rotation, rel=0.3)
+    found = adjusted_bundle(bundle, seen, TRUTH, SPREAD, 1.0)
+    np.testing.assert_allclose(found.cameras[4].viewmat, TRUTH[4].viewmat, atol=1e-6)
