@@ -1,7 +1,7 @@
 """How wrong cleaned pictures are: what a denoiser claims, against photos that it has not seen.
 
-A denoiser trained elsewhere misjudges scenes unlike its training's by one factor or another.
-Renders from the cameras of photos that were held out of a fit, beside these photos, tell by which.
+One without confidence is taken to claim an error as large as its changes. Renders from the cameras
+of photos that were held out of a fit, beside these photos, tell how wrong such pixels are.
 """
 
 from __future__ import annotations

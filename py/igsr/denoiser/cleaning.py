@@ -137,6 +137,23 @@ def denoise(
             used, ``denoiser`` returns arrays of another size, or the shipped weights cannot be
             read.
     """
+    picture, confidence = picture_and_confidence(render, photos, denoiser)
+    if confidence is None:
+        given = _buffers(render)
+        confidence = confidence_of(claimed_by_change(given.color, picture))
+    return picture, confidence
+
+
+def picture_and_confidence(
+    render: Buffers | Render | npt.NDArray[Any],
+    photos: Sequence[Source] = (),
+    denoiser: Denoiser | None = None,
+) -> tuple[Float32, Float32 | None]:
+    """As ``denoise``, but with no confidence where the denoiser gives none.
+
+    Raises:
+        IgsrError: as ``denoise``.
+    """
     others = [type(photo).__name__ for photo in photos if not isinstance(photo, Source)]
     if others:
         raise IgsrError(f"photos must be of igsr.denoiser.photo_sources, not {others[0]}")
@@ -158,8 +175,6 @@ def denoise(
             + ("" if confidence is None else f" and a confidence {list(confidence.shape)}")
             + f" of a render of {list(size)} pixels"
         )
-    if confidence is None:
-        confidence = confidence_of(claimed_by_change(given.color, picture))
     return picture, confidence
 
 

@@ -71,7 +71,10 @@ class CrossValidation:
         return self._share * FOLDS
 
     def calibration(self) -> Calibration:
-        """What the denoiser's claims mean, by the held-out photos of all folds as they are now."""
+        """What the changes of a denoiser without confidence mean, by the held-out photos.
+
+        Those of all folds, as they are now.
+        """
         self._folds = self._folds or self._fitted()
         for fold in self._folds:
             fold.errors = self._stages.denoising_errors(fold.reconstruction, fold.held_out)
@@ -80,15 +83,18 @@ class CrossValidation:
     def validate(self) -> Validation:
         """Held-out photos before each fold's own round and after it.
 
-        Each fold's round is calibrated by the other one's photos: its own are for scores.
+        Where the denoiser gives no confidence, each fold's round is calibrated by the other one's
+        photos: its own are for scores.
         """
+        self._folds = self._folds or self._fitted()
         before: list[ScoredView] = []
         after: list[ScoredView] = []
         errors = [fold.errors for fold in self._folds]
         for k, fold in enumerate(self._folds):
             before += fold.scored
             views = self._stages.render_and_denoise(fold.reconstruction)
-            views = views.calibrated(_calibrated(errors[:k] + errors[k + 1 :]))
+            if not views.have_confidence:
+                views = views.calibrated(_calibrated(errors[:k] + errors[k + 1 :]))
             selected, _ = self._stages.select(views)
             self._stages.refit(fold.reconstruction, selected, views.added_before, "cross_validate")
             fold.scored = self._scored(fold.reconstruction, fold.held_out)

@@ -166,11 +166,12 @@ def _round(
 
     validated = Validation({}, {}, [])
     if validation is not None:
-        views = views.calibrated(validation.calibration())
-        selected, rejected = stages.select(views)
-        if not selected:
-            stop = Stop(StopReason.NONE_SELECTED, len(rejected))
-            return replace(refined, stop=stop, rejected=rejected)
+        if not views.have_confidence:
+            views = views.calibrated(validation.calibration())
+            selected, rejected = stages.select(views)
+            if not selected:
+                stop = Stop(StopReason.NONE_SELECTED, len(rejected))
+                return replace(refined, stop=stop, rejected=rejected)
         validated = validation.validate()
     before, after = validated.before, validated.after
     accepted = validation is None or combined_error(after) < combined_error(before)

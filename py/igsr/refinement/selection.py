@@ -15,8 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.deprecation import renamed_attributes, renamed_names
-from igsr.denoiser import Buffers, Denoiser, Source, denoise
-from igsr.denoiser.calibration import Calibration, error_of
+from igsr.denoiser import Buffers, Denoiser, Source
+from igsr.denoiser.calibration import (
+    Calibration,
+    claimed_by_change,
+    confidence_of,
+    error_of,
+)
+from igsr.denoiser.cleaning import picture_and_confidence
 from igsr.refinement.novel_views import NovelView
 
 Float32 = npt.NDArray[np.float32]
@@ -45,10 +51,10 @@ class Candidate:
             has 1.
         gain: mean over the pixels of confidence weight times absolute change by denoising, in
             units of the colours' range.
-        claimed: float32 [H, W], the absolute error that the denoiser expects of each pixel, in
-            units of the colours' range; None where it is not known.
+        claimed: float32 [H, W], the absolute error that a denoiser without confidence is taken to
+            claim of each pixel, in units of the colours' range; None where it gives a confidence.
         change: float32 [H, W], mean absolute change of each pixel's colours by denoising, in units
-            of their range; None where ``claimed`` is.
+            of their range; None where it is not known.
         wanted: float32 [H, W] in [0, 1], how much of what a pixel shows belongs to the scene; None
             where all does.
     """
@@ -100,7 +106,10 @@ def denoised_candidate(
     Raises:
         IgsrError: as ``igsr.denoise``.
     """
-    denoised, certainty = denoise(buffers, photos, denoiser)
+    denoised, given = picture_and_confidence(buffers, photos, denoiser)
+    claimed = None if given is not None else claimed_by_change(buffers.color, denoised)
+    certainty = given if claimed is None else confidence_of(claimed)
+    assert certainty is not None
     wanted = None
     if buffers.support is not None and not all(photo.usable.all() for photo in photos):
         wanted = np.clip(buffers.support, 0.0, 1.0)
@@ -108,11 +117,14 @@ def denoised_candidate(
     change = np.abs(denoised - render).mean(axis=-1)
     confidence, gain = _weights_and_gain(certainty, change, wanted)
     pictures = _to_uint8(render), _to_uint8(denoised)
-    return Candidate(view, *pictures, confidence, gain, error_of(certainty), change, wanted)
+    return Candidate(view, *pictures, confidence, gain, claimed, change, wanted)
 
 
 def calibrated_candidate(candidate: Candidate, calibration: Calibration) -> Candidate:
-    """A candidate with the confidence weights and the gain that its denoiser's claims mean."""
+    """A candidate with the confidence weights and the gain that its denoiser's changes mean.
+
+    One of a denoiser that gives a confidence stays as it is.
+    """
     if candidate.claimed is None or candidate.change is None:
         return candidate
     confidence, gain = _weights_and_gain(

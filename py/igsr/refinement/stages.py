@@ -11,8 +11,9 @@ from PIL import Image
 
 from igsr._internal.choices import FitBackend
 from igsr.capture import Camera, Capture, View
-from igsr.denoiser import Denoiser, denoise, photo_support, render_buffers
-from igsr.denoiser.calibration import Calibration, error_of
+from igsr.denoiser import Denoiser, photo_support, render_buffers
+from igsr.denoiser.calibration import Calibration, claimed_by_change
+from igsr.denoiser.cleaning import picture_and_confidence
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import (
     METRICS,
@@ -88,8 +89,13 @@ class DenoisedViews:
     candidates: list[Candidate]
     added_before: list[Candidate]
 
+    @property
+    def have_confidence(self) -> bool:
+        """Whether the denoiser gave a confidence."""
+        return all(one.claimed is None for one in (*self.candidates, *self.added_before))
+
     def calibrated(self, calibration: Calibration) -> DenoisedViews:
-        """The same views with the confidence that the denoiser's claims mean."""
+        """The same views; where the denoiser gave no confidence, with what its changes mean."""
         return DenoisedViews(
             [calibrated_candidate(one, calibration) for one in self.candidates],
             [calibrated_candidate(one, calibration) for one in self.added_before],
@@ -101,7 +107,7 @@ class DenoisingErrors:
     """Errors of the denoised render of a photo, in units of the colours' range.
 
     Attributes:
-        claimed: float32 [H, W], absolute error that the denoiser expects of each pixel.
+        claimed: float32 [H, W], by how much the denoiser changed each pixel's surroundings.
         measured: float32 [H, W], its absolute error against the photo; NaN where a mask hides it.
     """
 
@@ -195,7 +201,10 @@ class Stages:
     def denoising_errors(
         self, reconstruction: Reconstruction, photos: Sequence[View]
     ) -> list[DenoisingErrors]:
-        """How wrong denoised renders are from where photos were taken that were not fitted."""
+        """How wrong denoised renders are from where photos were taken that were not fitted.
+
+        What is claimed is what a denoiser without confidence is taken to claim.
+        """
         splats, fitted, backend = (
             reconstruction.splats,
             reconstruction.photos,
@@ -208,12 +217,13 @@ class Stages:
             buffers = render_buffers(
                 splats, photo.camera, support, self._background_of_views, backend
             )
-            picture, certainty = denoise(buffers, sources.of(photo.camera), self._denoiser)
+            near = sources.of(photo.camera)
+            picture, _ = picture_and_confidence(buffers, near, self._denoiser)
             truth = over_background(photo.image, self._background).astype(np.float32) / 255.0
             measured = np.abs(picture - truth).mean(axis=-1)
             if photo.mask is not None:
                 measured = np.where(photo.mask, measured, np.float32(np.nan))
-            found.append(DenoisingErrors(error_of(certainty), measured))
+            found.append(DenoisingErrors(claimed_by_change(buffers.color, picture), measured))
             self._run.tell("cross_validate")
         return found
 
