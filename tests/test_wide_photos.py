@@ -505,7 +505,7 @@ def test_folds_hold_whole_panoramas_out(capture: Path) -> None:
             self.fitted.append(photos)
             return type("Fitted", (), {"splats": None})()
 
-        def validation_scores(self, splats: Any, held_out: list[Any]) -> list[Any]:
+        def validated(self, splats: Any, held_out: list[Any]) -> list[Any]:
             return []
 
     stages = Stages()
