@@ -76,11 +76,6 @@ def test_a_node_that_is_killed_in_mid_fit_changes_no_bit(cluster, tmp_path):
     assert len({block["process"] for block in report["blocks"]}) >= 2
 
 
-def test_a_cluster_that_does_not_answer_is_named(tmp_path):
-    with pytest.raises(igsr.IgsrError, match=r"Cannot join the Ray cluster at 127\.0\.0\.1:9"):
-        RayCluster("127.0.0.1:9").__enter__()
-
-
 def test_every_node_tells_what_it_is(cluster, tmp_path):
     with RayCluster(cluster.address) as joined:
         nodes = joined.check(tmp_path)

@@ -228,7 +228,7 @@ def test_auto_takes_given_cameras_then_a_checkpoint_then_colmap(
     assert calls[1] == {"name": "dust3r", "checkpoint": "weights.pth", "seed": 0}
     with pytest.raises(igsr.IgsrError, match="checkpoint is no option of colmap"):
         pose.estimate(photos[:3], "colmap", checkpoint="weights.pth")
-    with pytest.raises(igsr.IgsrError, match="estimator must be auto, dust3r or colmap"):
+    with pytest.raises(igsr.IgsrError, match="estimator must be auto, dust3r or da3 or colmap"):
         pose.estimate(photos[:3], "magic")
     with pytest.raises(igsr.IgsrError, match="seed is -1"):
         pose.estimate(photos[:3], seed=-1)

@@ -33,7 +33,6 @@ def test_ray_that_is_missing_or_of_another_version_is_named(ray, monkeypatch):
     [
         (ConnectionError("Could not find any running Ray instance.\nMore."), "Could not find any"),
         (RuntimeError("Version mismatch: The cluster was started with:\n Ray: 2.1"), "Version mis"),
-        (SystemExit(1), "none answers"),
     ],
 )
 def test_a_cluster_that_cannot_be_joined_is_named(ray, error, reason):
@@ -41,6 +40,12 @@ def test_a_cluster_that_cannot_be_joined_is_named(ray, error, reason):
     with pytest.raises(igsr.IgsrError, match=f"Ray cluster at auto: {reason}"):
         RayCluster("auto").__enter__()
     assert ray.addresses == ["auto"]
+
+
+def test_a_head_that_nobody_answers_for_is_named_at_once(ray):
+    with pytest.raises(igsr.IgsrError, match=r"Ray cluster at 127\.0\.0\.1:9: .*refused"):
+        RayCluster("127.0.0.1:9").__enter__()
+    assert ray.addresses == []
 
 
 @pytest.mark.parametrize(

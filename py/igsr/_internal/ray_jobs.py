@@ -19,6 +19,8 @@ OLDEST, BEFORE = (2, 40), (3, 0)
 RETRIES = 10
 #: Seconds within which a machine of the cluster must say what it is.
 ANSWERS_WITHIN = 120.0
+#: Seconds within which the head of a cluster must take a connection.
+LISTENS_WITHIN = 10.0
 
 
 @dataclass(frozen=True)
@@ -67,12 +69,12 @@ class RayCluster:
         if self._joined:
             named = {} if self.address is None else {"address": self.address}
             try:
+                _check_that_one_listens(self.address)
                 self._ray.init(log_to_driver=False, logging_level="warning", **named)
-            except (Exception, SystemExit) as error:  # by what is wrong with the cluster
+            except Exception as error:  # of any kind, by what is wrong with the cluster
                 where = "" if self.address is None else f" at {self.address}"
-                reason = "none answers" if isinstance(error, SystemExit) else _first_line(error)
                 raise IgsrError(
-                    f"Cannot join the Ray cluster{where}: {reason}. Start one with "
+                    f"Cannot join the Ray cluster{where}: {_first_line(error)}. Start one with "
                     "'ray start --head' and the same version of Ray on all machines."
                 ) from error
         return self
@@ -212,6 +214,18 @@ class RayCluster:
     def _alive(self) -> list[Any]:
         nodes = self._ray.nodes()
         return [n for n in nodes if n["Alive"] and n["Resources"].get("CPU", 0.0) >= 1.0]
+
+
+def _check_that_one_listens(address: str | None) -> None:
+    """Ray itself would try for minutes.
+
+    Raises:
+        OSError: nobody listens at this host and port.
+    """
+    host, colon, port = (address or "").rpartition(":")
+    if colon and port.isdigit() and "/" not in host:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=LISTENS_WITHIN):
+            pass
 
 
 def _imported() -> Any:

@@ -214,9 +214,12 @@ def chosen_estimator(estimator: str, options: dict[str, Any]) -> str:
         IgsrError: there is none of that name, or an option is not its own.
     """
     if estimator == AUTO:
-        # One that stands behind it may know an option that it does not.
-        ready = [name for name, entry in ESTIMATORS.items() if entry.ready(options)]
-        estimator = next((name for name in ready if not _foreign(name, options)), ready[0])
+        ready = (name for name, entry in ESTIMATORS.items() if entry.ready(options))
+        estimator = next(ready)
+        # One that stands behind it may know an option that it does not. It is asked only then: a
+        # checkpoint of one network is none of another.
+        if _foreign(estimator, options):
+            estimator = next((n for n in ready if not _foreign(n, options)), estimator)
     elif estimator not in ESTIMATORS:
         raise IgsrError(f"estimator must be {AUTO}, {' or '.join(ESTIMATORS)}, not {estimator!r}")
     foreign = _foreign(estimator, options)

@@ -761,7 +761,8 @@ mod tests {
             l1,
             ssim,
             has_weights,
-            frozen
+            frozen,
+            moving
         );
         assert_layout(
             "bin_scan",

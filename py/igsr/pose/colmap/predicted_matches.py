@@ -27,9 +27,11 @@ from igsr.pose.estimate import Progress
 BAND = 0.03
 #: Part of a photo's points, at least, that another must show for the two to overlap; points asked.
 OVERLAP, ASKED = 0.1, 500
+#: Matches in the band, at least: of repeated patterns some fit to some geometry by chance.
+FEWEST_IN_BAND = 30
 #: Parts of the longer side that matches may be from where the prediction has them: all together, as
 #: cameras that are turned wrongly have them, in the median; and each by itself.
-TOGETHER, ALONE = 0.15, 0.08
+TOGETHER, ALONE = 0.08, 0.05
 #: Part of a pair's matches that must agree with the prediction for these to be kept.
 LEAST_LEFT = 0.5
 #: Part that depths may differ by where two photos show one surface.
@@ -102,13 +104,13 @@ def matched_by_prediction(
             one, other = cameras[a], cameras[b]
             band = BAND * max(one.width, one.height, other.width, other.height)
             found = guided_matches(features[a], features[b], EpipolarLine(_lines(one, other), band))
-            if len(found) < FEWEST:
+            if len(found) < FEWEST_IN_BAND:
                 continue
             places = (features[i].xy.astype(np.float64) for i in (a, b))
             geometry = pycolmap.estimate_two_view_geometry(
                 _camera(one), next(places), _camera(other), next(places), found, options
             )
-            if len(geometry.inlier_matches) >= FEWEST:
+            if len(geometry.inlier_matches) >= FEWEST_IN_BAND:
                 opened.write_two_view_geometry(image_id(a), image_id(b), geometry)
     show("matching", len(pairs), len(pairs))
     return database
@@ -140,7 +142,8 @@ def without_contradictions(matches: Path, photos: Sequence[AlignedPhoto | None])
                 (one, other, places[0][found[:, 0]], places[1][found[:, 1]]),
                 (other, one, places[1][found[:, 1]], places[0][found[:, 0]]),
             )
-            agrees = np.all([_agrees(*way) for way in ways], axis=0)
+            # The depths of one of the two photos may be wrong.
+            agrees = max((_agrees(*way) for way in ways), key=np.count_nonzero)
             if agrees.all():
                 continue
             if np.count_nonzero(agrees) >= max(FEWEST, LEAST_LEFT * len(found)):
