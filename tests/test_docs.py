@@ -42,7 +42,7 @@ NOT_RUN = {
     "README.md": 2,
     "docs/getting-started.md": 3,
     "docs/guides/cameras.md": 4,
-    "docs/guides/denoising.md": 2,
+    "docs/guides/denoising.md": 3,
     "docs/guides/installation.md": 2,
     "docs/guides/smaller-scenes.md": 1,
     "docs/guides/synthetic-captures.md": 1,
