@@ -5,7 +5,7 @@
 Each capture has true cameras; depths come from ``depth/train`` (``igsr synth``), or are those of
 the nearest of COLMAP's points. A line for each way to find the cameras: COLMAP alone, the network
 alone, both together as ``--estimator da3`` does, bundle adjustment although COLMAP places all
-photos, and the same with one photo whose depths are wrong. Errors are those of ``igsr study poses``.
+photos, and the same with one photo whose depths are wrong. Errors are as in ``igsr study poses``.
 """
 
 from __future__ import annotations
