@@ -222,7 +222,7 @@ def _print_summary(refined: Refined, out: Path, pages: list[str]) -> None:
         markup=False,
     )
     for number, done in enumerate(refined.rounds, 1):
-        if done.verdict:
+        if done.gain is not None:
             console.print(f"Round {number}: {done.verdict}", markup=False)
     if refined.first_test:
         tests = [refined.first_test, *(done.test for done in accepted)]
