@@ -1,4 +1,4 @@
-"""``igsr study table2 | table3 | sweep | refinement-ablation``: views, methods, tables."""
+"""``igsr study table2 | table3 | sweep | photographs | refinement-ablation``."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from igsr.fitting import presets
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.selection import Candidate
 from igsr.study import loop_methods
+from igsr.study.loop_gains import mean_gains, paired_gains
 from igsr.study.loop_methods import METHODS, OURS, Method
 from igsr.study.loop_runs import RunSpec, split
 from igsr.study.splits import localized, scattered
@@ -213,6 +214,38 @@ def test_the_sweep_and_the_ablation(data):
     assert len(set(after.values())) >= 4, "what is taken out shows"
 
 
+def test_photographs_tell_what_kept_rounds_gain(data):
+    """All photos but every 8th, and the gain of each held-out view."""
+    options = given(data, scenes=("ball",), seeds=2)
+    report = study.photographs(data / "data", data / "out", views=("6", "all"), **options)
+    capture = igsr.load_capture(data / "data/ball")
+    assert set(report["gains"]["ball"]) == {"even 6", f"even {len(capture.train_views)}"}
+    six = report["gains"]["ball"]["even 6"]["ours"]
+    runs = [row["methods"]["ours"]["rounds"] for row in report["runs"] if row["photos"] == 6]
+    assert six["psnr"]["gain"] == pytest.approx(
+        np.mean([run[-1]["psnr"] - run[0]["psnr"] for run in runs])
+    )
+    assert report["protocol"]["max_size"] == presets.default_max_size("cpu")
+    assert "| mean | | ours |" in (data / "out/study.md").read_text()
+
+
+def test_gains_are_paired_by_held_out_view():
+    def run(*gains):
+        before = [{"psnr": 10.0 * k, "perceptual": None} for k in range(len(gains))]
+        after = [{**one, "psnr": one["psnr"] + by} for one, by in zip(before, gains, strict=True)]
+        return {"methods": {"ours": {"rounds": [{"views": before}, {"views": after}]}}}
+
+    gains = paired_gains([run(1.0, 3.0), run(2.0, 4.0)], "ours")
+    assert set(gains) == {"psnr"}, "no view has the other scores"
+    assert gains["psnr"]["gain"] == pytest.approx(2.5)
+    assert gains["psnr"]["standard_error"] == pytest.approx(1.0), "of 1.5 and 3.5"
+    assert gains["psnr"]["seeds"] == pytest.approx(np.sqrt(0.5))
+    one = paired_gains([run(0.5)], "ours")
+    assert one["psnr"] == {"gain": 0.5, "standard_error": None, "seeds": None}
+    assert mean_gains([gains, one])["psnr"]["gain"] == pytest.approx(1.5)
+    assert mean_gains([gains, one])["psnr"]["standard_error"] == pytest.approx(1.0)
+
+
 def test_bad_arguments_are_refused_before_the_first_fit(data, igsr_here):
     for changes, message in (
         ({"methods": ("best",)}, f"methods must be of {', '.join(METHODS)}, not 'best'"),
@@ -225,6 +258,9 @@ def test_bad_arguments_are_refused_before_the_first_fit(data, igsr_here):
             study.table2(data / "data", data / "bad", **given(data, **changes))
     with pytest.raises(igsr.IgsrError, match="views must be numbers of photos, not many"):
         study.sweep(data / "data", data / "bad", views=("many",), **given(data))
+    for views in (("many",), ("0",), ()):
+        with pytest.raises(igsr.IgsrError, match='views must be numbers of photos or "all", not'):
+            study.photographs(data / "data", data / "bad", views=views, **given(data))
     assert not (data / "bad").exists()
     command = ["study", "table2", data / "data", "--out", data / "bad"]
     refused = igsr_here(*command, "--noise", "0.1")

@@ -58,8 +58,10 @@ def test_default_follows_what_photos_tell_and_gives_way_to_the_caller():
     assert settings_for("default", detailed).max_splats == 35_000
     assert settings_for("default", replace(detailed, detail=20_000.0)).max_splats == 30_000
     noise = replace(detailed, detail=90_000.0)
-    assert settings_for("default", noise).max_splats == 40_000
-    assert settings_for("default", noise, "high").max_splats == 100_000
+    assert settings_for("default", noise).max_splats == 50_000
+    assert settings_for("default", noise, "high").max_splats == 125_000
+    more = replace(detailed, photos=16)
+    assert settings_for("default", more).max_splats == round(35_000 * 2**0.4)
     given = preset_settings("default", 8, dropout=0.0, hull=True, steps=None)
     assert (given["dropout"], given["hull"]) == (0.0, True)
     assert given["steps"] == settings_for("default", 8).steps

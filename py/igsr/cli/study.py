@@ -63,6 +63,20 @@ SweptPhotosOption = Annotated[
     list[str] | None,
     typer.Option("--views", metavar="N", help="Number of photos. Repeat it for several."),
 ]
+PhotographsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--views",
+        metavar="N",
+        help="Number of photos that are fitted, or all. Repeat it for several. Default: 3 and 6.",
+    ),
+]
+PhotographsSizeOption = Annotated[
+    int | None,
+    typer.Option(
+        "--max-size", metavar="N", help="Longest side of the photos, pixels. Default: a fit's."
+    ),
+]
 WeightsOption = Annotated[
     Path | None,
     typer.Option("--weights", metavar="FILE", help="Weights of a denoiser. Default: igsr's."),
@@ -373,6 +387,30 @@ def sweep_command(
         "sweep", _rounds_line, data, out, jobs, ray, as_json,
         scenes=scenes, views=views, weights=weights, steps=steps, features=features,
         seeds=seeds, backend=backend,
+    )  # fmt: skip
+
+
+@app.command("photographs")
+def photographs_command(
+    data: DataArgument,
+    out: OutOption,
+    scenes: ScenesOption = None,
+    views: PhotographsOption = None,
+    max_size: PhotographsSizeOption = None,
+    weights: WeightsOption = None,
+    steps: StepsOption = None,
+    features: FeaturesOption = None,
+    seeds: SeedsOption = None,
+    backend: FitBackendOption = FitBackendChoice.auto,
+    jobs: JobsOption = 1,
+    ray: RayOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Refine by two rounds from few photos of real captures, and tell the paired gain."""
+    _run(
+        "photographs", _rounds_line, data, out, jobs, ray, as_json,
+        scenes=scenes, views=views, max_size=max_size, weights=weights, steps=steps,
+        features=features, seeds=seeds, backend=backend,
     )  # fmt: skip
 
 

@@ -47,10 +47,10 @@ SPLATS_PER_PIXEL = 0.11
 FEW, SPLATS_POWER = 8.0, 0.4
 MOST_SPLATS = 1_000_000
 #: Small photos may have this many, or so many per pixel: they cost little there.
-SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL = 30_000, 0.3
-#: Photos of much detail have a splat for each of their squares of one tone, at most so many per
-#: pixel: what is finer is noise.
-DETAIL_PER_PIXEL = 0.4
+SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL = 45_000, 0.3
+#: Photos of much detail have a splat for each of their squares of one tone, times the same power,
+#: at most so many per pixel: what is finer is noise.
+DETAIL_PER_PIXEL = 0.5
 #: What depths of photos count at first, where there are any. Their relative difference is compared
 #: with differences of colors in 0..1.
 DEPTH_WEIGHT = 1.0
@@ -182,9 +182,12 @@ def _default(
         usual = min(MOST_STEPS, STEPS + STEPS_MORE * photos, STEPS_PER_PHOTO * photos)
         steps = round(more_steps * usual * (JOINT_STEPS if joint else 1))
     rate = 1.0 if joint else min(MOST_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps)))
-    splats = SPLATS_PER_PIXEL * support.pixels * (support.photos / FEW) ** SPLATS_POWER
-    splats = max(splats, min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * support.pixels))
-    splats = max(splats, min(support.detail, DETAIL_PER_PIXEL * support.pixels))
+    more = (support.photos / FEW) ** SPLATS_POWER
+    splats = max(
+        SPLATS_PER_PIXEL * support.pixels * more,
+        min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * support.pixels),
+        min(support.detail * more, DETAIL_PER_PIXEL * support.pixels),
+    )
     return replace(
         _DEFAULT,
         steps=steps,

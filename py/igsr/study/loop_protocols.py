@@ -18,11 +18,13 @@ from igsr.capture import load_capture
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance
 from igsr.denoiser.weights import load_network
 from igsr.errors import IgsrError
-from igsr.fitting.presets import preset_settings
+from igsr.fitting.presets import default_max_size, preset_settings
 from igsr.refinement.stages import SELECTED
+from igsr.study.loop_gains import gains_table, mean_gains, paired_gains
 from igsr.study.loop_methods import METHODS, OURS, PAPER, Method
 from igsr.study.loop_runs import FAR, NEAR, RunSpec, StudySpec, run_refinement, split
 from igsr.study.loop_tables import plot_rounds, summarized, write_run_sheet, write_table
+from igsr.study.splits import HOLDOUT
 
 PathLike = str | os.PathLike[str]
 OnRun = Callable[[int, int, dict[str, Any]], None]
@@ -43,6 +45,11 @@ TABLE3_PAPER = (
 TABLE2_METHODS = ("improvement", "absolute", "ours")
 TABLE3_METHODS = ("absolute", "ours")
 SWEPT_PHOTOS, SWEPT_VIEWS, SWEPT_ROUNDS = ("4", "6", "10", "15"), (1, 2, 4), 4
+#: Photos that are fitted of photographs, and what stands for all that are not held out.
+ALL = "all"
+PHOTOGRAPHS = ("3", "6")
+#: Size in pixels that photos have where they are only counted.
+READ_SIZE = 32
 #: Photos of the captures that the ablation is made on; others have 10.
 ABLATION_PHOTOS = {"tankard": 6, "fern": 3}
 ABLATION_METHODS = (*OURS, "improvement")
@@ -60,6 +67,7 @@ class _Options:
     jobs: int
     on_run: OnRun | None
     ray: bool
+    max_size: int | None = None
 
 
 def table2(
@@ -167,6 +175,69 @@ def sweep(
     return _study(title, (), data, out, kinds, chosen, options)
 
 
+def photographs(
+    data: PathLike,
+    out: PathLike,
+    *,
+    scenes: tuple[str, ...] = ("fern",),
+    views: tuple[str, ...] = PHOTOGRAPHS,
+    max_size: int | None = None,
+    weights: PathLike | None = None,
+    features: PathLike | None = None,
+    steps: int | None = None,
+    seeds: int = 3,
+    backend: FitBackend = "cpu",
+    jobs: int = 1,
+    on_run: OnRun | None = None,
+    ray: bool = False,
+) -> dict[str, Any]:
+    """Two rounds from few photos of real captures, as ``igsr.refine`` does them.
+
+    Every 8th photo is held out, as in LLFF's protocol; those that are fitted are evenly spaced
+    among the others.
+
+    Args:
+        data, out, scenes, weights, features, steps, seeds, backend, jobs, on_run, ray: as in
+            ``table2``.
+        views: numbers of photos; "all" are all that are not held out.
+        max_size: longest side of the photos in pixels; larger ones are reduced. None is what a fit
+            by this backend takes.
+
+    Returns:
+        As ``table2``; "gains" and "mean_gains" say what the kept rounds gained, paired.
+
+    Raises:
+        IgsrError: as ``table2``.
+    """
+    if max_size is None:
+        max_size = default_max_size(backend)
+    kinds = [
+        (scene, "even", count) for scene in scenes for count in _numbers(views, Path(data) / scene)
+    ]
+    title = "Photographs: two rounds, each kept only if it helps on folds"
+    options = _Options(weights, features, steps, seeds, backend, jobs, on_run, ray, max_size)
+    return _study(title, (), data, out, kinds, [Method("ours", "ours", SELECTED, 2, True)], options)
+
+
+def _numbers(views: Sequence[str], scene: Path) -> list[int]:
+    """Numbers of photos of a scene.
+
+    Raises:
+        IgsrError: one is neither a number nor "all", or the scene cannot be read.
+    """
+    if not views or not all(text == ALL or (text.isdecimal() and int(text)) for text in views):
+        raise IgsrError(
+            f'views must be numbers of photos or "{ALL}", not {", ".join(views) or "none"}.'
+        )
+    if ALL not in views:
+        return [int(text) for text in views]
+    capture = load_capture(scene, max_size=READ_SIZE)
+    fitted = len(capture.train_views)
+    if not capture.test_views:
+        fitted -= -(-fitted // HOLDOUT)
+    return list(dict.fromkeys(fitted if text == ALL else int(text) for text in views))
+
+
 def refinement_ablation(
     data: PathLike,
     out: PathLike,
@@ -225,6 +296,7 @@ def _study(
         None if options.weights is None else str(options.weights),
         None if options.features is None else str(options.features),
         options.steps,
+        options.max_size,
     )
     specs = [
         RunSpec(scene, layout, photos, seed, options.backend)
@@ -232,7 +304,7 @@ def _study(
         for scene, layout, photos in kinds
     ]
     for spec in specs:  # an error in the last scene must not come up hours later
-        split(load_capture(Path(data) / spec.scene), spec)
+        split(load_capture(Path(data) / spec.scene, max_size=study.max_size), spec)
     rows = finished_runs(
         out / "runs",
         [_job(spec, study) for spec in specs],
@@ -245,7 +317,7 @@ def _study(
     report = _report(title, paper, kinds, study, options, rows)
     with atomic_write(out / "study.json") as temporary:
         temporary.write_text(json.dumps(report, indent=2, allow_nan=False), encoding="utf-8")
-    write_table(out / "study.md", report)
+    write_table(out / "study.md", report, gains_table(report))
     plot_rounds(out / "study.png", report)
     for spec in (spec for spec in specs if spec.seed == 0):
         write_run_sheet(out, spec, methods)
@@ -272,6 +344,7 @@ def _check(methods: Sequence[Method], options: _Options) -> None:
 def _job(spec: RunSpec, study: StudySpec) -> Run:
     """A run, with all that its result depends on."""
     settings = preset_settings("default", spec.photos, steps=study.steps) | study.file_hashes
+    settings["max_size"] = study.max_size
     settings["methods"] = [list(vars(one).values()) for one in study.methods]
     return Run(spec.name, spec, settings, scene=spec.scene)
 
@@ -286,10 +359,14 @@ def _report(
 ) -> dict[str, Any]:
     """What ``study.json`` holds."""
     scenes: dict[str, Any] = {}
+    gains: dict[str, Any] = {}
     for kind in kinds:
         same = [row for row in rows if (row["scene"], row["layout"], row["photos"]) == kind]
         scene, layout, photos = kind
         scenes.setdefault(scene, {})[f"{layout} {photos}"] = summarized(same)
+        gains.setdefault(scene, {})[f"{layout} {photos}"] = {
+            one.name: paired_gains(same, one.name) for one in study.methods
+        }
     layouts = dict.fromkeys(layout for _, layout, _ in kinds)
     return {
         "title": title,
@@ -299,10 +376,16 @@ def _report(
             "backend": options.backend,
             "near": NEAR,
             "far": FAR,
+            "max_size": study.max_size,
             "rounds": [vars(one) for one in study.methods],
             "weights": study.file_hashes["weights"],
         },
         "scenes": scenes,
+        "gains": gains,
+        "mean_gains": {
+            one.name: mean_gains([of[one.name] for by in gains.values() for of in by.values()])
+            for one in study.methods
+        },
         "runs": list(rows),
         "paper": list(paper),
     } | {layout: summarized([row for row in rows if row["layout"] == layout]) for layout in layouts}

@@ -83,6 +83,7 @@ class StudySpec:
         weights: the denoiser's file; None is igsr's own.
         features: SqueezeNet's arrays, for "perceptual" and the paper's methods; None is without.
         steps: of each fit; None is the default preset's.
+        max_size: longest side of the photos in pixels; larger ones are reduced. None leaves them.
     """
 
     out: str
@@ -90,6 +91,7 @@ class StudySpec:
     weights: str | None
     features: str | None
     steps: int | None
+    max_size: int | None = None
 
     @property
     def file_hashes(self) -> dict[str, str | None]:
@@ -103,14 +105,16 @@ class StudySpec:
 class RoundRow(TypedDict, total=False):
     """Scores of the held-out views after a round; 0 is the first fit.
 
-    "near" and "far" have the scores of some of the views and their number, or None where there are
-    none. The row of a round that was rolled back has the scores of the round before.
+    "views" has the scores of each view, "near" and "far" those of some of them and their number, or
+    None where there are none. The row of a round that was rolled back has the scores of the round
+    before.
     """
 
     psnr: float
     ssim: float
     flip: float
     perceptual: float
+    views: list[dict[str, float | None]]
     near: dict[str, float] | None
     far: dict[str, float] | None
     splats: int
@@ -157,7 +161,8 @@ def run_refinement(study: StudySpec, data: str, spec: RunSpec) -> dict[str, Any]
     Raises:
         IgsrError: the scene cannot be read or has too few photos, or a fit fails.
     """
-    photos, held_out, given = split(load_capture(Path(data) / spec.scene), spec)
+    capture = load_capture(Path(data) / spec.scene, max_size=study.max_size)
+    photos, held_out, given = split(capture, spec)
     distance = None if study.features is None else SqueezeNetDistance(study.features)
     scorer = _Scorer(held_out, photos, spec.backend, distance)
     folder = Path(study.out) / "rounds" / spec.name
@@ -248,6 +253,7 @@ class _Scorer:
         far = [row for row, counts in zip(rows, self._far, strict=True) if counts]
         return {
             **_means(rows),  # type: ignore[typeddict-item]
+            "views": rows,
             "near": {"views": len(near), **_means(near)} if near else None,
             "far": {"views": len(far), **_means(far)} if far else None,
         }

@@ -64,8 +64,13 @@ def _lines(report: dict[str, Any]) -> list[tuple[str, str, str, list[dict[str, A
     ]
 
 
-def write_table(path: Path, report: dict[str, Any]) -> None:
-    """Write the table, with the paper's own figures under it.
+def write_table(path: Path, report: dict[str, Any], gains: Sequence[str]) -> None:
+    """Write the table, with what rounds gained and the paper's own figures under it.
+
+    Args:
+        path: of the file.
+        report: what ``study.json`` holds.
+        gains: lines of ``igsr.study.loop_gains.gains_table``.
 
     Raises:
         IgsrError: the file cannot be written.
@@ -78,7 +83,7 @@ def write_table(path: Path, report: dict[str, Any]) -> None:
         f"{report['protocol']['far']:g} far.",
         "",
     ]
-    lines += _table(_lines(report))
+    lines += [*_table(_lines(report)), "", *gains]
     if report.get("paper"):
         lines += ["", "The paper's own (PSNR / SSIM / LPIPS, 5 000 iterations, DUSt3R poses):", ""]
         lines += [f"* {row}" for row in report["paper"]]
