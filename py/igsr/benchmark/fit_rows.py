@@ -126,8 +126,10 @@ def fitted_model(capture: Capture, count: int, models: Path, seed: int) -> Splat
     if path.is_file():
         return Splats.load(path)
     # Relocation grows the model up to the number asked for; the original control stops where the
-    # photos ask for no more.
-    splats = fit(capture, FIT_STEPS, seed=seed, max_splats=count, density="mcmc")
+    # photos ask for no more, and removing floaters would leave fewer.
+    splats = fit(
+        capture, FIT_STEPS, seed=seed, max_splats=count, density="mcmc", remove_floaters=False
+    )
     if len(splats) < (1.0 - COUNT_TOLERANCE) * count:
         raise IgsrError(
             f"A fit of {capture.path} ended with {len(splats)} splats, not {count}; "
