@@ -35,12 +35,12 @@ from igsr.denoiser.training.pair_files import Pairs, read_pairs, write_pairs
 from igsr.denoiser.training.pair_sets import kept_for_validation
 from igsr.denoiser.training.pairs import capture_of_pairs
 from igsr.denoiser.training.perceptual_distance import SqueezeNetDistance, _Lpips, lpips_distance
-from igsr.denoiser.training.plot_training import plot_training
-from igsr.denoiser.training.train_network import train
-from igsr.denoiser.training.training_run import CHECKPOINT, LOG, WEIGHTS
+from igsr.denoiser.training.train_network import WEIGHTS, train
 from igsr.denoiser.training.training_settings import Training
 from igsr.denoiser.warping import Source
 from igsr.rendering.renders import Render
+from igsr.training.plot_training import plot_training
+from igsr.training.training_run import CHECKPOINT, LOG
 
 SMALL = Architecture(width=4, blocks=(1, 1, 1))
 
@@ -450,7 +450,7 @@ def test_a_training_that_was_stopped_ends_with_the_same_weights(tmp_path, loss):
     train(pairs, tmp_path / "b", training, SMALL, log_every=4, checkpoint_every=4, resume=True)
     assert [row["step"] for row in log_of(tmp_path / "b")] == [4, 8, 12]
 
-    other = "is of a training with other pairs or settings"
+    other = "is of a training with other data or settings"
     with pytest.raises(igsr.IgsrError, match=other):
         train(pairs, tmp_path / "b", replace(training, rate=1e-4), SMALL, resume=True)
     with pytest.raises(igsr.IgsrError, match=other):

@@ -32,7 +32,7 @@ MOVED: dict[str, tuple[str, ...]] = {
     "igsr.denoiser.pair_renders": ("igsr.denoiser.training.pair_renders",),
     "igsr.denoiser.pairs": ("igsr.denoiser.training.pairs",),
     "igsr.denoiser.perceptual": ("igsr.denoiser.training.perceptual_distance",),
-    "igsr.denoiser.plot": ("igsr.denoiser.training.plot_training",),
+    "igsr.denoiser.plot": ("igsr.training.plot_training",),
     "igsr.fitter": ("igsr.fitting.fitter",),
     "igsr.halved": ("igsr.capture.downscaling",),
     "igsr.initialization": (

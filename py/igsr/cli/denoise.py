@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import enum
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBar
 
 from igsr.cli.denoiser_option import DenoiserOption, chosen_denoiser
 from igsr.cli.error_messages import error_messages
@@ -31,8 +27,8 @@ from igsr.cli.shared import (
     picture_name,
     print_json,
     resolved,
-    stopped,
 )
+from igsr.cli.training_bar import training_bar
 from igsr.denoiser.architecture import Architecture
 from igsr.denoiser.training.training_settings import Training
 from igsr.errors import IgsrError
@@ -183,9 +179,9 @@ def train_command(
         SqueezeNetDistance,
         lpips_distance,
     )
-    from igsr.denoiser.training.plot_training import plot_training
-    from igsr.denoiser.training.train_network import train
-    from igsr.denoiser.training.training_run import LOG, WEIGHTS, TrainingProgress
+    from igsr.denoiser.training.train_network import WEIGHTS, train
+    from igsr.training.plot_training import plot_training
+    from igsr.training.training_run import LOG
 
     with error_messages(
         lambda: f"Interrupted; go on from the last checkpoint in {out} with --resume."
@@ -202,11 +198,7 @@ def train_command(
         if not files:
             raise IgsrError(f"{pairs} holds no .npz of pairs; make some with igsr denoise pairs.")
         training = Training(**given)
-        with _bar(training.steps) as show:
-
-            def progress(now: TrainingProgress) -> None:
-                show(now.step, now.parts)
-
+        with training_bar(training.steps) as progress:
             train(
                 files,
                 out,
@@ -230,26 +222,6 @@ def train_command(
         f"{out / WEIGHTS}",
         markup=False,
     )
-
-
-@contextlib.contextmanager
-def _bar(steps: int) -> Iterator[Any]:
-    bar = ProgressBar(
-        TextColumn("train {task.completed}/{task.total}"),
-        BarColumn(bar_width=30),
-        TextColumn("{task.fields[parts]}"),
-        TimeRemainingColumn(compact=True),
-        console=error_console(),
-    )
-    task = bar.add_task("train", total=steps, parts="")
-    with stopped(bar):
-
-        def show(step: int, parts: dict[str, float]) -> None:
-            bar.start()
-            text = "  ".join(f"{name} {value:.4g}" for name, value in list(parts.items())[:3])
-            bar.update(task, completed=step, parts=text)
-
-        yield show
 
 
 @app.command("apply")

@@ -14,8 +14,8 @@ from igsr._internal.lazy_exports import lazy_exports
 if TYPE_CHECKING:
     from igsr.denoiser.training.pairs import make_pairs
     from igsr.denoiser.training.train_network import train
-    from igsr.denoiser.training.training_run import TrainingProgress
     from igsr.denoiser.training.training_settings import Training
+    from igsr.training.training_run import TrainingProgress
 
 __all__ = ["Training", "TrainingProgress", "make_pairs", "train"]
 
@@ -25,11 +25,12 @@ if not TYPE_CHECKING:
         {
             "igsr.denoiser.training.pairs": ("make_pairs",),
             "igsr.denoiser.training.train_network": ("train",),
-            "igsr.denoiser.training.training_run": ("TrainingProgress",),
             "igsr.denoiser.training.training_settings": ("Training",),
+            "igsr.training.training_run": ("TrainingProgress",),
         },
         moved={
             "igsr.denoiser.training.distributed": ("is_first_process",),
-            "igsr.denoiser.training.training_run": ("LOG", "WEIGHTS"),
+            "igsr.denoiser.training.train_network": ("WEIGHTS",),
+            "igsr.training.training_run": ("LOG",),
         },
     )

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
 
 from igsr.denoiser.inputs import COLOR
 from igsr.denoiser.network import DenoiserNetwork
@@ -15,11 +12,7 @@ from igsr.denoiser.training.crops import Batch
 from igsr.denoiser.training.distributed import Processes
 from igsr.denoiser.training.losses import Loss, Prediction
 from igsr.denoiser.training.training_settings import Training
-
-#: The weights kept are a moving average over about the last tenth of the steps, at most over these.
-AVERAGED_STEPS = 500
-#: Gradients are scaled down to this norm, of all weights together.
-MOST_GRADIENT = 1.0
+from igsr.training.optimization import average, descend, optimizer, schedule
 
 
 class Learner:
@@ -46,31 +39,31 @@ class Learner:
         self._shared = processes.shared(self.network)
         self.averaged = _placed(DenoiserNetwork(network.architecture), self.device).eval()
         self.averaged.load_state_dict(network.state_dict())
-        self._adam = _adam(self.network, training)
+        self._adam = optimizer(self.network, training.weight_decay)
         self.discriminator = loss.discriminator.to(self.device) if loss.discriminator else None
         self._discriminator_adam = (
-            _adam(self.discriminator, training) if self.discriminator else None
+            optimizer(self.discriminator, training.weight_decay) if self.discriminator else None
         )
         self.step = 0
 
     def learn(self, batch: Batch) -> dict[str, float]:
         """Do one step; returns the parts of the loss before it, by name."""
-        rate = self._training.rate * _schedule(self.step, self._training.steps)
+        rate = self._training.rate * schedule(self.step, self._training.steps)
         made = self._predicted(batch)
         total, parts = self._loss(made)
-        _step(self._adam, total, rate)  # ``_shared`` has averaged its gradients
+        descend(self._adam, rate, total.backward)  # ``_shared`` averages the gradients
         if self.discriminator is not None and self._discriminator_adam is not None:
             discriminator, processes = self.discriminator, self._processes
             wrong = discriminator.loss(made)
-            _step(
-                self._discriminator_adam,
-                wrong,
-                rate,
-                lambda: processes.average_gradients(discriminator),
-            )
+
+            def backward() -> None:
+                wrong.backward()
+                processes.average_gradients(discriminator)
+
+            descend(self._discriminator_adam, rate, backward)
             parts["discriminator"] = float(wrong.detach())
         self.step += 1
-        self._average()
+        average(self.averaged, self.network, self.step)
         return parts
 
     def _predicted(self, batch: Batch) -> Prediction:
@@ -81,16 +74,6 @@ class Learner:
         image = torch.where(batch.known, image.float(), batch.truth)
         log_error = torch.where(batch.known, log_error.float(), log_error.detach().float())
         return Prediction(batch.inputs[:, :COLOR], image, log_error, batch.truth)
-
-    def _average(self) -> None:
-        # The first update of torch.optim.swa_utils.AveragedModel copies the weights; here the
-        # initial ones count, too.
-        share = 1.0 / min(1.0 + self.step / 10.0, AVERAGED_STEPS)
-        with torch.no_grad():
-            for mean, now in zip(
-                self.averaged.parameters(), self.network.parameters(), strict=True
-            ):
-                mean.lerp_(now, share)
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint holds: a state dict for each part, and "step"."""
@@ -113,32 +96,3 @@ class Learner:
 
 def _placed(network: DenoiserNetwork, device: torch.device) -> DenoiserNetwork:
     return network.to(device).to(memory_format=torch.channels_last)
-
-
-def _adam(network: nn.Module, training: Training) -> torch.optim.AdamW:
-    return torch.optim.AdamW(network.parameters(), weight_decay=training.weight_decay)
-
-
-def _step(
-    adam: torch.optim.AdamW,
-    loss: Tensor,
-    rate: float,
-    average_gradients: Callable[[], None] | None = None,
-) -> None:
-    for group in adam.param_groups:
-        group["lr"] = rate
-    adam.zero_grad()
-    loss.backward()
-    if average_gradients is not None:
-        average_gradients()
-    weights = [weight for group in adam.param_groups for weight in group["params"]]
-    nn.utils.clip_grad_norm_(weights, MOST_GRADIENT)
-    adam.step()
-
-
-def _schedule(step: int, steps: int) -> float:
-    """The rate's part of its highest: it warms up over a hundredth, then falls as a cosine."""
-    warm_up = max(1, steps // 100)
-    if step < warm_up:
-        return (step + 1) / warm_up
-    return 0.5 + 0.5 * math.cos(math.pi * (step - warm_up) / max(1, steps - warm_up))

@@ -21,11 +21,13 @@ from igsr.denoiser.training.learner import Learner
 from igsr.denoiser.training.losses import Loss
 from igsr.denoiser.training.pair_sets import PairSets, read_pair_sets
 from igsr.denoiser.training.perceptual_distance import Distance, distance_name
-from igsr.denoiser.training.training_run import TrainingProgress, TrainingRun
 from igsr.denoiser.training.training_settings import Training
 from igsr.denoiser.training.validation import validated
-from igsr.denoiser.weights import load_network
+from igsr.denoiser.weights import load_network, save_network
 from igsr.errors import IgsrError
+from igsr.training.training_run import TrainingProgress, TrainingRun
+
+WEIGHTS = "denoiser.safetensors"
 
 
 def train(
@@ -93,19 +95,15 @@ def train(
         checkpoint_every=checkpoint_every,
     )
 
-    run.start(learner, resume)
-    while learner.step < training.steps:
-        batch = draw_batch(sets.train, training, learner.step, share, processes.device)
-        parts = learner.learn(batch)
-        run.stepped(learner.step, parts)
-        row = dict(parts) if run.logs_at(learner.step) else {}
-        if run.checkpoint_at(learner.step):
-            row |= validated(learner.averaged, validation, distance, processes.device)
-        run.log(learner.step, row)
-        # After its row of the log: what comes later is cut from there, what lacks stays lacking.
-        if run.checkpoint_at(learner.step):
-            run.save_checkpoint(learner)
-    run.save_weights(learner)
+    def learn(step: int) -> dict[str, float]:
+        return learner.learn(draw_batch(sets.train, training, step, share, processes.device))
+
+    def validate() -> dict[str, float]:
+        return validated(learner.averaged, validation, distance, processes.device)
+
+    run.train(learner, learn, validate, resume=resume)
+    if processes.first:
+        save_network(learner.averaged, out / WEIGHTS, run.recipe())
     processes.end()
     return learner.averaged.to("cpu").eval()
 

@@ -1,4 +1,4 @@
-"""The run of a training: its time, its log, its checkpoints, and who is told how it goes."""
+"""The run of a training: its steps, time, log and checkpoints, and who is told how it goes."""
 
 from __future__ import annotations
 
@@ -8,19 +8,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
-from igsr.denoiser.training.learner import Learner
-from igsr.denoiser.weights import save_network
 from igsr.errors import IgsrError
 
 CHECKPOINT = "checkpoint.pt"
 LOG = "log.jsonl"
-WEIGHTS = "denoiser.safetensors"
 #: Steps between checkpoints, at most.
 MOST_BETWEEN = 500
 
@@ -42,11 +39,31 @@ class TrainingProgress:
     seconds: float
 
 
+class Learner(Protocol):
+    """What learns.
+
+    Attributes:
+        step: steps done.
+        device: where its arrays are.
+    """
+
+    step: int
+    device: torch.device
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds, "step" among it, but neither "seconds" nor "about"."""
+        ...
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state`` gave."""
+        ...
+
+
 class TrainingRun:
-    """The files of a training in its folder, and the time that it takes.
+    """The steps of a training, its files in its folder, and the time that it takes.
 
     Args:
-        out: folder for the log, the checkpoint and the weights.
+        out: folder for the log and the checkpoint.
         about: what the result depends on; a checkpoint of another training is refused.
         steps: steps in all.
         writes: whether this process writes files and reports progress.
@@ -70,7 +87,7 @@ class TrainingRun:
         log_every: int,
         checkpoint_every: int | None,
     ) -> None:
-        """Note what to do; ``start`` begins."""
+        """Note what to do; ``train`` begins."""
         if log_every < 1 or (checkpoint_every is not None and checkpoint_every < 1):
             raise IgsrError("log_every and checkpoint_every must be at least 1.")
         self._out, self._about, self._steps = out, about, steps
@@ -81,12 +98,50 @@ class TrainingRun:
         self._started = time.monotonic()
         self._board: Any = None
 
-    def start(self, learner: Learner, resume: bool) -> None:
-        """Begin, or go on from the checkpoint if there is one and ``resume`` says so.
+    def train(
+        self,
+        learner: Learner,
+        learn: Callable[[int], dict[str, float]],
+        validate: Callable[[], dict[str, float]],
+        *,
+        resume: bool,
+        validate_first: bool = False,
+    ) -> None:
+        """Learn from where the learner stands to the last step.
+
+        Args:
+            learner: what learns.
+            learn: does the step after the given number of steps, and returns parts of the loss.
+            validate: scores by name.
+            resume: go on from the checkpoint, if there is one.
+            validate_first: whether what has learned nothing yet is validated, too.
 
         Raises:
-            IgsrError: the checkpoint is damaged or of another training.
+            IgsrError: the checkpoint is damaged or of another training, or a part of the loss is
+                not finite.
         """
+        self._start(learner, resume)
+        if validate_first and learner.step == 0:
+            self._write_row(0, validate())
+        while learner.step < self._steps:
+            parts = learn(learner.step)
+            step = learner.step
+            self._stepped(step, parts)
+            row = dict(parts) if step % self._log_every == 0 or step == self._steps else {}
+            checkpoint = step % self._checkpoint_every == 0 or step == self._steps
+            if checkpoint:
+                row |= validate()
+            self._write_row(step, row)
+            # After its row of the log: what comes later is cut from there, what lacks stays
+            # lacking.
+            if checkpoint:
+                self._save_checkpoint(learner)
+
+    def recipe(self) -> dict[str, Any]:
+        """What came out was trained on and how, and with which igsr; to be kept beside it."""
+        return {"igsr": _core.__version__, **self._about, "seconds": round(self._seconds)}
+
+    def _start(self, learner: Learner, resume: bool) -> None:
         if resume and (self._out / CHECKPOINT).is_file():
             self._restore(learner)
         if self._writes:
@@ -94,27 +149,14 @@ class TrainingRun:
             self._board = _tensorboard(self._out)
         self._started = time.monotonic() - self._seconds
 
-    def stepped(self, step: int, parts: dict[str, float]) -> None:
-        """Take the time after a step.
-
-        Raises:
-            IgsrError: a part of the loss is not finite.
-        """
+    def _stepped(self, step: int, parts: dict[str, float]) -> None:
         self._seconds = time.monotonic() - self._started
         if not all(math.isfinite(part) for part in parts.values()):
             raise IgsrError(
                 f"the loss is not finite at step {step}; train with a lower rate, in another --out."
             )
 
-    def logs_at(self, step: int) -> bool:
-        """Whether the parts of the loss of this step are logged."""
-        return step % self._log_every == 0 or step == self._steps
-
-    def checkpoint_at(self, step: int) -> bool:
-        """Whether a validation and a checkpoint follow this step."""
-        return step % self._checkpoint_every == 0 or step == self._steps
-
-    def log(self, step: int, row: dict[str, float]) -> None:
+    def _write_row(self, step: int, row: dict[str, float]) -> None:
         """Write a row of the log and report progress; an empty row is none."""
         if not (row and self._writes):
             return
@@ -127,19 +169,12 @@ class TrainingRun:
         if self._progress is not None:
             self._progress(TrainingProgress(step, self._steps, row, self._seconds))
 
-    def save_checkpoint(self, learner: Learner) -> None:
-        """Write a checkpoint that ``start`` goes on from."""
+    def _save_checkpoint(self, learner: Learner) -> None:
         if not self._writes:
             return
         content = learner.state() | {"seconds": self._seconds, "about": self._about}
         with atomic_write(self._out / CHECKPOINT) as temporary:
             torch.save(content, temporary)
-
-    def save_weights(self, learner: Learner) -> None:
-        """Write the denoiser that came out, with what it was trained on and how."""
-        if self._writes:
-            recipe = {"igsr": _core.__version__, **self._about, "seconds": round(self._seconds)}
-            save_network(learner.averaged, self._out / WEIGHTS, recipe)
 
     def _restore(self, learner: Learner) -> None:
         path = self._out / CHECKPOINT
@@ -152,7 +187,7 @@ class TrainingRun:
             ) from error
         if not same:
             raise IgsrError(
-                f"{path} is of a training with other pairs or settings; repeat those, or use "
+                f"{path} is of a training with other data or settings; repeat those, or use "
                 "another --out."
             )
         learner.load_state(content)

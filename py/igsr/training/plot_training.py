@@ -9,6 +9,10 @@ from typing import Any
 from igsr._internal.atomic_write import atomic_write
 from igsr.errors import IgsrError
 
+#: What a score is held against, as the end of its name: the same before what was trained is
+#: applied, or of an answer that looks at nothing.
+BESIDE = ("_before", "_constant")
+
 
 def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
     """Plot every quantity of a training's log over its steps; returns the log's rows.
@@ -23,13 +27,13 @@ def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError) as error:
         raise IgsrError(f"{log} cannot be read ({error}); train again.") from error
     names = list(dict.fromkeys(key for row in rows for key in row))
-    # A score before has no axis of its own: it lies beside the one after, and what is validated
-    # beside what is trained.
+    # What a score is held against has no axis of its own: it lies beside the score, and what is
+    # validated beside what is trained.
     drawn = [
         name
         for name in names
         if name not in ("step", "seconds")
-        and not name.endswith("_before")
+        and not name.endswith(BESIDE)
         and name.removeprefix("validation_") not in set(names) - {name}
     ]
     if not drawn:
@@ -39,13 +43,12 @@ def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
     for axis in axes[len(drawn) :]:
         axis.remove()
     for axis, name in zip(axes, drawn, strict=False):
-        also = f"validation_{name}"
-        for key, style in (
-            (name, "-"),
-            (f"{name}_before", "--"),
-            (also, "-"),
-            (f"{also}_before", "--"),
-        ):
+        drawn_here = [
+            (f"{one}{end}", style)
+            for one in (name, f"validation_{name}")
+            for end, style in (("", "-"), *((end, "--") for end in BESIDE))
+        ]
+        for key, style in drawn_here:
             known = [(row["step"], row[key]) for row in rows if key in row]
             if known:
                 # A line of one point would not show.
