@@ -39,9 +39,10 @@ def pose_accuracy(
 
     Returns:
         "photos" and "registered", counts; "RRA@5", "RTA@5", "RRA@15", "RTA@15" and "mAA@30", parts
-        in 0..1 of all pairs; "rotation", the median over registered pairs in degrees, "ATE" in
-        units of the true world and "ATE_relative", in units of the root mean square distance of the
-        registered photos' true centres from their mean: None with fewer than two registered.
+        in 0..1 of all pairs; "rotation" and "translation" (its direction), the medians over
+        registered pairs in degrees, "ATE" in units of the true world and "ATE_relative", in units
+        of the root mean square distance of the registered photos' true centres from their mean:
+        None with fewer than two registered.
 
     Raises:
         IgsrError: the lists are not equally long or shorter than two.
@@ -58,9 +59,9 @@ def pose_accuracy(
             rotations.append(180.0)
             translations.append(180.0)
             continue
-        found, true = _relative(a, b), _relative(true_cameras[i], true_cameras[j])
+        found, true = relative_pose(a, b), relative_pose(true_cameras[i], true_cameras[j])
         rotations.append(rotation_angle(found[:3, :3] @ true[:3, :3].T))
-        translations.append(_direction_angle(found[:3, 3], true[:3, 3]))
+        translations.append(direction_angle(found[:3, 3], true[:3, 3]))
     rotation, translation = np.array(rotations), np.array(translations)
     worse = np.maximum(rotation, translation)
     result: dict[str, Any] = {
@@ -71,15 +72,18 @@ def pose_accuracy(
         result[f"RRA@{limit:g}"] = float(np.mean(rotation < limit))
         result[f"RTA@{limit:g}"] = float(np.mean(translation < limit))
     result[f"mAA@{LARGEST}"] = float(np.mean([np.mean(worse < t) for t in range(1, LARGEST + 1)]))
-    return {**result, **_absolute(cameras, true_cameras, rotation)}
+    return {**result, **_absolute(cameras, true_cameras, rotation, translation)}
 
 
 def _absolute(
-    cameras: Sequence[Camera | None], true_cameras: Sequence[Camera], rotation: Float64
+    cameras: Sequence[Camera | None],
+    true_cameras: Sequence[Camera],
+    rotation: Float64,
+    translation: Float64,
 ) -> dict[str, float | None]:
     pairs = [(c, t) for c, t in zip(cameras, true_cameras, strict=True) if c is not None]
     if len(pairs) < 2:
-        return dict.fromkeys(("rotation", "ATE", "ATE_relative"))
+        return dict.fromkeys(("rotation", "translation", "ATE", "ATE_relative"))
     placed = [
         cameras[i] is not None and cameras[j] is not None
         for i, j in combinations(range(len(cameras)), 2)
@@ -92,18 +96,19 @@ def _absolute(
     size = float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean()))
     return {
         "rotation": float(np.median(rotation[placed])),
+        "translation": float(np.median(translation[placed])),
         "ATE": error,
         "ATE_relative": error / size if size > 0.0 else None,
     }
 
 
-def _relative(a: Camera, b: Camera) -> Float64:
+def relative_pose(a: Camera, b: Camera) -> Float64:
     """From the frame of camera a to that of camera b, [4, 4]."""
     relative: Float64 = b.viewmat @ np.linalg.inv(a.viewmat)
     return relative
 
 
-def _direction_angle(a: Float64, b: Float64) -> float:
+def direction_angle(a: Float64, b: Float64) -> float:
     """Degrees between two directions; a camera that did not move has none, which is wrong."""
     lengths = np.linalg.norm(a), np.linalg.norm(b)
     if min(lengths) == 0.0:

@@ -164,6 +164,21 @@ def synthesize(
     }
 
 
+def is_made(
+    out: str | os.PathLike[str], index: int, *, seed: int = 0, settings: CaptureSettings
+) -> bool:
+    """Whether ``synthesize`` would find a scene there already.
+
+    Args:
+        out, seed, settings: as ``synthesize`` takes them.
+        index: the scene's number.
+
+    Raises:
+        IgsrError: the folder holds a scene of other settings, or what is no finished scene.
+    """
+    return _finished(Path(out) / scene_name(index), _recipe(seed, index, settings)) is not None
+
+
 def scene_name(index: int) -> str:
     """The name of a scene's folder."""
     return f"scene_{index:05d}"

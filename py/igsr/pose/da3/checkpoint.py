@@ -10,7 +10,7 @@ import json
 import os
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from igsr.errors import IgsrError
-from igsr.pose.da3.config import SIZES, NetworkConfig, size_of
+from igsr.pose.da3.config import RESOLUTION, SIZES, TRAINED, NetworkConfig, resolution_of, size_of
 from igsr.pose.da3.head import RAY_LEVEL, SHARED_NORM
 from igsr.pose.da3.network import Da3Network
 from igsr.pose.huggingface_cache import cached_snapshots
@@ -28,7 +28,8 @@ from igsr.pose.huggingface_cache import cached_snapshots
 VARIABLE = "IGSR_DA3"
 #: The published models, as huggingface names them, the better first.
 PUBLISHED = ("depth-anything/DA3-BASE", "depth-anything/DA3-SMALL")
-LICENCE = "Apache-2.0"
+#: Of the published models, and what is said of one that was trained by igsr.
+LICENCE, OWN = "Apache-2.0", "trained by igsr, so its maker's"
 #: The file in a folder of a checkpoint.
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
 #: What all keys begin with.
@@ -53,14 +54,26 @@ class Checkpoint:
     """A checked checkpoint.
 
     Attributes:
-        name: "da3-small" or "da3-base".
+        name: one of ``SIZES``.
+        config: its sizes, and the resolution that it was trained for.
         weights: float32, exactly the keys and shapes of a ``Da3Network`` of that size.
         unknown: keys of the file that no part of the network has, sorted; they were ignored.
     """
 
     name: str
+    config: NetworkConfig
     weights: dict[str, Tensor]
     unknown: list[str]
+
+
+def stated(config: NetworkConfig) -> dict[str, str]:
+    """The "name" of a network of one of the ``SIZES``, and the "licence" of its weights."""
+    name = next(
+        name
+        for name, size in SIZES.items()
+        if replace(size, resolution=config.resolution) == config
+    )
+    return {"name": name, "licence": OWN if name == TRAINED else LICENCE}
 
 
 def find_checkpoint(named: str | Path | None = None) -> Path | None:
@@ -115,7 +128,7 @@ def load_network(path: str | Path, device: str | None = None) -> Da3Network:
             + (f" and {more} more." if more > 0 else "."),
             stacklevel=2,
         )
-    network = _without_weights(SIZES[checkpoint.name])
+    network = _without_weights(checkpoint.config)
     network.load_state_dict(checkpoint.weights, assign=True)
     network.requires_grad_(False)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -147,19 +160,20 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
             f"{path} is no .safetensors file, the only kind that Depth Anything 3 comes in; name "
             f"its {WEIGHTS}"
         )
-    name = _size_beside(path)
+    beside = _size_beside(path)
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             # Keys are read by shape before anything is read whole.
             shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
-            name = name or _size_of_shapes(path, shapes)
+            name, resolution = beside or (_size_of_shapes(path, shapes), RESOLUTION)
             _check_larger(path, shapes)
-            weights, unknown = read_weights(path, file, shapes, SIZES[name])
+            config = replace(SIZES[name], resolution=resolution)
+            weights, unknown = read_weights(path, file, shapes, config)
     except IgsrError:
         raise
     except Exception as error:  # the library's own exception is not all that it raises
         raise IgsrError(f"{path} is damaged or no safetensors; download it again") from error
-    return Checkpoint(name, weights, unknown)
+    return Checkpoint(name, config, weights, unknown)
 
 
 def read_weights(
@@ -228,8 +242,8 @@ def _weight(
     return value
 
 
-def _size_beside(path: Path) -> str | None:
-    """What the ``config.json`` beside a checkpoint says; None where there is none."""
+def _size_beside(path: Path) -> tuple[str, int] | None:
+    """Name and resolution by the ``config.json`` beside a checkpoint; None where there is none."""
     beside = path.parent / CONFIG
     try:
         if not beside.exists():
@@ -239,7 +253,7 @@ def _size_beside(path: Path) -> str | None:
         content = json.loads(beside.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise IgsrError(f"{beside} cannot be read ({error}); download it again") from error
-    return size_of(content, str(beside))
+    return size_of(content, str(beside)), resolution_of(content, str(beside))
 
 
 def _size_of_shapes(path: Path, shapes: dict[str, tuple[int, ...]]) -> str:

@@ -1,4 +1,4 @@
-"""Sizes of Depth Anything 3, and the ``config.json`` that comes with a checkpoint.
+"""Sizes of Depth Anything 3 and of what is trained here, and the ``config.json`` of a checkpoint.
 
 Nothing in the file is imported or run: it names Python classes, of which only the names are read.
 """
@@ -13,6 +13,10 @@ from igsr.errors import IgsrError
 
 #: Pixels of a token's side.
 PATCH = 14
+#: Pixels of the longer side of photos as the published sizes see them.
+RESOLUTION = 504
+#: The largest that a network may ask for: what its passes take grows with the fourth power.
+MOST_RESOLUTION = 2016
 #: Tokens along a side of the stored position embedding: photos of 518 pixels.
 POSITIONS = 37
 #: Blocks of the backbone, and the first of those that have rotary positions, normalised queries and
@@ -44,9 +48,11 @@ class NetworkConfig:
         features: channels in which the head joins its levels.
         out_channels: channels of the head's four levels, the finest first.
         camera_heads: attention heads of the camera encoder.
+        resolution: pixels of the longer side of photos as it sees them; of no weight's shape.
 
     Raises:
-        IgsrError: a size is no whole number of at least 1, or does not divide into heads.
+        IgsrError: a size is no whole number of at least 1, or does not divide into heads; or the
+            resolution is no multiple of 14 from 14 to 2016.
     """
 
     embed_dim: int
@@ -54,6 +60,7 @@ class NetworkConfig:
     features: int
     out_channels: tuple[int, int, int, int]
     camera_heads: int = 16
+    resolution: int = RESOLUTION
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -75,17 +82,39 @@ class NetworkConfig:
                 f"embed_dim is {self.embed_dim}, heads {self.heads} and camera_heads "
                 f"{self.camera_heads}; give a multiple of four channels to each of the heads"
             )
+        checked_resolution("resolution", self.resolution)
+
+
+def checked_resolution(name: str, value: Any) -> int:
+    """A network's resolution.
+
+    Args:
+        name: what messages call it.
+        value: of any type.
+
+    Raises:
+        IgsrError: it is no multiple of 14 from 14 to 2016.
+    """
+    if type(value) is not int or value % PATCH or not PATCH <= value <= MOST_RESOLUTION:
+        raise IgsrError(
+            f"{name} is {value!r}; give a multiple of {PATCH} from {PATCH} to {MOST_RESOLUTION}"
+        )
+    return value
 
 
 SMALL = NetworkConfig(embed_dim=384, heads=6, features=64, out_channels=(48, 96, 192, 384))
 BASE = NetworkConfig(embed_dim=768, heads=12, features=128, out_channels=(96, 192, 384, 768))
+#: The size that ``igsr weights train`` trains.
+TINY = NetworkConfig(embed_dim=128, heads=2, features=32, out_channels=(24, 48, 96, 192))
+TRAINED = "igsr-tiny"
 #: The sizes that are implemented, under the names that checkpoints give themselves.
-SIZES = {"da3-small": SMALL, "da3-base": BASE}
-_NET_NAMES = {"vits": "da3-small", "vitb": "da3-base"}
+SIZES = {"da3-small": SMALL, "da3-base": BASE, TRAINED: TINY}
+#: And under the names that the backbone has in a ``config.json``.
+_NET_NAMES = {"vits": "da3-small", "vitb": "da3-base", TRAINED: TRAINED}
 
 
 def size_of(content: Any, source: str) -> str:
-    """The name, "da3-small" or "da3-base", of the network that a ``config.json`` describes.
+    """The name, one of ``SIZES``, of the network that a ``config.json`` describes.
 
     Args:
         content: the file's content as JSON reads it.
@@ -110,18 +139,43 @@ def size_of(content: Any, source: str) -> str:
     net = _part(parts, "net", source)
     size = _NET_NAMES.get(_text(net.get("name")))
     if size is None:
-        raise IgsrError(_another(source, "net.name", net.get("name"), "vits or vitb"))
+        wanted = " or ".join(_NET_NAMES)
+        raise IgsrError(_another(source, "net.name", net.get("name"), wanted))
     if named not in (None, size):
         raise IgsrError(_another(source, "net.name", net.get("name"), f"that of {named}"))
-    for part, wanted in _wanted(SIZES[size]).items():
+    for part, numbers in _wanted(SIZES[size]).items():
         if part == "cam_enc" and part not in parts:
             continue  # of no use without cameras
         given = _part(parts, part, source)
-        for name, value in wanted.items():
+        for name, value in numbers.items():
             found = given.get(name, value)
             if found != value:
                 raise IgsrError(_another(source, f"{part}.{name}", found, repr(value)))
     return size
+
+
+def resolution_of(content: Mapping[str, Any], source: str) -> int:
+    """The resolution of the network that a ``config.json`` describes.
+
+    Published networks are used at the one that they were trained for; one that was trained here
+    says its own.
+
+    Args:
+        content, source: as ``size_of`` takes them, and has found right.
+
+    Raises:
+        IgsrError: it is no multiple of 14 from 14 to 2016.
+    """
+    if size_of(content, source) != TRAINED:
+        return RESOLUTION
+    return checked_resolution(f"{source}: its resolution", content.get("resolution", RESOLUTION))
+
+
+def description(config: NetworkConfig) -> dict[str, Any]:
+    """What ``size_of`` and ``resolution_of`` read of a network of the size ``TRAINED``."""
+    parts = _wanted(config)
+    parts["net"]["name"] = TRAINED
+    return {"model_name": TRAINED, "config": parts, "resolution": config.resolution}
 
 
 def _wanted(config: NetworkConfig) -> dict[str, dict[str, Any]]:
@@ -156,6 +210,6 @@ def _text(value: Any) -> str:
 
 def _another(source: str, name: str, found: Any, wanted: str) -> str:
     return (
-        f"{source}: its {name} is {found!r} where {wanted} belongs; only DA3-SMALL and DA3-BASE "
-        "are implemented, so name a checkpoint of one of them"
+        f"{source}: its {name} is {found!r} where {wanted} belongs; only DA3-SMALL, DA3-BASE and "
+        "what igsr trains are implemented, so name a checkpoint of one of them"
     )

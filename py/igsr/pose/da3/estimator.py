@@ -230,8 +230,7 @@ class Da3:
         return {i: replace(placed[i].mapped(similarity), camera=given[i]) for i in order}
 
     def _network(self) -> tuple[Predictor, dict[str, str]]:
-        from igsr.pose.da3.checkpoint import LICENCE, find_checkpoint, load_network
-        from igsr.pose.da3.config import SIZES
+        from igsr.pose.da3.checkpoint import find_checkpoint, load_network, stated
         from igsr.pose.da3.passes import Da3Predictor
         from igsr.pose.weights import sha256_of
 
@@ -242,8 +241,7 @@ class Da3:
                 "da3-base', or name one by --checkpoint"
             )
         network = load_network(found)
-        name = next((name for name, size in SIZES.items() if size == network.config), "")
-        weights = {"name": name, "licence": LICENCE, "sha256": sha256_of(found)}
+        weights = {**stated(network.config), "sha256": sha256_of(found)}
         return Da3Predictor(network, self.cameras_from), weights
 
     def _check_cameras(self, photos: Sequence[Photo]) -> None:

@@ -16,7 +16,7 @@ from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.da3.cameras import cameras_of_rays, decode_pose
-from igsr.pose.da3.config import PATCH, NetworkConfig
+from igsr.pose.da3.config import PATCH, RESOLUTION, NetworkConfig
 from igsr.pose.da3.network import Da3Network, ViewPrediction
 from igsr.pose.da3.preprocessing import Resampling, network_input, resampling_of
 from igsr.pose.network_arrays import float32_array, half_precision
@@ -99,7 +99,7 @@ class Da3Predictor:
         """As ``Predictor``; by the free memory of the device, and by the time that a pass takes."""
         on_cpu = self.device.type == "cpu"
         free = available_memory() if on_cpu else torch.cuda.mem_get_info(self.device)[0]
-        pixels = max(one.width * one.height for one in resamplings_of(photos))
+        pixels = max(one.width * one.height for one in self._resamplings(photos))
         most = MOST_ON_CPU if on_cpu else MOST_ELSEWHERE
         while memory_of_pass(self.network.config, most, pixels) > USABLE * free:
             most -= 1
@@ -119,7 +119,7 @@ class Da3Predictor:
         Raises:
             IgsrError: the network gives what is not finite.
         """
-        resamplings = resamplings_of(photos)
+        resamplings = self._resamplings(photos)
         inputs = [
             torch.from_numpy(network_input(over_white(photo.image), one)).to(self.device)
             for photo, one in zip(photos, resamplings, strict=True)
@@ -137,6 +137,9 @@ class Da3Predictor:
             self._aligned(photo, one, view, seed)
             for photo, one, view in zip(photos, resamplings, views, strict=True)
         ]
+
+    def _resamplings(self, photos: Sequence[Photo]) -> list[Resampling]:
+        return resamplings_of(photos, self.network.config.resolution)
 
     def _aligned(
         self, photo: Photo, resampling: Resampling, view: ViewPrediction, seed: int
@@ -170,7 +173,7 @@ class Da3Predictor:
         return AlignedPhoto(Camera(viewmat, in_photo, width, height), grid, depth, confidence)
 
 
-def resamplings_of(photos: Sequence[Photo]) -> list[Resampling]:
+def resamplings_of(photos: Sequence[Photo], resolution: int = RESOLUTION) -> list[Resampling]:
     """How the photos of a scene come to the sizes that the network sees.
 
     Photos whose size differs from the commonest by a patch at most are brought to that: photos of
@@ -178,6 +181,7 @@ def resamplings_of(photos: Sequence[Photo]) -> list[Resampling]:
 
     Args:
         photos: of any sizes.
+        resolution: of the network.
 
     Raises:
         IgsrError: a photo is too narrow.
@@ -186,7 +190,7 @@ def resamplings_of(photos: Sequence[Photo]) -> list[Resampling]:
     for photo in photos:
         height, width = photo.image.shape[:2]
         try:
-            resamplings.append(resampling_of(width, height))
+            resamplings.append(resampling_of(width, height, resolution))
         except IgsrError as error:
             raise IgsrError(f"{photo.name}: {error}") from error
     sizes = Counter((one.width, one.height) for one in resamplings)

@@ -14,15 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.errors import IgsrError
-from igsr.pose.da3.config import PATCH
+from igsr.pose.da3.config import PATCH, RESOLUTION
 from igsr.pose.grid import Grid
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 UInt8 = npt.NDArray[np.uint8]
 
-#: The longer side in training.
-RESOLUTION = 504
 #: The side that is brought to the resolution, and how both become multiples of a patch.
 METHODS = ("upper_bound_resize", "upper_bound_crop", "lower_bound_resize", "lower_bound_crop")
 #: Mean and deviation of the training photos' channels.
