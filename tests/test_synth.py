@@ -1,6 +1,7 @@
 """Procedural captures: same seed, same bits; cameras, depths and masks agree; one sentence."""
 
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 from igsr import IgsrError
 from igsr.capture import load_capture
 from igsr.cli import app
-from igsr.synth import CaptureSettings, synthesize
+from igsr.synth import CaptureSettings, captures, synthesize
 from igsr.synth.cameras import Viewpoint, draw_rig, look_at
 from igsr.synth.description import Description, Material, Part
 from igsr.synth.materials import Materials
@@ -134,7 +135,7 @@ def test_a_second_run_makes_what_is_missing_only(made: Path, tmp_path: Path) -> 
     shutil.copytree(scene(made, LONE), scene(tmp_path, LONE))
     before = files(tmp_path)
     # As a run that was killed leaves it.
-    unfinished = tmp_path / f".scene_{OTHER:05d}.unfinished"
+    unfinished = tmp_path / f".scene_{OTHER:05d}.{2**30}.unfinished"
     (unfinished / "train").mkdir(parents=True)
     (unfinished / "train" / "099.png").write_bytes(b"half")
     seen: list[str] = []
@@ -154,6 +155,27 @@ def test_a_second_run_makes_what_is_missing_only(made: Path, tmp_path: Path) -> 
     assert {"scene.json", "train/002.png"} <= files(scene(tmp_path, OTHER)).keys()
     assert "train/099.png" not in files(scene(tmp_path, OTHER))
     assert before.items() <= files(tmp_path).items()
+
+
+def test_two_that_make_one_scene_do_not_touch_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Another live process is half through, and then the first to finish.
+    others = tmp_path / f".scene_{LONE:05d}.{os.getppid()}.unfinished"
+    (others / "train").mkdir(parents=True)
+    real = captures._photograph
+
+    def overtaken(folder: Path, *rest: object) -> dict[str, object]:
+        document = real(folder, *rest)
+        shutil.copytree(folder, scene(tmp_path, LONE))
+        (scene(tmp_path, LONE) / "scene.json").write_text(json.dumps(document))
+        return document
+
+    monkeypatch.setattr(captures, "_photograph", overtaken)
+    synthesize(tmp_path, 1, first=LONE, settings=SMALL)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [others.name, f"scene_{LONE:05d}"]
+    assert (others / "train").is_dir()
+    assert len(load_capture(scene(tmp_path, LONE)).train_views) == 3
 
 
 def ball_on_plane() -> Description:

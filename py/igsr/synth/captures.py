@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from PIL import Image
 
 from igsr._internal.atomic_write import check_writable
@@ -221,22 +222,41 @@ def make_scene(folder: Path, seed: int, index: int, settings: CaptureSettings) -
     """
     started = time.monotonic()
     final = folder / scene_name(index)
-    unfinished = folder / f".{final.name}.unfinished"
+    # Of this process: another may make the same scene at the same time.
+    unfinished = folder / _unfinished(final.name, os.getpid())
     try:
-        shutil.rmtree(unfinished, ignore_errors=True)
+        _remove_abandoned(folder, final.name)
         unfinished.mkdir(parents=True)
         with one_threaded_mitsuba() as mitsuba:
             document = _photograph(unfinished, seed, index, settings)
             document["mitsuba"] = mitsuba.__version__
         document["pyoidn"] = version("pyoidn")
         _write_json(unfinished / "scene.json", document)
-        unfinished.rename(final)
+        try:
+            unfinished.rename(final)
+        except OSError:
+            # The other was first, with the same bits.
+            if _finished(final, document["recipe"]) is None:
+                raise
     except OSError as error:
         raise IgsrError(f"Cannot write {final}: {error.strerror or error}.") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     row = {key: document[key] for key in ("family", "kind", "contents")}
     return {"name": final.name, **row, "seconds": round(time.monotonic() - started, 1)}
+
+
+def _unfinished(name: str, process: int | str) -> str:
+    """The name of a scene's folder while a process makes it."""
+    return f".{name}.{process}.unfinished"
+
+
+def _remove_abandoned(folder: Path, name: str) -> None:
+    """Remove what processes left of a scene that were killed while they made it."""
+    for path in folder.glob(_unfinished(name, "*")):
+        process = path.name.split(".")[-2]
+        if not process.isdigit() or not psutil.pid_exists(int(process)):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _photograph(folder: Path, seed: int, index: int, settings: CaptureSettings) -> dict[str, Any]:
