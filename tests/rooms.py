@@ -84,3 +84,16 @@ def picture(camera: Camera, seed: int = 0, k: float = 0.0) -> np.ndarray:
 def photos(cameras: list[Camera], seed: int = 0, k: float = 0.0) -> list[Photo]:
     """Photos of the room, named 0.png and so on."""
     return [Photo(f"{i}.png", picture(camera, seed, k)) for i, camera in enumerate(cameras)]
+
+
+def depth(camera: Camera) -> np.ndarray:
+    """float32 [H, W]: z-depth of the room as a camera sees it, at the pixels' centres."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays = pixels @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]  # their z is 1
+    nearest = np.full(x.shape, np.inf)
+    for normal, offset, *_ in WALLS:
+        with np.errstate(divide="ignore"):
+            distance = (offset - camera.centre @ normal) / (rays @ np.array(normal))
+        nearest = np.where((distance > 0.0) & (distance < nearest), distance, nearest)
+    return nearest.astype(np.float32)

@@ -111,5 +111,5 @@ def _device(name: str) -> torch.device:
     try:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError) as error:
-        reason = str(error).strip().splitlines() or ["no reason given"]
-        raise IgsrError(f"device {name!r} cannot be used ({reason[0]}); give 'cpu'") from error
+        reason = str(error).strip().partition("\n")[0].partition(". ")[0] or "no reason given"
+        raise IgsrError(f"device {name!r} cannot be used ({reason}); give 'cpu'") from error
