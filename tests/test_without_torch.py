@@ -33,6 +33,7 @@ OF_REFINE = (
     "igsr.rendering.rasterization",
     "igsr.rendering.rasterization_arguments",
     "igsr.study",
+    "igsr.training",
 )
 
 #: Imports every module, and prints those that cannot be imported without torch.
