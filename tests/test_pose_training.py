@@ -195,6 +195,14 @@ def test_a_gradient_reaches_every_weight():
     assert [name for name, one in reached.items() if not one] == []
 
 
+def test_cameras_are_shown_where_they_are_to_be():
+    learner = Learner(initial_network(SIZES["igsr-tiny"], 0), SMALL, CPU)
+    encoder = learner.network.cam_enc.trunk_norm.weight
+    for shown in (False, True):
+        learner.learn([true_pass(pose_trainings.views(2), 28)], shown)
+        assert (encoder.grad is not None) == shown
+
+
 def test_a_network_learns_what_it_is_shown():
     training = replace(SMALL, steps=16, rate=2e-3)
     learner = Learner(initial_network(SIZES["igsr-tiny"], 0), training, CPU)
