@@ -211,7 +211,7 @@ def test_a_network_learns_what_it_is_shown():
     for name in ("loss", "depth", "rays", "points", "camera"):
         assert lost[-1][name] < 0.7 * lost[0][name], name
     found = validated(learner.network.eval(), batch, CPU)
-    assert found["validation_depth"] < found["validation_depth_constant"]
+    assert found["validation_depth_error"] < found["validation_depth_error_constant"]
 
 
 def test_a_new_network_looks_ahead_through_a_usual_lens():
@@ -233,7 +233,7 @@ def test_scores_of_the_truth_and_of_an_answer_that_never_looks():
         return truth(next(one for one in passes if len(one.pixels) == len(pixels)))
 
     found = validated(tells_the_truth, passes, CPU)
-    for name in ("rotation", "translation", "depth"):
+    for name in ("rotation", "translation", "depth_error"):
         assert found[f"validation_{name}"] < 1e-3
         assert found[f"validation_{name}_constant"] > 0.02
     assert found["validation_RRA@15"] == found["validation_RTA@15"] == 1.0

@@ -36,9 +36,9 @@ def validated(
     Returns:
         "validation_rotation" and "validation_translation", medians over pairs of photos in degrees;
         "validation_RRA@15", "validation_RTA@15" and "validation_mAA@30", parts of all pairs, all as
-        ``igsr.geometry.pose_errors`` has them; "validation_depth", the mean error of depths that
-        are scaled by their median, as a part of the true ones. With "_constant" at the end, what
-        the answer that never looks scores, for all but mAA.
+        ``igsr.geometry.pose_errors`` has them; "validation_depth_error", the mean error of depths
+        that are scaled by their median, as a part of the true ones. With "_constant" at the end,
+        what the answer that never looks scores, for all but mAA.
     """
     sums: dict[str, float] = {}
     for true in passes:
@@ -49,9 +49,9 @@ def validated(
         )
         depth = true.depth.numpy()
         scores = {name: accuracy[name] for name in ("rotation", "translation", *PARTS)}
-        scores["depth"] = _depth_error(float32_array(predicted.depth), depth)
+        scores["depth_error"] = _depth_error(float32_array(predicted.depth), depth)
         constant = constant_scores(true.cameras())
-        constant["depth"] = _depth_error(np.ones_like(depth), depth)
+        constant["depth_error"] = _depth_error(np.ones_like(depth), depth)
         scores |= {f"{name}_constant": value for name, value in constant.items()}
         for name, score in scores.items():
             key = f"validation_{name}"
