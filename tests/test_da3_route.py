@@ -324,7 +324,7 @@ def test_photos_of_almost_one_size_are_shown_at_one():
 def small_photos(monkeypatch):
     """Photos of two formats, shown small so that the network is fast."""
     usual = passes.resampling_of
-    monkeypatch.setattr(passes, "resampling_of", lambda w, h: usual(w, h, 70))
+    monkeypatch.setattr(passes, "resampling_of", lambda w, h, _: usual(w, h, 70))
     _, photos = scene(3, 64, 40)
     high = replace(photos[2], image=np.ascontiguousarray(photos[2].image.swapaxes(0, 1)))
     return [*photos[:2], high]
