@@ -315,6 +315,7 @@ def test_what_was_trained_places_photos_at_its_own_resolution(trained):
     assert [depth.shape for depth in found.depths] == [(28, 28)] * 3  # 21 rows become 28
     assert found.weights["name"] == "igsr-tiny"
     assert found.weights["licence"].startswith("trained by igsr")
+    assert any("says how far off it is on captures that it never saw" in w for w in found.warnings)
     # A lone file is still known, at the resolution of the published ones.
     lone = out.parent / "lone.safetensors"
     lone.write_bytes((out / "model.safetensors").read_bytes())
