@@ -118,6 +118,7 @@ def test_the_browser_view_shows_it(fitted):
         (["denoise", "train", "--pairs", "x", "--out", "y"], "igsr denoise"),
         (["denoise", "pairs", "x", "--out", "y"], "igsr denoise"),
         (["study", "table2", "x", "--out", "y"], "igsr study"),
+        (["weights", "train", "--out", "y"], "igsr weights"),
         (
             ["fit", "photos", "--out", "y", "--estimator", "dust3r", "--checkpoint", "x.pth"],
             "estimator dust3r",
