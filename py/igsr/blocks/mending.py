@@ -12,6 +12,7 @@ import numpy.typing as npt
 from igsr.blocks.cells import EVERYWHERE, near_borders
 from igsr.blocks.manifest import Manifest
 from igsr.blocks.options import BlockOptions
+from igsr.blocks.photo_parts import Box, boxes_of
 from igsr.blocks.plan import BlockPlan
 from igsr.blocks.tasks import SPLATS, BlockPart, FitTask, key_of, save_splats
 from igsr.capture.exposure import Exposure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,9 @@ from igsr._internal.choices import Backend
 from igsr.blocks.assignment import photos_across_seams, photos_of_blocks
 from igsr.blocks.cells import Cell, Ground, ground_of, split_into_cells
 from igsr.blocks.manifest import Manifest
+from igsr.blocks.photo_parts import ALL, Box, boxes_of
 from igsr.blocks.shares import shown_shares, tracked_shares
+from igsr.capture.downscaling import reduced_size
 from igsr.capture.memory_check import LIBRARIES, USABLE, available_memory, needed_memory
 from igsr.capture.photos import loaded_sizes
 from igsr.capture.types import Points
@@ -35,6 +38,7 @@ class BlockPlan:
         photos: bool [P, C], which photos of the capture each block is fitted to.
         across: bool [P], which photos show a seam.
         shown: float64 [P, C], part of each photo that the coarse splats of each cell proper are.
+        boxes: for each photo, by block, the part of it that the block is fitted to.
     """
 
     ground: Ground
@@ -42,6 +46,11 @@ class BlockPlan:
     photos: npt.NDArray[np.bool_]
     across: npt.NDArray[np.bool_]
     shown: npt.NDArray[np.float64]
+    boxes: list[dict[int, Box]]
+
+    def box(self, photo: int, block: int) -> Box:
+        """The part of a photo that a block is fitted to."""
+        return self.boxes[photo].get(block, ALL)
 
     def plain(self) -> list[dict[str, Any]]:
         """As reports have it: each cell with its number of photos."""
@@ -92,9 +101,11 @@ def plan_blocks(
     near = np.stack([cell.holds(places) for cell in widened], axis=1)
     photos = photos_of_blocks(shares[:, count:], tracked, near)
     photos[[shot.split != "train" for shot in manifest.shots]] = False
-    return BlockPlan(
-        ground, cells, photos, photos_across_seams(shares[:, :count]), shares[:, :count]
-    )
+    proper, wide = shares[:, :count], shares[:, count:]
+    places = ground.places(coarse.means.astype(np.float64) + coarse.origin)
+    inside = np.stack([cell.holds(places) for cell in widened], axis=1)
+    boxes = boxes_of(coarse, cameras, inside, photos, wide.argmax(axis=1), backend)
+    return BlockPlan(ground, cells, photos, photos_across_seams(proper), proper, boxes)
 
 
 def blocks_for_memory(
@@ -118,7 +129,11 @@ def blocks_for_memory(
 
 
 def memory_of(
-    manifest: Manifest, photos: list[int], max_size: int | None, splats: int | None = None
+    manifest: Manifest,
+    photos: list[int],
+    max_size: int | None,
+    splats: int | None = None,
+    boxes: Sequence[Box] | None = None,
 ) -> int:
     """Bytes that a fit to these photos takes at most.
 
@@ -127,10 +142,15 @@ def memory_of(
         photos: their numbers in it.
         max_size: longest side in pixels of photos as loaded, or None.
         splats: most splats of the fit; None: what presets would have for them.
+        boxes: parts of the photos that are fitted; None: all of each.
     """
     shots = [manifest.shots[index] for index in photos]
     headers = [manifest.headers[index] for index in photos]
     sizes = loaded_sizes(shots, headers)
+    if boxes is not None:
+        sizes = [
+            box.size(*reduced_size(*size, max_size)) for box, size in zip(boxes, sizes, strict=True)
+        ]
     return needed_memory(
         sizes,
         max_size,

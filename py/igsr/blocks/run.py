@@ -15,11 +15,12 @@ from igsr._internal.part_usage import Parts
 from igsr.blocks.manifest import Manifest, read_manifest
 from igsr.blocks.mending import mending_task, near_seams
 from igsr.blocks.options import BlockOptions
+from igsr.blocks.photo_parts import Box
 from igsr.blocks.plan import BlockPlan, blocks_for_memory, cells_of, memory_of, plan_blocks
 from igsr.blocks.progress import Standing
 from igsr.blocks.report import block_report, held_out_scores
 from igsr.blocks.runner import Runner
-from igsr.blocks.seams import loaded_in_parts, psnr_by_name, seam_scores
+from igsr.blocks.seams import loaded_in_parts, psnr_of_parts, seam_scores
 from igsr.blocks.task_making import block_tasks, coarse_task, name_of
 from igsr.blocks.tasks import SPLATS, FitTask, key_of, load_splats
 from igsr.blocks.worker import joined, subset
@@ -104,11 +105,15 @@ def fit_in_blocks(
         splats = _joined(plan, coarse, tasks)
     with parts.measured("score seams"):
         own = [row["across"] for row in rows]
-        seams = _seams(manifest, own, splats, exposures, options)
+        boxes = [
+            {name: task.boxes[name] for name in scores}
+            for task, scores in zip(tasks, own, strict=True)
+        ]
+        seams = _seams(manifest, own, boxes, splats, exposures, options)
     if seams is not None and seams["visible"]:
         with parts.measured("mend seams"):
             mended = _mended(manifest, plan, splats, exposures, out, options, runner)
-            after = _seams(manifest, own, mended, exposures, options)
+            after = _seams(manifest, own, boxes, mended, exposures, options)
         if after is not None and after["loss_db"] < seams["loss_db"]:
             splats, seams = mended, {**after, "before_mending": seams}
     with parts.measured("score"):
@@ -177,15 +182,16 @@ def _mended(
 def _seams(
     manifest: Manifest,
     own: Sequence[Mapping[str, float]],
+    boxes: Sequence[Mapping[str, Box]],
     splats: Splats,
     exposures: Mapping[str, Exposure],
     options: BlockOptions,
 ) -> dict[str, Any] | None:
-    """What photos across seams lose by joining; see ``seam_scores``."""
+    """What parts of photos across seams lose by joining; see ``seam_scores``."""
     names = {name for scores in own for name in scores}
     photos = [i for i, shot in enumerate(manifest.shots) if shot.name in names]
     parts = loaded_in_parts(manifest, photos, options.max_size, exposures)
     has_alpha = any(manifest.headers[index].channels == 4 for index in photos)
     color = options.background or (WHITE if has_alpha else BLACK)
-    by_joined = psnr_by_name(splats, parts, color, cast(Backend, options.backend))
+    by_joined = psnr_of_parts(splats, parts, boxes, color, cast(Backend, options.backend))
     return seam_scores(own, by_joined)

@@ -10,6 +10,7 @@ import numpy as np
 
 from igsr._internal.choices import Backend
 from igsr.blocks.manifest import Manifest
+from igsr.blocks.photo_parts import Box, cut_out
 from igsr.capture import View
 from igsr.capture.described import DescribedCapture
 from igsr.capture.exposure import Exposure
@@ -56,43 +57,55 @@ def loaded_in_parts(
 
 
 def seam_scores(
-    own: Sequence[Mapping[str, float]], by_joined: Mapping[str, float]
+    own: Sequence[Mapping[str, float]], by_joined: Sequence[Mapping[str, float]]
 ) -> dict[str, Any] | None:
-    """What photos across seams lose by joining; None where there are none.
+    """What parts of photos across seams lose by joining; None where there are none.
 
     Args:
-        own: of each block, the PSNR in dB of its photos across seams, by its splats before those
-            beyond its cell were left out, with the coarse splats around them.
-        by_joined: their PSNR by the joined scene.
+        own: of each block, the PSNR in dB of its parts of photos across seams, by its splats before
+            those beyond its cell were left out, with the coarse splats around them.
+        by_joined: of each block, the PSNR of the same parts by the joined scene.
     """
-    best: dict[str, float] = {}
-    for scores in own:
-        for name, psnr in scores.items():
-            best[name] = max(psnr, best.get(name, -np.inf))
-    names = [name for name in by_joined if name in best]
-    if not names:
+    alone = [psnr for scores in own for psnr in scores.values()]
+    if not alone:
         return None
-    joined = float(np.mean([by_joined[name] for name in names]))
-    alone = float(np.mean([best[name] for name in names]))
-    loss = alone - joined
+    joined = [
+        found[name] for scores, found in zip(own, by_joined, strict=True) for name in scores
+    ]
+    loss = float(np.mean(alone) - np.mean(joined))
     return {
-        "photos": len(names),
-        "psnr_joined": round(joined, 3),
-        "psnr_best_block": round(alone, 3),
+        "photos": len({name for scores in own for name in scores}),
+        "parts": len(alone),
+        "psnr_joined": round(float(np.mean(joined)), 3),
+        "psnr_alone": round(float(np.mean(alone)), 3),
         "loss_db": round(loss, 3),
         "visible": loss > VISIBLE,
     }
 
 
-def psnr_by_name(
+def psnr_of_parts(
     splats: Splats,
-    parts: Iterator[list[View]],
+    loaded: Iterator[list[View]],
+    boxes: Sequence[Mapping[str, Box]],
     background: Sequence[float],
     backend: Backend,
-) -> dict[str, float]:
-    """PSNR in dB of photos, by name."""
-    found = {}
-    for views in parts:
-        for one in score_views(splats, views, background, backend, ("psnr",)):
-            found[one.name] = float(one.scores["psnr"] or 0.0)
+) -> list[dict[str, float]]:
+    """PSNR in dB of the parts of photos that blocks have.
+
+    Args:
+        splats: the scene.
+        loaded: the photos, some at a time.
+        boxes: of each block, the parts by the photo's name.
+        background: RGB in [0, 1] behind splats.
+        backend: "cpu" or "gpu".
+
+    Returns:
+        Of each block, by name.
+    """
+    found: list[dict[str, float]] = [{} for _ in boxes]
+    for views in loaded:
+        for scores, box in zip(found, boxes, strict=True):
+            parts = [cut_out(view, box[view.name]) for view in views if view.name in box]
+            for one in score_views(splats, parts, background, backend, ("psnr",)):
+                scores[one.name] = float(one.scores["psnr"] or 0.0)
     return found

@@ -53,7 +53,8 @@ def coarse_task(
         shots=shots,
         marks=[manifest.marks[index] for index in train],
         max_size=size,
-        settings=dict(options.settings),
+        # Transient things are looked for by the blocks: the search holds all photos of a fit.
+        settings={**options.settings, "transients": "off"},
         backend=options.backend,
         points=resized(points, before, cast(Any, after)),
     )
@@ -119,6 +120,7 @@ def block_tasks(
                 exposures={
                     shot.name: exposures[shot.name] for shot in shots if shot.name in exposures
                 },
+                boxes={manifest.shots[photo].name: plan.box(photo, index) for photo in photos},
                 block=BlockPart(
                     scene=out / "blocks" / "coarse" / SPLATS,
                     ground=plan.ground,

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
 from igsr.blocks.cells import Cell, Ground, near_borders
+from igsr.blocks.photo_parts import Box
 from igsr.capture.exposure import Exposure
 from igsr.capture.photos import Shot
 from igsr.capture.types import Points
@@ -81,6 +82,7 @@ class FitTask:
         settings: keywords of ``igsr.fit``: preset, quality and what was given by hand.
         backend: "cpu" or "gpu".
         exposures: of photos, by name, that are taken out of them before the fit.
+        boxes: of photos, by name, the part that is fitted; all of those that are not named.
         splats_part: part of the most splats there may be, where memory ran out before.
         points: the capture's, for the coarse fit; None for others, and where there are none.
         block: the part of the scene that is fitted; None for all of it, the coarse fit.
@@ -95,6 +97,7 @@ class FitTask:
     settings: dict[str, Any]
     backend: str
     exposures: Mapping[str, Exposure] = field(default_factory=dict)
+    boxes: Mapping[str, Box] = field(default_factory=dict)
     splats_part: float = 1.0
     points: Points | None = None
     block: BlockPart | None = None
@@ -115,6 +118,7 @@ def key_of(task: FitTask, **more: Any) -> dict[str, Any]:
         exposure = task.exposures.get(shot.name)
         about = [shot.name, shot.split, camera.width, camera.height, mark, repr(shot.lens)]
         about += [str(shot.side), None if exposure is None else exposure.plain()]
+        about += [task.boxes[shot.name].plain()] if shot.name in task.boxes else []
         digest.update(json.dumps(about).encode())
     return {
         "photos": digest.hexdigest(),

@@ -21,6 +21,7 @@ from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Meter
 from igsr._internal.worker_processes import in_a_process
 from igsr.blocks.manifest import shot_mark
+from igsr.blocks.photo_parts import ALL, cut_out
 from igsr.blocks.tasks import (
     CHECKPOINT,
     PROGRESS,
@@ -45,6 +46,8 @@ from igsr.splats import Splats
 
 Bool = npt.NDArray[np.bool_]
 
+#: Photos that are held whole at a time while parts of them are cut out.
+AT_A_TIME = 8
 #: Seconds between two reports of progress.
 TELL_EVERY = 1.0
 
@@ -79,6 +82,7 @@ def do_task(capture: str, task: FitTask) -> dict[str, Any]:
         "name": task.name,
         **row,
         "photos": len(views),
+        "pixels": sum(view.camera.width * view.camera.height for view in views),
         **used.plain(),
         "host": socket.gethostname(),
         "process": os.getpid(),
@@ -91,8 +95,14 @@ def _loaded(task: FitTask) -> list[View]:
     for shot, mark in zip(task.shots, task.marks, strict=True):
         if shot_mark(shot) != mark:
             raise IgsrError(f"{shot.path} was changed since the run began; start it again.")
-    described = DescribedCapture(task.capture, task.shots, lambda: None)
-    views = described.loaded(task.max_size).views
+    views = []
+    for first in range(0, len(task.shots), AT_A_TIME):
+        shots = task.shots[first : first + AT_A_TIME]
+        described = DescribedCapture(task.capture, shots, lambda: None)
+        views += [
+            cut_out(view, task.boxes.get(view.name, ALL))
+            for view in described.loaded(task.max_size).views
+        ]
     return without_exposures(views, [task.exposures.get(view.name) for view in views])
 
 

@@ -93,6 +93,6 @@ def _block_line(block: dict[str, Any]) -> str:
 
 def _seam_line(seams: dict[str, Any]) -> str:
     return (
-        f"seams: {seams['photos']} fitted photos across them score {seams['psnr_joined']:.2f} dB "
-        f"joined, {seams['psnr_best_block']:.2f} dB by the best block alone"
+        f"seams: what blocks have of {seams['photos']} photos across them scores "
+        f"{seams['psnr_joined']:.2f} dB joined, {seams['psnr_alone']:.2f} dB by the block alone"
     )
