@@ -18,20 +18,33 @@ import towns
 
 import igsr
 from igsr._internal.worker_processes import WorkerLostError
-from igsr.blocks import BlockOptions, fit_in_blocks, run, runner, seams, task_making, worker
+from igsr.blocks import (
+    BlockOptions,
+    assignment,
+    fit_in_blocks,
+    run,
+    runner,
+    seams,
+    task_making,
+    worker,
+)
 from igsr.blocks.tasks import load_splats, save_splats
 
 #: Fits of seconds.
 SETTINGS = {"steps": 120, "max_splats": 1200}
 
 
+#: Photos of 48 pixels are made smaller for the coarse fit, too; and two houses are a seam.
+SMALL = "from igsr.blocks import assignment, task_making; "
+SMALL += "task_making.COARSE_SIZES = (12, 400); assignment.ACROSS = 0.05"
+
+
 @pytest.fixture(autouse=True, scope="module")
-def coarse_photos():
-    """Photos of 48 pixels are made smaller for the coarse fit, too."""
-    usual = task_making.COARSE_SIZES
-    task_making.COARSE_SIZES = (12, 400)
+def small_scenes():
+    usual = task_making.COARSE_SIZES, assignment.ACROSS
+    exec(SMALL)
     yield
-    task_making.COARSE_SIZES = usual
+    task_making.COARSE_SIZES, assignment.ACROSS = usual
 
 
 def options(**changed):
@@ -97,9 +110,7 @@ def test_a_block_that_is_lost_is_done_alone_with_the_same_bits(whole, folder, tm
 
 
 def command(folder, out):
-    # The command, with coarse photos as small as here.
-    small = "from igsr.blocks import task_making; task_making.COARSE_SIZES = (12, 400)"
-    words = [sys.executable, "-c", f"{small}; from igsr.cli import main; main()"]
+    words = [sys.executable, "-c", f"{SMALL}; from igsr.cli import main; main()"]
     words += ["fit", str(folder), "--out", str(out)]
     words += ["--blocks", "2", "--holdout", "6", "--backend", "cpu", "--quality", "normal"]
     return [*words, "--steps", "120", "--max-splats", "1200", "--json"]

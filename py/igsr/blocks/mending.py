@@ -42,7 +42,8 @@ def mending_task(
 ) -> tuple[FitTask, dict[str, Any]] | None:
     """The task, which goes on from the joined scene, and its key; None where nothing lies there.
 
-    It has as many photos across seams as the largest block has photos, and so takes no more memory.
+    It has the parts of photos that show what is near seams, as many pixels of them as the largest
+    block has, and so takes no more memory.
 
     Raises:
         IgsrError: the joined scene cannot be written.
@@ -51,9 +52,12 @@ def mending_task(
     near = near_seams(plan, joined)
     if not len(across) or not near.any() or near.all():
         return None
-    most = int(plan.photos.sum(axis=0).max())
-    if len(across) > most:
-        across = across[np.linspace(0, len(across) - 1, most).round().astype(np.int64)]
+    boxes = _boxes(manifest, across, joined, near, options.backend)
+    pixels, most = sum(box.part for box in boxes), plan.largest_part
+    if pixels > most:
+        some = max(1, int(len(across) * most / pixels))
+        chosen = np.linspace(0, len(across) - 1, some).round().astype(np.int64)
+        across, boxes = across[chosen], [boxes[index] for index in chosen]
     folder = out / "blocks" / "seams"
     scene = out / "blocks" / "joined" / SPLATS
     save_splats(scene, joined)
@@ -81,6 +85,7 @@ def mending_task(
         },
         backend=options.backend,
         exposures={shot.name: exposures[shot.name] for shot in shots if shot.name in exposures},
+        boxes={shot.name: box for shot, box in zip(shots, boxes, strict=True)},
         block=BlockPart(
             scene=scene,
             ground=plan.ground,
@@ -91,3 +96,18 @@ def mending_task(
         ),
     )
     return task, key_of(task, scene=hash_of(splat_arrays(joined).values()))
+
+
+def _boxes(
+    manifest: Manifest,
+    photos: npt.NDArray[np.int64],
+    joined: Splats,
+    near: npt.NDArray[np.bool_],
+    backend: str,
+) -> list[Box]:
+    """Where photos show splats near seams."""
+    cameras = [manifest.shots[index].camera for index in photos]
+    every = np.ones((len(photos), 1), np.bool_)
+    none = np.full(len(photos), -1)
+    found = boxes_of(joined, cameras, near[:, None], every, none, backend)
+    return [boxes[0] for boxes in found]

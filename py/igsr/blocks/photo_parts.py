@@ -48,6 +48,11 @@ class Box:
         left, top, right, bottom = self.pixels(width, height)
         return right - left, bottom - top
 
+    @property
+    def part(self) -> float:
+        """Its part of the photo's pixels."""
+        return (self.right - self.left) * (self.bottom - self.top)
+
     def plain(self) -> list[float]:
         """As JSON has it."""
         return [self.left, self.top, self.right, self.bottom]

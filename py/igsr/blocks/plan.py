@@ -52,6 +52,14 @@ class BlockPlan:
         """The part of a photo that a block is fitted to."""
         return self.boxes[photo].get(block, ALL)
 
+    @property
+    def largest_part(self) -> float:
+        """The pixels of the block that has most, in whole photos."""
+        return max(
+            sum(self.box(int(photo), block).part for photo in np.flatnonzero(photos))
+            for block, photos in enumerate(self.photos.T)
+        )
+
     def plain(self) -> list[dict[str, Any]]:
         """As reports have it: each cell with its number of photos."""
         return [

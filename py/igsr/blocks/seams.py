@@ -69,9 +69,7 @@ def seam_scores(
     alone = [psnr for scores in own for psnr in scores.values()]
     if not alone:
         return None
-    joined = [
-        found[name] for scores, found in zip(own, by_joined, strict=True) for name in scores
-    ]
+    joined = [found[name] for scores, found in zip(own, by_joined, strict=True) for name in scores]
     loss = float(np.mean(alone) - np.mean(joined))
     return {
         "photos": len({name for scores in own for name in scores}),

@@ -29,6 +29,16 @@ COARSE, COARSE_SIZES = 1 / 3, (96, 400)
 COARSE_PIXELS = 600_000_000
 
 
+def _density(settings: Mapping[str, Any]) -> dict[str, str]:
+    """What the default preset does not choose here.
+
+    MCMC moves splats by noise that grows with the square of the scene's extent (its size is in world
+    units): over many houses, it blows them away. What the preset goes by, the angle between photos as
+    seen from the one place that all look at, says nothing of a scene without such a place.
+    """
+    return {"density": "original"} if settings.get("preset", "default") == "default" else {}
+
+
 def name_of(block: int) -> str:
     """The name of a block by its number, from 0."""
     return f"block-{block:03d}"
@@ -54,7 +64,7 @@ def coarse_task(
         marks=[manifest.marks[index] for index in train],
         max_size=size,
         # Transient things are looked for by the blocks: the search holds all photos of a fit.
-        settings={**options.settings, "transients": "off"},
+        settings={**_density(options.settings), **options.settings, "transients": "off"},
         backend=options.backend,
         points=resized(points, before, cast(Any, after)),
     )
@@ -89,7 +99,7 @@ def block_tasks(
         IgsrError: there is none.
         UserWarning: a block has no photos or no splats.
     """
-    given = dict(options.settings)
+    given = {**_density(options.settings), **options.settings}
     given.pop("start", None)
     given["exposure"] = "off"
     if given.get("max_splats") is not None:
