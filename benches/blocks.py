@@ -2,11 +2,12 @@
 
     python benches/blocks.py --out out/blocks [--houses 5x3] [--each 20] [--size 160] [--blocks 2,4]
 
-The town is ``soft_town``; with ``--capture``, other photos take its place. All runs have as many splats and
-steps: blocks share the steps of the whole fit, and have a coarse fit of as many steps as one block before
-them. Held-out photos are the same for all; "across" are those of them that show a seam of the run in blocks.
-The town and the whole fit are not made again where ``--out`` has them. Writes ``rows.json`` and, for each
-number of blocks, a picture of the photo across seams that loses most: photo, whole, blocks.
+The town is ``soft_town``; with ``--capture``, other photos take its place. All runs have as many
+splats and steps: blocks share the steps of the whole fit, and have a coarse fit of as many steps as
+one block before them. Held-out photos are the same for all; "across" are those of them that show a
+seam of the run in blocks. The town and the whole fit are not made again where ``--out`` has them.
+Writes ``rows.json`` and, for each number of blocks, a picture of the photo across seams that loses
+most: photo, whole, blocks.
 """
 
 from __future__ import annotations
@@ -122,11 +123,9 @@ def main() -> None:
         size = asked.size, 3 * asked.size // 4
         towns.written(soft_town.soft_town(columns, rows, asked.each, *size), folder)
     asked.out.mkdir(parents=True, exist_ok=True)
-    settings: dict[str, Any] = {
-        "steps": asked.steps,
-        "transients": asked.transients,
-        "density": asked.density,
-    }
+    settings: dict[str, Any] = {"steps": asked.steps, "transients": asked.transients}
+    if asked.density != "preset":
+        settings["density"] = asked.density
     if asked.max_splats is not None:
         settings["max_splats"] = asked.max_splats
     kept = asked.out / "whole.json"

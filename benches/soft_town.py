@@ -1,7 +1,7 @@
 """The made-up town of the tests with the look of photos: soft textures, windows, haze, a pale sky.
 
-The tests' town has square patches of pure colors, which no photo has and splats cannot show at small
-sizes. The houses, cameras and points are the same.
+The tests' town has square patches of pure colors, which no photo has and splats cannot show at
+small sizes. The houses, cameras and points are the same.
 """
 
 from __future__ import annotations

@@ -88,6 +88,12 @@ def test_a_scene_in_blocks_is_one_scene(whole, folder):
     assert {one.name for one in seen[-1]} == {"coarse", "block-000", "block-001"}
     assert all(one.work == 1.0 and one.text == "done" for one in seen[-1])
     assert not list((out / "blocks").rglob("checkpoint.npz"))
+    page = (out / "report.html").read_text()
+    across = [view["name"] for view in report["views"] if view["across"]]
+    shown = across or [view["name"] for view in report["views"]]
+    assert page.count("<figure>") == 3 * len(shown)
+    assert all(block["name"] in page for block in report["blocks"])
+    assert all(name in page for name in shown)
 
 
 def test_what_is_done_is_not_done_again(whole, folder, monkeypatch):

@@ -17,9 +17,10 @@ import igsr
 from igsr.blocks.assignment import photos_across_seams, photos_of_blocks
 from igsr.blocks.cells import Cell, ground_of, split_into_cells
 from igsr.blocks.manifest import file_mark, read_manifest
-from igsr.blocks.plan import blocks_for_memory
+from igsr.blocks.photo_parts import ALL, Box, box_of, boxes_of, cut_out
+from igsr.blocks.plan import blocks_for_memory, memory_of
 from igsr.blocks.shares import shown_shares, tracked_shares
-from igsr.capture import Camera
+from igsr.capture import Camera, View
 from igsr.capture.types import intrinsic_matrix
 
 
@@ -107,6 +108,68 @@ def test_photos_go_where_they_show_something():
         [False, False],  # it shows nothing
     ]
     assert photos_across_seams(shown).tolist() == [False, True, False, False, False]
+
+
+def test_a_part_of_a_photo_shows_what_the_photo_shows_there():
+    random = np.random.default_rng(5)
+    whole = Camera(np.eye(4), intrinsic_matrix(50.0, 60.0, 50.0, 40.0), 100, 80)
+    image = random.integers(0, 256, (80, 100, 3), np.uint8)
+    depth = random.uniform(1.0, 2.0, (80, 100)).astype(np.float32)
+    view = View("a.png", whole, "train", image, mask=image[..., 0] > 9, depth=depth)
+    part = cut_out(view, Box(0.255, 0.5, 0.75, 1.0))
+    assert part.image.shape == (40, 50, 3)
+    assert (part.image == image[40:, 25:75]).all()
+    assert (part.mask == view.mask[40:, 25:75]).all()
+    assert (part.depth == depth[40:, 25:75]).all()
+    assert part.image.base is None, "the whole photo stays in memory"
+    assert part.camera.K[:2, 2].tolist() == [25.0, 0.0]
+    assert cut_out(view, ALL) is view
+    # As small as it may be, at the photo's edge, too; and all of a smaller photo.
+    for box in (Box(0.0, 0.0, 0.01, 0.01), Box(0.99, 0.99, 1.0, 1.0), Box(0.5, 0.4, 0.5, 0.4)):
+        assert cut_out(view, box).image.shape == (24, 24, 3)
+    assert Box(0.9, 0.9, 1.0, 1.0).size(20, 10) == (20, 10)
+
+
+def test_boxes_hold_what_is_shown():
+    share = np.zeros((24, 32))
+    share[6:18, 8:24] = 1.0
+    assert box_of(share).plain() == [7 / 32, 5 / 24, 25 / 32, 19 / 24]
+    share[2, 2] = 0.5  # a stray pixel
+    assert box_of(share).plain() == [7 / 32, 5 / 24, 25 / 32, 19 / 24]
+    assert box_of(np.zeros((24, 32))) == ALL
+    corner = np.zeros((24, 32))
+    corner[0, 31] = 1.0
+    assert box_of(corner).plain() == [0.75, 0.0, 1.0, 0.25]
+
+
+def test_a_block_has_the_part_of_a_photo_that_its_splats_are_in():
+    means = np.array([[-1.0, 0.0, 4.0], [1.0, 0.5, 4.0]], np.float32)
+    splats = igsr.Splats(
+        means,
+        np.tile(np.array([1, 0, 0, 0], np.float32), (2, 1)),
+        np.full((2, 3), np.log(0.15), np.float32),
+        np.full(2, 6.0, np.float32),
+        np.zeros((2, 1, 3), np.float32),
+    )
+    inside, wanted = np.eye(2, dtype=np.bool_), np.array([[True, True], [False, True]])
+    cameras = [camera([0.0, 0.0, 0.0])] * 2
+    first, second = boxes_of(splats, cameras, inside, wanted, np.array([-1, 1]), "cpu")
+    assert set(first) == {0, 1}
+    assert set(second) == {1}
+    assert first[0].right < 0.5 < first[1].left
+    assert first[0].top == pytest.approx(1.0 - first[0].bottom, abs=0.05)
+    assert first[1].top > 0.25
+    # Where nothing is drawn, a photo shows what it shows most of.
+    assert second[1] == ALL
+
+
+def test_parts_of_photos_take_less_memory(town):
+    _, folder = town
+    manifest = read_manifest(folder, None, None)
+    photos = manifest.of_split("train")
+    whole = memory_of(manifest, photos, None)
+    half = [Box(0.0, 0.0, 0.5, 1.0)] * len(photos)
+    assert memory_of(manifest, photos, None, boxes=half) < whole
 
 
 def test_what_is_hidden_is_not_shown():

@@ -1,4 +1,4 @@
-"""The part of a photo that shows a block: a box, and all that a fit of the block has of the photo."""
+"""The part of a photo that shows a block: a box. A fit of the block has no more of the photo."""
 
 from __future__ import annotations
 

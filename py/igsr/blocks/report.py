@@ -53,18 +53,19 @@ def held_out_scores(
         protocol["of"] = count
     for row in rows:
         row["across"] = row["name"] in across
-    crossing = [row["psnr"] for row in rows if row["across"]]
+    crossing = [row for row in rows if row["across"]]
     return {
-        **{name: _mean([row[name] for row in rows]) for name in METRICS},
-        "across_seams": {"photos": len(crossing), "psnr": _mean(crossing)},
+        **_means(rows),
+        "across_seams": {"photos": len(crossing), **_means(crossing)},
         "protocol": protocol,
         "views": rows,
     }
 
 
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+def _means(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    """The mean of each score over the photos that have it."""
+    known = {name: [row[name] for row in rows if row[name] is not None] for name in METRICS}
+    return {name: float(np.mean(values)) if values else None for name, values in known.items()}
 
 
 def block_report(

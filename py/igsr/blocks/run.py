@@ -15,6 +15,7 @@ from igsr._internal.part_usage import Parts
 from igsr.blocks.manifest import Manifest, read_manifest
 from igsr.blocks.mending import mending_task, near_seams
 from igsr.blocks.options import BlockOptions
+from igsr.blocks.page import write_block_page
 from igsr.blocks.photo_parts import Box
 from igsr.blocks.plan import BlockPlan, blocks_for_memory, cells_of, memory_of, plan_blocks
 from igsr.blocks.progress import Standing
@@ -45,8 +46,8 @@ def fit_in_blocks(
 
     Args:
         path: the capture, as ``igsr.load_capture`` takes it.
-        out: folder for ``scene.ply``, ``report.json``, ``manifest.json`` and, in ``blocks/``, what
-            workers leave.
+        out: folder for ``scene.ply``, ``report.json``, ``report.html``, ``manifest.json`` and, in
+            ``blocks/``, what workers leave.
         options: what is asked for.
         told: called now and then with where all blocks stand.
 
@@ -96,7 +97,12 @@ def fit_in_blocks(
         keys = [key_of(task, **scene) for task in tasks]
         number = {shot.name: index for index, shot in enumerate(manifest.shots)}
         memory = [
-            memory_of(manifest, [number[shot.name] for shot in task.shots], options.max_size)
+            memory_of(
+                manifest,
+                [number[shot.name] for shot in task.shots],
+                options.max_size,
+                boxes=[task.boxes[shot.name] for shot in task.shots],
+            )
             for task in tasks
         ]
         rows = runner.rows(tasks, keys, memory)
@@ -124,6 +130,7 @@ def fit_in_blocks(
     )
     report |= {"seams": seams, **scores, "parts": parts.plain()}
     write_json(out / "report.json", report)
+    write_block_page(out / "report.html", report, manifest, splats, exposures, options)
     runner.forget_checkpoints()
     return splats, report
 

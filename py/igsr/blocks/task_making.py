@@ -32,9 +32,10 @@ COARSE_PIXELS = 600_000_000
 def _density(settings: Mapping[str, Any]) -> dict[str, str]:
     """What the default preset does not choose here.
 
-    MCMC moves splats by noise that grows with the square of the scene's extent (its size is in world
-    units): over many houses, it blows them away. What the preset goes by, the angle between photos as
-    seen from the one place that all look at, says nothing of a scene without such a place.
+    MCMC moves splats by noise that grows with the scene's extent and with the square of their
+    sizes, both in world units: over many houses, it blows them away. What the preset goes by, the
+    angle between photos as seen from the one place that all look at, says nothing of a scene
+    without such a place.
     """
     return {"density": "original"} if settings.get("preset", "default") == "default" else {}
 
@@ -130,7 +131,7 @@ def block_tasks(
                 exposures={
                     shot.name: exposures[shot.name] for shot in shots if shot.name in exposures
                 },
-                boxes={manifest.shots[photo].name: plan.box(photo, index) for photo in photos},
+                boxes={manifest.shots[photo].name: plan.box(int(photo), index) for photo in photos},
                 block=BlockPart(
                     scene=out / "blocks" / "coarse" / SPLATS,
                     ground=plan.ground,

@@ -75,7 +75,7 @@ def fit_blocks(
         console.print(_seam_line(report["seams"]))
     console.print(protocol_line(report["protocol"]), style="dim")
     console.print(parts_line(report["parts"]), style="dim")
-    names = ["scene.ply", "report.json", "manifest.json"]
+    names = ["scene.ply", "report.html", "report.json", "manifest.json"]
     console.print("  ".join(str(out / name) for name in names), style="dim")
 
 

@@ -85,7 +85,10 @@ def beside(views: Sequence[ScoredView]) -> list[dict[str, Any]]:
 
 
 def scene_frame(
-    models: Sequence[PageModel], capture: Capture, background: Sequence[float], title: str
+    models: Sequence[PageModel],
+    cameras: Sequence[PageCamera],
+    background: Sequence[float],
+    title: str,
 ) -> str | None:
     """The scene to turn, as HTML of a frame; None where it cannot be within a report.
 
@@ -94,19 +97,23 @@ def scene_frame(
 
     Args:
         models: the last is shown, and compared with the others where there is room for them.
-        capture: the photos; the page jumps to the cameras of those that were fitted.
+        cameras: of the photos that were fitted, to which the page jumps; see ``fitted_cameras``.
         background: RGB in [0, 1] behind the splats.
         title: of the page, and the name of its screenshots.
     """
     shown = compared(models)
     if sum(len(one.splats) for one in shown) > MOST_COMPARED:
         return None
-    cameras = [PageCamera(view.name, view.camera) for view in capture.train_views]
     try:
         page, _ = scene_page(shown, cameras, background, title, compares=True)
     except IgsrError:
         return None
     return framed(page, SCENE_HEIGHT)
+
+
+def fitted_cameras(capture: Capture) -> list[PageCamera]:
+    """The cameras of the photos that were fitted."""
+    return [PageCamera(view.name, view.camera) for view in capture.train_views]
 
 
 def part_rows(

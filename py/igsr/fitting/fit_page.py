@@ -18,6 +18,7 @@ from igsr.evaluation.report_page import (
     PHOTO,
     beside,
     drawn_cameras,
+    fitted_cameras,
     jpeg,
     number,
     part_rows,
@@ -64,7 +65,7 @@ def write_fit_page(
     name, background = _title(report["capture"]), report["protocol"]["background"]
     variables = {
         "name": name,
-        "scene": scene_frame([PageModel(name, splats)], capture, background, name),
+        "scene": scene_frame([PageModel(name, splats)], fitted_cameras(capture), background, name),
         "photos": report["photos"],
         "splats": report["splats"],
         "seconds": report["seconds"],

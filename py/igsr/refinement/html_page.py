@@ -18,6 +18,7 @@ from igsr.evaluation.report_page import (
     REJECTED,
     beside,
     drawn_cameras,
+    fitted_cameras,
     jpeg,
     number,
     part_rows,
@@ -62,7 +63,7 @@ def write_page(
     tests = [refined.first_test, *(done.test for done in refined.rounds)]
     variables = {
         "name": name,
-        "scene": scene_frame(refined.models(), refined.capture, background, name),
+        "scene": scene_frame(refined.models(), fitted_cameras(refined.capture), background, name),
         "photos": [
             {
                 "name": view.name,
