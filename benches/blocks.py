@@ -1,6 +1,6 @@
 """A made-up town fitted whole and in blocks: scores, peak memory, seconds, splats.
 
-    python benches/blocks.py --out out/blocks [--houses 5x3] [--each 20] [--size 160] [--blocks 2,4]
+    python benches/blocks.py --out out/blocks [--houses 5x3] [--photos 300] [--size 160] [--blocks 2,4]
 
 The town is ``soft_town``; with ``--capture``, other photos take its place. All runs have as many
 splats and steps: blocks share the steps of the whole fit, and have a coarse fit of as many steps as
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--capture", type=Path, default=None)
     parser.add_argument("--max-size", type=int, default=None)
     parser.add_argument("--houses", default="5x3")
-    parser.add_argument("--each", type=int, default=20)
+    parser.add_argument("--photos", type=int, default=300)
     parser.add_argument("--size", type=int, default=160)
     parser.add_argument("--blocks", default="2,4")
     parser.add_argument("--steps", type=int, default=5000)
@@ -121,7 +121,7 @@ def main() -> None:
     if not folder.is_dir():
         columns, rows = map(int, asked.houses.split("x"))
         size = asked.size, 3 * asked.size // 4
-        towns.written(soft_town.soft_town(columns, rows, asked.each, *size), folder)
+        towns.written(soft_town.soft_town(columns, rows, asked.photos, *size), folder)
     asked.out.mkdir(parents=True, exist_ok=True)
     settings: dict[str, Any] = {"steps": asked.steps, "transients": asked.transients}
     if asked.density != "preset":

@@ -43,13 +43,14 @@ def cameras(columns: int, rows: int, each: int, width: int, height: int) -> list
             away = 3.2 + random.uniform(-0.3, 0.3)
             centre = middle + [away * np.sin(angle), 0.0, away * np.cos(angle)]
             centre[1] = -1.9 + random.uniform(-0.4, 0.4)
-            found.append(_looking(centre, middle, 0.9 * width, width, height))
+            found.append(looking(centre, middle, 0.9 * width, width, height))
     return found
 
 
-def _looking(
+def looking(
     centre: np.ndarray, target: np.ndarray, focal: float, width: int, height: int
 ) -> Camera:
+    """A level camera that looks from one place to another; its focal length is in pixels."""
     z = (target - centre) / np.linalg.norm(target - centre)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -133,10 +134,18 @@ def town(
         View(f"images/{number:04d}.png", camera, "train", photo(boxes, camera, sharp))
         for number, camera in enumerate(cameras(columns, rows, each, width, height))
     ]
-    return Capture(Path("town"), views, _points(boxes, views, points))
+    return Capture(Path("town"), views, points_of(boxes, views, points))
 
 
-def _points(boxes: np.ndarray, views: list[View], each: int) -> Points:
+def points_of(boxes: np.ndarray, views: list[View], each: int, paint=colors) -> Points:
+    """Points on houses and on the ground around them, with tracks of all views that see them.
+
+    Args:
+        boxes: the houses.
+        views: whose photos see them.
+        each: for each house.
+        paint: colors of places on what was hit, as ``colors`` has them.
+    """
     random = np.random.default_rng(2)
     places, owners = [], []
     for number, (low, high) in enumerate(boxes):
@@ -167,7 +176,7 @@ def _points(boxes: np.ndarray, views: list[View], each: int) -> Points:
         point.append(those)
         xy.append(pixel[those])
     tracks = Tracks([v.name for v in views], *map(np.concatenate, (view, point, xy)))
-    return Points(xyz, colors(boxes, xyz, owner).astype(np.uint8), tracks=tracks)
+    return Points(xyz, np.clip(paint(boxes, xyz, owner), 0, 255).astype(np.uint8), tracks=tracks)
 
 
 def written(capture: Capture, folder: Path) -> Path:

@@ -32,10 +32,10 @@ COARSE_PIXELS = 600_000_000
 def _density(settings: Mapping[str, Any]) -> dict[str, str]:
     """What the default preset does not choose here.
 
-    MCMC moves splats by noise that grows with the scene's extent and with the square of their
-    sizes, both in world units: over many houses, it blows them away. What the preset goes by, the
-    angle between photos as seen from the one place that all look at, says nothing of a scene
-    without such a place.
+    MCMC pulls all splats in each step to be faint, however few photos show them: in a scene of many
+    places, most fade. (One house of the benchmark's town scores 25.4 dB with it, and 24.8 without;
+    all 15 houses 18.8 and 22.8 dB.) What the preset goes by, the angle between photos as seen from
+    the one place that all look at, says nothing of a scene without such a place.
     """
     return {"density": "original"} if settings.get("preset", "default") == "default" else {}
 
