@@ -1,6 +1,6 @@
 """A made-up town fitted whole and in blocks: scores, peak memory, seconds, splats.
 
-    python benches/blocks.py --out out/blocks [--houses 5x3] [--photos 300] [--size 160] [--blocks 2,4]
+    python benches/blocks.py --out out/blocks [--photos 300] [--size 160] [--blocks 2,4]
 
 The town is ``soft_town``; with ``--capture``, other photos take its place. All runs have as many
 splats and steps: blocks share the steps of the whole fit, and have a coarse fit of as many steps as

@@ -70,7 +70,8 @@ def test_a_scene_in_blocks_is_one_scene(whole, folder):
     splats, report, out, seen = whole
     assert igsr.Splats.load(out / "scene.ply") == splats
     assert json.loads((out / "report.json").read_text()) == report
-    assert len(splats) == report["splats"] == sum(block["splats"] for block in report["blocks"])
+    of_blocks = sum(block["splats"] for block in report["blocks"])
+    assert len(splats) == report["splats"] == of_blocks + report["background_splats"]
     assert [block["name"] for block in report["blocks"]] == ["block-000", "block-001"]
     # Each block has its own process and its own photos, and is rid of what lies beyond its cell.
     assert len({block["process"] for block in report["blocks"]} | {os.getpid()}) == 3

@@ -7,6 +7,7 @@ import os
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,13 +16,17 @@ from PIL import Image
 
 import igsr
 from igsr.blocks.assignment import photos_across_seams, photos_of_blocks
-from igsr.blocks.cells import Cell, ground_of, split_into_cells
+from igsr.blocks.cells import Cell, Ground, ground_of, split_into_cells
 from igsr.blocks.manifest import file_mark, read_manifest
 from igsr.blocks.photo_parts import ALL, Box, box_of, boxes_of, cut_out
 from igsr.blocks.plan import blocks_for_memory, memory_of
+from igsr.blocks.reach import reaching_out
 from igsr.blocks.shares import shown_shares, tracked_shares
+from igsr.blocks.tasks import BlockPart
+from igsr.blocks.worker import depths_of_points, depths_of_scene
 from igsr.capture import Camera, View
 from igsr.capture.types import intrinsic_matrix
+from igsr.fitting.photo_support import support_of
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +175,70 @@ def test_parts_of_photos_take_less_memory(town):
     whole = memory_of(manifest, photos, None)
     half = [Box(0.0, 0.0, 0.5, 1.0)] * len(photos)
     assert memory_of(manifest, photos, None, boxes=half) < whole
+
+
+def test_photos_of_many_places_tell_how_many_see_each():
+    # A drone's, straight down from 4 units: each shows 2.56 x 1.92 units, 1 unit from the next.
+    grid = [(float(x), float(z)) for x in range(10) for z in range(10)]
+    cameras = [camera([x, -4.0, z], (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)) for x, z in grid]
+    image = np.zeros((24, 32, 3), np.uint8)
+    views = [View(f"{k}.png", one, "train", image) for k, one in enumerate(cameras)]
+    assert support_of(views, np.full(100, 4.0)).seen_by == pytest.approx(2.8)
+    # Parts of photos look at what is in their own middle, and show less.
+    parts = [cut_out(view, Box(0.5, 0.0, 1.0, 1.0)) for view in views]
+    assert support_of(parts, np.full(100, 4.0)).seen_by == pytest.approx(1.0)
+
+
+def test_depths_are_those_of_the_points_that_photos_see():
+    capture = towns.town(2, 1, 6, 32, 24, points=100, sharp=1)
+    depths = depths_of_points(capture.views, capture.points)
+    assert np.median(depths) == pytest.approx(3.5, rel=0.3)
+    unseen = [replace(capture.views[0], name="other.png")]
+    assert depths_of_points(unseen, capture.points) == [0.0]
+    assert depths_of_points(capture.views, replace(capture.points, tracks=None)) is None
+    assert depths_of_points(capture.views, None) is None
+
+
+def test_splats_that_reach_into_other_cells_are_no_blocks():
+    cells = split_into_cells(np.stack([np.arange(8.0), np.zeros(8)], axis=1), 2)
+    ground = Ground(np.eye(3)[[0, 2]])
+    border, side = cells[0].high[0], cells[0].side[0]
+    # Half axes along x by turning a needle along z, and as they are.
+    means = np.array([[1.0, 0, 0], [1.0, 0, 0], [-50.0, 0, 9], [border - 0.1, 0, 0], [6.0, 0, 0]])
+    scales = np.full((5, 3), 0.01)
+    scales[0, 2] = scales[1, 0] = scales[4, 0] = 0.5 * (border - 1.0) + 0.2 * side
+    scales[2] = 20.0
+    scales[3] = 0.1
+    quats = np.tile([1.0, 0, 0, 0], (5, 1))
+    quats[4] = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]  # x becomes z
+    splats = igsr.Splats(
+        means.astype(np.float32),
+        quats.astype(np.float32),
+        np.log(scales).astype(np.float32),
+        np.zeros(5, np.float32),
+        np.zeros((5, 1, 3), np.float32),
+    )
+    assert reaching_out(splats, cells, ground).tolist() == [False, True, False, False, False]
+    # The block keeps what is its own alone, and fits no others.
+    part = BlockPart(
+        scene=None, ground=ground, cell=cells[0], fitted=cells[0].widened(), cells=tuple(cells)
+    )
+    assert part.moving(splats).tolist() == [True, False, True, True, False]
+    assert part.kept(splats).tolist() == [True, False, True, True, False]
+
+
+def test_depths_are_those_of_the_scene():
+    splats = igsr.Splats(
+        np.array([[0.0, 0.0, 4.0]], np.float32),
+        np.array([[1, 0, 0, 0]], np.float32),
+        np.full((1, 3), np.log(3.0), np.float32),
+        np.full(1, 6.0, np.float32),
+        np.zeros((1, 4, 3), np.float32),
+    )
+    image = np.zeros((24, 32, 3), np.uint8)
+    facing = View("a.png", camera([0.0, 0.0, 0.0]), "train", image)
+    away = View("b.png", camera([0.0, 0.0, 0.0], forward=(0.0, 0.0, -1.0)), "train", image)
+    assert depths_of_scene([facing, away], splats, "cpu") == pytest.approx([4.0, 0.0], abs=0.2)
 
 
 def test_what_is_hidden_is_not_shown():

@@ -91,7 +91,7 @@ def mending_task(
             ground=plan.ground,
             cell=EVERYWHERE,
             fitted=EVERYWHERE,
-            borders_of=tuple(plan.cells),
+            cells=tuple(plan.cells),
             band=BAND,
         ),
     )

@@ -68,7 +68,7 @@ def _merged_groups(splats: Splats, group: npt.NDArray[np.int64]) -> Splats:
 
     places = splats.means.astype(np.float64)
     middle = mean(places)
-    axes = _rotations(splats.quats.astype(np.float64))
+    axes = rotations_of(splats.quats.astype(np.float64))
     spread = np.einsum("nij,nj,nkj->nik", axes, scales**2, axes)
     apart = places - middle[group]
     spread = mean(spread + apart[:, :, None] * apart[:, None, :])
@@ -96,7 +96,7 @@ def _area(scales: Float64) -> Float64:
     return np.asarray(a * b + b * c + c * a)
 
 
-def _rotations(quats: Float64) -> Float64:
+def rotations_of(quats: Float64) -> Float64:
     """Rotation matrices [N, 3, 3] of quaternions w x y z."""
     norm = np.linalg.norm(quats, axis=1, keepdims=True)
     w, x, y, z = (quats / np.where(norm > 0.0, norm, 1.0)).T

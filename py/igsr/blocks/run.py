@@ -19,6 +19,7 @@ from igsr.blocks.page import write_block_page
 from igsr.blocks.photo_parts import Box
 from igsr.blocks.plan import BlockPlan, blocks_for_memory, cells_of, memory_of, plan_blocks
 from igsr.blocks.progress import Standing
+from igsr.blocks.reach import reaching_out
 from igsr.blocks.report import block_report, held_out_scores
 from igsr.blocks.runner import Runner
 from igsr.blocks.seams import loaded_in_parts, psnr_of_parts, seam_scores
@@ -128,6 +129,7 @@ def fit_in_blocks(
     report = block_report(
         path, options, plan, coarse_row, {row["name"]: row for row in rows}, splats
     )
+    report["background_splats"] = len(splats) - sum(row["splats"] for row in rows)
     report |= {"seams": seams, **scores, "parts": parts.plain()}
     write_json(out / "report.json", report)
     write_block_page(out / "report.html", report, manifest, splats, exposures, options)
@@ -147,9 +149,13 @@ def _check(options: BlockOptions) -> None:
 
 
 def _joined(plan: BlockPlan, coarse: Splats, tasks: Sequence[FitTask]) -> Splats:
-    """The splats of all blocks, in the order of the cells; coarse ones where none was fitted."""
+    """The splats of all blocks, in the order of the cells.
+
+    Coarse ones where none was fitted, and those that reach out into other cells.
+    """
     fitted = {task.name: task for task in tasks}
     places = plan.ground.places(coarse.means.astype(np.float64) + coarse.origin)
+    shared = reaching_out(coarse, plan.cells, plan.ground)
     kept = []
     for index, cell in enumerate(plan.cells):
         task = fitted.get(name_of(index))
@@ -157,6 +163,7 @@ def _joined(plan: BlockPlan, coarse: Splats, tasks: Sequence[FitTask]) -> Splats
             kept.append(subset(coarse, cell.holds(places)))
         else:
             kept.append(load_splats(task.folder / SPLATS))
+            kept.append(subset(coarse, shared & cell.holds(places)))
     degree = max(part.sh_degree for part in kept)
     return joined([_with_degree(part, degree) for part in kept])
 

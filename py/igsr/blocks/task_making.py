@@ -14,6 +14,7 @@ from igsr.blocks.cells import WIDENED
 from igsr.blocks.manifest import Manifest
 from igsr.blocks.options import BlockOptions
 from igsr.blocks.plan import BlockPlan
+from igsr.blocks.reach import reaching_out
 from igsr.blocks.tasks import SPLATS, BlockPart, FitTask
 from igsr.capture.downscaling import reduced_size
 from igsr.capture.exposure import Exposure
@@ -108,11 +109,12 @@ def block_tasks(
         most = given["max_splats"] / len(plan.cells)
         given["max_splats"] = max(1, round(most * (1.0 + WIDENED)))
     places = plan.ground.places(coarse.means.astype(np.float64) + coarse.origin)
+    fits = ~reaching_out(coarse, plan.cells, plan.ground)
     tasks = []
     for index, cell in enumerate(plan.cells):
         photos = np.flatnonzero(plan.photos[:, index])
         name = name_of(index)
-        inside = int(cell.widened().holds(places).sum())
+        inside = int((fits & cell.widened().holds(places)).sum())
         if not len(photos) or not inside:
             what = "photos" if not len(photos) else "splats of the coarse fit"
             warnings.warn(f"{name} has no {what}; it stays as coarse as it is.", stacklevel=3)
@@ -137,6 +139,7 @@ def block_tasks(
                     ground=plan.ground,
                     cell=cell,
                     fitted=cell.widened(),
+                    cells=tuple(plan.cells),
                     across=frozenset(manifest.shots[i].name for i in photos if plan.across[i]),
                 ),
             )

@@ -16,6 +16,7 @@ from igsr._internal.atomic_write import atomic_write
 from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
 from igsr.blocks.cells import Cell, Ground, near_borders
 from igsr.blocks.photo_parts import Box
+from igsr.blocks.reach import reaching_out
 from igsr.capture.exposure import Exposure
 from igsr.capture.photos import Shot
 from igsr.capture.types import Points
@@ -35,26 +36,35 @@ class BlockPart:
             others stay as they are.
         ground: the plane of the cells.
         cell: whose splats, once fitted, are the block's.
-        fitted: the cell whose splats are fitted, which is wider.
+        fitted: the cell whose splats are fitted, which is wider; but not those that reach out into
+            others.
+        cells: all cells of the plan.
         across: names of photos that show a seam: the block scores those of them that it has.
-        borders_of: cells; where there are some, splats are fitted that lie near their borders, and
-            no others.
-        band: how near, as a part of the cells' sides.
+        band: above 0, splats are fitted that lie as near to a border between cells, as a part of
+            the cells' sides, and no others.
     """
 
     scene: Path
     ground: Ground
     cell: Cell
     fitted: Cell
+    cells: tuple[Cell, ...]
     across: frozenset[str] = frozenset()
-    borders_of: tuple[Cell, ...] = ()
     band: float = 0.0
 
-    def moving(self, places: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-        """Which splats at these places [N, 2] are fitted."""
-        if self.borders_of:
-            return near_borders(self.borders_of, places, self.band)
-        return self.fitted.holds(places)
+    def moving(self, scene: Splats) -> npt.NDArray[np.bool_]:
+        """Which splats of the scene are fitted, bool [N]."""
+        places = self.ground.places(scene.means.astype(np.float64) + scene.origin)
+        if self.band > 0.0:
+            return near_borders(self.cells, places, self.band)
+        return self.fitted.holds(places) & ~reaching_out(scene, self.cells, self.ground)
+
+    def kept(self, fitted: Splats) -> npt.NDArray[np.bool_]:
+        """Which of the splats that were fitted are the block's, bool [N]."""
+        if self.band > 0.0:
+            return np.ones(len(fitted), np.bool_)
+        places = self.ground.places(fitted.means.astype(np.float64) + fitted.origin)
+        return self.cell.holds(places) & ~reaching_out(fitted, self.cells, self.ground)
 
     def plain(self) -> dict[str, Any]:
         """As JSON has it, without the scene."""
@@ -63,7 +73,7 @@ class BlockPart:
             "cell": self.cell.plain(),
             "fitted": self.fitted.plain(),
             "across": sorted(self.across),
-            "borders_of": [cell.plain() for cell in self.borders_of],
+            "cells": [cell.plain() for cell in self.cells],
             "band": self.band,
         }
 

@@ -7,7 +7,7 @@ import json
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +21,7 @@ from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Meter
 from igsr._internal.worker_processes import in_a_process
 from igsr.blocks.manifest import shot_mark
-from igsr.blocks.photo_parts import ALL, cut_out
+from igsr.blocks.photo_parts import ALL, ASKED_SIZE, cut_out
 from igsr.blocks.tasks import (
     CHECKPOINT,
     PROGRESS,
@@ -33,18 +33,22 @@ from igsr.blocks.tasks import (
 )
 from igsr.capture import Capture, View
 from igsr.capture.described import DescribedCapture
+from igsr.capture.downscaling import reduced_size, resized_camera
+from igsr.capture.types import Points
 from igsr.errors import IgsrError
-from igsr.evaluation.scores import default_background, score_views
+from igsr.evaluation.scores import BLACK, default_background, score_views
 from igsr.fitting.checkpoint import load_checkpoint
 from igsr.fitting.fit_capture import fit_with_cameras
-from igsr.fitting.fitter import PARAMETERS, without_exposures
-from igsr.fitting.photo_support import support_of
+from igsr.fitting.fitter import PARAMETERS, photos_among, without_exposures
+from igsr.fitting.photo_support import PhotoSupport, support_of
 from igsr.fitting.presets import settings_for
 from igsr.fitting.run import Progress
-from igsr.rendering.renders import project
+from igsr.fitting.settings import FitSettings
+from igsr.rendering.renders import project, render
 from igsr.splats import Splats
 
 Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
 
 #: Photos that are held whole at a time while parts of them are cut out.
 AT_A_TIME = 8
@@ -108,7 +112,7 @@ def _loaded(task: FitTask) -> list[View]:
 
 def _coarse(task: FitTask, views: list[View]) -> dict[str, Any]:
     capture = Capture(task.capture, views, task.points)
-    splats, fitted, last = _fit(task, capture, {})
+    splats, fitted, last = _fit(task, capture, {}, depths_of_points(views, task.points))
     exposures = {
         view.name: view.exposure.plain() for view in fitted.views if view.exposure is not None
     }
@@ -118,17 +122,17 @@ def _coarse(task: FitTask, views: list[View]) -> dict[str, Any]:
 
 def _block(task: FitTask, block: BlockPart, views: list[View]) -> dict[str, Any]:
     scene = load_splats(block.scene)
-    places = block.ground.places(scene.means.astype(np.float64) + scene.origin)
-    moving = block.moving(places)
+    moving = block.moving(scene)
     # What none of the photos shows takes memory and does nothing.
     background = ~moving & shown_by(scene, views, task.backend)
     still = subset(scene, background) if background.any() else None
     settings = {
         "start": subset(scene, moving),
         "frozen": still,
-        "whole_schedule": not block.borders_of,
+        "whole_schedule": block.band == 0.0,
     }
-    splats, _, last = _fit(task, Capture(task.capture, views), settings)
+    depths = depths_of_scene(views, scene, task.backend)
+    splats, _, last = _fit(task, Capture(task.capture, views), settings, depths)
     whole = splats if still is None else joined([splats, still])
     color = task.settings.get("background") or default_background(Capture(task.capture, views))
     across = [view for view in views if view.name in block.across]
@@ -136,8 +140,7 @@ def _block(task: FitTask, block: BlockPart, views: list[View]) -> dict[str, Any]
         score_views(whole, across, color, cast(Backend, task.backend), ("psnr",)) if across else ()
     )
     psnr = {one.name: one.scores["psnr"] for one in scored}
-    places = block.ground.places(splats.means.astype(np.float64) + splats.origin)
-    kept = subset(splats, block.cell.holds(places))
+    kept = subset(splats, block.kept(splats))
     save_splats(task.folder / SPLATS, kept)
     return {
         "splats": len(kept),
@@ -150,9 +153,17 @@ def _block(task: FitTask, block: BlockPart, views: list[View]) -> dict[str, Any]
 
 
 def _fit(
-    task: FitTask, capture: Capture, more: dict[str, Any]
+    task: FitTask, capture: Capture, more: dict[str, Any], depths: Float64 | None
 ) -> tuple[Splats, Capture, dict[str, Any]]:
-    """Fit, from the task's checkpoint where that can be used."""
+    """Fit, from the task's checkpoint where that can be used.
+
+    Args:
+        task: the task.
+        capture: its photos.
+        more: keywords of ``igsr.fit`` beside the task's.
+        depths: of what photos show, by which presets tell how many see the same place. (A fit of
+            one thing knows it by the place that all photos look at; here there is none.)
+    """
     checkpoint = task.folder / CHECKPOINT
     seen: list[Progress] = []
     attempt = 1 + attempts(task.folder)
@@ -163,7 +174,7 @@ def _fit(
         tell(now)
 
     def run(resume: bool) -> tuple[Splats, Capture]:
-        keywords = {**task.settings, **more, "max_splats": most}
+        keywords = {**chosen, **task.settings, **more, "max_splats": most}
         return fit_with_cameras(
             capture,
             progress=progress,
@@ -173,7 +184,14 @@ def _fit(
             **keywords,
         )
 
-    most = _most_splats(task, capture, more.get("start"))
+    support = support_of(photos_among(capture.train_views), depths)
+    usual = _usual_settings(task, support)
+    start = more.get("start")
+    chosen: dict[str, Any] = {"dropout": usual.dropout}
+    if start is None:
+        chosen["sh_degree"] = usual.sh_degree
+    # The task's part of the most splats there may be, but no fewer than there are at first.
+    most = max(1 if start is None else len(start), round(task.splats_part * usual.max_splats))
     resumed_from = _step_of(checkpoint)
     try:
         splats, fitted = run(resume=resumed_from is not None)
@@ -187,6 +205,7 @@ def _fit(
         "max_splats": most,
         "splats_part": task.splats_part,
         "steps": last.steps,
+        "dropout": usual.dropout,
         "loss": last.loss if np.isfinite(last.loss) else None,
         "start": last.started[0],
         "removed": dict(last.removed or {}),
@@ -197,12 +216,43 @@ def _fit(
     return splats, fitted, about
 
 
-def _most_splats(task: FitTask, capture: Capture, start: Splats | None) -> int:
-    """The task's part of the most splats there may be, but no fewer than there are at first."""
+def _usual_settings(task: FitTask, support: PhotoSupport) -> FitSettings:
+    """The settings of the task, and of its preset for photos that tell this."""
     given = {k: v for k, v in task.settings.items() if k not in ("preset", "quality", "start")}
     preset, quality = task.settings.get("preset", "default"), task.settings.get("quality", "normal")
-    usual = settings_for(preset, support_of(capture.train_views), quality, **given).max_splats
-    return max(1 if start is None else len(start), round(task.splats_part * usual))
+    return settings_for(preset, support, quality, **given)
+
+
+def depths_of_scene(views: Sequence[View], scene: Splats, backend: str) -> Float64:
+    """How far what photos show is, by a scene: the median over each picture, world units, [V]."""
+    plain = replace(scene, sh=np.ascontiguousarray(scene.sh[:, :1]))
+    depths = []
+    for view in views:
+        camera = view.camera
+        small = resized_camera(camera, *reduced_size(camera.width, camera.height, ASKED_SIZE))
+        drawn = render(plain, small, BLACK, cast(Backend, backend))
+        known = drawn.expected_depth[drawn.alpha > 0.5]
+        depths.append(float(np.median(known)) if len(known) else 0.0)
+    return np.array(depths)
+
+
+def depths_of_points(views: Sequence[View], points: Points | None) -> Float64 | None:
+    """How far what photos show is, by the points that they see, [V]; None without tracks."""
+    if points is None or points.tracks is None:
+        return None
+    tracks = points.tracks
+    number = {name: index for index, name in enumerate(tracks.names)}
+    order = np.argsort(tracks.view, kind="stable")
+    ends = np.searchsorted(tracks.view[order], np.arange(len(tracks.names) + 1))
+    depths = np.zeros(len(views))
+    for index, view in enumerate(views):
+        known = number.get(view.name)
+        if known is None or ends[known] == ends[known + 1]:
+            continue
+        seen = points.xyz[tracks.point[order[ends[known] : ends[known + 1]]]]
+        viewmat = view.camera.viewmat
+        depths[index] = np.median(seen @ viewmat[2, :3] + viewmat[2, 3])
+    return depths
 
 
 def _step_of(checkpoint: Path) -> int | None:

@@ -62,25 +62,33 @@ class PhotoSupport:
         return cls(photos, PIXELS, max(1.0, SUPPORTS_OF_ALL * photos), apart)
 
 
-def support_of(views: Sequence[View]) -> PhotoSupport:
+def support_of(views: Sequence[View], depths: np.ndarray | None = None) -> PhotoSupport:
     """What these photos tell.
 
     Args:
         views: at least one.
+        depths: float [V], how far what each shows in its middle is along its axis, world units;
+            None: as far as the place that all look at, where they do.
     """
     import numpy as np
 
     from igsr.geometry.focus_point import focus_point
 
-    target = focus_point([view.camera for view in views])
     centres = np.stack([view.camera.centre for view in views])
     forward = np.stack([view.camera.viewmat[2, :3] for view in views])
-    # What a photo looks at: as far along its axis as the place that all look at.
-    reach = np.maximum(((target - centres) * forward).sum(axis=1), 1e-9)
-    looked_at = centres + reach[:, None] * forward
     K = np.stack([view.camera.K for view in views])
     sizes = np.array([(view.camera.width, view.camera.height) for view in views])
     rotations = np.stack([view.camera.viewmat[:3, :3] for view in views])
+    if depths is None:
+        # What a photo looks at: as far along its axis as the place that all look at.
+        target = focus_point([view.camera for view in views])
+        reach = np.maximum(((target - centres) * forward).sum(axis=1), 1e-9)
+        looked_at = centres + reach[:, None] * forward
+    else:
+        middle = (0.5 * sizes - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]
+        rays = np.concatenate([middle, np.ones((len(views), 1))], axis=1)
+        rays = np.maximum(depths, 1e-9)[:, None] * rays
+        looked_at = centres + np.einsum("vji,vj->vi", rotations, rays)
     shifts = np.stack([view.camera.viewmat[:3, 3] for view in views])
     seen_by, apart = [], []
     for i, place in enumerate(looked_at):
