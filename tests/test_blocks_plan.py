@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,15 +18,19 @@ from PIL import Image
 import igsr
 from igsr.blocks.assignment import photos_across_seams, photos_of_blocks
 from igsr.blocks.cells import Cell, Ground, ground_of, split_into_cells
-from igsr.blocks.manifest import file_mark, read_manifest
+from igsr.blocks.manifest import Manifest, file_mark, read_manifest
+from igsr.blocks.options import BlockOptions
 from igsr.blocks.photo_parts import ALL, Box, box_of, boxes_of, cut_out
 from igsr.blocks.plan import blocks_for_memory, memory_of
 from igsr.blocks.reach import reaching_out
 from igsr.blocks.shares import shown_shares, tracked_shares
+from igsr.blocks.task_making import coarse_task
 from igsr.blocks.tasks import BlockPart
 from igsr.blocks.worker import depths_of_points, depths_of_scene
 from igsr.capture import Camera, View
+from igsr.capture.photos import PhotoHeader, Shot
 from igsr.capture.types import intrinsic_matrix
+from igsr.capture.undistort import Lens
 from igsr.fitting.photo_support import support_of
 
 
@@ -197,6 +202,32 @@ def test_depths_are_those_of_the_points_that_photos_see():
     assert depths_of_points(unseen, capture.points) == [0.0]
     assert depths_of_points(capture.views, replace(capture.points, tracks=None)) is None
     assert depths_of_points(capture.views, None) is None
+
+
+@pytest.mark.parametrize(
+    ("blocks", "splats", "size", "most"),
+    [
+        (2, 50_000, 333, 50_000),  # a small scene's are all that it has
+        (2, 9_000_000, 333, None),
+        (60, 9_000_000, 141, None),  # photos have as many pixels as a block's
+    ],
+)
+def test_a_coarse_fit_takes_no_more_memory_than_a_block(blocks, splats, size, most):
+    header = PhotoHeader((1000, 750), 3)
+    shots = [Shot("a", None, camera([0, 0, 0]), Lens(), "train", None, None)] * 3000
+    manifest = Manifest(Path(), shots, [header] * 3000, [""] * 3000, lambda: None)
+    settings = {"max_splats": splats}
+    options = BlockOptions(blocks=blocks, settings=settings)
+    task = coarse_task(manifest, None, Path("out"), options, blocks)
+    assert task.max_size == size
+    assert task.settings["transients"] == "off"
+    if most is not None:
+        assert task.settings["max_splats"] == most
+        return
+    photos = list(range(3000))
+    coarse = memory_of(manifest, photos, size, task.settings["max_splats"])
+    block = memory_of(manifest, photos[: 3600 // blocks], None, round(1.2 * splats / blocks))
+    assert 0.99 * block < coarse <= block
 
 
 def test_splats_that_reach_into_other_cells_are_no_blocks():

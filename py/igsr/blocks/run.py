@@ -80,7 +80,7 @@ def fit_in_blocks(
         options = replace(options, settings={**options.settings, **background})
     runner = Runner(out, str(path), options.backend, options.ray, told)
 
-    first = coarse_task(manifest, points, out, options)
+    first = coarse_task(manifest, points, out, options, count)
     with parts.measured("coarse fit"):
         coarse_row = runner.rows([first], [key_of(first)])[0]
         coarse = load_splats(first.folder / SPLATS)

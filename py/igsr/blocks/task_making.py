@@ -13,11 +13,12 @@ import numpy as np
 from igsr.blocks.cells import WIDENED
 from igsr.blocks.manifest import Manifest
 from igsr.blocks.options import BlockOptions
-from igsr.blocks.plan import BlockPlan
+from igsr.blocks.plan import BlockPlan, memory_of
 from igsr.blocks.reach import reaching_out
 from igsr.blocks.tasks import SPLATS, BlockPart, FitTask
 from igsr.capture.downscaling import reduced_size
 from igsr.capture.exposure import Exposure
+from igsr.capture.memory_check import OF_A_SPLAT
 from igsr.capture.tracks import resized
 from igsr.capture.types import Points
 from igsr.errors import IgsrError
@@ -28,6 +29,8 @@ from igsr.splats import Splats
 COARSE, COARSE_SIZES = 1 / 3, (96, 400)
 #: Pixels of all photos of the coarse fit together, at most.
 COARSE_PIXELS = 600_000_000
+#: So many splats it may have in any case: blocks that begin with few of them fall behind.
+COARSE_SPLATS = 100_000
 
 
 def _density(settings: Mapping[str, Any]) -> dict[str, str]:
@@ -47,11 +50,15 @@ def name_of(block: int) -> str:
 
 
 def coarse_task(
-    manifest: Manifest, points: Points | None, out: Path, options: BlockOptions
+    manifest: Manifest, points: Points | None, out: Path, options: BlockOptions, blocks: int
 ) -> FitTask:
-    """The fit of everything, at low resolution."""
+    """The fit of everything, at low resolution, so that it takes no more memory than a block."""
     train = manifest.of_split("train")
-    size = _coarse_size(manifest, train, options.max_size)
+    size = _coarse_size(manifest, train, options.max_size, blocks)
+    settings = {**_density(options.settings), **options.settings, "transients": "off"}
+    if settings.get("max_splats") is not None:
+        most = _coarse_splats(manifest, train, size, options.max_size, blocks, settings)
+        settings["max_splats"] = most
     shots = [manifest.shots[index] for index in train]
     before = {shot.name: shot.camera for shot in shots}
     after = {
@@ -66,7 +73,7 @@ def coarse_task(
         marks=[manifest.marks[index] for index in train],
         max_size=size,
         # Transient things are looked for by the blocks: the search holds all photos of a fit.
-        settings={**_density(options.settings), **options.settings, "transients": "off"},
+        settings=settings,
         backend=options.backend,
         points=resized(points, before, cast(Any, after)),
     )
@@ -78,13 +85,33 @@ class _Size:
     height: int
 
 
-def _coarse_size(manifest: Manifest, photos: Sequence[int], max_size: int | None) -> int:
-    """Longest side in pixels of the coarse fit's photos."""
+def _coarse_size(
+    manifest: Manifest, photos: Sequence[int], max_size: int | None, blocks: int
+) -> int:
+    """Longest side in pixels of the coarse fit's photos, which have no more than a block's."""
     longest = max(max(manifest.headers[index].size) for index in photos)
     longest = min(longest, max_size or longest)
     least, most = COARSE_SIZES
-    fitting = int((COARSE_PIXELS / (0.75 * len(photos))) ** 0.5)
+    of_a_block = 0.75 * longest**2 * len(photos) * (1.0 + WIDENED) / blocks
+    fitting = int((min(COARSE_PIXELS, of_a_block) / (0.75 * len(photos))) ** 0.5)
     return min(longest, max(least, min(most, fitting, round(COARSE * longest))))
+
+
+def _coarse_splats(
+    manifest: Manifest,
+    photos: Sequence[int],
+    size: int,
+    max_size: int | None,
+    blocks: int,
+    settings: Mapping[str, Any],
+) -> int:
+    """Most splats of the coarse fit: those of the scene, or as many as a block's memory holds."""
+    of_scene: int = settings["max_splats"]
+    of_block = max(1, round((1.0 + WIDENED) * of_scene / blocks))
+    some = list(photos)[: max(1, round((1.0 + WIDENED) * len(photos) / blocks))]
+    left = memory_of(manifest, some, max_size, of_block)
+    left -= memory_of(manifest, list(photos), size, 0)
+    return min(of_scene, max(of_block, COARSE_SPLATS, left // OF_A_SPLAT))
 
 
 def block_tasks(
