@@ -33,17 +33,6 @@ COARSE_PIXELS = 600_000_000
 COARSE_SPLATS = 100_000
 
 
-def _density(settings: Mapping[str, Any]) -> dict[str, str]:
-    """What the default preset does not choose here.
-
-    MCMC pulls all splats in each step to be faint, however few photos show them: in a scene of many
-    places, most fade. (One house of the benchmark's town scores 25.4 dB with it, and 24.8 without;
-    all 15 houses 18.8 and 22.8 dB.) What the preset goes by, the angle between photos as seen from
-    the one place that all look at, says nothing of a scene without such a place.
-    """
-    return {"density": "original"} if settings.get("preset", "default") == "default" else {}
-
-
 def name_of(block: int) -> str:
     """The name of a block by its number, from 0."""
     return f"block-{block:03d}"
@@ -55,7 +44,7 @@ def coarse_task(
     """The fit of everything, at low resolution, so that it takes no more memory than a block."""
     train = manifest.of_split("train")
     size = _coarse_size(manifest, train, options.max_size, blocks)
-    settings = {**_density(options.settings), **options.settings, "transients": "off"}
+    settings = {**options.settings, "transients": "off"}
     if settings.get("max_splats") is not None:
         most = _coarse_splats(manifest, train, size, options.max_size, blocks, settings)
         settings["max_splats"] = most
@@ -128,7 +117,7 @@ def block_tasks(
         IgsrError: there is none.
         UserWarning: a block has no photos or no splats.
     """
-    given = {**_density(options.settings), **options.settings}
+    given = dict(options.settings)
     given.pop("start", None)
     given["exposure"] = "off"
     if given.get("max_splats") is not None:
