@@ -128,7 +128,9 @@ def scene(photos: int, time: np.ndarray, memory: np.ndarray) -> dict[str, Any]:
     # They grow to the most there may be in the first half of the steps: three quarters in the mean.
     mean = {**block, "splats": 0.75 * settings.max_splats}
     seconds = settings.steps * float(time @ time_terms(mean))
-    coarse_side = min(400, int((600e6 / (0.75 * photos)) ** 0.5))
+    # A third of the size, and no more pixels than a block has.
+    pixels = min(600e6, 1.2 * 750_000 * photos / blocks)
+    coarse_side = max(96, min(333, int((pixels / (0.75 * photos)) ** 0.5)))
     coarse = {"photos": photos, "pixels": 0.75 * coarse_side**2, "splats": 100_000}
     coarse_seconds = settings.steps * float(time @ time_terms(coarse))
     return {
