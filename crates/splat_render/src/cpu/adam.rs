@@ -218,21 +218,79 @@ impl WithSimd for Adam<'_> {
         let [bias1, bias2] = self.bias;
         let bias = [Lanes::splat(s, bias1), Lanes::splat(s, bias2)];
         let n = self.values.len();
-        let (values, first, second) = (self.values, &mut self.first[..n], &mut self.second[..n]);
-        let (gradient, rates) = (&self.gradient[..n], &self.rates[..n]);
-        for at in (0..n).step_by(S::F32_LANES) {
-            let state = [
-                Lanes::new(s, s.partial_load_f32s(&values[at..])),
-                Lanes::new(s, s.partial_load_f32s(&first[at..])),
-                Lanes::new(s, s.partial_load_f32s(&second[at..])),
-            ];
-            let gradient = Lanes::new(s, s.partial_load_f32s(&gradient[at..]));
-            let rate = Lanes::new(s, s.partial_load_f32s(&rates[at..]));
-            let [value, m, v] = step(state, gradient, rate, bias);
-            s.partial_store_f32s(&mut values[at..], value.vector());
-            s.partial_store_f32s(&mut first[at..], m.vector());
-            s.partial_store_f32s(&mut second[at..], v.vector());
+        let arrays = [self.values, &mut self.first[..n], &mut self.second[..n]];
+        let mut vectors = StateVectors::new(s, arrays);
+        let (gradients, gradient) = S::as_simd_f32s(&self.gradient[..n]);
+        let (rates, rate) = S::as_simd_f32s(&self.rates[..n]);
+        for k in 0..vectors.whole() {
+            let (gradient, rate) = (Lanes::new(s, gradients[k]), Lanes::new(s, rates[k]));
+            vectors.set(k, step(vectors.get(k), gradient, rate, bias));
         }
+        if vectors.has_rest() {
+            let gradient = Lanes::new(s, s.partial_load_f32s(gradient));
+            let rate = Lanes::new(s, s.partial_load_f32s(rate));
+            vectors.set_rest(step(vectors.rest(), gradient, rate, bias));
+        }
+    }
+}
+
+/// Numbers with their first and second moments as whole vectors and a rest that fills none: to read a
+/// part of a vector is a call.
+pub(super) struct StateVectors<'a, S: Simd> {
+    s: S,
+    whole: [&'a mut [S::f32s]; 3],
+    rest: [&'a mut [f32]; 3],
+}
+
+impl<'a, S: Simd> StateVectors<'a, S> {
+    /// All of one length.
+    #[inline(always)]
+    pub fn new(s: S, [values, first, second]: [&'a mut [f32]; 3]) -> Self {
+        let (values, value) = S::as_mut_simd_f32s(values);
+        let (first, m) = S::as_mut_simd_f32s(&mut first[..]);
+        let (second, v) = S::as_mut_simd_f32s(&mut second[..]);
+        let n = values.len();
+        Self { s, whole: [values, &mut first[..n], &mut second[..n]], rest: [value, m, v] }
+    }
+
+    #[inline(always)]
+    pub fn whole(&self) -> usize {
+        self.whole[0].len()
+    }
+
+    #[inline(always)]
+    pub fn get(&self, k: usize) -> [Lanes<S>; 3] {
+        let [values, first, second] = &self.whole;
+        [Lanes::new(self.s, values[k]), Lanes::new(self.s, first[k]), Lanes::new(self.s, second[k])]
+    }
+
+    #[inline(always)]
+    pub fn set(&mut self, k: usize, [value, m, v]: [Lanes<S>; 3]) {
+        let [values, first, second] = &mut self.whole;
+        (values[k], first[k], second[k]) = (value.vector(), m.vector(), v.vector());
+    }
+
+    #[inline(always)]
+    pub fn has_rest(&self) -> bool {
+        !self.rest[0].is_empty()
+    }
+
+    #[inline(always)]
+    pub fn rest(&self) -> [Lanes<S>; 3] {
+        let (s, [value, m, v]) = (self.s, &self.rest);
+        [
+            Lanes::new(s, s.partial_load_f32s(value)),
+            Lanes::new(s, s.partial_load_f32s(m)),
+            Lanes::new(s, s.partial_load_f32s(v)),
+        ]
+    }
+
+    #[inline(always)]
+    pub fn set_rest(&mut self, [value, m, v]: [Lanes<S>; 3]) {
+        let [to_value, to_m, to_v] = &mut self.rest;
+        self.s.partial_store_f32s(to_value, value.vector());
+        self.s.partial_store_f32s(to_m, m.vector());
+        self.s.partial_store_f32s(to_v, v.vector());
     }
 }
 

@@ -4,7 +4,7 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::adam;
+use super::adam::{self, StateVectors};
 use super::block::{BLOCK, Ids, Row, get3, vectors};
 use super::lanes::Lanes;
 use super::project_backward::ColorGradient;
@@ -189,28 +189,38 @@ impl WithSimd for CatchUp<'_, '_> {
 fn steps<S: Simd>(
     s: S,
     steps: &[ColorStep],
-    [values, first, second]: [&mut [f32]; 3],
+    arrays: [&mut [f32]; 3],
     gradients: &[f32],
     is_first: &[f32],
 ) {
-    let zero = Lanes::splat(s, 0.0);
-    for at in (0..values.len()).step_by(S::F32_LANES) {
-        let mut state = [
-            Lanes::new(s, s.partial_load_f32s(&values[at..])),
-            Lanes::new(s, s.partial_load_f32s(&first[at..])),
-            Lanes::new(s, s.partial_load_f32s(&second[at..])),
-        ];
-        let mut gradient = Lanes::new(s, s.partial_load_f32s(&gradients[at..]));
-        let is_first = Lanes::new(s, s.partial_load_f32s(&is_first[at..])).gt(zero);
-        for step in steps {
-            let rate = is_first.select(zero.all(step.sh0), zero.all(step.sh_rest));
-            let [bias1, bias2] = step.bias;
-            state = adam::step(state, gradient, rate, [zero.all(bias1), zero.all(bias2)]);
-            gradient = zero;
-        }
-        let [value, m, v] = state;
-        s.partial_store_f32s(&mut values[at..], value.vector());
-        s.partial_store_f32s(&mut first[at..], m.vector());
-        s.partial_store_f32s(&mut second[at..], v.vector());
+    let mut vectors = StateVectors::new(s, arrays);
+    let (gradients, gradient) = S::as_simd_f32s(gradients);
+    let (are_first, is_first) = S::as_simd_f32s(is_first);
+    for k in 0..vectors.whole() {
+        let (gradient, is_first) = (Lanes::new(s, gradients[k]), Lanes::new(s, are_first[k]));
+        vectors.set(k, after(steps, vectors.get(k), gradient, is_first));
     }
+    if vectors.has_rest() {
+        let gradient = Lanes::new(s, s.partial_load_f32s(gradient));
+        let is_first = Lanes::new(s, s.partial_load_f32s(is_first));
+        vectors.set_rest(after(steps, vectors.rest(), gradient, is_first));
+    }
+}
+
+#[inline(always)]
+fn after<S: Simd>(
+    steps: &[ColorStep],
+    mut state: [Lanes<S>; 3],
+    mut gradient: Lanes<S>,
+    is_first: Lanes<S>,
+) -> [Lanes<S>; 3] {
+    let zero = gradient.all(0.0);
+    let is_first = is_first.gt(zero);
+    for step in steps {
+        let rate = is_first.select(zero.all(step.sh0), zero.all(step.sh_rest));
+        let [bias1, bias2] = step.bias;
+        state = adam::step(state, gradient, rate, [zero.all(bias1), zero.all(bias2)]);
+        gradient = zero;
+    }
+    state
 }
