@@ -582,3 +582,27 @@ fn the_last_splats_stay() {
 fn senseless_steps_are_refused() {
     common::agreement::senseless_steps_are_refused(&mut CpuFit::default());
 }
+
+#[test]
+fn waiting_colors_end_with_the_same_bits() {
+    let device = |most| CpuFit::default().with_color_wait(most);
+    common::waiting::waiting_colors_end_with_the_same_bits(device);
+}
+
+#[test]
+fn a_whole_fit_whose_colors_wait_ends_with_the_same_bits() {
+    for density in [DensityControl::Mcmc, DensityControl::Original] {
+        let end = |device: CpuFit| {
+            let (targets, cameras) = photos();
+            // Each camera sees a part of the scene.
+            let cameras = cameras.iter().map(|c| Camera { fx: 3.0 * c.fx, fy: 3.0 * c.fy, ..*c });
+            let config = FitConfig { hull: false, ..config(density) };
+            let device = Box::new(device);
+            let mut fitter =
+                Fitter::new(device, targets, cameras.collect(), start(1), 0, config).unwrap();
+            run(&mut fitter, STEPS)
+        };
+        let dense = end(CpuFit::default().with_color_wait(1));
+        assert!(end(CpuFit::default()) == dense, "{density:?}: waiting changed bits");
+    }
+}

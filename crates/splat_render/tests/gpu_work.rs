@@ -18,8 +18,8 @@ fn a_step_of_five_million_splats_costs_what_the_docs_say() {
         println!("| {kernel} | {runs} | {:.2} |", bytes / 1e9);
     }
     println!("{} dispatches, {:.2} GB", work.dispatches, work.bytes / 1e9);
-    assert_eq!(work.dispatches, 25);
-    assert!((work.bytes / 1e9 - 11.07).abs() < 0.005);
+    assert_eq!(work.dispatches, 24);
+    assert!((work.bytes / 1e9 - 6.31).abs() < 0.005);
     assert_eq!(work.dispatches, work.kernels.iter().map(|k| k.1).sum::<usize>() - 1, "and a copy");
     // What is left grows with the splats that are seen, but for the optimiser's moments.
     let none = plan.step(0, 0);
@@ -29,6 +29,6 @@ fn a_step_of_five_million_splats_costs_what_the_docs_say() {
     for kernel in ["tile_counts", "emit", "rasterize_backward_sum"] {
         assert!(of(&none, kernel) == 0.0 && of(&work, kernel) > 0.0, "{kernel}");
     }
-    let moments = of(&none, "adam_colors") + of(&none, "fit_geometry");
-    assert!(moments > 0.9 * none.bytes, "{moments} of {}", none.bytes);
+    let moments = of(&none, "fit_geometry");
+    assert!(moments > 0.6 * none.bytes, "{moments} of {}", none.bytes);
 }

@@ -24,7 +24,7 @@ pub(super) struct BlockGradients {
 }
 
 impl BlockGradients {
-    /// All zero, with `stride` coefficients per splat.
+    /// All zero, with `stride` coefficients per splat, or none.
     pub fn new(stride: usize) -> Self {
         Self {
             means: vec![[0.0; 3]; BLOCK],
@@ -122,20 +122,18 @@ impl BlockStep {
         });
     }
 
-    /// Moves a block of splats by its gradients.
-    #[inline(always)]
+    /// Moves a block of splats by its gradients, colours apart.
     pub fn apply(
         &self,
         values: &mut SplatSlices<'_>,
-        [first, second]: [SplatSlices<'_>; 2],
+        [first, second]: &mut [SplatSlices<'_>; 2],
         gradients: &BlockGradients,
     ) {
         if self.frozen {
             return;
         }
-        let n = values.means.len();
         macro_rules! adam {
-            ($name:ident, $row:expr, $used:expr) => {
+            ($name:ident) => {
                 dispatch(Adam {
                     values: bytemuck::cast_slice_mut(values.$name),
                     first: bytemuck::cast_slice_mut(first.$name),
@@ -143,19 +141,38 @@ impl BlockStep {
                     gradient: bytemuck::cast_slice(&gradients.$name),
                     rates: &self.rates.$name,
                     bias: self.bias,
-                    row: $row,
-                    used: $used,
                 })
             };
         }
-        adam!(means, 3 * n, 3 * n);
-        adam!(quats, 4 * n, 4 * n);
-        adam!(scales, 3 * n, 3 * n);
-        adam!(opacities, n, n);
-        if self.used == self.stored {
-            adam!(sh, self.stored * n, self.stored * n);
-        } else {
-            adam!(sh, self.stored, self.used);
+        adam!(means);
+        adam!(quats);
+        adam!(scales);
+        adam!(opacities);
+    }
+
+    /// Moves the colours of a block of splats by their gradients.
+    fn apply_colors(
+        &self,
+        values: &mut SplatSlices<'_>,
+        [first, second]: &mut [SplatSlices<'_>; 2],
+        gradients: &BlockGradients,
+    ) {
+        if self.frozen {
+            return;
+        }
+        // Whole blocks at once where no coefficient rests.
+        let (values, row) = (values.sh.as_flattened_mut(), self.stored);
+        let row = if self.used == row { values.len() } else { row };
+        for start in (0..values.len()).step_by(row.max(1)) {
+            let rows = start..start + if row == self.stored { self.used } else { row };
+            dispatch(Adam {
+                values: &mut values[rows.clone()],
+                first: &mut first.sh.as_flattened_mut()[rows.clone()],
+                second: &mut second.sh.as_flattened_mut()[rows.clone()],
+                gradient: &gradients.sh.as_flattened()[rows.clone()],
+                rates: &self.rates.sh[rows],
+                bias: self.bias,
+            });
         }
     }
 
@@ -167,8 +184,23 @@ impl BlockStep {
     }
 }
 
-/// Adam (Kingma and Ba, 2015, algorithm 1) on rows of values, each with its own rate: on the first
-/// `used` of every `row` values. All slices have room for as many as `values`.
+/// Adam's step (Kingma and Ba, 2015, algorithm 1) of numbers with their first and second moments: what
+/// all three become. Each operation rounds by itself, so that bits are the same on every machine.
+#[inline(always)]
+pub(super) fn step<S: Simd>(
+    [value, first, second]: [Lanes<S>; 3],
+    gradient: Lanes<S>,
+    rate: Lanes<S>,
+    [bias1, bias2]: [Lanes<S>; 2],
+) -> [Lanes<S>; 3] {
+    let (beta1, beta2, epsilon) = ADAM;
+    let m = first * beta1 + gradient * (1.0 - beta1);
+    let v = second * beta2 + gradient * (1.0 - beta2) * gradient;
+    let size = (v * bias2).sqrt() + epsilon;
+    [value - rate * (m * bias1) / size, m, v]
+}
+
+/// Adam on values, each with its own rate. All slices have room for as many as `values`.
 struct Adam<'a> {
     values: &'a mut [f32],
     first: &'a mut [f32],
@@ -176,32 +208,89 @@ struct Adam<'a> {
     gradient: &'a [f32],
     rates: &'a [f32],
     bias: [f32; 2],
-    row: usize,
-    used: usize,
 }
 
 impl WithSimd for Adam<'_> {
     type Output = ();
 
-    // A plain loop: the compiler turns it into vectors of whatever `dispatch` found.
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) {
-        let (beta1, beta2, epsilon) = ADAM;
+    fn with_simd<S: Simd>(self, s: S) {
         let [bias1, bias2] = self.bias;
-        for start in (0..self.values.len()).step_by(self.row) {
-            let n = self.used;
-            let values = &mut self.values[start..][..n];
-            let (first, second) = (&mut self.first[start..][..n], &mut self.second[start..][..n]);
-            let (gradient, rates) = (&self.gradient[start..][..n], &self.rates[start..][..n]);
-            for k in 0..n {
-                let g = gradient[k];
-                let m = beta1 * first[k] + (1.0 - beta1) * g;
-                let v = beta2 * second[k] + (1.0 - beta2) * g * g;
-                let size = (v * bias2).sqrt() + epsilon;
-                values[k] -= rates[k] * (m * bias1) / size;
-                (first[k], second[k]) = (m, v);
-            }
+        let bias = [Lanes::splat(s, bias1), Lanes::splat(s, bias2)];
+        let n = self.values.len();
+        let arrays = [self.values, &mut self.first[..n], &mut self.second[..n]];
+        let mut vectors = StateVectors::new(s, arrays);
+        let (gradients, gradient) = S::as_simd_f32s(&self.gradient[..n]);
+        let (rates, rate) = S::as_simd_f32s(&self.rates[..n]);
+        for k in 0..vectors.whole() {
+            let (gradient, rate) = (Lanes::new(s, gradients[k]), Lanes::new(s, rates[k]));
+            vectors.set(k, step(vectors.get(k), gradient, rate, bias));
         }
+        if vectors.has_rest() {
+            let gradient = Lanes::new(s, s.partial_load_f32s(gradient));
+            let rate = Lanes::new(s, s.partial_load_f32s(rate));
+            vectors.set_rest(step(vectors.rest(), gradient, rate, bias));
+        }
+    }
+}
+
+/// Numbers with their first and second moments as whole vectors and a rest that fills none: to read a
+/// part of a vector is a call.
+pub(super) struct StateVectors<'a, S: Simd> {
+    s: S,
+    whole: [&'a mut [S::f32s]; 3],
+    rest: [&'a mut [f32]; 3],
+}
+
+impl<'a, S: Simd> StateVectors<'a, S> {
+    /// All of one length.
+    #[inline(always)]
+    pub fn new(s: S, [values, first, second]: [&'a mut [f32]; 3]) -> Self {
+        let (values, value) = S::as_mut_simd_f32s(values);
+        let (first, m) = S::as_mut_simd_f32s(&mut first[..]);
+        let (second, v) = S::as_mut_simd_f32s(&mut second[..]);
+        let n = values.len();
+        Self { s, whole: [values, &mut first[..n], &mut second[..n]], rest: [value, m, v] }
+    }
+
+    #[inline(always)]
+    pub fn whole(&self) -> usize {
+        self.whole[0].len()
+    }
+
+    #[inline(always)]
+    pub fn get(&self, k: usize) -> [Lanes<S>; 3] {
+        let [values, first, second] = &self.whole;
+        [Lanes::new(self.s, values[k]), Lanes::new(self.s, first[k]), Lanes::new(self.s, second[k])]
+    }
+
+    #[inline(always)]
+    pub fn set(&mut self, k: usize, [value, m, v]: [Lanes<S>; 3]) {
+        let [values, first, second] = &mut self.whole;
+        (values[k], first[k], second[k]) = (value.vector(), m.vector(), v.vector());
+    }
+
+    #[inline(always)]
+    pub fn has_rest(&self) -> bool {
+        !self.rest[0].is_empty()
+    }
+
+    #[inline(always)]
+    pub fn rest(&self) -> [Lanes<S>; 3] {
+        let (s, [value, m, v]) = (self.s, &self.rest);
+        [
+            Lanes::new(s, s.partial_load_f32s(value)),
+            Lanes::new(s, s.partial_load_f32s(m)),
+            Lanes::new(s, s.partial_load_f32s(v)),
+        ]
+    }
+
+    #[inline(always)]
+    pub fn set_rest(&mut self, [value, m, v]: [Lanes<S>; 3]) {
+        let [to_value, to_m, to_v] = &mut self.rest;
+        self.s.partial_store_f32s(to_value, value.vector());
+        self.s.partial_store_f32s(to_m, m.vector());
+        self.s.partial_store_f32s(to_v, v.vector());
     }
 }
 
@@ -247,6 +336,7 @@ pub(super) fn adam(state: &mut AdamState<f32>, gradients: &SplatGradients<f32>, 
         .for_each_init(
             || (BlockGradients::new(stride), ExploreBlock::new()),
             |(v_block, explore), (block, (mut values, first, second))| {
+                let mut moments = [first, second];
                 let first_id = block * BLOCK;
                 let n = values.means.len();
                 let rows = first_id..first_id + n;
@@ -257,7 +347,8 @@ pub(super) fn adam(state: &mut AdamState<f32>, gradients: &SplatGradients<f32>, 
                 v_block.sh[..n * stride]
                     .copy_from_slice(&gradients.v_colors[first_id * stride..][..n * stride]);
                 plan.pull(&values, v_block);
-                plan.apply(&mut values, [first, second], v_block);
+                plan.apply(&mut values, &mut moments, v_block);
+                plan.apply_colors(&mut values, &mut moments, v_block);
                 plan.explore(&mut values, explore, first_id);
             },
         );

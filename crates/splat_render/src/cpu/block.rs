@@ -82,6 +82,12 @@ impl Ids {
         self.len += usize::from(wanted);
     }
 
+    /// Those of the first `count` splats.
+    pub fn below(&self, count: usize) -> Self {
+        let len = self.get().partition_point(|&k| usize::from(k) < count);
+        Self { len, ..*self }
+    }
+
     #[inline(always)]
     pub fn get(&self) -> &[u8] {
         &self.ids[..self.len]

@@ -18,12 +18,14 @@ use super::rasterize_backward::{
 };
 use super::simd::prefetch;
 use super::tile::TileSplat;
+use super::waiting_colors::{ColorBlock, ColorPlan, WaitingColor};
 use crate::constants::TILE;
 use crate::error::Result;
 use crate::fit_device::{
-    CameraGradient, ExposureGradient, FitDevice, FitState, StepInput, is_dropped,
+    CameraGradient, ExposureGradient, FitDevice, FitState, StepInput, WaitingSteps, is_dropped,
 };
-use crate::stages::ProjectOptions;
+use crate::splats::{SplatArrays, SplatParams};
+use crate::stages::{Colors, ProjectOptions};
 use crate::target::Target;
 
 /// Fits on the CPU.
@@ -31,6 +33,9 @@ use crate::target::Target;
 pub struct CpuFit {
     targets: Vec<Target>,
     state: FitState,
+    /// The steps that colours may be behind the other parameters, and where each splat's are.
+    steps: WaitingSteps,
+    waiting: Vec<WaitingColor>,
     loss_value: f32,
     camera_gradients: Vec<CameraGradient>,
     exposure_gradients: Vec<ExposureGradient>,
@@ -61,15 +66,19 @@ impl FitDevice for CpuFit {
     fn upload(&mut self, state: FitState) -> Result<()> {
         state.validate()?;
         self.state = state;
+        self.forget();
         Ok(())
     }
 
     fn download(&mut self) -> Result<FitState> {
+        self.catch_up();
         Ok(self.state.clone())
     }
 
     fn edit(&mut self, change: &mut dyn FnMut(&mut FitState)) -> Result<()> {
+        self.catch_up();
         change(&mut self.state);
+        self.forget();
         self.state.validate()
     }
 
@@ -78,34 +87,69 @@ impl FitDevice for CpuFit {
         let target = &self.targets[input.view];
         let view = View::new(&input.camera, &ProjectOptions::default());
         let (width, height) = (target.width, target.height);
+        let adam = input.adam();
+        if self.steps.must_end_before(&adam) {
+            self.catch_up();
+        }
+        let target = &self.targets[input.view];
 
         // project and the first half of bin
-        let params = self.state.splats.params(input.sh_degree);
         let dropout = Dropout::new(input);
-        self.splats.resize(params.len(), TileSplat::default());
-        self.chunks.resize(params.len().div_ceil(CHUNK), ChunkTiles::default());
-        let stats = &mut self.state.stats;
-        (self.splats.par_chunks_mut(CHUNK), &mut self.chunks, stats.seen.par_chunks_mut(CHUNK))
+        let moving = self.state.moving();
+        let FitState { splats: values, first, second, stats, .. } = &mut self.state;
+        let (n, stride, stored) = (values.len(), values.stride(), values.sh_degree);
+        let degree = input.sh_degree.min(stored);
+        let SplatArrays { means, quats, scales, opacities, sh, .. } = values;
+        let shapes =
+            SplatParams { means, quats, scales, opacities, colors: Colors::Direct(&[]), raw: true };
+        self.splats.resize(n, TileSplat::default());
+        self.waiting.resize(n, WaitingColor::default());
+        self.chunks.resize(n.div_ceil(CHUNK), ChunkTiles::default());
+        let plan = ColorPlan::new(self.steps.get(), stored, degree);
+        (
+            self.splats.par_chunks_mut(CHUNK),
+            &mut self.chunks,
+            stats.seen.par_chunks_mut(CHUNK),
+            self.waiting.par_chunks_mut(CHUNK),
+            sh.par_chunks_mut(CHUNK * stride),
+            first.sh.par_chunks_mut(CHUNK * stride),
+            second.sh.par_chunks_mut(CHUNK * stride),
+        )
             .into_par_iter()
             .enumerate()
-            .for_each_init(ProjectBlock::new, |block, (chunk, (splats, tiles, seen))| {
-                tiles.clear();
-                for (number, splats) in splats.chunks_mut(BLOCK).enumerate() {
-                    let start = number * BLOCK;
-                    let first = chunk * CHUNK + start;
-                    let ids = dropout.kept(first, splats.len());
-                    block.run(&view, &params, first, ids, dropout.compensation);
-                    let mut next = 0;
-                    for (k, splat) in block.visible() {
-                        (next..k).for_each(|_| tiles.push_culled());
-                        splats[k] = TileSplat::new(&splat);
-                        tiles.push(&splat, width, height);
-                        seen[start + k] += 1.0;
-                        next = k + 1;
+            .for_each_init(
+                || (ProjectBlock::new(), ColorBlock::new(&plan)),
+                |(block, colors),
+                 (chunk, (splats, tiles, seen, waiting, sh, first_sh, second_sh))| {
+                    tiles.clear();
+                    for (number, splats) in splats.chunks_mut(BLOCK).enumerate() {
+                        let start = number * BLOCK;
+                        let first = chunk * CHUNK + start;
+                        let ids = dropout.kept(first, splats.len());
+                        let shown = block.shapes(&view, &shapes, first, ids, dropout.compensation);
+                        let rows = start * stride..(start + splats.len()) * stride;
+                        let waiting = &mut waiting[start..start + splats.len()];
+                        let arrays = [&mut *sh, first_sh, second_sh].map(|a| &mut a[rows.clone()]);
+                        colors.run(
+                            &plan,
+                            shown.below(moving.saturating_sub(first)),
+                            waiting,
+                            arrays,
+                        );
+                        let coeffs = &sh[rows];
+                        block.colors(&view, Colors::Sh { degree, stride, coeffs }, 0);
+                        let mut next = 0;
+                        for (k, splat) in block.visible() {
+                            (next..k).for_each(|_| tiles.push_culled());
+                            splats[k] = TileSplat::new(&splat);
+                            tiles.push(&splat, width, height);
+                            seen[start + k] += 1.0;
+                            next = k + 1;
+                        }
+                        (next..splats.len()).for_each(|_| tiles.push_culled());
                     }
-                    (next..splats.len()).for_each(|_| tiles.push_culled());
-                }
-            });
+                },
+            );
         let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
         let splats = &self.splats;
         self.bins.fill(&self.chunks, tiles as usize, |i| splats[i].depth)?;
@@ -151,6 +195,7 @@ impl FitDevice for CpuFit {
             let sums = std::mem::take(&mut self.sums);
             self.update(&view, input, size, &sums);
             self.sums = sums;
+            self.steps.add(&adam);
             return Ok(());
         };
         let [.., accumulated, transmittance] = &self.image.planes;
@@ -165,6 +210,7 @@ impl FitDevice for CpuFit {
         let sums = std::mem::take(&mut self.depth_sums);
         self.update(&view, input, size, &sums);
         self.depth_sums = sums;
+        self.steps.add(&adam);
         Ok(())
     }
 
@@ -218,6 +264,44 @@ struct Scratch {
 }
 
 impl CpuFit {
+    /// Colours of splats that are not seen wait for at most so many steps, by default
+    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, all are brought up to date in every step. Bits are
+    /// the same.
+    pub fn with_color_wait(self, steps: usize) -> Self {
+        Self { steps: WaitingSteps::at_most(steps), ..self }
+    }
+
+    /// Brings all colours up to date.
+    fn catch_up(&mut self) {
+        if self.steps.get().is_empty() {
+            return;
+        }
+        let moving = self.state.moving();
+        let FitState { splats, first, second, .. } = &mut self.state;
+        let stride = splats.stride();
+        let plan = ColorPlan::new(self.steps.get(), splats.sh_degree, self.steps.degree());
+        (
+            self.waiting[..moving].par_chunks_mut(BLOCK),
+            splats.sh.par_chunks_mut(BLOCK * stride),
+            first.sh.par_chunks_mut(BLOCK * stride),
+            second.sh.par_chunks_mut(BLOCK * stride),
+        )
+            .into_par_iter()
+            .for_each_init(
+                || ColorBlock::new(&plan),
+                |block, (waiting, sh, first, second)| {
+                    block.run(&plan, Ids::all(waiting.len()), waiting, [sh, first, second]);
+                },
+            );
+        self.forget();
+    }
+
+    /// Begins anew, from colours that are up to date.
+    fn forget(&mut self) {
+        self.steps.clear();
+        self.waiting.clear();
+    }
+
     /// project_backward, adam and density statistics.
     fn update<const N: usize>(
         &mut self,
@@ -233,7 +317,9 @@ impl CpuFit {
         let degree = input.sh_degree.min(values.sh_degree);
         let (bins, tile_splats) = (&self.bins, &self.splats);
         let dropout = Dropout::new(input);
-        let plan = BlockStep::new(&input.adam(), moving, values.sh_degree);
+        let adam = input.adam();
+        let plan = BlockStep::new(&adam, moving, values.sh_degree);
+        let waits = !adam.is_frozen();
         self.block_cameras.clear();
         self.block_cameras.resize(n.div_ceil(BLOCK), VCamera::default());
 
@@ -242,6 +328,7 @@ impl CpuFit {
             first.blocks_mut(BLOCK),
             second.blocks_mut(BLOCK),
             stats.grad_sum.par_chunks_mut(BLOCK),
+            self.waiting.par_chunks_mut(BLOCK),
             &mut self.block_cameras,
         )
             .into_par_iter()
@@ -249,10 +336,10 @@ impl CpuFit {
             .for_each_init(
                 || Scratch {
                     backward: BackwardBlock::new(),
-                    v: BlockGradients::new(stride),
+                    v: BlockGradients::new(0),
                     explore: ExploreBlock::new(),
                 },
-                |scratch, (block, (values, first, second, grad_sum, v_camera))| {
+                |scratch, (block, (values, first, second, grad_sum, waiting, v_camera))| {
                     let first_id = block * BLOCK;
                     let n = values.means.len();
                     let moving = moving.saturating_sub(first_id).min(n);
@@ -286,10 +373,15 @@ impl CpuFit {
                     if moving == 0 {
                         return;
                     }
+                    for (k, gradient) in backward.color_gradients() {
+                        if waits && k < moving {
+                            waiting[k].add(gradient);
+                        }
+                    }
                     let [mut values, first, second] =
                         [values, first, second].map(|arrays| arrays.first(moving));
                     plan.pull(&values, v);
-                    plan.apply(&mut values, [first, second], v);
+                    plan.apply(&mut values, &mut [first, second], v);
                     plan.explore(&mut values, explore, first_id);
                 },
             );

@@ -20,6 +20,7 @@ mod rasterize_backward;
 mod simd;
 mod ssim_window;
 mod tile;
+mod waiting_colors;
 
 pub use fit::CpuFit;
 pub use peak::peak_multiply_add;

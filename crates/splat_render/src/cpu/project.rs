@@ -264,6 +264,8 @@ pub(super) struct ProjectBlock {
     reaches: Row,
     /// Places of those, in whose order is what follows: fewer, so that lanes are full.
     visible: Ids,
+    /// Their numbers in the block.
+    numbers: Ids,
     visible_t: [Row; 3],
     coeffs: ColorRows,
     colors: [Row; 3],
@@ -284,6 +286,7 @@ impl ProjectBlock {
             radii: [Row::ZERO; 2],
             reaches: Row::ZERO,
             visible: Ids::NONE,
+            numbers: Ids::NONE,
             visible_t: [Row::ZERO; 3],
             coeffs: ColorRows::ZERO,
             colors: [Row::ZERO; 3],
@@ -292,17 +295,25 @@ impl ProjectBlock {
     }
 
     /// Projects the splats `ids` of the block that begins with splat `first`, with opacities
-    /// multiplied by `compensation`.
-    pub fn run(
+    /// multiplied by `compensation`, but for their colours. Returns those that are visible as far as
+    /// their shape goes, by their numbers in the block.
+    pub fn shapes(
         &mut self,
         view: &View,
         splats: &SplatParams<'_, f32>,
         first: usize,
         ids: Ids,
         compensation: f32,
-    ) {
+    ) -> Ids {
         self.ids = ids;
-        dispatch(Project { block: self, view, splats, first, compensation });
+        dispatch(Shapes { block: self, view, splats, first, compensation });
+        self.numbers
+    }
+
+    /// The colours of the splats that [`ProjectBlock::shapes`] returned, of a block that begins with
+    /// splat `first` of `colors`.
+    pub fn colors(&mut self, view: &View, colors: Colors<'_, f32>, first: usize) {
+        dispatch(Paint { block: self, view, colors, first });
     }
 
     /// What came out: the visible splats with their numbers in the block, in order.
@@ -320,12 +331,12 @@ impl ProjectBlock {
                 reach: self.reach.0[k],
                 radii: [self.radii[0].0[k], self.radii[1].0[k]],
             };
-            (usize::from(self.ids.get()[k]), splat)
+            (usize::from(self.numbers.get()[at]), splat)
         })
     }
 }
 
-struct Project<'a> {
+struct Shapes<'a> {
     block: &'a mut ProjectBlock,
     view: &'a View,
     splats: &'a SplatParams<'a, f32>,
@@ -333,7 +344,7 @@ struct Project<'a> {
     compensation: f32,
 }
 
-impl WithSimd for Project<'_> {
+impl WithSimd for Shapes<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -349,7 +360,26 @@ impl WithSimd for Project<'_> {
         for k in 0..block.ids.get().len() {
             block.visible.push_if(k, block.reaches.0[k] != 0.0);
         }
-        block.color(s, view, splats, first);
+        block.numbers.clear();
+        for &place in block.visible.get() {
+            block.numbers.push(usize::from(block.ids.get()[usize::from(place)]));
+        }
+    }
+}
+
+struct Paint<'a> {
+    block: &'a mut ProjectBlock,
+    view: &'a View,
+    colors: Colors<'a, f32>,
+    first: usize,
+}
+
+impl WithSimd for Paint<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        self.block.paint(s, self.view, self.colors, self.first);
     }
 }
 
@@ -388,14 +418,10 @@ impl ProjectBlock {
 
     /// Colours of the visible splats.
     #[inline(always)]
-    fn color<S: Simd>(&mut self, s: S, view: &View, splats: &SplatParams<'_, f32>, first: usize) {
-        let places = self.visible.get();
-        let mut numbers = Ids::NONE;
-        for &place in places {
-            numbers.push(usize::from(self.ids.get()[usize::from(place)]));
-        }
+    fn paint<S: Simd>(&mut self, s: S, view: &View, colors: Colors<'_, f32>, first: usize) {
+        let (places, numbers) = (self.visible.get(), self.numbers);
         let one = Lanes::splat(s, 1.0);
-        match splats.colors {
+        match colors {
             Colors::Direct(colors) => {
                 self.coeffs.take(colors, [1, 1], first, numbers.get());
                 for at in 0..vectors::<S>(places.len()) {
@@ -449,7 +475,9 @@ pub(super) fn project(
         .for_each_init(
             ProjectBlock::new,
             |block, (number, (means2d, factors, depths, colors, opacities, radii))| {
-                block.run(&view, splats, number * BLOCK, Ids::all(means2d.len()), 1.0);
+                let first = number * BLOCK;
+                block.shapes(&view, splats, first, Ids::all(means2d.len()), 1.0);
+                block.colors(&view, splats.colors, first);
                 for (k, splat) in block.visible() {
                     means2d[k] = splat.mean;
                     factors[k] = splat.factor;

@@ -165,7 +165,17 @@ pub(super) struct BackwardBlock {
     v_opacities: Row,
     basis: [Row; SH_COEFFS_MAX],
     v_colors: [Row; 3],
+    /// What the basis was evaluated at.
+    directions: [Row; 3],
     v_camera: CameraRows,
+}
+
+/// Gradient of a splat's colour before the cut at zero, and the direction it is seen along: the
+/// gradient of each coefficient is its basis function there times that of the colour.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct ColorGradient {
+    pub v_color: [f32; 3],
+    pub direction: [f32; 3],
 }
 
 impl BackwardBlock {
@@ -185,6 +195,7 @@ impl BackwardBlock {
             v_opacities: Row::ZERO,
             basis: [Row::ZERO; SH_COEFFS_MAX],
             v_colors: [Row::ZERO; 3],
+            directions: [Row::ZERO; 3],
             v_camera: CameraRows::ZERO,
         })
     }
@@ -213,10 +224,32 @@ impl BackwardBlock {
         self.v_opacities2d.0[at] = v.v_opacity;
     }
 
-    /// Writes the gradients of the splats that were pushed to `out`, the block's part of the arrays,
-    /// and returns the camera's. The block begins with splat `first` of `stage.splats`.
+    /// Writes the gradients of the splats that were pushed, colours apart, to `out`, the block's part
+    /// of the arrays, and returns the camera's. The block begins with splat `first` of `stage.splats`.
     pub fn run(&mut self, stage: &Backward<'_>, first: usize, out: SplatSlices<'_>) -> VCamera {
         dispatch(Run { block: self, stage, first, out })
+    }
+
+    /// Gradients of the colours of the splats that were pushed, with their numbers in the block.
+    pub fn color_gradients(&self) -> impl Iterator<Item = (usize, ColorGradient)> {
+        let of = |rows: &[Row; 3], at: usize| [rows[0].0[at], rows[1].0[at], rows[2].0[at]];
+        self.ids.get().iter().enumerate().map(move |(at, &k)| {
+            let v_color = of(&self.v_colors, at);
+            (usize::from(k), ColorGradient { v_color, direction: of(&self.directions, at) })
+        })
+    }
+
+    /// Writes the gradients of the first `used` of `stride` coefficients of the splats that were pushed.
+    fn write_colors(&self, [stride, used]: [usize; 2], out: &mut [[f32; 3]]) {
+        for (at, &k) in (0..BLOCK).zip(self.ids.get()) {
+            let [red, green, blue] = &self.v_colors;
+            let (red, green, blue) = (red.0[at], green.0[at], blue.0[at]);
+            let rows = out[usize::from(k) * stride..][..used].iter_mut();
+            for (v, basis) in rows.zip(&self.basis) {
+                let basis = basis.0[at];
+                *v = [basis * red, basis * green, basis * blue];
+            }
+        }
     }
 }
 
@@ -236,15 +269,13 @@ impl WithSimd for Run<'_, '_> {
         let ids = block.ids;
         let ids = ids.get();
         block.splats.take(&stage.splats, first, ids);
-        let mut rows = [1, 1];
         if let Colors::Sh { degree, stride, coeffs } = stage.splats.colors {
-            rows = [stride, sh::coeffs(degree)];
-            block.coeffs.take(coeffs, rows, first, ids);
+            block.coeffs.take(coeffs, [stride, sh::coeffs(degree)], first, ids);
         }
         for at in 0..vectors::<S>(ids.len()) {
             block.gradients(s, stage, at);
         }
-        block.write(ids, rows, out);
+        block.write(ids, out);
         if stage.camera { block.v_camera.sum(ids.len()) } else { VCamera::default() }
     }
 }
@@ -271,6 +302,7 @@ impl BackwardBlock {
             let (dir, length) = direction(view, g.t);
             // Where nothing is drawn it may be anything, and zero times infinity is NaN.
             let dir = dir.is_finite().keep3(dir);
+            set3(&mut self.directions, at, dir);
             let basis = sh::basis(degree, [dir.x, dir.y, dir.z]);
             for k in 0..sh::coeffs(degree) {
                 self.basis[k].set(at, basis[k]);
@@ -419,9 +451,9 @@ impl BackwardBlock {
         intrinsics[3].set(at, kept.keep(v_cy));
     }
 
-    /// Writes what came out, in the parameters' layout: `used` of `stride` coefficients per splat.
+    /// Writes what came out, in the parameters' layout, colours apart.
     #[inline(always)]
-    fn write(&self, ids: &[u8], [stride, used]: [usize; 2], out: SplatSlices<'_>) {
+    fn write(&self, ids: &[u8], out: SplatSlices<'_>) {
         for (at, &k) in (0..BLOCK).zip(ids) {
             let k = usize::from(k);
             for (value, row) in out.means[k].iter_mut().zip(&self.v_means) {
@@ -434,12 +466,6 @@ impl BackwardBlock {
                 *value = row.0[at];
             }
             out.opacities[k] = self.v_opacities.0[at];
-            let [red, green, blue] = &self.v_colors;
-            let (red, green, blue) = (red.0[at], green.0[at], blue.0[at]);
-            for (v, basis) in out.sh[k * stride..][..used].iter_mut().zip(&self.basis) {
-                let basis = basis.0[at];
-                *v = [basis * red, basis * green, basis * blue];
-            }
         }
     }
 }
@@ -482,9 +508,9 @@ pub(super) fn project_backward(
     let view = View::new(camera, options);
     let stage = Backward { view: &view, splats: *splats, compensation: 1.0, camera: true };
     let n = splats.len();
-    let (stride, rows) = match splats.colors {
-        Colors::Direct(colors) => (1, colors.len()),
-        Colors::Sh { stride, coeffs, .. } => (stride, coeffs.len()),
+    let (stride, used, rows) = match splats.colors {
+        Colors::Direct(colors) => (1, 1, colors.len()),
+        Colors::Sh { degree, stride, coeffs } => (stride, sh::coeffs(degree), coeffs.len()),
     };
     let mut out = SplatGradients {
         v_means: vec![[0.0; 3]; n],
@@ -505,7 +531,7 @@ pub(super) fn project_backward(
     let cameras: Vec<VCamera> = all
         .into_blocks(BLOCK, stride)
         .enumerate()
-        .map_init(BackwardBlock::new, |block, (number, out)| {
+        .map_init(BackwardBlock::new, |block, (number, mut out)| {
             let first = number * BLOCK;
             block.clear();
             for k in 0..out.means.len() {
@@ -523,7 +549,10 @@ pub(super) fn project_backward(
                 };
                 block.push(k, &v);
             }
-            block.run(&stage, first, out)
+            let colors = std::mem::take(&mut out.sh);
+            let camera = block.run(&stage, first, out);
+            block.write_colors([stride, used], colors);
+            camera
         })
         .collect();
     let mut v_camera = VCamera::default();

@@ -4,6 +4,7 @@ mod fog;
 mod mcmc;
 mod random;
 mod state;
+mod waiting;
 
 pub(crate) use fog::{FogCamera, sampled_every};
 pub use mcmc::McmcRun;
@@ -14,6 +15,8 @@ pub(crate) use mcmc::{
 pub(crate) use random::{dropout_threshold, exp_accurate, noise_draw};
 pub use random::{is_dropped, noise_normal};
 pub use state::{DensityStats, FitState};
+pub use waiting::COLOR_WAIT;
+pub(crate) use waiting::{ColorStep, WaitingSteps};
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};
@@ -149,7 +152,8 @@ impl StepInput {
 /// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p
 /// and channels c, with s the SSIM weight, zero padding in the window, plus the loss of the depth,
 /// where the photo has one, and the two regularisers.
-/// Every parameter takes an Adam step in every step, seen or not. With [`Rates::ZERO`] nothing moves
+/// Every parameter takes an Adam step in every step, seen or not; colours of splats that are not seen may
+/// take theirs later, with the same bits. With [`Rates::ZERO`] nothing moves
 /// ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss, the density statistics and
 /// the cameras' gradients are as ever.
 pub trait FitDevice: Send {

@@ -1,17 +1,18 @@
 //! adam: one optimiser step of all parameters, the exploration noise, and what density control
-//! watches.
+//! watches. In fits colours wait ([`super::waiting_colors`]).
 
 use std::ops::Range;
 
-use bytemuck::Zeroable;
-
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
-use super::layout::{GEOMETRY, GRADIENT, SPLATS_PER_GROUP, STATS, Splat2d, StatusHead, Step, View};
+use super::layout::{
+    GEOMETRY, GRADIENT, NOTE_PULL, NOTE_SEEN, NOTES, SPLATS_PER_GROUP, Step, View,
+};
 use super::project::{Projection, SPLAT_2D, SplatBuffers, rows, window_uniform};
 use super::project_backward::GradientBuffers;
 use super::shaders::Kernel;
 use crate::error::Result;
+use crate::fit_device::DensityStats;
 use crate::splats::{SplatArrays, SplatParams};
 use crate::stages::{AdamState, AdamStep, SplatGradients};
 
@@ -27,23 +28,19 @@ pub(super) struct AdamBuffers {
     pub first: SplatBuffers,
     /// Second moments.
     pub second: SplatBuffers,
-    /// `[N * STATS]`
-    pub stats: wgpu::Buffer,
+    /// `[N * NOTES]`
+    pub notes: wgpu::Buffer,
     /// So many splats, the first ones, are moved.
     pub moving: u32,
 }
 
-/// What a step reads besides [`AdamBuffers`].
+/// What a step of a fit reads besides [`AdamBuffers`].
 #[derive(Debug)]
 pub(super) struct AdamInput<'a> {
     /// The camera and its 2D splats.
     pub drawn: Projection<'a>,
     /// A [`Step`].
     pub step: &'a wgpu::Buffer,
-    /// A [`StatusHead`]: no step is done after an overflow.
-    pub status: &'a wgpu::Buffer,
-    /// `[N * color_floats]`
-    pub v_colors: &'a wgpu::Buffer,
     /// `[camera_sums(N) * CAMERA]`
     pub v_camera: &'a wgpu::Buffer,
     /// `[N * GRADIENT]`
@@ -73,7 +70,7 @@ impl AdamBuffers {
     pub fn upload(
         gpu: &Gpu,
         [splats, first, second]: [SplatParams<'_, f32>; 3],
-        stats: &[[f32; STATS]],
+        stats: &DensityStats,
         moving: u32,
     ) -> Result<Self> {
         Ok(Self {
@@ -81,7 +78,7 @@ impl AdamBuffers {
             splats: SplatBuffers::upload(gpu, &splats)?,
             first: SplatBuffers::upload(gpu, &first)?,
             second: SplatBuffers::upload(gpu, &second)?,
-            stats: gpu.upload("stats", stats)?,
+            notes: gpu.upload("notes", &note_rows(stats))?,
         })
     }
 
@@ -93,7 +90,7 @@ impl AdamBuffers {
             splats: arrays()?,
             first: arrays()?,
             second: arrays()?,
-            stats: gpu.buffer("stats", u64::from(splats) * STATS as u64 * 4)?,
+            notes: gpu.buffer("notes", u64::from(splats) * NOTES as u64 * 4)?,
         })
     }
 
@@ -103,7 +100,7 @@ impl AdamBuffers {
         gpu: &Gpu,
         ops: &[Op],
         sh_degree: u32,
-    ) -> Result<([SplatArrays; 3], Vec<[f32; STATS]>)> {
+    ) -> Result<([SplatArrays; 3], DensityStats)> {
         let n = u64::from(self.splats.splats);
         let floats = [GEOMETRY as u64, self.splats.color_floats];
         let mut wanted = Vec::new();
@@ -111,15 +108,20 @@ impl AdamBuffers {
             wanted.push((&arrays.geometry, 4 * n * floats[0]));
             wanted.push((&arrays.colors, 4 * n * floats[1]));
         }
-        wanted.push((&self.stats, 4 * n * STATS as u64));
+        wanted.push((&self.notes, 4 * n * NOTES as u64));
         let data = gpu.download(ops, &wanted)?;
         let arrays = [0, 2, 4].map(|k| arrays_from_bytes(&data[k], &data[k + 1], sh_degree));
-        Ok((arrays, bytemuck::pod_collect_to_vec(&data[6])))
+        let notes: Vec<[f32; NOTES]> = bytemuck::pod_collect_to_vec(&data[6]);
+        let stats = DensityStats {
+            grad_sum: notes.iter().map(|note| note[NOTE_PULL]).collect(),
+            seen: notes.iter().map(|note| note[NOTE_SEEN]).collect(),
+        };
+        Ok((arrays, stats))
     }
 
-    /// project_backward, and the step of all but colours.
+    /// project_backward, the step of all but colours, and the statistics.
     pub fn fit_ops(&self, gpu: &Gpu, input: &AdamInput<'_>, bins: &SplatBins) -> Vec<Op> {
-        let Self { splats, first, second, .. } = self;
+        let Self { splats, first, second, notes, .. } = self;
         let (geometry, colors) = (GEOMETRY as u64, splats.color_floats);
         let op = |window: Range<u32>| {
             let uniform = window_uniform(gpu, &window);
@@ -130,7 +132,7 @@ impl AdamBuffers {
                 rows(&splats.colors, &window, colors),
                 rows(input.drawn.splats2d, &window, SPLAT_2D as u64),
                 rows(input.v_splats2d, &window, GRADIENT as u64),
-                rows(input.v_colors, &window, colors),
+                rows(notes, &window, NOTES as u64),
                 input.v_camera.into(),
                 rows(&first.geometry, &window, geometry),
                 rows(&second.geometry, &window, geometry),
@@ -161,30 +163,37 @@ impl AdamBuffers {
         splats.windows(gpu).into_iter().map(op).collect()
     }
 
-    /// The step of colours, and the statistics.
-    pub fn color_ops(&self, gpu: &Gpu, input: &AdamInput<'_>) -> Vec<Op> {
-        let Self { splats, first, second, stats, .. } = self;
+    /// The step of colours, from these gradients.
+    fn color_ops(&self, gpu: &Gpu, [view, step, gradient]: [&wgpu::Buffer; 3]) -> Vec<Op> {
+        let Self { splats, first, second, .. } = self;
         let floats = splats.color_floats;
         let op = |window: Range<u32>| {
             let uniform = window_uniform(gpu, &window);
+            let rows = |buffer| rows(buffer, &window, floats);
             let bindings = [
-                input.drawn.view.into(),
-                input.step.into(),
+                view.into(),
+                step.into(),
                 (&uniform).into(),
-                input.status.into(),
-                rows(&splats.colors, &window, floats),
-                rows(input.v_colors, &window, floats),
-                rows(&first.colors, &window, floats),
-                rows(&second.colors, &window, floats),
-                rows(input.drawn.splats2d, &window, SPLAT_2D as u64),
-                rows(input.v_splats2d, &window, GRADIENT as u64),
-                rows(stats, &window, STATS as u64),
+                rows(&splats.colors),
+                rows(gradient),
+                rows(&first.colors),
+                rows(&second.colors),
             ];
             let groups = gpu.groups(window.len() as u32 * floats as u32, COLOR_FLOATS_PER_GROUP);
             gpu.op(Kernel::AdamColors, &bindings, groups)
         };
         splats.windows(gpu).into_iter().map(op).collect()
     }
+}
+
+/// What is noted of each splat where its colours are up to date.
+fn note_rows(stats: &DensityStats) -> Vec<[f32; NOTES]> {
+    let row = |(&pull, &seen)| {
+        let mut row = [0.0; NOTES];
+        (row[NOTE_PULL], row[NOTE_SEEN]) = (pull, seen);
+        row
+    };
+    stats.grad_sum.iter().zip(&stats.seen).map(row).collect()
 }
 
 pub(super) fn adam(
@@ -196,35 +205,16 @@ pub(super) fn adam(
     let n = state.splats.len();
     let degree = state.splats.sh_degree;
     let params = [&state.splats, &state.first, &state.second].map(|a| a.params(degree));
-    let buffers = AdamBuffers::upload(gpu, params, &vec![[0.0; STATS]; n], n as u32)?;
+    let buffers = AdamBuffers::upload(gpu, params, &DensityStats::zeros(n), n as u32)?;
     let given = GradientBuffers::upload(gpu, gradients)?;
-    let count = buffers.splats.splats;
     let view = gpu.uniform(&View {
         sh_degree: step.sh_degree.min(degree),
         sh_stride: state.splats.stride() as u32,
         ..View::of_picture(1, 1, [0.0; 3])
     });
-    let status = gpu.upload(
-        "status",
-        &[StatusHead { splats: count, step: step.number, ..StatusHead::zeroed() }],
-    )?;
-    // None is culled: all have a gradient.
-    let seen = Splat2d { radii: [1.0; 2], ..Splat2d::zeroed() };
-    let splats2d = gpu.upload("splats2d", &vec![seen; n])?;
-    let v_splats2d = gpu.upload("v_splats2d", &vec![[0.0f32; GRADIENT]; n])?;
-    let step = gpu.uniform(&Step::of_adam(step, count));
+    let step = gpu.uniform(&Step::of_adam(step, buffers.splats.splats));
     let mut ops = buffers.geometry_ops(gpu, &step, &given.geometry);
-    ops.extend(buffers.color_ops(
-        gpu,
-        &AdamInput {
-            drawn: Projection { view: &view, splats2d: &splats2d },
-            step: &step,
-            status: &status,
-            v_colors: &given.colors,
-            v_camera: &given.camera,
-            v_splats2d: &v_splats2d,
-        },
-    ));
+    ops.extend(buffers.color_ops(gpu, [&view, &step, &given.colors]));
     let ([splats, first, second], _) = buffers.download(gpu, &ops, degree)?;
     *state = AdamState { splats, first, second };
     Ok(())

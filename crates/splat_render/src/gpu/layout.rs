@@ -7,6 +7,7 @@ use bytemuck::{Pod, Zeroable};
 
 use crate::camera::Camera;
 use crate::constants::TILE;
+use crate::fit_device::{COLOR_WAIT, ColorStep};
 use crate::stages::{AdamStep, Colors, Exposure, ProjectOptions, Rates, SplatParams};
 use crate::target::Weight;
 
@@ -23,8 +24,16 @@ pub(super) const GRADIENT_ABSOLUTE: usize = GRADIENT + 2;
 /// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.
 pub(super) const CAMERA: usize = 16;
 
-/// Floats per splat of what density control watches: sum of gradient lengths, steps seen.
-pub(super) const STATS: usize = 2;
+/// Words per splat of what a fit notes beside parameters and moments, and where in them lie: the sum of
+/// gradient lengths and the steps seen, as floats, which density control watches; twice the first of the
+/// steps that its colours wait for, and 1 more where that one has a gradient; and that gradient, as
+/// floats, of the colour 3 and the direction it was seen along 3.
+pub(super) const NOTES: usize = 9;
+pub(super) const NOTE_PULL: usize = 0;
+pub(super) const NOTE_SEEN: usize = 1;
+pub(super) const NOTE_WAITS: usize = 2;
+pub(super) const NOTE_COLOR: usize = 3;
+pub(super) const NOTE_DIRECTION: usize = 6;
 
 /// Splats per workgroup of the per-splat kernels; windows are multiples of it, which also keeps
 /// every per-splat buffer's offset a multiple of 256 bytes.
@@ -227,6 +236,25 @@ impl From<&Exposure<f32>> for ExposureUniform {
             behind: row(exposure.behind(), 0.0),
             background: exposure.background.map_or([0.0; 4], |color| row(color, 1.0)),
         }
+    }
+}
+
+/// The steps that colours may wait for.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(super) struct ColorSteps {
+    pub count: u32,
+    pub moving: u32,
+    pub unused: [u32; 2],
+    pub steps: [[f32; 4]; COLOR_WAIT],
+}
+
+impl ColorSteps {
+    /// Where step `at` lies, and what it holds.
+    pub fn entry(at: usize, step: &ColorStep) -> (u64, [f32; 4]) {
+        let offset = std::mem::offset_of!(Self, steps) + 16 * at;
+        let [bias_first, bias_second] = step.bias;
+        (offset as u64, [step.sh0, step.sh_rest, bias_first, bias_second])
     }
 }
 

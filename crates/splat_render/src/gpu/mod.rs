@@ -23,6 +23,7 @@ mod resident;
 mod resident_picture;
 mod shaders;
 mod traffic;
+mod waiting_colors;
 
 pub use device::{Gpu, Injected, needed_limits};
 pub use fit::{GpuFit, PlannedFit, StepWork};

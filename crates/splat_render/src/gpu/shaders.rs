@@ -3,14 +3,15 @@
 use std::fmt::Write;
 
 use super::layout::{
-    CAMERA, DEPTH_GROUPS, EXPOSURE_GROUPS, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, STATS,
+    CAMERA, DEPTH_GROUPS, EXPOSURE_GROUPS, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, NOTE_COLOR,
+    NOTE_DIRECTION, NOTE_PULL, NOTE_SEEN, NOTE_WAITS, NOTES,
 };
 use crate::constants::{
     ADAM, ALPHA_MAX, ALPHA_MIN, DEPTH_ALPHA, QUAT_NORM2_MIN, SH_COEFFS_MAX, SSIM_C, SSIM_WINDOW,
     TILE, TRANSMITTANCE_MIN,
 };
 use crate::fit_device::{
-    BINS, BINS_PER_LOGIT, CELLS, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX,
+    BINS, BINS_PER_LOGIT, CELLS, COLOR_WAIT, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX,
 };
 use crate::sh;
 
@@ -74,7 +75,13 @@ const GEOMETRY_WGSL: &str = include_str!("shaders/geometry.wgsl");
 const GEOMETRY_READ: &str = "@group(0) @binding(2) var<storage, read> geometry: array<f32>;\n";
 const GEOMETRY_UPDATED: &str =
     "@group(0) @binding(2) var<storage, read_write> geometry: array<f32>;\n";
+const COLORS_READ: &str = "@group(0) @binding(3) var<storage, read> colors: array<f32>;\n";
+const COLORS_UPDATED: &str = "@group(0) @binding(3) var<storage, read_write> colors: array<f32>;\n";
+const PROJECT: &str = include_str!("shaders/project.wgsl");
+/// Before [`PROJECT`] where colours are up to date.
+const NONE_WAIT: &str = "fn catch_up(i: u32) {}\n";
 const SPLAT_BACKWARD: &str = include_str!("shaders/splat_backward.wgsl");
+const ADAM_STEP: &str = include_str!("shaders/adam_step.wgsl");
 const ADAM_UPDATE: &str = include_str!("shaders/adam_update.wgsl");
 const ADAM_GEOMETRY: &str = include_str!("shaders/adam_geometry.wgsl");
 const MCMC_RUN: &str = include_str!("shaders/mcmc_run.wgsl");
@@ -108,12 +115,30 @@ const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 24] = [
+pub(super) static SOURCES: [Source; 25] = [
     Source {
         name: "project",
         shared_work: None,
-        parts: &[SHARED, GEOMETRY_READ, GEOMETRY_WGSL, include_str!("shaders/project.wgsl")],
+        parts: &[SHARED, GEOMETRY_READ, COLORS_READ, GEOMETRY_WGSL, NONE_WAIT, PROJECT],
         bindings: &[Uniform, Uniform, Read, Read, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "fit_project",
+        shared_work: None,
+        parts: &[
+            SHARED,
+            GEOMETRY_READ,
+            COLORS_UPDATED,
+            GEOMETRY_WGSL,
+            ADAM_STEP,
+            include_str!("shaders/waiting_colors.wgsl"),
+            PROJECT,
+        ],
+        bindings: &[
+            Uniform, Uniform, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite,
+            ReadWrite, Read, Uniform,
+        ],
         segmented: false,
     },
     Source {
@@ -122,6 +147,7 @@ pub(super) static SOURCES: [Source; 24] = [
         parts: &[
             SHARED,
             GEOMETRY_READ,
+            COLORS_READ,
             GEOMETRY_WGSL,
             SPLAT_BACKWARD,
             include_str!("shaders/project_backward.wgsl"),
@@ -135,8 +161,10 @@ pub(super) static SOURCES: [Source; 24] = [
         parts: &[
             SHARED,
             GEOMETRY_UPDATED,
+            COLORS_READ,
             GEOMETRY_WGSL,
             SPLAT_BACKWARD,
+            ADAM_STEP,
             ADAM_UPDATE,
             ADAM_GEOMETRY,
             include_str!("shaders/fit_geometry.wgsl"),
@@ -285,18 +313,21 @@ pub(super) static SOURCES: [Source; 24] = [
     Source {
         name: "adam_geometry",
         shared_work: None,
-        parts: &[SHARED, ADAM_UPDATE, ADAM_GEOMETRY, include_str!("shaders/adam_plain.wgsl")],
+        parts: &[
+            SHARED,
+            ADAM_STEP,
+            ADAM_UPDATE,
+            ADAM_GEOMETRY,
+            include_str!("shaders/adam_plain.wgsl"),
+        ],
         bindings: &[Uniform, Uniform, ReadWrite, Read, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
         name: "adam_colors",
         shared_work: None,
-        parts: &[SHARED, ADAM_UPDATE, include_str!("shaders/adam_colors.wgsl")],
-        bindings: &[
-            Uniform, Uniform, Uniform, Read, ReadWrite, Read, ReadWrite, ReadWrite, Read, Read,
-            ReadWrite,
-        ],
+        parts: &[SHARED, ADAM_STEP, ADAM_UPDATE, include_str!("shaders/adam_colors.wgsl")],
+        bindings: &[Uniform, Uniform, Uniform, ReadWrite, Read, ReadWrite, ReadWrite],
         segmented: false,
     },
 ];
@@ -305,6 +336,8 @@ pub(super) static SOURCES: [Source; 24] = [
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kernel {
     Project,
+    FitProject,
+    CatchUpAll,
     ProjectBackward,
     FitGeometry,
     DepthKeys,
@@ -348,8 +381,10 @@ pub(super) enum Kernel {
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 40] = [
+    pub const ALL: [Self; 42] = [
         Self::Project,
+        Self::FitProject,
+        Self::CatchUpAll,
         Self::ProjectBackward,
         Self::FitGeometry,
         Self::DepthKeys,
@@ -395,6 +430,8 @@ impl Kernel {
     pub fn entry(self) -> (&'static str, &'static str) {
         match self {
             Self::Project => ("project", "project"),
+            Self::FitProject => ("fit_project", "project"),
+            Self::CatchUpAll => ("fit_project", "catch_up_all"),
             Self::ProjectBackward => ("project_backward", "project_backward"),
             Self::FitGeometry => ("fit_geometry", "fit_geometry"),
             Self::DepthKeys => ("bin_count", "depth_keys"),
@@ -450,7 +487,13 @@ fn constants(rows: u32) -> String {
         ("GRADIENT", GRADIENT as u32),
         ("GRADIENT_ABSOLUTE", GRADIENT_ABSOLUTE as u32),
         ("CAMERA", CAMERA as u32),
-        ("STATS", STATS as u32),
+        ("NOTES", NOTES as u32),
+        ("NOTE_PULL", NOTE_PULL as u32),
+        ("NOTE_SEEN", NOTE_SEEN as u32),
+        ("NOTE_WAITS", NOTE_WAITS as u32),
+        ("NOTE_COLOR", NOTE_COLOR as u32),
+        ("NOTE_DIRECTION", NOTE_DIRECTION as u32),
+        ("COLOR_WAIT", COLOR_WAIT as u32),
         ("EXPOSURE_GROUPS", EXPOSURE_GROUPS),
         ("DEPTH_GROUPS", DEPTH_GROUPS),
         ("SH_COEFFS_MAX", SH_COEFFS_MAX as u32),
@@ -586,8 +629,8 @@ mod tests {
     use super::*;
     use crate::fit_device::FogCamera;
     use crate::gpu::layout::{
-        Chunk, ChunkCount, DepthStep, ExposureUniform, SortPass, Splat2d, StatusHead, Step, View,
-        Window,
+        Chunk, ChunkCount, ColorSteps, DepthStep, ExposureUniform, SortPass, Splat2d, StatusHead,
+        Step, View, Window,
     };
     use crate::gpu::mcmc::{CellsUniform, Rows, Run};
 
@@ -741,6 +784,17 @@ mod tests {
             groups_max
         );
         layout!("bin_sort", SortPass, shift, chunk, is_first, keeps_culled);
+        // Without what fills it up to the steps.
+        assert_layout(
+            "fit_project",
+            "ColorSteps",
+            size_of::<ColorSteps>(),
+            &[
+                ("count", offset_of!(ColorSteps, count)),
+                ("moving", offset_of!(ColorSteps, moving)),
+                ("steps", offset_of!(ColorSteps, steps)),
+            ],
+        );
         layout!("project", Splat2d, mean, pq, color, r, depth, opacity, radii);
         layout!("bin_scan", ChunkCount, pairs, total);
         layout!(

@@ -35,11 +35,9 @@ enum Touch {
     PerPair,
     /// The radii of all 2D splats, of which such rows are, and the rest of those that are not culled.
     Radii,
-    /// The radii of all 2D splats alone.
-    RadiiAlone,
 }
 
-use Touch::{Pairs, PerPair, Radii, RadiiAlone, Small, Visible, Whole};
+use Touch::{Pairs, PerPair, Radii, Small, Visible, Whole};
 
 /// Radii in a 2D splat.
 const RADII_PART: f64 = 2.0 / SPLAT_2D as f64;
@@ -53,7 +51,6 @@ impl Touch {
             Pairs(times) => f64::from(times) * counts.pairs / counts.capacity,
             PerPair => counts.pairs / counts.splats,
             Radii => RADII_PART + (1.0 - RADII_PART) * counts.visible / counts.splats,
-            RadiiAlone => RADII_PART,
         }
     }
 }
@@ -72,6 +69,32 @@ enum Sorted {
 fn touches(kernel: Kernel, sorted: Sorted) -> &'static [Touch] {
     match kernel {
         Kernel::Project => &[Small, Small, Whole(1), Visible(1), Radii, Whole(1)],
+        Kernel::FitProject => &[
+            Small,
+            Small,
+            Whole(1),
+            Visible(2),
+            Radii,
+            Whole(1),
+            Visible(2),
+            Visible(2),
+            Visible(2),
+            Small,
+            Small,
+        ],
+        Kernel::CatchUpAll => &[
+            Small,
+            Small,
+            Small,
+            Whole(2),
+            Small,
+            Small,
+            Whole(2),
+            Whole(2),
+            Whole(2),
+            Small,
+            Small,
+        ],
         Kernel::DepthKeys => &[Small, Small, Whole(1), Small, Small, Whole(1)],
         Kernel::TileCounts => &[Small, Small, Visible(1), Small, Visible(1), Visible(1)],
         Kernel::ScanSums => &[Small, Visible(1), Small, Small, Small],
@@ -137,26 +160,14 @@ fn touches(kernel: Kernel, sorted: Sorted) -> &'static [Touch] {
             Visible(1),
             Radii,
             Visible(1),
-            Visible(1),
+            Visible(2),
             Whole(1),
             Whole(2),
             Whole(2),
             Small,
         ],
         Kernel::AdamGeometry => &[Small, Small, Whole(2), Whole(1), Whole(2), Whole(2)],
-        Kernel::AdamColors => &[
-            Small,
-            Small,
-            Small,
-            Small,
-            Whole(2),
-            Visible(1),
-            Whole(2),
-            Whole(2),
-            RadiiAlone,
-            Visible(1),
-            Visible(2),
-        ],
+        Kernel::AdamColors => &[Small, Small, Small, Whole(2), Whole(1), Whole(2), Whole(2)],
         // Density control is no part of a step.
         Kernel::McmcSample
         | Kernel::McmcWeigh

@@ -7,6 +7,7 @@ pub mod hard_cases;
 pub mod narrowed;
 pub mod optimisation;
 pub mod properties;
+pub mod waiting;
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};

@@ -11,7 +11,7 @@ use crate::gpu::device::{Gpu, Op};
 use crate::gpu::exposure::{Exposed, ExposureBuffers};
 use crate::gpu::layout::Chunk;
 use crate::gpu::loss::LossBuffers;
-use crate::gpu::project::{Projection, project_ops};
+use crate::gpu::project::Projection;
 use crate::gpu::rasterize::{PictureBuffers, rasterize_ops};
 use crate::gpu::rasterize_backward::{BackwardBuffers, rasterize_backward_ops};
 
@@ -33,6 +33,17 @@ pub(super) struct Frame {
     pub ops: Vec<Op>,
     /// Whether they correct the picture by an exposure, and whether they compare its depth.
     parts: [bool; 2],
+}
+
+/// The uniforms of every step.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Uniforms<'a> {
+    /// A `View`.
+    pub view: &'a wgpu::Buffer,
+    /// A `Step`.
+    pub step: &'a wgpu::Buffer,
+    /// A `ColorSteps`.
+    pub color_steps: &'a wgpu::Buffer,
 }
 
 /// The uniforms of what only some steps have.
@@ -71,8 +82,7 @@ impl Frame {
     pub fn prepare(
         &mut self,
         gpu: &Gpu,
-        view: &wgpu::Buffer,
-        step: &wgpu::Buffer,
+        uniforms: Uniforms<'_>,
         parts: Parts<'_>,
         scene: &Scene,
     ) -> Result<()> {
@@ -88,18 +98,18 @@ impl Frame {
             self.depth = Some(DepthBuffers::new(gpu, pixels)?);
         }
         self.parts = wanted;
-        self.ops = self.step_ops(gpu, view, step, parts, scene);
+        self.ops = self.step_ops(gpu, uniforms, parts, scene);
         Ok(())
     }
 
     fn step_ops(
         &self,
         gpu: &Gpu,
-        view: &wgpu::Buffer,
-        step: &wgpu::Buffer,
+        uniforms: Uniforms<'_>,
         parts: Parts<'_>,
         scene: &Scene,
     ) -> Vec<Op> {
+        let Uniforms { view, step, color_steps } = uniforms;
         let n = scene.len();
         let whole = Chunk::whole(tile_count(self.width, self.height), n, scene.capacity);
         let numbered = whole.parts(&self.chunks).zip(0..);
@@ -118,7 +128,7 @@ impl Frame {
             slots: scene.slots.clone(),
             v_splats2d: scene.v_splats2d.clone(),
         };
-        let mut ops = project_ops(gpu, drawn, &scene.adam.splats, bins.keys());
+        let mut ops = scene.adam.project_ops(gpu, drawn, bins, color_steps);
         ops.extend(bins.depth_ops(gpu, false));
         for chunk in &chunks {
             bin(&mut ops, chunk);
@@ -157,16 +167,9 @@ impl Frame {
             let lists = (bins, pairs);
             ops.extend(rasterize_backward_ops(gpu, drawn, chunk, lists, &backward, false));
         }
-        let moved = AdamInput {
-            drawn,
-            step,
-            status: &bins.status,
-            v_colors: &scene.v_colors,
-            v_camera: &scene.v_camera,
-            v_splats2d: &scene.v_splats2d,
-        };
+        let moved =
+            AdamInput { drawn, step, v_camera: &scene.v_camera, v_splats2d: &scene.v_splats2d };
         ops.extend(scene.adam.fit_ops(gpu, &moved, bins));
-        ops.extend(scene.adam.color_ops(gpu, &moved));
         ops
     }
 }

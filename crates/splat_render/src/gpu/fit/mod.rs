@@ -5,9 +5,11 @@
 //! and leaves the state as it was, as do the steps after it; the host looks at that flag now and
 //! then, makes room and repeats those steps, so that no step waits for a read-back.
 //!
+//! Colours of splats that a step does not see wait ([`crate::fit_device::COLOR_WAIT`]).
+//!
 //! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P and two moments
-//! make 3 P, and colours have gradients, 12 K bytes; statistics, 2D splats, their gradients and the depth
-//! order take 116. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
+//! make 3 P; statistics, the gradient of a colour, 2D splats, their gradients and the depth order take
+//! 144. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
 //! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
 //! slopes of SSIM (96 and 48 on software adapters), 16 more where exposures are fitted and
 //! 8 more where photos have depths; a photo 4 per pixel, 4 more for weights and 8 more for depths. A
@@ -23,19 +25,21 @@ use super::bin::{SplatBins, pair_limit, tile_count};
 use super::depth_loss::{DepthBuffers, depth_rows};
 use super::device::{Gpu, Op};
 use super::exposure::ExposureBuffers;
-use super::layout::{ChunkCount, DepthStep, ExposureUniform, GRADIENT, StatusHead, Step, View};
+use super::layout::{
+    ChunkCount, ColorSteps, DepthStep, ExposureUniform, GRADIENT, StatusHead, Step, View,
+};
 use super::loss::{LossBuffers, rgba};
 use super::mcmc::shares;
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
 use crate::fit_device::{
-    CameraGradient, ExposureGradient, FitDevice, FitState, McmcRun, StepInput, dropout_threshold,
-    mcmc,
+    CameraGradient, ColorStep, ExposureGradient, FitDevice, FitState, McmcRun, StepInput,
+    WaitingSteps, dropout_threshold, mcmc,
 };
 use crate::sh;
 use crate::stages::ProjectOptions;
 use crate::target::{Target, Weight};
-use frame::{Frame, Parts};
+use frame::{Frame, Parts, Uniforms};
 pub use plan::{PlannedFit, StepWork};
 use scene::{Scene, pair_buffers};
 
@@ -52,13 +56,16 @@ pub struct GpuFit {
     tiles: u32,
     view: wgpu::Buffer,
     step: wgpu::Buffer,
+    color_steps: wgpu::Buffer,
     exposure: wgpu::Buffer,
     depth: wgpu::Buffer,
     scene: Option<Scene>,
     /// MCMC's table of shares; None until density control runs.
     shares: Option<wgpu::Buffer>,
-    /// Steps not known to have been done.
-    pending: Vec<StepInput>,
+    /// Steps not known to have been done, with the number of those that colours waited for before.
+    pending: Vec<(StepInput, usize)>,
+    /// The steps that colours may wait for, those that are pending included.
+    waiting: WaitingSteps,
     camera_gradients: Vec<CameraGradient>,
     exposure_gradients: Vec<ExposureGradient>,
     /// The exposure sums of each pending step; None until a step has them.
@@ -91,6 +98,7 @@ impl GpuFit {
         Self {
             view: gpu.uniform(&View::of_picture(1, 1, [0.0; 3])),
             step: gpu.uniform(&<Step as bytemuck::Zeroable>::zeroed()),
+            color_steps: gpu.uniform(&<ColorSteps as bytemuck::Zeroable>::zeroed()),
             exposure: gpu.uniform(&<ExposureUniform as bytemuck::Zeroable>::zeroed()),
             depth: gpu.uniform(&<DepthStep as bytemuck::Zeroable>::zeroed()),
             gpu,
@@ -100,11 +108,19 @@ impl GpuFit {
             scene: None,
             shares: None,
             pending: Vec::new(),
+            waiting: WaitingSteps::default(),
             camera_gradients: Vec::new(),
             exposure_gradients: Vec::new(),
             pending_exposures: None,
             last: None,
         }
+    }
+
+    /// Colours of splats that are not seen wait for at most so many steps, by default
+    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, all are brought up to date in every step. Bits are
+    /// the same.
+    pub fn with_color_wait(self, steps: usize) -> Self {
+        Self { waiting: WaitingSteps::at_most(steps), ..self }
     }
 
     fn scene(&self) -> Result<&Scene> {
@@ -113,8 +129,26 @@ impl GpuFit {
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))
     }
 
-    /// Submits one step without waiting for it, as number `at` of those pending.
-    fn enqueue(&mut self, input: &StepInput, at: usize) -> Result<()> {
+    /// Brings all colours up to date; all steps must be done.
+    fn catch_up(&mut self) -> Result<()> {
+        if self.waiting.get().is_empty() {
+            return Ok(());
+        }
+        let scene = self
+            .scene
+            .as_mut()
+            .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))?;
+        scene.prepare(&self.gpu, &self.view, &self.color_steps);
+        let head = [self.waiting.get().len() as u32, scene.adam.moving];
+        self.gpu.write(&self.color_steps, 0, bytemuck::bytes_of(&head));
+        self.gpu.submit(&[&scene.catch_up])?;
+        self.waiting.clear();
+        Ok(())
+    }
+
+    /// Submits one step without waiting for it, as number `at` of those pending; colours wait for
+    /// `waiting` steps before it.
+    fn enqueue(&mut self, input: &StepInput, at: usize, waiting: usize) -> Result<()> {
         let scene = self
             .scene
             .as_mut()
@@ -126,7 +160,10 @@ impl GpuFit {
             exposure: input.exposure.map(|_| &self.exposure),
             depth: depth.map(|_| &self.depth),
         };
-        frame.prepare(&self.gpu, &self.view, &self.step, parts, scene)?;
+        let uniforms =
+            Uniforms { view: &self.view, step: &self.step, color_steps: &self.color_steps };
+        frame.prepare(&self.gpu, uniforms, parts, scene)?;
+        scene.prepare(&self.gpu, &self.view, &self.color_steps);
         let view = View {
             sh_degree: input.sh_degree.min(scene.sh_degree),
             sh_stride: sh::coeffs(scene.sh_degree) as u32,
@@ -136,7 +173,8 @@ impl GpuFit {
             compensation: 1.0 / (1.0 - input.dropout),
             ..View::of_view(&input.camera, &ProjectOptions::default(), input.background)
         };
-        let step = Step::of_adam(&input.adam(), scene.adam.moving).with_loss(
+        let adam = input.adam();
+        let step = Step::of_adam(&adam, scene.adam.moving).with_loss(
             input.ssim_weight,
             photo.weight,
             photo.weights.is_some(),
@@ -144,6 +182,12 @@ impl GpuFit {
         let gpu = &self.gpu;
         gpu.write(&self.view, 0, bytemuck::bytes_of(&view));
         gpu.write(&self.step, 0, bytemuck::bytes_of(&step));
+        let head = [waiting as u32, scene.adam.moving];
+        gpu.write(&self.color_steps, 0, bytemuck::bytes_of(&head));
+        if !adam.is_frozen() {
+            let (offset, entry) = ColorSteps::entry(waiting, &ColorStep::new(&adam));
+            gpu.write(&self.color_steps, offset, bytemuck::bytes_of(&entry));
+        }
         if let Some(exposure) = &input.exposure {
             let uniform = ExposureUniform::from(exposure);
             gpu.write(&self.exposure, 0, bytemuck::bytes_of(&uniform));
@@ -190,9 +234,10 @@ impl GpuFit {
     }
 
     /// Takes in the sums of these steps, which have been done, for cameras and exposures.
-    fn read_sums(&mut self, steps: &[StepInput]) -> Result<()> {
-        self.read_exposures(steps)?;
-        self.read_cameras(steps)
+    fn read_sums(&mut self, steps: &[(StepInput, usize)]) -> Result<()> {
+        let steps: Vec<StepInput> = steps.iter().map(|(input, _)| *input).collect();
+        self.read_exposures(&steps)?;
+        self.read_cameras(&steps)
     }
 
     fn read_exposures(&mut self, steps: &[StepInput]) -> Result<()> {
@@ -261,15 +306,15 @@ impl GpuFit {
     }
 
     /// Does the pending steps again from the one whose pairs did not fit, with room for them.
-    fn redo(&mut self, pending: &[StepInput], overflow: u32) -> Result<()> {
-        let first = pending.iter().position(|p| p.step == overflow).unwrap_or(0);
+    fn redo(&mut self, pending: &[(StepInput, usize)], overflow: u32) -> Result<()> {
+        let first = pending.iter().position(|(p, _)| p.step == overflow).unwrap_or(0);
         // One at a time, so that the counts read are those of the step that needs the room.
-        for (at, input) in pending.iter().enumerate().skip(first) {
+        for (at, (input, waiting)) in pending.iter().enumerate().skip(first) {
             loop {
                 let clear = std::mem::offset_of!(StatusHead, overflow) as u64;
                 let status = &self.scene()?.bins.status;
                 self.gpu.write(status, clear, bytemuck::bytes_of(&0u32));
-                self.enqueue(input, at)?;
+                self.enqueue(input, at, *waiting)?;
                 let (head, counts) = self.status()?;
                 if head.overflow == 0 {
                     break;
@@ -322,6 +367,7 @@ impl GpuFit {
             scene.status_copy = gpu.readable(SplatBins::status_bytes(scene.chunks));
         }
         self.frames[frame].chunks = chunks;
+        scene.catch_up.clear();
         for frame in &mut self.frames {
             frame.ops.clear();
         }
@@ -374,6 +420,7 @@ impl FitDevice for GpuFit {
     fn upload(&mut self, state: FitState) -> Result<()> {
         state.validate()?;
         self.pending.clear();
+        self.waiting.clear();
         // What the last scene has grown to is likely to be needed again.
         let (capacity, chunks) = self.scene.take().map_or((0, 1), |s| (s.capacity, s.chunks));
         for frame in &mut self.frames {
@@ -385,11 +432,13 @@ impl FitDevice for GpuFit {
 
     fn download(&mut self) -> Result<FitState> {
         self.settle()?;
+        self.catch_up()?;
         self.scene()?.download(&self.gpu)
     }
 
     fn mcmc(&mut self, run: &McmcRun) -> Result<usize> {
         self.settle()?;
+        self.catch_up()?;
         let gpu = Arc::clone(&self.gpu);
         let shares = match &self.shares {
             Some(shares) => shares.clone(),
@@ -416,8 +465,15 @@ impl FitDevice for GpuFit {
             let frame = &self.frames[photo.frame];
             (frame.width, frame.height)
         }))?;
-        self.enqueue(input, self.pending.len())?;
-        self.pending.push(*input);
+        let adam = input.adam();
+        if self.waiting.must_end_before(&adam) {
+            self.settle()?;
+            self.catch_up()?;
+        }
+        let waiting = self.waiting.get().len();
+        self.enqueue(input, self.pending.len(), waiting)?;
+        self.pending.push((*input, waiting));
+        self.waiting.add(&adam);
         if self.pending.len() >= STEPS_AHEAD { self.settle() } else { Ok(()) }
     }
 

@@ -3,12 +3,13 @@
 
 use bytemuck::Zeroable;
 
-use super::frame::{Frame, Parts};
+use super::frame::{Frame, Parts, Uniforms};
 use super::scene::Scene;
 use crate::error::Result;
+use crate::fit_device::COLOR_WAIT;
 use crate::gpu::adam::AdamBuffers;
 use crate::gpu::device::{Gpu, Op};
-use crate::gpu::layout::{Step, View};
+use crate::gpu::layout::{ColorSteps, Step, View};
 use crate::gpu::project::count;
 use crate::gpu::traffic::{Counts, bytes};
 use crate::sh;
@@ -30,11 +31,25 @@ pub struct PlannedFit {
 pub struct StepWork {
     /// Kernels that are started.
     pub dispatches: usize,
-    /// Bytes of buffers that are read and written.
+    /// Bytes of buffers that are read and written, and the step's share of what brings all colours up
+    /// to date every [`COLOR_WAIT`] steps.
     pub bytes: f64,
     /// The same by kernel, in the order of their first dispatches; buffers that are cleared and copied by
     /// those names.
     pub kernels: Vec<(&'static str, usize, f64)>,
+}
+
+impl StepWork {
+    fn add(&mut self, name: &'static str, runs: usize, bytes: f64) {
+        self.bytes += bytes;
+        match self.kernels.iter_mut().find(|(known, ..)| *known == name) {
+            Some((_, count, sum)) => {
+                *count += runs;
+                *sum += bytes;
+            }
+            None => self.kernels.push((name, runs, bytes)),
+        }
+    }
 }
 
 impl PlannedFit {
@@ -53,9 +68,12 @@ impl PlannedFit {
         let adam = AdamBuffers::new(&gpu, count(splats)?, 3 * sh::coeffs(sh_degree) as u64)?;
         let mut frame = Frame::new(&gpu, width, height)?;
         let tiles = crate::gpu::bin::tile_count(width, height);
-        let scene = Scene::new(&gpu, adam, sh_degree, tiles, pairs, 1)?;
+        let mut scene = Scene::new(&gpu, adam, sh_degree, tiles, pairs, 1)?;
         let (view, step) = (gpu.uniform(&View::zeroed()), gpu.uniform(&Step::zeroed()));
-        frame.prepare(&gpu, &view, &step, Parts { exposure: None, depth: None }, &scene)?;
+        let color_steps = gpu.uniform(&ColorSteps::zeroed());
+        let uniforms = Uniforms { view: &view, step: &step, color_steps: &color_steps };
+        frame.prepare(&gpu, uniforms, Parts { exposure: None, depth: None }, &scene)?;
+        scene.prepare(&gpu, &view, &color_steps);
         let photo = gpu.bindable("photo", u64::from(width) * u64::from(height) * 4)?;
         let mut ops = vec![frame.copy_photo(&photo)];
         ops.append(&mut frame.ops);
@@ -71,23 +89,19 @@ impl PlannedFit {
             capacity: f64::from(self.scene.capacity),
         };
         let mut work = StepWork { dispatches: 0, bytes: 0.0, kernels: Vec::new() };
-        let moved = bytes(&self.gpu, &self.ops, u64::from(self.scene.capacity) * 4, &counts);
-        for (op, bytes) in self.ops.iter().zip(moved) {
+        let pair_keys = u64::from(self.scene.capacity) * 4;
+        let of_step = self.ops.iter().zip(bytes(&self.gpu, &self.ops, pair_keys, &counts));
+        for (op, bytes) in of_step {
             let (name, runs) = match op {
                 Op::Dispatch { kernel, .. } => (kernel.entry().1, 1),
                 Op::Clear(_) => ("clear", 0),
                 Op::Copy(..) => ("copy", 0),
             };
             work.dispatches += runs;
-            work.bytes += bytes;
-            match work.kernels.iter_mut().find(|(known, ..)| *known == name) {
-                Some((_, count, sum)) => {
-                    *count += 1;
-                    *sum += bytes;
-                }
-                None => work.kernels.push((name, 1, bytes)),
-            }
+            work.add(name, 1, bytes);
         }
+        let now_and_then = bytes(&self.gpu, &self.scene.catch_up, pair_keys, &counts);
+        work.add("catch_up_all", 0, now_and_then.iter().sum::<f64>() / COLOR_WAIT as f64);
         work
     }
 }

@@ -1,13 +1,13 @@
 //! What a fit keeps on the device that depends on the number of splats or pairs.
 
 use crate::error::Result;
-use crate::fit_device::{DensityStats, FitState, McmcRun};
+use crate::fit_device::{FitState, McmcRun};
 use crate::gpu::adam::AdamBuffers;
 use crate::gpu::bin::{PairBins, SplatBins, pair_limit};
 use crate::gpu::device::{Gpu, Op};
-use crate::gpu::layout::{CAMERA, GEOMETRY, GRADIENT, STATS};
+use crate::gpu::layout::{CAMERA, GEOMETRY, GRADIENT};
 use crate::gpu::mcmc::{Drawn, RowKind};
-use crate::gpu::project::{SPLAT_2D, count};
+use crate::gpu::project::{Projection, SPLAT_2D, count};
 use crate::gpu::project_backward::{camera_buffer, camera_sums};
 
 /// Pairs per splat that buffers have room for at first; they grow by what a step needs.
@@ -20,8 +20,6 @@ pub(super) struct Scene {
     pub sh_degree: u32,
     pub splats2d: wgpu::Buffer,
     pub v_splats2d: wgpu::Buffer,
-    /// `[N * color_floats]`
-    pub v_colors: wgpu::Buffer,
     /// Sums of the camera's gradients.
     pub v_camera: wgpu::Buffer,
     /// The camera sums of each pending step; None until a step is to have them.
@@ -34,10 +32,8 @@ pub(super) struct Scene {
     pub pairs: PairBins,
     pub slots: wgpu::Buffer,
     pub capacity: u32,
-}
-
-fn stats_rows(stats: &DensityStats) -> Vec<[f32; STATS]> {
-    stats.grad_sum.iter().zip(&stats.seen).map(|(&sum, &seen)| [sum, seen]).collect()
+    /// What brings all colours up to date. Empty until needed, and again whenever a buffer was replaced.
+    pub catch_up: Vec<Op>,
 }
 
 /// The pair buffers and their gradient slots.
@@ -62,7 +58,7 @@ impl Scene {
         let adam = AdamBuffers::upload(
             gpu,
             [&state.splats, &state.first, &state.second].map(|a| a.params(a.sh_degree)),
-            &stats_rows(&state.stats),
+            &state.stats,
             state.moving() as u32,
         )?;
         Self::new(gpu, adam, state.splats.sh_degree, tiles, capacity, chunks)
@@ -86,7 +82,6 @@ impl Scene {
             sh_degree,
             splats2d: gpu.bindable("splats2d", row(SPLAT_2D))?,
             v_splats2d: gpu.bindable("v_splats2d", row(GRADIENT))?,
-            v_colors: gpu.buffer("v_colors", row(adam.splats.color_floats as usize))?,
             v_camera: camera_buffer(gpu, n)?,
             pending_cameras: None,
             bins: SplatBins::new(gpu, n, chunks)?,
@@ -95,6 +90,7 @@ impl Scene {
             pairs,
             slots,
             capacity,
+            catch_up: Vec::new(),
             adam,
         })
     }
@@ -134,9 +130,17 @@ impl Scene {
             put(&from.geometry, &to.geometry, floats[0], RowKind::Moments);
             put(&from.colors, &to.colors, floats[1], RowKind::Moments);
         }
-        ops.push(Op::Clear(next.adam.stats.clone()));
+        ops.push(Op::Clear(next.adam.notes.clone()));
         gpu.submit(&[&ops])?;
         Ok(Some(next))
+    }
+
+    /// Makes the commands that bring all colours up to date, unless they are there already.
+    pub fn prepare(&mut self, gpu: &Gpu, view: &wgpu::Buffer, color_steps: &wgpu::Buffer) {
+        if self.catch_up.is_empty() {
+            let drawn = Projection { view, splats2d: &self.splats2d };
+            self.catch_up = self.adam.catch_up_ops(gpu, drawn, &self.bins, color_steps);
+        }
     }
 
     /// Number of splats.
@@ -149,17 +153,14 @@ impl Scene {
         u64::from(camera_sums(self.len())) * CAMERA as u64 * 4
     }
 
-    /// The state as it is now; all steps must be done.
+    /// The state as it is now; all steps must be done, and all colours up to date.
     pub fn download(&self, gpu: &Gpu) -> Result<FitState> {
         let ([splats, first, second], stats) = self.adam.download(gpu, &[], self.sh_degree)?;
         Ok(FitState {
             splats,
             first,
             second,
-            stats: DensityStats {
-                grad_sum: stats.iter().map(|s| s[0]).collect(),
-                seen: stats.iter().map(|s| s[1]).collect(),
-            },
+            stats,
             frozen: (self.len() - self.adam.moving) as usize,
         })
     }

@@ -1,10 +1,10 @@
-// Adam's step of one number. Follows shared.wgsl; the file that follows declares `step`, `first` and
-// `second`.
+// Adam's step of one number whose moments lie in buffers. Follows adam_step.wgsl; the file that follows
+// declares `step`, `first` and `second`.
 
 fn updated(value: f32, at: u32, g: f32, rate: f32) -> f32 {
-    let m = ADAM_BETA1 * first[at] + (1.0 - ADAM_BETA1) * g;
-    let v = ADAM_BETA2 * second[at] + (1.0 - ADAM_BETA2) * g * g;
-    first[at] = m;
-    second[at] = v;
-    return value - rate * (m * step.bias_first) / (sqrt(v * step.bias_second) + ADAM_EPSILON);
+    let bias = vec2(step.bias_first, step.bias_second);
+    let state = adam_step(vec3(value, first[at], second[at]), g, rate, bias);
+    first[at] = state.y;
+    second[at] = state.z;
+    return state.x;
 }

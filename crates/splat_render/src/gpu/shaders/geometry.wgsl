@@ -1,10 +1,9 @@
-// What both directions of the project stage need of one splat, and its spherical harmonics. `geometry` is
-// declared before: GEOMETRY floats per splat, mean 3, scales 3, quaternion 4 (wxyz), opacity 1.
+// What both directions of the project stage need of one splat, and its spherical harmonics. Declared
+// before are `geometry`, GEOMETRY floats per splat: mean 3, scales 3, quaternion 4 (wxyz), opacity 1; and
+// `colors`, 3 floats per coefficient, `sh_stride` coefficients per splat (1 for direct colours).
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> window: Window;
-// 3 floats per coefficient, `sh_stride` coefficients per splat (1 for direct colours).
-@group(0) @binding(3) var<storage, read> colors: array<f32>;
 
 // How colours and parameters are stored, as `look_up_mode` has it from the view.
 struct Mode {

@@ -1,4 +1,5 @@
-// project: splats and camera to 2D splats. Follows shared.wgsl and geometry.wgsl.
+// project: splats and camera to 2D splats. Follows geometry.wgsl, and waiting_colors.wgsl in fits, where
+// colours are brought up to date before they are evaluated.
 
 // Of culled splats, the radii alone.
 @group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;
@@ -39,28 +40,31 @@ fn project(
         let radii = vec2(sqrt(reach * cxx), sqrt(reach * cyy));
         let center = view.focal * (g.t.xy / g.t.z) + view.principal;
         let size = vec2(f32(view.width), f32(view.height));
-        var color = vec3(0.0);
-        if mode.sh_stride == 0u {
-            color = coefficient(i);
-        } else {
-            color = sh_color(i, view_direction(g.t).xyz);
-        }
-        // Tested before max(), which may turn NaN into 0.
-        let finite = is_finite3(color) && is_finite(center.x) && is_finite(center.y)
-            && is_finite(radii.x) && is_finite(radii.y) && is_finite(p) && is_finite(q)
-            && is_finite(r) && is_finite(root_det) && is_finite(sxy);
+        let finite = is_finite(center.x) && is_finite(center.y) && is_finite(radii.x)
+            && is_finite(radii.y) && is_finite(p) && is_finite(q) && is_finite(r)
+            && is_finite(root_det) && is_finite(sxy);
         let in_picture = all(center + radii >= vec2(0.0)) && all(center - radii <= size);
         if finite && in_picture && all(radii > vec2(0.0)) {
-            if mode.sh_stride != 0u {
-                color = max(color, vec3(0.0));
+            var color = vec3(0.0);
+            if mode.sh_stride == 0u {
+                color = coefficient(i);
+            } else {
+                catch_up(i);
+                color = sh_color(i, view_direction(g.t).xyz);
             }
-            out.mean = center;
-            out.pq = vec2(p, q);
-            out.color = color;
-            out.r = r;
-            out.depth = g.t.z;
-            out.opacity = opacity;
-            out.radii = radii;
+            // Tested before max(), which may turn NaN into 0.
+            if is_finite3(color) {
+                if mode.sh_stride != 0u {
+                    color = max(color, vec3(0.0));
+                }
+                out.mean = center;
+                out.pq = vec2(p, q);
+                out.color = color;
+                out.r = r;
+                out.depth = g.t.z;
+                out.opacity = opacity;
+                out.radii = radii;
+            }
         }
     }
     if all(out.radii == vec2(0.0)) {

@@ -9,6 +9,12 @@
 // CAMERA floats per workgroup: rows of the 3x4 viewmat, fx, fy, cx, cy.
 @group(0) @binding(8) var<storage, read_write> v_camera: array<f32>;
 
+fn keep_coefficient(row: u32, v: vec3<f32>) {
+    v_colors[3u * row] = v.x;
+    v_colors[3u * row + 1u] = v.y;
+    v_colors[3u * row + 2u] = v.z;
+}
+
 @compute @workgroup_size(64)
 fn project_backward(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -22,7 +28,7 @@ fn project_backward(
         if any(splats2d[i].radii != vec2(0.0)) {
             v = splat_backward(i);
         } else {
-            write_color_zeros(i);
+            keep_zeros(i);
         }
         for (var k = 0u; k < GEOMETRY; k++) {
             v_geometry[i * GEOMETRY + k] = v.geometry[k];

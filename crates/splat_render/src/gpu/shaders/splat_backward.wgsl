@@ -1,10 +1,17 @@
 // Gradients of one 2D splat to gradients of the splat and the camera. Follows shared.wgsl and
-// geometry.wgsl; the file that follows declares what is bound. Formulas and names as in
+// geometry.wgsl; the file that follows declares what is bound, and `keep_coefficient`, which is told the
+// gradient of each stored coefficient. Formulas and names as in
 // reference/project_backward.rs.
 
 struct Backward {
     geometry: array<f32, GEOMETRY>,
     camera: array<f32, CAMERA>,
+    // Of the colour before the cut at zero, and the direction it is seen along: the gradient of each
+    // coefficient is its basis function there times that of the colour.
+    v_color: vec3<f32>,
+    direction: vec3<f32>,
+    // Whether there is a gradient at all.
+    is_some: bool,
 }
 
 var<workgroup> camera_sums: array<array<f32, 64>, CAMERA>;
@@ -31,18 +38,16 @@ fn outer(a: vec3<f32>, b: vec3<f32>) -> mat3x3<f32> {
     return mat3x3(a * b.x, a * b.y, a * b.z);
 }
 
-fn write_color_zeros(i: u32) {
+fn keep_zeros(i: u32) {
     let rows = max(mode.sh_stride, 1u);
-    for (var k = 0u; k < 3u * rows; k++) {
-        v_colors[3u * i * rows + k] = 0.0;
+    for (var k = 0u; k < rows; k++) {
+        keep_coefficient(i * rows + k, vec3(0.0));
     }
 }
 
-// Writes the gradient of one coefficient; what it adds to that of the direction.
+// Keeps the gradient of one coefficient; what it adds to that of the direction.
 fn coefficient_backward(row: u32, term: Term, v_color: vec3<f32>) -> vec3<f32> {
-    v_colors[3u * row] = term.value * v_color.x;
-    v_colors[3u * row + 1u] = term.value * v_color.y;
-    v_colors[3u * row + 2u] = term.value * v_color.z;
+    keep_coefficient(row, term.value * v_color);
     return term.derivative * dot(v_color, coefficient(row));
 }
 
@@ -88,18 +93,18 @@ fn sh_backward(i: u32, direction: vec3<f32>, v_color: vec3<f32>) -> vec3<f32> {
     }
     // Coefficients of degrees that are not in use yet.
     let used = (mode.sh_degree + 1u) * (mode.sh_degree + 1u);
-    for (var k = 3u * used; k < 3u * mode.sh_stride; k++) {
-        v_colors[3u * row + k] = 0.0;
+    for (var k = used; k < mode.sh_stride; k++) {
+        keep_coefficient(row + k, vec3(0.0));
     }
     return v_direction;
 }
 
-// Gradients of a splat that is not culled; those of its colours are written.
+// Gradients of a splat that is not culled; those of its coefficients are kept.
 fn splat_backward(i: u32) -> Backward {
     var none: Backward;
     let g = load_geometry(i);
     if !g.visible {
-        write_color_zeros(i);
+        keep_zeros(i);
         return none;
     }
     var camera: array<f32, CAMERA>;
@@ -117,12 +122,11 @@ fn splat_backward(i: u32) -> Backward {
     var finite = true;
 
     // Colour and, through the view direction, t and the rotation.
+    var direction = vec4(0.0);
     if mode.sh_stride == 0u {
-        v_colors[3u * i] = v_color.x;
-        v_colors[3u * i + 1u] = v_color.y;
-        v_colors[3u * i + 2u] = v_color.z;
+        keep_coefficient(i, v_color);
     } else {
-        let direction = view_direction(g.t);
+        direction = view_direction(g.t);
         v_color = select(vec3(0.0), v_color, sh_color(i, direction.xyz) > vec3(0.0));
         let v_direction = sh_backward(i, direction.xyz, v_color);
         let v_along =
@@ -253,10 +257,10 @@ fn splat_backward(i: u32) -> Backward {
         finite = finite && is_finite(camera[k]);
     }
     if !finite {
-        write_color_zeros(i);
+        keep_zeros(i);
         return none;
     }
-    return Backward(row, camera);
+    return Backward(row, camera, v_color, direction.xyz, true);
 }
 
 // Adds a workgroup's gradients of the camera in the order of its splats, one thread per entry.

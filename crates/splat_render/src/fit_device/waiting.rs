@@ -1,0 +1,76 @@
+//! Steps that colours wait for. A splat that a step's photo does not show has no gradient of its colours,
+//! so that what the optimiser does to them needs nothing but the step's rates: it is done when the splat
+//! is next seen, or when someone asks for all colours, by the same operations in the same order.
+
+use crate::stages::AdamStep;
+
+/// Steps that colours wait for, at most. Whoever waits longer is brought up to date with all others, so
+/// that no kernel goes through more than so many steps at once.
+pub const COLOR_WAIT: usize = 128;
+
+/// What a step does to all colours, gradients apart.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ColorStep {
+    /// Rates of the first coefficient and of the others.
+    pub sh0: f32,
+    pub sh_rest: f32,
+    /// Bias corrections of the first and the second moment.
+    pub bias: [f32; 2],
+}
+
+impl ColorStep {
+    pub fn new(step: &AdamStep) -> Self {
+        let bias = step.bias().map(|bias| bias as f32);
+        Self { sh0: step.rates.sh0, sh_rest: step.rates.sh_rest, bias }
+    }
+}
+
+/// The steps since all colours were last up to date.
+#[derive(Debug, Clone)]
+pub(crate) struct WaitingSteps {
+    steps: Vec<ColorStep>,
+    /// The SH degree that all of them use.
+    degree: u32,
+    most: usize,
+}
+
+impl Default for WaitingSteps {
+    fn default() -> Self {
+        Self::at_most(COLOR_WAIT)
+    }
+}
+
+impl WaitingSteps {
+    /// Of which there are never more than `most`, at least 1 and at most [`COLOR_WAIT`].
+    pub fn at_most(most: usize) -> Self {
+        Self { steps: Vec::new(), degree: 0, most: most.clamp(1, COLOR_WAIT) }
+    }
+
+    /// Whether all colours must be brought up to date before `step`.
+    pub fn must_end_before(&self, step: &AdamStep) -> bool {
+        let others = step.is_frozen() || step.sh_degree != self.degree;
+        !self.steps.is_empty() && (others || self.steps.len() == self.most)
+    }
+
+    /// Adds a step that has been done, unless nothing moves in it.
+    pub fn add(&mut self, step: &AdamStep) {
+        if !step.is_frozen() {
+            self.degree = step.sh_degree;
+            self.steps.push(ColorStep::new(step));
+        }
+    }
+
+    /// All colours are up to date.
+    pub fn clear(&mut self) {
+        self.steps.clear();
+    }
+
+    /// The SH degree that all of them use.
+    pub fn degree(&self) -> u32 {
+        self.degree
+    }
+
+    pub fn get(&self) -> &[ColorStep] {
+        &self.steps
+    }
+}
