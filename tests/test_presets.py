@@ -117,6 +117,7 @@ def test_support_is_what_cameras_show():
     all_round = support_of(ring)
     assert all_round.photos == 12
     assert all_round.pixels == 1600.0
+    assert all_round.shown == 1.0
     # Within 60 degrees of each, itself included, on a ring of 30 degrees' steps.
     assert 3.0 <= all_round.seen_by <= 5.0
     half = support_of(ring[::2])
@@ -127,6 +128,20 @@ def test_support_is_what_cameras_show():
     assert support_of(ring[:1]) == replace(
         PhotoSupport(1, 1600.0, 1.0, 180.0), detail=support_of(ring[:1]).detail
     )
+
+
+def test_of_a_large_scene_few_photos_show_the_same_place():
+    ring = scenes.capture(views=12, size=40, alpha=True).views
+
+    def moved(view, by):
+        viewmat = view.camera.viewmat.copy()
+        viewmat[:3, 3] -= viewmat[:3, :3] @ [by, 0.0, 0.0]
+        return replace(view, camera=replace(view.camera, viewmat=viewmat))
+
+    rooms = support_of([moved(view, 50.0 * k) for k in range(3) for view in ring])
+    assert rooms.shown < presets.SHOWN_BY
+    assert settings_for("default", replace(rooms, apart=30.0)).density == "original"
+    assert settings_for("default", replace(rooms, apart=30.0, shown=1.0)).density == "mcmc"
 
 
 def test_squares_of_one_tone_are_counted():

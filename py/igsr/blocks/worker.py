@@ -52,10 +52,6 @@ Float64 = npt.NDArray[np.float64]
 
 #: Photos that are held whole at a time while parts of them are cut out.
 AT_A_TIME = 8
-#: MCMC pulls all splats in each step to be faint, however few photos show them. Where a place is
-#: seen by less than this part of the photos, most splats fade, and presets' MCMC is not taken. (One
-#: house of the benchmark's town scores 25.4 dB with it and 24.8 without, 15 houses 18.8 and 22.8.)
-SEEN = 0.5
 #: Seconds between two reports of progress.
 TELL_EVERY = 1.0
 
@@ -192,8 +188,6 @@ def _fit(
     usual = _usual_settings(task, support)
     start = more.get("start")
     chosen: dict[str, Any] = {"dropout": usual.dropout, "density": usual.density}
-    if support.seen_by < SEEN * support.photos and usual.density == "mcmc":
-        chosen["density"] = "original"
     if start is None:
         chosen["sh_degree"] = usual.sh_degree
     # The task's part of the most splats there may be, but no fewer than there are at first.

@@ -46,6 +46,8 @@ class PhotoSupport:
             from; the mean over photos.
         detail: number of squares of one tone that a photo is divided into, the mean over photos.
             0 where it is not known.
+        shown: part of the photos, itself included, that show what a photo looks at from any side;
+            the mean over photos.
     """
 
     photos: int
@@ -53,6 +55,7 @@ class PhotoSupport:
     seen_by: float
     apart: float
     detail: float = 0.0
+    shown: float = 1.0
 
     @classmethod
     def of_number(cls, photos: int) -> PhotoSupport:
@@ -90,7 +93,7 @@ def support_of(views: Sequence[View], depths: np.ndarray | None = None) -> Photo
         rays = np.maximum(depths, 1e-9)[:, None] * rays
         looked_at = centres + np.einsum("vji,vj->vi", rotations, rays)
     shifts = np.stack([view.camera.viewmat[:3, 3] for view in views])
-    seen_by, apart = [], []
+    seen_by, apart, shown = [], [], []
     for i, place in enumerate(looked_at):
         rays = centres - place
         rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
@@ -101,6 +104,7 @@ def support_of(views: Sequence[View], depths: np.ndarray | None = None) -> Photo
         pixel = K[:, [0, 1], [0, 1]] * at + K[:, [0, 1], [2, 2]]
         sees = ahead & ((pixel >= 0.0) & (pixel <= sizes)).all(axis=1)
         seen_by.append(int((sees & (angles < SUPPORTS_WITHIN)).sum()))
+        shown.append(float(sees.mean()))
         apart.append(np.delete(angles, i).min(initial=180.0))
     used = [
         view.camera.width * view.camera.height if view.mask is None else int(view.mask.sum())
@@ -113,6 +117,7 @@ def support_of(views: Sequence[View], depths: np.ndarray | None = None) -> Photo
         max(1.0, float(np.mean(seen_by))),
         float(np.mean(apart)),
         float(np.mean([squares_of_one_tone(view.image, view.mask) for view in some])),
+        float(np.mean(shown)),
     )
 
 

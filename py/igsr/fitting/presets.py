@@ -27,8 +27,9 @@ DROPOUT_PHOTOS = 1.2
 MOST_DROPOUT, LEAST_DROPOUT = 0.3, 0.05
 #: Photos further apart than this (degrees, in the mean) leave so much open that splats are only
 #: added where opaque ones are, with a pull to small and faint ones (MCMC). Nearer ones show where
-#: splats are missing.
-WIDE_APART = 7.0
+#: splats are missing. The pull is on all splats in each step, so most fade where less than this
+#: part of the photos show the same place: a large scene, a walk through rooms.
+WIDE_APART, SHOWN_BY = 7.0, 0.5
 #: From so many photos of the same place on, view-dependent color is more than a way to overfit.
 SH2_PHOTOS = 12.0
 #: Steps of any fit, and more for each photo, up to a most; but for few photos only so many each.
@@ -182,6 +183,7 @@ def _default(
         usual = min(MOST_STEPS, STEPS + STEPS_MORE * photos, STEPS_PER_PHOTO * photos)
         steps = round(more_steps * usual * (JOINT_STEPS if joint else 1))
     rate = 1.0 if joint else min(MOST_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps)))
+    wide = support.apart > WIDE_APART
     more = (support.photos / FEW) ** SPLATS_POWER
     splats = max(
         SPLATS_PER_PIXEL * support.pixels * more,
@@ -194,7 +196,7 @@ def _default(
         learning_rate=round(rate, 2),
         max_splats=max(1000, min(MOST_SPLATS, round(more_splats * splats))),
         sh_degree=2 if support.seen_by >= SH2_PHOTOS else 1,
-        density="mcmc" if support.apart > WIDE_APART else "original",
+        density="mcmc" if wide and support.shown >= SHOWN_BY else "original",
         dropout=round(dropout, 2) if dropout >= LEAST_DROPOUT else 0.0,
     )
 
