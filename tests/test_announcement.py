@@ -130,7 +130,7 @@ def test_detailed_photos_have_more_splats(monkeypatch, tmp_path):
     plain = said(monkeypatch, seen, cameras_kept=True)[1]
     detailed = said(monkeypatch, replace(seen, plain=[tmp_path / "0.png"]), cameras_kept=True)[1]
     most = [int(line.split("up to ")[1].split()[0]) for line in (plain, detailed)]
-    assert most == [18_240, round(0.4 * 304 * 200)]
+    assert most == [18_240, round(0.5 * 304 * 200)]
 
 
 def test_the_files_of_photos_are_named(tmp_path):
