@@ -438,3 +438,18 @@ def test_a_loss_that_is_not_finite_ends_the_training(captures, tmp_path, monkeyp
         IgsrError, match="the loss is not finite at step 1; train with a lower rate"
     ):
         train(tmp_path, SMALL, captures=captures)
+
+
+def test_mistakes_of_the_command_are_told_before_anything_is_made(tmp_path, igsr_here):
+    out = tmp_path / "none"
+    refused = igsr_here("weights", "train", "--out", out, "--resume")
+    assert refused.returncode == 1
+    assert f"{out} has no checkpoint to go on from; leave out --resume." in said(refused)
+    refused = igsr_here("weights", "train", "--out", out, "--photos", "20", "--views", "16")
+    assert refused.returncode == 1
+    assert "photos is 20, but a capture has 16 (views)" in said(refused)
+    assert not out.exists()
+
+
+def said(done):
+    return " ".join(done.stderr.split())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -34,6 +35,8 @@ def worker_processes(count: int, threads: int | None = None) -> ProcessPoolExecu
 
 def _begin(threads: int | None) -> None:
     """In a worker, before anything starts threads."""
+    # Ctrl-C goes to all processes of a terminal. The one that started them says what it means.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     if threads is not None:
         os.environ.update(dict.fromkeys(THREADS, str(threads)))
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -12,6 +12,7 @@ from igsr.cli.error_messages import error_messages, print_message
 from igsr.cli.settings_options import ConfigOption, settings_options
 from igsr.cli.shared import JsonOption, TimeLeft, error_console, output_console, print_json
 from igsr.cli.training_bar import training_bar
+from igsr.errors import IgsrError
 from igsr.pose.da3.training.training_settings import PoseTraining
 from igsr.pose.huggingface_cache import cache_folder
 from igsr.pose.weights import KNOWN, fetch_weights, known_weights, weights_path
@@ -107,11 +108,16 @@ def train_command(
     """
     from igsr.pose.da3.training.train_network import train
     from igsr.training.plot_training import plot_training
-    from igsr.training.training_run import LOG
+    from igsr.training.training_run import CHECKPOINT, LOG
 
-    with error_messages(
-        lambda: f"Interrupted; go on from the last checkpoint in {out} with --resume."
-    ):
+    def interrupted() -> str:
+        if (out / CHECKPOINT).is_file():
+            return f"Interrupted; go on from the last checkpoint in {out} with --resume."
+        return "Interrupted before the first checkpoint; captures that were made are kept."
+
+    with error_messages(interrupted):
+        if resume and not (out / CHECKPOINT).is_file():
+            raise IgsrError(f"{out} has no checkpoint to go on from; leave out --resume.")
         training = PoseTraining(**given)
         console, time_left = error_console(), TimeLeft()
 

@@ -153,7 +153,7 @@ impl StepInput {
 /// and channels c, with s the SSIM weight, zero padding in the window, plus the loss of the depth,
 /// where the photo has one, and the two regularisers.
 /// Every parameter takes an Adam step in every step, seen or not; colours of splats that are not seen may
-/// take theirs later, with the same bits. With [`Rates::ZERO`] nothing moves
+/// take theirs later, with the same bits (on GPUs whose driver fuses multiply-adds alike in both kernels). With [`Rates::ZERO`] nothing moves
 /// ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss, the density statistics and
 /// the cameras' gradients are as ever.
 pub trait FitDevice: Send {

@@ -74,3 +74,33 @@ impl WaitingSteps {
         &self.steps
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stages::Rates;
+
+    /// Rates and corrections are those of Adam (Kingma and Ba 2015, algorithm 1) at the step's own number.
+    #[test]
+    fn a_step_keeps_its_own_rates_and_corrections() {
+        let rates = Rates { sh0: 0.25, sh_rest: 0.0125, ..Rates::ZERO };
+        for number in [1u32, 2, 10, 1000] {
+            let step = AdamStep {
+                number,
+                rates,
+                sh_degree: 2,
+                opacity_regularizer: 0.0,
+                scale_regularizer: 0.0,
+                noise: 0.0,
+                noise_seed: 0,
+            };
+            let kept = ColorStep::new(&step);
+            assert_eq!((kept.sh0, kept.sh_rest), (0.25, 0.0125));
+            for (bias, beta) in kept.bias.into_iter().zip([0.9f64, 0.999]) {
+                let expected = 1.0 / (1.0 - beta.powi(number as i32));
+                let relative = (f64::from(bias) / expected - 1.0).abs();
+                assert!(relative < 1e-4, "{bias} {expected} at {number}");
+            }
+        }
+    }
+}

@@ -6,6 +6,11 @@ use super::optimisation::{random_adam, random_target};
 use super::*;
 
 const STEPS: u32 = 2 * COLOR_WAIT as u32 + 30;
+/// After these steps the degree grows, and in those nothing moves: both end all waiting, and between them
+/// it lasts longer than colours may wait.
+const GROWS: [u32; 2] = [20, STEPS - 50];
+const FROZEN: [u32; 3] = [3, 200, STEPS - 20];
+const _: () = assert!(FROZEN[1] - GROWS[0] > COLOR_WAIT as u32 + 1);
 
 /// Cameras that see a part of the scene each, and a state amid a fit, so that what no camera sees drifts.
 /// Some moments are zero, some splats are only drawn.
@@ -48,8 +53,8 @@ fn input(cameras: &[Camera], step: u32) -> StepInput {
         view,
         camera: cameras[view],
         background: [0.2, 0.4, 0.6],
-        sh_degree: [1, 2, 3][(step > 20) as usize + (step > STEPS - 50) as usize],
-        rates: if step % 97 == 3 { Rates::ZERO } else { rates },
+        sh_degree: [1, 2, 3][(step > GROWS[0]) as usize + (step > GROWS[1]) as usize],
+        rates: if FROZEN.contains(&step) { Rates::ZERO } else { rates },
         step,
         ssim_weight: 0.2,
         opacity_regularizer: 0.01,

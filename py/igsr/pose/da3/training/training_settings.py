@@ -88,3 +88,8 @@ class PoseTraining:
     def __post_init__(self) -> None:
         """Check every setting."""
         validate(self)
+        if self.photos > self.views:
+            raise IgsrError(
+                f"photos is {self.photos}, but a capture has {self.views} (views); give at most as "
+                "many, or more views"
+            )
