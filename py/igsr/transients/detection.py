@@ -15,6 +15,7 @@ from igsr.transients.witnesses import (
     SLACK,
     SmallPhoto,
     Testimony,
+    colors_at,
     shown_at_any_depth,
     small_photos,
     testimony,
@@ -40,6 +41,9 @@ THIN, FRAME = 2, 4
 VOTE, REACH = 4, 24
 #: Where others agree on no color, the mean of those within so many pixels stands for it.
 NEAR = 4
+#: The scene's deviation is told by so many photos at most, evenly spaced: what others say of a
+#: photo takes more memory than the photo.
+MEASURED = 64
 #: Masks are grown by so many small pixels: edges are mixed colors.
 MARGIN = 2
 
@@ -72,23 +76,25 @@ def find_transients(
     photos = small_photos(
         splats, [views[k] for k in which], [before[k] for k in which], background, backend
     )
-    said = [testimony(k, photos) for k in range(len(photos))]
-    deviation = _deviation(photos, said)
+    measured = np.linspace(0, len(photos) - 1, min(len(photos), MEASURED)).round().astype(int)
+    said = {int(k): testimony(int(k), photos) for k in measured}
+    deviation = _deviation([photos[k] for k in said], list(said.values()))
     found: list[Bool | None] = [None] * len(views)
     most = 0.0
-    for k, photo, what in zip(which, photos, said, strict=True):
+    for k, photo in enumerate(photos):
+        what = said.pop(k) if k in said else testimony(k, photos)
         if what is None:
             continue
         small, plain = regions(photo, what, deviation)
         most = max(most, plain)
         if small.any():
-            found[k] = _enlarged(small, views[k])
+            found[which[k]] = _enlarged(small, views[which[k]])
     return found if most >= least else [None] * len(views)
 
 
 def _difference(photo: SmallPhoto, what: Testimony) -> Float32:
     """How far colors are off what the others show, in the channel where most, [N]."""
-    own = photo.color.reshape(-1, 3)[what.pixels]
+    own = colors_at(photo.color, what.pixels)
     return np.asarray(np.abs(own - what.color).max(axis=-1))
 
 
@@ -126,7 +132,8 @@ def _unlike(photo: SmallPhoto, what: Testimony) -> Float32:
         shift = slice(dy, dy + height), slice(dx, dx + width)
         np.minimum(low, least[shift], out=low)
         np.maximum(high, most[shift], out=high)
-    off = np.maximum(low - photo.color, photo.color - high).max(axis=-1)
+    own = photo.color / np.float32(255.0)
+    off = np.maximum(low - own, own - high).max(axis=-1)
     return np.where(photo.usable & known, off, 0.0).astype(np.float32)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,7 @@ from igsr.splats import Splats
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+UInt8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
 #: Pixels of a photo's longer side at which photos are compared.
@@ -51,19 +53,21 @@ WHITE = 0.98
 class SmallPhoto:
     """A photo at the size at which photos are compared.
 
+    Colors are bytes, 0 to 255: those of all photos of a fit are held at once.
+
     Attributes:
         camera: of the small photo.
-        color: float32 [H, W, 3] in [0, 1], means of 3 x 3 pixels.
-        low, high: float32 [H, W, 3], least and most color within ``SLACK`` pixels.
+        color: uint8 [H, W, 3], means of 3 x 3 pixels.
+        low, high: uint8 [H, W, 3], least and most color within ``SLACK`` pixels.
         usable: bool [H, W], where its pixels count.
         trusted: bool [H, W], where they count as a witness, too.
         depth: float32 [H, W], of the render, world units; 0 where there is no surface.
     """
 
     camera: Camera
-    color: Float32
-    low: Float32
-    high: Float32
+    color: UInt8
+    low: UInt8
+    high: UInt8
     usable: Bool
     trusted: Bool
     depth: Float32
@@ -116,13 +120,13 @@ def small_photos(
         small = reduced_view(view, *size)
         drawn = render(splats, small.camera, background, backend)
         depth = np.where(drawn.alpha > SURFACE_ALPHA, drawn.expected_depth, np.float32(0.0))
-        color = over_background(small.image, background).astype(np.float32) / np.float32(255.0)
+        color = over_background(small.image, background).astype(np.float32)
         usable = np.ones(depth.shape, np.bool_) if small.mask is None else small.mask
         trusted = usable
         if doubted is not None:
             # A small pixel is doubtful if any under it is.
             trusted = usable & (plane_area_means(doubted.astype(np.float64), *size) == 0.0)
-        mean = _windows(color, 1).mean(axis=(-2, -1)).astype(np.float32)
+        mean = np.rint(_windows(color, 1).mean(axis=(-2, -1))).astype(np.uint8)
         wide = _windows(mean, SLACK)
         low, high = wide.min(axis=(-2, -1)), wide.max(axis=(-2, -1))
         photos.append(SmallPhoto(small.camera, mean, low, high, usable, trusted, depth))
@@ -145,10 +149,12 @@ def testimony(index: int, photos: Sequence[SmallPhoto]) -> Testimony | None:
     if not len(pixels):
         return None
     rays = _rays(photo.camera)[pixels]
-    own = photo.color.reshape(-1, 3)[pixels]
+    own = colors_at(photo.color, pixels)
     sights = [_sight(photo.camera, other, rays, surface[pixels]) for other in others]
     seen = np.stack([visible for _, visible in sights])
-    colors = np.stack([_at(other.color, at) for other, (at, _) in zip(others, sights, strict=True)])
+    colors = np.stack(
+        [colors_at(other.color, at) for other, (at, _) in zip(others, sights, strict=True)]
+    )
     gains = np.stack([_gain(own, *one) for one in zip(colors, seen, strict=True)])
     middle = _median(np.minimum(colors * gains[:, None], np.float32(1.0)), seen)
     # A photo agrees if the color is among those that it shows around there.
@@ -187,7 +193,7 @@ def shown_at_any_depth(photo: SmallPhoto, pixels: Int64, said: Testimony) -> Boo
         return found
     middle = float(np.median(surface))
     rays = _rays(photo.camera)[pixels]
-    own = photo.color.reshape(-1, 3)[pixels]
+    own = colors_at(photo.color, pixels)
     for inverse in np.linspace(1.0 / NEAREST, 1.0 / FARTHEST, DEPTHS):
         depth = np.full(len(pixels), middle / inverse, np.float32)
         count = np.zeros(len(pixels), np.int64)
@@ -199,16 +205,16 @@ def shown_at_any_depth(photo: SmallPhoto, pixels: Int64, said: Testimony) -> Boo
     return found
 
 
-def _windows(values: Float32, half: int) -> Float32:
+def _windows(values: npt.NDArray[Any], half: int) -> npt.NDArray[Any]:
     """The square window around each pixel, [H, W, 3, 2 half + 1, 2 half + 1], edges repeated."""
     padded = np.pad(values, [(half, half), (half, half), (0, 0)], mode="edge")
     side = 2 * half + 1
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, (side, side), axis=(0, 1)))
 
 
-def _at(picture: Float32, at: Int64) -> Float32:
-    """Colors [N, 3] of a picture [H, W, 3] in the pixels of these numbers."""
-    return picture.reshape(-1, 3)[at]
+def colors_at(picture: UInt8, at: Int64) -> Float32:
+    """Colors [N, 3] in [0, 1] of a small photo's picture [H, W, 3] in pixels of these numbers."""
+    return picture.reshape(-1, 3)[at].astype(np.float32) / np.float32(255.0)
 
 
 def _range(other: SmallPhoto, at: Int64, gain: Float32) -> tuple[Float32, Float32]:
@@ -217,7 +223,7 @@ def _range(other: SmallPhoto, at: Int64, gain: Float32) -> tuple[Float32, Float3
     A photo holds no more than white: what is brighter is white there, and what another has as white
     may be any color that is as bright or brighter.
     """
-    low, high = _at(other.low, at), _at(other.high, at)
+    low, high = colors_at(other.low, at), colors_at(other.high, at)
     most = np.where(high >= WHITE, np.float32(1.0), np.minimum(high * gain, np.float32(1.0)))
     return np.minimum(low * gain, np.float32(1.0)), most
 
