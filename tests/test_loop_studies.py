@@ -250,7 +250,7 @@ def test_bad_arguments_are_refused_before_the_first_fit(data, igsr_here):
         ({"features": None}, "give --features"),
         ({"weights": "none"}, "none does not exist"),
         ({"seeds": 0}, "seeds and jobs must be at least 1"),
-        ({"scenes": ("nothing",)}, "nothing"),
+        ({"scenes": ("nothing",)}, "nothing does not exist; name --scene"),
     ):
         with pytest.raises(igsr.IgsrError, match=message):
             study.table2(data / "data", data / "bad", **given(data, **changes))

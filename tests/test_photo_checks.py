@@ -84,6 +84,15 @@ def test_black_and_transparent_photos(views):
     clear[..., 3] = 0
     with pytest.raises(igsr.IgsrError, match="wholly transparent"):
         check_photos([replace(view, image=clear) for view in views])
+    dark = np.zeros((24, 24, 4), np.uint8)
+    dark[..., 3] = 255
+    with pytest.raises(igsr.IgsrError, match="Every photo is black"):
+        check_photos([replace(view, image=dark) for view in views])
+    outline = dark.copy()  # of a black thing: it tells where the thing is
+    outline[:8, :, 3] = 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_photos([replace(view, image=outline) for view in views])
 
 
 def test_a_mask_that_hides_everything(views):

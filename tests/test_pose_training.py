@@ -355,6 +355,8 @@ def test_a_training_that_was_stopped_ends_with_the_same_bits(trained, captures, 
     with pytest.raises(Stop):
         train(tmp_path, SMALL, progress=stop, log_every=1, **options)
     assert not (tmp_path / "model.safetensors").exists()
+    with pytest.raises(IgsrError, match="is of an earlier training; go on with it by --resume"):
+        train(tmp_path, SMALL, **options)
     resumed = train(tmp_path, SMALL, resume=True, log_every=2, **options)
     for key, value in network.state_dict().items():
         assert torch.equal(resumed.state_dict()[key], value), key

@@ -80,9 +80,10 @@ def _listed(names: list[str]) -> str:
 
 def _is_empty(view: View) -> bool:
     pixels = view.image if view.mask is None else view.image[view.mask]
-    if pixels.shape[-1] == 4:
+    if pixels.shape[-1] == 4 and not (pixels[..., 3] == 255).all():
+        # A black thing has an outline, which tells where it is.
         return not pixels[..., 3].any()
-    return not pixels.any()
+    return not pixels[..., :3].any()
 
 
 def _distances(centres: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

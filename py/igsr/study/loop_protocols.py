@@ -304,6 +304,8 @@ def _study(
         for scene, layout, photos in kinds
     ]
     for spec in specs:  # an error in the last scene must not come up hours later
+        if not (Path(data) / spec.scene).exists():
+            raise IgsrError(f"{Path(data) / spec.scene} does not exist; name --scene.")
         split(load_capture(Path(data) / spec.scene, max_size=study.max_size), spec)
     rows = finished_runs(
         out / "runs",

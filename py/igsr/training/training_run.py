@@ -117,8 +117,8 @@ class TrainingRun:
             validate_first: whether what has learned nothing yet is validated, too.
 
         Raises:
-            IgsrError: the checkpoint is damaged or of another training, or a part of the loss is
-                not finite.
+            IgsrError: the checkpoint is damaged or of another training, there is one and ``resume``
+                is off, or a part of the loss is not finite.
         """
         self._start(learner, resume)
         if validate_first and learner.step == 0:
@@ -142,7 +142,12 @@ class TrainingRun:
         return {"igsr": _core.__version__, **self._about, "seconds": round(self._seconds)}
 
     def _start(self, learner: Learner, resume: bool) -> None:
-        if resume and (self._out / CHECKPOINT).is_file():
+        if (self._out / CHECKPOINT).is_file():
+            if not resume:
+                raise IgsrError(
+                    f"{self._out / CHECKPOINT} is of an earlier training; go on with it by "
+                    "--resume (resume=True), or give another --out."
+                )
             self._restore(learner)
         if self._writes:
             _cut_log(self._out / LOG, learner.step)

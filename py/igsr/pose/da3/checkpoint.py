@@ -154,7 +154,10 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     path = Path(path)
     path = path / WEIGHTS if _is(path, Path.is_dir) else path
     if not _is(path, Path.is_file):
-        raise IgsrError(f"{path} is no file; name a checkpoint of Depth Anything 3")
+        raise IgsrError(
+            f"{path} is no file; name a checkpoint of Depth Anything 3, or the folder that holds "
+            f"its {WEIGHTS}"
+        )
     if path.suffix != ".safetensors":
         raise IgsrError(
             f"{path} is no .safetensors file, the only kind that Depth Anything 3 comes in; name "
