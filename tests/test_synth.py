@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from ray_stand_in import stand_in_ray
 from typer.testing import CliRunner
 
 from igsr import IgsrError
@@ -155,6 +156,40 @@ def test_a_second_run_makes_what_is_missing_only(made: Path, tmp_path: Path) -> 
     assert {"scene.json", "train/002.png"} <= files(scene(tmp_path, OTHER)).keys()
     assert "train/099.png" not in files(scene(tmp_path, OTHER))
     assert before.items() <= files(tmp_path).items()
+
+
+def test_scenes_made_over_ray_are_the_same(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ray = stand_in_ray(monkeypatch)
+    seen = []
+    report = synthesize(
+        tmp_path / "out",
+        2,
+        first=OTHER,
+        settings=SMALL,
+        on_scene=lambda done, total, row: seen.append((done, total, row["name"])),
+        ray=True,
+    )
+    # The stand-in does the last one first.
+    names = [f"scene_{index:05d}" for index in (OTHER, LONE)]
+    assert seen == [(1, 2, names[1]), (2, 2, names[0])]
+    assert [row["name"] for row in report["scenes"]] == names
+    assert files(scene(tmp_path / "out", LONE)) == files(scene(made, LONE))
+    assert not ray.running
+
+    real = captures._photograph
+
+    def broken(folder: Path, seed: int, index: int, settings: CaptureSettings) -> dict[str, object]:
+        if index == LONE:
+            raise OSError(28, "No space left on device")
+        return real(folder, seed, index, settings)
+
+    monkeypatch.setattr(captures, "_photograph", broken)
+    with pytest.raises(IgsrError, match=r"Cannot write .*No space left"):
+        synthesize(tmp_path / "full", 2, first=OTHER, settings=SMALL, ray=True)
+    assert scene(tmp_path / "full", OTHER).is_dir()
+    assert not scene(tmp_path / "full", LONE).exists()
 
 
 def test_two_that_make_one_scene_do_not_touch_each_other(

@@ -134,7 +134,7 @@ JobsOption = Annotated[
     int, typer.Option("--jobs", help="How many fits run at the same time; they share the cores.")
 ]
 RayOption = Annotated[
-    bool, typer.Option("--ray", help="Run fits on a Ray cluster (pip install 'igsr\\[ray]').")
+    bool, typer.Option("--ray", help="Work on a Ray cluster (pip install 'igsr\\[ray]').")
 ]
 ExampleOption = Annotated[
     bool,

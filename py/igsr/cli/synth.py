@@ -11,6 +11,7 @@ import typer
 from igsr.cli.error_messages import error_messages
 from igsr.cli.shared import (
     JsonOption,
+    RayOption,
     error_console,
     output_console,
     print_json,
@@ -32,6 +33,7 @@ def synth_command(
         int | None,
         typer.Option("--jobs", help="Scenes at the same time, a core each. Default: all."),
     ] = None,
+    ray: RayOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make synthetic captures: random scenes rendered with exact cameras, depth and masks.
@@ -61,6 +63,7 @@ def synth_command(
             settings=synth.CaptureSettings(size, views, test_views, spp),
             jobs=(os.cpu_count() or 1) if jobs is None else jobs,
             on_scene=on_scene,
+            ray=ray,
         )
     if as_json:
         print_json(report)

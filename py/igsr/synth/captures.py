@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ import psutil
 from PIL import Image
 
 from igsr._internal.atomic_write import check_writable
+from igsr._internal.ray_jobs import RayCluster
 from igsr._internal.worker_processes import worker_processes
 from igsr.errors import IgsrError
 from igsr.synth.cameras import Viewpoint, draw_rig
@@ -97,6 +99,7 @@ def synthesize(
     settings: CaptureSettings | None = None,
     jobs: int = 1,
     on_scene: Callable[[int, int, dict[str, Any]], None] | None = None,
+    ray: bool = False,
 ) -> dict[str, Any]:
     """Make procedural captures; those that are there already stay as they are.
 
@@ -111,14 +114,16 @@ def synthesize(
         settings: what each is photographed with.
         jobs: scenes at a time, each in a process of one thread.
         on_scene: called with (done, all, the scene's row) after each scene.
+        ray: scenes are made over a Ray cluster instead, whose machines see ``out`` under the same
+            path (``pip install 'igsr[ray]'``).
 
     Returns:
         {"out", "seed", "scenes": a row for each, in order: name, family, kind, contents, seconds
         (None where it was there already)}.
 
     Raises:
-        IgsrError: a number is out of range, Mitsuba is not installed, the folder cannot be written,
-            or it holds a scene of other settings.
+        IgsrError: a number is out of range, Mitsuba or Ray is not installed, the folder cannot be
+            written, or it holds a scene of other settings.
     """
     settings = settings or CaptureSettings()
     _check_range("scenes", scenes, 1, 100_000)
@@ -143,7 +148,9 @@ def synthesize(
         if on_scene is not None:
             on_scene(len(rows), scenes, row)
 
-    if jobs == 1 or len(missing) == 1:
+    if ray and missing:
+        _make_over_ray(folder, seed, settings, missing, keep)
+    elif jobs == 1 or len(missing) == 1:
         for index in missing:
             keep(index, make_scene(folder, seed, index, settings))
     elif missing:
@@ -163,6 +170,33 @@ def synthesize(
         "settings": asdict(settings),
         "scenes": [rows[index] for index in sorted(rows)],
     }
+
+
+def _make_over_ray(
+    folder: Path,
+    seed: int,
+    settings: CaptureSettings,
+    indices: list[int],
+    keep: Callable[[int, dict[str, Any]], None],
+) -> None:
+    """``keep`` is called with each scene as it is made; after a failure, with those under way."""
+    folder.mkdir(parents=True, exist_ok=True)
+    make = partial(_make_named, seed, settings)
+    failed: Exception | None = None
+    with RayCluster() as cluster:
+        cluster.check(folder.resolve())
+        for number, result in cluster.results(make, str(folder.resolve()), indices):
+            if not isinstance(result, Exception):
+                keep(indices[number], result)
+            elif failed is None:
+                failed = result
+    if failed is not None:
+        raise failed
+
+
+def _make_named(seed: int, settings: CaptureSettings, folder: str, index: int) -> dict[str, Any]:
+    """``make_scene``, in the order in which work for a cluster is called."""
+    return make_scene(Path(folder), seed, index, settings)
 
 
 def is_made(
