@@ -253,6 +253,24 @@ def test_a_fit_does_not_learn_what_one_photo_shows(static, visited):
     assert on < 0.7 * off
 
 
+def test_a_fit_begins_anew_with_the_first_masks(visited, monkeypatch):
+    monkeypatch.setattr(fitting, "CHUNK_SECONDS", 0.0)
+    told = []
+    fitted(visited, progress=told.append)
+    steps = [now.step for now in told]
+    back = [k for k in range(1, len(steps)) if steps[k] < steps[k - 1]]
+    assert len(back) == 1
+    assert steps[back[0] - 1] == round(0.3 * OPTIONS["steps"])
+    assert not told[back[0] - 1].transients
+    assert told[back[0]].transients
+    assert steps[-1] == OPTIONS["steps"]
+    # Splats that were given are kept: nobody knows how they came about.
+    told.clear()
+    fitted(visited, progress=told.append, start=WALL, sh_degree=0)
+    assert told[-1].transients
+    assert [now.step for now in told] == sorted(now.step for now in told)
+
+
 def with_ghost(view):
     """The wall, and first a green splat close before a camera, as it comes of a figure."""
     at = np.linalg.inv(view.camera.viewmat) @ np.array([0.0, 0.0, 1.0, 1.0])
@@ -312,10 +330,14 @@ def test_a_ghost_that_comes_after_the_last_look_is_taken_out_in_the_end(visited,
 def test_a_resumed_fit_has_the_same_masks_and_bits(visited, tmp_path, monkeypatch):
     monkeypatch.setattr(fitting, "CHUNK_SECONDS", 0.0)
     whole, masks = fitted(visited, checkpoint=tmp_path / "whole.npz")
-    # Before the first look, right where it is due, and after it.
-    for stop_at in (20, 36, 50):
-        kept = tmp_path / f"{stop_at}.npz"
-        fitted(visited, checkpoint=kept, progress=lambda now, at=stop_at: now.step < at)
+    # Before the first look, right where it is due, after the fit began anew, and after that step.
+    for stop_at, again in ((20, False), (36, False), (20, True), (50, True)):
+        kept = tmp_path / f"{stop_at}{again}.npz"
+
+        def goes_on(now, at=stop_at, again=again):
+            return now.step < at or bool(now.transients) != again
+
+        fitted(visited, checkpoint=kept, progress=goes_on)
         splats, found = fitted(visited, checkpoint=kept, resume=True)
         assert splats == whole
         assert [v.mask is None for v in found.views] == [v.mask is None for v in masks.views]

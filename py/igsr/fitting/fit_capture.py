@@ -307,8 +307,18 @@ def _fitted(
                 backend = device["backend"]
                 return fitter_of(views, origin, state, values, backend, priors, exposures)
 
+            def beginning(views: Sequence[View]) -> dict[str, Any]:
+                others = [view for view in capture.views if view.split != "train"]
+                masked = _seen_alike(replace(capture, views=[*views, *others]), exposures)
+                state, _ = initial_state(masked, settings, initial)
+                state["means"] = state["means"] + (state.pop("origin") - origin).astype(np.float32)
+                return state if frozen is None else state | with_splats_after(state, frozen)
+
             name = cast(Backend, device["backend"])
-            search = TransientSearch(views, settings, origin, name, make, masks, looked, still)
+            again = None if settings.moves_cameras or initial is not None else beginning
+            search = TransientSearch(
+                views, settings, origin, name, make, masks, looked, still, again
+            )
             fitter = make(search.masked_views(), state)
         except ValueError as error:
             if resume:

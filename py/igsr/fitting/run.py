@@ -31,7 +31,7 @@ class Progress:
     """Where a fit stands.
 
     Attributes:
-        step: steps done, of ``steps``.
+        step: steps done, of ``steps``. Where transient things are found, a fit begins anew once.
         steps: steps in all.
         loss: 0.8 L1 + 0.2 D-SSIM of the last step's photo, before that step; nan where a resumed
             fit had no step left to take.
@@ -189,6 +189,9 @@ class FitRun:
             self.fitter = search.look(self.fitter)
         except ValueError as error:
             raise IgsrError(f"{error}.") from error
+        # Fewer where the fit begins anew.
+        self._step = int(self.fitter.steps_done)
+        self._saved_step = min(self._saved_step, self._step)
 
     def _stepped(self, count: int) -> Progress:
         """Take ``count`` steps, or as many as there are before the next look or the end."""

@@ -1,7 +1,9 @@
 """Transient things in a fit: looked for at a few of its steps, and masked from then on.
 
 A fit is a function of its state and its views. Where masks change, the fitter is made anew from the
-state so far and the views with their new masks, as where a checkpoint is resumed.
+views with their new masks, and from the state so far, as where a checkpoint is resumed. Where the
+first are found, the fit begins anew: what it made of such things by then would stay where they hide
+the photos that tell against it.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ MOMENTS = (0.3, 0.5, 0.7)
 MASKS, LOOKED = "transient_masks", "transients_looked"
 
 MakeFitter: TypeAlias = Callable[[Sequence[View], dict[str, Any]], _core.Fitter]
+BeginningOf: TypeAlias = Callable[[Sequence[View]], dict[str, Any]]
 
 
 def steps_to_look(settings: FitSettings, views: Sequence[View]) -> tuple[int, ...]:
@@ -65,6 +68,8 @@ class TransientSearch:
         found: for each view, bool [H, W], the pixels that show transient things; None where none.
         looked: the step of the last look; -1 before the first.
         frozen: so many splats, the last ones, stay in any case.
+        beginning: the state that the fit of some views begins with; None where what was found so
+            far, such as cameras, must not be lost: then the fit goes on from there.
     """
 
     views: Sequence[View]
@@ -75,6 +80,7 @@ class TransientSearch:
     found: list[Bool | None] = field(default_factory=list)
     looked: int = -1
     frozen: int = 0
+    beginning: BeginningOf | None = None
 
     def __post_init__(self) -> None:
         """Begin without masks, unless some are given."""
@@ -98,7 +104,11 @@ class TransientSearch:
         return _masked(self.views, self.found)
 
     def look(self, fitter: _core.Fitter) -> _core.Fitter:
-        """Look for transient things; the fitter to go on with, the same where nothing changed."""
+        """Look for transient things; the fitter to go on with, the same where nothing changed.
+
+        Raises:
+            IgsrError, ValueError: the fit cannot begin anew.
+        """
         splats = Splats(**fitter.splats(), origin=self.origin, antialiased=False)
         cameras = fitted_cameras(self.views, fitter, self.origin)
         views = [
@@ -114,11 +124,15 @@ class TransientSearch:
             background=self.settings.background or (0.0, 0.0, 0.0),
             backend=self.backend,
         )
-        if any_of(found) or any_of(self.found):
+        looked = int(fitter.steps_done)
+        masked = _masked(self.views, found)
+        if any_of(found) and not any_of(self.found) and self.beginning is not None:
+            fitter = self.make(masked, self.beginning(masked))
+        elif any_of(found) or any_of(self.found):
             state = _selected(fitter.state(), self._kept(splats, views, found))
-            fitter = self.make(_masked(self.views, found), state)
+            fitter = self.make(masked, state)
         # Last: whoever is interrupted before saves a checkpoint of before the look.
-        self.found, self.looked = found, int(fitter.steps_done)
+        self.found, self.looked = found, looked
         return fitter
 
     def without_ghosts(self, splats: Splats, views: Sequence[View]) -> Splats:
