@@ -1,16 +1,23 @@
 //! Where a fit's steps run: the seam between the fitting loop and the backends.
 
+mod cell_order;
 mod fog;
 mod mcmc;
+mod original;
 mod random;
 mod state;
 mod waiting;
 
+pub(crate) use cell_order::{CELLS, Cells};
 pub(crate) use fog::{FogCamera, sampled_every};
 pub use mcmc::McmcRun;
 pub(crate) use mcmc::{
-    BINS, BINS_PER_LOGIT, CELLS, Cells, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX, mcmc,
-    share_table, weight_table,
+    BINS, BINS_PER_LOGIT, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX, mcmc, share_table,
+    weight_table,
+};
+pub use original::OriginalRun;
+pub(crate) use original::{
+    LOG_SPLIT_SHRINK, LOGIT_RESET, PULL_GROW, PULL_SUM_MAX, PULL_UNITS, original, reset_opacities,
 };
 pub(crate) use random::{dropout_threshold, exp_accurate, noise_draw};
 pub use random::{is_dropped, noise_normal};
@@ -183,6 +190,24 @@ pub trait FitDevice: Send {
             splats = state.moving();
         })?;
         Ok(splats)
+    }
+
+    /// Lets splats be cloned, split and pruned by the statistics so far (3DGS), which begin anew; returns
+    /// the number of those that move. Bits are the same on every device, but for the rounding of where
+    /// the halves of a split come to lie on GPUs that fuse multiplications with additions or round
+    /// quotients otherwise.
+    fn original(&mut self, run: &OriginalRun) -> Result<usize> {
+        let mut splats = 0;
+        self.edit(&mut |state| {
+            state.edit_moving(|state| original(state, run));
+            splats = state.moving();
+        })?;
+        Ok(splats)
+    }
+
+    /// Lowers the opacities of all splats that move to 0.01 at most and restarts their moments (3DGS).
+    fn reset_opacities(&mut self) -> Result<()> {
+        self.edit(&mut |state| state.edit_moving(reset_opacities))
     }
 
     /// One step: project, bin, rasterize, exposure, loss, exposure_backward, depth_loss,
