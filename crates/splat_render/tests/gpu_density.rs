@@ -1,4 +1,4 @@
-//! MCMC's density control on the GPU, which must give the bits that the host's gives.
+//! Density control on the GPU, which must give the bits that the host's gives.
 
 mod common;
 
@@ -8,7 +8,7 @@ use common::*;
 use rand::Rng;
 use splat_render::Camera;
 use splat_render::cpu::CpuFit;
-use splat_render::fit::{FitDevice, FitState, McmcRun, SplatArrays};
+use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun, SplatArrays};
 use splat_render::gpu::{Gpu, GpuFit};
 
 fn gpu() -> Gpu {
@@ -32,7 +32,8 @@ fn amid_a_fit(seed: u64, splats: usize, sh_degree: u32) -> FitState {
     let mut state = FitState { first, second, ..FitState::new(params) };
     let stride = state.splats.stride();
     for i in 0..splats {
-        state.stats.grad_sum[i] = rng.random();
+        state.stats.grad_sum[i] = rng.random::<f32>().powi(4);
+        state.stats.seen[i] = rng.random_range(0..30) as f32;
         match rng.random_range(0..20) {
             0 | 1 => state.splats.opacities[i] = -7.0,
             2 => state.splats.means[i][1] = f32::NAN,
@@ -60,15 +61,16 @@ fn after(device: &mut dyn FitDevice, state: &FitState, run: &McmcRun) -> FitStat
     state
 }
 
+const WAYS: [Way; 4] = [
+    ("as it is", |gpu| gpu),
+    ("without subgroups", Gpu::without_subgroups),
+    ("as discrete", Gpu::as_discrete),
+    ("few workgroups in a row", |gpu| gpu.with_group_limit(3)),
+];
+
 #[test]
 fn it_gives_the_bits_of_the_host() {
-    let ways: [Way; 4] = [
-        ("as it is", |gpu| gpu),
-        ("without subgroups", Gpu::without_subgroups),
-        ("as discrete", Gpu::as_discrete),
-        ("few workgroups in a row", |gpu| gpu.with_group_limit(3)),
-    ];
-    for (way, of) in ways {
+    for (way, of) in WAYS {
         let gpu = Arc::new(of(gpu()));
         for (k, (splats, target)) in
             [(1, 4), (150, 150), (700, 100), (900, 2000), (20_000, 21_000)].into_iter().enumerate()
@@ -129,4 +131,41 @@ fn little_goes_between_host_and_device() {
     assert_eq!(traffic[1], traffic[2]);
     assert!(traffic[0].abs_diff(traffic[1]) < 1000, "{traffic:?}");
     assert!(traffic[0] < 1_000_000, "{traffic:?}");
+}
+
+fn after_original(device: &mut dyn FitDevice, state: &FitState, run: &OriginalRun) -> FitState {
+    device.upload(state.clone()).unwrap();
+    let splats = device.original(run).unwrap();
+    let state = device.download().unwrap();
+    assert_eq!(state.splats.len(), splats);
+    state
+}
+
+/// The original control of a scene whose splats are mostly larger than `100 extent` for a small extent.
+fn original_run(max_splats: usize, extent: f32) -> OriginalRun {
+    OriginalRun { max_splats, extent, prune_huge: false, seed: 77 }
+}
+
+#[test]
+fn clones_splits_and_prunes_have_the_bits_of_the_host() {
+    for (way, of) in WAYS {
+        let gpu = Arc::new(of(gpu()));
+        for (k, (splats, most)) in
+            [(1, 4), (150, 150), (700, 100), (900, 1000), (900, 5000), (20_000, 22_000)]
+                .into_iter()
+                .enumerate()
+        {
+            let state = amid_a_fit(k as u64, splats, k as u32 % 4);
+            // Some are split, some cloned; the longest are huge.
+            for extent in [0.5, 8.0, 30.0, 1e6] {
+                for prune_huge in [false, true] {
+                    let run = OriginalRun { prune_huge, ..original_run(most, extent) };
+                    let expected = after_original(&mut CpuFit::default(), &state, &run);
+                    let got = after_original(&mut GpuFit::new(Arc::clone(&gpu)), &state, &run);
+                    assert!(got == expected, "{way}, {splats} splats, {run:?}: other bits");
+                    assert!(splats < 100 || got != state, "nothing was done");
+                }
+            }
+        }
+    }
 }

@@ -184,12 +184,7 @@ pub trait FitDevice: Send {
     /// are the same on every device, but for the rounding of whether a splat is fog on GPUs that fuse
     /// multiplications with additions.
     fn mcmc(&mut self, run: &McmcRun) -> Result<usize> {
-        let mut splats = 0;
-        self.edit(&mut |state| {
-            state.edit_moving(|state| mcmc(state, run));
-            splats = state.moving();
-        })?;
-        Ok(splats)
+        control_on_host(self, &|state| mcmc(state, run))
     }
 
     /// Lets splats be cloned, split and pruned by the statistics so far (3DGS), which begin anew; returns
@@ -197,12 +192,7 @@ pub trait FitDevice: Send {
     /// the halves of a split come to lie on GPUs that fuse multiplications with additions or round
     /// quotients otherwise.
     fn original(&mut self, run: &OriginalRun) -> Result<usize> {
-        let mut splats = 0;
-        self.edit(&mut |state| {
-            state.edit_moving(|state| original(state, run));
-            splats = state.moving();
-        })?;
-        Ok(splats)
+        control_on_host(self, &|state| original(state, run))
     }
 
     /// Lowers the opacities of all splats that move to 0.01 at most and restarts their moments (3DGS).
@@ -222,4 +212,17 @@ pub trait FitDevice: Send {
 
     /// Loss of the last step (before its update, regularisers not included).
     fn loss(&mut self) -> Result<f32>;
+}
+
+/// Lets a density control work on the host, on the splats that move; returns their number.
+pub(crate) fn control_on_host<D: FitDevice + ?Sized>(
+    device: &mut D,
+    control: &dyn Fn(&mut FitState),
+) -> Result<usize> {
+    let mut splats = 0;
+    device.edit(&mut |state| {
+        state.edit_moving(control);
+        splats = state.moving();
+    })?;
+    Ok(splats)
 }

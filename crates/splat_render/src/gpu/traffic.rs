@@ -171,15 +171,20 @@ fn touches(kernel: Kernel, sorted: Sorted) -> &'static [Touch] {
         // Density control is no part of a step.
         Kernel::McmcSample
         | Kernel::McmcWeigh
-        | Kernel::McmcSums
-        | Kernel::McmcPrefix
+        | Kernel::DensitySums
+        | Kernel::DensityPrefix
         | Kernel::McmcStart
         | Kernel::McmcDraw
         | Kernel::McmcShare
         | Kernel::McmcCopy
-        | Kernel::McmcBounds
-        | Kernel::McmcCodes
-        | Kernel::McmcRows => &[],
+        | Kernel::DensityBounds
+        | Kernel::DensityCodes
+        | Kernel::DensityRows
+        | Kernel::OriginalPull
+        | Kernel::OriginalGrow
+        | Kernel::OriginalKeep
+        | Kernel::OriginalDraw
+        | Kernel::OriginalReset => &[],
     }
 }
 

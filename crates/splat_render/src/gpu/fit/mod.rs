@@ -30,11 +30,12 @@ use super::layout::{
 };
 use super::loss::{LossBuffers, rgba};
 use super::mcmc::shares;
+use super::original::reset_ops;
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
 use crate::fit_device::{
-    CameraGradient, ColorStep, ExposureGradient, FitDevice, FitState, McmcRun, StepInput,
-    WaitingSteps, dropout_threshold, mcmc,
+    CameraGradient, ColorStep, ExposureGradient, FitDevice, FitState, McmcRun, OriginalRun,
+    StepInput, WaitingSteps, control_on_host, dropout_threshold, mcmc, original,
 };
 use crate::sh;
 use crate::stages::ProjectOptions;
@@ -325,6 +326,16 @@ impl GpuFit {
         Ok(())
     }
 
+    /// Goes on with these splats, and returns their number.
+    fn replace(&mut self, scene: Scene) -> usize {
+        for frame in &mut self.frames {
+            frame.ops.clear();
+        }
+        let splats = scene.len() as usize;
+        self.scene = Some(scene);
+        splats
+    }
+
     /// Makes room for the pairs that a step needs.
     fn grow(&mut self, frame: usize, counts: &[ChunkCount]) -> Result<()> {
         let gpu = Arc::clone(&self.gpu);
@@ -445,19 +456,25 @@ impl FitDevice for GpuFit {
             None => self.shares.insert(shares(&gpu)?).clone(),
         };
         let Some(next) = self.scene()?.after_mcmc(&gpu, run, self.tiles, &shares)? else {
-            let mut splats = 0;
-            self.edit(&mut |state| {
-                state.edit_moving(|state| mcmc(state, run));
-                splats = state.moving();
-            })?;
-            return Ok(splats);
+            return control_on_host(self, &|state| mcmc(state, run));
         };
-        for frame in &mut self.frames {
-            frame.ops.clear();
-        }
-        let splats = next.len() as usize;
-        self.scene = Some(next);
-        Ok(splats)
+        Ok(self.replace(next))
+    }
+
+    fn original(&mut self, run: &OriginalRun) -> Result<usize> {
+        self.settle()?;
+        self.catch_up()?;
+        let gpu = Arc::clone(&self.gpu);
+        let Some(next) = self.scene()?.after_original(&gpu, run, self.tiles)? else {
+            return control_on_host(self, &|state| original(state, run));
+        };
+        Ok(self.replace(next))
+    }
+
+    fn reset_opacities(&mut self) -> Result<()> {
+        self.settle()?;
+        let ops = reset_ops(&self.gpu, &self.scene()?.adam);
+        self.gpu.submit(&[&ops])
     }
 
     fn step(&mut self, input: &StepInput) -> Result<()> {
