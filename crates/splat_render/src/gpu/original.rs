@@ -2,8 +2,6 @@
 //! split and pruned, and all are put in the order of Morton's curve. The host learns how many stay and
 //! grow, and the bounding box.
 
-use std::ops::Range;
-
 use bytemuck::{Pod, Zeroable};
 
 use super::adam::AdamBuffers;
@@ -11,7 +9,7 @@ use super::bin::SplatBins;
 use super::device::{Bound, Gpu, Op};
 use super::drawn::{Bounds, Drawn, Scans, words};
 use super::layout::{GEOMETRY, SPLATS_PER_GROUP};
-use super::project::{count, rows, window_uniform};
+use super::project::{count, window_uniform};
 use super::shaders::Kernel;
 use crate::error::Result;
 use crate::fit_device::OriginalRun;
@@ -181,16 +179,14 @@ pub(super) fn draw(
 }
 
 /// Lowers the opacities of the splats that are moved, and restarts their moments.
-pub(super) fn reset_ops(gpu: &Gpu, adam: &AdamBuffers) -> Vec<Op> {
-    let op = |window: Range<u32>| {
-        let uniform = window_uniform(gpu, &window);
-        let bindings = [
-            (&uniform).into(),
-            rows(&adam.splats.geometry, &window, GEOMETRY as u64),
-            rows(&adam.first.geometry, &window, GEOMETRY as u64),
-            rows(&adam.second.geometry, &window, GEOMETRY as u64),
-        ];
-        gpu.op(Kernel::OriginalReset, &bindings, gpu.groups(window.len() as u32, SPLATS_PER_GROUP))
-    };
-    gpu.windows(adam.moving, 4 * GEOMETRY as u64).into_iter().map(op).collect()
+pub(super) fn reset_op(gpu: &Gpu, adam: &AdamBuffers) -> Op {
+    // Geometry is bound whole: rows of 2D splats are longer, and are.
+    let uniform = window_uniform(gpu, &(0..adam.moving));
+    let bindings = [
+        (&uniform).into(),
+        (&adam.splats.geometry).into(),
+        (&adam.first.geometry).into(),
+        (&adam.second.geometry).into(),
+    ];
+    gpu.op(Kernel::OriginalReset, &bindings, gpu.groups(adam.moving, SPLATS_PER_GROUP))
 }

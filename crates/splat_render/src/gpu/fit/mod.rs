@@ -30,7 +30,7 @@ use super::layout::{
 };
 use super::loss::{LossBuffers, rgba};
 use super::mcmc::shares;
-use super::original::reset_ops;
+use super::original::reset_op;
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
 use crate::fit_device::{
@@ -65,6 +65,8 @@ pub struct GpuFit {
     shares: Option<wgpu::Buffer>,
     /// Steps not known to have been done, with the number of those that colours waited for before.
     pending: Vec<(StepInput, usize)>,
+    /// While pending steps are done again: the last of them that was submitted again.
+    redone: Option<usize>,
     /// The steps that colours may wait for, those that are pending included.
     waiting: WaitingSteps,
     camera_gradients: Vec<CameraGradient>,
@@ -109,6 +111,7 @@ impl GpuFit {
             scene: None,
             shares: None,
             pending: Vec::new(),
+            redone: None,
             waiting: WaitingSteps::default(),
             camera_gradients: Vec::new(),
             exposure_gradients: Vec::new(),
@@ -148,8 +151,8 @@ impl GpuFit {
     }
 
     /// Submits one step without waiting for it, as number `at` of those pending; colours wait for
-    /// `waiting` steps before it.
-    fn enqueue(&mut self, input: &StepInput, at: usize, waiting: usize) -> Result<()> {
+    /// `waiting` steps before it. `again` where its pairs did not fit before.
+    fn enqueue(&mut self, input: &StepInput, at: usize, waiting: usize, again: bool) -> Result<()> {
         let scene = self
             .scene
             .as_mut()
@@ -231,6 +234,10 @@ impl GpuFit {
             sums.push(Op::Copy(from, to, at as u64 * bytes, bytes));
         }
         self.last = Some((input.view, input.ssim_weight, depth.is_some()));
+        if again {
+            self.set_overflow(0)?;
+        }
+        let frame = &self.frames[self.photos[input.view].frame];
         self.gpu.submit(&[&copies, &frame.ops, &sums])
     }
 
@@ -297,7 +304,13 @@ impl GpuFit {
         }
         let (head, _) = self.status()?;
         let pending = std::mem::take(&mut self.pending);
-        let settled = if head.overflow == 0 { Ok(()) } else { self.redo(&pending, head.overflow) };
+        let first = match (head.overflow, self.redone) {
+            (0, None) => pending.len(),
+            // The steps behind the last one that was done again still wait for that.
+            (0, Some(at)) => at + 1,
+            (overflow, _) => pending.iter().position(|(p, _)| p.step == overflow).unwrap_or(0),
+        };
+        let settled = self.redo(&pending, first);
         if let Err(error) = settled.and_then(|()| self.read_sums(&pending)) {
             // Whoever asks for the state gets this error again, and none without these steps.
             self.pending = pending;
@@ -306,16 +319,17 @@ impl GpuFit {
         Ok(())
     }
 
-    /// Does the pending steps again from the one whose pairs did not fit, with room for them.
-    fn redo(&mut self, pending: &[(StepInput, usize)], overflow: u32) -> Result<()> {
-        let first = pending.iter().position(|(p, _)| p.step == overflow).unwrap_or(0);
+    /// Does the pending steps again from `first` on, whose pairs did not fit, with room for them.
+    fn redo(&mut self, pending: &[(StepInput, usize)], first: usize) -> Result<()> {
         // One at a time, so that the counts read are those of the step that needs the room.
         for (at, (input, waiting)) in pending.iter().enumerate().skip(first) {
             loop {
-                let clear = std::mem::offset_of!(StatusHead, overflow) as u64;
-                let status = &self.scene()?.bins.status;
-                self.gpu.write(status, clear, bytemuck::bytes_of(&0u32));
-                self.enqueue(input, at, *waiting)?;
+                if let Err(error) = self.enqueue(input, at, *waiting, true) {
+                    // It has cleared the flag, and the step was not done.
+                    self.set_overflow(input.step)?;
+                    return Err(error);
+                }
+                self.redone = Some(at);
                 let (head, counts) = self.status()?;
                 if head.overflow == 0 {
                     break;
@@ -323,6 +337,14 @@ impl GpuFit {
                 self.grow(self.photos[input.view].frame, &counts)?;
             }
         }
+        self.redone = None;
+        Ok(())
+    }
+
+    /// Sets or clears the first step whose pairs did not fit, from the next submission on.
+    fn set_overflow(&self, step: u32) -> Result<()> {
+        let at = std::mem::offset_of!(StatusHead, overflow) as u64;
+        self.gpu.write(&self.scene()?.bins.status, at, bytemuck::bytes_of(&step));
         Ok(())
     }
 
@@ -431,6 +453,7 @@ impl FitDevice for GpuFit {
     fn upload(&mut self, state: FitState) -> Result<()> {
         state.validate()?;
         self.pending.clear();
+        self.redone = None;
         self.waiting.clear();
         // What the last scene has grown to is likely to be needed again.
         let (capacity, chunks) = self.scene.take().map_or((0, 1), |s| (s.capacity, s.chunks));
@@ -473,8 +496,8 @@ impl FitDevice for GpuFit {
 
     fn reset_opacities(&mut self) -> Result<()> {
         self.settle()?;
-        let ops = reset_ops(&self.gpu, &self.scene()?.adam);
-        self.gpu.submit(&[&ops])
+        let op = reset_op(&self.gpu, &self.scene()?.adam);
+        self.gpu.submit(&[&[op]])
     }
 
     fn step(&mut self, input: &StepInput) -> Result<()> {
@@ -482,13 +505,17 @@ impl FitDevice for GpuFit {
             let frame = &self.frames[photo.frame];
             (frame.width, frame.height)
         }))?;
+        // Steps that are to be done again come first.
+        if self.redone.is_some() || self.pending.len() >= STEPS_AHEAD {
+            self.settle()?;
+        }
         let adam = input.adam();
         if self.waiting.must_end_before(&adam) {
             self.settle()?;
             self.catch_up()?;
         }
         let waiting = self.waiting.get().len();
-        self.enqueue(input, self.pending.len(), waiting)?;
+        self.enqueue(input, self.pending.len(), waiting, false)?;
         self.pending.push((*input, waiting));
         self.waiting.add(&adam);
         if self.pending.len() >= STEPS_AHEAD { self.settle() } else { Ok(()) }

@@ -130,8 +130,15 @@ impl Scene {
         drawn.map(|drawn| self.after(gpu, &drawn, tiles)).transpose()
     }
 
-    /// Another scene of the splats that a density control has drawn; statistics begin anew.
     fn after(&self, gpu: &Gpu, drawn: &Drawn, tiles: u32) -> Result<Self> {
+        let (next, ops) = self.arranged(gpu, drawn, tiles)?;
+        gpu.submit(&[&ops])?;
+        Ok(next)
+    }
+
+    /// Another scene of the splats that a density control has drawn, and the commands that fill it;
+    /// statistics begin anew.
+    pub fn arranged(&self, gpu: &Gpu, drawn: &Drawn, tiles: u32) -> Result<(Self, Vec<Op>)> {
         let AdamBuffers { splats, first, second, .. } = &self.adam;
         let floats = [GEOMETRY as u32, splats.color_floats as u32];
         // What is there stays until all that follows has its memory.
@@ -149,8 +156,7 @@ impl Scene {
             put(&from.colors, &to.colors, floats[1], RowKind::Moments);
         }
         ops.push(Op::Clear(next.adam.notes.clone()));
-        gpu.submit(&[&ops])?;
-        Ok(next)
+        Ok((next, ops))
     }
 
     /// Makes the commands that bring all colours up to date, unless they are there already.

@@ -19,7 +19,15 @@ fn normal(base: u32, axis: u32) -> f32 {
         let word = hash(base + 6u * axis + k);
         sum += (word >> 16u) + (word & 0xffffu);
     }
-    return (f32(sum) - 393210.0) * (1.0 / 65536.0);
+    return f32(i32(sum) - 393210) * (1.0 / 65536.0);
+}
+
+// e^x to 0.4 %, in whole numbers.
+fn exp_whole(x: f32) -> f32 {
+    let power = i32(floor(clamp(x, -87.0, 88.0) * 94548.27));
+    let fraction = u32(power & 0xffff);
+    let bend = (((fraction * (0x10000u - fraction)) >> 16u) * 22493u) >> 16u;
+    return bitcast<f32>((u32((power >> 16u) + 127) << 23u) | ((fraction - bend) << 7u));
 }
 
 // Where one of the halves of a splat comes to lie.
@@ -34,9 +42,9 @@ fn half_mean(at: u32, base: u32) -> vec3<f32> {
         return mean;
     }
     let s = 2.0 / norm2;
-    let a = exp_accurate(geometry[at + 3u]) * normal(base, 0u);
-    let b = exp_accurate(geometry[at + 4u]) * normal(base, 1u);
-    let c = exp_accurate(geometry[at + 5u]) * normal(base, 2u);
+    let a = exp_whole(geometry[at + 3u]) * normal(base, 0u);
+    let b = exp_whole(geometry[at + 4u]) * normal(base, 1u);
+    let c = exp_whole(geometry[at + 5u]) * normal(base, 2u);
     let moved = mean + vec3(
         ((1.0 - s * (y * y + z * z)) * a + (s * (x * y - w * z)) * b) + (s * (x * z + w * y)) * c,
         ((s * (x * y + w * z)) * a + (1.0 - s * (x * x + z * z)) * b) + (s * (y * z - w * x)) * c,
