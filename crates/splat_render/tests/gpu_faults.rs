@@ -190,7 +190,9 @@ fn density_control_beyond_the_memory_is_one_message_and_leaves_the_splats() {
     let gpu = Arc::new(faulty(&injected));
     let mut fit = Fit::new(&gpu, 2000);
     (1..20).for_each(|step| fit.step(step).unwrap());
-    let before = fit.device.download().unwrap();
+    let mut before = fit.device.download().unwrap();
+    before.stats.grad_sum.fill(1.0);
+    fit.upload(before.clone()).unwrap();
     let run = McmcRun { cameras: vec![fit.camera], target: 200_000, seed: 1 };
     let mut original = OriginalRun { max_splats: 4000, extent: 1.0, prune_huge: false, seed: 1 };
     for result in [fit.device.mcmc(&run), fit.device.original(&original)] {

@@ -158,10 +158,11 @@ pub(crate) fn original(state: &mut FitState, run: &OriginalRun) {
     state.select(&order);
 }
 
-/// The original control's reset: no opacity above [`LOGIT_RESET`], moments of opacities restarted.
+/// The original control's reset: no opacity above [`LOGIT_RESET`], moments of opacities restarted. One
+/// that is not finite is left for the next run to remove.
 pub(crate) fn reset_opacities(state: &mut FitState) {
-    for opacity in &mut state.splats.opacities {
-        *opacity = if *opacity <= LOGIT_RESET { *opacity } else { LOGIT_RESET };
+    for opacity in state.splats.opacities.iter_mut().filter(|opacity| opacity.is_finite()) {
+        *opacity = opacity.min(LOGIT_RESET);
     }
     state.first.opacities.fill(0.0);
     state.second.opacities.fill(0.0);

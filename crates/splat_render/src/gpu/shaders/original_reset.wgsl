@@ -1,5 +1,5 @@
 // The original density control's reset: no opacity above a limit, moments of opacities restarted.
-// Follows shared.wgsl.
+// As fit_device/original.rs, bit for bit. Follows shared.wgsl.
 
 @group(0) @binding(0) var<uniform> window: Window;
 @group(0) @binding(1) var<storage, read_write> geometry: array<f32>;
@@ -17,7 +17,9 @@ fn original_reset(
         return;
     }
     let at = i * GEOMETRY + 10u;
-    geometry[at] = select(LOGIT_RESET, geometry[at], geometry[at] <= LOGIT_RESET);
+    if is_finite(geometry[at]) {
+        geometry[at] = min(geometry[at], LOGIT_RESET);
+    }
     first[at] = 0.0;
     second[at] = 0.0;
 }
