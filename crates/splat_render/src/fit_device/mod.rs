@@ -197,7 +197,7 @@ pub trait FitDevice: Send {
 
     /// Lowers the opacities of all splats that move to 0.01 at most and restarts their moments (3DGS).
     fn reset_opacities(&mut self) -> Result<()> {
-        self.edit(&mut |state| state.edit_moving(reset_opacities))
+        self.edit(&mut reset_opacities)
     }
 
     /// One step: project, bin, rasterize, exposure, loss, exposure_backward, depth_loss,

@@ -158,14 +158,16 @@ pub(crate) fn original(state: &mut FitState, run: &OriginalRun) {
     state.select(&order);
 }
 
-/// The original control's reset: no opacity above [`LOGIT_RESET`], moments of opacities restarted. One
+/// The original control's reset: no opacity that moves above [`LOGIT_RESET`], moments restarted. One
 /// that is not finite is left for the next run to remove.
 pub(crate) fn reset_opacities(state: &mut FitState) {
-    for opacity in state.splats.opacities.iter_mut().filter(|opacity| opacity.is_finite()) {
+    let moving = state.moving();
+    for opacity in state.splats.opacities[..moving].iter_mut().filter(|o| o.is_finite()) {
         *opacity = opacity.min(LOGIT_RESET);
     }
-    state.first.opacities.fill(0.0);
-    state.second.opacities.fill(0.0);
+    for moments in [&mut state.first, &mut state.second] {
+        moments.opacities[..moving].fill(0.0);
+    }
 }
 
 #[cfg(test)]
