@@ -212,10 +212,10 @@ fn where_the_original_control_has_nothing_to_do_it_does_nothing_but_order() {
     assert_eq!(after.splats.len(), 600);
     // Of statistics that are no numbers nothing grows.
     let mut odd = state.clone();
-    odd.stats.grad_sum = vec![f32::NAN, f32::INFINITY, -1.0].repeat(100);
+    odd.stats.grad_sum = [f32::NAN, f32::INFINITY, -1.0].repeat(100);
     assert_eq!(same_after_original(&gpu, &odd, &original_run(900, 1.0)).splats.len(), 300);
     odd.stats.grad_sum.fill(1e30);
-    odd.stats.seen = vec![f32::NAN, f32::INFINITY, -1.0].repeat(100);
+    odd.stats.seen = [f32::NAN, f32::INFINITY, -1.0].repeat(100);
     assert_eq!(same_after_original(&gpu, &odd, &original_run(900, 1.0)).splats.len(), 400);
 }
 

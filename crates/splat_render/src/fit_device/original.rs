@@ -76,7 +76,7 @@ fn exp(x: f32) -> f32 {
     let power = (x.clamp(-87.0, 88.0) * 94_548.27).floor() as i32;
     let fraction = (power & 0xffff) as u32;
     // 2^f is about 1 + f - 0.343 f (1 - f).
-    let bend = ((fraction * (0x1_0000 - fraction)) >> 16) * 22_493 >> 16;
+    let bend = (((fraction * (0x1_0000 - fraction)) >> 16) * 22_493) >> 16;
     f32::from_bits((((power >> 16) + 127) as u32) << 23 | (fraction - bend) << 7)
 }
 
