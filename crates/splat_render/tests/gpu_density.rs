@@ -1,4 +1,4 @@
-//! MCMC's density control on the GPU, which must give the bits that the host's gives.
+//! Density control on the GPU, which must give the bits that the host's gives.
 
 mod common;
 
@@ -8,7 +8,7 @@ use common::*;
 use rand::Rng;
 use splat_render::Camera;
 use splat_render::cpu::CpuFit;
-use splat_render::fit::{FitDevice, FitState, McmcRun, SplatArrays};
+use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun, SplatArrays};
 use splat_render::gpu::{Gpu, GpuFit};
 
 fn gpu() -> Gpu {
@@ -32,7 +32,8 @@ fn amid_a_fit(seed: u64, splats: usize, sh_degree: u32) -> FitState {
     let mut state = FitState { first, second, ..FitState::new(params) };
     let stride = state.splats.stride();
     for i in 0..splats {
-        state.stats.grad_sum[i] = rng.random();
+        state.stats.grad_sum[i] = rng.random::<f32>().powi(4);
+        state.stats.seen[i] = rng.random_range(0..30) as f32;
         match rng.random_range(0..20) {
             0 | 1 => state.splats.opacities[i] = -7.0,
             2 => state.splats.means[i][1] = f32::NAN,
@@ -60,15 +61,16 @@ fn after(device: &mut dyn FitDevice, state: &FitState, run: &McmcRun) -> FitStat
     state
 }
 
+const WAYS: [Way; 4] = [
+    ("as it is", |gpu| gpu),
+    ("without subgroups", Gpu::without_subgroups),
+    ("as discrete", Gpu::as_discrete),
+    ("few workgroups in a row", |gpu| gpu.with_group_limit(3)),
+];
+
 #[test]
 fn it_gives_the_bits_of_the_host() {
-    let ways: [Way; 4] = [
-        ("as it is", |gpu| gpu),
-        ("without subgroups", Gpu::without_subgroups),
-        ("as discrete", Gpu::as_discrete),
-        ("few workgroups in a row", |gpu| gpu.with_group_limit(3)),
-    ];
-    for (way, of) in ways {
+    for (way, of) in WAYS {
         let gpu = Arc::new(of(gpu()));
         for (k, (splats, target)) in
             [(1, 4), (150, 150), (700, 100), (900, 2000), (20_000, 21_000)].into_iter().enumerate()
@@ -129,4 +131,173 @@ fn little_goes_between_host_and_device() {
     assert_eq!(traffic[1], traffic[2]);
     assert!(traffic[0].abs_diff(traffic[1]) < 1000, "{traffic:?}");
     assert!(traffic[0] < 1_000_000, "{traffic:?}");
+}
+
+fn after_original(device: &mut dyn FitDevice, state: &FitState, run: &OriginalRun) -> FitState {
+    device.upload(state.clone()).unwrap();
+    let splats = device.original(run).unwrap();
+    let state = device.download().unwrap();
+    assert_eq!(state.moving(), splats);
+    state
+}
+
+fn original_run(max_splats: usize, extent: f32) -> OriginalRun {
+    OriginalRun { max_splats, extent, prune_huge: false, seed: 77 }
+}
+
+/// The same with no number that is not finite.
+fn sound(mut state: FitState) -> FitState {
+    let splats = &mut state.splats;
+    let numbers = splats.means.as_flattened_mut().iter_mut();
+    for v in numbers.chain(splats.sh.as_flattened_mut()).filter(|v| !v.is_finite()) {
+        *v = 0.1;
+    }
+    state
+}
+
+/// What the host makes of a state, after the GPU has been seen to make the same of it.
+fn same_after_original(gpu: &Arc<Gpu>, state: &FitState, run: &OriginalRun) -> FitState {
+    let expected = after_original(&mut CpuFit::default(), state, run);
+    let got = after_original(&mut GpuFit::new(Arc::clone(gpu)), state, run);
+    assert!(got == expected, "{} splats, {run:?}: other bits", state.splats.len());
+    expected
+}
+
+#[test]
+fn clones_splits_and_prunes_have_the_bits_of_the_host() {
+    for (way, of) in WAYS {
+        println!("{way}");
+        let gpu = Arc::new(of(gpu()));
+        let cases = [(1, 4), (700, 100), (900, 950), (900, 5000), (20_000, 22_000)];
+        for (k, (splats, most)) in cases.into_iter().enumerate() {
+            let state = amid_a_fit(k as u64, splats, k as u32 % 4);
+            let split = same_after_original(&gpu, &state, &original_run(most, 0.5));
+            // Larger than 0.3 is split, larger than 3 removed.
+            let run = OriginalRun { prune_huge: true, ..original_run(most, 30.0) };
+            let fewer = same_after_original(&gpu, &state, &run);
+            if splats >= 900 {
+                assert_ne!(split.splats.means, fewer.splats.means, "nothing was split");
+                let pulled = (0..splats).filter(|&i| state.stats.grad_sum[i] > 1e-2).count();
+                let pruned =
+                    (splats + pulled.min(most - splats)).saturating_sub(split.splats.len());
+                assert!(pruned > splats / 10 && split.splats.len() <= most, "{pruned} pruned");
+            }
+        }
+    }
+}
+
+#[test]
+fn where_the_original_control_has_nothing_to_do_it_does_nothing_but_order() {
+    let gpu = Arc::new(gpu());
+    let mut state = sound(amid_a_fit(4, 300, 1));
+    state.splats.opacities.fill(1.0);
+    let sorted = |state: &FitState| {
+        let mut means = state.splats.means.clone();
+        means.sort_by(|a, b| a.partial_cmp(b).unwrap());
+        means
+    };
+    // No gradient; never seen, where a gradient counts as that of one step; and at the cap or above.
+    let mut still = state.clone();
+    still.stats.grad_sum.fill(0.0);
+    let mut unseen = state.clone();
+    unseen.stats.seen.fill(0.0);
+    unseen.stats.grad_sum.fill(1.9e-4);
+    for (state, most) in [(&still, 900), (&unseen, 900), (&state, 300), (&state, 10)] {
+        let after = same_after_original(&gpu, state, &original_run(most, 1.0));
+        assert_eq!(sorted(&after), sorted(state));
+        assert!(after.stats.grad_sum.iter().chain(&after.stats.seen).all(|&v| v == 0.0));
+    }
+    unseen.stats.grad_sum.fill(2.1e-4);
+    let after = same_after_original(&gpu, &unseen, &original_run(900, 1e9));
+    assert_eq!(after.splats.len(), 600);
+    // Of statistics that are no numbers nothing grows.
+    let mut odd = state.clone();
+    odd.stats.grad_sum = [f32::NAN, f32::INFINITY, -1.0].repeat(100);
+    assert_eq!(same_after_original(&gpu, &odd, &original_run(900, 1.0)).splats.len(), 300);
+    odd.stats.grad_sum.fill(1e30);
+    odd.stats.seen = [f32::NAN, f32::INFINITY, -1.0].repeat(100);
+    assert_eq!(same_after_original(&gpu, &odd, &original_run(900, 1.0)).splats.len(), 400);
+}
+
+#[test]
+fn where_all_would_be_pruned_all_stay() {
+    let gpu = Arc::new(gpu());
+    let mut state = sound(amid_a_fit(1, 300, 1));
+    state.splats.opacities.fill(-8.0);
+    let run = original_run(310, 1.0);
+    // Those that grow do so.
+    assert_eq!(same_after_original(&gpu, &state, &run).splats.len(), 310);
+    state.splats.opacities.fill(1.0);
+    state.splats.scales.fill([2.0; 3]);
+    let huge = OriginalRun { prune_huge: true, ..run };
+    assert_eq!(same_after_original(&gpu, &state, &huge).splats.len(), 310);
+}
+
+#[test]
+fn halves_that_would_leave_the_numbers_stay_where_they_are() {
+    let mut state = amid_a_fit(6, 200, 0);
+    state.stats.grad_sum.fill(1.0);
+    state.splats.means.fill([3.4e38; 3]);
+    state.splats.scales.fill([87.9; 3]);
+    state.splats.quats[..50].fill([0.0; 4]);
+    let after = same_after_original(&Arc::new(gpu()), &state, &original_run(400, 1.0));
+    assert!(after.splats.means.as_flattened().iter().all(|v| v.is_finite()));
+    assert!(after.splats.len() > 300);
+}
+
+#[test]
+fn opacities_are_reset_as_on_the_host() {
+    for (way, of) in WAYS {
+        let gpu = Arc::new(of(gpu()));
+        let mut state = amid_a_fit(5, 4000, 1);
+        // A moved splat whose opacity is not finite, and frozen ones.
+        state.splats.means.fill([0.5; 3]);
+        state.splats.sh.fill([0.1; 3]);
+        state.splats.opacities[3] = f32::INFINITY;
+        state.frozen = 300;
+        let [expected, got] =
+            [&mut CpuFit::default() as &mut dyn FitDevice, &mut GpuFit::new(Arc::clone(&gpu))].map(
+                |device| {
+                    device.upload(state.clone()).unwrap();
+                    device.reset_opacities().unwrap();
+                    device.download().unwrap()
+                },
+            );
+        assert!(got == expected, "{way}: other bits");
+        assert!(expected.splats.opacities[..3700].iter().all(|&o| o < -4.59 || o.is_infinite()));
+        assert!(expected.splats.opacities[3700..] == state.splats.opacities[3700..]);
+    }
+}
+
+/// What does not fit one binding, and what is frozen, is done on the host.
+#[test]
+fn what_the_device_does_not_take_is_the_same_by_the_host() {
+    let state = amid_a_fit(3, 2000, 2);
+    let small = Arc::new(gpu().with_binding_limit(200_000));
+    let before = small.host_bytes();
+    same_after_original(&small, &state, &original_run(2500, 1.0));
+    assert!(small.host_bytes() - before > 4 * 2000 * 3 * (11 + 27) * 2, "not on the host");
+    // Those there are fit, those that there will be do not.
+    let tight = Arc::new(gpu().with_binding_limit(2000 * 27 * 4));
+    same_after_original(&tight, &state, &original_run(4000, 1e-3));
+    let frozen = FitState { frozen: 500, ..sound(state) };
+    same_after_original(&Arc::new(gpu()), &frozen, &original_run(2500, 1.0));
+}
+
+#[test]
+fn little_of_the_original_control_goes_between_host_and_device() {
+    let gpu = Arc::new(gpu());
+    let mut traffic = Vec::new();
+    for splats in [20_000, 40_000, 40_000] {
+        let mut fit = GpuFit::new(Arc::clone(&gpu));
+        fit.upload(amid_a_fit(2, splats, 1)).unwrap();
+        let before = gpu.host_bytes();
+        let left = fit.original(&original_run(2 * splats, 1.0)).unwrap();
+        fit.reset_opacities().unwrap();
+        assert!(left > splats);
+        traffic.push(gpu.host_bytes() - before);
+    }
+    println!("bytes of each run: {traffic:?}");
+    assert_eq!(traffic, [traffic[0]; 3], "it grows with the splats");
+    assert!(traffic[0] < 10_000, "{traffic:?}");
 }

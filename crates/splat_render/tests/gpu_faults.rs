@@ -6,7 +6,9 @@ mod common;
 use std::sync::Arc;
 
 use common::*;
-use splat_render::fit::{FitDevice, FitState, McmcRun, Rates, SplatArrays, StepInput, Target};
+use splat_render::fit::{
+    FitDevice, FitState, McmcRun, OriginalRun, Rates, SplatArrays, StepInput, Target,
+};
 use splat_render::gpu::{Gpu, GpuFit, Injected, needed_limits};
 use splat_render::gpu_check::{open_tested_with, self_test};
 use splat_render::{Camera, Error};
@@ -188,14 +190,63 @@ fn density_control_beyond_the_memory_is_one_message_and_leaves_the_splats() {
     let gpu = Arc::new(faulty(&injected));
     let mut fit = Fit::new(&gpu, 2000);
     (1..20).for_each(|step| fit.step(step).unwrap());
-    let before = fit.device.download().unwrap();
+    let mut before = fit.device.download().unwrap();
+    before.stats.grad_sum.fill(1.0);
+    fit.upload(before.clone()).unwrap();
     let run = McmcRun { cameras: vec![fit.camera], target: 200_000, seed: 1 };
-    let found = message(fit.device.mcmc(&run).map(drop));
-    assert!(found.contains("is out of memory; use fewer splats or smaller images"), "{found}");
+    let mut original = OriginalRun { max_splats: 4000, extent: 1.0, prune_huge: false, seed: 1 };
+    for result in [fit.device.mcmc(&run), fit.device.original(&original)] {
+        let found = message(result.map(drop));
+        assert!(found.contains("is out of memory; use fewer splats or smaller images"), "{found}");
+    }
     assert!(fit.device.download().unwrap() == before, "a run that failed changed splats");
     // The fit itself goes on, and so does density control within the memory.
     (20..40).for_each(|step| fit.step(step).unwrap());
     assert_eq!(fit.device.mcmc(&McmcRun { target: 2200, ..run }).unwrap(), 2200);
     (40..60).for_each(|step| fit.step(step).unwrap());
+    original.max_splats = 2300;
+    assert!(fit.device.original(&original).unwrap() <= 2300);
+    (60..80).for_each(|step| fit.step(step).unwrap());
     assert!(fit.device.loss().unwrap() > 0.0);
+}
+
+#[test]
+fn a_submission_that_fails_loses_no_step_and_repeats_none() {
+    let gpu = Arc::new(Gpu::new(true).unwrap());
+    // Splats as wide as the picture: their pairs outgrow the first guess, and steps are done again.
+    let end = |failing: u64| {
+        let mut fit = Fit::new(&gpu, 200);
+        let mut state = fit.device.download().unwrap();
+        state.splats.scales.iter_mut().for_each(|scale| *scale = [3.0; 3]);
+        state.splats.opacities.fill(0.0);
+        fit.upload(state).unwrap();
+        gpu.fail_submission(failing);
+        let mut failures = 0;
+        for step in 1..=4 {
+            while fit.step(step).is_err() {
+                failures += 1;
+            }
+        }
+        loop {
+            match fit.device.download() {
+                Ok(state) => return (state, failures),
+                Err(_) => failures += 1,
+            }
+        }
+    };
+    let (expected, none) = end(0);
+    assert_eq!(none, 0);
+    let mut failed = 0;
+    loop {
+        let (state, failures) = end(failed + 1);
+        assert!(state == expected, "other bits after submission {} has failed", failed + 1);
+        if failures == 0 {
+            break;
+        }
+        assert_eq!(failures, 1);
+        failed += 1;
+    }
+    gpu.fail_submission(0);
+    // Four steps, the status, the steps again, each with a status of its own.
+    assert!(failed >= 4 + 1 + 2 * 4, "{failed}");
 }

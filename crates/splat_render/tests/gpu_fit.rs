@@ -8,7 +8,8 @@ use common::*;
 use rand::Rng;
 use splat_render::cpu::CpuFit;
 use splat_render::fit::{
-    Exposure, FitDevice, FitState, Rates, SplatArrays, StepInput, Target, TargetDepth,
+    DensityControl, Exposure, FitConfig, FitDevice, FitState, Fitter, Rates, SplatArrays,
+    StepInput, Target, TargetDepth,
 };
 use splat_render::gpu::{Gpu, GpuFit};
 use splat_render::reference::Reference;
@@ -390,6 +391,43 @@ fn a_fit_ends_as_on_the_cpu_and_repeats_itself() {
     assert!((cpu_psnr - gpu_psnr).abs() <= 0.1);
     let (again, losses_again) = run(&mut gpu_fit(), &capture, 200, 0.0);
     assert!(got == again && losses == losses_again, "the same fit twice gave other bits");
+}
+
+#[test]
+fn a_fit_that_clones_splits_and_prunes_ends_as_on_the_cpu_and_repeats_itself() {
+    let capture = capture(2, &[(64, 64); 6], 100);
+    let fit = |device: Box<dyn FitDevice>| {
+        let config = FitConfig {
+            steps: 400,
+            seed: 3,
+            sh_degree: 1,
+            max_splats: 180,
+            density: DensityControl::Original,
+            ..FitConfig::default()
+        };
+        let (targets, cameras) = (capture.targets.clone(), capture.cameras.clone());
+        let mut fitter =
+            Fitter::new(device, targets, cameras, capture.start.clone(), 0, config).unwrap();
+        let mut counts = Vec::new();
+        while fitter.steps_done() < 250 {
+            fitter.step().unwrap();
+            if counts.last() != Some(&fitter.splat_count()) {
+                counts.push(fitter.splat_count());
+            }
+        }
+        (fitter.state().unwrap(), counts)
+    };
+    let (expected, cpu_counts) = fit(Box::new(CpuFit::default()));
+    let (got, counts) = fit(Box::new(gpu_fit()));
+    let before = psnr(&capture, &capture.start);
+    let (cpu_psnr, gpu_psnr) = (psnr(&capture, &expected), psnr(&capture, &got));
+    println!("start {before:.3} dB, cpu {cpu_psnr:.3} dB, gpu {gpu_psnr:.3} dB");
+    println!("splats: cpu {cpu_counts:?}, gpu {counts:?}");
+    assert!(counts.len() > 2 && counts.iter().any(|&n| n > 110), "{counts:?}");
+    assert!(cpu_psnr > before + 3.0, "the fit must improve the picture");
+    assert!((cpu_psnr - gpu_psnr).abs() <= 0.1);
+    let again = fit(Box::new(gpu_fit()));
+    assert!((got, counts) == again, "the same fit twice gave other bits");
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! What a fit step costs on a GPU, counted where its commands are made.
 
+use splat_render::fit::OriginalRun;
 use splat_render::gpu::{Gpu, PlannedFit};
 
 /// The scene that docs/how-it-works/gpus.md counts: a garden's splats and photos.
@@ -31,4 +32,24 @@ fn a_step_of_five_million_splats_costs_what_the_docs_say() {
     }
     let moments = of(&none, "fit_geometry");
     assert!(moments > 0.6 * none.bytes, "{moments} of {}", none.bytes);
+}
+
+#[test]
+fn a_run_of_density_control_costs_what_the_docs_say() {
+    let gpu = Gpu::new(true).unwrap_or_else(|e| panic!("{e}"));
+    let plan = PlannedFit::new(gpu, SPLATS, 3, SIZE, PAIRS).unwrap();
+    let run = OriginalRun { max_splats: 6_000_000, extent: 1.0, prune_huge: true, seed: 1 };
+    // A tenth of the splats wants to grow, and as many are removed.
+    let (work, host) = plan.original(&run, SPLATS / 10, SPLATS).unwrap();
+    for (kernel, runs, bytes) in &work.kernels {
+        println!("| {kernel} | {runs} | {:.2} |", bytes / 1e9);
+    }
+    println!(
+        "{} dispatches, {:.2} GB, {host} bytes of host traffic",
+        work.dispatches,
+        work.bytes / 1e9
+    );
+    assert_eq!(work.dispatches, 41);
+    assert!((work.bytes / 1e9 - 11.50).abs() < 0.005);
+    assert!(host < 10_000, "{host}");
 }

@@ -17,8 +17,7 @@ use super::exposures::{ExposureState, Exposures};
 use super::hull::Hull;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
-use crate::fit_device::{FitDevice, FitState, McmcRun, StepInput};
-use crate::morton::morton_order;
+use crate::fit_device::{FitDevice, FitState, McmcRun, OriginalRun, StepInput};
 use crate::stages::Exposure;
 use crate::target::Target;
 
@@ -426,31 +425,27 @@ impl Fitter {
         let mut rng = self.rng(Draw::Density, u64::from(step));
         let mcmc = refine && config.density == DensityControl::Mcmc;
         let original = refine && config.density == DensityControl::Original;
-        let (extent, splats, hull) = (self.extent, &mut self.splats, &self.hull);
-        let cameras = &self.cameras;
-        if leaving || original || reset {
+        if let Some(hull) = self.hull.as_ref().filter(|_| leaving) {
+            let (splats, cameras) = (&mut self.splats, &self.cameras);
             let mut change = |state: &mut FitState| {
-                if let Some(hull) = hull.as_ref().filter(|_| leaving) {
-                    let inside = hull.inside(&state.splats, cameras);
-                    if inside.len() < state.splats.len() {
-                        state.select(&inside);
-                    }
-                }
-                if original {
-                    let huge = step > RESET_EVERY;
-                    density::original(state, config.max_splats, extent, huge, &mut rng);
-                }
-                if reset {
-                    density::reset_opacities(state);
-                }
-                if original {
-                    // Neighbours in space are neighbours in memory: tiles and pairs of splats then
-                    // are near each other, too.
-                    state.select(&morton_order(&state.splats.means));
+                let inside = hull.inside(&state.splats, cameras);
+                if inside.len() < state.splats.len() {
+                    state.select(&inside);
                 }
                 *splats = state.splats.len();
             };
             self.device.edit(&mut |state| state.edit_moving(&mut change))?;
+        }
+        if original {
+            self.splats = self.device.original(&OriginalRun {
+                max_splats: config.max_splats,
+                extent: self.extent,
+                prune_huge: step > RESET_EVERY,
+                seed: rng.random(),
+            })?;
+        }
+        if reset {
+            self.device.reset_opacities()?;
         }
         if mcmc {
             let until = (MCMC_GROWN * f64::from(config.steps)) as u32;

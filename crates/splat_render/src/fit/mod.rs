@@ -20,7 +20,7 @@ pub use plane_sweep::{DepthMap, GreyPhoto, Sweep, plane_sweep};
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
 pub use crate::fit_device::{
     COLOR_WAIT, CameraGradient, DensityStats, ExposureGradient, FitDevice, FitState, McmcRun,
-    StepInput, is_dropped, noise_normal,
+    OriginalRun, StepInput, is_dropped, noise_normal,
 };
 pub use crate::splats::SplatArrays;
 pub use crate::stages::{Exposure, Rates};

@@ -4,6 +4,7 @@
 
 use std::sync::OnceLock;
 
+use super::cell_order::cell_order;
 use super::fog::{FogCamera, sampled_every};
 use super::random::hash;
 use super::state::{DensityStats, FitState};
@@ -22,9 +23,6 @@ pub(crate) const BINS_PER_LOGIT: f32 = 64.0;
 pub(crate) const LOGIT_FIRST: f32 = -6.0;
 /// Bins of logits: up to 10.
 pub(crate) const BINS: usize = 1024;
-/// Cells of the bounding box along an axis, along whose curve splats are ordered.
-pub(crate) const CELLS: u32 = 1 << 20;
-
 /// One run of the density control.
 #[derive(Debug, Clone)]
 pub struct McmcRun {
@@ -88,7 +86,7 @@ fn draw(run: &McmcRun, round: u32, k: u32, total: u32) -> u32 {
 }
 
 /// Whether all that is looked at is finite; colours only in the first round.
-fn finite(splats: &SplatArrays, i: usize, round: u32) -> bool {
+pub(super) fn finite(splats: &SplatArrays, i: usize, round: u32) -> bool {
     let stride = splats.stride();
     let colors = if round == 0 { &splats.sh[i * stride..(i + 1) * stride] } else { &[] };
     splats.means[i]
@@ -182,58 +180,6 @@ fn spread(state: &mut FitState, run: &McmcRun, round: u32, weights: &[u32], targ
     }
 }
 
-/// Cells of a bounding box: its low corner and what differences to it are multiplied by.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Cells {
-    pub low: [f32; 3],
-    pub scale: [f32; 3],
-}
-
-impl Cells {
-    /// Of the box between two corners.
-    pub fn new(low: [f32; 3], high: [f32; 3]) -> Self {
-        let scale = std::array::from_fn(|k| {
-            let extent = f64::from(high[k]) - f64::from(low[k]);
-            let scale = (f64::from(CELLS - 1) / extent) as f32;
-            // All points lie in one plane, or there are none.
-            if scale.is_finite() && scale > 0.0 { scale } else { 0.0 }
-        });
-        Self { low, scale }
-    }
-
-    /// A point's place on Morton's curve: the lower and the upper halves of its cell's bits.
-    fn code(&self, point: [f32; 3]) -> (u32, u32) {
-        let mut code = (0, 0);
-        for k in 0..3 {
-            let place = (point[k] - self.low[k]) * self.scale[k];
-            let cell =
-                if place.is_finite() { place.clamp(0.0, (CELLS - 1) as f32) as u32 } else { 0 };
-            for bit in 0..10 {
-                code.0 |= (cell >> bit & 1) << (3 * bit + k as u32);
-                code.1 |= (cell >> (bit + 10) & 1) << (3 * bit + k as u32);
-            }
-        }
-        code
-    }
-}
-
-/// Ids of the points along Morton's curve through the box of the finite ones: neighbours in space become
-/// neighbours in memory, and tiles and pairs of splats near each other, too.
-fn cell_order(points: &[[f32; 3]]) -> Vec<usize> {
-    let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
-    for point in points.iter().filter(|point| point.iter().all(|v| v.is_finite())) {
-        for k in 0..3 {
-            low[k] = low[k].min(point[k]);
-            high[k] = high[k].max(point[k]);
-        }
-    }
-    let cells = Cells::new(low, high);
-    let codes: Vec<_> = points.iter().map(|&point| cells.code(point)).collect();
-    let mut ids: Vec<usize> = (0..points.len()).collect();
-    ids.sort_by_key(|&i| (codes[i].1, codes[i].0));
-    ids
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -321,12 +267,5 @@ mod tests {
         state.splats.opacities.fill(-20.0);
         mcmc(&mut state, &run(20));
         assert_eq!(state.splats.len(), 10);
-    }
-
-    #[test]
-    fn neighbours_in_space_become_neighbours_in_memory() {
-        let order = cell_order(&[[3.0, 0.0, 0.0], [0.0; 3], [2.9, 0.0, 0.0], [f32::NAN; 3]]);
-        assert_eq!(order, [1, 3, 2, 0]);
-        assert_eq!(cell_order(&[[1.0; 3]; 3]), [0, 1, 2]);
     }
 }

@@ -1,16 +1,23 @@
 //! Where a fit's steps run: the seam between the fitting loop and the backends.
 
+mod cell_order;
 mod fog;
 mod mcmc;
+mod original;
 mod random;
 mod state;
 mod waiting;
 
+pub(crate) use cell_order::{CELLS, Cells};
 pub(crate) use fog::{FogCamera, sampled_every};
 pub use mcmc::McmcRun;
 pub(crate) use mcmc::{
-    BINS, BINS_PER_LOGIT, CELLS, Cells, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX, mcmc,
-    share_table, weight_table,
+    BINS, BINS_PER_LOGIT, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX, mcmc, share_table,
+    weight_table,
+};
+pub use original::OriginalRun;
+pub(crate) use original::{
+    LOG_SPLIT_SHRINK, LOGIT_RESET, PULL_GROW, PULL_SUM_MAX, PULL_UNITS, original, reset_opacities,
 };
 pub(crate) use random::{dropout_threshold, exp_accurate, noise_draw};
 pub use random::{is_dropped, noise_normal};
@@ -177,12 +184,20 @@ pub trait FitDevice: Send {
     /// are the same on every device, but for the rounding of whether a splat is fog on GPUs that fuse
     /// multiplications with additions.
     fn mcmc(&mut self, run: &McmcRun) -> Result<usize> {
-        let mut splats = 0;
-        self.edit(&mut |state| {
-            state.edit_moving(|state| mcmc(state, run));
-            splats = state.moving();
-        })?;
-        Ok(splats)
+        control_on_host(self, &|state| mcmc(state, run))
+    }
+
+    /// Lets splats be cloned, split and pruned by the statistics so far (3DGS), which begin anew; returns
+    /// the number of those that move. Bits are the same on every device, but for the rounding of where
+    /// the halves of a split come to lie on GPUs that fuse multiplications with additions or round
+    /// quotients otherwise.
+    fn original(&mut self, run: &OriginalRun) -> Result<usize> {
+        control_on_host(self, &|state| original(state, run))
+    }
+
+    /// Lowers the opacities of all splats that move to 0.01 at most and restarts their moments (3DGS).
+    fn reset_opacities(&mut self) -> Result<()> {
+        self.edit(&mut reset_opacities)
     }
 
     /// One step: project, bin, rasterize, exposure, loss, exposure_backward, depth_loss,
@@ -197,4 +212,17 @@ pub trait FitDevice: Send {
 
     /// Loss of the last step (before its update, regularisers not included).
     fn loss(&mut self) -> Result<f32>;
+}
+
+/// Lets a density control work on the host, on the splats that move; returns their number.
+pub(crate) fn control_on_host<D: FitDevice + ?Sized>(
+    device: &mut D,
+    control: &dyn Fn(&mut FitState),
+) -> Result<usize> {
+    let mut splats = 0;
+    device.edit(&mut |state| {
+        state.edit_moving(control);
+        splats = state.moving();
+    })?;
+    Ok(splats)
 }

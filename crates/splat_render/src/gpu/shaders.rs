@@ -11,7 +11,8 @@ use crate::constants::{
     TILE, TRANSMITTANCE_MIN,
 };
 use crate::fit_device::{
-    BINS, BINS_PER_LOGIT, CELLS, COLOR_WAIT, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, SHARES_MAX,
+    BINS, BINS_PER_LOGIT, CELLS, COLOR_WAIT, LOG_SPLIT_SHRINK, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG,
+    LOGIT_RESET, PULL_GROW, PULL_SUM_MAX, PULL_UNITS, SHARES_MAX,
 };
 use crate::sh;
 
@@ -85,6 +86,7 @@ const ADAM_STEP: &str = include_str!("shaders/adam_step.wgsl");
 const ADAM_UPDATE: &str = include_str!("shaders/adam_update.wgsl");
 const ADAM_GEOMETRY: &str = include_str!("shaders/adam_geometry.wgsl");
 const MCMC_RUN: &str = include_str!("shaders/mcmc_run.wgsl");
+const ORIGINAL_RUN: &str = include_str!("shaders/original_run.wgsl");
 const SORT_KEYS: &str = include_str!("shaders/bin_sort_keys.wgsl");
 const SORT_BINDINGS: [Access; 7] =
     [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
@@ -115,7 +117,7 @@ const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 /// All shader files.
-pub(super) static SOURCES: [Source; 25] = [
+pub(super) static SOURCES: [Source; 29] = [
     Source {
         name: "project",
         shared_work: None,
@@ -176,12 +178,17 @@ pub(super) static SOURCES: [Source; 25] = [
         segmented: false,
     },
     Source {
+        name: "density_scan",
+        shared_work: None,
+        parts: &[SHARED, include_str!("shaders/density_scan.wgsl")],
+        bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
         name: "mcmc_weigh",
         shared_work: None,
         parts: &[SHARED, MCMC_RUN, include_str!("shaders/mcmc_weigh.wgsl")],
-        bindings: &[
-            Uniform, ReadWrite, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite,
-        ],
+        bindings: &[Uniform, ReadWrite, Read, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {
@@ -192,17 +199,38 @@ pub(super) static SOURCES: [Source; 25] = [
         segmented: false,
     },
     Source {
-        name: "mcmc_order",
+        name: "density_order",
         shared_work: None,
-        parts: &[SHARED, include_str!("shaders/mcmc_order.wgsl")],
+        parts: &[SHARED, include_str!("shaders/density_order.wgsl")],
         bindings: &[Uniform, Read, Read, ReadWrite],
         segmented: false,
     },
     Source {
-        name: "mcmc_rows",
+        name: "density_rows",
         shared_work: None,
-        parts: &[SHARED, include_str!("shaders/mcmc_rows.wgsl")],
+        parts: &[SHARED, include_str!("shaders/density_rows.wgsl")],
         bindings: &[Uniform, Read, Read, Read, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "original_choose",
+        shared_work: None,
+        parts: &[SHARED, ORIGINAL_RUN, include_str!("shaders/original_choose.wgsl")],
+        bindings: &[Uniform, Read, Read, Read, ReadWrite, Read, Read, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "original_draw",
+        shared_work: None,
+        parts: &[SHARED, ORIGINAL_RUN, include_str!("shaders/original_draw.wgsl")],
+        bindings: &[Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
+        segmented: false,
+    },
+    Source {
+        name: "original_reset",
+        shared_work: None,
+        parts: &[SHARED, include_str!("shaders/original_reset.wgsl")],
+        bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite],
         segmented: false,
     },
     Source {
@@ -368,20 +396,25 @@ pub(super) enum Kernel {
     AdamColors,
     McmcSample,
     McmcWeigh,
-    McmcSums,
-    McmcPrefix,
+    DensitySums,
+    DensityPrefix,
     McmcStart,
     McmcDraw,
     McmcShare,
     McmcCopy,
-    McmcBounds,
-    McmcCodes,
-    McmcRows,
+    DensityBounds,
+    DensityCodes,
+    DensityRows,
+    OriginalPull,
+    OriginalGrow,
+    OriginalKeep,
+    OriginalDraw,
+    OriginalReset,
 }
 
 impl Kernel {
     /// Every kernel, in the order of their numbers.
-    pub const ALL: [Self; 42] = [
+    pub const ALL: [Self; 47] = [
         Self::Project,
         Self::FitProject,
         Self::CatchUpAll,
@@ -415,15 +448,20 @@ impl Kernel {
         Self::AdamColors,
         Self::McmcSample,
         Self::McmcWeigh,
-        Self::McmcSums,
-        Self::McmcPrefix,
+        Self::DensitySums,
+        Self::DensityPrefix,
         Self::McmcStart,
         Self::McmcDraw,
         Self::McmcShare,
         Self::McmcCopy,
-        Self::McmcBounds,
-        Self::McmcCodes,
-        Self::McmcRows,
+        Self::DensityBounds,
+        Self::DensityCodes,
+        Self::DensityRows,
+        Self::OriginalPull,
+        Self::OriginalGrow,
+        Self::OriginalKeep,
+        Self::OriginalDraw,
+        Self::OriginalReset,
     ];
 
     /// (file, entry point)
@@ -466,15 +504,20 @@ impl Kernel {
             Self::AdamColors => ("adam_colors", "adam_colors"),
             Self::McmcSample => ("mcmc_weigh", "mcmc_sample"),
             Self::McmcWeigh => ("mcmc_weigh", "mcmc_weigh"),
-            Self::McmcSums => ("mcmc_weigh", "mcmc_sums"),
-            Self::McmcPrefix => ("mcmc_weigh", "mcmc_prefix"),
+            Self::DensitySums => ("density_scan", "density_sums"),
+            Self::DensityPrefix => ("density_scan", "density_prefix"),
             Self::McmcStart => ("mcmc_spread", "mcmc_start"),
             Self::McmcDraw => ("mcmc_spread", "mcmc_draw"),
             Self::McmcShare => ("mcmc_spread", "mcmc_share"),
             Self::McmcCopy => ("mcmc_spread", "mcmc_copy"),
-            Self::McmcBounds => ("mcmc_order", "mcmc_bounds"),
-            Self::McmcCodes => ("mcmc_order", "mcmc_codes"),
-            Self::McmcRows => ("mcmc_rows", "mcmc_rows"),
+            Self::DensityBounds => ("density_order", "density_bounds"),
+            Self::DensityCodes => ("density_order", "density_codes"),
+            Self::DensityRows => ("density_rows", "density_rows"),
+            Self::OriginalPull => ("original_choose", "original_pull"),
+            Self::OriginalGrow => ("original_choose", "original_grow"),
+            Self::OriginalKeep => ("original_choose", "original_keep"),
+            Self::OriginalDraw => ("original_draw", "original_draw"),
+            Self::OriginalReset => ("original_reset", "original_reset"),
         }
     }
 }
@@ -500,6 +543,7 @@ fn constants(rows: u32) -> String {
         ("BINS", BINS as u32),
         ("SHARES_MAX", SHARES_MAX as u32),
         ("CELLS", CELLS),
+        ("PULL_GROW", PULL_GROW),
     ]) {
         let _ = writeln!(out, "const {name} = {value}u;");
     }
@@ -517,6 +561,10 @@ fn constants(rows: u32) -> String {
         ("ADAM_EPSILON", ADAM.2),
         ("LOGIT_DEAD", LOGIT_DEAD),
         ("LOGIT_FOG", LOGIT_FOG),
+        ("LOGIT_RESET", LOGIT_RESET),
+        ("LOG_SPLIT_SHRINK", LOG_SPLIT_SHRINK),
+        ("PULL_UNITS", PULL_UNITS),
+        ("PULL_SUM_MAX", PULL_SUM_MAX),
         ("LOGIT_FIRST", LOGIT_FIRST),
         ("BINS_PER_LOGIT", BINS_PER_LOGIT),
         ("SSIM_C1", SSIM_C.0),
@@ -628,11 +676,13 @@ mod tests {
 
     use super::*;
     use crate::fit_device::FogCamera;
+    use crate::gpu::drawn::{CellsUniform, Rows, Scan};
     use crate::gpu::layout::{
         Chunk, ChunkCount, ColorSteps, DepthStep, ExposureUniform, SortPass, Splat2d, StatusHead,
         Step, View, Window,
     };
-    use crate::gpu::mcmc::{CellsUniform, Rows, Run};
+    use crate::gpu::mcmc::Run;
+    use crate::gpu::original::RunUniform;
 
     fn parse(source: &Source) -> naga::Module {
         let text = source.text(Build::ALL[0]);
@@ -744,10 +794,26 @@ mod tests {
             color_floats,
             unused
         );
-        layout!("mcmc_rows", Rows, splats, floats, kind, unused);
+        assert_layout(
+            "original_choose",
+            "OriginalRun",
+            size_of::<RunUniform>(),
+            &[
+                ("splats", offset_of!(RunUniform, splats)),
+                ("color_floats", offset_of!(RunUniform, color_floats)),
+                ("room", offset_of!(RunUniform, room)),
+                ("seed", offset_of!(RunUniform, seed)),
+                ("log_split", offset_of!(RunUniform, log_split)),
+                ("log_huge", offset_of!(RunUniform, log_huge)),
+                ("keeps_all", offset_of!(RunUniform, keeps_all)),
+                ("unused", offset_of!(RunUniform, unused)),
+            ],
+        );
+        layout!("density_scan", Scan, splats, round);
+        layout!("density_rows", Rows, splats, floats, kind, unused);
         layout!("mcmc_weigh", FogCamera, rows, focal, principal, size, nearest, unused);
         assert_layout(
-            "mcmc_order",
+            "density_order",
             "Cells",
             size_of::<CellsUniform>(),
             &[

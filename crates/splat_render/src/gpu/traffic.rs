@@ -168,18 +168,31 @@ fn touches(kernel: Kernel, sorted: Sorted) -> &'static [Touch] {
         ],
         Kernel::AdamGeometry => &[Small, Small, Whole(2), Whole(1), Whole(2), Whole(2)],
         Kernel::AdamColors => &[Small, Small, Small, Whole(2), Whole(1), Whole(2), Whole(2)],
-        // Density control is no part of a step.
+        Kernel::DensitySums => &[Small, Whole(1), Small, Small, Small],
+        Kernel::DensityPrefix => &[Small, Whole(3), Small, Whole(1), Small],
+        Kernel::DensityBounds => &[Small, Whole(1), Small, Small],
+        Kernel::DensityCodes => &[Small, Whole(1), Whole(1), Whole(1)],
+        Kernel::DensityRows => &[Small, Whole(1), Whole(1), Whole(1), Whole(1)],
+        Kernel::OriginalPull => {
+            &[Small, Whole(1), Whole(1), Whole(1), Whole(1), Small, Small, Whole(1), Small]
+        }
+        Kernel::OriginalGrow => {
+            &[Small, Small, Small, Small, Small, Visible(1), Small, Visible(2), Small]
+        }
+        Kernel::OriginalKeep => {
+            &[Small, Whole(1), Small, Small, Whole(1), Small, Small, Whole(1), Whole(1)]
+        }
+        Kernel::OriginalDraw => {
+            &[Small, Whole(1), Whole(1), Whole(1), Whole(1), Small, Whole(1), Whole(1)]
+        }
+        Kernel::OriginalReset => &[Small, Whole(2), Whole(1), Whole(1)],
+        // Not counted.
         Kernel::McmcSample
         | Kernel::McmcWeigh
-        | Kernel::McmcSums
-        | Kernel::McmcPrefix
         | Kernel::McmcStart
         | Kernel::McmcDraw
         | Kernel::McmcShare
-        | Kernel::McmcCopy
-        | Kernel::McmcBounds
-        | Kernel::McmcCodes
-        | Kernel::McmcRows => &[],
+        | Kernel::McmcCopy => &[],
     }
 }
 

@@ -11,7 +11,7 @@ use crate::camera::Camera;
 use crate::constants::DEPTH_ALPHA;
 use crate::cpu::CpuFit;
 use crate::error::{Error, Result};
-use crate::fit_device::{FitDevice, FitState, McmcRun, StepInput, noise_draw};
+use crate::fit_device::{FitDevice, FitState, McmcRun, OriginalRun, StepInput, noise_draw};
 use crate::gpu::{Gpu, GpuFit};
 use crate::reference::Reference;
 use crate::splats::SplatArrays;
@@ -33,7 +33,7 @@ const BACKGROUND: [f64; 3] = [0.25, 0.5, 0.75];
 type Outputs = Vec<(&'static str, Vec<f64>)>;
 
 /// Compiles every kernel and compares what they compute of a small scene with the reference, and a step
-/// and a run of density control of a fit with the CPU's.
+/// and runs of density control of a fit with the CPU's.
 ///
 /// # Errors
 /// [`Error::Device`] with what the driver says, or with the first stage that is wrong.
@@ -222,7 +222,7 @@ fn all_stages<T: Float>(stages: &impl Stages<T>) -> Result<Outputs> {
     ])
 }
 
-/// A step of a fit, whose kernels join stages, and a run of density control.
+/// A step of a fit, whose kernels join stages, and runs of density control.
 fn a_fit(device: &mut dyn FitDevice) -> Result<Outputs> {
     let (mut first, mut second) = (scene::<f32>(), scene::<f32>());
     fill(&mut first, 0.0);
@@ -264,6 +264,17 @@ fn a_fit(device: &mut dyn FitDevice) -> Result<Outputs> {
     device.upload(FitState::new(scene()))?;
     device.mcmc(&McmcRun { cameras: vec![self::camera()], target: SPLATS + 20, seed: SEED })?;
     let grown = device.download()?.splats;
+    let mut pulled = FitState::new(scene());
+    pulled.stats.grad_sum = (0..SPLATS).map(|i| 1e-3 * draw(i) as f32).collect();
+    pulled.stats.seen.fill(2.0);
+    pulled.splats.opacities.iter_mut().step_by(7).for_each(|opacity| *opacity = -9.0);
+    device.upload(pulled)?;
+    // Some are split and some cloned.
+    let run = OriginalRun { max_splats: SPLATS + 20, extent: 40.0, prune_huge: true, seed: SEED };
+    device.original(&run)?;
+    let split = device.download()?.splats;
+    device.reset_opacities()?;
+    let reset = device.download()?.splats;
     Ok(vec![
         ("a fit's step", flat(&step.splats.means)),
         ("a fit's step", flat(&step.splats.scales)),
@@ -278,6 +289,11 @@ fn a_fit(device: &mut dyn FitDevice) -> Result<Outputs> {
         ("density control", flat(&grown.scales)),
         ("density control", plain(&grown.opacities)),
         ("density control", flat(&grown.sh)),
+        ("original density control", flat(&split.means)),
+        ("original density control", flat(&split.scales)),
+        ("original density control", plain(&split.opacities)),
+        ("original density control", flat(&split.sh)),
+        ("original density control", plain(&reset.opacities)),
     ])
 }
 

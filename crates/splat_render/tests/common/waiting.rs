@@ -1,6 +1,8 @@
 //! Colours of splats that a step does not see take its update later; no bit may tell.
 
-use splat_render::fit::{COLOR_WAIT, DensityStats, FitDevice, FitState, McmcRun, Rates, StepInput};
+use splat_render::fit::{
+    COLOR_WAIT, DensityStats, FitDevice, FitState, McmcRun, OriginalRun, Rates, StepInput,
+};
 
 use super::optimisation::{random_adam, random_target};
 use super::*;
@@ -77,6 +79,13 @@ fn end(device: &mut dyn FitDevice, control: &[u32], resume: &[u32], frozen: usiz
         if control.contains(&step) {
             let cameras = cameras.clone();
             device.mcmc(&McmcRun { cameras, target: 310, seed: step }).unwrap();
+        }
+        if control.contains(&(step + 20)) {
+            let run = OriginalRun { max_splats: 305, extent: 1.0, prune_huge: false, seed: step };
+            device.original(&run).unwrap();
+        }
+        if control.contains(&(step + 33)) {
+            device.reset_opacities().unwrap();
         }
         if resume.contains(&step) {
             let saved = device.download().unwrap();

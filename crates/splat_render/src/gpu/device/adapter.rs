@@ -184,6 +184,7 @@ impl Gpu {
             failure,
             lost,
             injected: injected.clone(),
+            submissions_left: AtomicU64::new(0),
             planned: None,
             made: Default::default(),
             host_bytes: AtomicU64::new(0),

@@ -96,8 +96,8 @@ impl Gpu {
 
     /// Overwrites a part of a buffer.
     pub(in crate::gpu) fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
+        self.count_host(bytes.len() as u64);
         if self.planned.is_none() {
-            self.count_host(bytes.len() as u64);
             self.queue.write_buffer(buffer, offset, bytes);
         }
     }

@@ -209,6 +209,9 @@ impl Gpu {
 
     /// Runs lists of prepared commands, without waiting for them.
     pub(in crate::gpu) fn submit(&self, lists: &[&[Op]]) -> Result<()> {
+        if self.submission_fails() {
+            return Err(self.error("is out of memory"));
+        }
         let mut encoder = self.device.create_command_encoder(&Default::default());
         for ops in lists {
             Self::record(&mut encoder, ops);

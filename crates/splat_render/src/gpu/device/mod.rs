@@ -32,6 +32,8 @@ pub struct Gpu {
     lost: Arc<OnceLock<String>>,
     /// What tests make it do.
     injected: Injected,
+    /// Submissions until one fails, that one included; 0 where none will.
+    submissions_left: AtomicU64,
     /// Where work is planned and not done.
     planned: Option<planned::Planned>,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
@@ -170,6 +172,18 @@ impl Gpu {
         self.device.destroy();
         // The callback is called from here, once nothing is under way.
         let _ = self.device.poll(wgpu::PollType::wait_indefinitely());
+    }
+
+    /// Lets a submission fail, once: the next one at 1. For tests of what becomes of its callers.
+    pub fn fail_submission(&self, number: u64) {
+        self.submissions_left.store(number, Ordering::Relaxed);
+    }
+
+    /// Whether the submission at hand is the one that is to fail.
+    fn submission_fails(&self) -> bool {
+        let left = &self.submissions_left;
+        let less = left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| n.checked_sub(1));
+        less == Ok(1)
     }
 
     /// The wgpu device, for callers that draw from the kernels' buffers.

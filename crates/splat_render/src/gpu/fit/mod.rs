@@ -13,7 +13,8 @@
 //! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
 //! slopes of SSIM (96 and 48 on software adapters), 16 more where exposures are fitted and
 //! 8 more where photos have depths; a photo 4 per pixel, 4 more for weights and 8 more for depths. A
-//! test holds the sum per splat. While density control runs, splats and moments are there twice.
+//! test holds the sum per splat. While density control runs, splats and moments are there twice, and 60 to
+//! 70 bytes per splat for what it draws.
 
 mod frame;
 mod plan;
@@ -30,11 +31,12 @@ use super::layout::{
 };
 use super::loss::{LossBuffers, rgba};
 use super::mcmc::shares;
+use super::original::reset_op;
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
 use crate::fit_device::{
-    CameraGradient, ColorStep, ExposureGradient, FitDevice, FitState, McmcRun, StepInput,
-    WaitingSteps, dropout_threshold, mcmc,
+    CameraGradient, ColorStep, ExposureGradient, FitDevice, FitState, McmcRun, OriginalRun,
+    StepInput, WaitingSteps, control_on_host, dropout_threshold, mcmc, original,
 };
 use crate::sh;
 use crate::stages::ProjectOptions;
@@ -64,6 +66,8 @@ pub struct GpuFit {
     shares: Option<wgpu::Buffer>,
     /// Steps not known to have been done, with the number of those that colours waited for before.
     pending: Vec<(StepInput, usize)>,
+    /// While pending steps are done again: the last of them that was submitted again.
+    redone: Option<usize>,
     /// The steps that colours may wait for, those that are pending included.
     waiting: WaitingSteps,
     camera_gradients: Vec<CameraGradient>,
@@ -108,6 +112,7 @@ impl GpuFit {
             scene: None,
             shares: None,
             pending: Vec::new(),
+            redone: None,
             waiting: WaitingSteps::default(),
             camera_gradients: Vec::new(),
             exposure_gradients: Vec::new(),
@@ -147,8 +152,8 @@ impl GpuFit {
     }
 
     /// Submits one step without waiting for it, as number `at` of those pending; colours wait for
-    /// `waiting` steps before it.
-    fn enqueue(&mut self, input: &StepInput, at: usize, waiting: usize) -> Result<()> {
+    /// `waiting` steps before it. `again` where its pairs did not fit before.
+    fn enqueue(&mut self, input: &StepInput, at: usize, waiting: usize, again: bool) -> Result<()> {
         let scene = self
             .scene
             .as_mut()
@@ -230,6 +235,10 @@ impl GpuFit {
             sums.push(Op::Copy(from, to, at as u64 * bytes, bytes));
         }
         self.last = Some((input.view, input.ssim_weight, depth.is_some()));
+        if again {
+            self.set_overflow(0)?;
+        }
+        let frame = &self.frames[self.photos[input.view].frame];
         self.gpu.submit(&[&copies, &frame.ops, &sums])
     }
 
@@ -296,7 +305,13 @@ impl GpuFit {
         }
         let (head, _) = self.status()?;
         let pending = std::mem::take(&mut self.pending);
-        let settled = if head.overflow == 0 { Ok(()) } else { self.redo(&pending, head.overflow) };
+        let first = match (head.overflow, self.redone) {
+            (0, None) => pending.len(),
+            // The steps behind the last one that was done again still wait for that.
+            (0, Some(at)) => at + 1,
+            (overflow, _) => pending.iter().position(|(p, _)| p.step == overflow).unwrap_or(0),
+        };
+        let settled = self.redo(&pending, first);
         if let Err(error) = settled.and_then(|()| self.read_sums(&pending)) {
             // Whoever asks for the state gets this error again, and none without these steps.
             self.pending = pending;
@@ -305,16 +320,17 @@ impl GpuFit {
         Ok(())
     }
 
-    /// Does the pending steps again from the one whose pairs did not fit, with room for them.
-    fn redo(&mut self, pending: &[(StepInput, usize)], overflow: u32) -> Result<()> {
-        let first = pending.iter().position(|(p, _)| p.step == overflow).unwrap_or(0);
+    /// Does the pending steps again from `first` on, whose pairs did not fit, with room for them.
+    fn redo(&mut self, pending: &[(StepInput, usize)], first: usize) -> Result<()> {
         // One at a time, so that the counts read are those of the step that needs the room.
         for (at, (input, waiting)) in pending.iter().enumerate().skip(first) {
             loop {
-                let clear = std::mem::offset_of!(StatusHead, overflow) as u64;
-                let status = &self.scene()?.bins.status;
-                self.gpu.write(status, clear, bytemuck::bytes_of(&0u32));
-                self.enqueue(input, at, *waiting)?;
+                if let Err(error) = self.enqueue(input, at, *waiting, true) {
+                    // It has cleared the flag, and the step was not done.
+                    self.set_overflow(input.step)?;
+                    return Err(error);
+                }
+                self.redone = Some(at);
                 let (head, counts) = self.status()?;
                 if head.overflow == 0 {
                     break;
@@ -322,7 +338,25 @@ impl GpuFit {
                 self.grow(self.photos[input.view].frame, &counts)?;
             }
         }
+        self.redone = None;
         Ok(())
+    }
+
+    /// Sets or clears the first step whose pairs did not fit, from the next submission on.
+    fn set_overflow(&self, step: u32) -> Result<()> {
+        let at = std::mem::offset_of!(StatusHead, overflow) as u64;
+        self.gpu.write(&self.scene()?.bins.status, at, bytemuck::bytes_of(&step));
+        Ok(())
+    }
+
+    /// Goes on with these splats, and returns their number.
+    fn replace(&mut self, scene: Scene) -> usize {
+        for frame in &mut self.frames {
+            frame.ops.clear();
+        }
+        let splats = scene.len() as usize;
+        self.scene = Some(scene);
+        splats
     }
 
     /// Makes room for the pairs that a step needs.
@@ -420,6 +454,7 @@ impl FitDevice for GpuFit {
     fn upload(&mut self, state: FitState) -> Result<()> {
         state.validate()?;
         self.pending.clear();
+        self.redone = None;
         self.waiting.clear();
         // What the last scene has grown to is likely to be needed again.
         let (capacity, chunks) = self.scene.take().map_or((0, 1), |s| (s.capacity, s.chunks));
@@ -445,19 +480,25 @@ impl FitDevice for GpuFit {
             None => self.shares.insert(shares(&gpu)?).clone(),
         };
         let Some(next) = self.scene()?.after_mcmc(&gpu, run, self.tiles, &shares)? else {
-            let mut splats = 0;
-            self.edit(&mut |state| {
-                state.edit_moving(|state| mcmc(state, run));
-                splats = state.moving();
-            })?;
-            return Ok(splats);
+            return control_on_host(self, &|state| mcmc(state, run));
         };
-        for frame in &mut self.frames {
-            frame.ops.clear();
-        }
-        let splats = next.len() as usize;
-        self.scene = Some(next);
-        Ok(splats)
+        Ok(self.replace(next))
+    }
+
+    fn original(&mut self, run: &OriginalRun) -> Result<usize> {
+        self.settle()?;
+        self.catch_up()?;
+        let gpu = Arc::clone(&self.gpu);
+        let Some(next) = self.scene()?.after_original(&gpu, run, self.tiles)? else {
+            return control_on_host(self, &|state| original(state, run));
+        };
+        Ok(self.replace(next))
+    }
+
+    fn reset_opacities(&mut self) -> Result<()> {
+        self.settle()?;
+        let op = reset_op(&self.gpu, &self.scene()?.adam);
+        self.gpu.submit(&[&[op]])
     }
 
     fn step(&mut self, input: &StepInput) -> Result<()> {
@@ -465,13 +506,17 @@ impl FitDevice for GpuFit {
             let frame = &self.frames[photo.frame];
             (frame.width, frame.height)
         }))?;
+        // Steps that are to be done again come first.
+        if self.redone.is_some() || self.pending.len() >= STEPS_AHEAD {
+            self.settle()?;
+        }
         let adam = input.adam();
         if self.waiting.must_end_before(&adam) {
             self.settle()?;
             self.catch_up()?;
         }
         let waiting = self.waiting.get().len();
-        self.enqueue(input, self.pending.len(), waiting)?;
+        self.enqueue(input, self.pending.len(), waiting, false)?;
         self.pending.push((*input, waiting));
         self.waiting.add(&adam);
         if self.pending.len() >= STEPS_AHEAD { self.settle() } else { Ok(()) }

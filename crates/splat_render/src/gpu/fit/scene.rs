@@ -1,14 +1,15 @@
 //! What a fit keeps on the device that depends on the number of splats or pairs.
 
 use crate::error::Result;
-use crate::fit_device::{FitState, McmcRun};
+use crate::fit_device::{FitState, McmcRun, OriginalRun};
 use crate::gpu::adam::AdamBuffers;
 use crate::gpu::bin::{PairBins, SplatBins, pair_limit};
 use crate::gpu::device::{Gpu, Op};
+use crate::gpu::drawn::{Drawn, RowKind};
 use crate::gpu::layout::{CAMERA, GEOMETRY, GRADIENT};
-use crate::gpu::mcmc::{Drawn, RowKind};
 use crate::gpu::project::{Projection, SPLAT_2D, count};
 use crate::gpu::project_backward::{camera_buffer, camera_sums};
+use crate::gpu::{mcmc, original};
 
 /// Pairs per splat that buffers have room for at first; they grow by what a step needs.
 const PAIRS_PER_SPLAT: u32 = 4;
@@ -95,6 +96,12 @@ impl Scene {
         })
     }
 
+    /// Whether the device does density control that leaves so many splats.
+    fn binds(&self, gpu: &Gpu, splats: u32) -> bool {
+        let floats = self.adam.splats.color_floats.max(GEOMETRY as u64);
+        self.adam.moving == self.len() && u64::from(splats) * 4 * floats <= gpu.binding_limit
+    }
+
     /// What a run of MCMC's density control makes of it; None where an array cannot be bound at once,
     /// or some splats are only drawn.
     pub fn after_mcmc(
@@ -104,18 +111,36 @@ impl Scene {
         tiles: u32,
         shares: &wgpu::Buffer,
     ) -> Result<Option<Self>> {
-        let AdamBuffers { splats, first, second, .. } = &self.adam;
-        if self.adam.moving < self.len() {
+        let splats = &self.adam.splats;
+        if !self.binds(gpu, count(run.target.max(self.len() as usize))?) {
             return Ok(None);
         }
-        let most = count(run.target.max(self.len() as usize))?;
-        let floats = [GEOMETRY as u64, splats.color_floats];
-        if u64::from(most) * 4 * floats[0].max(floats[1]) > gpu.binding_limit {
-            return Ok(None);
-        }
-        let floats = floats.map(|floats| floats as u32);
         let arrays = (&splats.geometry, &splats.colors);
-        let drawn = Drawn::new(gpu, arrays, (self.len(), floats[1]), run, shares)?;
+        let drawn = mcmc::draw(gpu, arrays, (self.len(), splats.color_floats as u32), run, shares)?;
+        self.after(gpu, &drawn, tiles).map(Some)
+    }
+
+    /// What a run of the original density control makes of it; None as above.
+    pub fn after_original(&self, gpu: &Gpu, run: &OriginalRun, tiles: u32) -> Result<Option<Self>> {
+        if !self.binds(gpu, self.len()) {
+            return Ok(None);
+        }
+        let now = (&self.adam, &self.bins);
+        let drawn = original::draw(gpu, now, run, |splats| self.binds(gpu, splats))?;
+        drawn.map(|drawn| self.after(gpu, &drawn, tiles)).transpose()
+    }
+
+    fn after(&self, gpu: &Gpu, drawn: &Drawn, tiles: u32) -> Result<Self> {
+        let (next, ops) = self.arranged(gpu, drawn, tiles)?;
+        gpu.submit(&[&ops])?;
+        Ok(next)
+    }
+
+    /// Another scene of the splats that a density control has drawn, and the commands that fill it;
+    /// statistics begin anew.
+    pub fn arranged(&self, gpu: &Gpu, drawn: &Drawn, tiles: u32) -> Result<(Self, Vec<Op>)> {
+        let AdamBuffers { splats, first, second, .. } = &self.adam;
+        let floats = [GEOMETRY as u32, splats.color_floats as u32];
         // What is there stays until all that follows has its memory.
         let adam = AdamBuffers::new(gpu, drawn.splats, splats.color_floats)?;
         let next = Self::new(gpu, adam, self.sh_degree, tiles, self.capacity, self.chunks)?;
@@ -131,8 +156,7 @@ impl Scene {
             put(&from.colors, &to.colors, floats[1], RowKind::Moments);
         }
         ops.push(Op::Clear(next.adam.notes.clone()));
-        gpu.submit(&[&ops])?;
-        Ok(Some(next))
+        Ok((next, ops))
     }
 
     /// Makes the commands that bring all colours up to date, unless they are there already.

@@ -1,4 +1,4 @@
-// MCMC's density control, first part: what is fog or dead, what the others weigh, and the sums of that.
+// MCMC's density control, first part: what is fog or dead, and what the others weigh.
 // As fit_device/mcmc.rs and fit_device/fog.rs, bit for bit. Follows shared.wgsl and mcmc_run.wgsl.
 
 @group(0) @binding(1) var<storage, read_write> geometry: array<f32>;
@@ -7,16 +7,8 @@
 @group(0) @binding(3) var<storage, read> cameras: array<FogCamera>;
 // What a living splat weighs, by the bin of its logit.
 @group(0) @binding(4) var<storage, read> table: array<u32>;
-// Weights, 0 of the dead, then their inclusive sums. In `sample`, centres of the sampled splats.
+// Weights, 0 of the dead. In `sample`, centres of the sampled splats.
 @group(0) @binding(5) var<storage, read_write> words: array<u32>;
-// Of each segment: sum of weights, number of dead.
-@group(0) @binding(6) var<storage, read_write> segment_sums: array<vec2<u32>, SEGMENTS>;
-@group(0) @binding(7) var<storage, read_write> dead: array<u32>;
-// Sum of weights, number of dead, of each round.
-@group(0) @binding(8) var<storage, read_write> totals: array<vec2<u32>, 2>;
-
-const SEGMENTS = 256u;
-const THREADS = 64u;
 
 struct FogCamera {
     rows: array<vec4<f32>, 3>,
@@ -26,8 +18,6 @@ struct FogCamera {
     nearest: f32,
     unused: f32,
 }
-
-var<workgroup> sums: array<vec2<u32>, THREADS>;
 
 // Centres of every `run.every` splats.
 @compute @workgroup_size(64)
@@ -109,64 +99,4 @@ fn mcmc_weigh(
         weight = table[logit_bin(logit)];
     }
     words[i] = weight;
-}
-
-// The part of the segment that a thread owns.
-fn own_range(segment: u32, local: u32) -> vec2<u32> {
-    let per_thread = (run.splats + SEGMENTS * THREADS - 1u) / (SEGMENTS * THREADS);
-    let begin = min((segment * THREADS + local) * per_thread, run.splats);
-    return vec2(begin, min(begin + per_thread, run.splats));
-}
-
-fn own_sum(range: vec2<u32>) -> vec2<u32> {
-    var sum = vec2(0u);
-    for (var i = range.x; i < range.y; i++) {
-        sum += vec2(words[i], u32(words[i] == 0u));
-    }
-    return sum;
-}
-
-@compute @workgroup_size(THREADS)
-fn mcmc_sums(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    sums[local] = own_sum(own_range(workgroup.x, local));
-    workgroupBarrier();
-    if local == 0u {
-        var sum = vec2(0u);
-        for (var k = 0u; k < THREADS; k++) {
-            sum += sums[k];
-        }
-        segment_sums[workgroup.x] = sum;
-    }
-}
-
-@compute @workgroup_size(THREADS)
-fn mcmc_prefix(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let range = own_range(workgroup.x, local);
-    sums[local] = own_sum(range);
-    workgroupBarrier();
-    var sum = vec2(0u);
-    for (var k = 0u; k < workgroup.x; k++) {
-        sum += segment_sums[k];
-    }
-    for (var k = 0u; k < local; k++) {
-        sum += sums[k];
-    }
-    for (var i = range.x; i < range.y; i++) {
-        let weight = words[i];
-        if weight == 0u {
-            dead[sum.y] = i;
-            sum.y += 1u;
-        }
-        sum.x += weight;
-        words[i] = sum.x;
-    }
-    if workgroup.x == SEGMENTS - 1u && local == THREADS - 1u {
-        totals[run.round] = sum;
-    }
 }

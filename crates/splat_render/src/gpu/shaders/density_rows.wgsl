@@ -1,9 +1,9 @@
-// MCMC's density control: rows of one array put in order, one thread per float. Follows shared.wgsl.
+// Density control: rows of one array put in order, one thread per float. Follows shared.wgsl.
 
 struct Rows {
     splats: u32,
     floats: u32,
-    // 0: rows as they lie. 1: colours, from where `rows` says. 2: moments, zero where `rows` says.
+    // 0: rows as they lie. 1: colours, from where `rows` says. 2: moments, from there or zero.
     kind: u32,
     unused: u32,
 }
@@ -15,7 +15,7 @@ struct Rows {
 @group(0) @binding(4) var<storage, read_write> new_: array<f32>;
 
 @compute @workgroup_size(256)
-fn mcmc_rows(
+fn density_rows(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
@@ -28,7 +28,7 @@ fn mcmc_rows(
     let i = order[k];
     let row = rows[i];
     var from_row = i;
-    if array_.kind == 1u {
+    if array_.kind != 0u {
         from_row = row >> 1u;
     }
     var value = 0.0;

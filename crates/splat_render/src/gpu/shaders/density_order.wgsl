@@ -1,4 +1,4 @@
-// MCMC's density control, last part: splats along Morton's curve. As fit_device/mcmc.rs, bit for bit.
+// Density control, last part: splats along Morton's curve. As fit_device/cell_order.rs, bit for bit.
 // Follows shared.wgsl.
 
 struct Cells {
@@ -12,7 +12,7 @@ struct Cells {
 @group(0) @binding(0) var<uniform> cells: Cells;
 @group(0) @binding(1) var<storage, read> geometry: array<f32>;
 @group(0) @binding(2) var<storage, read> order: array<u32>;
-// Keys of the sort. In mcmc_bounds, of each workgroup: bits of the low corner and of the high one.
+// Keys of the sort. In density_bounds, of each workgroup: bits of the low corner and of the high one.
 @group(0) @binding(3) var<storage, read_write> words: array<u32>;
 
 const THREADS = 64u;
@@ -42,7 +42,7 @@ fn bits_or(low: vec3<f32>, high: vec3<f32>, k: u32) -> f32 {
 
 // The box of the finite centres, a part for each workgroup.
 @compute @workgroup_size(THREADS)
-fn mcmc_bounds(
+fn density_bounds(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
@@ -88,7 +88,7 @@ fn spread(x: u32) -> u32 {
 }
 
 @compute @workgroup_size(64)
-fn mcmc_codes(
+fn density_codes(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
