@@ -31,7 +31,11 @@ pub fn write_levels<'py>(
 
 /// Reads the finest level of a folder that has no more splats than `most`; `level` is its number.
 #[pyfunction]
-pub fn read_level<'py>(py: Python<'py>, path: PathBuf, most: usize) -> PyResult<Bound<'py, PyDict>> {
+pub fn read_level<'py>(
+    py: Python<'py>,
+    path: PathBuf,
+    most: usize,
+) -> PyResult<Bound<'py, PyDict>> {
     let read = py.detach(|| splat_render::levels::read_within(&path, most)).map_err(to_python)?;
     let (file, level) = read;
     let dict = PyDict::new(py);

@@ -33,8 +33,8 @@ pub use exr::{ExrPicture, encode_exr, write_exr};
 pub use exr_depth::read_exr_depth;
 pub use format::Format;
 pub use open::open_file;
-pub use rows::SplatRows;
 pub(crate) use prepare::{cut_degree, is_drawn};
+pub use rows::SplatRows;
 pub(crate) use sog::{META as SOG_META, write_folder as write_sog_folder};
 pub use splat_file::{Loaded, SplatFile};
 

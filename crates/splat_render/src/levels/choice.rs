@@ -79,8 +79,8 @@ pub fn choose(manifest: &Manifest, view: &View, budget: usize) -> Choice {
     for &i in &order {
         let Some(level) = cells[i].runs.iter().rposition(Option::is_some) else { continue };
         let count = count(&cells[i], level);
-        let fits = out.held + count <= budget
-            && (seen[i] || unseen + count <= budget / UNSEEN_PART);
+        let fits =
+            out.held + count <= budget && (seen[i] || unseen + count <= budget / UNSEEN_PART);
         if fits {
             out.levels[i] = Some(level);
             out.order.push(i);
@@ -109,6 +109,21 @@ pub fn choose(manifest: &Manifest, view: &View, budget: usize) -> Choice {
             out.held += more;
             out.levels[i] = Some(next);
             candidates.extend(candidate(i, next));
+        }
+    }
+    out
+}
+
+/// All cells as coarse as there are, as many as the budget has room for.
+pub fn coarsest(manifest: &Manifest, budget: usize) -> Choice {
+    let cells = &manifest.cells;
+    let mut out = Choice { levels: vec![None; cells.len()], order: Vec::new(), held: 0 };
+    for (i, cell) in cells.iter().enumerate() {
+        let Some(level) = cell.runs.iter().rposition(Option::is_some) else { continue };
+        if out.held + count(cell, level) <= budget {
+            out.held += count(cell, level);
+            out.levels[i] = Some(level);
+            out.order.push(i);
         }
     }
     out

@@ -108,12 +108,13 @@ fn parse(json: &Value, folder: &Path) -> Reason {
     let levels = json.get("lodLevels").and_then(Value::as_u64);
     let levels = levels
         .filter(|n| (1..=LEVELS_MAX).contains(n))
-        .ok_or_else(|| format!("has no lodLevels from 1 to {LEVELS_MAX}"))? as usize;
+        .ok_or_else(|| format!("has no lodLevels from 1 to {LEVELS_MAX}"))?
+        as usize;
     let names = json.get("filenames").and_then(Value::as_array);
     let files: Vec<PathBuf> = names
         .ok_or("has no list of filenames")?
         .iter()
-        .map(|name| inside(name))
+        .map(inside)
         .collect::<std::result::Result<_, _>>()?;
     let environment = match json.get("environment") {
         None | Some(Value::Null) => None,
@@ -138,7 +139,8 @@ fn parse(json: &Value, folder: &Path) -> Reason {
         match (node.get("children"), node.get("lods")) {
             (Some(children), None) => {
                 let children = children.as_array().filter(|c| !c.is_empty());
-                nodes.extend(children.ok_or("has a node without children and levels")?.iter().rev());
+                nodes
+                    .extend(children.ok_or("has a node without children and levels")?.iter().rev());
             }
             (None, Some(lods)) => {
                 let cell = leaf(node, lods, &out, has_errors)?;
@@ -167,19 +169,15 @@ fn leaf(
     let mut runs = vec![None; manifest.levels];
     for (level, run) in lods.as_object().ok_or("has lods that are no object")? {
         let place = level.parse().ok().filter(|&level: &usize| level < manifest.levels);
-        let place = place
-            .ok_or_else(|| format!("has a level {level:?} where {} are", manifest.levels))?;
+        let place =
+            place.ok_or_else(|| format!("has a level {level:?} where {} are", manifest.levels))?;
         let number = |name: &str| {
             let value = run.get(name).and_then(Value::as_u64).filter(|&n| n <= 1 << 30);
             value.map(|n| n as usize).ok_or_else(|| format!("has a level without a valid {name}"))
         };
         let run = Run { file: number("file")?, offset: number("offset")?, count: number("count")? };
         if run.file >= manifest.files.len() {
-            return Err(format!(
-                "has a cell in file {} of {}",
-                run.file,
-                manifest.files.len()
-            ));
+            return Err(format!("has a cell in file {} of {}", run.file, manifest.files.len()));
         }
         runs[place] = Some(run).filter(|run| run.count > 0);
     }
@@ -241,8 +239,9 @@ fn numbers(value: &Value) -> Option<[f64; 3]> {
 /// The text of a file with these cells, as the leaves of the tree in order; those without splats are None.
 pub fn written(manifest: &Manifest, tree: &Cells, cells: &[Option<Cell>]) -> String {
     let counts = manifest.counts();
-    let (_, tree) = node(tree, 0, cells)
-        .unwrap_or_else(|| (([0.0; 3], [0.0; 3]), json!({ "bound": bound(&[0.0; 3], &[0.0; 3]), "lods": {} })));
+    let (_, tree) = node(tree, 0, cells).unwrap_or_else(|| {
+        (([0.0; 3], [0.0; 3]), json!({ "bound": bound(&[0.0; 3], &[0.0; 3]), "lods": {} }))
+    });
     let files: Vec<String> =
         manifest.files.iter().map(|f| f.to_string_lossy().replace('\\', "/")).collect();
     let mut out = json!({

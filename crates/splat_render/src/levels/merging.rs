@@ -1,8 +1,10 @@
 //! Fewer splats that look alike from afar: neighbours along Morton's curve are merged, those first whose
 //! merging moves the least color.
 //!
-//! The mean, spread, color and opacity of a merged splat are those of what it stands for, each weighted by
-//! its opacity times its area (as in Kerbl et al., "A Hierarchical 3D Gaussian Representation", 2024).
+//! The mean, spread and color of a merged splat are those of what it stands for, each weighted by its
+//! opacity times its area (as in Kerbl et al., "A Hierarchical 3D Gaussian Representation", 2024); its
+//! opacity times its area is their sum. Two are merged for the square of what they are moved times their
+//! weight, as in Ward's clustering ("Hierarchical Grouping to Optimize an Objective Function", 1963).
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -14,10 +16,10 @@ use crate::splats::SplatArrays;
 
 /// Merged splats are no more opaque than this: a logit of 1 is infinite.
 const MOST_OPAQUE: f64 = 0.995;
-/// They are at most so many times larger than those that they stand for spread.
-const MOST_LARGER: f64 = 2.0;
 /// What a difference in color costs, against being apart by the root of both spreads.
 const COLOR: f64 = 4.0;
+/// The lowest coefficient of degree 0 that differs from black: color = 0.5 + coefficient / (2 sqrt(pi)).
+const BLACK: f32 = -1.772_453_9;
 /// Nothing weighs less than this.
 const LEAST: f64 = 1e-30;
 
@@ -60,16 +62,28 @@ impl Ord for Cost {
 /// Two neighbours, and their versions when their merging had that cost.
 type Pair = (Reverse<(Cost, u32)>, u32, [u32; 2]);
 
-/// Levels of the splats, which lie in Morton's order and are finite, one for each of the falling counts.
-pub fn merged(splats: &SplatArrays, counts: &[usize]) -> Vec<Merged> {
+/// Levels of the splats, which lie in Morton's order and are finite, one for each of the rising costs:
+/// all is merged that costs no more. A level has at least a `most`th of the splats of the last one.
+pub fn merged(splats: &SplatArrays, costs: &[f64], most: usize) -> Vec<Merged> {
     let mut merging = Merging::new(splats);
-    counts
+    costs
         .iter()
-        .map(|&count| {
-            merging.reduce(count.max(1));
+        .map(|&cost| {
+            merging.reduce(cost, merging.left.div_ceil(most).max(1));
             merging.level(splats)
         })
         .collect()
+}
+
+/// What it costs to merge the splats into one, merging by merging: each the highest cost so far.
+pub fn costs(splats: &SplatArrays) -> Vec<f64> {
+    let mut merging = Merging::new(splats);
+    let (mut highest, mut out) = (0.0f64, Vec::with_capacity(splats.len()));
+    while let Some(cost) = merging.step(f64::INFINITY) {
+        highest = highest.max(cost);
+        out.push(highest);
+    }
+    out
 }
 
 struct Merging {
@@ -88,7 +102,8 @@ impl Merging {
         let n = splats.len();
         let clusters = (0..n).map(|i| {
             let opacity = 1.0 / (1.0 + (-f64::from(splats.opacities[i])).exp());
-            let scales = DVec3::from(splats.scales[i].map(|s| f64::from(s).clamp(-80.0, 80.0).exp()));
+            let scales =
+                DVec3::from(splats.scales[i].map(|s| f64::from(s).clamp(-80.0, 80.0).exp()));
             let [w, x, y, z] = splats.quats[i].map(f64::from);
             let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
             let along = rotation * DMat3::from_diagonal(scales);
@@ -102,9 +117,14 @@ impl Merging {
                 after: if i + 1 < n { i as u32 + 1 } else { NONE },
             }
         });
+        let mut sh = splats.sh.clone();
+        // What is darker than black is drawn black, and is so in a mean.
+        for row in sh.chunks_exact_mut(splats.stride()) {
+            row[0] = row[0].map(|c| c.max(BLACK));
+        }
         let mut out = Self {
             clusters: clusters.collect(),
-            sh: splats.sh.clone(),
+            sh,
             stride: splats.stride(),
             pairs: BinaryHeap::with_capacity(n),
             left: n,
@@ -132,18 +152,29 @@ impl Merging {
         self.pairs.push((Reverse((Cost(cost), i)), one.after, [one.version, other.version]));
     }
 
-    /// Merges until so many are left.
-    fn reduce(&mut self, count: usize) {
-        while self.left > count {
-            let Some((Reverse((_, i)), j, versions)) = self.pairs.pop() else { return };
+    /// Merges what costs no more than this, until so many are left.
+    fn reduce(&mut self, cost: f64, least: usize) {
+        while self.left > least && self.step(cost).is_some() {}
+    }
+
+    /// Merges the two that cost least, if it is no more than this; their cost.
+    fn step(&mut self, most: f64) -> Option<f64> {
+        loop {
+            let (Reverse((Cost(cost), i)), j, versions) = self.pairs.pop()?;
             let (one, other) = (self.clusters[i as usize], self.clusters[j as usize]);
             let is_current = one.members > 0
                 && other.members > 0
                 && one.after == j
                 && [one.version, other.version] == versions;
-            if is_current {
-                self.merge(i, j);
+            if !is_current {
+                continue;
             }
+            if cost > most {
+                self.pairs.push((Reverse((Cost(cost), i)), j, versions));
+                return None;
+            }
+            self.merge(i, j);
+            return Some(cost);
         }
     }
 
@@ -190,11 +221,8 @@ impl Merging {
                 continue;
             }
             let (squares, turned) = axes(cluster.spread.to_cols_array_2d());
-            let mut sizes = DVec3::from(squares.map(|s| s.max(LEAST).sqrt()));
-            let opaque = cluster.weight / area(sizes);
-            // What would be more than opaque is larger instead, or gaps would open between splats.
-            sizes *= (opaque / MOST_OPAQUE).clamp(1.0, MOST_LARGER * MOST_LARGER).sqrt();
-            let opaque = opaque.clamp(1e-4, MOST_OPAQUE);
+            let sizes = DVec3::from(squares.map(|s| s.max(LEAST).sqrt()));
+            let opaque = (cluster.weight / area(sizes)).clamp(1e-4, MOST_OPAQUE);
             // `turned` has the axes as columns, in rows.
             let turn = DQuat::from_mat3(&DMat3::from_cols_array_2d(&turned).transpose());
             out.means[at] = cluster.mean.as_vec3().to_array();

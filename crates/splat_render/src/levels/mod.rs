@@ -14,7 +14,7 @@ mod resident;
 mod symmetric;
 mod write;
 
-pub use choice::{Choice, View, choose};
+pub use choice::{Choice, View, choose, coarsest};
 pub use manifest::{Cell, INDEX, Manifest, Run};
 pub use resident::{Drawn, Resident, read_within};
 pub use write::{LevelsWritten, write_levels};

@@ -44,7 +44,8 @@ impl Resident {
             let file = read_splats(&manifest.folder.join(name))?.file;
             if file.splats.len() >= budget {
                 let n = file.splats.len();
-                let what = format!("of {budget} splats has no room beside the {n} that are always drawn");
+                let what =
+                    format!("of {budget} splats has no room beside the {n} that are always drawn");
                 return Err(Error::argument("budget", format!("{what}; give more")));
             }
             out.environment = file.splats;
