@@ -54,6 +54,10 @@ def write_levels(
     Raises:
         IgsrError: an argument cannot be used, or a file cannot be read or written.
     """
+    if not 1 <= levels <= 8:
+        raise IgsrError(f"lod must be a number of levels from 1 to 8, not {levels}.")
+    if per_cell < 1:
+        raise IgsrError(f"per_cell must be at least 1 splat, not {per_cell}.")
     with atomic_folder(out) as folder:
         try:
             done = _core.write_levels(os.fspath(scene), str(folder), levels, per_cell)

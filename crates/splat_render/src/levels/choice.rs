@@ -234,7 +234,7 @@ mod tests {
     #[test]
     fn from_afar_nothing_finer_is_chosen_than_can_be_seen() {
         let manifest = row();
-        let far = choose(&manifest, &view(900.0, 1.0), 5000);
+        let far = choose(&manifest, &view(700.0, 1.0), 5000);
         assert_eq!(far.levels, vec![Some(2); 10]);
         let near = choose(&manifest, &view(999.0, 1.0), 5000);
         assert_eq!(near.levels[0], Some(0));

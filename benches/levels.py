@@ -1,0 +1,148 @@
+"""Levels of detail of a scene and of a city made of copies of it: how near they are to the whole, and what a
+budget draws and holds.
+
+    python benches/levels.py SCENE CAPTURE --out DIR [--copies 8] [--budgets 50000,200000]
+
+Each level is compared with the scene in pictures of the capture's cameras, from as near as they are and from
+2 to 16 times as far: smaller pictures, whose truth is the mean of the whole scene's pixels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import igsr
+from igsr.blocks.levels import INDEX, write_levels
+from igsr.capture import Camera, load_capture
+from igsr.capture.write_cameras import write_cameras
+from igsr.viewing.level_files import level_within
+
+#: How many times as far.
+FAR = (1, 2, 4, 8, 16)
+#: Splats whose standard deviations are beyond this part of the scene are sky and haze of one copy.
+HAZE = 0.1
+NAMES = ("means", "quats", "scales", "opacities", "sh")
+
+
+def smaller(camera: Camera, times: int) -> Camera:
+    """A camera whose picture is so many times smaller."""
+    K = camera.K.copy()
+    K[:2] /= times
+    return Camera(camera.viewmat, K, camera.width // times, camera.height // times)
+
+
+def mean_of(image: np.ndarray, times: int) -> np.ndarray:
+    """Means of squares of so many pixels a side."""
+    height, width = (side // times for side in image.shape[:2])
+    image = image[: height * times, : width * times]
+    return image.reshape(height, times, width, times, 3).mean(axis=(1, 3))
+
+
+def drawn(splats: igsr.Splats, camera: Camera) -> np.ndarray:
+    """A picture, clipped to what a screen shows."""
+    return np.clip(igsr.render(splats, camera, backend="cpu").color, 0.0, 1.0)
+
+
+def scores(splats: igsr.Splats, cameras: list[Camera], true: list[np.ndarray]) -> list[str]:
+    """PSNR in dB and SSIM of each distance."""
+    rows = []
+    for times in FAR:
+        psnr, ssim = [], []
+        for camera, whole in zip(cameras, true, strict=True):
+            seen, wanted = drawn(splats, smaller(camera, times)), mean_of(whole, times)
+            psnr.append(igsr.evaluation.psnr(seen, wanted))
+            ssim.append(igsr.evaluation.ssim(seen, wanted))
+        rows.append(f"{np.mean(psnr):.1f} / {np.mean(ssim):.3f}")
+    return rows
+
+
+def city(scene: igsr.Splats, copies: int) -> igsr.Splats:
+    """Copies of a scene side by side on the plane that it spreads along, without its sky and haze."""
+    middle = np.median(scene.means, axis=0)
+    side = np.quantile(np.abs(scene.means - middle), 0.95, axis=0)
+    along = np.argsort(side)[1:]
+    inside = (np.abs(scene.means - middle) < 1.1 * side).all(axis=1)
+    keep = inside & (np.exp(scene.scales).max(axis=1) < HAZE * side.max())
+    kept = replace(scene, **{name: getattr(scene, name)[keep] for name in NAMES})
+    shifts = np.zeros((copies * copies, 3), np.float32)
+    grid = np.stack(np.meshgrid(*[np.arange(copies) - copies // 2] * 2), axis=-1).reshape(-1, 2)
+    shifts[:, along] = 2.0 * grid * side[along]
+    means = (kept.means + shifts[:, None, :]).reshape(-1, 3).astype(np.float32)
+    rows = {
+        name: np.concatenate([getattr(kept, name)] * len(shifts)) for name in NAMES if name != "means"
+    }
+    return replace(kept, means=means, **rows)
+
+
+def timed(words: list[str]) -> tuple[str, float, int]:
+    """What a command says, its seconds, and the most kB that it held."""
+    code = (
+        "import resource, subprocess, sys; done = subprocess.run(sys.argv[1:]); "
+        "print('kB', resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, file=sys.stderr); "
+        "sys.exit(done.returncode)"
+    )
+    start = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    seconds = time.perf_counter() - start
+    if done.returncode != 0:
+        raise SystemExit(done.stderr)
+    said, _, kilobytes = done.stderr.rpartition("kB ")
+    return said.strip(), seconds, int(kilobytes)
+
+
+def main() -> None:
+    """Write levels, and print tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--copies", type=int, default=8)
+    parser.add_argument("--budgets", default="50000,200000")
+    parser.add_argument("--max-size", type=int, default=800)
+    parser.add_argument("--per-cell", type=int, default=4096)
+    args = parser.parse_args()
+    args.out.mkdir(parents=True)
+    scene = igsr.Splats.load(args.scene)
+    views = load_capture(args.capture, max_size=args.max_size).views
+    views = [views[i] for i in np.linspace(0, len(views) - 1, 4).astype(int)]
+    cameras = [view.camera for view in views]
+    true = [drawn(scene, camera) for camera in cameras]
+
+    print(f"| of {args.scene} | splats | " + " | ".join(f"{times}x" for times in FAR) + " |")
+    print(f"| whole | {len(scene)} | " + " | ".join(scores(scene, cameras, true)) + " |")
+    written = write_levels(args.scene, args.out / "levels", 4, args.per_cell)
+    for level, count in enumerate(written.counts):
+        found = level_within(args.out / "levels" / INDEX, count)
+        print(f"| {level} | {count} | " + " | ".join(scores(found, cameras, true)) + " |", flush=True)
+
+    large = city(scene, args.copies)
+    path, folder = args.out / "city.ply", args.out / "city"
+    large.save(path)
+    write_cameras(args.out / "cameras.json", views)
+    convert = [sys.executable, "-m", "igsr.cli", "convert", str(path), str(folder), "--lod", "5"]
+    _, seconds, kilobytes = timed(convert)
+    disk = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    print(f"\n{len(large)} splats, {path.stat().st_size / 1e6:.0f} MB as .ply, {disk / 1e6:.0f} MB in levels")
+    print(f"convert --lod 5: {seconds:.0f} s, {kilobytes / 1024:.0f} MB")
+    index = json.loads((folder / INDEX).read_text())
+    print(f"levels {index['counts']}, {len(index['filenames'])} files")
+    view = [sys.executable, "-m", "igsr.viewing.window"]
+    for shown, more in [(path, []), *((folder, ["--budget", b]) for b in args.budgets.split(","))]:
+        name = args.out / f"{shown.stem}-{'-'.join(more[1:]) or 'whole'}.png"
+        words = [*view, str(shown), "--screenshot", str(name), "--backend", "cpu", *more]
+        said, seconds, kilobytes = timed(
+            [*words, "--cameras", str(args.out / "cameras.json"), "--camera", "0"]
+        )
+        print(f"{name.name}: {said} {seconds:.1f} s, {kilobytes / 1024:.0f} MB", flush=True)
+
+
+if __name__ == "__main__":
+    main()
