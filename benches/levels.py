@@ -18,11 +18,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 import igsr
 from igsr.blocks.levels import INDEX, write_levels
-from igsr.capture import Camera, load_capture
+from igsr.capture import Camera, View, load_capture
 from igsr.capture.write_cameras import write_cameras
+from igsr.evaluation.metrics import psnr, ssim
 from igsr.viewing.level_files import level_within
 
 #: How many times as far.
@@ -51,16 +53,22 @@ def drawn(splats: igsr.Splats, camera: Camera) -> np.ndarray:
     return np.clip(igsr.render(splats, camera, backend="cpu").color, 0.0, 1.0)
 
 
+def in_bytes(image: np.ndarray) -> np.ndarray:
+    """A picture of uint8."""
+    return np.rint(255.0 * image).astype(np.uint8)
+
+
 def scores(splats: igsr.Splats, cameras: list[Camera], true: list[np.ndarray]) -> list[str]:
     """PSNR in dB and SSIM of each distance."""
     rows = []
     for times in FAR:
-        psnr, ssim = [], []
+        decibels, alike = [], []
         for camera, whole in zip(cameras, true, strict=True):
-            seen, wanted = drawn(splats, smaller(camera, times)), mean_of(whole, times)
-            psnr.append(igsr.evaluation.psnr(seen, wanted))
-            ssim.append(igsr.evaluation.ssim(seen, wanted))
-        rows.append(f"{np.mean(psnr):.1f} / {np.mean(ssim):.3f}")
+            seen = in_bytes(drawn(splats, smaller(camera, times)))
+            wanted = in_bytes(mean_of(whole, times))
+            decibels.append(psnr(seen, wanted))
+            alike.append(ssim(seen, wanted))
+        rows.append(f"{np.mean(decibels):.1f} / {np.mean(alike):.3f}")
     return rows
 
 
@@ -80,6 +88,39 @@ def city(scene: igsr.Splats, copies: int) -> igsr.Splats:
         name: np.concatenate([getattr(kept, name)] * len(shifts)) for name in NAMES if name != "means"
     }
     return replace(kept, means=means, **rows)
+
+
+def over(large: igsr.Splats) -> list[View]:
+    """Two cameras: over the streets of a city, looking across it, and above all of it."""
+    low, high = np.quantile(large.means, [0.02, 0.98], axis=0)
+    side = high - low
+    along = np.argsort(side)[1:]
+    # The wider side lies across the picture.
+    ahead = np.eye(3)[along[0]]
+    up = np.array([0.0, -1.0, 0.0])
+    middle = 0.5 * (low + high)
+    corner = low + 0.1 * side
+    corner[1] = middle[1]
+    across = low + 0.45 * side
+    across[1] = middle[1]
+    far = 0.7 * side.max()
+    return [
+        looking(corner + 0.03 * side.max() * up, across, "street"),
+        looking(middle + far * (up - 0.6 * ahead), middle, "above"),
+    ]
+
+
+def looking(eye: np.ndarray, at: np.ndarray, name: str) -> View:
+    """A view of 960 x 600 pixels from one place to another; y is down."""
+    forward = (at - eye) / np.linalg.norm(at - eye)
+    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    K = np.array([[700.0, 0, 480], [0, 700.0, 300], [0, 0, 1]])
+    blank = np.zeros((600, 960, 3), np.uint8)
+    return View(f"{name}.png", Camera(viewmat, K, 960, 600), "train", blank)
 
 
 def timed(words: list[str]) -> tuple[str, float, int]:
@@ -123,10 +164,12 @@ def main() -> None:
         found = level_within(args.out / "levels" / INDEX, count)
         print(f"| {level} | {count} | " + " | ".join(scores(found, cameras, true)) + " |", flush=True)
 
+    if args.copies == 0:
+        return
     large = city(scene, args.copies)
     path, folder = args.out / "city.ply", args.out / "city"
     large.save(path)
-    write_cameras(args.out / "cameras.json", views)
+    write_cameras(args.out / "cameras.json", over(large))
     convert = [sys.executable, "-m", "igsr.cli", "convert", str(path), str(folder), "--lod", "5"]
     _, seconds, kilobytes = timed(convert)
     disk = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
@@ -136,12 +179,15 @@ def main() -> None:
     print(f"levels {index['counts']}, {len(index['filenames'])} files")
     view = [sys.executable, "-m", "igsr.viewing.window"]
     for shown, more in [(path, []), *((folder, ["--budget", b]) for b in args.budgets.split(","))]:
-        name = args.out / f"{shown.stem}-{'-'.join(more[1:]) or 'whole'}.png"
-        words = [*view, str(shown), "--screenshot", str(name), "--backend", "cpu", *more]
-        said, seconds, kilobytes = timed(
-            [*words, "--cameras", str(args.out / "cameras.json"), "--camera", "0"]
-        )
-        print(f"{name.name}: {said} {seconds:.1f} s, {kilobytes / 1024:.0f} MB", flush=True)
+        for camera, place in enumerate(("street", "above")):
+            name = args.out / f"{place}-{'-'.join(more[1:]) or 'whole'}.png"
+            words = [*view, str(shown), "--screenshot", str(name), "--backend", "cpu", *more]
+            cameras_of = ["--cameras", str(args.out / "cameras.json"), "--camera", str(camera)]
+            said, seconds, kilobytes = timed([*words, *cameras_of])
+            pictures = [np.asarray(Image.open(args.out / f"{place}-whole.png")), np.asarray(Image.open(name))]
+            score = f"{psnr(*pictures):.1f} dB, SSIM {ssim(*pictures):.3f}"
+            memory = f"{kilobytes / 1024:.0f} MB"
+            print(f"{name.stem}: {score}, {seconds:.1f} s, {memory}. {said}", flush=True)
 
 
 if __name__ == "__main__":

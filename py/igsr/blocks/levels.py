@@ -13,7 +13,7 @@ from igsr.errors import IgsrError
 #: The file that lists cells and levels, in PlayCanvas's layout of streamed SOG.
 INDEX = "lod-meta.json"
 #: Most splats that a cell of the finest level has, about.
-PER_CELL = 65_536
+PER_CELL = 16_384
 
 
 @dataclass(frozen=True)
