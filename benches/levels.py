@@ -1,10 +1,12 @@
-"""Levels of detail of a scene and of a city made of copies of it: how near they are to the whole, and what a
-budget draws and holds.
+"""Levels of detail of a scene, and of a city made of copies of it.
+
+How near levels are to the whole, and what a budget draws and holds:
 
     python benches/levels.py SCENE CAPTURE --out DIR [--copies 8] [--budgets 50000,200000]
 
-Each level is compared with the scene in pictures of the capture's cameras, from as near as they are and from
-2 to 16 times as far: smaller pictures, whose truth is the mean of the whole scene's pixels.
+Each level is compared with the scene in pictures of the capture's cameras, from as near as they
+are and from 2 to 16 times as far: smaller pictures, whose truth is the mean of the whole scene's
+pixels. The city leaves out sky and haze, which would be there once for each copy.
 """
 
 from __future__ import annotations
@@ -73,7 +75,7 @@ def scores(splats: igsr.Splats, cameras: list[Camera], true: list[np.ndarray]) -
 
 
 def city(scene: igsr.Splats, copies: int) -> igsr.Splats:
-    """Copies of a scene side by side on the plane that it spreads along, without its sky and haze."""
+    """Copies of a scene side by side on the plane that it spreads along."""
     middle = np.median(scene.means, axis=0)
     side = np.quantile(np.abs(scene.means - middle), 0.95, axis=0)
     along = np.argsort(side)[1:]
@@ -84,10 +86,8 @@ def city(scene: igsr.Splats, copies: int) -> igsr.Splats:
     grid = np.stack(np.meshgrid(*[np.arange(copies) - copies // 2] * 2), axis=-1).reshape(-1, 2)
     shifts[:, along] = 2.0 * grid * side[along]
     means = (kept.means + shifts[:, None, :]).reshape(-1, 3).astype(np.float32)
-    rows = {
-        name: np.concatenate([getattr(kept, name)] * len(shifts)) for name in NAMES if name != "means"
-    }
-    return replace(kept, means=means, **rows)
+    copied = {name: np.concatenate([getattr(kept, name)] * len(shifts)) for name in NAMES}
+    return replace(kept, **{**copied, "means": means})
 
 
 def over(large: igsr.Splats) -> list[View]:
@@ -162,7 +162,8 @@ def main() -> None:
     written = write_levels(args.scene, args.out / "levels", 4, args.per_cell)
     for level, count in enumerate(written.counts):
         found = level_within(args.out / "levels" / INDEX, count)
-        print(f"| {level} | {count} | " + " | ".join(scores(found, cameras, true)) + " |", flush=True)
+        row = " | ".join(scores(found, cameras, true))
+        print(f"| {level} | {count} | {row} |", flush=True)
 
     if args.copies == 0:
         return
@@ -173,7 +174,8 @@ def main() -> None:
     convert = [sys.executable, "-m", "igsr.cli", "convert", str(path), str(folder), "--lod", "5"]
     _, seconds, kilobytes = timed(convert)
     disk = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    print(f"\n{len(large)} splats, {path.stat().st_size / 1e6:.0f} MB as .ply, {disk / 1e6:.0f} MB in levels")
+    sizes = f"{path.stat().st_size / 1e6:.0f} MB as .ply, {disk / 1e6:.0f} MB in levels"
+    print(f"\n{len(large)} splats, {sizes}")
     print(f"convert --lod 5: {seconds:.0f} s, {kilobytes / 1024:.0f} MB")
     index = json.loads((folder / INDEX).read_text())
     print(f"levels {index['counts']}, {len(index['filenames'])} files")
@@ -184,7 +186,10 @@ def main() -> None:
             words = [*view, str(shown), "--screenshot", str(name), "--backend", "cpu", *more]
             cameras_of = ["--cameras", str(args.out / "cameras.json"), "--camera", str(camera)]
             said, seconds, kilobytes = timed([*words, *cameras_of])
-            pictures = [np.asarray(Image.open(args.out / f"{place}-whole.png")), np.asarray(Image.open(name))]
+            pictures = [
+                np.asarray(Image.open(args.out / f"{place}-whole.png")),
+                np.asarray(Image.open(name)),
+            ]
             score = f"{psnr(*pictures):.1f} dB, SSIM {ssim(*pictures):.3f}"
             memory = f"{kilobytes / 1024:.0f} MB"
             print(f"{name.stem}: {score}, {seconds:.1f} s, {memory}. {said}", flush=True)

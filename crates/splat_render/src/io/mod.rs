@@ -45,6 +45,9 @@ use crate::error::Result;
 use bytes::Named;
 use ply_header::Header;
 
+/// The index of a scene in levels of detail, which no one file holds.
+const STREAMED: &str = "lod-meta.json";
+
 /// Reads a file of any format in [`Format`]. The format is detected from the content or, where that
 /// has no signature, from the ending. A file named `meta.json` is that of a SOG in a folder.
 ///
@@ -55,6 +58,12 @@ pub fn read_splats(path: &Path) -> Result<Loaded> {
     let named = Named(path);
     if path.file_name().is_some_and(|name| name == sog::META) {
         return sog::parse_folder(&named);
+    }
+    if path.file_name().is_some_and(|name| name == STREAMED) {
+        return Err(named.bad(
+            "is a scene in levels of detail; look at it with splat-view or igsr view, or give the \
+             meta.json of one of its folders",
+        ));
     }
     let file = open_file(path)?;
     let unreadable = |e| named.bad(format!("cannot be read ({e})"));
