@@ -9,8 +9,9 @@ use splat_render::{Camera, Error, Result};
 
 /// Most splats that are held, unless the command line says otherwise.
 pub const BUDGET: usize = 1_000_000;
-/// Splats nearer to each other than this, in pixels, are fine enough.
-const FINE: f64 = 1.0;
+/// Splats nearer to each other than this, in pixels, are fine enough: finer ones would look worse, as each
+/// covers a part of a pixel and is drawn as large as one.
+const FINE: f64 = 1.5;
 
 /// Whether a path is that of a scene in levels of detail.
 pub fn is_in_levels(path: &Path) -> bool {

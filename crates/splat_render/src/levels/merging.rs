@@ -62,28 +62,16 @@ impl Ord for Cost {
 /// Two neighbours, and their versions when their merging had that cost.
 type Pair = (Reverse<(Cost, u32)>, u32, [u32; 2]);
 
-/// Levels of the splats, which lie in Morton's order and are finite, one for each of the rising costs:
-/// all is merged that costs no more. A level has at least a `most`th of the splats of the last one.
-pub fn merged(splats: &SplatArrays, costs: &[f64], most: usize) -> Vec<Merged> {
+/// Levels of the splats, which lie in Morton's order and are finite, one for each of the falling counts.
+pub fn merged(splats: &SplatArrays, counts: &[usize]) -> Vec<Merged> {
     let mut merging = Merging::new(splats);
-    costs
+    counts
         .iter()
-        .map(|&cost| {
-            merging.reduce(cost, merging.left.div_ceil(most).max(1));
+        .map(|&count| {
+            while merging.left > count.max(1) && merging.step() {}
             merging.level(splats)
         })
         .collect()
-}
-
-/// What it costs to merge the splats into one, merging by merging: each the highest cost so far.
-pub fn costs(splats: &SplatArrays) -> Vec<f64> {
-    let mut merging = Merging::new(splats);
-    let (mut highest, mut out) = (0.0f64, Vec::with_capacity(splats.len()));
-    while let Some(cost) = merging.step(f64::INFINITY) {
-        highest = highest.max(cost);
-        out.push(highest);
-    }
-    out
 }
 
 struct Merging {
@@ -152,30 +140,20 @@ impl Merging {
         self.pairs.push((Reverse((Cost(cost), i)), one.after, [one.version, other.version]));
     }
 
-    /// Merges what costs no more than this, until so many are left.
-    fn reduce(&mut self, cost: f64, least: usize) {
-        while self.left > least && self.step(cost).is_some() {}
-    }
-
-    /// Merges the two that cost least, if it is no more than this; their cost.
-    fn step(&mut self, most: f64) -> Option<f64> {
-        loop {
-            let (Reverse((Cost(cost), i)), j, versions) = self.pairs.pop()?;
+    /// Merges the two that cost least; false if there are none.
+    fn step(&mut self) -> bool {
+        while let Some((Reverse((_, i)), j, versions)) = self.pairs.pop() {
             let (one, other) = (self.clusters[i as usize], self.clusters[j as usize]);
             let is_current = one.members > 0
                 && other.members > 0
                 && one.after == j
                 && [one.version, other.version] == versions;
-            if !is_current {
-                continue;
+            if is_current {
+                self.merge(i, j);
+                return true;
             }
-            if cost > most {
-                self.pairs.push((Reverse((Cost(cost), i)), j, versions));
-                return None;
-            }
-            self.merge(i, j);
-            return Some(cost);
         }
+        false
     }
 
     fn merge(&mut self, i: u32, j: u32) {

@@ -1,9 +1,8 @@
 //! Writes a scene in levels of detail, in memory that does not grow with it.
 //!
 //! The file is read twice. First, every so manieth position says where space is split into cells. Then
-//! each splat goes to a file of its cell. The cells are merged twice, one after the other: first to learn
-//! at what cost a level of the whole scene has a quarter of the splats of the next finer one, then down to
-//! that cost in each. Of a level, cells that follow each other share a SOG until it is as large as a cell.
+//! each splat goes to a file of its cell, and the cells are merged one after the other. Of a level, cells
+//! that follow each other share a SOG until it is as large as a cell.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
@@ -14,15 +13,13 @@ use rayon::prelude::*;
 
 use super::cells::Cells;
 use super::manifest::{Cell, INDEX, Manifest, Run, written};
-use super::merging::{costs, merged};
+use super::merging::merged;
 use crate::error::{Error, Result};
 use crate::io::{SOG_META, SplatRows, cut_degree, is_drawn, morton_order, write_sog_folder};
 use crate::splats::SplatArrays;
 
 /// Splats of a level by those of the next finer one.
 const QUARTER: usize = 4;
-/// In a cell a level has at least such a part of the next finer one.
-const LEAST_PART: usize = 16;
 /// Positions that tell where to split space.
 const SAMPLES: usize = 1 << 20;
 /// Splats that are read at once, and that wait to be written to their cells' files.
@@ -99,15 +96,10 @@ pub fn write_levels(
     };
     let mut cells = Vec::with_capacity(tree.count);
     let numbers: Vec<usize> = (0..tree.count).collect();
-    let costs = levels_at(&spool, &numbers, levels)?;
     for some in numbers.chunks(rayon::current_num_threads().max(1)) {
         let made: Vec<Option<Made>> = some
             .par_iter()
-            .map(|&cell| {
-                let splats = spool.read(cell)?;
-                spool.remove(cell)?;
-                Ok(splats.map(|splats| Made::new(&splats, &costs)))
-            })
+            .map(|&cell| Ok(spool.take(cell)?.map(|splats| Made::new(&splats, levels))))
             .collect::<Result<_>>()?;
         for made in made {
             cells.push(made.map(|made| out.add(made)).transpose()?);
@@ -139,39 +131,6 @@ pub fn write_levels(
         files: manifest.files.len(),
         notes,
     })
-}
-
-/// The cost that each level but the finest is merged to.
-fn levels_at(spool: &Spool, cells: &[usize], levels: usize) -> Result<Vec<f64>> {
-    // By the upper bits of a cost that is not negative: its exponent, and 32 steps within each.
-    let bin = |cost: f64| (cost.to_bits() >> 47) as usize;
-    let mut merges = vec![0usize; bin(f64::INFINITY) + 1];
-    let mut count = 0;
-    for some in cells.chunks(rayon::current_num_threads().max(1)) {
-        let of = |&cell: &usize| -> Result<Vec<f64>> {
-            Ok(spool.read(cell)?.map_or_else(Vec::new, |splats| {
-                let mut all = costs(&splats.select(&morton_order(&splats.means)));
-                // The splat that is left.
-                all.push(f64::INFINITY);
-                all
-            }))
-        };
-        for costs in some.par_iter().map(of).collect::<Result<Vec<_>>>()? {
-            count += costs.len();
-            costs.iter().for_each(|&cost| merges[bin(cost)] += 1);
-        }
-    }
-    let mut out = Vec::new();
-    let (mut at, mut done) = (0, 0);
-    for level in 1..levels {
-        let wanted = count - count.div_ceil(QUARTER.pow(level as u32));
-        while done < wanted && at + 1 < merges.len() {
-            done += merges[at];
-            at += 1;
-        }
-        out.push(f64::from_bits((at as u64) << 47));
-    }
-    Ok(out)
 }
 
 fn unwritable(path: &Path, why: &dyn std::fmt::Display) -> Error {
@@ -241,8 +200,8 @@ impl Spool {
         Ok(())
     }
 
-    /// A cell's splats; None if it has none.
-    fn read(&self, cell: usize) -> Result<Option<SplatArrays>> {
+    /// A cell's splats, whose file goes; None if it has none.
+    fn take(&self, cell: usize) -> Result<Option<SplatArrays>> {
         let path = self.path(cell);
         if !path.is_file() {
             return Ok(None);
@@ -250,6 +209,7 @@ impl Spool {
         let unreadable = |e| Error::file(&path, format!("cannot be read ({e})"));
         let mut bytes = Vec::new();
         File::open(&path).and_then(|mut f| f.read_to_end(&mut bytes)).map_err(unreadable)?;
+        std::fs::remove_file(&path).map_err(unreadable)?;
         let stride = crate::sh::coeffs(self.degree);
         let each = 11 + 3 * stride;
         let mut splats = SplatArrays::zeros(bytes.len() / (4 * each), self.degree);
@@ -264,15 +224,6 @@ impl Spool {
             }
         }
         Ok(Some(splats))
-    }
-
-    /// Removes a cell's splats from the disk.
-    fn remove(&self, cell: usize) -> Result<()> {
-        let path = self.path(cell);
-        match std::fs::remove_file(&path) {
-            Err(error) if path.exists() => Err(unwritable(&path, &error)),
-            _ => Ok(()),
-        }
     }
 }
 
@@ -292,10 +243,12 @@ struct Made {
 }
 
 impl Made {
-    fn new(splats: &SplatArrays, costs: &[f64]) -> Self {
+    fn new(splats: &SplatArrays, levels: usize) -> Self {
         let finest = splats.select(&morton_order(&splats.means));
+        let counts: Vec<usize> =
+            (1..levels).map(|level| finest.len().div_ceil(QUARTER.pow(level as u32))).collect();
         let (mut all, mut errors) = (Vec::new(), vec![0.0]);
-        for level in merged(&finest, costs, LEAST_PART) {
+        for level in merged(&finest, &counts) {
             errors.push(level.moved);
             all.push(level.splats);
         }
