@@ -198,6 +198,6 @@ def test_scenes_without_levels_are_refused(wall, tmp_path):
         splats.save(tmp_path / "scene.ply")
         with pytest.raises(igsr.IgsrError, match=message):
             write_levels(tmp_path / "scene.ply", tmp_path / "out", 2, per_cell)
-    with pytest.raises(igsr.IgsrError, match=r"none.ply cannot be"):
+    with pytest.raises(igsr.IgsrError, match=r"none.ply: cannot be opened"):
         write_levels(tmp_path / "none.ply", tmp_path / "out", 2)
     assert not (tmp_path / "out").exists()

@@ -6,7 +6,7 @@ use std::collections::BinaryHeap;
 
 use glam::DVec3;
 
-use super::manifest::{Cell, Manifest};
+use super::manifest::{Cell, Manifest, face};
 use crate::camera::Camera;
 
 /// Cells out of the picture may take this part of the budget, coarse, so that a turn shows something.
@@ -142,13 +142,6 @@ fn count(cell: &Cell, level: usize) -> usize {
 fn held(cell: &Cell, level: usize) -> usize {
     let coarsest = cell.runs.iter().rposition(Option::is_some).filter(|&c| c != level);
     count(cell, level) + coarsest.map_or(0, |c| count(cell, c))
-}
-
-/// Area of the largest face of a box.
-pub fn face(low: &[f64; 3], high: &[f64; 3]) -> f64 {
-    let mut sides: [f64; 3] = std::array::from_fn(|k| high[k] - low[k]);
-    sides.sort_by(f64::total_cmp);
-    sides[1] * sides[2]
 }
 
 /// Whether a part of a cell may be in the picture.

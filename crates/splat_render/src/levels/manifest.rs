@@ -198,12 +198,19 @@ fn leaf(
 /// finest.
 fn spacings(low: &[f64; 3], high: &[f64; 3], runs: &[Option<Run>]) -> Vec<f64> {
     let finest = runs.iter().position(Option::is_some);
-    let face = super::choice::face(low, high);
+    let face = face(low, high);
     let spacing = |(level, run): (usize, &Option<Run>)| match run {
         Some(run) if Some(level) != finest => (face / run.count as f64).sqrt(),
         _ => 0.0,
     };
     runs.iter().enumerate().map(spacing).collect()
+}
+
+/// Area of the largest face of a box.
+pub fn face(low: &[f64; 3], high: &[f64; 3]) -> f64 {
+    let mut sides: [f64; 3] = std::array::from_fn(|k| high[k] - low[k]);
+    sides.sort_by(f64::total_cmp);
+    sides[1] * sides[2]
 }
 
 /// Refuses runs that share splats: a file would be counted twice.
