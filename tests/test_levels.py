@@ -13,9 +13,12 @@ import scenes
 
 import igsr
 from igsr.blocks.levels import write_levels
-from igsr.blocks.merging import merged
 from igsr.capture import Camera
 from igsr.capture.types import intrinsic_matrix
+from igsr.viewing.found_models import check_shown, found_models
+from igsr.viewing.level_files import level_within
+
+NAMES = ("means", "quats", "scales", "opacities", "sh")
 
 
 @pytest.fixture(scope="module")
@@ -32,62 +35,130 @@ def wall():
     return igsr.Splats(means, quats, scales, opacities, sh, origin=np.array([5.0, 0.0, -2.0]))
 
 
-def seen(splats, size=64):
+@pytest.fixture(scope="module")
+def levels(wall, tmp_path_factory):
+    """The wall at four levels, in cells of about 700."""
+    folder = tmp_path_factory.mktemp("levels")
+    wall.save(folder / "scene.ply")
+    return folder / "out", write_levels(folder / "scene.ply", folder / "out", 4, per_cell=700)
+
+
+def seen(splats, size=64, finer=1):
+    """The wall; with ``finer``, each pixel is the mean of that many squared."""
+    size *= finer
     viewmat = np.eye(4)
     viewmat[:3, 3] = [0.0, 0.0, 4.0] - splats.origin
     K = intrinsic_matrix(0.9 * size, 0.9 * size, size / 2, size / 2)
-    return igsr.render(splats, Camera(viewmat, K, size, size), backend="cpu").color
+    color = igsr.render(splats, Camera(viewmat, K, size, size), backend="cpu").color
+    return color.reshape(size // finer, finer, size // finer, finer, 3).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize("part", [0.5, 0.25, 0.06])
-def test_fewer_splats_look_alike(wall, part):
-    count = round(part * len(wall))
-    fewer = merged(wall, count)
-    assert 0.5 * count <= len(fewer) <= count
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_fewer_splats_look_alike(wall, levels, level):
+    out, written = levels
+    assert written.counts[0] == len(wall)
+    assert 0.2 < written.counts[level] / written.counts[level - 1] < 0.3
+    fewer = level_within(out / "lod-meta.json", written.counts[level])
+    assert len(fewer) == written.counts[level]
     assert np.array_equal(fewer.origin, wall.origin)
-    size = round(64 * part**0.5)  # as much further away as there are fewer
-    error = np.sqrt(np.mean((seen(fewer, size) - seen(wall, size)) ** 2))
-    assert error < 0.075, "it looks otherwise"
+    size = 64 // 2**level  # as much further away as there are fewer
+    true = seen(wall, size, finer=2**level)
+    error = np.sqrt(np.mean((seen(fewer, size) - true) ** 2))
+    assert error < 0.08, "it looks otherwise"
     # Leaving splats out instead looks worse.
-    every = np.arange(len(wall)) % round(1 / part) == 0
-    names = ("means", "quats", "scales", "opacities", "sh")
-    left_out = replace(wall, **{name: getattr(wall, name)[every] for name in names})
-    assert error < 0.7 * np.sqrt(np.mean((seen(left_out, size) - seen(wall, size)) ** 2))
+    every = np.arange(len(wall)) % 4**level == 0
+    left_out = replace(wall, **{name: getattr(wall, name)[every] for name in NAMES})
+    assert error < 0.8 * np.sqrt(np.mean((seen(left_out, size) - true) ** 2))
 
 
-def test_one_turned_splat_stays_as_it_is(wall):
+def test_one_turned_splat_stays_as_it_is(wall, tmp_path):
     """Two at one place: their spread, turned as it is, is that of the one that they become."""
     quats = np.array([[0.8, 0.2, -0.5, 0.3]] * 2, np.float32)
-    names = ("means", "scales", "opacities", "sh")
-    two = replace(wall, quats=quats, **{name: getattr(wall, name)[[0, 0]] for name in names})
+    two = replace(wall, quats=quats, **{n: getattr(wall, n)[[0, 0]] for n in NAMES if n != "quats"})
     scales = np.log(np.array([[0.5, 0.2, 0.05]] * 2, np.float32))
     two = replace(two, scales=scales, opacities=np.full(2, -1.0, np.float32))
-    one = merged(two, 1)
-    assert len(one) == 1
-    single = replace(two, **{n: getattr(two, n)[:1] for n in ("quats", *names)})
+    two.save(tmp_path / "two.ply")
+    written = write_levels(tmp_path / "two.ply", tmp_path / "out", 2)
+    assert written.counts == [2, 1]
+    one = level_within(tmp_path / "out/lod-meta.json", 1)
+    # Twice as opaque as one of the two, and not more.
+    assert 1 / (1 + np.exp(-one.opacities[0])) == pytest.approx(2 / (1 + np.e), abs=0.01)
+    single = replace(two, **{name: getattr(two, name)[:1] for name in NAMES})
     single = replace(single, opacities=one.opacities)
-    assert seen(one) == pytest.approx(seen(single), abs=1e-4)
+    assert seen(one) == pytest.approx(seen(single), abs=0.02)
 
 
-def test_levels_hold_all_splats_from_coarse_to_fine(wall, tmp_path):
-    out = tmp_path / "levels"
-    index = write_levels(wall, out, 3, cells=5)
-    assert json.loads((out / "lod.json").read_text()) == index
-    counts = [level["splats"] for level in index["levels"]]
-    assert counts[2] == len(wall)
-    assert counts[0] < counts[1] < counts[2]
-    assert [len(level["cells"]) for level in index["levels"]] == [1, 1, 5]
-    for level in index["levels"]:
-        loaded = [igsr.Splats.load(out / cell["file"]) for cell in level["cells"]]
-        assert sum(map(len, loaded)) == level["splats"]
-        for cell, part in zip(level["cells"], loaded, strict=True):
-            low, high = part.bounds()
-            assert low == pytest.approx(cell["low"], abs=1e-4)
-            assert high == pytest.approx(cell["high"], abs=1e-4)
-    world = np.concatenate([part.means + part.origin for part in loaded])
-    assert np.sort(world, axis=0) == pytest.approx(
-        np.sort(wall.means + wall.origin, axis=0), abs=1e-5
-    )
+def test_what_is_darker_than_black_is_black_in_a_mean(wall, tmp_path):
+    """It is drawn black: merged with a white one it is grey, not black."""
+    two = replace(wall, **{name: getattr(wall, name)[[0, 0]] for name in NAMES})
+    sh = np.zeros((2, 1, 3), np.float32)
+    sh[0], sh[1] = 0.5 / 0.28209479, -40.0
+    replace(two, sh=sh).save(tmp_path / "two.ply")
+    write_levels(tmp_path / "two.ply", tmp_path / "out", 2)
+    one = level_within(tmp_path / "out/lod-meta.json", 1)
+    assert 0.5 + 0.28209479 * one.sh[0, 0] == pytest.approx(0.5, abs=0.01)
+
+
+def test_chunks_are_sog_as_another_decoder_reads_it(levels):
+    """Positions of a chunk, decoded in numpy by the published formulas, lie in its cells' boxes."""
+    from PIL import Image
+
+    out, _ = levels
+    index = json.loads((out / "lod-meta.json").read_text())
+    leaves, nodes = [], [index["tree"]]
+    while nodes:
+        node = nodes.pop()
+        nodes += node.get("children", [])
+        leaves += [node] if "lods" in node else []
+    assert len(leaves) == 4
+    checked = 0
+    for leaf in leaves:
+        for run in leaf["lods"].values():
+            path = out / index["filenames"][run["file"]]
+            means = json.loads(path.read_text())["means"]
+            low, high = (np.asarray(Image.open(path.parent / f))[..., :3] for f in means["files"])
+            place = (low.astype(float) + 256.0 * high).reshape(-1, 3) / 65535.0
+            at = np.array(means["mins"]) + place * np.subtract(means["maxs"], means["mins"])
+            at = np.sign(at) * np.expm1(np.abs(at))
+            at = at[run["offset"] : run["offset"] + run["count"]]
+            assert (at >= np.array(leaf["bound"]["min"]) - 1e-3).all()
+            assert (at <= np.array(leaf["bound"]["max"]) + 1e-3).all()
+            checked += len(at)
+    assert checked == index["count"]
+
+
+def test_the_page_shows_the_finest_level_that_it_holds(levels, monkeypatch):
+    out, written = levels
+    check_shown(out)
+    (found,) = found_models(out)
+    assert (found.path.name, found.label) == ("lod-meta.json", "out")
+    assert len(found.load()) == written.counts[0]
+    (alone,) = found_models(out / "lod-meta.json")
+    assert alone.load() == found.load()
+    coarse = level_within(out / "lod-meta.json", written.counts[0] - 1)
+    assert len(coarse) == written.counts[1]
+    with pytest.raises(igsr.IgsrError, match="more levels"):
+        level_within(out / "lod-meta.json", 3)
+
+
+def test_a_chunk_is_a_splat_file_of_its_own(levels):
+    out, _ = levels
+    name = json.loads((out / "lod-meta.json").read_text())["filenames"][0]
+    chunk = igsr.Splats.load(out / name)
+    assert 300 < len(chunk) <= 700
+    assert chunk.sh_degree == 1
+    with pytest.raises(igsr.IgsrError, match="levels of detail; look at it with"):
+        igsr.Splats.load(out / "lod-meta.json")
+
+
+@pytest.mark.parametrize("ending", ["spz", "compressed.ply", "sog"])
+def test_other_formats_have_levels_too(wall, tmp_path, ending):
+    wall.save(tmp_path / f"scene.{ending}")
+    written = write_levels(tmp_path / f"scene.{ending}", tmp_path / "out", 2, per_cell=700)
+    assert written.counts[0] == len(wall)
+    found = level_within(tmp_path / "out/lod-meta.json", len(wall))
+    world = igsr.Splats.load(tmp_path / f"scene.{ending}").bounds()
+    assert np.allclose(found.bounds(), world, atol=1e-3)
 
 
 def test_the_command_writes_levels_and_says_what_it_cannot(tmp_path):
@@ -99,24 +170,34 @@ def test_the_command_writes_levels_and_says_what_it_cannot(tmp_path):
 
     done = run(str(tmp_path / "out"), "--lod", "2")
     assert done.returncode == 0, done.stderr
-    assert "level 1: 50 splats in 1 cells" in done.stdout
+    assert "level 0: 50 splats" in done.stdout
+    assert (tmp_path / "out/lod-meta.json").is_file()
     again = run(str(tmp_path / "out"), "--lod", "2")
     assert again.returncode != 0
     assert "holds something already" in " ".join(again.stderr.split())
-    assert "from 1 to 8" in " ".join(run(str(tmp_path / "other"), "--lod", "9").stderr.split())
-    assert not (tmp_path / "other").exists()
+    for wrong in ("9", "0", "-1"):
+        refused = run(str(tmp_path / "other"), "--lod", wrong)
+        assert "from 1 to 8" in " ".join(refused.stderr.split())
+    told = json.loads(run(str(tmp_path / "json"), "--lod", "1", "--json").stdout)
+    assert told["counts"] == [50]
+    (tmp_path / "scene.ply").write_bytes(b"ply\n")
+    broken = run(str(tmp_path / "other"), "--lod", "2")
+    assert broken.returncode != 0
+    assert "Traceback" not in broken.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["json", "out", "scene.ply"]
 
 
 def test_scenes_without_levels_are_refused(wall, tmp_path):
-    names = ("means", "quats", "scales", "opacities", "sh")
-    none = replace(wall, **{name: getattr(wall, name)[:0] for name in names})
+    none = replace(wall, **{name: getattr(wall, name)[:0] for name in NAMES})
     lost = replace(wall, means=np.full_like(wall.means, np.nan))
-    for splats, cells, message in (
-        (none, None, "no splats"),
-        (lost, None, "no finite splats"),
-        (wall, 0, "cells must be from 1"),
+    for splats, per_cell, message in (
+        (none, 100, "no finite splats"),
+        (lost, 100, "no finite splats"),
+        (wall, 0, "per_cell must be at least 1"),
     ):
+        splats.save(tmp_path / "scene.ply")
         with pytest.raises(igsr.IgsrError, match=message):
-            write_levels(splats, tmp_path / "out", 2, cells)
-    with pytest.raises(igsr.IgsrError, match="at least one splat"):
-        merged(wall, 0)
+            write_levels(tmp_path / "scene.ply", tmp_path / "out", 2, per_cell)
+    with pytest.raises(igsr.IgsrError, match=r"none.ply: cannot be opened"):
+        write_levels(tmp_path / "none.ply", tmp_path / "out", 2)
+    assert not (tmp_path / "out").exists()

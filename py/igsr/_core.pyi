@@ -345,6 +345,20 @@ def write_splats(path: str, splats: dict[str, Any]) -> list[str]:
     cannot be written.
     """
 
+def write_levels(source: str, folder: str, levels: int, per_cell: int) -> dict[str, Any]:
+    """Write a splat file in levels of detail into an empty folder, in bounded memory.
+
+    Returns counts (splats of each level, 0 the finest), cells, files (numbers) and notes. Raises
+    ValueError for a number that cannot be used, and OSError where a file cannot be read or written.
+    """
+
+def read_level(path: str, most: int) -> dict[str, Any]:
+    """Read the finest level of a ``lod-meta.json`` that has at most so many splats.
+
+    Returns ``SplatArrays``, antialiased (bool) and level (its number). Raises OSError where a file
+    cannot be read, or the coarsest level has more.
+    """
+
 def morton_order(points: Float32) -> npt.NDArray[np.int64]:
     """Ids of points [N, 3] along Morton's curve, as the writers order splats."""
 

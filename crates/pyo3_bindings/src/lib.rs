@@ -15,6 +15,7 @@ mod exr_files;
 mod fit_settings;
 mod fit_state;
 mod fitter;
+mod level_files;
 mod photos;
 mod plane_sweep;
 mod splat_arrays;
@@ -60,6 +61,8 @@ mod _core {
     use crate::fit_settings::reduction;
     #[pymodule_export]
     use crate::fitter::{Fitter, splats_from_points};
+    #[pymodule_export]
+    use crate::level_files::{read_level, write_levels};
     #[pymodule_export]
     use crate::plane_sweep::plane_sweep;
     #[pymodule_export]

@@ -17,7 +17,8 @@
 //! | adam | gradients of the splats | splats after one optimiser step |
 //!
 //! [`fit`] runs them in a loop on a [`fit::FitDevice`], which keeps splats and photos where its kernels
-//! run. [`gpu_check`] opens a GPU that is known to compute right. [`io`] reads and writes files of splats and pictures.
+//! run. [`gpu_check`] opens a GPU that is known to compute right. [`io`] reads and writes files of splats and pictures,
+//! and [`levels`] scenes in levels of detail.
 //!
 //! Frames: the world is the scene's own, less an f64 origin that its files keep; cameras are OpenCV's
 //! (x right, y down, z forward), pixel centres at +0.5. Errors are [`Error`].
@@ -31,6 +32,7 @@ pub mod fit_device;
 pub mod gpu;
 pub mod gpu_check;
 pub mod io;
+pub mod levels;
 mod morton;
 pub mod reference;
 pub mod sh;

@@ -15,7 +15,7 @@ const LAYERS: [&[&str]; 7] = [
     &["stages"],
     &["fit_device"],
     &["reference", "cpu", "gpu", "io"],
-    &["fit", "gpu_check"],
+    &["fit", "gpu_check", "levels"],
 ];
 
 /// Names of a path, `crate` left out.

@@ -16,7 +16,8 @@ splat-view [OPTIONS] SCENE [SCENE...]
 
 SCENE is a splat file (.ply, .compressed.ply, .splat, .ksplat, .spz, .sog, .glb, .gltf) or the folder
 of an igsr fit or igsr refine. A folder is watched: new and changed models appear. Two scenes are
-compared side by side.
+compared side by side. A folder with a lod-meta.json, by igsr convert --lod or of other programs, is a
+scene in levels of detail: what the camera is near is drawn fine, the rest coarse.
 
 Pictures without a window:
   --screenshot FILE    draw one picture: .png, or .exr with alpha and depth
@@ -28,6 +29,9 @@ Pictures without a window:
 In the window and for --time:
   --draw NAME          rasterize: as --screenshot does; blend: by the GPU's blending unit;
                        auto (default): rasterize on software GPUs, else blend
+
+Levels of detail:
+  --budget N           most splats of a scene that are in memory and drawn; default 1000000
 
 View:
   --cameras PATH       cameras.json of igsr, or a folder with one; default: that of the fit which
@@ -71,6 +75,8 @@ pub struct Arguments {
     pub drawing: Drawing,
     /// File or folder of the capture's cameras.
     pub cameras: Option<PathBuf>,
+    /// Most splats of a scene in levels of detail.
+    pub budget: Option<usize>,
     /// Number of the camera to start at.
     pub camera: Option<usize>,
     /// Degrees about the scene's centre, or a number of pictures.
@@ -111,6 +117,7 @@ impl Arguments {
             backend: Backend::Auto,
             drawing: Drawing::Auto,
             cameras: None,
+            budget: None,
             camera: None,
             orbit: None,
             up: None,
@@ -145,6 +152,9 @@ impl Arguments {
                 "size" => out.size = Some(size(&value()?)?),
                 "backend" => out.backend = backend(&value()?)?,
                 "draw" => out.drawing = drawing(&value()?)?,
+                "budget" => {
+                    out.budget = Some(number("--budget", &value()?, 1.0, 1e9, true)? as usize);
+                }
                 "camera" => {
                     out.camera = Some(number("--camera", &value()?, 0.0, 1e9, true)? as usize);
                 }

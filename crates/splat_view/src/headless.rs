@@ -7,9 +7,11 @@ use std::time::Instant;
 use splat_render::cpu::Cpu;
 use splat_render::gpu::Gpu;
 use splat_render::gpu_check::open_tested;
+use splat_render::io::SplatFile;
 use splat_render::{Camera, Error, Image, ProjectOptions, Projected, Result, Stages};
 
 use crate::arguments::{Arguments, Backend};
+use crate::detail::view;
 use crate::display::Settings;
 use crate::model::Model;
 use crate::painter::{Painter, Shot, check_size};
@@ -17,6 +19,7 @@ use crate::picture_files::{to_bytes, write_exr, write_png};
 use crate::scene_view::{background, cameras_of, first_camera, first_view, near, up};
 use crate::sources::find_sources;
 use crate::stage_times::STAGES;
+use crate::start::no_levels;
 use crate::viewpoint::{Viewpoint, fitted, relative_to};
 
 /// Default size of pictures.
@@ -24,6 +27,7 @@ const SIZE: [u32; 2] = [1280, 720];
 
 /// What the pictures are of.
 struct Scene {
+    /// Its splats are those for the camera of the last picture, where it is in levels of detail.
     model: Model,
     camera: Camera,
     viewpoint: Viewpoint,
@@ -33,8 +37,9 @@ struct Scene {
 
 /// Does what the command line asks for without a window.
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let scene = Scene::new(arguments)?;
+    let mut scene = Scene::new(arguments)?;
     if let Some(frames) = arguments.time {
+        scene.look(&scene.camera.clone())?;
         return time(&scene, frames);
     }
     let stages = stages(arguments.backend)?;
@@ -43,6 +48,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         if let Some(degrees) = arguments.orbit {
             camera = scene.turned(degrees);
         }
+        scene.look(&camera)?;
         let image = scene.draw(&*stages, &camera)?;
         return write(path, &image);
     }
@@ -51,6 +57,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let count = arguments.orbit.unwrap_or(1.0) as u32;
         for i in 0..count {
             let camera = scene.turned(360.0 * f64::from(i) / f64::from(count));
+            scene.look(&camera)?;
             let image = scene.draw(&*stages, &camera)?;
             write(&folder.join(format!("{i:04}.png")), &image)?;
         }
@@ -90,7 +97,10 @@ impl Scene {
     fn new(arguments: &Arguments) -> Result<Self> {
         let path = &arguments.scenes[0];
         let source = find_sources(path)?.remove(0);
-        let model = Model::read(&source.path)?;
+        let model = Model::read(&source.path, arguments.budget)?;
+        if arguments.budget.is_some() && model.detail.is_none() {
+            return Err(no_levels());
+        }
         let (cameras, note) = cameras_of(arguments.cameras.as_deref(), Some(path))?;
         for note in model.notes.iter().chain(&note) {
             eprintln!("{note}");
@@ -114,6 +124,27 @@ impl Scene {
             viewpoint = Viewpoint::of_camera(&found.camera, model.center, model.radius);
         }
         Ok(Self { model, camera, viewpoint, settings, up })
+    }
+
+    /// Reads what a camera needs of a scene in levels of detail, and says how much that is.
+    fn look(&mut self, camera: &Camera) -> Result<()> {
+        let Some(detail) = &mut self.model.detail else { return Ok(()) };
+        let choice = detail.choose(&view(camera, self.settings.near));
+        // The copy of the last picture would be held beside what is read.
+        self.model.file = SplatFile::default();
+        while let Some(loaded) = detail.load_next(&choice) {
+            loaded?;
+        }
+        let drawn = detail.drawn(&choice);
+        let (splats, cells) = detail.total();
+        eprintln!(
+            "{} of {splats} splats, in {} of {cells} cells; {} are in memory.",
+            drawn.file.splats.len(),
+            drawn.cells,
+            detail.most()
+        );
+        self.model.file = drawn.file;
+        Ok(())
     }
 
     /// The camera, turned by degrees about the scene's centre.

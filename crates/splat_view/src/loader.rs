@@ -28,13 +28,15 @@ pub struct Loader {
     receiver: Receiver<Loaded>,
     /// The file that each side waits for.
     waits: [Option<PathBuf>; 2],
+    /// Most splats of a scene in levels of detail.
+    budget: Option<usize>,
 }
 
 impl Loader {
     /// Nothing to read yet.
-    pub fn new() -> Self {
+    pub fn new(budget: Option<usize>) -> Self {
         let (sender, receiver) = channel();
-        Self { sender, receiver, waits: [None, None] }
+        Self { sender, receiver, waits: [None, None], budget }
     }
 
     /// Whether a side waits for a model.
@@ -45,10 +47,10 @@ impl Loader {
     /// Reads a file for a side; `wake` is called when it is there.
     pub fn load(&mut self, side: usize, path: &Path, wake: impl FnOnce() + Send + 'static) {
         self.waits[side] = Some(path.to_owned());
-        let (path, sender) = (path.to_owned(), self.sender.clone());
+        let (path, sender, budget) = (path.to_owned(), self.sender.clone(), self.budget);
         std::thread::spawn(move || {
             let stamp = stamp(&path);
-            let model = Model::read(&path);
+            let model = Model::read(&path, budget);
             // Nobody receives once the window is closed.
             let _ = sender.send(Loaded { side, path, stamp, model });
             wake();
@@ -78,7 +80,7 @@ mod tests {
 
     #[test]
     fn what_was_forgotten_while_it_was_read_is_not_shown() {
-        let mut loader = Loader::new();
+        let mut loader = Loader::new(None);
         let (there, done) = channel();
         for (side, name) in [(1, "no such file"), (0, "nor this")] {
             let there = there.clone();

@@ -7,6 +7,7 @@ use splat_render::io::{SplatFile, read_splats};
 use splat_render::{Error, Result};
 
 use crate::checkpoint::read_checkpoint;
+use crate::detail::{BUDGET, Detail, is_in_levels};
 
 /// Splats of a lower opacity logit do not count for the extent.
 const FAINT_LOGIT: f32 = -2.2;
@@ -14,7 +15,7 @@ const FAINT_LOGIT: f32 = -2.2;
 const SAMPLES: usize = 100_000;
 
 /// A scene in memory.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Model {
     /// Its splats and their origin.
     pub file: SplatFile,
@@ -24,11 +25,21 @@ pub struct Model {
     pub radius: f64,
     /// What was ignored in reading, one message each.
     pub notes: Vec<String>,
+    /// Where more of it lies: `file` is the part of a scene in levels of detail that is drawn.
+    pub detail: Option<Detail>,
+    /// Splats that the whole scene has, if that is not what `file` has.
+    pub whole: Option<usize>,
 }
 
 impl Model {
-    /// Reads a splat file or a checkpoint of a fit.
-    pub fn read(path: &Path) -> Result<Self> {
+    /// Reads a splat file, a checkpoint of a fit, or a scene in levels of detail, of which no more splats
+    /// than a budget are held.
+    pub fn read(path: &Path, budget: Option<usize>) -> Result<Self> {
+        if is_in_levels(path) {
+            let (detail, file) = Detail::open(path, budget.unwrap_or(BUDGET))?;
+            let whole = Some(detail.total().0);
+            return Ok(Self { detail: Some(detail), whole, ..Self::new(file, Vec::new()) });
+        }
         if path.extension().is_some_and(|ending| ending == "npz") {
             return Ok(Self::new(read_checkpoint(path)?, Vec::new()));
         }
@@ -48,7 +59,7 @@ impl Model {
             ));
         }
         let (center, radius) = extent(&file);
-        Self { file, center, radius, notes }
+        Self { file, center, radius, notes, detail: None, whole: None }
     }
 }
 

@@ -220,7 +220,8 @@ fn files(viewer: &mut Viewer, ui: &mut Ui, actions: &mut Vec<Action>) {
 fn statistics(viewer: &Viewer, ui: &mut Ui, times: Option<[f32; STAGES.len()]>) {
     for shown in viewer.shown.iter().flatten() {
         let splats = shown.model.file.splats.len();
-        ui.label(format!("{splats} splats: {}", viewer.name_of(&shown.path)));
+        let of = shown.model.whole.map_or_else(String::new, |whole| format!(" of {whole}"));
+        ui.label(format!("{splats}{of} splats: {}", viewer.name_of(&shown.path)));
     }
     ui.label(format!("Frame: {:.1} ms", viewer.frame_ms));
     let Some(times) = times else {
@@ -291,9 +292,11 @@ mod tests {
         };
         let file = SplatFile { splats, origin: [0.0; 3], antialiased: false };
         let drawable = painter.upload(&file).expect("a splat has room");
-        let model = Model { file, center: DVec3::ZERO, radius: 1.0, notes: Vec::new() };
+        let (center, notes) = (DVec3::ZERO, Vec::new());
+        let model = Model { file, center, radius: 1.0, notes, detail: None, whole: None };
         let mut viewer = Viewer::new(Settings::default(), String::new());
-        viewer.shown[0] = Some(Shown { path: "a.ply".into(), stamp: None, model, drawable });
+        let path = "a.ply".into();
+        viewer.shown[0] = Some(Shown { path, stamp: None, model, drawable, streaming: None });
         assert_eq!(untouched(viewer), Settings::default());
     }
 }

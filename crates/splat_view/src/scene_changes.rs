@@ -4,11 +4,13 @@ use std::path::{Path, PathBuf};
 
 use splat_render::Result;
 
+use crate::detail::view;
 use crate::loader::Loaded;
 use crate::scene_view::{background, cameras_of, first_camera, first_view, near, up};
 use crate::session::{Session, Wake};
 use crate::sources::{Source, find_sources, stamp};
 use crate::start::Start;
+use crate::streaming::Streaming;
 use crate::viewer::Shown;
 
 impl Session {
@@ -42,7 +44,7 @@ impl Session {
         let Loaded { side, path, stamp, model } = loaded;
         let viewer = &mut self.viewer;
         let drawable = model.and_then(|model| Ok((self.painter.upload(&model.file)?, model)));
-        let (drawable, model) = match drawable {
+        let (drawable, mut model) = match drawable {
             Ok(both) => both,
             Err(error) => {
                 viewer.notes.tell(error.to_string());
@@ -73,12 +75,49 @@ impl Session {
                 viewer.settings.near = near(&model);
             }
         }
-        viewer.shown[side] = Some(Shown { path, stamp, model, drawable });
+        let streaming = model.detail.take().map(|detail| {
+            let proxy = self.proxy.clone();
+            Streaming::start(detail, move || {
+                // The window may have been closed meanwhile.
+                let _ = proxy.send_event(Wake);
+            })
+        });
+        viewer.shown[side] = Some(Shown { path, stamp, model, drawable, streaming });
         self.screen.window.request_redraw();
+    }
+
+    /// Tells scenes in levels of detail where the camera is.
+    pub fn follow(&mut self) {
+        let size = self.screen.size();
+        let seen = view(&self.viewer.camera(size), self.viewer.settings.near);
+        for shown in self.viewer.shown.iter_mut().flatten() {
+            if let Some(streaming) = &mut shown.streaming {
+                streaming.look(seen);
+            }
+        }
+    }
+
+    /// Draws what scenes in levels of detail have read since.
+    fn receive_details(&mut self) {
+        let viewer = &mut self.viewer;
+        for shown in viewer.shown.iter_mut().flatten() {
+            while let Some(drawn) = shown.streaming.as_mut().and_then(Streaming::next) {
+                let drawn = drawn.and_then(|d| Ok((self.painter.upload(&d.file)?, d.file)));
+                match drawn {
+                    Ok((drawable, file)) => {
+                        shown.drawable = drawable;
+                        shown.model.file = file;
+                    }
+                    Err(error) => viewer.notes.tell(error.to_string()),
+                }
+                self.screen.window.request_redraw();
+            }
+        }
     }
 
     /// Shows what the loader has read.
     pub fn receive(&mut self) {
+        self.receive_details();
         while let Some(loaded) = self.loader.next() {
             self.show(loaded);
             // Also to show why a model cannot be read.

@@ -63,7 +63,7 @@ impl Session {
         Ok(Self {
             viewer: Viewer::new(settings, screen.gpu.name()),
             painter,
-            loader: Loader::new(),
+            loader: Loader::new(arguments.budget),
             proxy,
             arguments,
             photo: None,
@@ -99,6 +99,7 @@ impl Session {
             self.say(done)?;
         }
         self.load_photo();
+        self.follow();
         self.due = interface.repaint_delay.and_then(|delay| started.checked_add(delay));
         self.draw(interface)?;
         if self.viewer.recording.is_some() {

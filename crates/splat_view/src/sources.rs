@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use splat_render::levels::INDEX;
 use splat_render::{Error, Result};
 
 /// A model that can be shown.
@@ -58,6 +59,11 @@ pub fn find_sources(path: &Path) -> Result<Vec<Source>> {
         let folder = folder.unwrap_or(Path::new(".")).to_owned();
         return Ok(vec![Source { name, path: path.to_owned(), folder }]);
     }
+    // A scene in levels of detail is the folder, whatever else lies there.
+    let index = path.join(INDEX);
+    if index.is_file() {
+        return Ok(vec![Source { name: INDEX.to_owned(), path: index, folder: path.to_owned() }]);
+    }
     let mut sources = Vec::new();
     let mut add = |name: String, file: PathBuf| {
         if file.is_file() {
@@ -84,8 +90,8 @@ pub fn find_sources(path: &Path) -> Result<Vec<Source>> {
     if sources.is_empty() {
         return Err(Error::file(
             path,
-            "holds no scene.ply, rounds or checkpoint; give a splat file or the folder of an igsr fit \
-             or igsr refine",
+            "holds no scene.ply, rounds, checkpoint or lod-meta.json; give a splat file or the folder of an \
+             igsr fit or igsr refine",
         ));
     }
     // A scene is written when its fit ends: a newer checkpoint belongs to a fit in progress.

@@ -2,9 +2,10 @@
 
 use std::path::PathBuf;
 
-use splat_render::Result;
+use splat_render::{Error, Result};
 
 use crate::arguments::Arguments;
+use crate::detail::is_in_levels;
 use crate::model::Model;
 use crate::sources::{Source, find_sources};
 
@@ -28,11 +29,23 @@ impl Start {
                 out.folder.get_or_insert_with(|| scene.clone());
             }
             if out.models.len() < 2 {
-                let model = Model::read(&found[0].path)?;
+                let model = Model::read(&found[0].path, arguments.budget)?;
                 out.models.push((found[0].clone(), model));
             }
             out.sources.extend(found);
         }
+        let has_levels = out.sources.iter().any(|source| is_in_levels(&source.path));
+        if arguments.budget.is_some() && !arguments.scenes.is_empty() && !has_levels {
+            return Err(no_levels());
+        }
         Ok(out)
     }
+}
+
+/// The error of a budget for a scene that is drawn whole.
+pub fn no_levels() -> Error {
+    Error::argument(
+        "--budget",
+        "is for scenes in levels of detail; write one with igsr convert --lod, or leave it out",
+    )
 }

@@ -13,6 +13,7 @@ use crate::model::Model;
 use crate::notes::Notes;
 use crate::painter::{Painter, Shot};
 use crate::sources::{Source, Stamp, label};
+use crate::streaming::Streaming;
 use crate::viewpoint::{Viewpoint, fitted};
 
 /// How keys and drags move the camera.
@@ -44,6 +45,8 @@ pub struct Shown {
     pub model: Model,
     /// On the device.
     pub drawable: Drawable,
+    /// Reads what the view needs of a scene in levels of detail.
+    pub streaming: Option<Streaming>,
 }
 
 /// What the panel, keys and gestures ask the session to do.

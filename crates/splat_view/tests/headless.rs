@@ -8,6 +8,7 @@ use common::{Folder, ball, program, read_png, refused, run, said, write, write_c
 use glam::{DMat4, DVec3};
 use splat_render::cpu::Cpu;
 use splat_render::io::SplatFile;
+use splat_render::levels::write_levels;
 use splat_render::{Camera, Image, ProjectOptions, Stages};
 
 /// A camera 4 units off, with its middle elsewhere than the picture's.
@@ -662,4 +663,76 @@ fn a_file_of_cameras_that_is_too_large_is_not_read() {
     let mut command = program();
     command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(&cameras);
     refused(&command.output().expect("start"), &["cameras.json", "67108865 bytes"]);
+}
+
+/// A ball of 3000 splats at three levels, in `levels` of the folder.
+fn ball_in_levels(folder: &Folder) -> std::path::PathBuf {
+    let (scene, levels) = (folder.join("scene.ply"), folder.join("levels"));
+    write(&scene, &ball(3000, 5, [0.6, 0.4, 0.3]));
+    std::fs::create_dir(&levels).expect("a folder");
+    write_levels(&scene, &levels, 3, 200).expect("levels");
+    levels
+}
+
+/// "N of M splats, in C of D cells; H are in memory.": all numbers.
+fn numbers(output: &std::process::Output) -> Vec<usize> {
+    let text = said(output);
+    let line = text.lines().find(|line| line.contains("cells")).expect("a line of cells");
+    line.split(|c: char| !c.is_ascii_digit()).filter_map(|word| word.parse().ok()).collect()
+}
+
+#[test]
+fn levels_are_drawn_within_a_budget_and_look_better_with_more() {
+    let folder = Folder::new();
+    let levels = ball_in_levels(&folder);
+    let draw = |scene: &Path, more: &[&str]| {
+        let out = folder.join("out.png");
+        let size: [&dyn AsRef<std::ffi::OsStr>; 7] =
+            [&scene, &"--screenshot", &out, &"--size", &"120x90", &"--backend", &"cpu"];
+        let more = more.iter().map(|word| word as &dyn AsRef<std::ffi::OsStr>);
+        let output = run(&size.into_iter().chain(more).collect::<Vec<_>>());
+        (read_png(&out), output)
+    };
+    // One view for all: the coarse scenes have another middle.
+    write_cameras(&folder.join("cameras.json"), &[camera()]);
+    let cameras = folder.join("cameras.json");
+    let cameras = ["--cameras", cameras.to_str().expect("a path")];
+    let (whole, _) = draw(&folder.join("scene.ply"), &cameras);
+    let mut last = f64::INFINITY;
+    for budget in [300usize, 1500, 4000] {
+        let text = budget.to_string();
+        let words = [&cameras[..], &["--budget", &text]].concat();
+        let (picture, output) = draw(&levels, &words);
+        let [drawn, all, cells, of, held] = numbers(&output)[..] else { panic!("five numbers") };
+        assert!(drawn <= budget && held <= budget, "{drawn} and {held} of {budget}");
+        assert!(drawn * 2 > budget.min(3000), "{drawn} of {budget}");
+        assert_eq!((all, cells), (3000, of));
+        let off = picture.apart(&whole).1;
+        assert!(off < last, "{budget} splats are off by {off}, fewer by {last}");
+        last = off;
+    }
+    // The budget has room for all, but for what SOG rounds.
+    assert!(last < 2.0, "{last}");
+    let (index, _) = draw(&levels.join("lod-meta.json"), &cameras);
+    assert!(index.apart(&whole).1 < 2.0);
+}
+
+#[test]
+fn budgets_and_levels_that_cannot_be_are_told() {
+    let folder = Folder::new();
+    let levels = ball_in_levels(&folder);
+    let out = folder.join("out.png");
+    let said = |scene: &Path, more: &[&str], words: &[&str]| {
+        let mut command = program();
+        command.arg(scene).arg("--screenshot").arg(&out).args(["--backend", "cpu"]).args(more);
+        refused(&command.output().expect("splat-view starts"), words);
+        assert!(!out.exists());
+    };
+    said(&folder.join("scene.ply"), &["--budget", "100"], &["--budget", "igsr convert --lod"]);
+    said(&levels, &["--budget", "0"], &["--budget", "from 1 to"]);
+    said(&levels, &["--budget", "1"], &["--budget", "of 1 splats", "give more"]);
+    std::fs::remove_dir_all(levels.join("0_0")).expect("gone");
+    said(&levels, &[], &["0_0"]);
+    std::fs::write(levels.join("lod-meta.json"), "{}").expect("an index");
+    said(&levels, &[], &["lod-meta.json", "lodLevels"]);
 }

@@ -13,6 +13,7 @@ use common::dragging::drop_file;
 use common::{Folder, Picture, ball, program, read_png, refused, run, write, write_cameras};
 use glam::{DMat4, DVec3};
 use splat_render::Camera;
+use splat_render::levels::write_levels;
 
 /// Longest that anything may take on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -391,6 +392,29 @@ fn a_refinement_s_folder_opens_and_a_new_scene_in_it_appears() {
     write(&folder.join("out/scene.ply"), &ball(600, 20, [0.2, 0.4, 0.8]));
     let changed = viewer.shot_when("round 1", |shot| shot.apart(&blue).1 < MEAN);
     agree("round 1", &changed, &blue);
+}
+
+#[test]
+fn a_scene_in_levels_gets_as_fine_as_its_budget_allows_and_follows_the_camera() {
+    let (xvfb, folder) = (Xvfb::start(), Folder::new());
+    let (scene, levels) = (folder.join("scene.ply"), folder.join("levels"));
+    write(&scene, &ball(3000, 20, [0.8, 0.3, 0.2]));
+    std::fs::create_dir(&levels).expect("a folder");
+    write_levels(&scene, &levels, 3, 200).expect("levels");
+    write_cameras(&folder.join("cameras.json"), &cameras());
+    let path = folder.join("cameras.json");
+    let words = ["--cameras", path.to_str().expect("a path"), "--budget", "1500"];
+    let expected = |camera: &str| {
+        rasterized_with(&levels, SIZE, &[&words[..], &["--camera", camera]].concat())
+    };
+    let (near, far) = (expected("0"), expected("1"));
+    differ("the cameras", &near, &far);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &[&["levels"], &words[..]].concat());
+    let fine = viewer.shot_when("levels", |shot| shot.apart(&near).1 < MEAN);
+    agree("levels", &fine, &near);
+    viewer.key("bracketright");
+    let fine = viewer.shot_when("other levels", |shot| shot.apart(&far).1 < MEAN);
+    agree("other levels", &fine, &far);
 }
 
 /// Three cameras of the window's size: two near, and one behind that sees them.

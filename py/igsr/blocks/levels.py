@@ -3,101 +3,66 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_folder
-from igsr._internal.json_file import write_json
-from igsr.blocks.cells import Ground, split_into_cells
-from igsr.blocks.merging import merged
-from igsr.blocks.worker import subset
 from igsr.errors import IgsrError
-from igsr.splats import Splats
 
-#: Splats of a level are this part of the next finer one's.
-PART = 0.25
-#: Splats that a cell of the finest level has, about.
-PER_CELL = 100_000
-#: The file that lists levels and cells.
-INDEX = "lod.json"
+#: The file that lists cells and levels, in PlayCanvas's layout of streamed SOG.
+INDEX = "lod-meta.json"
+#: Most splats that a cell of the finest level has, about.
+PER_CELL = 16_384
+
+
+@dataclass(frozen=True)
+class LevelsWritten:
+    """What ``write_levels`` wrote.
+
+    Attributes:
+        counts: splats of each level, the finest first.
+        cells: number of cells.
+        files: number of SOGs, folders of images each.
+        notes: messages about what was left out.
+    """
+
+    counts: list[int]
+    cells: int
+    files: int
+    notes: list[str]
 
 
 def write_levels(
-    splats: Splats, out: str | os.PathLike[str], levels: int, cells: int | None = None
-) -> dict[str, Any]:
-    """Write a scene in levels of detail: a file for each cell of each level.
+    scene: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    levels: int,
+    per_cell: int = PER_CELL,
+) -> LevelsWritten:
+    """Write a scene in levels of detail: streamed SOG, as PlayCanvas's engine reads it, too.
 
-    A level has a quarter of the splats of the next finer one, and as many times fewer cells, down
-    to one. The finest has all splats as they are, each in one cell.
+    The finest level has all splats, in cells of about equally many. Each other one has a quarter of
+    the splats of the next finer one: in each cell neighbours are merged into one of their mean,
+    spread, color and opacity. A ``.ply`` is read from the disk twice, and never whole.
 
     Args:
-        splats: the scene.
-        out: folder to write; it must be new or empty. ``lod.json`` lists, for each level from
-            coarse to fine, the cells: file, number of splats, and the box around their centres in
-            the world frame.
+        scene: a splat file.
+        out: folder to write; it must be new or empty. ``lod-meta.json`` lists the cells.
         levels: how many, 1 to 8.
-        cells: of the finest level; None: as many as have 100 000 splats each.
-
-    Returns:
-        What ``lod.json`` holds.
+        per_cell: most splats that a cell has at the finest level, about.
 
     Raises:
-        IgsrError: an argument cannot be used, or a file cannot be written.
+        IgsrError: an argument cannot be used, or a file cannot be read or written.
     """
     if not 1 <= levels <= 8:
         raise IgsrError(f"lod must be a number of levels from 1 to 8, not {levels}.")
-    if len(splats) == 0:
-        raise IgsrError("The scene has no splats to make levels of.")
-    finest = max(1, -(-len(splats) // PER_CELL)) if cells is None else cells
-    if not 1 <= finest <= len(splats):
-        raise IgsrError(f"cells must be from 1 to {len(splats)}, the splats there are.")
-    ground = _ground(splats)
-    index: dict[str, Any] = {
-        "format": 1,
-        "igsr": _core.__version__,
-        "splats": len(splats),
-        "levels": [],
-    }
+    if per_cell < 1:
+        raise IgsrError(f"per_cell must be at least 1 splat, not {per_cell}.")
     with atomic_folder(out) as folder:
-        for level in range(levels):
-            finer = levels - 1 - level
-            count = max(1, round(len(splats) * PART**finer))
-            part = splats if finer == 0 else merged(splats, count)
-            wanted = max(1, min(len(part), round(finest * PART**finer)))
-            rows = _written(part, ground, folder, level, wanted)
-            index["levels"].append({"splats": len(part), "cells": rows})
-        write_json(folder / INDEX, index)
-    return index
-
-
-def _ground(splats: Splats) -> Ground:
-    """The plane that splats spread along most."""
-    means = splats.means[splats.finite].astype(np.float64)
-    if len(means) == 0:
-        raise IgsrError("The scene has no finite splats to make levels of.")
-    _, axes = np.linalg.eigh(np.cov(means.T, bias=True))
-    return Ground(axes.T[::-1][:2])
-
-
-def _written(
-    splats: Splats, ground: Ground, folder: Path, level: int, count: int
-) -> list[dict[str, Any]]:
-    places = np.nan_to_num(ground.places(splats.means.astype(np.float64) + splats.origin))
-    try:
-        cells = split_into_cells(places, count)
-    except IgsrError:  # too many splats at one place
-        cells = split_into_cells(places, 1)
-    rows = []
-    for number, cell in enumerate(cells):
-        part = subset(splats, cell.holds(places))
-        bounds = part.bounds()
-        if bounds is None:
-            continue
-        name = f"level-{level}/cell-{number:04d}.ply"
-        part.save(folder / name)
-        low, high = (corner.tolist() for corner in bounds)
-        rows.append({"file": name, "splats": len(part), "low": low, "high": high})
-    return rows
+        try:
+            done = _core.write_levels(os.fspath(scene), str(folder), levels, per_cell)
+        except (OSError, ValueError) as error:
+            # The folder's own name is a temporary one.
+            message = str(error).replace(str(folder), str(Path(out)))
+            raise IgsrError(f"{message}.") from error
+    return LevelsWritten(**done)

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.blocks.cells import Cell, Ground
-from igsr.blocks.merging import rotations_of
 from igsr.splats import Splats
 
 #: A splat reaches out if it goes on beyond a border to another cell by more than this part of the
@@ -39,3 +38,17 @@ def reaching_out(splats: Splats, cells: Sequence[Cell], ground: Ground) -> npt.N
         )
         out |= cell.holds(places) & beyond.any(axis=1)
     return out
+
+
+def rotations_of(quats: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Rotation matrices [N, 3, 3] of quaternions w x y z."""
+    norm = np.linalg.norm(quats, axis=1, keepdims=True)
+    w, x, y, z = (quats / np.where(norm > 0.0, norm, 1.0)).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1),
+        ],
+        axis=1,
+    )

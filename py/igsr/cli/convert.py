@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -57,8 +58,9 @@ def convert_command(
         typer.Option(
             "--lod",
             metavar="N",
-            help="Write TARGET as a folder of N levels of detail, coarse to fine, each a quarter "
-            "of the next one, in cells; lod.json lists them.",
+            help="Write TARGET as a folder of N levels of detail by cells, each level a quarter of "
+            "the next finer one: streamed SOG, whose lod-meta.json lists them. SCENE may be larger "
+            "than memory if it is a .ply.",
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -107,14 +109,16 @@ def convert_command(
 def _write_levels(scene: Path, target: Path, levels: int, as_json: bool) -> None:
     from igsr.blocks.levels import INDEX, write_levels
 
-    index = write_levels(Splats.load(scene), target, levels)
+    written = write_levels(scene, target, levels)
     if as_json:
-        print_json({"scene": str(scene), "target": str(target), **index})
+        print_json({"scene": str(scene), "target": str(target), **asdict(written)})
         return
+    for note in written.notes:
+        print_message(note)
     console = output_console()
-    for number, level in enumerate(index["levels"]):
-        console.print(f"level {number}: {level['splats']} splats in {len(level['cells'])} cells")
-    console.print(str(target / INDEX), style="dim")
+    for level, count in enumerate(written.counts):
+        console.print(f"level {level}: {count} splats")
+    console.print(f"{written.cells} cells in {written.files} files, {target / INDEX}")
 
 
 def _write_page(

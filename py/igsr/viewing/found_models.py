@@ -9,6 +9,7 @@ from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import checkpoint_splats
 from igsr.fitting.followed_run import CAMERAS, VIEW
 from igsr.splats import Splats
+from igsr.viewing.level_files import INDEX, level_within
 from igsr.viewing.run_news import round_labels
 
 #: Ending of checkpoints.
@@ -35,13 +36,15 @@ class FoundModel:
     changed: int
 
     def load(self) -> Splats:
-        """Its splats.
+        """Its splats; of a scene in levels of detail those of the finest level that a page holds.
 
         Raises:
             IgsrError: the file cannot be read.
         """
         if self.path.suffix == CHECKPOINT:
             return checkpoint_splats(self.path)
+        if self.path.name == INDEX:
+            return level_within(self.path)
         return Splats.load(self.path)
 
 
@@ -49,12 +52,14 @@ def found_models(path: Path) -> list[FoundModel]:
     """The models of a splat file or a folder, the newest last; none where there is none yet.
 
     Args:
-        path: a splat file, or the folder of a fit or a refinement. In a folder these are the
-            models of a refinement's rounds, else ``scene.ply``; and the checkpoint of the fit to
-            all photos that is under way, until it has a scene.
+        path: a splat file, or the folder of a fit, a refinement or a scene in levels of detail. In
+            that of a run these are the models of a refinement's rounds, else ``scene.ply``; and the
+            checkpoint of the fit to all photos that is under way, until it has a scene.
     """
     if not path.is_dir():
         return _present([("scene", path.stem, path)])
+    if (path / INDEX).is_file():
+        return _present([("scene", path.resolve().name, path / INDEX)])
     found = _present([(f"round-{number}", label, file) for number, label, file in _rounds(path)])
     number_next = len(found)
     if not found:

@@ -20,6 +20,7 @@ mod ply;
 mod ply_header;
 mod prepare;
 mod quantize;
+mod rows;
 mod sh_rotation;
 mod sog;
 mod splat;
@@ -32,6 +33,9 @@ pub use exr::{ExrPicture, encode_exr, write_exr};
 pub use exr_depth::read_exr_depth;
 pub use format::Format;
 pub use open::open_file;
+pub(crate) use prepare::{cut_degree, is_drawn};
+pub use rows::SplatRows;
+pub(crate) use sog::{META as SOG_META, write_folder as write_sog_folder};
 pub use splat_file::{Loaded, SplatFile};
 
 use std::io::{BufRead, BufReader, Read, Write};
@@ -41,14 +45,26 @@ use crate::error::Result;
 use bytes::Named;
 use ply_header::Header;
 
+/// The index of a scene in levels of detail, which no one file holds.
+const STREAMED: &str = "lod-meta.json";
+
 /// Reads a file of any format in [`Format`]. The format is detected from the content or, where that
-/// has no signature, from the ending.
+/// has no signature, from the ending. A file named `meta.json` is that of a SOG in a folder.
 ///
 /// # Errors
 /// [`crate::Error::File`] that names the file: it cannot be opened or read, is damaged, truncated or
 /// of an unknown format.
 pub fn read_splats(path: &Path) -> Result<Loaded> {
     let named = Named(path);
+    if path.file_name().is_some_and(|name| name == sog::META) {
+        return sog::parse_folder(&named);
+    }
+    if path.file_name().is_some_and(|name| name == STREAMED) {
+        return Err(named.bad(
+            "is a scene in levels of detail; look at it with splat-view or igsr view, or give the \
+             meta.json of one of its folders",
+        ));
+    }
     let file = open_file(path)?;
     let unreadable = |e| named.bad(format!("cannot be read ({e})"));
     let size = file.metadata().map_err(unreadable)?.len();

@@ -15,6 +15,96 @@ use crate::error::Result;
 use crate::sh;
 use crate::splats::SplatArrays;
 
+/// Where each number of a splat lies in the rows of a `.ply`.
+pub struct Rows {
+    /// Number of splats.
+    pub count: usize,
+    /// SH degree.
+    pub degree: u32,
+    xyz: Vec<usize>,
+    quat: Vec<usize>,
+    scale: Vec<usize>,
+    opacity: Vec<usize>,
+    dc: Vec<usize>,
+    rest: Vec<usize>,
+    row: Vec<u8>,
+}
+
+impl Rows {
+    /// Those that a header says, of a file of `size` bytes; nothing large is allocated.
+    pub fn new(header: &Header, size: u64, named: &Named<'_>) -> Result<Self> {
+        let vertex = &header.elements[0];
+        if vertex.name != "vertex" {
+            return Err(named.bad(format!("starts with '{}' where 'vertex' belongs", vertex.name)));
+        }
+        if vertex.lists {
+            return Err(named.bad("holds lists in its vertices; it is a mesh, not splats"));
+        }
+        let need = |name: &str| {
+            vertex.offset(name, Kind::Float).ok_or_else(|| {
+                named.bad(format!(
+                    "has no float property '{name}'; it is not a .ply of Gaussian splats"
+                ))
+            })
+        };
+        let columns =
+            |names: &[&str]| -> Result<Vec<usize>> { names.iter().map(|n| need(n)).collect() };
+        let xyz = columns(&["x", "y", "z"])?;
+        let quat = columns(&["rot_0", "rot_1", "rot_2", "rot_3"])?;
+        let scale = columns(&["scale_0", "scale_1", "scale_2"])?;
+        let opacity = columns(&["opacity"])?;
+        let dc = columns(&["f_dc_0", "f_dc_1", "f_dc_2"])?;
+        let rest_count = vertex
+            .properties
+            .iter()
+            .filter(|p| p.kind == Kind::Float && p.name.starts_with("f_rest_"))
+            .count();
+        let degree = (0..=SH_DEGREE_MAX)
+            .find(|&d| 3 * (sh::coeffs(d) - 1) == rest_count)
+            .ok_or_else(|| {
+                named.bad(format!(
+                    "has {rest_count} f_rest properties, which is no SH degree in 0..=4"
+                ))
+            })?;
+        let rest: Vec<usize> =
+            (0..rest_count).map(|k| need(&format!("f_rest_{k}"))).collect::<Result<_>>()?;
+        if vertex.size() > size {
+            return Err(named.bad(format!(
+                "claims {} splats of {} bytes but has only {size} bytes; it is truncated",
+                vertex.count, vertex.stride
+            )));
+        }
+        let (count, row) = (vertex.count as usize, vec![0u8; vertex.stride]);
+        Ok(Self { count, degree, xyz, quat, scale, opacity, dc, rest, row })
+    }
+
+    /// Reads the next row, that of splat `number`, into splat `i`.
+    pub fn read(
+        &mut self,
+        reader: &mut impl BufRead,
+        number: usize,
+        splats: &mut SplatArrays,
+        i: usize,
+        named: &Named<'_>,
+    ) -> Result<()> {
+        reader.read_exact(&mut self.row).map_err(|_| {
+            named.bad(format!("ends at splat {number} of {}; it is truncated", self.count))
+        })?;
+        let at = |offset: usize| f32_at(&self.row, offset);
+        let stride = splats.stride();
+        splats.means[i] = std::array::from_fn(|k| at(self.xyz[k]));
+        splats.quats[i] = std::array::from_fn(|k| at(self.quat[k]));
+        splats.scales[i] = std::array::from_fn(|k| at(self.scale[k]));
+        splats.opacities[i] = at(self.opacity[0]);
+        splats.sh[i * stride] = std::array::from_fn(|c| at(self.dc[c]));
+        for k in 0..stride - 1 {
+            splats.sh[i * stride + 1 + k] =
+                std::array::from_fn(|c| at(self.rest[c * (stride - 1) + k]));
+        }
+        Ok(())
+    }
+}
+
 /// Reads what follows the header of a `.ply` of `size` bytes, row by row; sizes are checked before
 /// anything is allocated.
 pub fn read(
@@ -23,61 +113,10 @@ pub fn read(
     size: u64,
     named: &Named<'_>,
 ) -> Result<Loaded> {
-    let vertex = &header.elements[0];
-    if vertex.name != "vertex" {
-        return Err(named.bad(format!("starts with '{}' where 'vertex' belongs", vertex.name)));
-    }
-    if vertex.lists {
-        return Err(named.bad("holds lists in its vertices; it is a mesh, not splats"));
-    }
-    let need = |name: &str| {
-        vertex.offset(name, Kind::Float).ok_or_else(|| {
-            named
-                .bad(format!("has no float property '{name}'; it is not a .ply of Gaussian splats"))
-        })
-    };
-    let columns =
-        |names: &[&str]| -> Result<Vec<usize>> { names.iter().map(|n| need(n)).collect() };
-    let xyz = columns(&["x", "y", "z"])?;
-    let quat = columns(&["rot_0", "rot_1", "rot_2", "rot_3"])?;
-    let scale = columns(&["scale_0", "scale_1", "scale_2"])?;
-    let opacity = columns(&["opacity"])?;
-    let dc = columns(&["f_dc_0", "f_dc_1", "f_dc_2"])?;
-    let rest_count = vertex
-        .properties
-        .iter()
-        .filter(|p| p.kind == Kind::Float && p.name.starts_with("f_rest_"))
-        .count();
-    let degree =
-        (0..=SH_DEGREE_MAX).find(|&d| 3 * (sh::coeffs(d) - 1) == rest_count).ok_or_else(|| {
-            named.bad(format!("has {rest_count} f_rest properties, which is no SH degree in 0..=4"))
-        })?;
-    let rest: Vec<usize> =
-        (0..rest_count).map(|k| need(&format!("f_rest_{k}"))).collect::<Result<_>>()?;
-    if vertex.size() > size {
-        return Err(named.bad(format!(
-            "claims {} splats of {} bytes but has only {size} bytes; it is truncated",
-            vertex.count, vertex.stride
-        )));
-    }
-
-    let n = vertex.count as usize;
-    let mut splats = SplatArrays::zeros(n, degree);
-    let (stride, per_channel) = (splats.stride(), splats.stride() - 1);
-    let mut row = vec![0u8; vertex.stride];
-    for i in 0..n {
-        reader
-            .read_exact(&mut row)
-            .map_err(|_| named.bad(format!("ends at splat {i} of {n}; it is truncated")))?;
-        let at = |offset: usize| f32_at(&row, offset);
-        splats.means[i] = std::array::from_fn(|k| at(xyz[k]));
-        splats.quats[i] = std::array::from_fn(|k| at(quat[k]));
-        splats.scales[i] = std::array::from_fn(|k| at(scale[k]));
-        splats.opacities[i] = at(opacity[0]);
-        splats.sh[i * stride] = std::array::from_fn(|c| at(dc[c]));
-        for k in 0..per_channel {
-            splats.sh[i * stride + 1 + k] = std::array::from_fn(|c| at(rest[c * per_channel + k]));
-        }
+    let mut rows = Rows::new(header, size, named)?;
+    let mut splats = SplatArrays::zeros(rows.count, rows.degree);
+    for i in 0..rows.count {
+        rows.read(reader, i, &mut splats, i, named)?;
     }
     Ok(Loaded {
         file: SplatFile { splats, origin: header.origin, antialiased: header.antialiased },

@@ -88,7 +88,8 @@ pub fn say_clipped(notes: &mut Vec<String>, count: usize, what: &str, range: &st
     }
 }
 
-fn is_drawn(splats: &SplatArrays, i: usize) -> bool {
+/// Whether a renderer draws splat `i`: its numbers are finite, and it has a rotation.
+pub fn is_drawn(splats: &SplatArrays, i: usize) -> bool {
     let stride = splats.stride();
     let finite = |values: &[f32]| values.iter().all(|v| v.is_finite());
     finite(&splats.means[i])
@@ -99,7 +100,8 @@ fn is_drawn(splats: &SplatArrays, i: usize) -> bool {
         && splats.quats[i].iter().map(|c| c * c).sum::<f32>() >= QUAT_NORM2_MIN
 }
 
-fn cut_degree(splats: &SplatArrays, degree: u32) -> SplatArrays {
+/// The splats with SH up to a degree that is lower than theirs.
+pub fn cut_degree(splats: &SplatArrays, degree: u32) -> SplatArrays {
     let (stride, kept) = (splats.stride(), sh::coeffs(degree));
     SplatArrays {
         sh: splats.sh.chunks_exact(stride).flat_map(|row| &row[..kept]).copied().collect(),

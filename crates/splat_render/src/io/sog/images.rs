@@ -1,15 +1,18 @@
-//! The zip and the WebP images in it.
+//! The files of a SOG, in a zip or in a folder, and the WebP images among them.
 
+use std::fs::File;
 use std::io::{Cursor, Read, Write};
+use std::path::{Component, Path, PathBuf};
 
 use image_webp::{ColorType, WebPDecoder, WebPEncoder};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::META;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::io::bytes::Named;
 use crate::io::limits::unpacked_max;
+use crate::io::open::open_file;
 
 /// Pixels that an image may have beyond those that are used: writers round sizes up.
 const SPARE_PIXELS: u64 = 1 << 16;
@@ -17,11 +20,17 @@ const SPARE_PIXELS: u64 = 1 << 16;
 /// Longest meta.json that is read: real ones are 20 kB, and JSON takes many times its text.
 const META_MAX: u64 = 1 << 20;
 
-/// The zip of a `.sog`.
+/// Where the files lie.
+enum Place<'a> {
+    /// The zip of a `.sog`, and the bytes that an entry may unpack to.
+    Zip(Box<ZipArchive<Cursor<&'a [u8]>>>, u64),
+    /// The folder of a `meta.json`.
+    Folder(PathBuf),
+}
+
+/// The files of a SOG.
 pub struct Bundle<'a> {
-    zip: ZipArchive<Cursor<&'a [u8]>>,
-    /// Bytes that an entry may unpack to.
-    limit: u64,
+    place: Place<'a>,
     named: Named<'a>,
 }
 
@@ -31,7 +40,13 @@ impl<'a> Bundle<'a> {
         let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|e| {
             named.bad(format!("cannot be opened as the zip that a .sog is ({e}); copy it again"))
         })?;
-        Ok(Self { zip, limit: unpacked_max(bytes.len()), named: *named })
+        Ok(Self { place: Place::Zip(Box::new(zip), unpacked_max(bytes.len())), named: *named })
+    }
+
+    /// The files beside the `meta.json` that is named.
+    pub fn beside(named: &Named<'a>) -> Self {
+        let folder = named.0.parent().unwrap_or(Path::new("")).to_owned();
+        Self { place: Place::Folder(folder), named: *named }
     }
 
     /// The text of `meta.json`.
@@ -39,20 +54,46 @@ impl<'a> Bundle<'a> {
         self.file(META, META_MAX)
     }
 
-    /// The first `limit` bytes of the file `name`.
-    fn file(&mut self, name: &str, limit: u64) -> Result<Vec<u8>> {
-        let damaged = |e: &dyn std::fmt::Display| {
-            self.named.bad(format!("has no readable '{name}' in it ({e}); export it again"))
+    /// Bytes that files of a folder take on the disk.
+    pub fn size_of<'n>(&self, names: impl Iterator<Item = &'n str>) -> Result<u64> {
+        names.map(|name| Ok(self.outside(name)?.1)).sum()
+    }
+
+    /// A file of the folder, which lies in it and nowhere else, and its size.
+    fn outside(&self, name: &str) -> Result<(File, u64)> {
+        let Place::Folder(folder) = &self.place else {
+            return Err(unreadable(&self.named, name, &"it is in no folder"));
         };
-        let entry = self.zip.by_name(name).map_err(|e| damaged(&e))?;
+        let mut parts = Path::new(name).components();
+        if !matches!((parts.next(), parts.next()), (Some(Component::Normal(_)), None)) {
+            return Err(unreadable(&self.named, name, &"it lies in another folder"));
+        }
+        let file = open_file(&folder.join(name)).map_err(|e| unreadable(&self.named, name, &e))?;
+        let size = file.metadata().map_err(|e| unreadable(&self.named, name, &e))?.len();
+        Ok((file, size))
+    }
+
+    /// The first `limit` bytes of the file `name`; None: what may be unpacked.
+    fn file(&mut self, name: &str, limit: impl Into<Option<u64>>) -> Result<Vec<u8>> {
+        let (limit, named) = (limit.into(), self.named);
         let mut bytes = Vec::new();
-        entry.take(limit).read_to_end(&mut bytes).map_err(|e| damaged(&e))?;
+        let read = match &mut self.place {
+            Place::Zip(zip, unpacked) => match zip.by_name(name) {
+                Ok(entry) => entry.take(limit.unwrap_or(*unpacked)).read_to_end(&mut bytes),
+                Err(error) => return Err(unreadable(&named, name, &error)),
+            },
+            Place::Folder(_) => {
+                let (file, size) = self.outside(name)?;
+                file.take(limit.unwrap_or(size)).read_to_end(&mut bytes)
+            }
+        };
+        read.map_err(|e| unreadable(&named, name, &e))?;
         Ok(bytes)
     }
 
     /// The image `name`, which is to have at least `used` pixels, or more by a little.
     pub fn image(&mut self, name: &str, used: usize) -> Result<Image> {
-        let bytes = self.file(name, self.limit)?;
+        let bytes = self.file(name, None)?;
         let damaged = |e: &dyn std::fmt::Display| {
             self.named
                 .bad(format!("has an image '{name}' that cannot be read ({e}); export it again"))
@@ -76,6 +117,10 @@ impl<'a> Bundle<'a> {
         };
         Ok(Image { width: width as usize, rgba })
     }
+}
+
+fn unreadable(named: &Named<'_>, name: &str, why: &dyn std::fmt::Display) -> Error {
+    named.bad(format!("has no readable '{name}' in it ({why}); export it again"))
 }
 
 /// Pixels.

@@ -108,6 +108,13 @@ impl Meta {
         })
     }
 
+    /// Names of all images.
+    pub fn files(&self) -> impl Iterator<Item = &str> {
+        let rest = self.rest.iter().flat_map(|rest| [&rest.centroids, &rest.labels]);
+        let others = [&self.scales.image, &self.quats, &self.sh0.image];
+        self.means.iter().chain(others).chain(rest).map(String::as_str)
+    }
+
     /// The JSON.
     pub fn write(&self) -> String {
         let coded = |part: &Coded| json!({ "codebook": part.codebook, "files": [part.image] });

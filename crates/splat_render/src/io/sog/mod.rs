@@ -1,4 +1,4 @@
-//! PlayCanvas's `.sog`, version 2: a zip of lossless WebP images and a `meta.json`.
+//! PlayCanvas's `.sog`, version 2: a zip of lossless WebP images and a `meta.json`; or these in a folder.
 //!
 //! Pixel i of each image belongs to splat i. Positions are 16 bits per axis of a signed logarithm,
 //! scales and colours are indices into codebooks of 256 values, rotations the smallest three in a
@@ -12,8 +12,8 @@ mod palette;
 mod read;
 mod write;
 
-pub use read::parse;
-pub use write::encode;
+pub use read::{parse, parse_folder};
+pub use write::{encode, write_folder};
 
 /// Entries of a codebook: one byte's.
 const CODES: usize = 256;
@@ -23,4 +23,5 @@ const PALETTE_COLUMNS: usize = 64;
 const SH_DEGREE: u32 = 3;
 /// The alpha byte of a rotation whose component 0 (w) is left out.
 const ROTATION_TAG: u8 = 252;
-const META: &str = "meta.json";
+/// The file that names the images.
+pub const META: &str = "meta.json";

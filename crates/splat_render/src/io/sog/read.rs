@@ -5,7 +5,7 @@ use super::meta::{Meta, Rest};
 use super::{PALETTE_COLUMNS, ROTATION_TAG};
 use crate::error::Result;
 use crate::io::bytes::Named;
-use crate::io::limits::check_claim;
+use crate::io::limits::{check_claim, check_file_size};
 use crate::io::quantize::{SmallestThree, logit_of_byte, to_f32};
 use crate::io::{Format, Loaded, SplatFile};
 use crate::splats::SplatArrays;
@@ -14,8 +14,22 @@ use crate::splats::SplatArrays;
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let mut bundle = Bundle::open(bytes, named)?;
     let meta = Meta::read(&bundle.meta()?, named)?;
+    unpack(&meta, &mut bundle, bytes.len(), named)
+}
+
+/// Reads a `meta.json` and the images beside it.
+pub fn parse_folder(named: &Named<'_>) -> Result<Loaded> {
+    let mut bundle = Bundle::beside(named);
+    let meta = Meta::read(&bundle.meta()?, named)?;
+    let size = bundle.size_of(meta.files())?;
+    check_file_size(named, size)?;
+    unpack(&meta, &mut bundle, size as usize, named)
+}
+
+/// The splats in images that take `size` bytes.
+fn unpack(meta: &Meta, bundle: &mut Bundle<'_>, size: usize, named: &Named<'_>) -> Result<Loaded> {
     let degree = meta.rest.as_ref().map_or(0, |rest| rest.degree);
-    let n = check_claim(named, meta.count, degree, bytes.len())?;
+    let n = check_claim(named, meta.count, degree, size)?;
     let mut splats = SplatArrays::zeros(n, degree);
     let stride = splats.stride();
 
@@ -49,7 +63,7 @@ pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
         splats.quats[i] = to_f32(three.quat());
     }
     if let Some(rest) = &meta.rest {
-        unpack_rest(&mut splats, rest, &mut bundle, named)?;
+        unpack_rest(&mut splats, rest, bundle, named)?;
     }
     Ok(Loaded {
         file: SplatFile { splats, antialiased: meta.antialiased, ..SplatFile::default() },

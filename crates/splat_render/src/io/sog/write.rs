@@ -1,11 +1,13 @@
-//! Writing a `.sog`.
+//! Writing a `.sog`, or the folder that it is a zip of.
+
+use std::path::Path;
 
 use super::codebook::{codebook, nearest};
 use super::images::{Image, webp, zipped};
 use super::meta::{Coded, Meta, Rest};
 use super::palette::palette;
 use super::{META, PALETTE_COLUMNS, ROTATION_TAG, SH_DEGREE};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::io::SplatFile;
 use crate::io::prepare::{Room, prepare, unfit};
 use crate::io::quantize::{SmallestThree, opacity_byte, to_f64, unit_byte};
@@ -30,10 +32,28 @@ const LABELS: &str = "shN_labels.webp";
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let prepared = prepare(file, &ROOM, notes);
     let splats = prepared.select(&morton_order(&prepared.means));
-    let stride = splats.stride();
-    let mut images: Vec<(&str, Image)> = Vec::new();
+    let files = files(&splats, file.antialiased)?;
+    // Writing to memory does not fail.
+    zipped(&files).map_err(|e| unfit(&format!("cannot be zipped ({e})")))
+}
 
-    let (low, high) = bounds(&splats);
+/// Writes `meta.json` and its images into a folder that is there. The splats keep their order; all are
+/// finite, and of a degree up to 3.
+pub fn write_folder(folder: &Path, splats: &SplatArrays, antialiased: bool) -> Result<()> {
+    for (name, bytes) in files(splats, antialiased)? {
+        let path = folder.join(name);
+        std::fs::write(&path, bytes)
+            .map_err(|e| Error::file(&path, format!("cannot be written ({e})")))?;
+    }
+    Ok(())
+}
+
+/// The files by name, `meta.json` last.
+fn files(splats: &SplatArrays, antialiased: bool) -> Result<Vec<(&'static str, Vec<u8>)>> {
+    let stride = splats.stride();
+    let mut images: Vec<(&'static str, Image)> = Vec::new();
+
+    let (low, high) = bounds(splats);
     let mut means = [Image::square(splats.len()), Image::square(splats.len())];
     for (i, mean) in splats.means.iter().enumerate() {
         for k in 0..3 {
@@ -74,10 +94,10 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     }
     images.push((SH0, sh0));
 
-    let rest = (stride > 1 && !splats.is_empty()).then(|| pack_rest(&splats, &mut images));
+    let rest = (stride > 1 && !splats.is_empty()).then(|| pack_rest(splats, &mut images));
     let meta = Meta {
         count: splats.len() as u64,
-        antialiased: file.antialiased,
+        antialiased,
         low,
         high,
         means: MEANS.map(String::from),
@@ -94,11 +114,10 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
         files.push((*name, bytes));
     }
     files.push((META, meta.write().into_bytes()));
-    // Writing to memory does not fail.
-    zipped(&files).map_err(|e| unfit(&format!("cannot be zipped ({e})")))
+    Ok(files)
 }
 
-fn pack_rest(splats: &SplatArrays, images: &mut Vec<(&str, Image)>) -> Rest {
+fn pack_rest(splats: &SplatArrays, images: &mut Vec<(&'static str, Image)>) -> Rest {
     let stride = splats.stride();
     let each = stride - 1;
     let vectors: Vec<f32> = splats
