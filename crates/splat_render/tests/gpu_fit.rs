@@ -417,7 +417,7 @@ fn a_fit_that_clones_splits_and_prunes_ends_as_on_the_cpu_and_repeats_itself() {
         }
         (fitter.state().unwrap(), counts)
     };
-    let (expected, cpu_counts) = fit(Box::new(CpuFit::default()));
+    let (expected, cpu_counts) = fit(Box::<CpuFit>::default());
     let (got, counts) = fit(Box::new(gpu_fit()));
     let before = psnr(&capture, &capture.start);
     let (cpu_psnr, gpu_psnr) = (psnr(&capture, &expected), psnr(&capture, &got));
