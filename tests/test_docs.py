@@ -44,6 +44,7 @@ NOT_RUN = {
     "docs/guides/cameras.md": 5,
     "docs/guides/denoising.md": 3,
     "docs/guides/installation.md": 2,
+    "docs/guides/levels.md": 1,
     "docs/guides/smaller-scenes.md": 1,
     "docs/guides/synthetic-captures.md": 1,
     "docs/guides/viewing.md": 5,
