@@ -410,11 +410,14 @@ fn a_scene_in_levels_gets_as_fine_as_its_budget_allows_and_follows_the_camera() 
     let (near, far) = (expected("0"), expected("1"));
     differ("the cameras", &near, &far);
     let mut viewer = Viewer::start(&xvfb, &folder.0, &[&["levels"], &words[..]].concat());
-    let fine = viewer.shot_when("levels", |shot| shot.apart(&near).1 < MEAN);
-    agree("levels", &fine, &near);
+    // Coarser levels are near enough in the mean, and drawn until these are read.
+    let as_fine = |shot: &Picture, expected: &Picture| {
+        let (most, mean) = shot.apart(expected);
+        most <= MOST && mean <= MEAN
+    };
+    viewer.shot_when("levels", |shot| as_fine(shot, &near));
     viewer.key("bracketright");
-    let fine = viewer.shot_when("other levels", |shot| shot.apart(&far).1 < MEAN);
-    agree("other levels", &fine, &far);
+    viewer.shot_when("other levels", |shot| as_fine(shot, &far));
 }
 
 /// Three cameras of the window's size: two near, and one behind that sees them.
