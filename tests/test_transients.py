@@ -15,6 +15,7 @@ import igsr
 from igsr.capture import Capture, Points, View
 from igsr.capture.write_transforms import write_transforms
 from igsr.fitting import checkpoint as checkpoints
+from igsr.fitting import fit_capture
 from igsr.fitting import run as fitting
 from igsr.fitting.transient_search import PARAMETERS, TransientSearch
 from igsr.floaters.photo_evidence import behind_masks
@@ -263,12 +264,33 @@ def test_a_fit_begins_anew_with_the_first_masks(visited, monkeypatch):
     assert steps[back[0] - 1] == round(0.3 * OPTIONS["steps"])
     assert not told[back[0] - 1].transients
     assert told[back[0]].transients
+    # What the report says it began with is what it began anew with.
+    assert told[-1].started == ("points", 8100)
     assert steps[-1] == OPTIONS["steps"]
     # Splats that were given are kept: nobody knows how they came about.
     told.clear()
     fitted(visited, progress=told.append, start=WALL, sh_degree=0)
     assert told[-1].transients
     assert [now.step for now in told] == sorted(now.step for now in told)
+
+
+def test_a_fit_goes_on_where_too_little_is_left_to_begin_with(visited, monkeypatch):
+    whole, _ = fitted(visited)
+    real = fit_capture.initial_state
+    calls = []
+
+    def once(*arguments):
+        calls.append(arguments)
+        if len(calls) > 1:
+            raise igsr.IgsrError("depth maps agree in 8 points only")
+        return real(*arguments)
+
+    monkeypatch.setattr(fit_capture, "initial_state", once)
+    told = []
+    splats, _ = fitted(visited, progress=told.append)
+    assert len(calls) == 2
+    assert told[-1].transients
+    assert splats != whole
 
 
 def with_ghost(view):

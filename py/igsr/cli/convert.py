@@ -109,6 +109,8 @@ def convert_command(
 def _write_levels(scene: Path, target: Path, levels: int, as_json: bool) -> None:
     from igsr.blocks.levels import INDEX, write_levels
 
+    if target.resolve() == Path.cwd().resolve():
+        raise IgsrError(f"{target} is the folder that the command runs in; name another")
     written = write_levels(scene, target, levels)
     if as_json:
         print_json({"scene": str(scene), "target": str(target), **asdict(written)})

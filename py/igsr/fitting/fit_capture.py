@@ -307,12 +307,12 @@ def _fitted(
                 backend = device["backend"]
                 return fitter_of(views, origin, state, values, backend, priors, exposures)
 
-            def beginning(views: Sequence[View]) -> dict[str, Any]:
+            def beginning(views: Sequence[View]) -> tuple[dict[str, Any], tuple[str, int]]:
                 others = [view for view in capture.views if view.split != "train"]
                 masked = _seen_alike(replace(capture, views=[*views, *others]), exposures)
-                state, _ = initial_state(masked, settings, initial)
+                state, begun = initial_state(masked, settings, initial)
                 state["means"] = state["means"] + (state.pop("origin") - origin).astype(np.float32)
-                return state if frozen is None else state | with_splats_after(state, frozen)
+                return state, begun
 
             name = cast(Backend, device["backend"])
             again = None if settings.moves_cameras or initial is not None else beginning

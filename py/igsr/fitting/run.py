@@ -65,6 +65,8 @@ def bar_state(now: Progress) -> BarState:
     """What a progress bar shows of a fit."""
     speed = f"{now.steps_per_second:.0f} steps/s"
     details = [f"loss {now.loss:.4f}", f"{now.splats} splats", speed]
+    if now.transients:
+        details.append(f"{len(now.transients)} photos masked")
     if math.isnan(now.loss):
         details = details[1:2]
     return BarState(now.step, now.steps, "  ".join(details), now.work)
@@ -187,11 +189,13 @@ class FitRun:
             return
         try:
             self.fitter = search.look(self.fitter)
+        except IgsrError:
+            raise
         except ValueError as error:
             raise IgsrError(f"{error}.") from error
-        # Fewer where the fit begins anew.
+        # Where the fit begins anew, it has taken fewer.
         self._step = int(self.fitter.steps_done)
-        self._saved_step = min(self._saved_step, self._step)
+        self.started = search.begun or self.started
 
     def _stepped(self, count: int) -> Progress:
         """Take ``count`` steps, or as many as there are before the next look or the end."""

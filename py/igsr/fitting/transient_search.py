@@ -18,6 +18,7 @@ import numpy.typing as npt
 from igsr import _core
 from igsr._internal.choices import Backend
 from igsr.capture import Capture, View
+from igsr.errors import IgsrError
 from igsr.fitting.fitter import (
     PARAMETERS,
     fitted_cameras,
@@ -37,7 +38,8 @@ MOMENTS = (0.3, 0.5, 0.7)
 MASKS, LOOKED = "transient_masks", "transients_looked"
 
 MakeFitter: TypeAlias = Callable[[Sequence[View], dict[str, Any]], _core.Fitter]
-BeginningOf: TypeAlias = Callable[[Sequence[View]], dict[str, Any]]
+#: Of some views: the state, and what its splats were made from, with their number.
+BeginningOf: TypeAlias = Callable[[Sequence[View]], tuple[dict[str, Any], tuple[str, int]]]
 
 
 def steps_to_look(settings: FitSettings, views: Sequence[View]) -> tuple[int, ...]:
@@ -68,8 +70,9 @@ class TransientSearch:
         found: for each view, bool [H, W], the pixels that show transient things; None where none.
         looked: the step of the last look; -1 before the first.
         frozen: so many splats, the last ones, stay in any case.
-        beginning: the state that the fit of some views begins with; None where what was found so
-            far, such as cameras, must not be lost: then the fit goes on from there.
+        beginning: what the fit of some views begins with; None where what was found so far, such as
+            cameras, must not be lost: then the fit goes on from there.
+        begun: what splats the fit began anew with, and their number; None where it did not.
     """
 
     views: Sequence[View]
@@ -81,6 +84,7 @@ class TransientSearch:
     looked: int = -1
     frozen: int = 0
     beginning: BeginningOf | None = None
+    begun: tuple[str, int] | None = None
 
     def __post_init__(self) -> None:
         """Begin without masks, unless some are given."""
@@ -104,11 +108,7 @@ class TransientSearch:
         return _masked(self.views, self.found)
 
     def look(self, fitter: _core.Fitter) -> _core.Fitter:
-        """Look for transient things; the fitter to go on with, the same where nothing changed.
-
-        Raises:
-            IgsrError, ValueError: the fit cannot begin anew.
-        """
+        """Look for transient things; the fitter to go on with, the same where nothing changed."""
         splats = Splats(**fitter.splats(), origin=self.origin, antialiased=False)
         cameras = fitted_cameras(self.views, fitter, self.origin)
         views = [
@@ -126,14 +126,25 @@ class TransientSearch:
         )
         looked = int(fitter.steps_done)
         masked = _masked(self.views, found)
-        if any_of(found) and not any_of(self.found) and self.beginning is not None:
-            fitter = self.make(masked, self.beginning(masked))
+        anew = None if any_of(self.found) or not any_of(found) else self._beginning_of(masked)
+        if anew is not None:
+            state, self.begun = anew
+            fitter = self.make(masked, state)
         elif any_of(found) or any_of(self.found):
             state = _selected(fitter.state(), self._kept(splats, views, found))
             fitter = self.make(masked, state)
         # Last: whoever is interrupted before saves a checkpoint of before the look.
         self.found, self.looked = found, looked
         return fitter
+
+    def _beginning_of(self, views: Sequence[View]) -> tuple[dict[str, Any], tuple[str, int]] | None:
+        """What a fit of the views begins with; None where it goes on from the splats so far."""
+        if self.beginning is None:
+            return None
+        try:
+            return self.beginning(views)
+        except IgsrError:  # too little is left of the photos to start from
+            return None
 
     def without_ghosts(self, splats: Splats, views: Sequence[View]) -> Splats:
         """The splats that a fit has ended with, without those that only masked pixels show.

@@ -135,17 +135,22 @@ def behind_masks(
     """
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)
-    areas = []
+    total = np.zeros(len(splats))
+    areas = []  # of photos with masks alone: there may be thousands without
     for camera, hidden in zip(cameras, masked, strict=True):
         picture = _Picture(splats, camera, np.zeros(3, dtype), backend)
         ones = np.ones((camera.height, camera.width), dtype)
         inside = np.zeros_like(ones) if hidden is None else hidden.astype(dtype)
         v = picture.backward(np.stack([ones - inside, inside, np.zeros_like(ones)], axis=-1))
-        areas.append(v["v_colors"][:, :2].astype(np.float64))
-    open_area, masked_area = np.stack(areas, axis=-1).transpose(1, 0, 2)
-    others = open_area.sum(axis=1, keepdims=True) - open_area
-    made_up = (masked_area > 0.0) & (masked_area >= MASKED * (masked_area + open_area))
-    return np.asarray((made_up & (others < masked_area)).any(axis=1))
+        open_area, masked_area = v["v_colors"][:, :2].astype(np.float64).T
+        total += open_area
+        if hidden is not None:
+            areas.append((open_area, masked_area))
+    found = np.zeros(len(splats), np.bool_)
+    for open_area, masked_area in areas:
+        made_up = (masked_area > 0.0) & (masked_area >= MASKED * (masked_area + open_area))
+        found |= made_up & (total - open_area < masked_area)
+    return found
 
 
 def needed_by_others(

@@ -179,7 +179,7 @@ def _make_over_ray(
     indices: list[int],
     keep: Callable[[int, dict[str, Any]], None],
 ) -> None:
-    """``keep`` is called with each scene as it is made; after a failure, with those under way."""
+    """``keep`` is called with each scene as it is made, the others' of one that fails, too."""
     folder.mkdir(parents=True, exist_ok=True)
     make = partial(_make_named, seed, settings)
     failed: Exception | None = None

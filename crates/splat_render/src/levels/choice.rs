@@ -104,7 +104,7 @@ pub fn choose(manifest: &Manifest, view: &View, budget: usize) -> Choice {
         let Some((level, next)) = out.levels[i].and_then(|l| Some((l, finer(cell, l)?))) else {
             continue;
         };
-        let more = held(cell, next) - held(cell, level);
+        let more = held(cell, next).saturating_sub(held(cell, level));
         if out.held + more <= budget {
             out.held += more;
             out.levels[i] = Some(next);
