@@ -23,11 +23,10 @@ import numpy as np
 from PIL import Image
 
 import igsr
-from igsr.blocks.levels import INDEX, write_levels
 from igsr.capture import Camera, View, load_capture
 from igsr.capture.write_cameras import write_cameras
 from igsr.evaluation.metrics import psnr, ssim
-from igsr.viewing.level_files import level_within
+from igsr.viewing.level_files import INDEX, level_within, write_levels
 
 #: How many times as far.
 FAR = (1, 2, 4, 8, 16)

@@ -12,11 +12,10 @@ import pytest
 import scenes
 
 import igsr
-from igsr.blocks.levels import write_levels
 from igsr.capture import Camera
 from igsr.capture.types import intrinsic_matrix
 from igsr.viewing.found_models import check_shown, found_models
-from igsr.viewing.level_files import level_within
+from igsr.viewing.level_files import level_within, write_levels
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")
 

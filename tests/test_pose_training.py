@@ -283,7 +283,7 @@ def test_captures_are_made_when_they_are_drawn(tmp_path):
         "scene_00001",
     }
     with pytest.raises(IgsrError, match="was made with views 2, not 3"):
-        train(tmp_path, replace(training, views=3))
+        train(tmp_path / "other", replace(training, views=3), captures=tmp_path / "captures")
 
 
 # ---- what is kept ------------------------------------------------------------------------------

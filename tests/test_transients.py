@@ -256,6 +256,15 @@ def test_a_fit_does_not_learn_what_one_photo_shows(static, visited):
 
 def test_a_fit_begins_anew_with_the_first_masks(visited, monkeypatch):
     monkeypatch.setattr(fitting, "CHUNK_SECONDS", 0.0)
+    real = fit_capture.initial_state
+    beginnings = []
+
+    def counted(*arguments):
+        state, (made_from, count) = real(*arguments)
+        beginnings.append([view.mask is None for view in arguments[0].train_views])
+        return state, (f"{made_from}, {len(beginnings)}", count)
+
+    monkeypatch.setattr(fit_capture, "initial_state", counted)
     told = []
     fitted(visited, progress=told.append)
     steps = [now.step for now in told]
@@ -264,8 +273,10 @@ def test_a_fit_begins_anew_with_the_first_masks(visited, monkeypatch):
     assert steps[back[0] - 1] == round(0.3 * OPTIONS["steps"])
     assert not told[back[0] - 1].transients
     assert told[back[0]].transients
+    assert beginnings == [[True] * 6, [True, False, True, True, False, True]]
     # What the report says it began with is what it began anew with.
-    assert told[-1].started == ("points", 8100)
+    assert told[0].started == ("points, 1", 8100)
+    assert told[-1].started == ("points, 2", 8100)
     assert steps[-1] == OPTIONS["steps"]
     # Splats that were given are kept: nobody knows how they came about.
     told.clear()

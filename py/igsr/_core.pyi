@@ -222,6 +222,7 @@ TRANSMITTANCE_MIN: float  # a pixel stops before its transmittance falls below t
 RIGID_TOLERANCE: float  # largest deviation of R R^T from the identity in a viewmat
 TILE_SIZE: int  # side of a tile in pixels
 SIDE_MAX: int  # largest side of a picture in pixels
+LEVELS_INDEX: str  # name of the file that lists the cells of a scene in levels of detail
 
 def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict[str, Float32]:
     """One isotropic splat per point [P, 3] with colours [P, 3] in 0..1.

@@ -244,7 +244,7 @@ class Splats(ArrayEquality, NotebookPicture):
         """
         if Path(path).exists() and not Path(path).is_file() and not Path(path).is_dir():
             raise IgsrError(f"{path} is a pipe or a device; save what it gives to a file first.")
-        if (Path(path) / "lod-meta.json").is_file():
+        if (Path(path) / _core.LEVELS_INDEX).is_file():
             raise IgsrError(
                 f"{path} is a scene in levels of detail; splat-view draws it, and a level's "
                 f"{Path(path) / '0_0' / 'meta.json'} is a splat file."

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use pyo3::exceptions::PyKeyboardInterrupt;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -18,9 +19,19 @@ pub fn write_levels<'py>(
     levels: usize,
     per_cell: usize,
 ) -> PyResult<Bound<'py, PyDict>> {
+    let mut interrupted = None;
+    let mut goes_on = || {
+        interrupted = Python::attach(|py| py.check_signals().err());
+        interrupted.is_none()
+    };
     let done = py
-        .detach(|| splat_render::levels::write_levels(&source, &folder, levels, per_cell))
+        .detach(|| {
+            splat_render::levels::write_levels(&source, &folder, levels, per_cell, &mut goes_on)
+        })
         .map_err(to_python)?;
+    let Some(done) = done else {
+        return Err(interrupted.unwrap_or_else(|| PyKeyboardInterrupt::new_err(())));
+    };
     let dict = PyDict::new(py);
     dict.set_item("counts", done.counts)?;
     dict.set_item("cells", done.cells)?;

@@ -44,7 +44,8 @@ mod _core {
         module.add("TRANSMITTANCE_MIN", constants::TRANSMITTANCE_MIN)?;
         module.add("RIGID_TOLERANCE", constants::RIGID_TOLERANCE)?;
         module.add("TILE_SIZE", constants::TILE)?;
-        module.add("SIDE_MAX", constants::SIDE_MAX)
+        module.add("SIDE_MAX", constants::SIDE_MAX)?;
+        module.add("LEVELS_INDEX", splat_render::levels::INDEX)
     }
     #[pymodule_export]
     use crate::backend::{

@@ -51,8 +51,9 @@ fn written(name: &str) -> Folder {
     let folder = Folder::new(name);
     write_splats(&folder.join("scene.ply"), &field()).expect("a scene");
     std::fs::create_dir(folder.join("out")).expect("a folder");
-    let done =
-        write_levels(&folder.join("scene.ply"), &folder.join("out"), 3, 100).expect("levels");
+    let done = write_levels(&folder.join("scene.ply"), &folder.join("out"), 3, 100, &mut || true)
+        .expect("levels")
+        .expect("all of it");
     assert_eq!(done.counts[0], 1600);
     assert!((250..=450).contains(&done.counts[1]), "{done:?}");
     assert!((40..=120).contains(&done.counts[2]), "{done:?}");
@@ -180,7 +181,9 @@ fn scenes_and_numbers_that_give_no_levels_are_refused() {
     file.splats.means.fill([f32::NAN; 3]);
     write_splats(&scene, &file).expect("a scene");
     let say = |scene: &Path, levels, per_cell| {
-        write_levels(scene, &folder.0, levels, per_cell).expect_err("refused").to_string()
+        write_levels(scene, &folder.0, levels, per_cell, &mut || true)
+            .expect_err("refused")
+            .to_string()
     };
     assert!(say(&scene, 2, 100).contains("no finite splats"));
     assert!(say(&scene, 0, 100).contains("from 1 to 8 levels, not 0"));
@@ -194,6 +197,26 @@ fn scenes_and_numbers_that_give_no_levels_are_refused() {
 }
 
 #[test]
+fn it_stops_within_a_cell_where_it_is_told_to() {
+    let folder = Folder::new("told");
+    write_splats(&folder.join("scene.ply"), &field()).expect("a scene");
+    // While it looks for cells, while it puts splats into them, before any cell is merged, and after some.
+    for asked in [0, 1, 2, 3] {
+        let out = folder.join(&format!("out{asked}"));
+        std::fs::create_dir(&out).expect("a folder");
+        let mut left = asked;
+        let mut goes_on = || {
+            left -= 1;
+            left >= 0
+        };
+        let done = write_levels(&folder.join("scene.ply"), &out, 3, 100, &mut goes_on);
+        assert_eq!(done.expect("no error"), None);
+        assert_eq!(left, -1, "it goes on though told to stop");
+        assert!(!out.join(INDEX).exists());
+    }
+}
+
+#[test]
 fn splats_that_no_renderer_draws_are_left_out_and_counted() {
     let folder = Folder::new("left");
     let mut file = field();
@@ -201,8 +224,9 @@ fn splats_that_no_renderer_draws_are_left_out_and_counted() {
     file.splats.quats[9] = [0.0; 4];
     write_splats(&folder.join("scene.ply"), &file).expect("a scene");
     std::fs::create_dir(folder.join("out")).expect("a folder");
-    let done =
-        write_levels(&folder.join("scene.ply"), &folder.join("out"), 2, 100).expect("levels");
+    let done = write_levels(&folder.join("scene.ply"), &folder.join("out"), 2, 100, &mut || true)
+        .expect("levels")
+        .expect("all of it");
     assert_eq!(done.counts[0], 1598);
     assert!(done.notes[0].starts_with("2 splats"), "{:?}", done.notes);
 }

@@ -36,7 +36,10 @@ impl Detail {
     /// Reads the list of cells, and all of them as coarse as there are.
     pub fn open(path: &Path, budget: usize) -> Result<(Self, SplatFile)> {
         let manifest = Manifest::read(path)?;
-        let resident = Resident::new(&manifest, budget)?;
+        let resident = Resident::new(&manifest, budget).map_err(|error| match error {
+            Error::Argument { reason, .. } => Error::argument("--budget", reason),
+            other => other,
+        })?;
         let mut out = Self { manifest, resident, failed: BTreeSet::new() };
         let choice = coarsest(&out.manifest, out.resident.room());
         while let Some(loaded) = out.load_next(&choice) {

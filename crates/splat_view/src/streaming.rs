@@ -130,7 +130,7 @@ mod tests {
         let file = SplatFile { splats, ..SplatFile::default() };
         write_splats(&folder.join("scene.ply"), &file).expect("a scene");
         let levels = folder.join("levels");
-        write_levels(&folder.join("scene.ply"), &levels, 3, 100).expect("levels");
+        write_levels(&folder.join("scene.ply"), &levels, 3, 100, &mut || true).expect("levels");
         folder
     }
 

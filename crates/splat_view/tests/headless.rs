@@ -670,7 +670,7 @@ fn ball_in_levels(folder: &Folder) -> std::path::PathBuf {
     let (scene, levels) = (folder.join("scene.ply"), folder.join("levels"));
     write(&scene, &ball(3000, 5, [0.6, 0.4, 0.3]));
     std::fs::create_dir(&levels).expect("a folder");
-    write_levels(&scene, &levels, 3, 200).expect("levels");
+    write_levels(&scene, &levels, 3, 200, &mut || true).expect("levels");
     levels
 }
 

@@ -400,7 +400,7 @@ fn a_scene_in_levels_gets_as_fine_as_its_budget_allows_and_follows_the_camera() 
     let (scene, levels) = (folder.join("scene.ply"), folder.join("levels"));
     write(&scene, &ball(3000, 20, [0.8, 0.3, 0.2]));
     std::fs::create_dir(&levels).expect("a folder");
-    write_levels(&scene, &levels, 3, 200).expect("levels");
+    write_levels(&scene, &levels, 3, 200, &mut || true).expect("levels");
     write_cameras(&folder.join("cameras.json"), &cameras());
     let path = folder.join("cameras.json");
     let words = ["--cameras", path.to_str().expect("a path"), "--budget", "1500"];

@@ -193,6 +193,33 @@ class RayCluster:
                 with contextlib.suppress(Exception):
                     ray.cancel(reference, force=True)
 
+    def do(
+        self,
+        work: Callable[[str, Any], Any],
+        data: str,
+        pieces: Sequence[Any],
+        keep: Callable[[int, Any], None],
+        **options: Any,
+    ) -> None:
+        """Do all pieces of work, also where one fails.
+
+        Args:
+            work, data, pieces: as for ``results``.
+            keep: called with the number of each piece that is done, and its result.
+            options: the other arguments of ``results``.
+
+        Raises:
+            Exception: what the first piece that failed ended with, after all others.
+        """
+        failed: Exception | None = None
+        for number, result in self.results(work, data, pieces, **options):
+            if not isinstance(result, Exception):
+                keep(number, result)
+            elif failed is None:
+                failed = result
+        if failed is not None:
+            raise failed
+
     def _result(self, reference: Any) -> Any:
         """What a piece of work returned, or the exception that it ended with."""
         lost = (

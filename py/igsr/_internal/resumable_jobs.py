@@ -175,17 +175,15 @@ def _over_ray(
 
     with RayCluster(ray if isinstance(ray, str) else None) as cluster:
         cluster.check(shared)
-        failed: Exception | None = None
-        pieces = [run.what for run in runs]
-        memory = [run.memory for run in runs]
-        results = cluster.results(work, data, pieces, memory=memory, spread=spread, again=other)
-        for number, result in results:
-            if not isinstance(result, Exception):
-                keep(runs[number], result)
-            elif failed is None:
-                failed = result
-        if failed is not None:
-            raise failed
+        cluster.do(
+            work,
+            data,
+            [run.what for run in runs],
+            lambda number, row: keep(runs[number], row),
+            memory=[run.memory for run in runs],
+            spread=spread,
+            again=other,
+        )
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -105,7 +105,7 @@ def _boxes(
     near: npt.NDArray[np.bool_],
     backend: str,
 ) -> list[Box]:
-    """Where photos show splats near seams."""
+    """The parts of photos that show splats near seams."""
     cameras = [manifest.shots[index].camera for index in photos]
     every = np.ones((len(photos), 1), np.bool_)
     none = np.full(len(photos), -1)

@@ -104,7 +104,7 @@ def boxes_of(
     most: npt.NDArray[np.int64],
     backend: str,
 ) -> list[dict[int, Box]]:
-    """Where photos show splats of some groups.
+    """The parts of photos that show splats of some groups.
 
     Args:
         splats: N splats.

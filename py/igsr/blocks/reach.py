@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.rotations import rotations_of
 from igsr.blocks.cells import Cell, Ground
 from igsr.splats import Splats
 
@@ -27,7 +28,7 @@ def reaching_out(splats: Splats, cells: Sequence[Cell], ground: Ground) -> npt.N
         ground: the plane of the cells.
     """
     places = ground.places(splats.means.astype(np.float64) + splats.origin)
-    turned = np.einsum("gk,nkj->ngj", ground.axes, rotations_of(splats.quats.astype(np.float64)))
+    turned = np.einsum("gk,nkj->ngj", ground.axes, rotations_of(_unit(splats.quats)))
     along = turned * np.exp(splats.scales.astype(np.float64))[:, None, :]
     half = DEVIATIONS * np.sqrt((along**2).sum(axis=2))
     out: npt.NDArray[np.bool_] = np.zeros(len(splats), np.bool_)
@@ -40,15 +41,7 @@ def reaching_out(splats: Splats, cells: Sequence[Cell], ground: Ground) -> npt.N
     return out
 
 
-def rotations_of(quats: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Rotation matrices [N, 3, 3] of quaternions w x y z."""
-    norm = np.linalg.norm(quats, axis=1, keepdims=True)
-    w, x, y, z = (quats / np.where(norm > 0.0, norm, 1.0)).T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1),
-        ],
-        axis=1,
-    )
+def _unit(quats: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """Unit quaternions; zero stays zero."""
+    norm = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
+    return np.asarray(quats / np.where(norm > 0.0, norm, 1.0))

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from igsr._internal.rotations import rotations_of
 from igsr.capture.colmap_rigs import read_frames, shared_centres
 from igsr.capture.depth_files import FOLDER, depth_beside
 from igsr.capture.described import DescribedCapture
@@ -333,13 +334,8 @@ def _viewmat(image: _ColmapImage, path: Path) -> np.ndarray:
             f"{path}: the pose of {image.name} has a NaN or infinite entry or a zero quaternion; "
             "run COLMAP again"
         )
-    w, x, y, z = (value / norm for value in image.quat)
     viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    viewmat[:3, :3] = rotations_of(np.array(image.quat, np.float64) / norm)
     viewmat[:3, 3] = image.translation
     return viewmat
 

@@ -107,7 +107,7 @@ def convert_command(
 
 
 def _write_levels(scene: Path, target: Path, levels: int, as_json: bool) -> None:
-    from igsr.blocks.levels import INDEX, write_levels
+    from igsr.viewing.level_files import INDEX, write_levels
 
     if target.resolve() == Path.cwd().resolve():
         raise IgsrError(f"{target} is the folder that the command runs in; name another")

@@ -308,9 +308,8 @@ def _fitted(
                 return fitter_of(views, origin, state, values, backend, priors, exposures)
 
             def beginning(views: Sequence[View]) -> tuple[dict[str, Any], tuple[str, int]]:
-                others = [view for view in capture.views if view.split != "train"]
-                masked = _seen_alike(replace(capture, views=[*views, *others]), exposures)
-                state, begun = initial_state(masked, settings, initial)
+                masked = _seen_alike(replace(capture, views=list(views)), exposures)
+                state, begun = initial_state(masked, settings)
                 state["means"] = state["means"] + (state.pop("origin") - origin).astype(np.float32)
                 return state, begun
 

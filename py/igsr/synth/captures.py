@@ -182,16 +182,14 @@ def _make_over_ray(
     """``keep`` is called with each scene as it is made, the others' of one that fails, too."""
     folder.mkdir(parents=True, exist_ok=True)
     make = partial(_make_named, seed, settings)
-    failed: Exception | None = None
     with RayCluster() as cluster:
         cluster.check(folder.resolve())
-        for number, result in cluster.results(make, str(folder.resolve()), indices):
-            if not isinstance(result, Exception):
-                keep(indices[number], result)
-            elif failed is None:
-                failed = result
-    if failed is not None:
-        raise failed
+        cluster.do(
+            make,
+            str(folder.resolve()),
+            indices,
+            lambda number, row: keep(indices[number], row),
+        )
 
 
 def _make_named(seed: int, settings: CaptureSettings, folder: str, index: int) -> dict[str, Any]:

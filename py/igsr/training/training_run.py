@@ -71,9 +71,10 @@ class TrainingRun:
         log_every: steps between rows of the log.
         checkpoint_every: steps between checkpoints and validations; None is a tenth of all, at
             most ``MOST_BETWEEN``.
+        resume: go on from the checkpoint, if there is one.
 
     Raises:
-        IgsrError: a number of steps is below 1.
+        IgsrError: a number of steps is below 1, or there is a checkpoint and ``resume`` is off.
     """
 
     def __init__(
@@ -86,12 +87,18 @@ class TrainingRun:
         progress: Callable[[TrainingProgress], None] | None,
         log_every: int,
         checkpoint_every: int | None,
+        resume: bool,
     ) -> None:
         """Note what to do; ``train`` begins."""
+        if not resume and (out / CHECKPOINT).is_file():
+            raise IgsrError(
+                f"{out / CHECKPOINT} is of an earlier training; go on with it by --resume "
+                "(resume=True), or give another --out."
+            )
         if log_every < 1 or (checkpoint_every is not None and checkpoint_every < 1):
             raise IgsrError("log_every and checkpoint_every must be at least 1.")
         self._out, self._about, self._steps = out, about, steps
-        self._writes, self._progress = writes, progress
+        self._writes, self._progress, self._resume = writes, progress, resume
         self._log_every = log_every
         self._checkpoint_every = checkpoint_every or min(MOST_BETWEEN, max(1, steps // 10))
         self._seconds = 0.0
@@ -104,7 +111,6 @@ class TrainingRun:
         learn: Callable[[int], dict[str, float]],
         validate: Callable[[], dict[str, float]],
         *,
-        resume: bool,
         validate_first: bool = False,
     ) -> None:
         """Learn from where the learner stands to the last step.
@@ -113,14 +119,13 @@ class TrainingRun:
             learner: what learns.
             learn: does the step after the given number of steps, and returns parts of the loss.
             validate: scores by name.
-            resume: go on from the checkpoint, if there is one.
             validate_first: whether what has learned nothing yet is validated, too.
 
         Raises:
-            IgsrError: the checkpoint is damaged or of another training, there is one and ``resume``
-                is off, or a part of the loss is not finite.
+            IgsrError: the checkpoint is damaged or of another training, or a part of the loss is
+                not finite.
         """
-        self._start(learner, resume)
+        self._start(learner)
         if validate_first and learner.step == 0:
             self._write_row(0, validate())
         while learner.step < self._steps:
@@ -141,13 +146,8 @@ class TrainingRun:
         """What came out was trained on and how, and with which igsr; to be kept beside it."""
         return {"igsr": _core.__version__, **self._about, "seconds": round(self._seconds)}
 
-    def _start(self, learner: Learner, resume: bool) -> None:
-        if (self._out / CHECKPOINT).is_file():
-            if not resume:
-                raise IgsrError(
-                    f"{self._out / CHECKPOINT} is of an earlier training; go on with it by "
-                    "--resume (resume=True), or give another --out."
-                )
+    def _start(self, learner: Learner) -> None:
+        if self._resume and (self._out / CHECKPOINT).is_file():
             self._restore(learner)
         if self._writes:
             _cut_log(self._out / LOG, learner.step)

@@ -208,8 +208,11 @@ pub fn read_within(path: &Path, budget: usize) -> Result<(SplatFile, usize)> {
     let counts = manifest.counts();
     let level = counts.iter().position(|&n| n > 0 && n <= resident.room()).ok_or_else(|| {
         let least = counts.last().copied().unwrap_or(0);
+        if least == 0 {
+            return Error::file(path, "has no splats; write the levels again");
+        }
         let what = format!("has {least} splats at its coarsest level, more than {budget}");
-        Error::file(path, format!("{what}; write more levels, or allow more splats"))
+        Error::file(path, format!("{what}; write more levels"))
     })?;
     let levels: Vec<_> = manifest.cells.iter().map(|c| c.runs[level].map(|_| level)).collect();
     let files: BTreeSet<usize> =

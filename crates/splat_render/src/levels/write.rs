@@ -42,7 +42,8 @@ pub struct LevelsWritten {
 }
 
 /// Writes the scene of a file into a folder, which is there and empty: `levels` of them, each with a
-/// quarter of the splats of the next finer one, in cells of at most about `per_cell` splats.
+/// quarter of the splats of the next finer one, in cells of at most about `per_cell` splats. None, with the
+/// folder half written, once `goes_on`, which is asked now and then, says no.
 ///
 /// # Errors
 /// [`Error::Argument`]: a number cannot be used; [`Error::File`]: a file cannot be read or written, or has
@@ -52,7 +53,8 @@ pub fn write_levels(
     folder: &Path,
     levels: usize,
     per_cell: usize,
-) -> Result<LevelsWritten> {
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Result<Option<LevelsWritten>> {
     if !(1..=8).contains(&levels) {
         return Err(Error::argument("lod", format!("must be from 1 to 8 levels, not {levels}")));
     }
@@ -63,8 +65,12 @@ pub fn write_levels(
         ));
     }
     let mut rows = SplatRows::open(source)?;
-    let tree = split(&mut rows, per_cell)?
-        .ok_or_else(|| Error::file(source, "has no finite splats to make levels of"))?;
+    let Some(mut points) = sample(&mut rows, goes_on)? else { return Ok(None) };
+    if points.is_empty() {
+        return Err(Error::file(source, "has no finite splats to make levels of"));
+    }
+    let tree = Cells::new(&mut points, per_cell / step(&rows));
+    drop(points);
     let degree = rows.sh_degree.min(DEGREE);
     let mut spool = Spool::new(folder.join(".cells"), degree, tree.count)?;
     rows.rewind()?;
@@ -73,6 +79,9 @@ pub fn write_levels(
         let mut batch = rows.next(BATCH)?;
         if batch.is_empty() {
             break;
+        }
+        if !goes_on() {
+            return Ok(None);
         }
         if batch.sh_degree > degree {
             batch = cut_degree(&batch, degree);
@@ -97,6 +106,9 @@ pub fn write_levels(
     let mut cells = Vec::with_capacity(tree.count);
     let numbers: Vec<usize> = (0..tree.count).collect();
     for some in numbers.chunks(rayon::current_num_threads().max(1)) {
+        if !goes_on() {
+            return Ok(None);
+        }
         let made: Vec<Option<Made>> = some
             .par_iter()
             .map(|&cell| Ok(spool.take(cell)?.map(|splats| Made::new(&splats, levels))))
@@ -125,26 +137,37 @@ pub fn write_levels(
     if rows.sh_degree > DEGREE {
         notes.push(format!("SOG holds spherical harmonics up to degree {DEGREE}."));
     }
-    Ok(LevelsWritten {
+    Ok(Some(LevelsWritten {
         counts: manifest.counts(),
         cells: manifest.cells.len(),
         files: manifest.files.len(),
         notes,
-    })
+    }))
 }
 
 fn unwritable(path: &Path, why: &dyn std::fmt::Display) -> Error {
     Error::file(path, format!("cannot be written ({why})"))
 }
 
-/// Cells of about `per_cell` splats; None if no position is finite.
-fn split(rows: &mut SplatRows, per_cell: usize) -> Result<Option<Cells>> {
-    let step = rows.count.div_ceil(SAMPLES).max(1);
+/// Of how many splats one position is looked at to split space.
+fn step(rows: &SplatRows) -> usize {
+    rows.count.div_ceil(SAMPLES).max(1)
+}
+
+/// The finite ones of these positions; None where it was told to stop.
+fn sample(
+    rows: &mut SplatRows,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Result<Option<Vec<[f32; 3]>>> {
+    let step = step(rows);
     let (mut points, mut number) = (Vec::new(), 0usize);
     loop {
         let batch = rows.next(BATCH)?;
         if batch.is_empty() {
-            break;
+            return Ok(Some(points));
+        }
+        if !goes_on() {
+            return Ok(None);
         }
         for mean in &batch.means {
             if number % step == 0 && mean.iter().all(|c| c.is_finite()) {
@@ -153,7 +176,6 @@ fn split(rows: &mut SplatRows, per_cell: usize) -> Result<Option<Cells>> {
             number += 1;
         }
     }
-    Ok((!points.is_empty()).then(|| Cells::new(&mut points, per_cell / step)))
 }
 
 /// Splats on the disk by their cells.

@@ -93,6 +93,7 @@ def train(
         progress=progress,
         log_every=log_every,
         checkpoint_every=checkpoint_every,
+        resume=resume,
     )
 
     def learn(step: int) -> dict[str, float]:
@@ -101,7 +102,7 @@ def train(
     def validate() -> dict[str, float]:
         return validated(learner.averaged, validation, distance, processes.device)
 
-    run.train(learner, learn, validate, resume=resume)
+    run.train(learner, learn, validate)
     if processes.first:
         save_network(learner.averaged, out / WEIGHTS, run.recipe())
     processes.end()

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from igsr._internal.rotations import rotations_of
 from igsr.capture.types import intrinsic_matrix
 from igsr.errors import IgsrError
 
@@ -51,15 +52,8 @@ def decode_pose(
         IgsrError: the encoding has another shape.
     """
     numbers = _array(encoding, "encoding", 2, 9)
-    centre, (x, y, z, w) = numbers[:, :3], _unit(numbers[:, 3:7]).T
-    c2w = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=1,
-    )
+    # The encoding has w last.
+    centre, c2w = numbers[:, :3], rotations_of(np.roll(_unit(numbers[:, 3:7]), 1, axis=-1))
     tangents = np.maximum(np.tan(numbers[:, 7:] / 2.0), LEAST_TANGENT)
     focal_y, focal_x = (height / 2.0) / tangents[:, 0], (width / 2.0) / tangents[:, 1]
     intrinsics = np.stack(

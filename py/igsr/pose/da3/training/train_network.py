@@ -85,6 +85,7 @@ def train(
         progress=progress,
         log_every=log_every,
         checkpoint_every=checkpoint_every,
+        resume=resume,
     )
     folder = out / CAPTURES if captures is None else Path(captures)
     with CaptureSource(training, folder, jobs).open() as source:
@@ -96,7 +97,7 @@ def train(
         def validate() -> dict[str, float]:
             return validated(learner.averaged, validation, learner.device)
 
-        run.train(learner, learn, validate, resume=resume, validate_first=True)
+        run.train(learner, learn, validate, validate_first=True)
     network = learner.averaged.to("cpu").eval().requires_grad_(False)
     # The sizes before the weights, which without them would be used at another resolution.
     with atomic_write(out / CONFIG) as temporary:
