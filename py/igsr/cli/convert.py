@@ -120,7 +120,8 @@ def _write_levels(scene: Path, target: Path, levels: int, as_json: bool) -> None
     console = output_console()
     for level, count in enumerate(written.counts):
         console.print(f"level {level}: {count} splats")
-    console.print(f"{written.cells} cells in {written.files} files, {target / INDEX}")
+    cells = "1 cell" if written.cells == 1 else f"{written.cells} cells"
+    console.print(f"{cells} in {written.files} files, {target / INDEX}")
 
 
 def _write_page(
