@@ -297,11 +297,12 @@ def test_a_million_splats(browser, tmp_path):
     write_scene_page(path, splats, named(three_cameras()), BACKGROUND)
     assert path.stat().st_size <= 20e6
     started = time.monotonic()
-    browser.open(path, 300.0)
+    # A software renderer on a busy machine takes minutes.
+    browser.open(path, 600.0)
     assert browser.run("window.igsr.error") is None
     camera = three_cameras()[1]
-    drawn(browser, camera, 300.0)
+    drawn(browser, camera, 600.0)
     # The second picture: the browser has drawn the page's first by then.
     print(f"{path.stat().st_size / 1e6:.1f} MB, drawn after {time.monotonic() - started:.1f} s")
     expected = render(splats, camera, BACKGROUND, backend="cpu").to_uint8()
-    assert np.abs(drawn(browser, camera, 120.0) - expected).mean() <= MEAN
+    assert np.abs(drawn(browser, camera, 600.0) - expected).mean() <= MEAN

@@ -121,7 +121,8 @@ def _write_levels(scene: Path, target: Path, levels: int, as_json: bool) -> None
     for level, count in enumerate(written.counts):
         console.print(f"level {level}: {count} splats")
     cells = "1 cell" if written.cells == 1 else f"{written.cells} cells"
-    console.print(f"{cells} in {written.files} files, {target / INDEX}")
+    files = "1 file" if written.files == 1 else f"{written.files} files"
+    console.print(f"{cells} in {files}, {target / INDEX}")
 
 
 def _write_page(
