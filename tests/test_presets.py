@@ -52,7 +52,7 @@ def test_default_follows_what_photos_tell_and_gives_way_to_the_caller():
         "original",
         "mcmc",
     )
-    assert (few.max_splats, many.max_splats) == (30_000, 30_210)
+    assert (few.max_splats, many.max_splats) == (30_000, 45_000)
     assert settings_for("default", support(8, pixels=1e9)).max_splats == presets.MOST_SPLATS
     detailed = replace(support(8), detail=35_000.0)
     assert settings_for("default", detailed).max_splats == 35_000

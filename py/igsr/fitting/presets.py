@@ -33,7 +33,7 @@ WIDE_APART, SHOWN_BY = 7.0, 0.5
 #: From so many photos of the same place on, view-dependent color is more than a way to overfit.
 SH2_PHOTOS = 12.0
 #: Steps of any fit, and more for each photo, up to a most; but for few photos only so many each.
-STEPS, STEPS_MORE, MOST_STEPS = 1600, 9, 2500
+STEPS, STEPS_MORE, MOST_STEPS = 1500, 25, 2500
 STEPS_PER_PHOTO = 250
 #: 3DGS's learning rates are for this many steps. With ``n`` times fewer, rates ``sqrt(n)`` times as
 #: large reach more than theirs do; above ``MOST_LEARNING_RATE`` splats overshoot.
@@ -47,7 +47,8 @@ JOINT_STEPS = 2
 SPLATS_PER_PIXEL = 0.11
 FEW, SPLATS_POWER = 8.0, 0.4
 MOST_SPLATS = 1_000_000
-#: Small photos may have this many, or so many per pixel: they cost little there.
+#: Small photos may have this many, or so many per pixel, times the same power where they are more
+#: than ``FEW``: they cost little there.
 SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL = 45_000, 0.3
 #: Photos of much detail have a splat for each of their squares of one tone, times the same power,
 #: at most so many per pixel: what is finer is noise.
@@ -187,7 +188,7 @@ def _default(
     more = (support.photos / FEW) ** SPLATS_POWER
     splats = max(
         SPLATS_PER_PIXEL * support.pixels * more,
-        min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * support.pixels),
+        min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * support.pixels * max(1.0, more)),
         min(support.detail * more, DETAIL_PER_PIXEL * support.pixels),
     )
     return replace(
