@@ -93,6 +93,45 @@ def test_masked_pixels_need_nothing():
     assert needed_by_others(BALL, views, BLACK, backend="cpu").any()
 
 
+def with_masks_of(views, scene, splats):
+    """The views of which only those pixels count that these splats of the scene cover."""
+    cut = removal._subset(scene, splats)
+    alphas = [igsr.render(cut, view.camera, backend="cpu").alpha for view in views]
+    return [replace(view, mask=alpha > 0.05) for view, alpha in zip(views, alphas, strict=True)]
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_sightings_tell_the_area_in_pixels_that_count(backend):
+    views = with_masks_of(scenes.capture(views=4, scene=BALL).views, BALL, np.arange(60) < 8)
+    cameras, masks = [view.camera for view in views], [view.mask for view in views]
+    seen = sightings(BALL, cameras, backend, masks)
+    alphas = [igsr.render(BALL, camera, backend=backend).alpha for camera in cameras]
+    inside = sum(alpha[mask].sum() for alpha, mask in zip(alphas, masks, strict=True))
+    assert seen.counted.sum() == pytest.approx(inside, rel=1e-4)
+    assert seen.counted.sum() < 0.9 * seen.area.sum()
+    everywhere = sightings(BALL, cameras, backend)
+    assert np.array_equal(everywhere.counted, everywhere.area)
+
+
+def test_what_masks_hide_is_found_and_what_some_photos_count_is_kept():
+    """Nothing corrects what a fit puts round an object whose surroundings are masked."""
+    aside = specks([[0.0, -1.5, 0.0], [0.3, -1.5, 0.0]], size=0.08)
+    scene = joined(BALL, aside)
+    ball = np.arange(62) < 60
+    views = scenes.capture(views=6, scene=scene).views
+    masked = with_masks_of(views, scene, ball)
+    kinds = unsupported_splats(scene, masked, BLACK, backend="cpu")
+    assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
+    assert not unsupported_splats(scene, views, BLACK, backend="cpu")["masked"].any()
+    # A person before them in half of the photos is no reason to remove what the others show.
+    some = [*masked[:3], *views[3:]]
+    assert not unsupported_splats(scene, some, BLACK, backend="cpu")["masked"].any()
+    # Pseudo-views do not tell: they show what was fitted.
+    pseudo = [replace(view, weights=np.ones((48, 48), np.float32)) for view in views]
+    kinds = unsupported_splats(scene, [*masked, *pseudo], BLACK, backend="cpu")
+    assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
+
+
 def test_what_no_photo_shows_and_what_only_one_photo_needs_is_found():
     views = scenes.capture(views=6, scene=BALL).views
     unseen, floating = [0.0, 40.0, 0.0], before(views[2])
@@ -214,7 +253,7 @@ def test_photos_decide_and_the_scene_keeps_its_order():
     origin = np.array([1.0, 0.0, 0.0])
     model = replace(model, origin=origin, means=(model.means - origin).astype(np.float32))
     cleaned = igsr.remove_floaters(model, capture, backend="cpu")
-    assert cleaned.removed == {"unseen": 1, "floating": 1}
+    assert cleaned.removed == {"unseen": 1, "masked": 0, "floating": 1}
     assert np.array_equal(cleaned.splats.means, model.means[1:-1])
     assert np.array_equal(cleaned.splats.origin, model.origin)
 
@@ -223,7 +262,7 @@ def test_a_scene_of_floaters_alone_stays_whole():
     capture = scenes.capture(views=4)
     cleaned = igsr.remove_floaters(specks([[0.0, 40.0, 0.0]]), capture, backend="cpu")
     assert len(cleaned.splats) == 1
-    assert cleaned.removed == {"unseen": 0, "floating": 0}
+    assert cleaned.removed == {"unseen": 0, "masked": 0, "floating": 0}
 
 
 def test_a_capture_without_photos_to_ask_is_refused():
@@ -298,7 +337,7 @@ def test_clean_removes_what_photos_do_not_show(scene, tmp_path):
     result = command(path, *words, "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
-    assert report["removed"] == {"unseen": 1, "floating": 0}
+    assert report["removed"] == {"unseen": 1, "masked": 0, "floating": 0}
     assert (report["before"], report["splats"]) == (61, 60)
     assert report["held_out"]["before"] == report["held_out"]["after"]
     assert report["held_out"]["after"]["views"] == 2

@@ -278,6 +278,7 @@ def parts_line(parts: dict[str, dict[str, Any]]) -> str:
 #: What the kinds of floaters are, as ``igsr.floaters.Cleaned`` names them.
 _FLOATERS = {
     "unseen": "that no photo shows",
+    "masked": "that masks hide",
     "floating": "floating before the surface",
     "invisible": "too faint to be drawn",
     "alone": "with few others near",

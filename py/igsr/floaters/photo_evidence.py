@@ -35,11 +35,13 @@ class Sightings:
     Attributes:
         area: blending weight summed over pixels and cameras: the area in pixels that the splat
             covers, as far as nothing before it hides it.
+        counted: the part of that area in pixels that count.
         shown: number of cameras that show it.
         before: number of those where it stands before the surface that its pixels show.
     """
 
     area: Float64
+    counted: Float64
     shown: Int64
     before: Int64
 
@@ -74,8 +76,19 @@ class _Picture:
             backend=self._backend,
         )
 
+    def areas(self, pixels: npt.NDArray[np.bool_]) -> Float64:
+        """The area that each splat covers of some pixels, bool [H, W]."""
+        inside = pixels.astype(self.image["alpha"].dtype)
+        v_color = np.stack([inside, np.zeros_like(inside), np.zeros_like(inside)], axis=-1)
+        return self.backward(v_color)["v_colors"][:, 0].astype(np.float64)
 
-def sightings(splats: Splats, cameras: Sequence[Camera], backend: str = "auto") -> Sightings:
+
+def sightings(
+    splats: Splats,
+    cameras: Sequence[Camera],
+    backend: str = "auto",
+    masks: Sequence[npt.NDArray[np.bool_] | None] | None = None,
+) -> Sightings:
     """Count who shows each splat, and who shows it before the surface.
 
     The surface of a pixel is its expected depth; a splat's is the mean of its pixels' by its weight
@@ -85,6 +98,7 @@ def sightings(splats: Splats, cameras: Sequence[Camera], backend: str = "auto") 
         splats: the scene.
         cameras: of the photos.
         backend: "auto", "cpu", "gpu" or "reference".
+        masks: bool [H, W] for each camera, True for pixels that count; None where all do.
 
     Raises:
         ValueError: the parameters cannot be drawn; the message names the argument.
@@ -92,9 +106,9 @@ def sightings(splats: Splats, cameras: Sequence[Camera], backend: str = "auto") 
     """
     backend = _core.resolve_backend(backend)
     dtype = _core.working_dtype(backend)
-    area = np.zeros(len(splats))
+    area, counted = np.zeros((2, len(splats)))
     shown, before = np.zeros((2, len(splats)), np.int64)
-    for camera in cameras:
+    for camera, mask in zip(cameras, masks or [None] * len(cameras), strict=True):
         picture = _Picture(splats, camera, np.zeros(3, dtype), backend)
         alpha = picture.image["alpha"]
         surface = picture.image["depth"] / np.maximum(alpha, np.finfo(dtype).tiny)
@@ -104,9 +118,10 @@ def sightings(splats: Splats, cameras: Sequence[Camera], backend: str = "auto") 
         covered = v[:, 0].astype(np.float64)
         is_shown = covered >= SHOWN
         area += covered
+        counted += covered if mask is None else picture.areas(mask)
         shown += is_shown
         before += is_shown & (picture.projected["depths"] * covered < BEFORE * v[:, 1])
-    return Sightings(area, shown, before)
+    return Sightings(area, counted, shown, before)
 
 
 def behind_masks(

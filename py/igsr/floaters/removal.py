@@ -18,6 +18,8 @@ from igsr.splats import Splats
 
 Bool = npt.NDArray[np.bool_]
 
+#: What has less than this part of its area in pixels that count, was made up where nothing corrects.
+COUNTED = 1.0 / 3.0
 #: Most photos that are asked whether they need a splat; with more, these are evenly spaced.
 MOST_ASKED = 24
 
@@ -28,9 +30,10 @@ class Cleaned:
 
     Attributes:
         splats: those that are left, in their order.
-        removed: number of splats removed of each kind. With photos: "unseen" (nothing shows it)
-            and "floating" (every photo that shows it shows it far before the surface, and at most
-            one of them needs it). Without photos: "invisible" (not finite, or fainter than
+        removed: number of splats removed of each kind. With photos: "unseen" (nothing shows it),
+            "masked" (photos show most of it in masked pixels) and "floating" (every photo that
+            shows it shows it far before the surface, and at most one of them needs it). Without
+            photos: "invisible" (not finite, or fainter than
             anything that is drawn) and "alone" (few others are near).
     """
 
@@ -107,7 +110,7 @@ def unsupported_splats(
     seed: int = 0,
     backend: str = "auto",
 ) -> dict[str, Bool]:
-    """Which splats no photo shows, and which are floating.
+    """Which splats no photo shows, which masks hide, and which are floating.
 
     Args:
         splats: the scene.
@@ -117,15 +120,17 @@ def unsupported_splats(
         backend: "auto", "cpu", "gpu" or "reference".
 
     Returns:
-        bool [N] under "unseen" and "floating".
+        bool [N] under "unseen", "masked" and "floating"; no splat is of two kinds.
 
     Raises:
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     photos = [view for view in views if view.weights is None] or views
-    seen = sightings(splats, [view.camera for view in photos], backend)
+    masks = [view.mask for view in photos]
+    seen = sightings(splats, [view.camera for view in photos], backend, masks)
     others = [view.camera for view in views if view.weights is not None]
     unseen = seen.area + sightings(splats, others, backend).area < SHOWN
+    masked = ~unseen & (seen.counted < COUNTED * seen.area)
     floating = (seen.before > 0) & (seen.before == seen.shown)
     if floating.any():
         evenly = np.linspace(0, len(photos) - 1, min(len(photos), MOST_ASKED)).round()
@@ -133,7 +138,7 @@ def unsupported_splats(
         needed = needed_by_others(splats, asked, background, seed, backend)
         # Where not all are asked, 0 may be for lack of an answer.
         floating &= (needed < 0.0) | (seen.shown == 1)
-    return {"unseen": unseen, "floating": floating & ~unseen}
+    return {"unseen": unseen, "masked": masked, "floating": floating & ~unseen & ~masked}
 
 
 def _without(splats: Splats, kinds: dict[str, Bool], frozen: int = 0) -> Cleaned:
