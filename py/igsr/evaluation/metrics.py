@@ -32,8 +32,9 @@ MS_SSIM_EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 PSNR_CAP = 100.0
 #: Color correction: repetitions, and how far from 0 and 1 a channel counts as not clipped.
 CORRECTIONS, CLIPPED = 5, 0.5 / 255.0
-#: Pixels whose features are held at a time.
-PART = 1 << 16
+#: Pixels whose features are held at a time: so few that BLAS takes one thread for them, since waking
+#: others takes longer than the product.
+PART = 1 << 12
 #: What ``score`` gives.
 NAMES = ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim")
 
@@ -242,43 +243,44 @@ def color_corrected(render: Image, photo: Image, mask: Mask | None = None) -> Im
         uint8 [H, W, 3]. A channel with too few pixels to fit a map to stays as it is.
     """
     render, photo, mask = _checked(render, photo, mask)
-    chosen = np.ones(photo.shape[:2], np.bool_) if mask is None else mask
-    wanted = photo.reshape(-1, 3) / 255.0
-    start = colors = render.reshape(-1, 3) / 255.0
-    inside = chosen.reshape(-1)
-    # Large photos are taken in parts: ten features of each pixel are many.
-    parts = [slice(at, at + PART) for at in range(0, len(colors), PART)]
+    inside = None if mask is None else mask.reshape(-1)
+    wanted, start = (_planes(picture).reshape(3, -1) for picture in (photo, render))
+    open_in_both = ~(_clipped(wanted) | _clipped(start))
+    if inside is not None:
+        open_in_both &= inside
+    colors = start
+    # In parts that stay in a processor's cache.
+    parts = [slice(at, at + PART) for at in range(0, colors.shape[1], PART)]
     for _ in range(CORRECTIONS):
         squares, products = np.zeros((3, 10, 10)), np.zeros((3, 10))
-        counts = np.zeros(3, np.int64)
+        usable = open_in_both & ~_clipped(colors)
         for part in parts:
-            features = _quadratic(colors[part])
+            features = _quadratic(colors[:, part])
             for channel in range(3):
-                usable = inside[part].copy()
-                for values in (start, colors, wanted):
-                    each = values[part, channel]
-                    usable &= (each >= CLIPPED) & (each <= 1.0 - CLIPPED)
-                rows = features[usable]
-                squares[channel] += rows.T @ rows
-                products[channel] += rows.T @ wanted[part, channel][usable]
-                counts[channel] += len(rows)
-        mapped = colors.copy()
+                kept = features * usable[channel, part]
+                squares[channel] += kept @ features.T
+                products[channel] += kept @ wanted[channel, part]
+        weights = np.zeros((3, 10))
         for channel in range(3):
-            if counts[channel] < 10:
-                continue
-            weights = np.linalg.lstsq(squares[channel], products[channel])[0]
-            for part in parts:
-                line = _quadratic(colors[part]) @ weights
-                mapped[part, channel] = np.clip(line, 0.0, 1.0)
-        colors = mapped
-    return np.asarray((colors * 255.0 + 0.5).astype(np.uint8)).reshape(render.shape)
+            if usable[channel].sum() < 10:
+                weights[channel, 6 + channel] = 1.0
+            else:
+                weights[channel] = np.linalg.lstsq(squares[channel], products[channel])[0]
+        colors = np.concatenate(
+            [np.clip(weights @ _quadratic(colors[:, part]), 0.0, 1.0) for part in parts], axis=1
+        )
+    return np.ascontiguousarray((colors.T * 255.0 + 0.5).astype(np.uint8)).reshape(render.shape)
+
+
+def _clipped(colors: Planes) -> Mask:
+    return np.asarray((colors < CLIPPED) | (colors > 1.0 - CLIPPED))
 
 
 def _quadratic(colors: Planes) -> Planes:
-    """Products of two channels, the channels, and 1: float64 [P, 10]."""
-    red, green, blue = colors.T
+    """Products of two channels, the channels, and 1, of colors [3, P]: float64 [10, P]."""
+    red, green, blue = colors
     products = (red * red, red * green, red * blue, green * green, green * blue, blue * blue)
-    return np.stack([*products, red, green, blue, np.ones(len(colors))], axis=1)
+    return np.stack([*products, red, green, blue, np.ones_like(red)])
 
 
 def score(
