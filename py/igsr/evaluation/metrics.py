@@ -32,7 +32,7 @@ MS_SSIM_EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 PSNR_CAP = 100.0
 #: Color correction: repetitions, and how far from 0 and 1 a channel counts as not clipped.
 CORRECTIONS, CLIPPED = 5, 0.5 / 255.0
-#: Pixels whose features are held at a time: so few that BLAS takes one thread for them, since waking
+#: Pixels whose features are held at a time: so few that BLAS takes one thread for them. Waking
 #: others takes longer than the product.
 PART = 1 << 12
 #: What ``score`` gives.
@@ -243,13 +243,11 @@ def color_corrected(render: Image, photo: Image, mask: Mask | None = None) -> Im
         uint8 [H, W, 3]. A channel with too few pixels to fit a map to stays as it is.
     """
     render, photo, mask = _checked(render, photo, mask)
-    inside = None if mask is None else mask.reshape(-1)
     wanted, start = (_planes(picture).reshape(3, -1) for picture in (photo, render))
     open_in_both = ~(_clipped(wanted) | _clipped(start))
-    if inside is not None:
-        open_in_both &= inside
+    if mask is not None:
+        open_in_both &= mask.reshape(-1)
     colors = start
-    # In parts that stay in a processor's cache.
     parts = [slice(at, at + PART) for at in range(0, colors.shape[1], PART)]
     for _ in range(CORRECTIONS):
         squares, products = np.zeros((3, 10, 10)), np.zeros((3, 10))

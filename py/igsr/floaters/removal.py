@@ -18,7 +18,7 @@ from igsr.splats import Splats
 
 Bool = npt.NDArray[np.bool_]
 
-#: What has less than this part of its area in pixels that count, was made up where nothing corrects.
+#: Nothing corrects what has less than this part of its area in pixels that count.
 COUNTED = 1.0 / 3.0
 #: Most photos that are asked whether they need a splat; with more, these are evenly spaced.
 MOST_ASKED = 24
@@ -33,8 +33,8 @@ class Cleaned:
         removed: number of splats removed of each kind. With photos: "unseen" (nothing shows it),
             "masked" (photos show most of it in masked pixels) and "floating" (every photo that
             shows it shows it far before the surface, and at most one of them needs it). Without
-            photos: "invisible" (not finite, or fainter than
-            anything that is drawn) and "alone" (few others are near).
+            photos: "invisible" (not finite, or fainter than anything that is drawn) and "alone"
+            (few others are near).
     """
 
     splats: Splats
