@@ -25,8 +25,9 @@ COVER, COVER_OF_ALPHA = 40.0, 18.0
 START_PART, GROWN, REACHED = 0.5, 0.5, 0.95
 #: Splats per pixel that fits without a limit of their own come to, at most.
 UNLIMITED_PER_PIXEL = 0.5
-#: Seconds of a photo's depth map, and of a scored photo's pixel; measured on two cores.
-SWEPT, SCORED = 0.4, 3.5e-6
+#: Seconds of a photo's depth map, and of a scored photo's pixel, on a machine whose steps take as
+#: long as ``USUAL``; others are as many times as fast as their steps.
+SWEPT, SCORED = 0.4, 2e-6
 #: Parts that steps are counted in.
 PARTS = 50
 
@@ -50,7 +51,7 @@ class StepTime:
         return self.fixed + self.per_pixel * pixels + self.per_splat * splats
 
 
-#: What steps take on two cores; only how pixels and splats compare matters.
+#: What steps take on two cores.
 USUAL = StepTime(1e-3, 7e-8, 4e-7)
 
 
@@ -121,15 +122,18 @@ def work_done(settings: FitSettings, width: float, height: float, step: int) -> 
     return fit_seconds(settings, width, height, USUAL, until=max(first, step)) / whole
 
 
-def other_seconds(photos: int, scored: int, pixels: float) -> float:
+def other_seconds(photos: int, scored: int, pixels: float, step: StepTime = USUAL) -> float:
     """Seconds that a run takes beside the steps: depth maps before them, and scores after.
 
     Args:
         photos: number of photos that depth maps are found for.
         scored: number of photos scored.
         pixels: of a photo.
+        step: what steps take on this machine.
     """
-    return SWEPT * min(photos, MOST_SWEPT) + SCORED * scored * pixels
+    usual = (float(SIDES[1] ** 2), float(SPLATS[1]))
+    as_long = step.of(*usual) / USUAL.of(*usual)
+    return as_long * (SWEPT * min(photos, MOST_SWEPT) + SCORED * scored * pixels)
 
 
 def _timed(backend: str, side: int, splats: int, sh_degree: int, cover: float) -> float:

@@ -19,7 +19,7 @@ from igsr.splats import Splats
 Bool = npt.NDArray[np.bool_]
 
 #: Nothing corrects what has less than this part of its area in pixels that count.
-COUNTED = 1.0 / 3.0
+COUNTED = 0.05
 #: Most photos that are asked whether they need a splat; with more, these are evenly spaced.
 MOST_ASKED = 24
 
