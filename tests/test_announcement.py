@@ -20,6 +20,7 @@ from igsr.fitting.time_estimate import (
     fit_seconds,
     other_seconds,
     timed_steps,
+    times_usual,
     work_done,
 )
 from igsr.pose.colmap.time_estimate import camera_seconds
@@ -69,7 +70,10 @@ def test_depth_maps_and_scores_count():
     assert other_seconds(0, 10, 2e6) == pytest.approx(2.0 * other_seconds(0, 10, 1e6))
     # A machine whose steps take half as long takes half as long for the rest.
     fast = StepTime(USUAL.fixed / 2.0, USUAL.per_pixel / 2.0, USUAL.per_splat / 2.0)
-    assert other_seconds(8, 10, 1e6, fast) == pytest.approx(0.5 * other_seconds(8, 10, 1e6))
+    assert times_usual(USUAL, alpha=False) == 1.0
+    assert times_usual(fast, alpha=False) == pytest.approx(0.5)
+    assert times_usual(fast, alpha=True) > 0.5
+    assert other_seconds(8, 10, 1e6, 0.5) == pytest.approx(0.5 * other_seconds(8, 10, 1e6))
 
 
 def test_cameras_take_longer_for_more_and_larger_photos():
@@ -158,6 +162,9 @@ def test_photos_that_need_no_depth_maps_take_less(monkeypatch):
         return said(monkeypatch, changed, cameras_kept=True, given=given)[2]
 
     assert "about 75 s" in seconds(seen)
+    # A slow GPU says nothing of the CPU, which finds depth maps and scores.
+    slow = said(monkeypatch, seen, cameras_kept=True, given={"steps": 10}, backend="gpu")[2]
+    assert "about 10 s" in slow
     for without in (replace(seen, channels=4), replace(seen, depths=True)):
         assert "about 5 s" in seconds(without)
     assert "about 5 s" in seconds(seen, start="points")

@@ -126,10 +126,24 @@ def test_what_masks_hide_is_found_and_what_some_photos_count_is_kept():
     # A person before them in half of the photos is no reason to remove what the others show.
     some = [*masked[:3], *views[3:]]
     assert not unsupported_splats(scene, some, BLACK, backend="cpu")["masked"].any()
-    # Pseudo-views do not tell: they show what was fitted.
+    # Pseudo-views do not tell that masks hide nothing: they show what was fitted.
     pseudo = [replace(view, weights=np.ones((48, 48), np.float32)) for view in views]
     kinds = unsupported_splats(scene, [*masked, *pseudo], BLACK, backend="cpu")
     assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
+
+
+def test_what_photos_hardly_show_behind_masks_is_left_to_pseudo_views():
+    speck = specks([[0.1, -1.4, 0.0]], size=0.004, opacity=-1.0)
+    scene = joined(BALL, speck)
+    ball = np.arange(61) < 60
+    views = scenes.capture(views=6, scene=scene).views
+    masked = with_masks_of(views, scene, ball)
+    cameras = [view.camera for view in views]
+    assert 0.0 < sightings(scene, cameras, "cpu").area[-1] < photo_evidence.SHOWN
+    pseudo = [replace(view, weights=np.ones((48, 48), np.float32)) for view in views]
+    many = [*masked, *(pseudo * 40)]
+    kinds = unsupported_splats(scene, many, BLACK, backend="cpu")
+    assert not any(kind[-1] for kind in kinds.values())
 
 
 def test_what_no_photo_shows_and_what_only_one_photo_needs_is_found():

@@ -11,7 +11,7 @@ from igsr.cli.error_messages import print_message
 from igsr.evaluation.quick_scores import MOST_TRAIN
 from igsr.fitting.photo_support import PhotoSupport, detail_of_files
 from igsr.fitting.presets import Quality, settings_for
-from igsr.fitting.time_estimate import USUAL, fit_seconds, other_seconds, timed_steps
+from igsr.fitting.time_estimate import fit_seconds, other_seconds, timed_steps, times_usual
 from igsr.pose.colmap.time_estimate import camera_seconds
 
 #: Photos as people take them stand this far apart, seen from what they show: degrees.
@@ -55,15 +55,16 @@ def announce(
     support = PhotoSupport(photos, pixels, float(photos), USUALLY_APART, detail)
     settings = settings_for(preset, support, quality, **given)
     cameras = 0.0 if cameras_kept else camera_seconds(seen.sizes)
-    step = timed_steps(backend, settings.sh_degree, seen.channels == 4)
+    alpha = seen.channels == 4
+    step = timed_steps(backend, settings.sh_degree, alpha)
     fit = (1.0 + ROUND * rounds) * fit_seconds(settings, width, height, step)
     held_out = len(seen.sizes) - train
     # Photos with alpha are fitted from their hull, and those with depths from these.
     swept = settings.start in ("auto", "depths") and seen.channels < 4 and not seen.depths
     scored = held_out + min(photos, MOST_TRAIN)
-    # The rest runs on the CPU in any case.
-    rest = step if backend == "cpu" else USUAL
-    fit += other_seconds(photos if swept else 0, scored, pixels, rest)
+    # The rest runs on the CPU in any case; a GPU's steps do not tell how fast that is.
+    times = times_usual(step, alpha) if backend == "cpu" else 1.0
+    fit += other_seconds(photos if swept else 0, scored, pixels, times)
     print_message(
         f"Found {len(seen.sizes)} photos of {_range_of(seen.sizes)}"
         + (f", {held_out} of them held out" if held_out else "")

@@ -42,8 +42,8 @@ def clean_command(
             "--capture",
             metavar="CAPTURE",
             help="The photos that SCENE was fitted to, with their cameras: remove what no photo "
-            "shows, and what floats before the surface and at most one photo needs. Without it, "
-            "remove what is too faint to be drawn, and splats that stand alone.",
+            "shows, what masks hide, and what floats before the surface and at most one photo "
+            "needs. Without it, remove what is too faint to be drawn, and splats that stand alone.",
         ),
     ] = None,
     holdout: HoldoutOption = None,

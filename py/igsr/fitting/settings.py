@@ -135,8 +135,8 @@ class FitSettings:
     )
     remove_floaters: bool = field(
         metadata=about(
-            "In the end, remove splats that no photo shows, and those far before the surface that "
-            "at most one photo needs."
+            "In the end, remove splats that no photo shows, those that masks hide, and those far "
+            "before the surface that at most one photo needs."
         )
     )
     background: tuple[float, float, float] | None = field(

@@ -51,7 +51,8 @@ class StepTime:
         return self.fixed + self.per_pixel * pixels + self.per_splat * splats
 
 
-#: What steps take on two cores.
+#: What steps take on two cores, without alpha, and what part of it with alpha.
+USUAL_OF_ALPHA = 0.6
 USUAL = StepTime(1e-3, 7e-8, 4e-7)
 
 
@@ -122,18 +123,27 @@ def work_done(settings: FitSettings, width: float, height: float, step: int) -> 
     return fit_seconds(settings, width, height, USUAL, until=max(first, step)) / whole
 
 
-def other_seconds(photos: int, scored: int, pixels: float, step: StepTime = USUAL) -> float:
+def times_usual(step: StepTime, alpha: bool) -> float:
+    """How many times as long as usual a step takes on this machine.
+
+    Args:
+        step: of ``timed_steps``.
+        alpha: whether it was timed for photos with alpha.
+    """
+    work = (float(SIDES[1] ** 2), float(SPLATS[1]))
+    return step.of(*work) / USUAL.of(*work) / (USUAL_OF_ALPHA if alpha else 1.0)
+
+
+def other_seconds(photos: int, scored: int, pixels: float, times: float = 1.0) -> float:
     """Seconds that a run takes beside the steps: depth maps before them, and scores after.
 
     Args:
         photos: number of photos that depth maps are found for.
         scored: number of photos scored.
         pixels: of a photo.
-        step: what steps take on this machine.
+        times: how many times as long as usual this machine takes.
     """
-    usual = (float(SIDES[1] ** 2), float(SPLATS[1]))
-    as_long = step.of(*usual) / USUAL.of(*usual)
-    return as_long * (SWEPT * min(photos, MOST_SWEPT) + SCORED * scored * pixels)
+    return times * (SWEPT * min(photos, MOST_SWEPT) + SCORED * scored * pixels)
 
 
 def _timed(backend: str, side: int, splats: int, sh_degree: int, cover: float) -> float:

@@ -1,4 +1,4 @@
-"""Floaters: splats that no photo shows, that stand before what photos show, or that stand alone."""
+"""Floaters: splats that no photo shows, that masks hide, before the surface, or alone."""
 
 from igsr.floaters.removal import Cleaned, remove_floaters
 

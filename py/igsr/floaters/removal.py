@@ -18,7 +18,7 @@ from igsr.splats import Splats
 
 Bool = npt.NDArray[np.bool_]
 
-#: Nothing corrects what has less than this part of its area in pixels that count.
+#: Little corrects what has less than this part of its area in pixels that count.
 COUNTED = 0.05
 #: Most photos that are asked whether they need a splat; with more, these are evenly spaced.
 MOST_ASKED = 24
@@ -31,10 +31,10 @@ class Cleaned:
     Attributes:
         splats: those that are left, in their order.
         removed: number of splats removed of each kind. With photos: "unseen" (nothing shows it),
-            "masked" (photos show most of it in masked pixels) and "floating" (every photo that
-            shows it shows it far before the surface, and at most one of them needs it). Without
-            photos: "invisible" (not finite, or fainter than anything that is drawn) and "alone"
-            (few others are near).
+            "masked" (photos show nearly all of it in masked pixels) and "floating" (every photo
+            that shows it shows it far before the surface, and at most one of them needs it).
+            Without photos: "invisible" (not finite, or fainter than anything that is drawn) and
+            "alone" (few others are near).
     """
 
     splats: Splats
@@ -56,7 +56,8 @@ def remove_floaters(
         splats: the scene.
         capture: the photos that the scene was fitted to, and their cameras; only train views are
             asked. What no photo shows is removed: give all of them. Pseudo-views (views with
-            weights) keep what they show, but cannot tell what is floating.
+            weights) keep what they show and photos do not, but cannot tell what is floating or
+            what masks hide.
         background: RGB in [0, 1], behind renders and behind photos with alpha. None: white if
             photos have alpha, else black.
         seed: of the random numbers of the estimate which photos need a splat.
@@ -130,7 +131,8 @@ def unsupported_splats(
     seen = sightings(splats, [view.camera for view in photos], backend, masks)
     others = [view.camera for view in views if view.weights is not None]
     unseen = seen.area + sightings(splats, others, backend).area < SHOWN
-    masked = ~unseen & (seen.counted < COUNTED * seen.area)
+    # What photos hardly show, pseudo-views do.
+    masked = ~unseen & (seen.area >= SHOWN) & (seen.counted < COUNTED * seen.area)
     floating = (seen.before > 0) & (seen.before == seen.shown)
     if floating.any():
         evenly = np.linspace(0, len(photos) - 1, min(len(photos), MOST_ASKED)).round()
