@@ -29,6 +29,7 @@ from igsr.fitting.exposures import (
 )
 from igsr.fitting.fitter import without_exposures
 from igsr.refinement import loop
+from igsr.refinement.cut_highlights import with_cut_highlights
 
 NONE = Exposure()
 
@@ -369,3 +370,27 @@ def test_a_refinement_sees_photos_without_their_exposures(ball_photos, monkeypat
         assert all(view.exposure is None for view in fold)
     assert all(view.exposure is not None for view in refined.capture.train_views)
     assert all(view.exposure is None for view in refined.capture.test_views)
+
+
+@pytest.mark.parametrize("gain", [4.0, 0.7])
+def test_what_a_photo_cuts_to_white_is_as_bright_as_the_fit_shows(gain):
+    """With the exposure taken out, white would be grey."""
+    exposure = Exposure((gain,) * 3, (0.0, 0.0, 0.0))
+    model = scenes.splats(60, degree=0)
+    views, true = [], []
+    for view in scenes.capture(views=3, scene=model).views:
+        color = igsr.render(model, view.camera, backend="cpu").color
+        taken = np.clip(255.0 * exposure.given_to(color) + 0.5, 0.0, 255.0).astype(np.uint8)
+        views.append(replace(view, image=taken, exposure=exposure))
+        true.append(np.clip(255.0 * color + 0.5, 0.0, 255.0).astype(np.uint8).astype(int))
+    plain = without_exposures(views, [exposure] * 3)
+    lifted = with_cut_highlights(plain, views, model, (0.0, 0.0, 0.0), "cpu")
+    off = [np.abs(view.image - one).max() for view, one in zip(plain, true, strict=True)]
+    assert (max(off) > 20) == (gain > 1.0)
+    for view, one in zip(lifted, true, strict=True):
+        assert np.abs(view.image - one).max() <= 2
+    assert all(view.exposure is None for view in lifted)
+    # A fit that is darker than white with the exposure taken out does not make photos darker.
+    dark = replace(model, opacities=model.opacities - 20.0)
+    still = with_cut_highlights(plain, views, dark, (0.0, 0.0, 0.0), "cpu")
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(still, plain, strict=True))

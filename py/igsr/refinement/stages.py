@@ -29,6 +29,7 @@ from igsr.fitting.fitter import with_train_exposures, without_exposures
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import preset_settings
 from igsr.fitting.settings import ExposureMode, TransientMode
+from igsr.refinement.cut_highlights import with_cut_highlights
 from igsr.refinement.near_sources import NearSources
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.results import HELD_OUT_SIDE, Scores, Stage
@@ -170,7 +171,13 @@ class Stages:
         exposures = [view.exposure for view in fitted.train_views]
         if any(exposures):
             self._capture = with_train_exposures(self._capture, exposures)
-        photos = without_exposures(fitted.train_views, exposures)
+        photos = with_cut_highlights(
+            without_exposures(fitted.train_views, exposures),
+            fitted.train_views,
+            splats,
+            self._background,
+            self._settings.backend,
+        )
         return Reconstruction("whole", photos, 1.0, splats)
 
     def fit(self, name: str, photos: list[View], share: float = 1.0) -> Reconstruction:
