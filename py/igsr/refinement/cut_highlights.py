@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from igsr._internal.choices import Backend
 from igsr.capture import View
 from igsr.rendering.renders import render
 from igsr.splats import Splats
@@ -25,7 +26,7 @@ def with_cut_highlights(
     views: Sequence[View],
     splats: Splats,
     background: Sequence[float],
-    backend: str = "auto",
+    backend: Backend = "auto",
 ) -> list[View]:
     """The photos, with cut channels at least as bright as the fit shows them.
 
@@ -43,7 +44,7 @@ def with_cut_highlights(
 
 
 def _lifted(
-    photo: View, view: View, splats: Splats, background: Sequence[float], backend: str
+    photo: View, view: View, splats: Splats, background: Sequence[float], backend: Backend
 ) -> View:
     cut = view.image[..., :3] == CUT
     if view.image.shape[2] == 4:
