@@ -458,8 +458,8 @@ def test_hundreds_of_photos_are_planned_without_decoding_any(tmp_path):
 
 @pytest.mark.long
 def test_thousands_of_photos_are_planned_in_time_that_grows_as_they_do(tmp_path):
-    """5 000 photos of 12 megapixels take 14 s of one idle processor, ten times what 500 take."""
+    """5 000 photos of 12 megapixels take 11 to 14 s of one processor, five times what 500 take."""
     few = planned(tmp_path / "few", 500)
     many = planned(tmp_path / "many", 5000)
     check_plan(many, 5000)
-    assert many["seconds"] < 20.0 * few["seconds"]
+    assert many["seconds"] < 10.0 * few["seconds"]

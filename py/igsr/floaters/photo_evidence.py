@@ -76,12 +76,6 @@ class _Picture:
             backend=self._backend,
         )
 
-    def areas(self, pixels: npt.NDArray[np.bool_]) -> Float64:
-        """The area that each splat covers of some pixels, bool [H, W]."""
-        inside = pixels.astype(self.image["alpha"].dtype)
-        v_color = np.stack([inside, np.zeros_like(inside), np.zeros_like(inside)], axis=-1)
-        return self.backward(v_color)["v_colors"][:, 0].astype(np.float64)
-
 
 def sightings(
     splats: Splats,
@@ -113,12 +107,15 @@ def sightings(
         alpha = picture.image["alpha"]
         surface = picture.image["depth"] / np.maximum(alpha, np.finfo(dtype).tiny)
         # The gradient for a splat's color is the sum of its weights with the picture's gradient: of
-        # ones it is the area, of the surface's depth the area times the mean depth.
-        v = picture.backward(np.stack([np.ones_like(alpha), surface, alpha], axis=-1))["v_colors"]
+        # ones it is the area, of the surface's depth the area times the mean depth, and of ones
+        # where pixels count the area that does.
+        ones = np.ones_like(alpha)
+        counting = ones if mask is None else mask.astype(dtype)
+        v = picture.backward(np.stack([ones, surface, counting], axis=-1))["v_colors"]
         covered = v[:, 0].astype(np.float64)
         is_shown = covered >= SHOWN
         area += covered
-        counted += covered if mask is None else picture.areas(mask)
+        counted += v[:, 2]
         shown += is_shown
         before += is_shown & (picture.projected["depths"] * covered < BEFORE * v[:, 1])
     return Sightings(area, counted, shown, before)
