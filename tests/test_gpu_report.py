@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import igsr
 from igsr import _core, benchmark
 from igsr.benchmark import gpu_report, gsplat_rows, run, viewer_rows
 from igsr.benchmark.growth import shot_of
@@ -148,6 +149,18 @@ def test_gsplat_gets_the_scene_in_its_own_terms(monkeypatch):
     assert Ks.shape == (1, 3, 3)
     assert Ks[0, 0, 0] == scene.intrinsics[0]
     assert backgrounds == (1, 3)
+    assert min(row["max_error"] for row in rows) > 1.0  # a picture of nothing, and of no splats
+
+
+def test_gsplats_rows_have_the_errors_that_igsrs_have(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(igsr.rasterization))
+    scene = shot_of(0, 30, 16).scene
+    picture, gradients = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
+    assert picture["error_of"] == "picture"
+    assert 0.0 < picture["max_error"] < 1e-5
+    assert gradients["error_of"] == "gradients"
+    assert 0.0 < gradients["max_error"] < 1e-4
+    assert gradients["worst"].startswith("v_")
 
 
 def test_a_gsplat_that_fails_is_one_message(monkeypatch):

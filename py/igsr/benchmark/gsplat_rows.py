@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from igsr import _core
+from igsr.benchmark.comparison import BOUND_3D, errors_row
 from igsr.benchmark.scenes import Arrays, Scene
+from igsr.benchmark.stage_rows import beside_reference
 from igsr.benchmark.timed_work import repeated
 from igsr.errors import IgsrError
 
@@ -29,7 +32,9 @@ def why_not() -> str | None:
 def gsplat_rows(
     workload: str, scene: Scene, v_image: Arrays, seconds: float, device: str = "cuda"
 ) -> list[dict[str, Any]]:
-    """Forward and backward of gsplat's ``rasterization``, timed between two synchronizations.
+    """Forward and backward of gsplat's ``rasterization``: times, and errors as igsr's own have.
+
+    Times are between two synchronizations.
 
     Args:
         workload: its name.
@@ -47,6 +52,9 @@ def gsplat_rows(
     def tensor(array: Any) -> torch.Tensor:
         return torch.as_tensor(np.asarray(array, np.float32), device=device)
 
+    def array(tensor: Any) -> Any:
+        return tensor.detach().cpu().numpy()
+
     names = ("means", "quats", "scales", "opacities", "colors")
     parameters = {name: tensor(scene.splats[name]).requires_grad_() for name in names}
     fx, fy, cx, cy = (float(x) for x in scene.intrinsics)
@@ -57,33 +65,62 @@ def gsplat_rows(
         "height": scene.height,
         "sh_degree": scene.sh_degree,
         "backgrounds": tensor(scene.background)[None],
+        # gsplat 1.5.3 refuses backgrounds where it packs what is in sight.
+        "packed": False,
     }
-    v_color, v_alpha = tensor(v_image["v_color"])[None], tensor(v_image["v_alpha"])[None, ..., None]
 
     def done() -> float:
         if device == "cuda":
             torch.cuda.synchronize()
         return time.perf_counter()
 
-    def once(repeats: int) -> dict[str, Any]:
+    def drawn() -> tuple[torch.Tensor, torch.Tensor]:
         given = dict(parameters)
         if scene.raw_parameters:
             given["scales"] = given["scales"].exp()
             given["opacities"] = given["opacities"].sigmoid()
-        began = done()
         colors, alphas, _ = gsplat.rasterization(**given, **camera)
-        drawn = done()
-        torch.autograd.backward([colors, alphas], [v_color, v_alpha])
+        return colors, alphas
+
+    def on_device(v_image: Arrays) -> list[torch.Tensor]:
+        return [tensor(v_image["v_color"])[None], tensor(v_image["v_alpha"])[None, ..., None]]
+
+    def once(repeats: int) -> dict[str, Any]:
+        for one in parameters.values():
+            one.grad = None
+        began = done()
+        picture = drawn()
         ended = done()
+        torch.autograd.backward(picture, v_given)
         return {
-            "forward": np.array([1e3 * (drawn - began)]),
-            "backward": np.array([1e3 * (ended - drawn)]),
+            "forward": np.array([1e3 * (ended - began)]),
+            "backward": np.array([1e3 * (done() - ended)]),
         }
+
+    v_given = on_device(v_image)
+
+    def gradients(counted: Arrays) -> Arrays:
+        for one in parameters.values():
+            one.grad = None
+        torch.autograd.backward(picture, on_device(counted))
+        return {f"v_{name}": array(one.grad) for name, one in parameters.items()}
 
     try:
         times = repeated(once, seconds)
+        picture = drawn()
+        alpha = array(picture[1])[0, ..., 0]
+        got = {"color": array(picture[0])[0], "alpha": alpha, "transmittance": 1.0 - alpha}
+        own = scene.arrays(_core.working_dtype("cpu"))
+        in_sight = _core.project(*own, **scene.options(), backend="cpu")
+        # Depth is a picture of its own there, and has no part in this loss.
+        v_drawn = {**v_image, "v_depth": np.zeros_like(v_image["v_depth"])}
+        compared, _ = beside_reference(scene, in_sight, got, gradients, BOUND_3D["gpu"], v_drawn)
     except Exception as error:  # whatever another library raises, the report goes on
         raise IgsrError(f"gsplat {getattr(gsplat, '__version__', '')} failed: {error}") from error
+    errors = {
+        "forward": errors_row("picture", compared.picture, compared.band),
+        "backward": errors_row("gradients", compared.gradients, compared.band),
+    }
     return [
         {
             "workload": workload,
@@ -95,6 +132,7 @@ def gsplat_rows(
             "ms": float(ms.min()),
             "ms_median": float(np.median(ms)),
             "repeats": len(ms),
+            **errors[name],
         }
         for name, ms in times.items()
     ]

@@ -178,28 +178,56 @@ def compare(
 
     Returns the comparison and the upstream gradients that count.
     """
-    shape = (scene.height, scene.width)
     dtype = _core.working_dtype(backend)
     parameters = scene.arrays(dtype)
     projected = _core.project(*parameters, **scene.options(), backend=backend)
-    exact = oracle.project(scene, projected)
-    crops = chosen(oracle.crops(exact, scene.width, scene.height))
-    expected = oracle.picture(exact, crops, shape, scene.background)
-    in_band = oracle.band(exact, crops, shape, oracle.ALPHA_BAND_3D)
     options: dict[str, Any] = {"background": scene.background.astype(dtype), "backend": backend}
     got = _core.rasterize(projected, width=scene.width, height=scene.height, **options)
-    picture, band = picture_error(got, expected, in_band, BOUND_3D[backend])
+
+    def gradients(counted: Arrays) -> Arrays:
+        v_own = {name: v.astype(dtype) for name, v in counted.items()}
+        v2d = _core.rasterize_backward(projected, got, **v_own, **options, absolute=False)
+        return _core.project_backward(
+            *parameters, projected, v2d, **scene.options(), backend=backend
+        ) | {"v_background": v2d["v_background"]}
+
+    return beside_reference(scene, projected, got, gradients, BOUND_3D[backend], v_image, chosen)
+
+
+def beside_reference(
+    scene: Scene,
+    projected: Arrays,
+    got: Arrays,
+    gradients: Callable[[Arrays], Arrays],
+    bound: float,
+    v_image: Arrays,
+    chosen: Callable[[list[Any]], list[Any]] = list,
+) -> tuple[Comparison, Arrays]:
+    """Anybody's picture and gradients of a scene beside the reference's.
+
+    Args:
+        scene: what was drawn.
+        projected: its splats, projected in f32 by any of igsr's backends: which are in sight.
+        got: "color" [H, W, 3], "alpha" and "transmittance" [H, W].
+        gradients: from upstream gradients to those of ``_core.project_backward``'s names.
+        bound: of pixels that may differ; see ``comparison.BOUND_3D``.
+        v_image: upstream gradients.
+        chosen: picks crops.
+
+    Returns:
+        The comparison and the upstream gradients that count.
+    """
+    exact = oracle.project(scene, projected)
+    crops = chosen(oracle.crops(exact, scene.width, scene.height))
+    expected = oracle.picture(exact, crops, (scene.height, scene.width), scene.background)
+    in_band = oracle.band(exact, crops, (scene.height, scene.width), oracle.ALPHA_BAND_3D)
+    picture, band = picture_error(got, expected, in_band, bound)
     counted = masked(v_image, band.left_out, expected["alpha"])
-    v_own = {name: v.astype(dtype) for name, v in counted.items()}
-    v2d = _core.rasterize_backward(projected, got, **v_own, **options, absolute=False)
-    v_got = _core.project_backward(
-        *parameters, projected, v2d, **scene.options(), backend=backend
-    ) | {"v_background": v2d["v_background"]}
     v2d_expected = oracle.gradients2d(exact, crops, expected, counted, scene.background)
     v_expected = oracle.gradients3d(scene, exact, v2d_expected) | {
         "v_background": v2d_expected["v_background"]
     }
-    return Comparison(picture, gradient_error(v_got, v_expected), band), counted
+    return Comparison(picture, gradient_error(gradients(counted), v_expected), band), counted
 
 
 def time_scene(scene: Scene, backend: str, v_image: Arrays, seconds: float) -> Times:
