@@ -2,9 +2,11 @@
 
 mod common;
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use common::*;
+use glam::DMat4;
 use rand::Rng;
 use splat_render::Camera;
 use splat_render::cpu::CpuFit;
@@ -243,6 +245,72 @@ fn halves_that_would_leave_the_numbers_stay_where_they_are() {
     let after = same_after_original(&Arc::new(gpu()), &state, &original_run(400, 1.0));
     assert!(after.splats.means.as_flattened().iter().all(|v| v.is_finite()));
     assert!(after.splats.len() > 300);
+}
+
+/// Rotations of every length, numbers that a driver may flush, and those that leave the range in between.
+#[test]
+fn halves_of_splats_with_extreme_numbers_lie_where_the_host_has_them() {
+    let mut rng = rng(8);
+    let n = 6000;
+    let mut state = sound(amid_a_fit(8, n, 0));
+    state.stats.grad_sum.fill(1.0);
+    state.stats.seen.fill(1.0);
+    state.splats.opacities.fill(1.0);
+    for i in 0..n {
+        let length = 10f32.powf(rng.random_range(-7.0..20.0));
+        state.splats.quats[i] = state.splats.quats[i].map(|v| v * length);
+        match i % 6 {
+            0 => state.splats.quats[i][rng.random_range(0..4)] = 1e-40,
+            1 => state.splats.quats[i][rng.random_range(0..4)] *= 1e-30,
+            2 => state.splats.means[i] = [-0.0, 1.2e-38, -1e-40],
+            3 => state.splats.scales[i] = [-1e-40, 1e-44, -70.0],
+            4 => state.splats.scales[i] = [-70.0, -50.0, 80.0],
+            _ => state.splats.scales[i] = [rng.random_range(-70.0..88.0); 3],
+        }
+    }
+    // All that is larger than e^-73 is split.
+    let after = same_after_original(&Arc::new(gpu()), &state, &original_run(2 * n, 1e-30));
+    assert_eq!(after.splats.len(), 2 * n);
+    let before: HashSet<_> = state.splats.means.iter().map(|m| m.map(f32::to_bits)).collect();
+    let still = after.splats.means.iter().filter(|m| before.contains(&m.map(f32::to_bits)));
+    let still = still.count();
+    assert!(still > n / 10 && still < n, "{still} halves lie where their splat lay");
+}
+
+/// Splats that reach to the edge of a picture and not a bit further: rounding alone tells which are fog.
+#[test]
+fn fog_on_the_edge_of_a_picture_is_told_as_on_the_host() {
+    let mut rng = rng(9);
+    let n = 5000;
+    let camera = Camera {
+        viewmat: DMat4::from_rotation_y(0.4) * DMat4::from_rotation_x(0.3),
+        fx: 53.0,
+        fy: 47.0,
+        cx: 49.0,
+        cy: 51.0,
+        width: 100,
+        height: 100,
+    };
+    let mut state = sound(amid_a_fit(9, n, 0));
+    state.splats.opacities.fill(0.0);
+    let back = camera.viewmat.inverse();
+    for i in 0..n {
+        // A wall behind, before it those in question.
+        let wall = i % 10 == 0;
+        let scale = if wall { -3.0 } else { rng.random_range(-2.5..0.0) };
+        let [y, depth] = [rng.random_range(-0.3..0.3), rng.random_range(0.5..1.5)];
+        let x = -depth * camera.cx / camera.fx - 3.0 * f64::from(scale).exp();
+        let at = if wall { [y, y, 4.0] } else { [x, y, depth] };
+        state.splats.means[i] = back.transform_point3(at.into()).as_vec3().to_array();
+        state.splats.scales[i] = [scale, -9.0, -9.0];
+    }
+    let run = McmcRun { cameras: vec![camera], target: n, seed: 1 };
+    let expected = after(&mut CpuFit::default(), &state, &run);
+    let got = after(&mut GpuFit::new(Arc::new(gpu())), &state, &run);
+    assert!(got == expected, "other bits");
+    let left: HashSet<_> = expected.splats.means.iter().map(|m| m.map(f32::to_bits)).collect();
+    let fog = state.splats.means.iter().filter(|m| !left.contains(&m.map(f32::to_bits))).count();
+    assert!(fog > n / 4 && fog < n * 3 / 4, "{fog} of {n} are fog");
 }
 
 #[test]

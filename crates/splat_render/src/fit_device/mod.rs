@@ -17,7 +17,8 @@ pub(crate) use mcmc::{
 };
 pub use original::OriginalRun;
 pub(crate) use original::{
-    LOG_SPLIT_SHRINK, LOGIT_RESET, PULL_GROW, PULL_SUM_MAX, PULL_UNITS, original, reset_opacities,
+    INVERSE_GUESS, KEPT_BITS_MIN, LOG_SPLIT_SHRINK, LOGIT_RESET, PULL_GROW, PULL_SUM_MAX,
+    PULL_UNITS, original, reset_opacities,
 };
 pub(crate) use random::{dropout_threshold, exp_accurate, noise_draw};
 pub use random::{is_dropped, noise_normal};

@@ -26,6 +26,11 @@ const SCALE_HUGE: f64 = 0.1;
 pub(crate) const LOG_SPLIT_SHRINK: f32 = 0.470_003_63;
 /// Logit of the opacity that a reset leaves at most: 0.01.
 pub(crate) const LOGIT_RESET: f32 = -4.595_12;
+/// Bits of the least number that is kept where halves are placed: twice the least normal one, as some
+/// devices tell what is too small before they round, and others after.
+pub(crate) const KEPT_BITS_MIN: u32 = 0x0100_0000;
+/// Less the bits of a number from 1 to 2, those of its inverse to 12 %.
+pub(crate) const INVERSE_GUESS: u32 = 0x7ef3_11c7;
 
 /// One run of the density control.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -80,23 +85,55 @@ fn exp(x: f32) -> f32 {
     f32::from_bits((((power >> 16) + 127) as u32) << 23 | (fraction - bend) << 7)
 }
 
-/// Where one of the halves of splat `i` comes to lie.
+/// What one operation made, or 0 where that is tiny: some devices flush such numbers.
+fn kept(x: f32) -> f32 {
+    if x.to_bits() & 0x7fff_ffff < KEPT_BITS_MIN { 0.0 } else { x }
+}
+
+fn times(a: f32, b: f32) -> f32 {
+    kept(a * b)
+}
+
+fn plus(a: f32, b: f32) -> f32 {
+    kept(a + b)
+}
+
+/// 2 / x to 1e-7 of a finite x that is not tiny. Devices need not round quotients as the host does, but
+/// products and differences: so it is Newton's steps for the inverse of x without its power of two.
+fn two_over(x: f32) -> f32 {
+    let bits = x.to_bits();
+    let fraction = f32::from_bits(bits & 0x007f_ffff | 0x3f80_0000);
+    let mut inverse = f32::from_bits(INVERSE_GUESS - fraction.to_bits());
+    for _ in 0..4 {
+        inverse = times(inverse, plus(2.0, -times(fraction, inverse)));
+    }
+    kept(f32::from_bits(inverse.to_bits() + 0x4000_0000 - (bits & 0x7f80_0000)))
+}
+
+/// Where one of the halves of splat `i` comes to lie. Every product and every sum is rounded on its own,
+/// as `half_mean` of original_draw.wgsl has it.
 fn half_mean(splats: &SplatArrays, i: usize, draw: [f32; 3]) -> [f32; 3] {
-    let (mean, [w, x, y, z]) = (splats.means[i], splats.quats[i]);
-    let norm2 = ((w * w + x * x) + y * y) + z * z;
-    if norm2 < QUAT_NORM2_MIN {
+    let mean = splats.means[i];
+    let [w, x, y, z] = splats.quats[i].map(kept);
+    let [ww, xx, yy, zz] = [w, x, y, z].map(|v| times(v, v));
+    let norm2 = plus(plus(plus(ww, xx), yy), zz);
+    if norm2 < QUAT_NORM2_MIN || !norm2.is_finite() {
         return mean;
     }
-    let s = 2.0 / norm2;
+    let s = two_over(norm2);
+    let [xy, xz, yz] = [times(x, y), times(x, z), times(y, z)];
+    let [wx, wy, wz] = [x, y, z].map(|v| times(w, v));
+    let beside = |a: f32, b: f32| times(s, plus(a, b));
+    let on = |a: f32, b: f32| plus(1.0, -beside(a, b));
     let rows = [
-        [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
-        [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
-        [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
+        [on(yy, zz), beside(xy, -wz), beside(xz, wy)],
+        [beside(xy, wz), on(xx, zz), beside(yz, -wx)],
+        [beside(xz, -wy), beside(yz, wx), on(xx, yy)],
     ];
-    let along: [f32; 3] = std::array::from_fn(|k| exp(splats.scales[i][k]) * draw[k]);
+    let along: [f32; 3] = std::array::from_fn(|k| times(exp(kept(splats.scales[i][k])), draw[k]));
     let moved: [f32; 3] = std::array::from_fn(|k| {
-        let [a, b, c] = rows[k];
-        mean[k] + ((a * along[0] + b * along[1]) + c * along[2])
+        let [a, b, c] = std::array::from_fn(|axis| times(rows[k][axis], along[axis]));
+        plus(kept(mean[k]), plus(plus(a, b), c))
     });
     if moved.iter().all(|v| v.is_finite()) { moved } else { mean }
 }
@@ -266,6 +303,39 @@ mod tests {
             assert!(off.abs() < 4e-3, "{x}: {off}");
         }
         assert!(exp(-1e9) > 0.0 && exp(1e9).is_finite());
+    }
+
+    #[test]
+    fn products_and_sums_give_two_over_a_number() {
+        let mut worst = 0.0f64;
+        // Every power of two that a squared norm can have, and between them 2000 numbers.
+        for power in -40..126 {
+            for step in 0..2000 {
+                let x = (1.0 + f64::from(step) / 2000.0) * f64::from(power).exp2();
+                let x = x as f32;
+                worst = worst.max((f64::from(two_over(x)) * f64::from(x) / 2.0 - 1.0).abs());
+            }
+        }
+        let last = f32::from_bits(0x3fff_ffff);
+        worst = worst.max((f64::from(two_over(last)) * f64::from(last) / 2.0 - 1.0).abs());
+        assert!(worst < 1e-7, "{worst}");
+        // What is larger than that has 0: of 2 / x a device may keep nothing.
+        for x in [2f32.powi(126) * 1.5, f32::MAX] {
+            assert_eq!(two_over(x), 0.0);
+        }
+    }
+
+    #[test]
+    fn tiny_numbers_are_not_kept() {
+        let least = 2f32.powi(-125);
+        assert_eq!(least.to_bits(), KEPT_BITS_MIN);
+        let below = f32::from_bits(KEPT_BITS_MIN - 1);
+        for (x, expected) in [(least, least), (-least, -least), (below, 0.0), (-below, 0.0)] {
+            assert_eq!(kept(x).to_bits(), expected.to_bits());
+        }
+        assert_eq!(kept(-0.0).to_bits(), 0);
+        assert!(kept(f32::NAN).is_nan() && kept(f32::INFINITY).is_infinite());
+        assert_eq!(times(1e-20, 1e-20), 0.0);
     }
 
     #[test]

@@ -9,8 +9,7 @@ pub(super) fn hash(x: u32) -> u32 {
     (word >> 22) ^ word
 }
 
-/// exp to about 1e-7 relative, the same bits as `exp_accurate` of shaders/shared.wgsl where that is
-/// computed as it is written.
+/// exp to about 1e-7 relative, the same bits as `exp_of_rounded` of shaders/mcmc_weigh.wgsl.
 #[allow(clippy::excessive_precision, reason = "the digits of the shader's")]
 pub(crate) fn exp_accurate(x: f32) -> f32 {
     let y = x.clamp(-87.0, 88.0);
@@ -18,7 +17,7 @@ pub(crate) fn exp_accurate(x: f32) -> f32 {
     let r = (y - k * 0.693_359_375) + k * 2.121_944_40e-4;
     let poly = [
         1.398_199_950_7e-3_f32,
-        8.333_453_190_2e-3,
+        8.333_451_907_3e-3,
         4.166_579_589_4e-2,
         1.666_666_545_9e-1,
         5.000_000_120_1e-1,

@@ -23,7 +23,8 @@ pub(super) struct Run {
     pub cameras: u32,
     pub every: u32,
     pub color_floats: u32,
-    pub unused: u32,
+    /// Always 0 (`rounded` in shared.wgsl).
+    pub zero: u32,
 }
 
 /// The table of shares on the device, made once.
@@ -53,7 +54,7 @@ pub(super) fn draw(
         cameras: run.cameras.len() as u32,
         every,
         color_floats,
-        unused: 0,
+        zero: 0,
     };
     let rounds = [first, Run { round: 1, cameras: 0, ..first }].map(|run| gpu.uniform(&run));
     let table = gpu.upload("weights by opacity", &weight_table((n + fresh) as usize))?;

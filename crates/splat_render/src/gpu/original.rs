@@ -25,7 +25,8 @@ pub(super) struct RunUniform {
     pub log_split: f32,
     pub log_huge: f32,
     pub keeps_all: u32,
-    pub unused: u32,
+    /// Always 0 (`rounded` in shared.wgsl).
+    pub zero: u32,
 }
 
 /// A run: what becomes of each splat.
@@ -61,7 +62,7 @@ impl<'a> Choice<'a> {
             log_split,
             log_huge,
             keeps_all: 0,
-            unused: 0,
+            zero: 0,
         };
         Ok(Self {
             adam,

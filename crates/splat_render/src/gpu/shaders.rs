@@ -11,8 +11,9 @@ use crate::constants::{
     TILE, TRANSMITTANCE_MIN,
 };
 use crate::fit_device::{
-    BINS, BINS_PER_LOGIT, CELLS, COLOR_WAIT, LOG_SPLIT_SHRINK, LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG,
-    LOGIT_RESET, PULL_GROW, PULL_SUM_MAX, PULL_UNITS, SHARES_MAX,
+    BINS, BINS_PER_LOGIT, CELLS, COLOR_WAIT, INVERSE_GUESS, KEPT_BITS_MIN, LOG_SPLIT_SHRINK,
+    LOGIT_DEAD, LOGIT_FIRST, LOGIT_FOG, LOGIT_RESET, PULL_GROW, PULL_SUM_MAX, PULL_UNITS,
+    SHARES_MAX,
 };
 use crate::sh;
 
@@ -544,6 +545,8 @@ fn constants(rows: u32) -> String {
         ("SHARES_MAX", SHARES_MAX as u32),
         ("CELLS", CELLS),
         ("PULL_GROW", PULL_GROW),
+        ("KEPT_BITS_MIN", KEPT_BITS_MIN),
+        ("INVERSE_GUESS", INVERSE_GUESS),
     ]) {
         let _ = writeln!(out, "const {name} = {value}u;");
     }
@@ -782,18 +785,7 @@ mod tests {
             compensation
         );
         layout!("project", Window, first, count, groups_max);
-        layout!(
-            "mcmc_weigh",
-            Run,
-            splats,
-            fresh,
-            seed,
-            round,
-            cameras,
-            every,
-            color_floats,
-            unused
-        );
+        layout!("mcmc_weigh", Run, splats, fresh, seed, round, cameras, every, color_floats, zero);
         assert_layout(
             "original_choose",
             "OriginalRun",
@@ -806,7 +798,7 @@ mod tests {
                 ("log_split", offset_of!(RunUniform, log_split)),
                 ("log_huge", offset_of!(RunUniform, log_huge)),
                 ("keeps_all", offset_of!(RunUniform, keeps_all)),
-                ("unused", offset_of!(RunUniform, unused)),
+                ("zero", offset_of!(RunUniform, zero)),
             ],
         );
         layout!("density_scan", Scan, splats, round);

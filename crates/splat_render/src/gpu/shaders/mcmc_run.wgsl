@@ -11,7 +11,8 @@ struct Run {
     // Every so many splats are sampled.
     every: u32,
     color_floats: u32,
-    unused: u32,
+    // Always 0, for rounded.
+    zero: u32,
 }
 
 @group(0) @binding(0) var<uniform> run: Run;

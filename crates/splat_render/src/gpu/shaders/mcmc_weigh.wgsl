@@ -36,15 +36,38 @@ fn mcmc_sample(
     words[3u * k + 2u] = bitcast<u32>(geometry[i * GEOMETRY + 2u]);
 }
 
+fn times(a: f32, b: f32) -> f32 {
+    return rounded(a * b, run.zero);
+}
+
+fn plus(a: f32, b: f32) -> f32 {
+    return rounded(a + b, run.zero);
+}
+
+// As exp_accurate, with the same bits on every device.
+fn exp_of_rounded(x: f32) -> f32 {
+    let y = clamp(x, -87.0, 88.0);
+    let k = floor(plus(times(y, 1.44269504), 0.5));
+    let r = plus(plus(y, -times(k, 0.693359375)), times(k, 2.12194440e-4));
+    var poly = 1.9875691500e-4;
+    poly = plus(times(poly, r), 1.3981999507e-3);
+    poly = plus(times(poly, r), 8.3334519073e-3);
+    poly = plus(times(poly, r), 4.1665795894e-2);
+    poly = plus(times(poly, r), 1.6666665459e-1);
+    poly = plus(times(poly, r), 5.0000001201e-1);
+    let sum = plus(plus(times(times(poly, r), r), r), 1.0);
+    return times(sum, bitcast<f32>((i32(k) + 127) << 23u));
+}
+
 fn camera_row(camera: u32, row: u32, x: f32, y: f32, z: f32) -> f32 {
     let r = cameras[camera].rows[row];
-    return ((r.x * x + r.y * y) + r.z * z) + r.w;
+    return plus(plus(plus(times(r.x, x), times(r.y, y)), times(r.z, z)), r.w);
 }
 
 fn shows(u: f32, depth: f32, focal: f32, principal: f32, size: f32, radius: f32) -> bool {
-    let middle = focal * u + principal * depth;
-    let wide = focal * radius;
-    return middle + wide >= 0.0 && middle - wide <= size * depth;
+    let middle = plus(times(focal, u), times(principal, depth));
+    let wide = times(focal, radius);
+    return plus(middle, wide) >= 0.0 && plus(middle, -wide) <= times(size, depth);
 }
 
 fn is_fog(at: u32) -> bool {
@@ -52,7 +75,7 @@ fn is_fog(at: u32) -> bool {
     let y = geometry[at + 1u];
     let z = geometry[at + 2u];
     let largest = max(max(geometry[at + 3u], geometry[at + 4u]), geometry[at + 5u]);
-    let radius = 3.0 * exp_accurate(largest);
+    let radius = times(3.0, exp_of_rounded(largest));
     var fog = false;
     for (var k = 0u; k < run.cameras && !fog; k++) {
         let depth = camera_row(k, 2u, x, y, z);

@@ -1,6 +1,5 @@
 // The original density control, second part: those that stay, and behind them what is added, clones and
-// halves of splits. As fit_device/original.rs, bit for bit where multiplications and additions are not
-// fused and quotients are rounded as there. Follows shared.wgsl and original_run.wgsl.
+// halves of splits. As fit_device/original.rs, bit for bit. Follows shared.wgsl and original_run.wgsl.
 
 @group(0) @binding(2) var<storage, read> told: array<u32>;
 // Splats that stay, and those of them that grow.
@@ -30,25 +29,71 @@ fn exp_whole(x: f32) -> f32 {
     return bitcast<f32>((u32((power >> 16u) + 127) << 23u) | ((fraction - bend) << 7u));
 }
 
+// What one operation made, or 0 where that is tiny: some drivers flush such numbers, so none may keep them.
+fn kept(x: f32) -> f32 {
+    let bits = bitcast<u32>(rounded(x, run.zero));
+    return bitcast<f32>(select(bits, 0u, (bits & 0x7fffffffu) < KEPT_BITS_MIN));
+}
+
+fn times(a: f32, b: f32) -> f32 {
+    return kept(a * b);
+}
+
+fn plus(a: f32, b: f32) -> f32 {
+    return kept(a + b);
+}
+
+// 2 / x of a finite x that is not tiny. A driver's quotient may be 2.5 units in the last place off, so it
+// is made of products and differences, which all round alike: Newton's steps for the inverse of x
+// without its power of two, from a first guess to 12 %.
+fn two_over(x: f32) -> f32 {
+    let bits = bitcast<u32>(x);
+    let fraction = bitcast<f32>((bits & 0x7fffffu) | 0x3f800000u);
+    var inverse = bitcast<f32>(INVERSE_GUESS - bitcast<u32>(fraction));
+    for (var k = 0u; k < 4u; k++) {
+        inverse = times(inverse, plus(2.0, -times(fraction, inverse)));
+    }
+    return kept(bitcast<f32>(bitcast<u32>(inverse) + 0x40000000u - (bits & 0x7f800000u)));
+}
+
 // Where one of the halves of a splat comes to lie.
 fn half_mean(at: u32, base: u32) -> vec3<f32> {
     let mean = vec3(geometry[at], geometry[at + 1u], geometry[at + 2u]);
-    let w = geometry[at + 6u];
-    let x = geometry[at + 7u];
-    let y = geometry[at + 8u];
-    let z = geometry[at + 9u];
-    let norm2 = ((w * w + x * x) + y * y) + z * z;
-    if norm2 < QUAT_NORM2_MIN {
+    let w = kept(geometry[at + 6u]);
+    let x = kept(geometry[at + 7u]);
+    let y = kept(geometry[at + 8u]);
+    let z = kept(geometry[at + 9u]);
+    let ww = times(w, w);
+    let xx = times(x, x);
+    let yy = times(y, y);
+    let zz = times(z, z);
+    let norm2 = plus(plus(plus(ww, xx), yy), zz);
+    if norm2 < QUAT_NORM2_MIN || !is_finite(norm2) {
         return mean;
     }
-    let s = 2.0 / norm2;
-    let a = exp_whole(geometry[at + 3u]) * normal(base, 0u);
-    let b = exp_whole(geometry[at + 4u]) * normal(base, 1u);
-    let c = exp_whole(geometry[at + 5u]) * normal(base, 2u);
-    let moved = mean + vec3(
-        ((1.0 - s * (y * y + z * z)) * a + (s * (x * y - w * z)) * b) + (s * (x * z + w * y)) * c,
-        ((s * (x * y + w * z)) * a + (1.0 - s * (x * x + z * z)) * b) + (s * (y * z - w * x)) * c,
-        ((s * (x * z - w * y)) * a + (s * (y * z + w * x)) * b) + (1.0 - s * (x * x + y * y)) * c,
+    let s = two_over(norm2);
+    let xy = times(x, y);
+    let xz = times(x, z);
+    let yz = times(y, z);
+    let wx = times(w, x);
+    let wy = times(w, y);
+    let wz = times(w, z);
+    let a = times(exp_whole(kept(geometry[at + 3u])), normal(base, 0u));
+    let b = times(exp_whole(kept(geometry[at + 4u])), normal(base, 1u));
+    let c = times(exp_whole(kept(geometry[at + 5u])), normal(base, 2u));
+    let moved = vec3(
+        plus(kept(mean.x), plus(plus(
+            times(plus(1.0, -times(s, plus(yy, zz))), a),
+            times(times(s, plus(xy, -wz)), b)),
+            times(times(s, plus(xz, wy)), c))),
+        plus(kept(mean.y), plus(plus(
+            times(times(s, plus(xy, wz)), a),
+            times(plus(1.0, -times(s, plus(xx, zz))), b)),
+            times(times(s, plus(yz, -wx)), c))),
+        plus(kept(mean.z), plus(plus(
+            times(times(s, plus(xz, -wy)), a),
+            times(times(s, plus(yz, wx)), b)),
+            times(plus(1.0, -times(s, plus(xx, yy))), c))),
     );
     return select(mean, moved, is_finite3(moved));
 }

@@ -11,7 +11,8 @@ struct OriginalRun {
     log_huge: f32,
     // 1 where nothing is removed.
     keeps_all: u32,
-    unused: u32,
+    // Always 0, for rounded.
+    zero: u32,
 }
 
 @group(0) @binding(0) var<uniform> run: OriginalRun;

@@ -160,6 +160,13 @@ fn exp_accurate4(x: vec4<f32>) -> vec4<f32> {
     return ((poly * r * r + r) + 1.0) * bitcast<vec4<f32>>((vec4<i32>(k) + 127) << vec4(23u));
 }
 
+// What one operation made, rounded before the next one has it: where bits decide. WGSL lets a compiler fuse
+// a product with a sum (NVIDIA's does) and put sums in another order (Mesa's does). `zero` comes from a
+// uniform and is always 0. No compiler can know that, so it has to make the bits.
+fn rounded(x: f32, zero: u32) -> f32 {
+    return bitcast<f32>(bitcast<u32>(x) ^ zero);
+}
+
 // The index of an invocation in a dispatch whose workgroups may spill into y.
 fn linear_index(workgroup: vec3<u32>, groups: vec3<u32>, local: u32, size: u32) -> u32 {
     return (workgroup.y * groups.x + workgroup.x) * size + local;
