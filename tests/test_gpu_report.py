@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
+import time
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,6 +124,45 @@ def test_without_a_device_the_page_says_why(monkeypatch, tmp_path):
 def test_a_report_is_a_page(tmp_path):
     with pytest.raises(IgsrError, match=r"ends in \.html"):
         benchmark.json_beside(tmp_path / "report.json")
+
+
+@pytest.fixture
+def gpu_check(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benches")
+    return importlib.import_module("gpu_check")
+
+
+PRINTS = """
+print("test first ... ok")
+print("test second ... noise")
+print("FAILED")
+print("test third ... ", end="", flush=True)
+"""
+
+
+def test_tests_that_do_not_end_are_ended_and_named(gpu_check, tmp_path):
+    # What hangs is the program of tests that cargo started, which keeps cargo's output open.
+    sign = tmp_path / "sign"
+    child = f"import time\nwhile True: open({str(sign)!r}, 'a').write('.'); time.sleep(0.02)"
+    waits = f"{PRINTS}\nimport subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    found = gpu_check.run_tests([sys.executable, "-c", waits], timeout=4.0)
+    assert found["passed"] == 1
+    assert found["failed"] == ["second", "third did not end within 4 s; nothing ran after"]
+    assert found["seconds"] >= 4.0
+    written = sign.stat().st_size
+    time.sleep(0.5)
+    assert sign.stat().st_size == written > 0, "what the command started goes on"
+
+
+def test_tests_run_one_by_one_and_say_what_failed(gpu_check):
+    ends = PRINTS + "print('ok'); raise SystemExit(101)"
+    found = gpu_check.run_tests([sys.executable, "-c", ends])
+    assert (found["passed"], found["failed"], found["error"]) == (2, ["second"], "")
+    assert found["command"].endswith(" -- --test-threads=1")
+    crashed = "import sys; print('test first ... ok'); sys.exit('no device')"
+    found = gpu_check.run_tests([sys.executable, "-c", crashed])
+    assert found["failed"] == ["the tests did not run"]
+    assert "no device" in found["error"]
 
 
 def made_up_gsplat(draws):
