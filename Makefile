@@ -125,10 +125,19 @@ RAY := ray==2.60.0 msgpack==1.2.4 protobuf==7.36.2
 # A process of tests per core. Each has one torch thread: more of them wait for each other.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
+# As plain `cargo test` (pyo3_bindings has no tests in Rust), but the tests that open a GPU each run one
+# after the other: side by side, NVIDIA's driver 580 can spin for ever. On two cores and the software
+# driver, whose threads fill them anyway, that takes 12 % longer.
+CARGO_TEST := $(CARGO) test --workspace --exclude pyo3_bindings
+RUST_TESTS := $(sort $(notdir $(basename $(wildcard crates/*/tests/*.rs)) \
+	$(patsubst %/main.rs,%,$(wildcard crates/*/tests/*/main.rs))))
+
 check-rust: build vulkan display shader-validators
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy $(PROFILE) --locked --workspace --all-targets -- -D warnings
-	$(CARGO) test
+	$(CARGO_TEST) --lib --bins $(patsubst %,--test %,$(filter-out gpu_%,$(RUST_TESTS)))
+	RUST_TEST_THREADS=1 $(CARGO_TEST) --test 'gpu_*'
+	$(CARGO_TEST) --doc
 
 # The same seeded changes as in make test, and more of them. cargo-fuzz would need a nightly compiler.
 CASES ?= 100000
