@@ -127,7 +127,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 # As plain `cargo test` (pyo3_bindings has no tests in Rust), but the tests that open a GPU each run one
 # after the other: side by side, NVIDIA's driver 580 can spin for ever. On two cores and the software
-# driver, whose threads fill them anyway, that takes 12 % longer.
+# driver, whose threads fill them anyway, they take a tenth longer.
 CARGO_TEST := $(CARGO) test --workspace --exclude pyo3_bindings
 RUST_TESTS := $(sort $(notdir $(basename $(wildcard crates/*/tests/*.rs)) \
 	$(patsubst %/main.rs,%,$(wildcard crates/*/tests/*/main.rs))))
