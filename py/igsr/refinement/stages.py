@@ -254,7 +254,7 @@ class Stages:
         """Fit photos and novel views from the initialization that the photos alone had.
 
         A fit that went on from the splats so far would keep what these made up where no photo
-        showed better.
+        showed better. Its seed is another one: the same draws would err where the views err.
         """
         name = f"{reconstruction.name}-round{self._run.round}"
         views = [
@@ -270,7 +270,8 @@ class Stages:
             for number, candidate in enumerate((*selected, *added_before))
         ]
         pictures = [*reconstruction.photos, *views]
-        reconstruction.splats, _ = self._fit(name, stage, pictures, reconstruction.share)
+        seed = seed_of_round(self._settings.seed, self._run.round)
+        reconstruction.splats, _ = self._fit(name, stage, pictures, reconstruction.share, seed=seed)
         reconstruction.added += [candidate.view for candidate in selected]
 
     def validated(self, splats: Splats, photos: list[View]) -> list[ScoredView]:
@@ -300,6 +301,7 @@ class Stages:
         share: float,
         exposure: ExposureMode = "off",
         transients: TransientMode = "off",
+        seed: int | None = None,
     ) -> tuple[Splats, Capture]:
         goes_on = True
 
@@ -314,7 +316,7 @@ class Stages:
             Capture(self._capture.path, views, self._capture.points),
             progress=progress,
             backend=self._settings.backend,
-            seed=self._settings.seed,
+            seed=self._settings.seed if seed is None else seed,
             max_splats=max(1, round(share * self._max_splats)),
             checkpoint=checkpoint,
             resume=resume,
@@ -326,6 +328,16 @@ class Stages:
             raise IgsrError(STOPPED)
         self._run.work_done(share)
         return fitted
+
+
+def seed_of_round(seed: int, number: int) -> int:
+    """The seed of the fits of a round: other draws than the run's other fits have.
+
+    Args:
+        seed: the run's.
+        number: of the round, from 1.
+    """
+    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
 def _small(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
