@@ -128,7 +128,13 @@ def fitted_model(capture: Capture, count: int, models: Path, seed: int) -> Splat
     # Relocation grows the model up to the number asked for; the original control stops where the
     # photos ask for no more, and removing floaters would leave fewer.
     splats = fit(
-        capture, FIT_STEPS, seed=seed, max_splats=count, density="mcmc", remove_floaters=False
+        capture,
+        FIT_STEPS,
+        seed=seed,
+        max_splats=count,
+        density="mcmc",
+        remove_floaters=False,
+        backdrop=False,
     )
     if len(splats) < (1.0 - COUNT_TOLERANCE) * count:
         raise IgsrError(

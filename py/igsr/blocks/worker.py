@@ -175,12 +175,14 @@ def _fit(
 
     def run(resume: bool) -> tuple[Splats, Capture]:
         keywords = {**chosen, **task.settings, **more, "max_splats": most}
+        keywords.pop("backdrop", None)
         return fit_with_cameras(
             capture,
             progress=progress,
             backend=cast(FitBackend, task.backend),
             checkpoint=checkpoint,
             resume=resume,
+            backdrop=False,  # blocks are joined: each would have a sphere of its own
             **keywords,
         )
 

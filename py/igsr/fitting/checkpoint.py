@@ -44,8 +44,9 @@ def recorded_settings(
         capture: fingerprint of photos, cameras and tracks.
         splats: hash of the splats that the fit goes on from, if it does.
     """
-    # Floaters are removed after the last step, from what the checkpoint keeps.
-    plain = {key: value for key, value in settings.plain().items() if key != "remove_floaters"}
+    # Floaters are removed, and the backdrop added, after the last step.
+    after = ("remove_floaters", "backdrop")
+    plain = {key: value for key, value in settings.plain().items() if key not in after}
     recorded = {
         **plain,
         "backend": backend["backend"],

@@ -56,6 +56,7 @@ from igsr.fitting.settings import (
 )
 from igsr.fitting.transient_search import TransientSearch, resumed_masks, with_train_masks
 from igsr.floaters import remove_floaters as without_floaters
+from igsr.rendering.backdrop import wants_backdrop, with_backdrop, without_backdrop
 from igsr.splats import Splats
 
 __all__ = [
@@ -97,6 +98,7 @@ def fit(
     exposure: ExposureMode | None = None,
     transients: TransientMode | None = None,
     remove_floaters: bool | None = None,
+    backdrop: bool | None = None,
     background: tuple[float, float, float] | None = None,
     frozen: Splats | None = None,
     whole_schedule: bool = False,
@@ -161,6 +163,10 @@ def fit(
             are large and plain to see, else the fit has the same bits as with "off".
         remove_floaters: whether splats that photos do not support are removed after the last step
             (``igsr.remove_floaters``); the last progress counts them. The checkpoint keeps them.
+        backdrop: whether 200 splats are put behind the others in the end, on a sphere round the
+            scene, with the colors of the photos in their direction (``igsr.rendering.backdrop``):
+            what no photo shows is else the background, black. Not for photos with alpha or masks,
+            and not beside ``frozen`` splats. The checkpoint has none.
         background: RGB in [0, 1] behind splats and photos with alpha; None is a new random color in
             every step for photos with alpha and black for photos without.
         frozen: splats that renders show beside those that are fitted, and that stay as they are:
@@ -234,7 +240,7 @@ def _fitted(
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
-    initial = start if isinstance(start, Splats) else None
+    initial = without_backdrop(start) if isinstance(start, Splats) else None
     if initial is None:
         settings = settings_for(
             preset, support_of(photos_among(views)), quality, start=start, **given
@@ -369,6 +375,10 @@ def _fitted(
             )
             splats, removed = cleaned.splats, cleaned.removed
         splats = first_splats(splats, len(splats) - still)
+        wanted = settings.backdrop and frozen is None and not stopped and run.is_done
+        if wanted and wants_backdrop(views, settings.background):
+            photos = photos_among(without_exposures(capture.train_views, found))
+            splats = with_backdrop(splats, photos, name)
         if not stopped:
             run.end(len(splats), removed)
     return splats, with_train_exposures(capture, found)

@@ -83,6 +83,7 @@ _DEFAULT = FitSettings(
     exposure="off",
     transients="auto",
     remove_floaters=True,
+    backdrop=True,
 )
 #: As Kerbl et al. 2023 fit, at their shorter number of steps: SfM points where there are some, and
 #: as many splats as their density control adds.
@@ -96,6 +97,7 @@ _3DGS = replace(
     depth_weight=0.0,
     transients="off",
     remove_floaters=False,
+    backdrop=False,
 )
 #: As InstantSplat (Fan et al. 2024) fits: many splats from dense points, which stay as many, with
 #: cameras and one focal length optimized. Here the points are the capture's or made from its
@@ -112,6 +114,7 @@ _INSTANTSPLAT = replace(
     focal="shared",
     transients="off",
     remove_floaters=False,
+    backdrop=False,
 )
 #: What a preset says nothing of.
 _NOT_OF_PRESETS = ("seed", "background")

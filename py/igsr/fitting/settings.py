@@ -139,6 +139,12 @@ class FitSettings:
             "before the surface that at most one photo needs."
         )
     )
+    backdrop: bool = field(
+        metadata=about(
+            "In the end, put a sphere of 200 large splats behind the scene, so that what no photo "
+            "shows is not black; not for photos with alpha or masks."
+        )
+    )
     background: tuple[float, float, float] | None = field(
         default=None,
         metadata=about(

@@ -14,6 +14,7 @@ from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background
 from igsr.floaters.isolation import alone
 from igsr.floaters.photo_evidence import SHOWN, needed_by_others, sightings
+from igsr.rendering.backdrop import backdrop_splats
 from igsr.splats import Splats
 
 Bool = npt.NDArray[np.bool_]
@@ -62,7 +63,7 @@ def remove_floaters(
             photos have alpha, else black.
         seed: of the random numbers of the estimate which photos need a splat.
         backend: "auto", "cpu", "gpu" or "reference".
-        frozen: with photos, so many splats, the last ones, stay in any case.
+        frozen: so many splats, the last ones, stay in any case; a backdrop does, too.
 
     Returns:
         The splats that are left, and how many of which kind were removed. Where none would be left,
@@ -72,14 +73,13 @@ def remove_floaters(
         IgsrError: the capture has no train views.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
+    frozen = max(frozen, backdrop_splats(splats))
     if capture is None:
-        return _without(splats, stray_splats(splats))
+        return _without(splats, stray_splats(splats), frozen)
     if not capture.train_views:
         raise IgsrError(f"{capture.path} has no train views to ask about splats.")
     color = default_background(capture) if background is None else background
     kinds = unsupported_splats(splats, capture.train_views, color, seed, backend)
-    for kind in kinds.values():
-        kind[len(kind) - frozen :] = False
     return _without(splats, kinds, frozen)
 
 
@@ -144,7 +144,9 @@ def unsupported_splats(
 
 
 def _without(splats: Splats, kinds: dict[str, Bool], frozen: int = 0) -> Cleaned:
-    """The splats that are of no kind."""
+    """The splats that are of no kind, and the last ``frozen``."""
+    for kind in kinds.values():
+        kind[len(kind) - frozen :] = False
     keep = ~np.logical_or.reduce(list(kinds.values()))
     if not keep[: len(keep) - frozen].any():
         return Cleaned(splats, dict.fromkeys(kinds, 0))

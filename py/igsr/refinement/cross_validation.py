@@ -116,7 +116,7 @@ class CrossValidation:
         return folds
 
     def _scored(self, fitted: Reconstruction, held_out: list[View]) -> list[ScoredView]:
-        return self._stages.validated(fitted.splats, held_out)
+        return self._stages.validated(fitted.shown, held_out)
 
 
 def combined_error(scores: dict[str, float]) -> float:

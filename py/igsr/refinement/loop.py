@@ -129,8 +129,8 @@ def refine(
         whole = stages.fit_whole()
         if validation is not None:
             validation.use(whole.photos)
-        test = stages.test_scores(whole.splats)
-        refined = Refined(whole.splats, whole.splats, test, stages.capture, [], None, [], {})
+        test = stages.test_scores(whole.shown)
+        refined = Refined(whole.shown, whole.shown, test, stages.capture, [], None, [], {})
         while refined.stop is None:
             refined = run.write(refined)
             run.round += 1
@@ -177,12 +177,12 @@ def _round(
     accepted = validation is None or combined_error(after) < combined_error(before)
     if accepted:
         stages.refit(whole, selected, views.added_before, "refit")
-    splats = whole.splats if accepted else None
+    splats = whole.shown if accepted else None
     test = stages.test_scores(splats)
 
     done = Round(selected, rejected, before, after, accepted, splats, test, validated.held_out)
     rolled_back = None if accepted else Stop(StopReason.NOT_ACCEPTED, number)
-    return replace(refined, splats=whole.splats, rounds=[*refined.rounds, done], stop=rolled_back)
+    return replace(refined, splats=whole.shown, rounds=[*refined.rounds, done], stop=rolled_back)
 
 
 def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDenoiser:

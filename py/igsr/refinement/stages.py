@@ -42,6 +42,7 @@ from igsr.refinement.selection import (
     rejected,
 )
 from igsr.refinement.settings import RefineSettings
+from igsr.rendering.backdrop import wants_backdrop, with_backdrop
 from igsr.splats import Splats
 
 Float32 = npt.NDArray[np.float32]
@@ -67,7 +68,8 @@ class Reconstruction:
         photos: that are fitted, with the scene's colors: exposures that the first fit has found are
             taken out of them, and with masks that leave out what it has found to be transient.
         share: the photos' pixels as a part of all; time and number of splats go by it.
-        splats: after the last fit.
+        splats: after the last fit, without a backdrop: holes are to be seen as such.
+        shown: the same with the backdrop, if the scene has one: what is scored and written.
         added: novel views that the rounds so far have added.
     """
 
@@ -75,6 +77,7 @@ class Reconstruction:
     photos: list[View]
     share: float
     splats: Splats
+    shown: Splats
     added: list[NovelView] = field(default_factory=list)
 
 
@@ -178,12 +181,12 @@ class Stages:
             self._background,
             self._settings.backend,
         )
-        return Reconstruction("whole", photos, 1.0, splats)
+        return Reconstruction("whole", photos, 1.0, splats, self._shown(splats, photos))
 
     def fit(self, name: str, photos: list[View], share: float = 1.0) -> Reconstruction:
         """Fit photos alone, which have the scene's colors."""
         splats, _ = self._fit(name, "fit", photos, share)
-        return Reconstruction(name, photos, share, splats)
+        return Reconstruction(name, photos, share, splats, self._shown(splats, photos))
 
     def render_and_denoise(self, reconstruction: Reconstruction) -> DenoisedViews:
         """Render novel views, and again those that were added before, and denoise them."""
@@ -271,7 +274,9 @@ class Stages:
         ]
         pictures = [*reconstruction.photos, *views]
         seed = seed_of_round(self._settings.seed, self._run.round)
-        reconstruction.splats, _ = self._fit(name, stage, pictures, reconstruction.share, seed=seed)
+        splats, _ = self._fit(name, stage, pictures, reconstruction.share, seed=seed)
+        reconstruction.splats = splats
+        reconstruction.shown = self._shown(splats, reconstruction.photos)
         reconstruction.added += [candidate.view for candidate in selected]
 
     def validated(self, splats: Splats, photos: list[View]) -> list[ScoredView]:
@@ -292,6 +297,12 @@ class Stages:
         scores = evaluate(splats, self._capture, "test", self._background, backend)
         self._run.tell("test")
         return {metric: scores[metric] for metric in METRICS}
+
+    def _shown(self, splats: Splats, photos: Sequence[View]) -> Splats:
+        """The splats with a backdrop, if the capture's photos want one."""
+        if not wants_backdrop(self._capture.train_views):
+            return splats
+        return with_backdrop(splats, photos, self._settings.backend)
 
     def _fit(
         self,
@@ -322,6 +333,7 @@ class Stages:
             resume=resume,
             exposure=exposure,
             transients=transients,
+            backdrop=False,
             **self._fit_settings,
         )
         if not goes_on:  # not raised in the callback, so that the fit saves its checkpoint

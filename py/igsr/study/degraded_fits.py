@@ -166,6 +166,7 @@ def run_fit(out: Path, data: str, one: DegradedFit) -> dict[str, Any]:
         hull=None if one.kind in FEW else False,
         # Few photos have depths; those of rendered captures would tell a fit too much.
         depth_weight=0.0,
+        backdrop=False,  # holes are to be seen as such
         progress=progress,
     )
     background = known_background(capture.views)

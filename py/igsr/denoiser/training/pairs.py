@@ -209,6 +209,7 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
         hull=_hull(one),
         # Exact depths of rendered captures would make these fits better than those of photos.
         depth_weight=0.0,
+        backdrop=False,  # holes are to be seen as such
     )
     has_alpha = plan.train[0].image.shape[2] == 4
     background: tuple[float, ...] | None = None

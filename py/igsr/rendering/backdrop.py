@@ -1,0 +1,180 @@
+"""The backdrop: a sphere of a few large splats behind a scene.
+
+Between and behind the splats of photographs is nothing, and renders show the background there,
+which is black. A novel view that sees past what was photographed has black holes and edges. The
+sphere has the colors that photos have in its direction, smoothed. Where photos show that the scene
+is transparent, they tell the color themselves: what the render lacks there. Its splats are ordinary
+ones behind all others, which any viewer draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr._internal.choices import Backend
+from igsr.capture import View
+from igsr.capture.downscaling import reduced_size, reduced_view
+from igsr.rendering.renders import render
+from igsr.splats import Splats
+
+Float64 = npt.NDArray[np.float64]
+
+#: Splats of the sphere, about 14 degrees from each other.
+COUNT = 200
+#: Their standard deviation, in units of their distance to each other, and logit of their opacities.
+#: With these the sphere lets 1 % through at most.
+WIDTH, OPACITY = 0.75, 6.0
+#: Radius of the sphere in units of the distance of the farthest splat (but at most so many of the
+#: median one), and at least in units of the farthest camera's: viewers go back to see the whole.
+FAR, MOST_FAR, BEYOND_CAMERAS = 1.5, 1000.0, 10.0
+#: Colors are smoothed over directions by a Gaussian of this standard deviation, degrees.
+SMOOTH = 15.0
+#: Pixels that are transparent by this much tell as much of the color as the photos' own colors do.
+TOLD = 0.05
+#: What the mean color of all directions counts beside a direction's own pixels, in parts of what
+#: directions have.
+MEAN_COUNTS = 1e-4
+#: Photos that are asked at most, evenly spread, and the longest side that they are reduced to.
+MOST_ASKED, SIDE = 24, 64
+#: A sphere whose colors are all less than this is not added: the background is black as it is.
+BLACK = 2.0 / 255.0
+#: Of the first spherical harmonic.
+_SH_0 = 0.28209479177387814
+
+
+def wants_backdrop(photos: Sequence[View], background: Sequence[float] | None = None) -> bool:
+    """Whether something has to be behind what is fitted to these photos.
+
+    Not where photos have alpha or masks, which cut an object out, or a background is given.
+
+    Args:
+        photos: that are fitted.
+        background: RGB in [0, 1], if one was asked for.
+    """
+    cut_out = any(
+        photo.image.shape[2] == 4 or photo.mask is not None or photo.background is not None
+        for photo in photos
+    )
+    return background is None and not cut_out
+
+
+def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "auto") -> Splats:
+    """The splats, and behind them ``COUNT`` more; the same splats where the background is black.
+
+    Args:
+        splats: of a fit before black, without a backdrop.
+        photos: that it was fitted to, with the scene's colors; pixels outside masks do not count.
+        backend: what renders: "auto", "cpu", "gpu" or "reference".
+
+    Raises:
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    evenly = np.linspace(0, len(photos) - 1, min(len(photos), MOST_ASKED)).round()
+    asked = [photos[int(i)] for i in evenly]
+    cameras = np.array([photo.camera.centre for photo in photos])
+    middle = cameras.mean(axis=0)
+    apart = np.linalg.norm(splats.means[splats.finite] + splats.origin - middle, axis=1)
+    if not len(apart) or not 0.0 < apart.max() < np.inf:
+        return splats
+    radius = max(
+        min(FAR * apart.max(), MOST_FAR * np.median(apart)),
+        BEYOND_CAMERAS * np.linalg.norm(cameras - middle, axis=1).max(),
+    )
+    directions = _directions()
+    colors = _colors(splats, asked, directions, backend)
+    if colors.max() < BLACK:
+        return splats
+    sh = np.zeros((COUNT, *splats.sh.shape[1:]), np.float32)
+    sh[:, 0] = (colors - 0.5) / _SH_0
+    size = np.log(WIDTH * radius * np.sqrt(4.0 * np.pi / COUNT))
+    added = {
+        "means": middle + radius * directions - splats.origin,
+        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1)),
+        "scales": np.full((COUNT, 3), size),
+        "opacities": np.full(COUNT, OPACITY),
+        "sh": sh,
+    }
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(splats, name), array.astype(np.float32)])
+        for name, array in added.items()
+    }
+    return replace(splats, **arrays)
+
+
+def backdrop_splats(splats: Splats) -> int:
+    """How many splats, the last ones, are a backdrop: ``COUNT`` or 0.
+
+    They are known by their shapes, which no fit gives: all alike.
+    """
+    last = slice(len(splats) - COUNT, None)
+    if len(splats) < COUNT:
+        return 0
+    alike = (
+        (splats.opacities[last] == np.float32(OPACITY)).all()
+        and (splats.scales[last] == splats.scales[-1, 0]).all()
+        and (splats.quats[last] == [1.0, 0.0, 0.0, 0.0]).all()
+        and (splats.sh[last, 1:] == 0.0).all()
+    )
+    return COUNT if alike else 0
+
+
+def without_backdrop(splats: Splats) -> Splats:
+    """The splats without their backdrop, if they have one."""
+    kept = len(splats) - backdrop_splats(splats)
+    if kept == len(splats):
+        return splats
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return replace(splats, **{name: getattr(splats, name)[:kept] for name in names})
+
+
+def _directions() -> Float64:
+    """Unit vectors [COUNT, 3] evenly spread over the sphere: Fibonacci's spiral."""
+    k = np.arange(COUNT) + 0.5
+    z = 1.0 - 2.0 * k / COUNT
+    turn = np.pi * (1.0 + np.sqrt(5.0)) * k
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([np.cos(turn) * flat, np.sin(turn) * flat, z], axis=1)
+
+
+def _colors(
+    splats: Splats, photos: Sequence[View], directions: Float64, backend: Backend
+) -> Float64:
+    """Colors [COUNT, 3] in [0, 1] by least squares.
+
+    With the transmittance T of a pixel, what its render lacks is T times the sphere's color; beside
+    that the sphere has the photos' own colors, with ``TOLD`` in place of T.
+    """
+    lacking, weight = np.zeros((COUNT, 3)), np.zeros(COUNT)
+    for photo in photos:
+        size = reduced_size(photo.camera.width, photo.camera.height, SIDE)
+        small = reduced_view(photo, *size)
+        shown = render(splats, small.camera, backend=backend)
+        through = 1.0 - np.nan_to_num(shown.alpha, nan=1.0).reshape(-1)
+        color = small.image[..., :3].reshape(-1, 3) / 255.0
+        lacks = color - np.nan_to_num(shown.color, nan=0.0).reshape(-1, 3)
+        cosines = directions @ _rays(small).T
+        near = np.exp((cosines - 1.0) / (1.0 - np.cos(np.radians(SMOOTH))))
+        if small.mask is not None:
+            near = near * small.mask.reshape(-1)
+        lacking += near @ (through[:, None] * lacks + TOLD**2 * color)
+        weight += near @ (through**2 + TOLD**2)
+    if weight.sum() <= 0.0:
+        return np.zeros((COUNT, 3))
+    # Where no photo looks, all directions' mean.
+    few = MEAN_COUNTS * weight.mean()
+    mean = lacking.sum(axis=0) / weight.sum()
+    return np.clip((lacking + few * mean) / (weight + few)[:, None], 0.0, 1.0)
+
+
+def _rays(view: View) -> Float64:
+    """Directions [H * W, 3] in the world that a view's pixels look in, of length one."""
+    camera = view.camera
+    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+    x, y = (columns - camera.K[0, 2]) / camera.K[0, 0], (rows - camera.K[1, 2]) / camera.K[1, 1]
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.viewmat[:3, :3]
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.float64)

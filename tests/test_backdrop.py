@@ -1,0 +1,180 @@
+"""The backdrop: a sphere behind what was fitted to photographs, its colors, and who keeps it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+import igsr
+from igsr.capture import Capture
+from igsr.rendering.backdrop import (
+    COUNT,
+    backdrop_splats,
+    wants_backdrop,
+    with_backdrop,
+    without_backdrop,
+)
+
+BALL = scenes.splats(60, degree=1)
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+SKY = (51, 128, 204)
+
+
+def before_sky(views=6, arc=2.0 * np.pi):
+    """Photos of the ball before a sky of one color, and the same photos before black."""
+    made = scenes.capture(views=views, scene=BALL, arc=arc)
+    photos = []
+    for view in made.views:
+        shown = igsr.render(BALL, view.camera, np.array(SKY) / 255.0, "cpu").to_uint8()
+        photos.append(replace(view, image=shown))
+    return Capture(made.path, photos, made.points), made
+
+
+def looking_away(camera):
+    """A camera at the same place that looks the other way: nothing but the backdrop is there."""
+    viewmat = camera.viewmat.copy()
+    viewmat[[0, 2]] *= -1.0
+    return replace(camera, viewmat=viewmat)
+
+
+def same(one, other, count=None):
+    return all(
+        np.array_equal(getattr(one, n)[:count], getattr(other, n)[:count]) for n in PARAMETERS
+    )
+
+
+def test_photos_that_see_through_the_scene_tell_what_is_behind_it():
+    photos, _ = before_sky()
+    scene = with_backdrop(BALL, photos.views, "cpu")
+    assert len(scene) == len(BALL) + COUNT
+    assert same(scene, BALL, len(BALL))
+    for view in photos.views:
+        shown = igsr.render(scene, view.camera, backend="cpu")
+        assert shown.alpha.min() > 0.985
+        assert np.abs(shown.to_uint8().astype(int) - view.image).max() < 12
+
+
+def test_where_no_photo_looks_it_has_the_photos_mean_color():
+    photos, _ = before_sky(views=2, arc=0.5)
+    scene = with_backdrop(BALL, photos.views, "cpu")
+    away = igsr.render(scene, looking_away(photos.views[0].camera), backend="cpu")
+    np.testing.assert_allclose(away.color.mean(axis=(0, 1)), np.array(SKY) / 255.0, atol=0.1)
+    black = igsr.render(BALL, looking_away(photos.views[0].camera), backend="cpu")
+    assert black.color.max() == 0.0
+
+
+def test_behind_an_opaque_scene_it_has_the_colors_of_photos_in_its_direction():
+    # A wall that fills the picture of a camera: nothing can be seen behind it.
+    camera = scenes.ring_camera(0.0)
+    image = np.full((camera.height, camera.width, 3), (200, 100, 50), np.uint8)
+    view = igsr.View("wall.png", camera, "train", image)
+    forward = camera.viewmat[2, :3]
+    wall = igsr.Splats(
+        means=(camera.centre + 2.0 * forward)[None].astype(np.float32),
+        quats=np.float32([[1.0, 0.0, 0.0, 0.0]]),
+        scales=np.full((1, 3), 2.0, np.float32),
+        opacities=np.float32([9.0]),
+        sh=((np.array([[[200, 100, 50]]]) / 255.0 - 0.5) / 0.28209479).astype(np.float32),
+    )
+    scene = with_backdrop(wall, [view], "cpu")
+    behind = igsr.render(scene, looking_away(camera), backend="cpu")
+    np.testing.assert_allclose(
+        behind.color.reshape(-1, 3).mean(axis=0), np.array([200, 100, 50]) / 255.0, atol=0.02
+    )
+
+
+def test_before_black_there_is_none():
+    _, before_black = before_sky()
+    assert with_backdrop(BALL, before_black.views, "cpu") is BALL
+
+
+def test_masked_pixels_do_not_count():
+    photos, _ = before_sky()
+    wrong = []
+    for view in photos.views:
+        image, mask = view.image.copy(), np.ones(view.image.shape[:2], np.bool_)
+        image[:8], mask[:8] = (255, 0, 0), False
+        wrong.append(replace(view, image=image, mask=mask))
+    scene = with_backdrop(BALL, wrong, "cpu")
+    shown = igsr.render(scene, photos.views[0].camera, backend="cpu").to_uint8()
+    assert np.abs(shown[:8].astype(int) - SKY).max() < 25
+
+
+def test_splats_without_a_finite_centre_have_none():
+    photos, _ = before_sky()
+    broken = replace(BALL, means=np.full_like(BALL.means, np.nan))
+    assert with_backdrop(broken, photos.views, "cpu") is broken
+
+
+@pytest.mark.parametrize("name", ["scene.ply", "scene.splat"])
+def test_it_is_known_in_a_file_where_numbers_stay_as_they_are(tmp_path, name):
+    photos, _ = before_sky()
+    scene = with_backdrop(BALL, photos.views, "cpu")
+    scene.save(tmp_path / name)
+    read = igsr.Splats.load(tmp_path / name)
+    assert backdrop_splats(read) == (COUNT if name.endswith(".ply") else 0)
+    assert backdrop_splats(BALL) == 0
+    assert same(without_backdrop(scene), BALL)
+    assert without_backdrop(BALL) is BALL
+
+
+def test_floaters_are_not_looked_for_in_it():
+    photos, _ = before_sky()
+    scene = with_backdrop(BALL, photos.views, "cpu")
+    for cleaned in (
+        igsr.remove_floaters(scene, photos, backend="cpu"),
+        igsr.remove_floaters(scene),
+    ):
+        assert backdrop_splats(cleaned.splats) == COUNT
+
+
+def test_fits_of_photographs_end_with_one_and_go_on_without_it():
+    photos, _ = before_sky()
+    options = {"steps": 40, "backend": "cpu", "max_splats": 300, "seed": 3}
+    bare = igsr.fit(photos, backdrop=False, **options)
+    whole = igsr.fit(photos, **options)
+    assert backdrop_splats(bare) == 0
+    assert same(without_backdrop(whole), bare)
+    assert same(whole, with_backdrop(bare, photos.train_views, "cpu"))
+    on = igsr.fit(photos, start=whole, **options)
+    assert same(on, igsr.fit(photos, start=bare, **options))
+    assert backdrop_splats(on) == COUNT
+
+
+def test_what_is_cut_out_and_what_has_a_background_gets_none():
+    photos, _ = before_sky()
+    options = {"steps": 3, "backend": "cpu"}
+    assert wants_backdrop(photos.views)
+    assert not wants_backdrop(scenes.capture(alpha=True).views)
+    masks = [replace(v, mask=np.ones(v.image.shape[:2], np.bool_)) for v in photos.views]
+    assert not wants_backdrop(masks)
+    for capture, more in (
+        (scenes.capture(alpha=True), {}),
+        (Capture(photos.path, masks), {}),
+        (photos, {"background": (0.2, 0.5, 0.8)}),
+        (photos, {"preset": "3dgs"}),
+    ):
+        assert backdrop_splats(igsr.fit(capture, **options, **more)) == 0
+
+
+def test_a_refinement_writes_and_scores_it_and_its_rounds_look_without_it(monkeypatch):
+    from igsr.refinement import stages
+
+    photos, _ = before_sky(views=6)
+    views = [replace(v, split="test" if k == 3 else "train") for k, v in enumerate(photos.views)]
+    seen = []
+    looked_at = stages.photo_support
+    monkeypatch.setattr(
+        stages,
+        "photo_support",
+        lambda splats, *more: seen.append(backdrop_splats(splats)) or looked_at(splats, *more),
+    )
+    refined = igsr.refine(Capture(photos.path, views), rounds=1, steps=40, backend="cpu")
+    assert backdrop_splats(refined.splats) == COUNT
+    assert seen
+    assert not any(seen)
+    scores = igsr.evaluate(refined.first, Capture(photos.path, views), backend="cpu")
+    assert refined.first_test["psnr"] == pytest.approx(scores["psnr"])
