@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -119,6 +120,18 @@ def test_it_is_known_in_a_file_where_numbers_stay_as_they_are(tmp_path, name):
     assert backdrop_splats(BALL) == 0
     assert same(without_backdrop(scene), BALL)
     assert without_backdrop(BALL) is BALL
+
+
+def test_info_tells_of_it_and_of_the_corners_of_the_rest(tmp_path, igsr_here):
+    photos, _ = before_sky()
+    for name, scene in (("bare", BALL), ("whole", with_backdrop(BALL, photos.views, "cpu"))):
+        scene.save(tmp_path / f"{name}.ply")
+    bare, whole = (
+        json.loads(igsr_here("info", tmp_path / f"{name}.ply", "--json").stdout)
+        for name in ("bare", "whole")
+    )
+    assert (bare["backdrop_splats"], whole["backdrop_splats"]) == (0, COUNT)
+    assert bare["highest_corner"] == whole["highest_corner"]
 
 
 def test_floaters_are_not_looked_for_in_it():
