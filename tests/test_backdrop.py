@@ -11,13 +11,8 @@ import scenes
 
 import igsr
 from igsr.capture import Capture
-from igsr.rendering.backdrop import (
-    COUNT,
-    backdrop_splats,
-    wants_backdrop,
-    with_backdrop,
-    without_backdrop,
-)
+from igsr.rendering.backdrop import wants_backdrop, with_backdrop
+from igsr.splats import BACKDROP_SPLATS as COUNT
 
 BALL = scenes.splats(60, degree=1)
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
@@ -116,10 +111,10 @@ def test_it_is_known_in_a_file_where_numbers_stay_as_they_are(tmp_path, name):
     scene = with_backdrop(BALL, photos.views, "cpu")
     scene.save(tmp_path / name)
     read = igsr.Splats.load(tmp_path / name)
-    assert backdrop_splats(read) == (COUNT if name.endswith(".ply") else 0)
-    assert backdrop_splats(BALL) == 0
-    assert same(without_backdrop(scene), BALL)
-    assert without_backdrop(BALL) is BALL
+    assert read.backdrop_splats == (COUNT if name.endswith(".ply") else 0)
+    assert BALL.backdrop_splats == 0
+    assert same(scene.without_backdrop(), BALL)
+    assert BALL.without_backdrop() is BALL
 
 
 def test_info_tells_of_it_and_of_the_corners_of_the_rest(tmp_path, igsr_here):
@@ -141,7 +136,7 @@ def test_floaters_are_not_looked_for_in_it():
         igsr.remove_floaters(scene, photos, backend="cpu"),
         igsr.remove_floaters(scene),
     ):
-        assert backdrop_splats(cleaned.splats) == COUNT
+        assert cleaned.splats.backdrop_splats == COUNT
 
 
 def test_fits_of_photographs_end_with_one_and_go_on_without_it():
@@ -149,12 +144,12 @@ def test_fits_of_photographs_end_with_one_and_go_on_without_it():
     options = {"steps": 40, "backend": "cpu", "max_splats": 300, "seed": 3}
     bare = igsr.fit(photos, backdrop=False, **options)
     whole = igsr.fit(photos, **options)
-    assert backdrop_splats(bare) == 0
-    assert same(without_backdrop(whole), bare)
+    assert bare.backdrop_splats == 0
+    assert same(whole.without_backdrop(), bare)
     assert same(whole, with_backdrop(bare, photos.train_views, "cpu"))
     on = igsr.fit(photos, start=whole, **options)
     assert same(on, igsr.fit(photos, start=bare, **options))
-    assert backdrop_splats(on) == COUNT
+    assert on.backdrop_splats == COUNT
 
 
 def test_what_is_cut_out_and_what_has_a_background_gets_none():
@@ -170,7 +165,7 @@ def test_what_is_cut_out_and_what_has_a_background_gets_none():
         (photos, {"background": (0.2, 0.5, 0.8)}),
         (photos, {"preset": "3dgs"}),
     ):
-        assert backdrop_splats(igsr.fit(capture, **options, **more)) == 0
+        assert igsr.fit(capture, **options, **more).backdrop_splats == 0
 
 
 def test_a_refinement_writes_and_scores_it_and_its_rounds_look_without_it(monkeypatch):
@@ -183,10 +178,10 @@ def test_a_refinement_writes_and_scores_it_and_its_rounds_look_without_it(monkey
     monkeypatch.setattr(
         stages,
         "photo_support",
-        lambda splats, *more: seen.append(backdrop_splats(splats)) or looked_at(splats, *more),
+        lambda splats, *more: seen.append(splats.backdrop_splats) or looked_at(splats, *more),
     )
     refined = igsr.refine(Capture(photos.path, views), rounds=1, steps=40, backend="cpu")
-    assert backdrop_splats(refined.splats) == COUNT
+    assert refined.splats.backdrop_splats == COUNT
     assert seen
     assert not any(seen)
     scores = igsr.evaluate(refined.first, Capture(photos.path, views), backend="cpu")

@@ -43,8 +43,8 @@ def same(a, b):
 
 
 def small_fit(capture, **options):
-    arguments = {"steps": STEPS, "backend": "cpu", "max_splats": 400, "sh_degree": 1, **options}
-    return igsr.fit(capture, **arguments)
+    arguments = {"steps": STEPS, "backend": "cpu", "max_splats": 400, "sh_degree": 1}
+    return igsr.fit(capture, **{**arguments, "backdrop": False, **options})
 
 
 @pytest.mark.parametrize("density", ["mcmc", "original", "fixed"])

@@ -425,6 +425,7 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
         exposure="off",
         transients="off",
         remove_floaters=False,
+        backdrop=False,
     )
     monkeypatch.setattr(presets, "_default", lambda *_: short)
     row = run_fit(str(data), PoseFit("ball", Noise("turn", 1.0), "joint", 0, "cpu"))

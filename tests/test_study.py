@@ -41,6 +41,7 @@ SHORT = FitSettings(
     exposure="off",
     transients="off",
     remove_floaters=False,
+    backdrop=False,
 )
 
 

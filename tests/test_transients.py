@@ -224,6 +224,7 @@ OPTIONS = {
     "dropout": 0.0,
     "learning_rate": 3.0,
     "remove_floaters": False,
+    "backdrop": False,
 }
 
 

@@ -198,7 +198,13 @@ def test_a_fit_and_its_checkpoint(tmp_path):
         assert state_of(server)["run"] == {"text": "find cameras", "done": 0.0}
         followed.show(made, (1.0, 0.5, 0.0))
         fitted = igsr.fit(
-            made, 6, look, "cpu", remove_floaters=False, checkpoint=folder / "checkpoint.npz"
+            made,
+            6,
+            look,
+            "cpu",
+            remove_floaters=False,
+            backdrop=False,
+            checkpoint=folder / "checkpoint.npz",
         )
         assert seen[0]["run"] == {"text": "step 1", "done": 0.5}
         state = state_of(server)

@@ -503,7 +503,7 @@ def test_folds_hold_whole_panoramas_out(capture: Path) -> None:
 
         def fit(self, name: str, photos: list[Any], share: float) -> Any:
             self.fitted.append(photos)
-            return type("Fitted", (), {"splats": None})()
+            return type("Fitted", (), {"splats": None, "shown": None})()
 
         def validated(self, splats: Any, held_out: list[Any]) -> list[Any]:
             return []

@@ -7,7 +7,7 @@ import os
 import pkgutil
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -29,6 +29,9 @@ FloatArray = npt.NDArray[np.float32]
 
 #: Highest spherical-harmonics degree there is code for.
 MAX_SH_DEGREE = 4
+
+#: Splats of a backdrop (``igsr.rendering.backdrop``), and logit of their opacities.
+BACKDROP_SPLATS, BACKDROP_OPACITY = 200, 6.0
 
 #: Endings of the files that :meth:`Splats.load` reads, in lower case.
 SPLAT_ENDINGS = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb", ".gltf")
@@ -101,6 +104,32 @@ class Splats(ArrayEquality, NotebookPicture):
     def sh_degree(self) -> int:
         """Degree of the stored spherical harmonics, 0-4."""
         return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def backdrop_splats(self) -> int:
+        """How many splats, the last ones, are a backdrop (``igsr.rendering.backdrop``), or 0.
+
+        They are known by their shapes, which are all alike, so only in formats that keep numbers as
+        they are.
+        """
+        last = slice(len(self) - BACKDROP_SPLATS, None)
+        if len(self) < BACKDROP_SPLATS:
+            return 0
+        alike = (
+            (self.opacities[last] == np.float32(BACKDROP_OPACITY)).all()
+            and (self.scales[last] == self.scales[-1, 0]).all()
+            and (self.quats[last] == [1.0, 0.0, 0.0, 0.0]).all()
+            and (self.sh[last, 1:] == 0.0).all()
+        )
+        return BACKDROP_SPLATS if alike else 0
+
+    def without_backdrop(self) -> Splats:
+        """The splats without their backdrop; the same ones if they have none."""
+        kept = len(self) - self.backdrop_splats
+        if kept == len(self):
+            return self
+        names = ("means", "quats", "scales", "opacities", "sh")
+        return replace(self, **{name: getattr(self, name)[:kept] for name in names})
 
     @property
     def finite(self) -> npt.NDArray[np.bool_]:

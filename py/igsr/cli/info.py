@@ -48,17 +48,15 @@ def _opacity(logit: float) -> float:
 
 
 def _scene_info(path: Path) -> dict[str, Any]:
-    from igsr.rendering.backdrop import backdrop_splats, without_backdrop
-
     splats = Splats.load(path)
-    bounds = without_backdrop(splats).bounds()
+    bounds = splats.without_backdrop().bounds()
     finite = splats.finite
     logit = float(np.median(splats.opacities[finite])) if finite.any() else None
     return {
         "kind": "scene",
         "path": str(path),
         "splats": len(splats),
-        "backdrop_splats": backdrop_splats(splats),
+        "backdrop_splats": splats.backdrop_splats,
         "not_finite": int((~finite).sum()),
         "sh_degree": splats.sh_degree,
         "antialiased": splats.antialiased,

@@ -56,7 +56,7 @@ from igsr.fitting.settings import (
 )
 from igsr.fitting.transient_search import TransientSearch, resumed_masks, with_train_masks
 from igsr.floaters import remove_floaters as without_floaters
-from igsr.rendering.backdrop import wants_backdrop, with_backdrop, without_backdrop
+from igsr.rendering.backdrop import wants_backdrop, with_backdrop
 from igsr.splats import Splats
 
 __all__ = [
@@ -240,7 +240,7 @@ def _fitted(
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
-    initial = without_backdrop(start) if isinstance(start, Splats) else None
+    initial = start.without_backdrop() if isinstance(start, Splats) else None
     if initial is None:
         settings = settings_for(
             preset, support_of(photos_among(views)), quality, start=start, **given

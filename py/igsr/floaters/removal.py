@@ -14,7 +14,6 @@ from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background
 from igsr.floaters.isolation import alone
 from igsr.floaters.photo_evidence import SHOWN, needed_by_others, sightings
-from igsr.rendering.backdrop import backdrop_splats
 from igsr.splats import Splats
 
 Bool = npt.NDArray[np.bool_]
@@ -73,7 +72,7 @@ def remove_floaters(
         IgsrError: the capture has no train views.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
-    frozen = max(frozen, backdrop_splats(splats))
+    frozen = max(frozen, splats.backdrop_splats)
     if capture is None:
         return _without(splats, stray_splats(splats), frozen)
     if not capture.train_views:

@@ -257,7 +257,8 @@ class Stages:
         """Fit photos and novel views from the initialization that the photos alone had.
 
         A fit that went on from the splats so far would keep what these made up where no photo
-        showed better. Its seed is another one: the same draws would err where the views err.
+        showed better. The seed of a whole fit is another one: the same draws would err where the
+        views err. That of a fold stays, so that chance is the same before its round and after it.
         """
         name = f"{reconstruction.name}-round{self._run.round}"
         views = [
@@ -273,7 +274,8 @@ class Stages:
             for number, candidate in enumerate((*selected, *added_before))
         ]
         pictures = [*reconstruction.photos, *views]
-        seed = seed_of_round(self._settings.seed, self._run.round)
+        own = seed_of_round(self._settings.seed, self._run.round)
+        seed = own if stage == "refit" else None
         splats, _ = self._fit(name, stage, pictures, reconstruction.share, seed=seed)
         reconstruction.splats = splats
         reconstruction.shown = self._shown(splats, reconstruction.photos)

@@ -20,15 +20,14 @@ from igsr._internal.choices import Backend
 from igsr.capture import View
 from igsr.capture.downscaling import reduced_size, reduced_view
 from igsr.rendering.renders import render
-from igsr.splats import Splats
+from igsr.splats import BACKDROP_OPACITY, Splats
+from igsr.splats import BACKDROP_SPLATS as COUNT
 
 Float64 = npt.NDArray[np.float64]
 
-#: Splats of the sphere, about 14 degrees from each other.
-COUNT = 200
-#: Their standard deviation, in units of their distance to each other, and logit of their opacities.
-#: With these the sphere lets 1 % through at most.
-WIDTH, OPACITY = 0.75, 6.0
+#: Standard deviation of the sphere's splats, in units of their distance to each other, about 14
+#: degrees. With it the sphere lets 1 % through at most.
+WIDTH = 0.75
 #: Radius of the sphere in units of the distance of the farthest splat (but at most so many of the
 #: median one), and at least in units of the farthest camera's: viewers go back to see the whole.
 FAR, MOST_FAR, BEYOND_CAMERAS = 1.5, 1000.0, 10.0
@@ -41,8 +40,9 @@ TOLD = 0.05
 MEAN_COUNTS = 1e-4
 #: Photos that are asked at most, evenly spread, and the longest side that they are reduced to.
 MOST_ASKED, SIDE = 24, 64
-#: A sphere whose colors are all less than this is not added: the background is black as it is.
-BLACK = 2.0 / 255.0
+#: Where photos see through the scene in more of their pixels than this, and renders before black
+#: lack less there than this, black is what stands behind it, and no sphere is added.
+OPEN, BLACK = 0.1, 8.0 / 255.0
 #: Of the first spherical harmonic.
 _SH_0 = 0.28209479177387814
 
@@ -64,7 +64,7 @@ def wants_backdrop(photos: Sequence[View], background: Sequence[float] | None = 
 
 
 def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "auto") -> Splats:
-    """The splats, and behind them ``COUNT`` more; the same splats where the background is black.
+    """The splats, and behind them 200 more; none where photos show that it is black there.
 
     Args:
         splats: of a fit before black, without a backdrop.
@@ -87,7 +87,7 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
     )
     directions = _directions()
     colors = _colors(splats, asked, directions, backend)
-    if colors.max() < BLACK:
+    if colors is None:
         return splats
     sh = np.zeros((COUNT, *splats.sh.shape[1:]), np.float32)
     sh[:, 0] = (colors - 0.5) / _SH_0
@@ -96,7 +96,7 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
         "means": middle + radius * directions - splats.origin,
         "quats": np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1)),
         "scales": np.full((COUNT, 3), size),
-        "opacities": np.full(COUNT, OPACITY),
+        "opacities": np.full(COUNT, BACKDROP_OPACITY),
         "sh": sh,
     }
     arrays: dict[str, Any] = {
@@ -104,32 +104,6 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
         for name, array in added.items()
     }
     return replace(splats, **arrays)
-
-
-def backdrop_splats(splats: Splats) -> int:
-    """How many splats, the last ones, are a backdrop: ``COUNT`` or 0.
-
-    They are known by their shapes, which no fit gives: all alike.
-    """
-    last = slice(len(splats) - COUNT, None)
-    if len(splats) < COUNT:
-        return 0
-    alike = (
-        (splats.opacities[last] == np.float32(OPACITY)).all()
-        and (splats.scales[last] == splats.scales[-1, 0]).all()
-        and (splats.quats[last] == [1.0, 0.0, 0.0, 0.0]).all()
-        and (splats.sh[last, 1:] == 0.0).all()
-    )
-    return COUNT if alike else 0
-
-
-def without_backdrop(splats: Splats) -> Splats:
-    """The splats without their backdrop, if they have one."""
-    kept = len(splats) - backdrop_splats(splats)
-    if kept == len(splats):
-        return splats
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return replace(splats, **{name: getattr(splats, name)[:kept] for name in names})
 
 
 def _directions() -> Float64:
@@ -143,13 +117,14 @@ def _directions() -> Float64:
 
 def _colors(
     splats: Splats, photos: Sequence[View], directions: Float64, backend: Backend
-) -> Float64:
-    """Colors [COUNT, 3] in [0, 1] by least squares.
+) -> Float64 | None:
+    """Colors [COUNT, 3] in [0, 1] by least squares; None where the background is black.
 
     With the transmittance T of a pixel, what its render lacks is T times the sphere's color; beside
     that the sphere has the photos' own colors, with ``TOLD`` in place of T.
     """
     lacking, weight = np.zeros((COUNT, 3)), np.zeros(COUNT)
+    pixels, open_pixels, open_lacks = 0.0, 0.0, 0.0
     for photo in photos:
         size = reduced_size(photo.camera.width, photo.camera.height, SIDE)
         small = reduced_view(photo, *size)
@@ -157,14 +132,17 @@ def _colors(
         through = 1.0 - np.nan_to_num(shown.alpha, nan=1.0).reshape(-1)
         color = small.image[..., :3].reshape(-1, 3) / 255.0
         lacks = color - np.nan_to_num(shown.color, nan=0.0).reshape(-1, 3)
+        counts = np.ones(len(color)) if small.mask is None else small.mask.reshape(-1) * 1.0
+        is_open = counts * (through > 0.5)
+        pixels += counts.sum()
+        open_pixels += is_open.sum()
+        open_lacks += (is_open * lacks.mean(axis=1)).sum()
         cosines = directions @ _rays(small).T
-        near = np.exp((cosines - 1.0) / (1.0 - np.cos(np.radians(SMOOTH))))
-        if small.mask is not None:
-            near = near * small.mask.reshape(-1)
+        near = counts * np.exp((cosines - 1.0) / (1.0 - np.cos(np.radians(SMOOTH))))
         lacking += near @ (through[:, None] * lacks + TOLD**2 * color)
         weight += near @ (through**2 + TOLD**2)
-    if weight.sum() <= 0.0:
-        return np.zeros((COUNT, 3))
+    if pixels == 0.0 or (open_pixels > OPEN * pixels and open_lacks < BLACK * open_pixels):
+        return None
     # Where no photo looks, all directions' mean.
     few = MEAN_COUNTS * weight.mean()
     mean = lacking.sum(axis=0) / weight.sum()
