@@ -84,10 +84,11 @@ def run_tests(command: Sequence[str], timeout: float = TIMEOUT) -> dict[str, Any
 
 def _end(running: subprocess.Popen[bytes]) -> None:
     """End a command and what it started."""
-    if hasattr(os, "killpg"):
-        os.killpg(running.pid, signal.SIGKILL)
-    else:
-        running.kill()
+    with contextlib.suppress(OSError):  # it has just ended by itself
+        if hasattr(os, "killpg"):
+            os.killpg(running.pid, signal.SIGKILL)
+        else:
+            running.kill()
     with contextlib.suppress(subprocess.TimeoutExpired):
         running.wait(END_TIMEOUT)
 

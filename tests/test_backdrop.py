@@ -11,12 +11,20 @@ import scenes
 
 import igsr
 from igsr.capture import Capture
+from igsr.geometry.camera_paths import cameras_around
+from igsr.rendering import backdrop
 from igsr.rendering.backdrop import wants_backdrop, with_backdrop
+from igsr.rendering.scene_model import embedded_model
 from igsr.splats import BACKDROP_SPLATS as COUNT
 
 BALL = scenes.splats(60, degree=1)
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 SKY = (51, 128, 204)
+
+
+@pytest.fixture(autouse=True)
+def small_scenes_have_one(monkeypatch):
+    monkeypatch.setattr(backdrop, "LEAST_SPLATS", 0)
 
 
 def before_sky(views=6, arc=2.0 * np.pi):
@@ -129,14 +137,44 @@ def test_info_tells_of_it_and_of_the_corners_of_the_rest(tmp_path, igsr_here):
     assert bare["highest_corner"] == whole["highest_corner"]
 
 
-def test_floaters_are_not_looked_for_in_it():
+@pytest.mark.parametrize("photographs", [True, False])
+def test_floaters_are_not_looked_for_in_it_and_it_does_not_make_any(photographs):
     photos, _ = before_sky()
     scene = with_backdrop(BALL, photos.views, "cpu")
-    for cleaned in (
-        igsr.remove_floaters(scene, photos, backend="cpu"),
-        igsr.remove_floaters(scene),
-    ):
-        assert cleaned.splats.backdrop_splats == COUNT
+    capture = photos if photographs else None
+    cleaned = igsr.remove_floaters(scene, capture, backend="cpu")
+    bare = igsr.remove_floaters(BALL, capture, backend="cpu")
+    assert cleaned.removed == bare.removed
+    assert same(cleaned.splats, bare.splats.with_backdrop_of(scene))
+    assert cleaned.splats.backdrop_splats == COUNT
+
+
+def test_scenes_are_framed_by_what_is_before_it():
+    photos, _ = before_sky()
+    scene = with_backdrop(BALL, photos.views, "cpu")
+    for one, other in zip(cameras_around(BALL, 3, 32), cameras_around(scene, 3, 32), strict=True):
+        np.testing.assert_array_equal(one.viewmat, other.viewmat)
+    assert embedded_model(scene).radius == embedded_model(BALL).radius
+
+
+def test_a_smaller_model_keeps_it():
+    photos, _ = before_sky()
+    scene = with_backdrop(BALL, photos.views, "cpu")
+    compact = igsr.compact(scene, 3.0, capture=photos, sh_degree=0, steps=20, backend="cpu").splats
+    assert compact.backdrop_splats == COUNT
+    assert compact.sh_degree == 0
+    away = igsr.render(compact, looking_away(photos.views[0].camera), backend="cpu")
+    assert away.alpha.min() > 0.98
+
+
+def test_few_splats_and_scenes_without_a_size_have_none(monkeypatch):
+    photos, _ = before_sky()
+    still = photos.views[0].camera.centre
+    at_camera = replace(BALL, means=np.tile(still, (len(BALL), 1)).astype(np.float32))
+    same_place = [replace(v, camera=photos.views[0].camera) for v in photos.views]
+    assert with_backdrop(at_camera, same_place, "cpu") is at_camera
+    monkeypatch.setattr(backdrop, "LEAST_SPLATS", len(BALL) + 1)
+    assert with_backdrop(BALL, photos.views, "cpu") is BALL
 
 
 def test_fits_of_photographs_end_with_one_and_go_on_without_it():
@@ -157,8 +195,14 @@ def test_what_is_cut_out_and_what_has_a_background_gets_none():
     options = {"steps": 3, "backend": "cpu"}
     assert wants_backdrop(photos.views)
     assert not wants_backdrop(scenes.capture(alpha=True).views)
-    masks = [replace(v, mask=np.ones(v.image.shape[:2], np.bool_)) for v in photos.views]
+    masks = []
+    for view in photos.views:
+        mask = np.ones(view.image.shape[:2], np.bool_)
+        mask[:, :15] = False
+        masks.append(replace(view, mask=mask))
     assert not wants_backdrop(masks)
+    # One photo's, or the edges that undistortion leaves, cut nothing out.
+    assert wants_backdrop([masks[0], *photos.views[1:]])
     for capture, more in (
         (scenes.capture(alpha=True), {}),
         (Capture(photos.path, masks), {}),

@@ -131,6 +131,29 @@ class Splats(ArrayEquality, NotebookPicture):
         names = ("means", "quats", "scales", "opacities", "sh")
         return replace(self, **{name: getattr(self, name)[:kept] for name in names})
 
+    def with_backdrop_of(self, other: Splats) -> Splats:
+        """The splats, which have no backdrop, and behind them that of another scene, if it has one.
+
+        Args:
+            other: in the same world; its spherical harmonics may have another degree.
+        """
+        count = other.backdrop_splats
+        if not count:
+            return self
+        sh = np.zeros((count, *self.sh.shape[1:]), np.float32)
+        sh[:, 0] = other.sh[-count:, 0]  # it has no other bands
+        added = {
+            "means": (other.means[-count:] + (other.origin - self.origin)).astype(np.float32),
+            "quats": other.quats[-count:],
+            "scales": other.scales[-count:],
+            "opacities": other.opacities[-count:],
+            "sh": sh,
+        }
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), array]) for name, array in added.items()
+        }
+        return replace(self, **arrays)
+
     @property
     def finite(self) -> npt.NDArray[np.bool_]:
         """bool [N]: which splats have only finite parameters. The others are not drawn."""

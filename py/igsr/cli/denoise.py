@@ -278,7 +278,7 @@ def apply_command(
             denoiser: Denoiser = chosen_denoiser(denoiser_name, weights)
         else:
             denoiser = NetworkDenoiser(load_network(weights))
-        splats = Splats.load(scene)
+        splats = Splats.load(scene).without_backdrop()  # holes are to be seen as such
         capture = load(capture_path, holdout)
         background, behind = default_background(capture), known_background(capture.views)
         on = resolved(backend)

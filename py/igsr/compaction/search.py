@@ -138,7 +138,9 @@ def compact(
     if splats.antialiased:
         raise IgsrError("Antialiased splats cannot be compacted: fits render without antialiasing.")
     name = _core.resolve_backend(backend)
-    finite = subset(fresh_state(splats), np.flatnonzero(splats.finite))
+    # Photos show nearly nothing of a backdrop: by what they show it would go.
+    bare = splats.without_backdrop()
+    finite = subset(fresh_state(bare), np.flatnonzero(bare.finite))
     whole = splats_of(finite, splats.origin)
     if len(whole) == 0:
         raise IgsrError("The scene has no finite splats to compact.")
@@ -150,7 +152,7 @@ def compact(
         search = _Search(validation, whole.origin, max_loss, sh_degree, steps, seed, name, report)
         best = search.run(whole)
     return Compaction(
-        splats_of(best.state, whole.origin),
+        splats_of(best.state, whole.origin).with_backdrop_of(splats),
         {
             "max_loss": float(max_loss),
             "whole": search.curve[0],

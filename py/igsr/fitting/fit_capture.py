@@ -165,8 +165,9 @@ def fit(
             (``igsr.remove_floaters``); the last progress counts them. The checkpoint keeps them.
         backdrop: whether 200 splats are put behind the others in the end, on a sphere round the
             scene, with the colors of the photos in their direction (``igsr.rendering.backdrop``):
-            what no photo shows is else the background, black. Not for photos with alpha or masks,
-            and not beside ``frozen`` splats. The checkpoint has none.
+            what no photo shows is else the background, black. They come on top of ``max_splats``.
+            Not for photos with alpha or masks that cut an object out, fits of fewer than 5 000
+            splats, or beside ``frozen`` splats. The checkpoint has none.
         background: RGB in [0, 1] behind splats and photos with alpha; None is a new random color in
             every step for photos with alpha and black for photos without.
         frozen: splats that renders show beside those that are fitted, and that stay as they are:

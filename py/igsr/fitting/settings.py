@@ -142,7 +142,7 @@ class FitSettings:
     backdrop: bool = field(
         metadata=about(
             "In the end, put a sphere of 200 large splats behind the scene, so that what no photo "
-            "shows is not black; not for photos with alpha or masks."
+            "shows is not black; not for photos with alpha, or with masks that cut an object out."
         )
     )
     background: tuple[float, float, float] | None = field(

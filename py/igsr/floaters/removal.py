@@ -62,7 +62,8 @@ def remove_floaters(
             photos have alpha, else black.
         seed: of the random numbers of the estimate which photos need a splat.
         backend: "auto", "cpu", "gpu" or "reference".
-        frozen: so many splats, the last ones, stay in any case; a backdrop does, too.
+        frozen: so many splats, the last ones before a backdrop, stay in any case. A backdrop
+            stays, and hides nothing: depths are asked without it.
 
     Returns:
         The splats that are left, and how many of which kind were removed. Where none would be left,
@@ -72,7 +73,12 @@ def remove_floaters(
         IgsrError: the capture has no train views.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
-    frozen = max(frozen, splats.backdrop_splats)
+    if splats.backdrop_splats:
+        bare = splats.without_backdrop()
+        cleaned = remove_floaters(
+            bare, capture, background=background, seed=seed, backend=backend, frozen=frozen
+        )
+        return replace(cleaned, splats=cleaned.splats.with_backdrop_of(splats))
     if capture is None:
         return _without(splats, stray_splats(splats), frozen)
     if not capture.train_views:

@@ -98,6 +98,7 @@ def cameras_around(splats: Splats, count: int, side: int) -> list[Camera]:
 
 def _framed(splats: Splats) -> tuple[Vector, float]:
     """The middle of the splats and how far away a camera of the default lens frames them."""
+    splats = splats.without_backdrop()
     finite = splats.finite
     if not finite.any():
         raise IgsrError("The scene has no finite splats to look at.")

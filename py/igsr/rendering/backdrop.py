@@ -31,6 +31,8 @@ WIDTH = 0.75
 #: Radius of the sphere in units of the distance of the farthest splat (but at most so many of the
 #: median one), and at least in units of the farthest camera's: viewers go back to see the whole.
 FAR, MOST_FAR, BEYOND_CAMERAS = 1.5, 1000.0, 10.0
+#: No sphere is larger: its covariance is computed in float32.
+LARGEST = 1e15
 #: Colors are smoothed over directions by a Gaussian of this standard deviation, degrees.
 SMOOTH = 15.0
 #: Pixels that are transparent by this much tell as much of the color as the photos' own colors do.
@@ -38,6 +40,10 @@ TOLD = 0.05
 #: What the mean color of all directions counts beside a direction's own pixels, in parts of what
 #: directions have.
 MEAN_COUNTS = 1e-4
+#: Fits of fewer splats have none: what frames a scene by its splats would frame the sphere.
+LEAST_SPLATS = 25 * COUNT
+#: Photos of which masks hide more than this part show an object that is cut out.
+CUT_OUT = 0.25
 #: Photos that are asked at most, evenly spread, and the longest side that they are reduced to.
 MOST_ASKED, SIDE = 24, 64
 #: Where photos see through the scene in more of their pixels than this, and renders before black
@@ -50,17 +56,18 @@ _SH_0 = 0.28209479177387814
 def wants_backdrop(photos: Sequence[View], background: Sequence[float] | None = None) -> bool:
     """Whether something has to be behind what is fitted to these photos.
 
-    Not where photos have alpha or masks, which cut an object out, or a background is given.
+    Not where photos have alpha, or masks that cut an object out, or a background is given.
 
     Args:
         photos: that are fitted.
         background: RGB in [0, 1], if one was asked for.
     """
-    cut_out = any(
-        photo.image.shape[2] == 4 or photo.mask is not None or photo.background is not None
-        for photo in photos
-    )
-    return background is None and not cut_out
+    if background is not None or any(
+        photo.image.shape[2] == 4 or photo.background is not None for photo in photos
+    ):
+        return False
+    hidden = [0.0 if photo.mask is None else 1.0 - photo.mask.mean() for photo in photos]
+    return bool(np.mean(hidden) <= CUT_OUT)
 
 
 def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "auto") -> Splats:
@@ -74,6 +81,8 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
     Raises:
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
+    if len(splats) < LEAST_SPLATS:
+        return splats
     evenly = np.linspace(0, len(photos) - 1, min(len(photos), MOST_ASKED)).round()
     asked = [photos[int(i)] for i in evenly]
     cameras = np.array([photo.camera.centre for photo in photos])
@@ -85,6 +94,8 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
         min(FAR * apart.max(), MOST_FAR * np.median(apart)),
         BEYOND_CAMERAS * np.linalg.norm(cameras - middle, axis=1).max(),
     )
+    if not 0.0 < radius < LARGEST:
+        return splats
     directions = _directions()
     colors = _colors(splats, asked, directions, backend)
     if colors is None:

@@ -54,7 +54,7 @@ def embedded_model(splats: Splats) -> EmbeddedModel:
     Raises:
         IgsrError: the page's format cannot hold the model.
     """
-    center, radius = _extent(splats)
+    center, radius = _extent(splats.without_backdrop())
     offsets = splats.means - center.astype(np.float32)
     kept = ~(np.abs(offsets).max(axis=1, initial=0.0) > FAR_RADII * radius)
     unit = _unit(splats)
