@@ -29,6 +29,7 @@ from igsr.blocks import (
     worker,
 )
 from igsr.blocks.tasks import load_splats, save_splats
+from igsr.splats import joined, subset
 
 #: Fits of seconds.
 SETTINGS = {"steps": 120, "max_splats": 1200}
@@ -274,8 +275,8 @@ def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
     capture = igsr.load_capture(folder)
     splats = igsr.fit(capture, steps=40, max_splats=500, backend="cpu")
     middle = len(splats) // 2
-    start, frozen = worker.subset(splats, np.arange(len(splats)) < middle), None
-    frozen = worker.subset(splats, np.arange(len(splats)) >= middle)
+    start, frozen = subset(splats, np.arange(len(splats)) < middle), None
+    frozen = subset(splats, np.arange(len(splats)) >= middle)
     checkpoint = tmp_path / "checkpoint.npz"
     fitted = igsr.fit(
         capture,
@@ -293,7 +294,7 @@ def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
     assert len(fitted) <= len(kept) - len(frozen)
     # Beside what is frozen, photos are shown better than without.
     alone = igsr.evaluate(start, capture, "train").psnr
-    both = igsr.evaluate(worker.joined([fitted, frozen]), capture, "train").psnr
+    both = igsr.evaluate(joined([fitted, frozen]), capture, "train").psnr
     assert both > alone
     usual = {"start": start, "frozen": frozen}
     for changed, message in (

@@ -17,6 +17,7 @@ from igsr.floaters import photo_evidence, removal
 from igsr.floaters.isolation import alone
 from igsr.floaters.photo_evidence import needed_by_others, sightings
 from igsr.floaters.removal import stray_splats, unsupported_splats
+from igsr.splats import subset
 
 BLACK = (0.0, 0.0, 0.0)
 BALL = scenes.splats(60, degree=0)
@@ -81,7 +82,7 @@ def test_needed_by_others_is_the_growth_of_the_squared_error(monkeypatch):
         )
 
     for k in range(8):
-        without = removal._subset(model, np.arange(8) != k)
+        without = subset(model, np.arange(8) != k)
         grown = errors(without) - errors(model)
         assert estimated[k] == pytest.approx(grown.sum() - grown.max(), rel=0.1, abs=0.3)
 
@@ -95,7 +96,7 @@ def test_masked_pixels_need_nothing():
 
 def with_masks_of(views, scene, splats):
     """The views of which only those pixels count that these splats of the scene cover."""
-    cut = removal._subset(scene, splats)
+    cut = subset(scene, splats)
     alphas = [igsr.render(cut, view.camera, backend="cpu").alpha for view in views]
     return [replace(view, mask=alpha > 0.05) for view, alpha in zip(views, alphas, strict=True)]
 

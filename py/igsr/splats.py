@@ -27,6 +27,9 @@ logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float32]
 
+#: The arrays of splats, a row for each.
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+
 #: Highest spherical-harmonics degree there is code for.
 MAX_SH_DEGREE = 4
 
@@ -128,8 +131,7 @@ class Splats(ArrayEquality, NotebookPicture):
         kept = len(self) - self.backdrop_splats
         if kept == len(self):
             return self
-        names = ("means", "quats", "scales", "opacities", "sh")
-        return replace(self, **{name: getattr(self, name)[:kept] for name in names})
+        return subset(self, slice(kept))
 
     def with_backdrop_of(self, other: Splats) -> Splats:
         """The splats, which have no backdrop, and behind them that of another scene, if it has one.
@@ -140,19 +142,11 @@ class Splats(ArrayEquality, NotebookPicture):
         count = other.backdrop_splats
         if not count:
             return self
+        last = slice(-count, None)
         sh = np.zeros((count, *self.sh.shape[1:]), np.float32)
-        sh[:, 0] = other.sh[-count:, 0]  # it has no other bands
-        added = {
-            "means": (other.means[-count:] + (other.origin - self.origin)).astype(np.float32),
-            "quats": other.quats[-count:],
-            "scales": other.scales[-count:],
-            "opacities": other.opacities[-count:],
-            "sh": sh,
-        }
-        arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name), array]) for name, array in added.items()
-        }
-        return replace(self, **arrays)
+        sh[:, 0] = other.sh[last, 0]  # it has no other bands
+        means = (other.means[last] + (other.origin - self.origin)).astype(np.float32)
+        return joined([self, replace(subset(other, last), means=means, sh=sh)])
 
     @property
     def finite(self) -> npt.NDArray[np.bool_]:
@@ -312,3 +306,21 @@ class Splats(ArrayEquality, NotebookPicture):
         splats = Splats(**{part.name: read[part.name] for part in fields(Splats)})
         logger.info("%s: %r", path, splats)
         return splats
+
+
+def subset(splats: Splats, chosen: npt.NDArray[np.bool_] | slice) -> Splats:
+    """The chosen splats, in their order.
+
+    Args:
+        splats: the scene.
+        chosen: bool [N], or a slice.
+    """
+    return replace(splats, **{name: getattr(splats, name)[chosen] for name in PARAMETERS})
+
+
+def joined(parts: Sequence[Splats]) -> Splats:
+    """Splats of one origin and SH degree as one scene, in this order."""
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in PARAMETERS
+    }
+    return replace(parts[0], **arrays)

@@ -25,13 +25,12 @@ from igsr.blocks.runner import Runner
 from igsr.blocks.seams import loaded_in_parts, psnr_of_parts, seam_scores
 from igsr.blocks.task_making import block_tasks, coarse_task, name_of
 from igsr.blocks.tasks import SPLATS, FitTask, key_of, load_splats
-from igsr.blocks.worker import joined, subset
 from igsr.capture.exposure import Exposure
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import BLACK, WHITE
 from igsr.fitting.fingerprint import hash_of
 from igsr.fitting.fitter import splat_arrays
-from igsr.splats import Splats
+from igsr.splats import Splats, joined, subset
 
 
 def fit_in_blocks(

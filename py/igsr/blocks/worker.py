@@ -39,13 +39,13 @@ from igsr.errors import IgsrError
 from igsr.evaluation.scores import BLACK, default_background, score_views
 from igsr.fitting.checkpoint import load_checkpoint
 from igsr.fitting.fit_capture import fit_with_cameras
-from igsr.fitting.fitter import PARAMETERS, photos_among, without_exposures
+from igsr.fitting.fitter import photos_among, without_exposures
 from igsr.fitting.photo_support import PhotoSupport, support_of
 from igsr.fitting.presets import settings_for
 from igsr.fitting.run import Progress
 from igsr.fitting.settings import FitSettings
 from igsr.rendering.renders import project, render
-from igsr.splats import Splats
+from igsr.splats import Splats, joined, subset
 
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
@@ -303,16 +303,3 @@ def shown_by(splats: Splats, views: list[View], backend: str) -> Bool:
     for view in views:
         shown |= (project(plain, view.camera, backend)["radii"] > 0).any(axis=1)
     return shown
-
-
-def subset(splats: Splats, keep: Bool) -> Splats:
-    """The splats that are kept, in their order."""
-    return replace(splats, **{name: getattr(splats, name)[keep] for name in PARAMETERS})
-
-
-def joined(parts: list[Splats]) -> Splats:
-    """Splats of one origin and SH degree as one scene, in this order."""
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(p, name) for p in parts]) for name in PARAMETERS
-    }
-    return replace(parts[0], **arrays)

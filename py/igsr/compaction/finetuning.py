@@ -11,7 +11,7 @@ import numpy.typing as npt
 from igsr.capture import View
 from igsr.errors import IgsrError
 from igsr.fitting.fitter import fitter_of
-from igsr.splats import Splats
+from igsr.splats import PARAMETERS, Splats
 
 #: Parameters of splats with the optimiser's moments, as ``_core.Fitter`` takes and returns them.
 State = dict[str, npt.NDArray[Any]]
@@ -21,7 +21,6 @@ State = dict[str, npt.NDArray[Any]]
 STEPS_PER_DEGREE = 1000
 #: Steps between two looks at Ctrl-C and calls of the progress callback.
 CHUNK_STEPS = 10
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 MOMENTS = ("first_", "second_")
 
 

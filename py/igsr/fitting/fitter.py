@@ -20,10 +20,8 @@ from igsr.fitting.initialization.initial_splats import initial_splats
 from igsr.fitting.pose_priors import PosePriors
 from igsr.fitting.settings import FitSettings
 from igsr.rendering.renders import intrinsics_of, viewmat_about
-from igsr.splats import Splats
+from igsr.splats import PARAMETERS, Splats, subset
 
-#: Parameters of splats, each with a row for every splat.
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 #: Steps on photos, at least, for one on a pseudo-view, where there are both: these teach what they
 #: can soon, and what photos show is right.
 PHOTO_STEPS = 5
@@ -139,7 +137,7 @@ def first_splats(splats: Splats, count: int) -> Splats:
     """The first ``count`` splats."""
     if count == len(splats):
         return splats
-    return replace(splats, **{name: getattr(splats, name)[:count] for name in PARAMETERS})
+    return subset(splats, slice(count))
 
 
 def photos_among(views: list[View]) -> list[View]:

@@ -20,14 +20,13 @@ from igsr._internal.choices import Backend
 from igsr.capture import Capture, View
 from igsr.errors import IgsrError
 from igsr.fitting.fitter import (
-    PARAMETERS,
     fitted_cameras,
     fitted_exposures,
     without_exposures,
 )
 from igsr.fitting.settings import FitSettings
 from igsr.floaters.photo_evidence import behind_masks
-from igsr.splats import Splats
+from igsr.splats import PARAMETERS, Splats, subset
 from igsr.transients import PLAIN, find_transients
 
 Bool = npt.NDArray[np.bool_]
@@ -156,7 +155,7 @@ class TransientSearch:
         if not any_of(self.found):
             return splats
         keep = self._kept(splats, views, self.found)
-        return replace(splats, **{name: getattr(splats, name)[keep] for name in PARAMETERS})
+        return subset(splats, keep)
 
     def _kept(self, splats: Splats, views: Sequence[View], found: Sequence[Bool | None]) -> Bool:
         """Which splats other pixels show, too; what only masked ones show nothing would correct."""

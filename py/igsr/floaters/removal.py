@@ -14,7 +14,7 @@ from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background
 from igsr.floaters.isolation import alone
 from igsr.floaters.photo_evidence import SHOWN, needed_by_others, sightings
-from igsr.splats import Splats
+from igsr.splats import Splats, subset
 
 Bool = npt.NDArray[np.bool_]
 
@@ -103,7 +103,7 @@ def stray_splats(splats: Splats) -> dict[str, Bool]:
     invisible = ~splats.finite | ~(splats.opacities >= faintest)
     visible = np.flatnonzero(~invisible)
     stray = np.zeros(len(splats), np.bool_)
-    stray[visible] = alone(_subset(splats, ~invisible))
+    stray[visible] = alone(subset(splats, ~invisible))
     if 2 * stray.sum() > len(visible):
         stray[:] = False
     return {"invisible": invisible, "alone": stray}
@@ -155,9 +155,4 @@ def _without(splats: Splats, kinds: dict[str, Bool], frozen: int = 0) -> Cleaned
     keep = ~np.logical_or.reduce(list(kinds.values()))
     if not keep[: len(keep) - frozen].any():
         return Cleaned(splats, dict.fromkeys(kinds, 0))
-    return Cleaned(_subset(splats, keep), {name: int(kind.sum()) for name, kind in kinds.items()})
-
-
-def _subset(splats: Splats, keep: Bool) -> Splats:
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return replace(splats, **{name: getattr(splats, name)[keep] for name in names})
+    return Cleaned(subset(splats, keep), {name: int(kind.sum()) for name, kind in kinds.items()})

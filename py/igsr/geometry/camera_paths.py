@@ -82,18 +82,24 @@ def cameras_around(splats: Splats, count: int, side: int) -> list[Camera]:
         IgsrError: there are no finite splats to look at.
     """
     target, distance = _framed(splats)
-    # A Fibonacci lattice: equal areas by height, the golden angle apart.
-    heights = 1.0 - (2.0 * np.arange(count) + 1.0) / count
-    angles = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
-    flat = np.sqrt(1.0 - heights**2)
-    directions = np.stack([flat * np.cos(angles), flat * np.sin(angles), heights], axis=1)
-    # No direction of the lattice is vertical, so z is never along the view.
+    # No direction is vertical, so z is never along the view.
     up = np.array([0.0, 0.0, 1.0])
     K = _default_lens(side, side)
     return [
         Camera(look_at(target + distance * direction, target, up), K, side, side)
-        for direction in directions
+        for direction in even_directions(count)
     ]
+
+
+def even_directions(count: int) -> npt.NDArray[np.float64]:
+    """Unit vectors [count, 3] spread evenly over all directions, none of them along z.
+
+    A Fibonacci lattice: equal areas by height, the golden angle apart.
+    """
+    heights = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    angles = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    flat = np.sqrt(1.0 - heights**2)
+    return np.stack([flat * np.cos(angles), flat * np.sin(angles), heights], axis=1)
 
 
 def _framed(splats: Splats) -> tuple[Vector, float]:

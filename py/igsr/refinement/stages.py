@@ -139,7 +139,7 @@ class Stages:
         self._capture, self._settings, self._run = capture, settings, run
         self._denoiser, self._propose, self._select = denoiser, propose, select
         self._background = default_background(capture)
-        self._backdrop: bool | None = None
+        self._backdrop = wants_backdrop(capture.train_views)
         self._background_of_views = known_background(capture.views)
         # Folds have fewer photos, but are fitted with the settings for all of them.
         preset = preset_settings(
@@ -182,7 +182,10 @@ class Stages:
             self._background,
             self._settings.backend,
         )
-        return Reconstruction("whole", photos, 1.0, splats, self._shown(splats, photos))
+        shown = self._shown(splats, photos)
+        # This fit decides for all, so that none with a backdrop is compared with one without.
+        self._backdrop = shown is not splats
+        return Reconstruction("whole", photos, 1.0, splats, shown)
 
     def fit(self, name: str, photos: list[View], share: float = 1.0) -> Reconstruction:
         """Fit photos alone, which have the scene's colors."""
@@ -302,15 +305,7 @@ class Stages:
         return {metric: scores[metric] for metric in METRICS}
 
     def _shown(self, splats: Splats, photos: Sequence[View]) -> Splats:
-        """The splats with a backdrop, if the scene wants one.
-
-        The first fit decides for all, so that none is compared with what has none.
-        """
-        if self._backdrop is None:
-            self._backdrop = wants_backdrop(self._capture.train_views)
-            shown = self._shown(splats, photos)
-            self._backdrop = shown is not splats
-            return shown
+        """The splats with a backdrop, if the scene wants one."""
         if not self._backdrop:
             return splats
         return with_backdrop(splats, photos, self._settings.backend)

@@ -2,16 +2,15 @@
 
 Between and behind the splats of photographs is nothing, and renders show the background there,
 which is black. A novel view that sees past what was photographed has black holes and edges. The
-sphere has the colors that photos have in its direction, smoothed. Where photos show that the scene
-is transparent, they tell the color themselves: what the render lacks there. Its splats are ordinary
-ones behind all others, which any viewer draws.
+sphere has the colors of the photos in its direction, smoothed. Where a render of the scene is
+transparent, its difference to the photo gives the color. The splats are ordinary ones behind the
+others, which any viewer draws.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +18,10 @@ import numpy.typing as npt
 from igsr._internal.choices import Backend
 from igsr.capture import View
 from igsr.capture.downscaling import reduced_size, reduced_view
+from igsr.geometry.camera_paths import even_directions
+from igsr.geometry.pixel_rays import pixel_rays
 from igsr.rendering.renders import render
-from igsr.splats import BACKDROP_OPACITY, Splats
+from igsr.splats import BACKDROP_OPACITY, Splats, joined
 from igsr.splats import BACKDROP_SPLATS as COUNT
 
 Float64 = npt.NDArray[np.float64]
@@ -71,7 +72,7 @@ def wants_backdrop(photos: Sequence[View], background: Sequence[float] | None = 
 
 
 def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "auto") -> Splats:
-    """The splats, and behind them 200 more; none where photos show that it is black there.
+    """The splats, and behind them 200 more; none where the background of the photos is black.
 
     Args:
         splats: of a fit before black, without a backdrop.
@@ -96,34 +97,22 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
     )
     if not 0.0 < radius < LARGEST:
         return splats
-    directions = _directions()
+    directions = even_directions(COUNT)
     colors = _colors(splats, asked, directions, backend)
     if colors is None:
         return splats
     sh = np.zeros((COUNT, *splats.sh.shape[1:]), np.float32)
     sh[:, 0] = (colors - 0.5) / _SH_0
     size = np.log(WIDTH * radius * np.sqrt(4.0 * np.pi / COUNT))
-    added = {
-        "means": middle + radius * directions - splats.origin,
-        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1)),
-        "scales": np.full((COUNT, 3), size),
-        "opacities": np.full(COUNT, BACKDROP_OPACITY),
-        "sh": sh,
-    }
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(splats, name), array.astype(np.float32)])
-        for name, array in added.items()
-    }
-    return replace(splats, **arrays)
-
-
-def _directions() -> Float64:
-    """Unit vectors [COUNT, 3] evenly spread over the sphere: Fibonacci's spiral."""
-    k = np.arange(COUNT) + 0.5
-    z = 1.0 - 2.0 * k / COUNT
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * k
-    flat = np.sqrt(1.0 - z * z)
-    return np.stack([np.cos(turn) * flat, np.sin(turn) * flat, z], axis=1)
+    sphere = replace(
+        splats,
+        means=(middle + radius * directions - splats.origin).astype(np.float32),
+        quats=np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (COUNT, 1)),
+        scales=np.full((COUNT, 3), size, np.float32),
+        opacities=np.full(COUNT, BACKDROP_OPACITY, np.float32),
+        sh=sh,
+    )
+    return joined([splats, sphere])
 
 
 def _colors(
@@ -148,7 +137,8 @@ def _colors(
         pixels += counts.sum()
         open_pixels += is_open.sum()
         open_lacks += (is_open * lacks.mean(axis=1)).sum()
-        cosines = directions @ _rays(small).T
+        rays = pixel_rays(small.camera) @ small.camera.viewmat[:3, :3]
+        cosines = directions @ (rays / np.linalg.norm(rays, axis=1, keepdims=True)).T
         near = counts * np.exp((cosines - 1.0) / (1.0 - np.cos(np.radians(SMOOTH))))
         lacking += near @ (through[:, None] * lacks + TOLD**2 * color)
         weight += near @ (through**2 + TOLD**2)
@@ -158,12 +148,3 @@ def _colors(
     few = MEAN_COUNTS * weight.mean()
     mean = lacking.sum(axis=0) / weight.sum()
     return np.clip((lacking + few * mean) / (weight + few)[:, None], 0.0, 1.0)
-
-
-def _rays(view: View) -> Float64:
-    """Directions [H * W, 3] in the world that a view's pixels look in, of length one."""
-    camera = view.camera
-    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
-    x, y = (columns - camera.K[0, 2]) / camera.K[0, 0], (rows - camera.K[1, 2]) / camera.K[1, 1]
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.viewmat[:3, :3]
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.float64)

@@ -18,6 +18,7 @@ from igsr._internal.choices import Backend
 from igsr.capture import Camera, View
 from igsr.capture.downscaling import plane_area_means, reduced_size, reduced_view
 from igsr.evaluation.scores import over_background
+from igsr.geometry.pixel_rays import pixel_rays
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
@@ -148,7 +149,7 @@ def testimony(index: int, photos: Sequence[SmallPhoto]) -> Testimony | None:
     pixels = np.flatnonzero((surface > 0.0) & photo.usable.reshape(-1))
     if not len(pixels):
         return None
-    rays = _rays(photo.camera)[pixels]
+    rays = pixel_rays(photo.camera)[pixels]
     own = colors_at(photo.color, pixels)
     sights = [_sight(photo.camera, other, rays, surface[pixels]) for other in others]
     seen = np.stack([visible for _, visible in sights])
@@ -192,7 +193,7 @@ def shown_at_any_depth(photo: SmallPhoto, pixels: Int64, said: Testimony) -> Boo
     if not len(pixels) or not len(surface):
         return found
     middle = float(np.median(surface))
-    rays = _rays(photo.camera)[pixels]
+    rays = pixel_rays(photo.camera)[pixels]
     own = colors_at(photo.color, pixels)
     for inverse in np.linspace(1.0 / NEAREST, 1.0 / FARTHEST, DEPTHS):
         depth = np.full(len(pixels), middle / inverse, np.float32)
@@ -274,14 +275,6 @@ def _nearest(index: int, photos: Sequence[SmallPhoto]) -> list[SmallPhoto]:
     return [photos[others[k]] for k in sorted(order)]
 
 
-def _rays(camera: Camera) -> Float32:
-    """Directions [H * W, 3] of a camera's pixels, with z of 1, in its axes."""
-    rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
-    K = camera.K
-    x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
-    return np.stack([x, y, np.ones_like(x)], axis=-1).astype(np.float32)
-
-
 def _moved(
     start: Camera, end: Camera, rays: Float32, depth: Float32
 ) -> tuple[Float32, Float32, Float32]:
@@ -317,7 +310,7 @@ def _depth_from(photo: SmallPhoto, other: SmallPhoto) -> Float32:
     Each of the other's pixels is seen in the four that are nearest to where it comes to lie.
     """
     height, width = photo.usable.shape
-    x, y, z = _moved(other.camera, photo.camera, _rays(other.camera), other.depth.reshape(-1))
+    x, y, z = _moved(other.camera, photo.camera, pixel_rays(other.camera), other.depth.reshape(-1))
     there = (other.depth.reshape(-1) > 0.0) & (z > 0.0)
     there &= (x > 0.0) & (x < width) & (y > 0.0) & (y < height)
     x, y, z = x[there] - 0.5, y[there] - 0.5, z[there]
