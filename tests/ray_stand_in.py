@@ -17,6 +17,7 @@ class StandInRay(types.ModuleType):
         self.running = False
         self.refuses = None
         self.addresses = []
+        self.listed = ["head"]
         lost = ("OutOfMemoryError", "WorkerCrashedError", "NodeDiedError")
         self.exceptions = types.SimpleNamespace(**{n: type(n, (Exception,), {}) for n in lost})
 
@@ -34,7 +35,10 @@ class StandInRay(types.ModuleType):
 
     def nodes(self):
         resources = {"CPU": 2.0, "memory": 4e9}
-        return [{"Alive": True, "NodeID": "head", "Resources": resources}]
+        return [{"Alive": True, "NodeID": node, "Resources": resources} for node in self.listed]
+
+    def get_runtime_context(self):
+        return types.SimpleNamespace(get_node_id=lambda: "head")
 
     def remote(self, num_cpus, max_retries, runtime_env=None):
         self.environments.append((num_cpus, (runtime_env or {}).get("env_vars")))

@@ -51,8 +51,8 @@ def test_a_head_that_nobody_answers_for_is_named_at_once(ray):
 @pytest.mark.parametrize(
     ("told", "message"),
     [
-        (("far", "0.0.1", "AVX2", True), "far of the Ray cluster has igsr 0.0.1 where this one"),
-        (("far", igsr.__version__, "AVX2", False), "far of the Ray cluster does not see"),
+        (("1", "far", "0.0.1", "AVX2", True), "far of the Ray cluster has igsr 0.0.1 where this one"),
+        (("1", "far", igsr.__version__, "AVX2", False), "far of the Ray cluster does not see"),
         (None, "head of the Ray cluster cannot run igsr .No module named 'igsr'.; install igsr"),
     ],
 )
@@ -66,6 +66,13 @@ def test_a_machine_that_cannot_do_the_work_is_named(ray, monkeypatch, tmp_path, 
     with RayCluster() as cluster, pytest.raises(igsr.IgsrError, match=message):
         cluster.check(tmp_path)
     assert not ray.running
+
+
+def test_a_machine_that_went_away_is_not_counted(ray, tmp_path):
+    ray.listed = ["head", "gone"]
+    with RayCluster() as cluster:
+        assert [node.igsr for node in cluster.check(tmp_path)] == [igsr.__version__]
+        assert cluster.nodes == cluster.check(tmp_path)
 
 
 def test_lost_work_is_given_again_or_told(ray):

@@ -87,6 +87,9 @@ class RayCluster:
     def check(self, folder: Path | None = None) -> list[Node]:
         """Ask all machines what they are.
 
+        A machine that has gone away is left out, also while the cluster still lists it: what it is
+        asked is then answered by another.
+
         Args:
             folder: that all must see under the same path; None asks for none.
 
@@ -103,10 +106,11 @@ class RayCluster:
             task = remote.options(scheduling_strategy=there)
             name = node.get("NodeManagerHostname") or node["NodeID"][:8]
             asked[task.remote(None if folder is None else str(folder))] = name
-        self.nodes = []
+        answered: dict[str, Node] = {}
         for reference, name in asked.items():
             try:
-                node = Node(*ray.get(reference, timeout=ANSWERS_WITHIN))
+                node_id, *about = ray.get(reference, timeout=ANSWERS_WITHIN)
+                node = Node(*about)
             except Exception as error:
                 reason = _first_line(error)
                 raise IgsrError(
@@ -123,7 +127,8 @@ class RayCluster:
                     f"The machine {node.host} of the Ray cluster does not see {folder}; put "
                     "photos and results on a disk that all machines mount under the same path."
                 )
-            self.nodes.append(node)
+            answered[node_id] = node
+        self.nodes = list(answered.values())
         return self.nodes
 
     def results(
@@ -280,8 +285,11 @@ def _first_line(error: BaseException) -> str:
     return lines[0].rstrip(".")
 
 
-def _what_it_is(folder: str | None) -> tuple[str, str, str, bool]:
-    """On a machine of the cluster: the fields of its ``Node``."""
+def _what_it_is(folder: str | None) -> tuple[str, str, str, str, bool]:
+    """On a machine of the cluster: its ID there and the fields of its ``Node``."""
+    import ray
+
+    node_id = ray.get_runtime_context().get_node_id()
     about = _core.backend_info("cpu")
     sees = folder is None or Path(folder).is_dir()
-    return socket.gethostname(), _core.__version__, about["instruction_set"], sees
+    return node_id, socket.gethostname(), _core.__version__, about["instruction_set"], sees
