@@ -1,4 +1,4 @@
-"""Iterative refinement: fit, render novel views, denoise, select, cross-validate, refit.
+"""Iterative refinement: fit, cross-validate, render novel views, denoise, select, refit.
 
 Names are imported when they are first used: the settings alone load neither torch nor the renderer.
 """

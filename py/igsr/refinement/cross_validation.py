@@ -12,6 +12,7 @@ from igsr.capture.downscaling import halved
 from igsr.denoiser.calibration import Calibration, calibrate
 from igsr.evaluation.scores import ScoredView
 from igsr.refinement.results import HeldOutView
+from igsr.refinement.selection import Rejected
 from igsr.refinement.stages import VALIDATED, DenoisingErrors, Reconstruction, Stages
 
 #: Fewest photos: each fold needs two to fit.
@@ -30,22 +31,35 @@ class Fold:
 
     Attributes:
         scored: each held-out photo and its render, with its scores.
-        errors: of each held-out photo's denoised render.
     """
 
     reconstruction: Reconstruction
     held_out: list[View]
     scored: list[ScoredView]
-    errors: list[DenoisingErrors] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """Mean scores of held-out photos before a round and after it, and the photos themselves."""
+    """What the folds say of a round.
 
-    before: dict[str, float]
-    after: dict[str, float]
-    held_out: list[HeldOutView]
+    Attributes:
+        before, after: mean scores of the held-out photos of all folds, before the round and after
+            it; empty if no fold did it.
+        held_out: the photos themselves.
+        selected: novel views that the folds added.
+        rejected: those that they did not.
+    """
+
+    before: dict[str, float] = field(default_factory=dict)
+    after: dict[str, float] = field(default_factory=dict)
+    held_out: list[HeldOutView] = field(default_factory=list)
+    selected: int = 0
+    rejected: list[Rejected] = field(default_factory=list)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the round makes held-out photos better."""
+        return combined_error(self.after) < combined_error(self.before)
 
 
 class CrossValidation:
@@ -53,7 +67,13 @@ class CrossValidation:
 
     The folds are fitted when the first round is validated. They keep the views that a round adds:
     the next round is validated from there.
+
+    Attributes:
+        calibration: what the changes of a denoiser without confidence mean, by the held-out photos
+            of all folds as they were before the last round that was validated.
     """
+
+    calibration: Calibration
 
     def __init__(self, stages: Stages, photos: Sequence[View]) -> None:
         """Halve the photos, with as many splats per pixel."""
@@ -70,36 +90,37 @@ class CrossValidation:
         """What fitting all folds takes, in units of a fit to all photos."""
         return self._share * FOLDS
 
-    def calibration(self) -> Calibration:
-        """What the changes of a denoiser without confidence mean, by the held-out photos.
-
-        Those of all folds, as they are now.
-        """
-        self._folds = self._folds or self._fitted()
-        for fold in self._folds:
-            fold.errors = self._stages.denoising_errors(fold.reconstruction, fold.held_out)
-        return _calibrated([fold.errors for fold in self._folds])
-
     def validate(self) -> Validation:
         """Held-out photos before each fold's own round and after it.
 
-        Where the denoiser gives no confidence, each fold's round is calibrated by the other one's
+        Where the denoiser gives no confidence, each fold's round is calibrated by the other folds'
         photos: its own are for scores.
         """
         self._folds = self._folds or self._fitted()
-        before: list[ScoredView] = []
-        after: list[ScoredView] = []
-        errors = [fold.errors for fold in self._folds]
-        for k, fold in enumerate(self._folds):
-            before += fold.scored
-            views = self._stages.render_and_denoise(fold.reconstruction)
-            if not views.have_confidence:
-                views = views.calibrated(_calibrated(errors[:k] + errors[k + 1 :]))
-            selected, _ = self._stages.select(views)
-            self._stages.refit(fold.reconstruction, selected, views.added_before, "cross_validate")
-            fold.scored = self._scored(fold.reconstruction, fold.held_out)
-            after += fold.scored
-        return Validation(_means(before), _means(after), _beside(before, after))
+        found = [self._stages.render_and_denoise(fold.reconstruction) for fold in self._folds]
+        if not all(views.have_confidence for views in found):
+            errors = [
+                self._stages.denoising_errors(fold.reconstruction, fold.held_out)
+                for fold in self._folds
+            ]
+            self.calibration = _calibrated(errors)
+            found = [
+                views.calibrated(_calibrated(errors[:k] + errors[k + 1 :]))
+                for k, views in enumerate(found)
+            ]
+        selections = [self._stages.select(views) for views in found]
+        count = sum(len(selected) for selected, _ in selections)
+        not_added = [view for _, some in selections for view in some]
+        if not count:
+            return Validation(rejected=not_added)
+        before = [one for fold in self._folds for one in fold.scored]
+        for fold, views, (selected, _) in zip(self._folds, found, selections, strict=True):
+            if selected or views.added_before:
+                fitted = fold.reconstruction
+                self._stages.refit(fitted, selected, views.added_before, "cross_validate")
+                fold.scored = self._scored(fitted, fold.held_out)
+        after = [one for fold in self._folds for one in fold.scored]
+        return Validation(_means(before), _means(after), _beside(before, after), count, not_added)
 
     def _fitted(self) -> list[Fold]:
         """Fit the folds: no photo is held out of two, and at least one of each."""

@@ -27,7 +27,7 @@ from igsr.evaluation.report_page import (
 )
 from igsr.evaluation.scores import ScoredView, default_background, over_background
 from igsr.refinement.novel_views import NovelView
-from igsr.refinement.results import HELD_OUT_SIDE, HeldOutView, Refined, Round
+from igsr.refinement.results import HELD_OUT_SIDE, HeldOutView, Refined
 from igsr.refinement.selection import LEAST_CONFIDENCE, LEAST_GAIN, Candidate, Rejected
 
 #: Longest side of pictures on the page, pixels.
@@ -36,8 +36,8 @@ THUMBNAIL, PICTURE = 160, 320
 STAGES = {
     "cameras": "find cameras",
     "fit": "fit the photos",
-    "novel_views": "render and denoise novel views",
     "cross_validate": "cross-validate",
+    "novel_views": "render and denoise novel views",
     "refit": "refit with novel views",
     "test": "score the test views",
 }
@@ -181,9 +181,8 @@ def _cameras(refined: Refined) -> list[tuple[int, list[list[float]]]]:
     return drawn_cameras(kinds, [*photos, *added])
 
 
-def _last_rejected(refined: Refined) -> Sequence[Candidate | Rejected]:
-    """Views that the last round did not add; of one that was rolled back all."""
+def _last_rejected(refined: Refined) -> Sequence[Rejected]:
+    """Views that the last round did not add, or those of the one that was not begun."""
     if refined.rejected or not refined.rounds:
         return refined.rejected
-    last: Round = refined.rounds[-1]
-    return last.rejected if last.accepted else [*last.rejected, *last.selected]
+    return refined.rounds[-1].rejected

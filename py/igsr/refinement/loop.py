@@ -1,8 +1,8 @@
 """The loop of the paper's Figure 1: fit; then render novel views, denoise, select, refit.
 
 It differs from the paper's in two ways. Which novel views are added, and how much each of their
-pixels counts, is decided without the true pictures. And a round is kept only if cross-validation
-says that it helps: if it improves the scores of photos that were held out of it.
+pixels counts, is decided without the true pictures. And a round is done only if cross-validation
+says that it helps: if, done by folds first, it improves the scores of photos that they hold out.
 """
 
 from __future__ import annotations
@@ -25,16 +25,11 @@ from igsr.evaluation.scores import check_masks
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import Quality, default_max_size
 from igsr.fitting.settings import ExposureMode, TransientMode
-from igsr.refinement.cross_validation import (
-    FEWEST_PHOTOS,
-    CrossValidation,
-    Validation,
-    combined_error,
-)
+from igsr.refinement.cross_validation import FEWEST_PHOTOS, CrossValidation, Validation
 from igsr.refinement.novel_views import novel_views
 from igsr.refinement.results import Refined, RefineProgress, Round, Stop, StopReason
 from igsr.refinement.run import RefineRun, bar_state
-from igsr.refinement.selection import select_views
+from igsr.refinement.selection import Rejected, select_views
 from igsr.refinement.settings import AUTO, RefineSettings
 from igsr.refinement.stages import NOVEL_VIEWS_WORK, Propose, Reconstruction, Select, Stages
 
@@ -156,33 +151,39 @@ def _round(
     if validation and len(whole.photos) < FEWEST_PHOTOS:
         return replace(refined, stop=Stop(StopReason.TOO_FEW_PHOTOS, FEWEST_PHOTOS))
 
-    views = stages.render_and_denoise(whole)
-    selected, rejected = stages.select(views)
-    if not views.candidates:
-        return replace(refined, stop=Stop(StopReason.NO_NOVEL_VIEW))
-    if not selected:
-        stop = Stop(StopReason.NONE_SELECTED, len(rejected))
-        return replace(refined, stop=stop, rejected=rejected)
-
-    validated = Validation({}, {}, [])
+    validated = Validation()
     if validation is not None:
-        if not views.have_confidence:
-            views = views.calibrated(validation.calibration())
-            selected, rejected = stages.select(views)
-            if not selected:
-                stop = Stop(StopReason.NONE_SELECTED, len(rejected))
-                return replace(refined, stop=stop, rejected=rejected)
+        # Before anything is rendered for the whole fit: a round that does not help costs no more.
         validated = validation.validate()
-    before, after = validated.before, validated.after
-    accepted = validation is None or combined_error(after) < combined_error(before)
-    if accepted:
-        stages.refit(whole, selected, views.added_before, "refit")
-    splats = whole.shown if accepted else None
-    test = stages.test_scores(splats)
+        if not validated.selected:
+            return _ended_before(refined, validated.rejected)
+        if not validated.accepted:
+            done = Round(
+                [], [], validated.before, validated.after, False, None, None, validated.held_out
+            )
+            stop = Stop(StopReason.NOT_ACCEPTED, number)
+            return replace(refined, rounds=[*refined.rounds, done], stop=stop)
 
-    done = Round(selected, rejected, before, after, accepted, splats, test, validated.held_out)
-    rolled_back = None if accepted else Stop(StopReason.NOT_ACCEPTED, number)
-    return replace(refined, splats=whole.shown, rounds=[*refined.rounds, done], stop=rolled_back)
+    views = stages.render_and_denoise(whole)
+    if validation is not None and not views.have_confidence:
+        views = views.calibrated(validation.calibration)
+    selected, rejected = stages.select(views)
+    if not selected:
+        return _ended_before(refined, rejected)
+    stages.refit(whole, selected, views.added_before, "refit")
+    splats = whole.shown
+    test = stages.test_scores(splats)
+    before, after, held_out = validated.before, validated.after, validated.held_out
+    done = Round(selected, rejected, before, after, True, splats, test, held_out)
+    return replace(refined, splats=splats, rounds=[*refined.rounds, done])
+
+
+def _ended_before(refined: Refined, rejected: list[Rejected]) -> Refined:
+    """The end of a refinement of whose next round no novel view is selected."""
+    if not rejected:
+        return replace(refined, stop=Stop(StopReason.NO_NOVEL_VIEW))
+    stop = Stop(StopReason.NONE_SELECTED, len(rejected))
+    return replace(refined, stop=stop, rejected=rejected)
 
 
 def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDenoiser:

@@ -19,9 +19,9 @@ from igsr.rendering.notebook_page import NotebookPage, notebook_page
 from igsr.rendering.scene_page import PageModel, compared
 from igsr.splats import Splats
 
-#: What a refinement does, in the order of a round: find cameras; fit the photos; render, denoise
-#: and select novel views; cross-validate; fit the photos and novel views; score the test views.
-Stage = Literal["pose", "fit", "novel_views", "cross_validate", "refit", "test"]
+#: What a refinement does, in the order of a round: find cameras; fit the photos; cross-validate;
+#: render, denoise and select novel views; fit the photos and novel views; score the test views.
+Stage = Literal["pose", "fit", "cross_validate", "novel_views", "refit", "test"]
 #: Stages by the names that reports of format 1 and ``RefineProgress.doing`` have for them.
 OLD_STAGES: dict[str, Stage] = {"look": "novel_views", "judge": "cross_validate"}
 #: Mean scores by name ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim"); None where a score
@@ -128,8 +128,9 @@ class Round:
 
     Attributes:
         selected: novel views that were added, the one of the largest gain first. Views of earlier
-            rounds are not among them; they were rendered and denoised again.
-        rejected: novel views that were not added.
+            rounds are not among them; they were rendered and denoised again. None of a round that
+            was rolled back: only its folds had novel views.
+        rejected: novel views that were rendered and not added.
         validation_before: mean scores ("psnr", "ssim", "flip") of the held-out photos of all
             folds, before the round.
         validation_after: the same after the round. Both are empty without cross-validation.
@@ -187,7 +188,8 @@ class Refined(ArrayEquality, NotebookPicture):
         capture: photos and cameras.
         rounds: those that were tried, in order; only the last one can have been rolled back.
         stop: why there was no further round; None while there may be one.
-        rejected: novel views of a round that was not begun, since none of them was selected.
+        rejected: novel views of a round that was not begun, since none of them was selected; those
+            of the folds where it was cross-validated.
         seconds: that each stage but "pose" took, by its name, with the time of earlier calls that
             this one resumed.
     """

@@ -37,8 +37,8 @@ STOPPED = "the refinement was stopped; go on with resume."
 _STAGES: dict[Stage, str] = {
     "pose": "find cameras",
     "fit": "fit photos",
-    "novel_views": "render and denoise novel views",
     "cross_validate": "cross-validate",
+    "novel_views": "render and denoise novel views",
     "refit": "refit with novel views",
     "test": "score test views",
 }
