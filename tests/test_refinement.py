@@ -1,4 +1,4 @@
-"""The loop: rounds that it accepts and rolls back, why it stops, cross-validation, arguments."""
+"""The loop: rounds that it accepts and others, why it stops, cross-validation, arguments."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_round_helps_with_as_many_steps_on_photos_as_igsr_has(ball_photos, hel
         assert same(refined.first, helped[0].first) is (seed == 0)
         (one,) = refined.rounds
         assert not same(refined.splats, helped[0].rounds[0].splats)
-        # None of a round that is rolled back.
+        # None of a round that is not accepted.
         gains.append(one.test["psnr"] - refined.first_test["psnr"] if one.accepted else 0.0)
     # On three photos a round gives 0.0 to 0.7 dB by the seed; seeds 0 to 7: one of none, 0.3 in the
     # mean.
@@ -62,7 +62,7 @@ def test_a_round_helps_with_as_many_steps_on_photos_as_igsr_has(ball_photos, hel
     assert np.mean(gains) > 0.1
 
 
-def test_a_round_that_does_not_help_is_rolled_back(ball_photos, helped, tmp_path):
+def test_a_round_that_does_not_help_is_not_accepted(ball_photos, helped, tmp_path):
     refined = refine(ball_photos, "auto", lying, out=tmp_path)
     assert [one.accepted for one in refined.rounds] == [False]
     assert refined.stop == Stop(StopReason.NOT_ACCEPTED, 1)
@@ -75,7 +75,7 @@ def test_a_round_that_does_not_help_is_rolled_back(ball_photos, helped, tmp_path
     assert (kinds.count(0), kinds.count(1), kinds.count(2)) == (9, 0, 0)
 
 
-def test_a_round_that_is_rolled_back_renders_nothing_of_the_whole_fit(ball_photos, monkeypatch):
+def test_a_round_that_is_not_accepted_renders_nothing_of_the_whole_fit(ball_photos, monkeypatch):
     """It costs what its folds cost."""
     rendered = []
     real = stages.Stages.render_and_denoise
@@ -86,7 +86,7 @@ def test_a_round_that_is_rolled_back_renders_nothing_of_the_whole_fit(ball_photo
 
     monkeypatch.setattr(stages.Stages, "render_and_denoise", watched)
     assert refine(ball_photos, 1, lying, steps=40).stop == Stop(StopReason.NOT_ACCEPTED, 1)
-    assert rendered == ["fold0", "fold1"]
+    assert rendered == ["fold0", "fold1", "fold2", "fold3"]
 
 
 def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(ball_photos, helped, monkeypatch):
@@ -207,17 +207,18 @@ def test_each_fold_holds_out_photos_that_no_other_does(ball_photos, count, monke
         folds = real(validation)
         held_out.extend([view.name for view in fold.held_out] for fold in folds)
         photos = [len(fold.held_out) + len(fold.reconstruction.photos) for fold in folds]
-        assert photos == [count, count]
+        assert photos == min(4, count) * [count]
         return folds
 
     monkeypatch.setattr(CrossValidation, "_fitted", watched)
     refine(fewer, 1, lying, steps=40)
-    assert len(held_out) == 2
+    assert len(held_out) == min(4, count)
     assert all(held_out)
-    assert not set(held_out[0]) & set(held_out[1])
+    names = [name for of_fold in held_out for name in of_fold]
+    assert len(set(names)) == len(names)
 
 
-def test_folds_of_halved_photos_have_as_many_splats_per_pixel(ball_photos, monkeypatch):
+def test_folds_of_smaller_photos_have_as_many_splats_per_pixel(ball_photos, monkeypatch):
     monkeypatch.setattr(cross_validation, "LEAST_FOLD_SIDE", 16)
     counts = []
     real = CrossValidation._fitted
@@ -229,9 +230,23 @@ def test_folds_of_halved_photos_have_as_many_splats_per_pixel(ball_photos, monke
 
     monkeypatch.setattr(CrossValidation, "_fitted", watched)
     whole, folds = len(refine(ball_photos, 1, lying, steps=400).first), counts
-    assert len(folds) == 2
+    assert len(folds) == 4
     assert 250 < whole <= 1000
     assert all(0 < fold <= 250 for fold in folds)
+
+
+@pytest.mark.parametrize(
+    ("side", "small", "steps"), [(127, 127, 1.0), (129, 64, 1.0), (256, 64, 0.5), (800, 200, 0.5)]
+)
+def test_folds_fit_photos_that_are_halved_at_most_twice(side, small, steps):
+    image = np.zeros((side, 2 * side, 3), np.uint8)
+    K = np.array([[side, 0.0, side], [0.0, side, side / 2], [0.0, 0.0, 1.0]])
+    camera = igsr.Camera(np.eye(4), K, 2 * side, side)
+    photos = [igsr.View(f"{k}.png", camera, "train", image) for k in range(3)]
+    made, share, part = cross_validation._fold_photos(photos)
+    assert {photo.camera.height for photo in made} == {small}
+    assert share == pytest.approx((small / side) ** 2, rel=0.02)
+    assert part == steps
 
 
 def test_a_round_is_validated_by_three_errors_together():

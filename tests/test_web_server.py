@@ -281,7 +281,7 @@ def test_a_refinement_has_rounds_and_their_scores(tmp_path):
         ]
         assert state["scores"]["rows"] == [
             ["first fit", "20.00", "–", "400"],
-            ["round 1: rolled back", "–", "21.00 → 20.50", "–"],
+            ["round 1: not accepted", "–", "21.00 → 20.50", "–"],
         ]
         os.utime(checkpoint, (1e9, 1e9))
         assert state_of(server)["newest"] == "round-10"

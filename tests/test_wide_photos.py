@@ -501,7 +501,7 @@ def test_folds_hold_whole_panoramas_out(capture: Path) -> None:
         def __init__(self) -> None:
             self.fitted: list[list[Any]] = []
 
-        def fit(self, name: str, photos: list[Any], share: float) -> Any:
+        def fit(self, name: str, photos: list[Any], share: float, steps: float) -> Any:
             self.fitted.append(photos)
             return type("Fitted", (), {"splats": None, "shown": None})()
 

@@ -17,12 +17,15 @@ from igsr.refinement.stages import VALIDATED, DenoisingErrors, Reconstruction, S
 
 #: Fewest photos: each fold needs two to fit.
 FEWEST_PHOTOS = 3
-#: Each of two folds holds out one photo in eight. Where more are held out the folds' fits are worse
-#: than the whole one, and denoised views help them where they do not help it.
-FOLDS, HOLD_OUT_EVERY = 2, 8
-#: Folds fit photos of half the size, unless their shorter side then has fewer pixels than this.
-#: Fewer steps on whole photos would be as fast, but are no model of a whole fit.
+#: Each fold holds out one photo in eight. Where more are held out the folds' fits are worse than
+#: the whole one, and denoised views help them where they do not help it.
+FOLDS, HOLD_OUT_EVERY = 4, 8
+#: Folds fit photos that are halved twice, so that there can be four of them for a third of the time
+#: of a whole fit; none whose shorter side then has fewer pixels than this.
 LEAST_FOLD_SIDE = 64
+#: Steps of their fits, as a part of a whole fit's, by how often the photos are halved: small ones
+#: are done learning sooner. Fewer steps on whole photos would be no model of a whole fit.
+FOLD_STEPS = (1.0, 1.0, 0.5)
 
 
 @dataclass(eq=False)
@@ -76,19 +79,19 @@ class CrossValidation:
     calibration: Calibration
 
     def __init__(self, stages: Stages, photos: Sequence[View]) -> None:
-        """Halve the photos, with as many splats per pixel."""
+        """Make the photos smaller, with as many splats per pixel."""
         self._stages = stages
-        self._photos, self._share = _fold_photos(photos)
+        self._photos, self._share, self._steps = _fold_photos(photos)
         self._folds: list[Fold] = []
 
     def use(self, photos: Sequence[View]) -> None:
         """Take these photos instead, which have the scene's colors; before the first round."""
-        self._photos, self._share = _fold_photos(photos)
+        self._photos, self._share, self._steps = _fold_photos(photos)
 
     @property
     def work(self) -> float:
         """What fitting all folds takes, in units of a fit to all photos."""
-        return self._share * FOLDS
+        return FOLDS * self._share * self._steps
 
     def validate(self) -> Validation:
         """Held-out photos before each fold's own round and after it.
@@ -127,12 +130,13 @@ class CrossValidation:
         names = list(dict.fromkeys(photo.photo for photo in self._photos))
         every = min(HOLD_OUT_EVERY, len(names))
         folds = []
-        for number in range(FOLDS):
+        count = min(FOLDS, every)
+        for number in range(count):
             # The views of a panorama are held out together.
-            out = set(names[number * every // FOLDS :: every])
+            out = set(names[number * every // count :: every])
             held_out = [photo for photo in self._photos if photo.photo in out]
             kept = [photo for photo in self._photos if photo.photo not in out]
-            fitted = self._stages.fit(f"fold{number}", kept, self._share)
+            fitted = self._stages.fit(f"fold{number}", kept, self._share, self._steps)
             folds.append(Fold(fitted, held_out, self._scored(fitted, held_out)))
         return folds
 
@@ -175,11 +179,17 @@ def _beside(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> list[H
     ]
 
 
-def _fold_photos(photos: Sequence[View]) -> tuple[list[View], float]:
-    """Photos as folds fit them, and their pixels as a part of the photos' own."""
-    shortest = min(min(photo.camera.width, photo.camera.height) for photo in photos)
-    if shortest < 2 * LEAST_FOLD_SIDE:
-        return list(photos), 1.0
-    small = [halved(photo) for photo in photos]
-    pixels = (sum(v.camera.width * v.camera.height for v in some) for some in (small, photos))
-    return small, next(pixels) / next(pixels)
+def _fold_photos(photos: Sequence[View]) -> tuple[list[View], float, float]:
+    """Photos as folds fit them, their pixels as a part of the photos' own, and that of steps."""
+    small, halvings = list(photos), 0
+    while halvings < len(FOLD_STEPS) - 1 and _shortest(small) >= 2 * LEAST_FOLD_SIDE:
+        small, halvings = [halved(photo) for photo in small], halvings + 1
+    return small, _pixels(small) / _pixels(photos), FOLD_STEPS[halvings]
+
+
+def _shortest(photos: Sequence[View]) -> int:
+    return min(min(photo.camera.width, photo.camera.height) for photo in photos)
+
+
+def _pixels(photos: Sequence[View]) -> int:
+    return sum(photo.camera.width * photo.camera.height for photo in photos)

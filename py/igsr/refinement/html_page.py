@@ -118,7 +118,7 @@ def _score_rows(refined: Refined) -> list[dict[str, Any]]:
             before = _score_row(f"{count}, held-out photos before", done.validation_before, "")
             after = _score_row(f"{count}, held-out photos after", done.validation_after, splats)
             after["accepted"] = done.accepted
-            after["verdict"] = "accepted" if done.accepted else "rolled back"
+            after["verdict"] = "accepted" if done.accepted else "not accepted"
             rows += [before, after]
         else:
             rows.append(_score_row(f"{count}, not cross-validated", {}, splats))

@@ -54,7 +54,7 @@ class Stop:
         count: what the reason counts. ``ROUNDS_DONE``: the rounds. ``TOO_FEW_PHOTOS``: the photos
             that cross-validation needs. ``ENOUGH_PHOTOS``: the photos that see the same place.
             ``NONE_SELECTED``: the novel views that were rejected.
-            ``NOT_ACCEPTED``: the number of the round that was rolled back. ``NO_NOVEL_VIEW``: 0.
+            ``NOT_ACCEPTED``: the number of the round that was not. ``NO_NOVEL_VIEW``: 0.
     """
 
     reason: StopReason
@@ -86,7 +86,7 @@ class RefineProgress:
     Attributes:
         round: 0 is the fit to the photos alone.
         stage: what it is doing.
-        done: part of all the work that there may be, in [0, 1]. A round that is rolled back ends
+        done: part of all the work that there may be, in [0, 1]. A round that is not accepted ends
             the refinement early.
         seconds: so far.
     """
@@ -129,16 +129,16 @@ class Round:
     Attributes:
         selected: novel views that were added, the one of the largest gain first. Views of earlier
             rounds are not among them; they were rendered and denoised again. None of a round that
-            was rolled back: only its folds had novel views.
+            was not accepted: its folds alone did it.
         rejected: novel views that were rendered and not added.
         validation_before: mean scores ("psnr", "ssim", "flip") of the held-out photos of all
             folds, before the round.
         validation_after: the same after the round. Both are empty without cross-validation.
         accepted: whether the geometric mean of root squared error, 1 - SSIM and FLIP of the
-            held-out photos fell; if not, the round was rolled back. True without cross-validation.
-        splats: after the round; None where it was rolled back.
+            held-out photos fell; if not, folds alone did the round. True without cross-validation.
+        splats: after the round; None where it was not accepted.
         test: mean scores of the capture's test views; they decide nothing. None where the round
-            was rolled back or there are no test views.
+            was not accepted or there are no test views.
         held_out: the held-out photos of all folds; empty without cross-validation.
     """
 
@@ -186,7 +186,7 @@ class Refined(ArrayEquality, NotebookPicture):
         first: after the fit to the photos alone, which is round 0.
         first_test: mean scores of the capture's test views by ``first``, if it has any.
         capture: photos and cameras.
-        rounds: those that were tried, in order; only the last one can have been rolled back.
+        rounds: those that were tried, in order; only the last one can have been not accepted.
         stop: why there was no further round; None while there may be one.
         rejected: novel views of a round that was not begun, since none of them was selected; those
             of the folds where it was cross-validated.

@@ -34,7 +34,7 @@ class RefineSettings:
     """What a refinement depends on, beside the photos and the denoiser.
 
     Attributes:
-        rounds: most rounds, or "auto", which is 4. A round that is rolled back is the last one.
+        rounds: most rounds, or "auto", which is 4. A round that is not accepted is the last one.
         steps: of each fit; None is the default preset's.
         quality: "draft", "normal" or "high", of the default preset.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".

@@ -67,7 +67,8 @@ class Reconstruction:
         name: "whole" or "fold0", "fold1" ...; checkpoints are named after it.
         photos: that are fitted, with the scene's colors: exposures that the first fit has found are
             taken out of them, and with masks that leave out what it has found to be transient.
-        share: the photos' pixels as a part of all; time and number of splats go by it.
+        share: the photos' pixels as a part of all; the number of splats goes by it.
+        steps: of its fits, as a part of those that all photos are fitted with.
         splats: after the last fit, without a backdrop: holes are to be seen as such.
         shown: the same with the backdrop, if the scene has one: what is scored and written.
         added: novel views that the rounds so far have added.
@@ -76,9 +77,15 @@ class Reconstruction:
     name: str
     photos: list[View]
     share: float
+    steps: float
     splats: Splats
     shown: Splats
     added: list[NovelView] = field(default_factory=list)
+
+    @property
+    def work(self) -> float:
+        """About the time of a fit, in units of one to all photos."""
+        return self.share * self.steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +177,7 @@ class Stages:
         """Fit all photos; find their exposures and what is transient where that is asked for."""
         views, settings = self._capture.train_views, self._settings
         splats, fitted = self._fit(
-            "whole", "fit", views, 1.0, settings.exposure, settings.transients
+            "whole", "fit", views, 1.0, 1.0, settings.exposure, settings.transients
         )
         exposures = [view.exposure for view in fitted.train_views]
         if any(exposures):
@@ -185,12 +192,14 @@ class Stages:
         shown = self._shown(splats, photos)
         # This fit decides for all, so that none with a backdrop is compared with one without.
         self._backdrop = shown is not splats
-        return Reconstruction("whole", photos, 1.0, splats, shown)
+        return Reconstruction("whole", photos, 1.0, 1.0, splats, shown)
 
-    def fit(self, name: str, photos: list[View], share: float = 1.0) -> Reconstruction:
-        """Fit photos alone, which have the scene's colors."""
-        splats, _ = self._fit(name, "fit", photos, share)
-        return Reconstruction(name, photos, share, splats, self._shown(splats, photos))
+    def fit(
+        self, name: str, photos: list[View], share: float = 1.0, steps: float = 1.0
+    ) -> Reconstruction:
+        """Fit photos alone, which have the scene's colors; ``share`` and ``steps`` as there."""
+        splats, _ = self._fit(name, "fit", photos, share, steps)
+        return Reconstruction(name, photos, share, steps, splats, self._shown(splats, photos))
 
     def render_and_denoise(self, reconstruction: Reconstruction) -> DenoisedViews:
         """Render novel views, and again those that were added before, and denoise them."""
@@ -280,7 +289,9 @@ class Stages:
         pictures = [*reconstruction.photos, *views]
         own = seed_of_round(self._settings.seed, self._run.round)
         seed = own if stage == "refit" else None
-        splats, _ = self._fit(name, stage, pictures, reconstruction.share, seed=seed)
+        splats, _ = self._fit(
+            name, stage, pictures, reconstruction.share, reconstruction.steps, seed=seed
+        )
         reconstruction.splats = splats
         reconstruction.shown = self._shown(splats, reconstruction.photos)
         reconstruction.added += [candidate.view for candidate in selected]
@@ -316,16 +327,19 @@ class Stages:
         stage: Stage,
         views: list[View],
         share: float,
+        steps: float,
         exposure: ExposureMode = "off",
         transients: TransientMode = "off",
         seed: int | None = None,
     ) -> tuple[Splats, Capture]:
         goes_on = True
+        whole = int(self._fit_settings["steps"])
+        settings = {**self._fit_settings, "steps": max(1, round(steps * whole))}
 
         def progress(now: Progress) -> bool:
             nonlocal goes_on
             if now.removed is None:  # the end, which resumed fits tell again, is no news
-                goes_on = self._run.fitting(stage, share * now.step / now.steps)
+                goes_on = self._run.fitting(stage, share * steps * now.step / now.steps)
             return goes_on
 
         checkpoint, resume = self._run.checkpoint(name)
@@ -340,11 +354,11 @@ class Stages:
             exposure=exposure,
             transients=transients,
             backdrop=False,
-            **self._fit_settings,
+            **settings,
         )
         if not goes_on:  # not raised in the callback, so that the fit saves its checkpoint
             raise IgsrError(STOPPED)
-        self._run.work_done(share)
+        self._run.work_done(share * steps)
         return fitted
 
 

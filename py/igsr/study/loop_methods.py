@@ -37,7 +37,7 @@ class Method:
         method: of ``METHODS``.
         views: most views that a round adds.
         rounds: most rounds.
-        cross_validate: whether a round of ours that does not help is rolled back. The paper's
+        cross_validate: whether a round of ours must help held-out photos. The paper's
             rounds never are.
     """
 

@@ -162,7 +162,7 @@ def sweep(
     on_run: OnRun | None = None,
     ray: bool = False,
 ) -> dict[str, Any]:
-    """4, 6, 10 and 15 scattered photos, up to four rounds of 1, 2 and 4 views, none rolled back.
+    """4, 6, 10 and 15 scattered photos; four rounds of 1, 2 and 4 views, none cross-validated.
 
     Arguments are those of ``table2``; ``views`` are the numbers of photos. Raises as ``table2``.
     """
@@ -253,7 +253,7 @@ def refinement_ablation(
     on_run: OnRun | None = None,
     ray: bool = False,
 ) -> dict[str, Any]:
-    """One round of our loop with each of its parts taken out, none rolled back.
+    """One round of our loop with each of its parts taken out, none cross-validated.
 
     Scenes have evenly spaced photos: the tankard 6, fern 3, others 10. Arguments are those of
     ``table2``. Raises as ``table2``.

@@ -106,7 +106,7 @@ class RoundRow(TypedDict, total=False):
     """Scores of the held-out views after a round; 0 is the first fit.
 
     "views" has the scores of each view, "near" and "far" those of some of them and their number, or
-    None where there are none. The row of a round that was rolled back has the scores of the round
+    None where there are none. The row of a round that was not accepted has the scores of the round
     before.
     """
 

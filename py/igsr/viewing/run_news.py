@@ -92,7 +92,7 @@ def run_background(folder: Path) -> tuple[float, float, float] | None:
 def _round_row(number: int, one: dict[str, Any]) -> list[str]:
     label = "first fit" if number == 0 else f"round {number}"
     if number > 0:
-        label += ": accepted" if one.get("accepted") is True else ": rolled back"
+        label += ": accepted" if one.get("accepted") is True else ": not accepted"
     validation = _within(one, "cross_validation")
     before, after = (
         _numbers(_within(validation, when), ("psnr",))[0] for when in ("before", "after")
