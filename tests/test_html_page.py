@@ -65,8 +65,8 @@ def test_held_out_photos_are_compared_by_a_line_to_drag(browser, tmp_path):
 
     refined = igsr.refine(capture, 1, steps=30, backend="cpu", denoiser=sure, out=tmp_path)
     (done,) = refined.rounds
-    assert len(done.held_out) == 2
-    assert done.verdict == "2 held-out photos are too few to tell gain from chance."
+    assert len(done.held_out) == 3
+    assert done.verdict.startswith("3 held-out photos change by ")
     report = json.loads((tmp_path / "report.json").read_text())
     rows = report["rounds"][1]["cross_validation"]["held_out"]
     assert [row["name"] for row in rows] == [view.name for view in done.held_out]
@@ -75,9 +75,9 @@ def test_held_out_photos_are_compared_by_a_line_to_drag(browser, tmp_path):
     )
     browser.load(tmp_path / "report.html")
     sliders = "document.querySelectorAll('.slider')"
-    assert browser.run(f"{sliders}.length") == 2
+    assert browser.run(f"{sliders}.length") == 3
     shown = "[...document.querySelectorAll('.slider img')].map(one => one.naturalWidth)"
-    assert browser.run(shown) == [40] * 4
+    assert browser.run(shown) == [40] * 6
     over = f"{sliders}[1].querySelector('.over')"
     assert browser.run(f"getComputedStyle({over}).clipPath") == "inset(0px 0px 0px 50%)"
     moved = f"(() => {{ const bar = {sliders}[1].querySelector('input'); bar.value = 20; "

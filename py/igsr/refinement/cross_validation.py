@@ -19,9 +19,9 @@ from igsr.refinement.stages import VALIDATED, DenoisingErrors, Reconstruction, S
 FEWEST_PHOTOS = 3
 #: Each fold holds out one photo in eight. Where more are held out the folds' fits are worse than
 #: the whole one, and denoised views help them where they do not help it.
-FOLDS, HOLD_OUT_EVERY = 4, 8
-#: Folds fit photos that are halved twice, so that there can be four of them for a third of the time
-#: of a whole fit; none whose shorter side then has fewer pixels than this.
+FOLDS, HOLD_OUT_EVERY = 3, 8
+#: Folds fit photos that are halved twice, so that a round that does not help costs a third of a
+#: whole fit's time; none whose shorter side then has fewer pixels than this.
 LEAST_FOLD_SIDE = 64
 #: Steps of their fits, as a part of a whole fit's, by how often the photos are halved: small ones
 #: are done learning sooner. Fewer steps on whole photos would be no model of a whole fit.
