@@ -26,6 +26,7 @@ from igsr.denoiser.calibration import (
     confidence_of,
     error_of,
 )
+from igsr.refinement import cross_validation, stages
 from igsr.refinement.results import StopReason
 from igsr.refinement.selection import confidence_weights
 
@@ -100,6 +101,44 @@ def test_rounds_by_a_denoiser_without_confidence_help(ball_photos):
     assert refined.rounds[0].test["psnr"] > refined.first_test["psnr"]
     selected = refined.rounds[0].selected
     assert np.mean([one.mean_confidence for one in selected]) > 0.5
+
+
+@pytest.mark.usefixtures("small_fits")
+def test_each_fold_is_calibrated_by_the_others_and_the_whole_by_all_before_the_round(
+    ball_photos, monkeypatch
+):
+    told, asked, order = [], [], []
+    errors, calibrated = stages.Stages.denoising_errors, cross_validation._calibrated
+    refit, applied = stages.Stages.refit, stages.DenoisedViews.calibrated
+
+    def errors_of(self, fold, photos):
+        order.append("errors")
+        told.append(errors(self, fold, photos))
+        return told[-1]
+
+    def calibration(some):
+        asked.append([next(k for k, one in enumerate(told) if one is part) for part in some])
+        made = calibrated(some)
+        names[id(made)] = asked[-1]
+        kept.append(made)
+        return made
+
+    def used(self, calibration):
+        by.append(names[id(calibration)])
+        return applied(self, calibration)
+
+    def refitted(self, *arguments):
+        order.append("refit")
+        return refit(self, *arguments)
+
+    names, kept, by = {}, [], []
+    monkeypatch.setattr(stages.Stages, "denoising_errors", errors_of)
+    monkeypatch.setattr(stages.Stages, "refit", refitted)
+    monkeypatch.setattr(stages.DenoisedViews, "calibrated", used)
+    monkeypatch.setattr(cross_validation, "_calibrated", calibration)
+    refine(ball_photos, 1, lambda buffers, photos: truthful(buffers, photos)[0])
+    assert by == [[1, 2], [0, 2], [0, 1], [0, 1, 2]]
+    assert order == ["errors"] * 3 + ["refit"] * 4
 
 
 @pytest.mark.usefixtures("small_fits")

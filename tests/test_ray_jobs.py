@@ -51,11 +51,11 @@ def test_a_head_that_nobody_answers_for_is_named_at_once(ray):
 @pytest.mark.parametrize(
     ("told", "message"),
     [
+        (("far", "0.0.1", "AVX2", True), "far of the Ray cluster has igsr 0.0.1 where this one"),
         (
-            ("1", "far", "0.0.1", "AVX2", True),
-            "far of the Ray cluster has igsr 0.0.1 where this one",
+            ("far", igsr.__version__, "AVX2", False, "1"),
+            "far of the Ray cluster does not see",
         ),
-        (("1", "far", igsr.__version__, "AVX2", False), "far of the Ray cluster does not see"),
         (None, "head of the Ray cluster cannot run igsr .No module named 'igsr'.; install igsr"),
     ],
 )

@@ -107,6 +107,13 @@ def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(ball_photos, help
     assert refine(two, 1, truthful).stop == Stop(StopReason.TOO_FEW_PHOTOS, 3)
 
 
+def test_one_panorama_is_too_few_to_hold_any_out(ball_photos):
+    """Its views are held out together."""
+    of_one = [replace(view, rig="panorama.jpg") for view in ball_photos.train_views]
+    refined = refine(igsr.Capture(ball_photos.path, of_one), 1, truthful, steps=40)
+    assert refined.stop == Stop(StopReason.TOO_FEW_PHOTOS, 3)
+
+
 def test_folds_are_fitted_as_all_photos_are(ball_photos, monkeypatch):
     """The folds have fewer photos, further apart, but are fitted with the settings for all."""
     photos = ball_photos.train_views

@@ -109,8 +109,9 @@ class RayCluster:
         answered: dict[str, Node] = {}
         for reference, name in asked.items():
             try:
-                node_id, *about = ray.get(reference, timeout=ANSWERS_WITHIN)
-                node = Node(*about)
+                # An older igsr does not say who answers.
+                answer = (*ray.get(reference, timeout=ANSWERS_WITHIN), name)
+                node, node_id = Node(*answer[:4]), answer[4]
             except Exception as error:
                 reason = _first_line(error)
                 raise IgsrError(
@@ -285,11 +286,11 @@ def _first_line(error: BaseException) -> str:
     return lines[0].rstrip(".")
 
 
-def _what_it_is(folder: str | None) -> tuple[str, str, str, str, bool]:
-    """On a machine of the cluster: its ID there and the fields of its ``Node``."""
+def _what_it_is(folder: str | None) -> tuple[str, str, str, bool, str]:
+    """On a machine of the cluster: the fields of its ``Node``, and its ID there."""
     import ray
 
     node_id = ray.get_runtime_context().get_node_id()
     about = _core.backend_info("cpu")
     sees = folder is None or Path(folder).is_dir()
-    return node_id, socket.gethostname(), _core.__version__, about["instruction_set"], sees
+    return socket.gethostname(), _core.__version__, about["instruction_set"], sees, node_id

@@ -17,7 +17,7 @@ from igsr.pose.colmap.time_estimate import camera_seconds
 #: Photos as people take them stand this far apart, seen from what they show: degrees.
 USUALLY_APART = 10.0
 #: A round of a refinement takes this part of a fit's time, by its folds, novel views and refit.
-ROUND = 1.8
+ROUND = 1.5
 
 
 def announce(

@@ -13,15 +13,22 @@ from igsr.denoiser.calibration import Calibration, calibrate
 from igsr.evaluation.scores import ScoredView
 from igsr.refinement.results import HeldOutView
 from igsr.refinement.selection import Rejected
-from igsr.refinement.stages import VALIDATED, DenoisingErrors, Reconstruction, Stages
+from igsr.refinement.stages import (
+    NOVEL_VIEWS_WORK,
+    VALIDATED,
+    DenoisingErrors,
+    Reconstruction,
+    Stages,
+)
 
-#: Fewest photos: each fold needs two to fit.
+#: Fewest photos, panoramas counted as one: each fold needs two to fit.
 FEWEST_PHOTOS = 3
 #: Each fold holds out one photo in eight. Where more are held out the folds' fits are worse than
 #: the whole one, and denoised views help them where they do not help it.
 FOLDS, HOLD_OUT_EVERY = 3, 8
 #: Folds fit photos that are halved twice, so that a round that does not help costs a third of a
-#: whole fit's time; none whose shorter side then has fewer pixels than this.
+#: whole fit's time; none whose shorter side then has fewer pixels than this: folds of small photos
+#: cost more, up to six fits.
 LEAST_FOLD_SIDE = 64
 #: Steps of their fits, as a part of a whole fit's, by how often the photos are halved: small ones
 #: are done learning sooner. Fewer steps on whole photos would be no model of a whole fit.
@@ -62,7 +69,7 @@ class Validation:
     @property
     def accepted(self) -> bool:
         """Whether the round makes held-out photos better."""
-        return combined_error(self.after) < combined_error(self.before)
+        return bool(self.after) and combined_error(self.after) < combined_error(self.before)
 
 
 class CrossValidation:
@@ -76,13 +83,12 @@ class CrossValidation:
             of all folds as they were before the last round that was validated.
     """
 
-    calibration: Calibration
-
     def __init__(self, stages: Stages, photos: Sequence[View]) -> None:
         """Make the photos smaller, with as many splats per pixel."""
         self._stages = stages
         self._photos, self._share, self._steps = _fold_photos(photos)
         self._folds: list[Fold] = []
+        self.calibration = Calibration()
 
     def use(self, photos: Sequence[View]) -> None:
         """Take these photos instead, which have the scene's colors; before the first round."""
@@ -92,6 +98,11 @@ class CrossValidation:
     def work(self) -> float:
         """What fitting all folds takes, in units of a fit to all photos."""
         return FOLDS * self._share * self._steps
+
+    @property
+    def novel_views_work(self) -> float:
+        """What their novel views of a round take, in the same units."""
+        return FOLDS * self._share * NOVEL_VIEWS_WORK
 
     def validate(self) -> Validation:
         """Held-out photos before each fold's own round and after it.
@@ -130,10 +141,9 @@ class CrossValidation:
         names = list(dict.fromkeys(photo.photo for photo in self._photos))
         every = min(HOLD_OUT_EVERY, len(names))
         folds = []
-        count = min(FOLDS, every)
-        for number in range(count):
+        for number in range(FOLDS):
             # The views of a panorama are held out together.
-            out = set(names[number * every // count :: every])
+            out = set(names[number * every // FOLDS :: every])
             held_out = [photo for photo in self._photos if photo.photo in out]
             kept = [photo for photo in self._photos if photo.photo not in out]
             fitted = self._stages.fit(f"fold{number}", kept, self._share, self._steps)

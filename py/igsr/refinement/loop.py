@@ -79,7 +79,8 @@ def refine(
             are until there is more. Without, checkpoints of an earlier run are removed.
         propose: what proposes the cameras of novel views.
         select: which of the denoised views to add.
-        cross_validate: whether a round is kept only if it improves the scores of held-out photos.
+        cross_validate: whether a round is done with all photos only if, done by folds, it improves
+            the scores of the photos that they hold out.
         exposure: "on", "off" or "auto": whether the first fit finds the photos' exposures, which
             are then taken out of them, as ``igsr.fit``.
         transients: "on", "off" or "auto": whether what one photo shows and the others do not is
@@ -118,8 +119,10 @@ def refine(
         _check_views(capture)
         stages = Stages(capture, settings, run, denoiser or round_denoiser(), propose, select)
         validation = CrossValidation(stages, capture.train_views) if cross_validate else None
-        fits = 1.0 + (validation.work if validation else 0.0)
-        run.prepare(capture, work=fits * (1.0 + settings.most_rounds * (NOVEL_VIEWS_WORK + 1.0)))
+        fits, novel = 1.0, NOVEL_VIEWS_WORK
+        if validation is not None:
+            fits, novel = fits + validation.work, novel + validation.novel_views_work
+        run.prepare(capture, work=fits + settings.most_rounds * (fits + novel))
 
         whole = stages.fit_whole()
         if validation is not None:
@@ -146,9 +149,9 @@ def _round(
         return replace(refined, stop=Stop(StopReason.ROUNDS_DONE, settings.most_rounds))
     seen_by = support_of(whole.photos).seen_by
     if settings.rounds == AUTO and seen_by >= ENOUGH_PHOTOS:
-        # Known before the folds are fitted, which would cost as much as the fit itself.
+        # Known before the folds are fitted.
         return replace(refined, stop=Stop(StopReason.ENOUGH_PHOTOS, round(seen_by)))
-    if validation and len(whole.photos) < FEWEST_PHOTOS:
+    if validation and len({view.photo for view in whole.photos}) < FEWEST_PHOTOS:
         return replace(refined, stop=Stop(StopReason.TOO_FEW_PHOTOS, FEWEST_PHOTOS))
 
     validated = Validation()

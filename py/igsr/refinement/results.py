@@ -53,7 +53,7 @@ class Stop:
         reason: what ended it.
         count: what the reason counts. ``ROUNDS_DONE``: the rounds. ``TOO_FEW_PHOTOS``: the photos
             that cross-validation needs. ``ENOUGH_PHOTOS``: the photos that see the same place.
-            ``NONE_SELECTED``: the novel views that were rejected.
+            ``NONE_SELECTED``: the novel views that were rejected, of all folds.
             ``NOT_ACCEPTED``: the number of the round that was not. ``NO_NOVEL_VIEW``: 0.
     """
 
@@ -188,8 +188,8 @@ class Refined(ArrayEquality, NotebookPicture):
         capture: photos and cameras.
         rounds: those that were tried, in order; only the last one can have been not accepted.
         stop: why there was no further round; None while there may be one.
-        rejected: novel views of a round that was not begun, since none of them was selected; those
-            of the folds where it was cross-validated.
+        rejected: novel views of a round that was not begun, since none of them was selected: of
+            the folds, or, if these selected some, of the whole fit.
         seconds: that each stage but "pose" took, by its name, with the time of earlier calls that
             this one resumed.
     """

@@ -44,7 +44,8 @@ class RefineSettings:
             ``FitSettings.exposure``.
         transients: whether the first fit finds things that are in one photo alone, which are masked
             from then on: "off", "on" or "auto", as ``FitSettings.transients``.
-        cross_validate: whether a round is kept only if it improves the scores of held-out photos.
+        cross_validate: whether a round is done with all photos only if, done by folds, it improves
+            the scores of the photos that they hold out.
 
     Raises:
         IgsrError: a setting cannot be used.
@@ -94,7 +95,10 @@ class RefineSettings:
     )
     cross_validate: bool = field(
         default=True,
-        metadata=about("Keep a round only if it improves the scores of held-out photos."),
+        metadata=about(
+            "Do a round with all photos only if, done by folds of them first, it improves the "
+            "scores of the photos that these hold out."
+        ),
     )
 
     def __post_init__(self) -> None:

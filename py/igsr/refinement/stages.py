@@ -50,7 +50,7 @@ Float32 = npt.NDArray[np.float32]
 #: Novel views rendered in a round, and how many of them are added at most.
 CANDIDATES, SELECTED = 24, 16
 #: Rendering and denoising novel views takes about this part of the time of a fit.
-NOVEL_VIEWS_WORK = 0.1
+NOVEL_VIEWS_WORK = 0.4
 #: Scores that cross-validation compares.
 VALIDATED = ("psnr", "ssim", "flip")
 #: Proposes novel views from the splats, the known cameras, the most views and the backend.
@@ -81,11 +81,6 @@ class Reconstruction:
     splats: Splats
     shown: Splats
     added: list[NovelView] = field(default_factory=list)
-
-    @property
-    def work(self) -> float:
-        """About the time of a fit, in units of one to all photos."""
-        return self.share * self.steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +143,7 @@ class Stages:
         self._background = default_background(capture)
         self._backdrop = wants_backdrop(capture.train_views)
         self._background_of_views = known_background(capture.views)
-        # Folds have fewer photos, but are fitted with the settings for all of them.
+        # Folds have fewer photos and steps, but the settings and learning rate for all of them.
         preset = preset_settings(
             "default",
             support_of(capture.train_views),
@@ -194,10 +189,8 @@ class Stages:
         self._backdrop = shown is not splats
         return Reconstruction("whole", photos, 1.0, 1.0, splats, shown)
 
-    def fit(
-        self, name: str, photos: list[View], share: float = 1.0, steps: float = 1.0
-    ) -> Reconstruction:
-        """Fit photos alone, which have the scene's colors; ``share`` and ``steps`` as there."""
+    def fit(self, name: str, photos: list[View], share: float, steps: float) -> Reconstruction:
+        """Fit photos alone, which have the scene's colors; the arguments are the result's."""
         splats, _ = self._fit(name, "fit", photos, share, steps)
         return Reconstruction(name, photos, share, steps, splats, self._shown(splats, photos))
 

@@ -214,7 +214,7 @@ def photographs(
     kinds = [
         (scene, "even", count) for scene in scenes for count in _numbers(views, Path(data) / scene)
     ]
-    title = "Photographs: two rounds, each kept only if it helps on folds"
+    title = "Photographs: two rounds, each done only if it helps folds"
     options = _Options(weights, features, steps, seeds, backend, jobs, on_run, ray, max_size)
     return _study(title, (), data, out, kinds, [Method("ours", "ours", SELECTED, 2, True)], options)
 

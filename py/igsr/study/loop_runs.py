@@ -27,6 +27,7 @@ from igsr.denoiser.weights import SHIPPED
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background, over_background, score_views
 from igsr.fitting.fit_capture import fingerprint
+from igsr.refinement.cross_validation import FOLDS
 from igsr.refinement.loop import refine, round_denoiser
 from igsr.refinement.results import Refined, Round
 from igsr.splats import Splats
@@ -46,7 +47,7 @@ HELD_OUT, HELD_OUT_OF_ALL, GIVEN_VIEWS = 15, 7, 6
 #: farther than the second are far.
 NEAR, FAR = 45.0, 60.0
 #: Fits that all methods of a run share, by the names of their checkpoints.
-SHARED_FITS = ("whole", "fold0", "fold1")
+SHARED_FITS = ("whole", *(f"fold{number}" for number in range(FOLDS)))
 
 
 @dataclass(frozen=True)
