@@ -37,8 +37,8 @@ class Method:
         method: of ``METHODS``.
         views: most views that a round adds.
         rounds: most rounds.
-        cross_validate: whether a round of ours must help held-out photos. The paper's
-            rounds never are.
+        cross_validate: whether a round of ours must help held-out photos. The paper's need
+            not.
     """
 
     name: str
