@@ -55,6 +55,22 @@ def helped(ball_photos, tmp_path_factory):
 
 
 @pytest.fixture
+def rendered(monkeypatch):
+    """The reconstructions that refinements render novel views of, in their order."""
+    from igsr.refinement.stages import Stages
+
+    seen = []
+    real = Stages.render_and_denoise
+
+    def watched(stages, reconstruction):
+        seen.append(reconstruction)
+        return real(stages, reconstruction)
+
+    monkeypatch.setattr(Stages, "render_and_denoise", watched)
+    return seen
+
+
+@pytest.fixture
 def igsr_here(capsys):
     """The ``igsr`` command within this process: a new one would import torch each time."""
 

@@ -75,18 +75,10 @@ def test_a_round_that_does_not_help_is_not_accepted(ball_photos, helped, tmp_pat
     assert (kinds.count(0), kinds.count(1), kinds.count(2)) == (9, 0, 0)
 
 
-def test_a_round_that_is_not_accepted_renders_nothing_of_the_whole_fit(ball_photos, monkeypatch):
+def test_a_round_that_is_not_accepted_renders_nothing_of_the_whole_fit(ball_photos, rendered):
     """It costs what its folds cost."""
-    rendered = []
-    real = stages.Stages.render_and_denoise
-
-    def watched(self, reconstruction):
-        rendered.append(reconstruction.name)
-        return real(self, reconstruction)
-
-    monkeypatch.setattr(stages.Stages, "render_and_denoise", watched)
     assert refine(ball_photos, 1, lying, steps=40).stop == Stop(StopReason.NOT_ACCEPTED, 1)
-    assert rendered == ["fold0", "fold1", "fold2"]
+    assert [one.name for one in rendered] == ["fold0", "fold1", "fold2"]
 
 
 def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(ball_photos, helped, monkeypatch):

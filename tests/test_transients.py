@@ -19,7 +19,6 @@ from igsr.fitting import fit_capture
 from igsr.fitting import run as fitting
 from igsr.fitting.transient_search import PARAMETERS, TransientSearch
 from igsr.floaters.photo_evidence import behind_masks
-from igsr.refinement import loop
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 from igsr.transients import PLAIN, find_transients
@@ -453,9 +452,8 @@ def test_the_command_reports_what_it_masked(visited, tmp_path, igsr_here):
 
 
 @pytest.mark.usefixtures("small_fits")
-def test_a_refinement_masks_what_its_first_fit_found(ball_photos, monkeypatch):
-    looks, seen = [], []
-    real = loop.Stages.render_and_denoise
+def test_a_refinement_masks_what_its_first_fit_found(ball_photos, monkeypatch, rendered):
+    looks = []
 
     def found(splats, views, before, **_):
         looks.append(len(views))
@@ -464,17 +462,12 @@ def test_a_refinement_masks_what_its_first_fit_found(ball_photos, monkeypatch):
         masks[0][:5] = True
         return masks
 
-    def watched(self, reconstruction):
-        seen.append(reconstruction)
-        return real(self, reconstruction)
-
     monkeypatch.setattr("igsr.fitting.transient_search.find_transients", found)
-    monkeypatch.setattr(loop.Stages, "render_and_denoise", watched)
     refinements.refine(ball_photos, 1, refinements.lying, transients="on")
     refinements.refine(ball_photos, 1, refinements.lying, transients="on", cross_validate=False)
     name, count = ball_photos.train_views[0].name, len(ball_photos.train_views)
     assert set(looks) == {count}, "only the first fit looks, at all photos"
-    assert [one.name for one in seen] == ["fold0", "fold1", "fold2", "whole"]
-    for view in (view for one in seen for view in one.photos):
+    assert [one.name for one in rendered] == ["fold0", "fold1", "fold2", "whole"]
+    for view in (view for one in rendered for view in one.photos):
         hidden = 0 if view.mask is None else int((~view.mask).sum())
         assert hidden == (5 * view.camera.width if view.name == name else 0)
