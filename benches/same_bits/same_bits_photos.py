@@ -200,3 +200,33 @@ def write_bent(folder: Path, splats: igsr.Splats) -> Path:
     document = {"camera_model": "OPENCV", **camera, **lens, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document))
     return folder
+
+
+def write_plain_photos(folder: Path) -> Path:
+    """Photos of a painted wall with a step in it, without cameras: COLMAP finds them."""
+    folder.mkdir(parents=True)
+    random = np.random.default_rng(11)
+    size, depth = 420, 3.0
+    coarse = Image.fromarray(random.integers(0, 256, (70, 70, 3), dtype=np.uint8))
+    fine = random.integers(-40, 41, (size, size, 3))
+    wall = np.asarray(coarse.resize((size, size), Image.Resampling.BICUBIC)).astype(int) + fine
+    wall = np.clip(wall, 0, 255).astype(np.uint8)
+    width, height, focal = 240, 200, 240.0
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    for number in range(7):
+        camera = camera_at(6.0 * number - 18.0, 4.0 * (number % 3) - 4.0, width, height, depth)
+        rays = np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], -1)
+        rays = rays @ camera.viewmat[:3, :3]
+        picture = np.zeros((height, width, 3), np.uint8)
+        # The right half of the wall stands back by half a unit, a third of it comes forward.
+        for z, low, high in ((0.5, 0.0, 9.0), (0.0, -9.0, 0.0), (-0.4, -0.5, 0.6)):
+            reach = (z - camera.centre[2]) / rays[..., 2]
+            place = camera.centre[:2] + reach[..., None] * rays[..., :2]
+            column, row = ((place + 1.75) / 3.5 * size).astype(int).transpose(2, 0, 1)
+            inside = (place[..., 0] >= low) & (place[..., 0] < high)
+            if z < 0.0:
+                inside &= np.abs(place[..., 1]) < 0.6
+            shown = wall[(row + int(90 * z)) % size, column % size]
+            picture = np.where(inside[..., None], shown, picture)
+        Image.fromarray(picture).save(folder / f"p{number}.png")
+    return folder

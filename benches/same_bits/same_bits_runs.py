@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
+import json
 import os
 import platform
 import subprocess
@@ -11,7 +13,6 @@ import sys
 import tempfile
 import time
 import traceback
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,10 +27,12 @@ from same_bits_photos import (
     with_wall,
     write_ball,
     write_bent,
+    write_plain_photos,
     write_room,
 )
 
 import igsr
+from igsr import _core
 from igsr.denoiser import photo_sources, photo_support, render_buffers
 
 #: The pictures that a refinement writes of each novel view, by the names that this script uses.
@@ -144,7 +147,7 @@ def fits(inputs: Inputs) -> Results:
     ]
     mixed = igsr.Capture(around.path, weighted)
     yield "weights", fitted(mixed, **small | {"steps": 400})
-    begun = igsr.fit(around, 200, backend="cpu", max_splats=600, seed=9)
+    begun, _ = fit(around, 200, backend="cpu", max_splats=600, seed=9)
     yield "from splats", fitted(mixed, 150, max_splats=700, start=begun, seed=4)
 
 
@@ -152,8 +155,30 @@ def fitted(capture: igsr.Capture, *arguments: Any, **options: Any) -> list[Any]:
     """The splats of a fit, and the last loss that it tells."""
     losses: list[float] = []
     options = {"backend": "cpu", **options}
-    splats = igsr.fit(capture, *arguments, progress=lambda now: losses.append(now.loss), **options)
+    splats, _ = fit(
+        capture, *arguments, progress=lambda now: losses.append(loss_of(now)), **options
+    )
     return [splats, losses[-1]]
+
+
+def fit(capture: igsr.Capture, *arguments: Any, **options: Any) -> tuple[igsr.Splats, igsr.Capture]:
+    """Splats and fitted cameras by ``igsr.fit``, which once returned the splats alone."""
+    if hasattr(igsr, "fit_with_cameras"):
+        return igsr.fit_with_cameras(capture, *arguments, **options)
+    result: Any = igsr.fit(capture, *arguments, **options)
+    return result.splats, result.capture
+
+
+def loss_of(now: Any) -> float:
+    """The loss that a progress report tells."""
+    return now.loss if hasattr(now, "loss") else now.values.get("loss", float("nan"))
+
+
+def step_of(now: Any) -> float:
+    """The step that a progress report tells; less than none before the fit."""
+    if hasattr(now, "step"):
+        return now.step
+    return now.done if now.stage == "fit" else -1
 
 
 def opaque(view: igsr.View) -> igsr.View:
@@ -177,7 +202,7 @@ def gpu_fits(inputs: Inputs) -> Results:
     for density, steps in (("mcmc", 420), ("original", 620), ("fixed", 60)):
         yield density, fitted(inputs.around, steps, density=density, **small)
     yield "dropout and hull", fitted(inputs.around, 320, dropout=0.4, hull=True, **small)
-    splats, capture = igsr.fit_with_cameras(inputs.room, 40, poses="joint", focal="shared", **small)
+    splats, capture = fit(inputs.room, 40, poses="joint", focal="shared", **small)
     yield "joint poses", [splats, *cameras_of(capture)]
 
 
@@ -199,11 +224,11 @@ def poses(inputs: Inputs) -> Results:
             ("joint", "per-camera"),
             ("fixed", "shared"),
         ):
-            splats, found = igsr.fit_with_cameras(
+            splats, found = fit(
                 capture, 160, backend="cpu", seed=1, max_splats=900, poses=joint, focal=focal
             )
             yield f"{joint}, focal {focal}, {name}", [splats, *cameras_of(found)]
-    splats = igsr.fit(room, 150, backend="cpu", max_splats=900, seed=2)
+    splats, _ = fit(room, 150, backend="cpu", max_splats=900, seed=2)
     found = igsr.refine_cameras(splats, room.test_views, (0.0, 0.0, 0.0), backend="cpu")
     yield "refined cameras of test photos", [view.camera for view in found]
 
@@ -226,8 +251,14 @@ def resumed(inputs: Inputs) -> Results:
                 **options,
             }
             at = given["steps"] // 3
-            igsr.fit(capture, progress=lambda now, at=at: now.step < at, **given)
-            splats, found = igsr.fit_with_cameras(capture, resume=True, **given)
+
+            def stop(now: Any, at: int = at) -> None:
+                if step_of(now) >= at:
+                    raise KeyboardInterrupt
+
+            with contextlib.suppress(KeyboardInterrupt):
+                fit(capture, progress=stop, **given)
+            splats, found = fit(capture, resume=True, **given)
             yield f"{backend}, {name}", [splats, *cameras_of(found)]
 
 
@@ -318,9 +349,9 @@ def fit_files(out: Path) -> Results:
     yield from prefixed("report", named_numbers(read_json(out / "report.json")))
 
 
-def run(command: str, *arguments: Any) -> None:
-    """Run ``igsr`` of the same tree, on the CPU where the command has the choice."""
-    backend = () if command == "convert" else ("--backend", "cpu")
+def run(command: str, *arguments: Any) -> str:
+    """Run ``igsr`` of the same tree, on the CPU where the command has the choice; its output."""
+    backend = () if command in ("convert", "pose") else ("--backend", "cpu")
     words = [*COMMAND, command, *map(str, arguments), *backend]
     # A folder igsr where this was started must not be taken for it.
     place = {"PYTHONPATH": str(Path(igsr.__file__).resolve().parents[1])}
@@ -334,11 +365,12 @@ def run(command: str, *arguments: Any) -> None:
     )
     if done.returncode:
         raise RuntimeError(f"{' '.join(words)} failed:\n{done.stderr}")
+    return done.stdout
 
 
 def compactions(inputs: Inputs) -> Results:
     """Smaller models, by photos and without."""
-    splats = igsr.fit(inputs.around, 400, backend="cpu", max_splats=500, seed=8)
+    splats, _ = fit(inputs.around, 400, backend="cpu", max_splats=500, seed=8)
     for name, options in (
         ("by photos", {"capture": inputs.around, "max_loss": 0.5, "steps": 60}),
         ("by itself", {"max_loss": 0.4, "psnr": 60.0, "sh_degree": 0, "steps": 12}),
@@ -457,9 +489,31 @@ def scores(inputs: Inputs) -> Results:
         yield from prefixed(name, named_numbers(found))
 
 
+def plain_photos(inputs: Inputs) -> Results:
+    """Folders of photos without cameras: ``igsr pose``, ``fit`` and ``refine`` find them."""
+    photos = write_plain_photos(inputs.folder / "plain")
+    out = inputs.folder / "plain-out"
+    report = json.loads(run("pose", photos, "--out", out / "pose", "--seed", 3, "--json"))
+    yield from prefixed("pose", named_numbers(report))
+    for path in sorted((out / "pose" / "sparse").rglob("*.*")):
+        yield f"pose.{path.name}", path
+    yield "pose.images", [pixels(path) for path in sorted((out / "pose" / "images").glob("*"))]
+    smaller = ("--max-size", 160)
+    run("fit", photos, "--out", out / "fit", "--steps", 120, "--max-splats", 900, *smaller)
+    yield from prefixed("fit", fit_files(out / "fit"))
+    # The cameras are kept, and used for photos of another size.
+    run("fit", photos, "--out", out / "fit", "--steps", 60, "--max-splats", 700, "--holdout", 4)
+    yield from prefixed("fit again", fit_files(out / "fit"))
+    rounds = ("--rounds", 1, "--steps", 100, "--no-cross-validate")
+    run("refine", photos, "--out", out / "refine", *rounds, *smaller, "--exposure", "on")
+    yield from prefixed("refine", refinement_files(out / "refine"))
+    found = igsr.estimate_poses(photos, seed=1, max_size=200)
+    yield "python", [[view.camera, view.image] for view in found.views]
+
+
 def denoised(inputs: Inputs) -> Results:
     """Renders as the denoiser that comes with igsr cleans them, alone and beside photos."""
-    splats = igsr.fit(inputs.around, 200, backend="cpu", max_splats=400, seed=1)
+    splats, _ = fit(inputs.around, 200, backend="cpu", max_splats=400, seed=1)
     camera = camera_at(33.0, 4.0, 80, 72)
     found = igsr.render(splats, camera, WHITE, backend="cpu")
     for name, given in (("render", found), ("picture", found.to_uint8())):
@@ -485,6 +539,7 @@ PARTS: dict[str, Callable[[Inputs], Results]] = {
     "refine": refinements,
     "command": commands,
     "gpu_fit": gpu_fits,
+    "photos": plain_photos,
 }
 
 
@@ -495,36 +550,13 @@ def machine() -> dict[str, str | None]:
         "numpy": np.__version__,
         "python": ".".join(platform.python_version_tuple()[:2]),
     }
-    capture = igsr.Capture(
-        Path("machine"),
-        [
-            igsr.View(
-                f"{k}.png",
-                camera_at(9.0 * k, 0.0, 16, 16),
-                "train",
-                np.full((16, 16, 3), 99, np.uint8),
-            )
-            for k in range(2)
-        ],
-    )
     for backend in ("cpu", "gpu"):
-        told: list[dict[str, str]] = []
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                igsr.fit(
-                    capture,
-                    1,
-                    lambda now, told=told: told.append(now.backend),
-                    backend=backend,
-                    start="random",
-                    max_splats=10,
-                )
+            told = _core.backend_info(backend)
         except RuntimeError:
-            if backend == "cpu":
-                raise
-        found[f"{backend} device"] = told[-1]["device"] if told else None
-        found[f"{backend} instruction set"] = told[-1]["instruction_set"] if told else None
+            told = {}
+        found[f"{backend} device"] = told.get("device")
+        found[f"{backend} instruction set"] = told.get("instruction_set")
     return found
 
 
