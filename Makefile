@@ -46,25 +46,25 @@ demo: build
 
 # What to measure on, and the files that two of the workloads need.
 BACKENDS ?= cpu
-BENCH := $(BIN)/igsr bench $(if $(GARDEN),--garden '$(GARDEN)') $(if $(CAPTURE),--capture '$(CAPTURE)')
+BENCH := $(BIN)/python -m igsr_lab bench $(if $(GARDEN),--garden '$(GARDEN)') $(if $(CAPTURE),--capture '$(CAPTURE)')
 
 bench: build
 	$(BENCH) $(BACKENDS:%=--backend %) --plot out/bench/speed_vs_error.png --json out/bench/rows.json
 
 BASE ?= HEAD~1
 bench-check: build
-	$(BIN)/python benches/bench_check.py '$(BASE)'
+	$(BIN)/python -m igsr_lab bench-check '$(BASE)'
 
 # What a person with a GPU can send: tests of the kernels, times beside errors (and beside gsplat where
 # CUDA and gsplat are), driver and limits. On the software driver where there is no GPU.
 SECONDS ?= 2
 gpu-check: build vulkan
-	$(BIN)/python benches/gpu_check.py --seconds $(SECONDS) \
+	$(BIN)/python -m igsr_lab gpu-check --seconds $(SECONDS) \
 		$(if $(GARDEN),--garden '$(GARDEN)') $(if $(CAPTURE),--capture '$(CAPTURE)')
 
 # Writes the page of accuracy and its plot; on the software driver where there is no GPU.
 accuracy: build vulkan
-	$(BIN)/igsr bench --backend cpu --backend gpu --accuracy docs/how-it-works/accuracy.md
+	$(BIN)/python -m igsr_lab bench --backend cpu --backend gpu --accuracy docs/how-it-works/accuracy.md
 
 # Stops at any warning: a link without a target, a page that no menu leads to.
 docs: build $(VENV)/.dev-ready

@@ -27,10 +27,10 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-from igsr.synth.cameras import Viewpoint
-from igsr.synth.meshes import Mesh, box, grid_mesh, lathe, place, tube
-from igsr.synth.mitsuba_scene import bitmap, camera_error, encode, sensor, shape
-from igsr.synth.textures import mix, noise
+from igsr_lab.synth.cameras import Viewpoint
+from igsr_lab.synth.meshes import Mesh, box, grid_mesh, lathe, place, tube
+from igsr_lab.synth.mitsuba_scene import bitmap, camera_error, encode, sensor, shape
+from igsr_lab.synth.textures import mix, noise
 
 mi.set_variant("scalar_rgb")
 

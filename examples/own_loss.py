@@ -5,7 +5,7 @@
     python examples/own_loss.py [examples/tea_table] [--steps 1000]
 
 The number of splats stays as it is here; gsplat's strategies, which add and remove splats, run on
-`igsr.rasterization` too. `igsr bench` times such a loop beside the built-in fit.
+`igsr.rasterization` too. `python -m igsr_lab bench` times such a loop beside the built-in fit.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ import pytest
 import refinements
 
 from igsr import cli
+from igsr_lab import __main__ as lab
 
 # Its numbers are megabytes that are not here: it is run where a folder of them is named.
 collect_ignore = [] if os.environ.get("IGSR_DA3_FIXTURES") else ["test_da3_published.py"]
@@ -73,15 +74,21 @@ def rendered(monkeypatch):
 @pytest.fixture
 def igsr_here(capsys):
     """The ``igsr`` command within this process: a new one would import torch each time."""
+    return lambda *arguments: _run(cli.app, arguments, capsys)
 
-    def run(*arguments):
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.app([str(argument) for argument in arguments])
-        output = capsys.readouterr()
-        return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
 
-    return run
+@pytest.fixture
+def lab_here(capsys):
+    """``python -m igsr_lab`` within this process."""
+    return lambda *arguments: _run(lab.app, arguments, capsys)
+
+
+def _run(app, arguments, capsys):
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        app([str(argument) for argument in arguments])
+    output = capsys.readouterr()
+    return subprocess.CompletedProcess(arguments, ended.value.code, output.out, output.err)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from igsr.denoiser.training.perceptual_distance import _FIRES
+from igsr_lab.denoiser.perceptual_distance import _FIRES
 
 
 def squeezenet_file(path):

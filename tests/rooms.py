@@ -11,6 +11,7 @@ import numpy as np
 from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import intrinsic_matrix
+from igsr_lab.large_scenes.towns import texture
 
 #: Planes point . normal = offset, and two axes along each.
 WALLS = (
@@ -20,16 +21,6 @@ WALLS = (
     ((1.0, 0.0, 0.4), 3.0, (0.4, 0.0, -1.0), (0.0, 1.0, 0.0)),
 )
 TEXELS = 24.0
-
-
-def texture(seed: int, size: int = 256) -> np.ndarray:
-    """float64 [size, size, 3] in 0..255: blotches of several sizes."""
-    random = np.random.default_rng(seed)
-    total = np.zeros((size, size, 3))
-    for cell in (2, 4, 8, 16):
-        noise = random.uniform(-1.0, 1.0, (size // cell, size // cell, 3))
-        total += np.repeat(np.repeat(noise, cell, axis=0), cell, axis=1) * np.sqrt(cell)
-    return np.clip(128.0 + 25.0 * total, 0.0, 255.0)
 
 
 def camera(angle: float, focal: float = 200.0, width: int = 240, height: int = 180) -> Camera:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import towns
 
 import igsr
 from igsr._internal.worker_processes import WorkerLostError
@@ -30,6 +29,7 @@ from igsr.blocks import (
 )
 from igsr.blocks.tasks import load_splats, save_splats
 from igsr.splats import joined, subset
+from igsr_lab.large_scenes import towns
 
 #: Fits of seconds.
 SETTINGS = {"steps": 120, "max_splats": 1200}

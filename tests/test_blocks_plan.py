@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import towns
 from PIL import Image
 
 import igsr
@@ -32,6 +31,7 @@ from igsr.capture.photos import PhotoHeader, Shot
 from igsr.capture.types import intrinsic_matrix
 from igsr.capture.undistort import Lens
 from igsr.fitting.photo_support import support_of
+from igsr_lab.large_scenes import towns
 
 
 @pytest.fixture(scope="module")

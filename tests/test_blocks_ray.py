@@ -7,11 +7,11 @@ import threading
 import time
 
 import pytest
-import towns
 
 import igsr
 from igsr._internal.ray_jobs import RayCluster
 from igsr.blocks import BlockOptions, fit_in_blocks
+from igsr_lab.large_scenes import towns
 
 pytestmark = pytest.mark.long
 

@@ -420,8 +420,8 @@ def test_missing_adapter_is_a_sentence(capture_path, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_study_few_photos(igsr_here, tmp_path, monkeypatch):
-    from igsr.study import scored_fits as fits
+def test_study_few_photos(lab_here, tmp_path, monkeypatch):
+    from igsr_lab.study import scored_fits as fits
 
     scenes.write_capture(tmp_path / "leaf", scenes.capture(views=10, size=16))
 
@@ -438,11 +438,11 @@ def test_study_few_photos(igsr_here, tmp_path, monkeypatch):
 
     monkeypatch.setattr(fits, "run_fit", quick)
     study = ["study", "few-photos", tmp_path, "--out", tmp_path / "out", "--scene", "leaf"]
-    done = igsr_here(*study, "--views", "3", "--preset", "default", "--seeds", "1")
+    done = lab_here(*study, "--views", "3", "--preset", "default", "--seeds", "1")
     assert done.returncode == 0, done.stderr
     assert "1 of 1: leaf views 3 default seed 0: 20.00 dB" in done.stderr
     assert "| leaf | 3 | default | 20.00 | 21.00 |" in done.stdout
-    refused(igsr_here(*study, "--views", "9"), "leaf", "has 8 photos", "not 9")
+    refused(lab_here(*study, "--views", "9"), "leaf", "has 8 photos", "not 9")
 
 
 def test_every_preset_can_be_named():

@@ -331,7 +331,7 @@ def test_lenses_are_undone(monkeypatch, photos, tmp_path, igsr_here):
     assert not np.array_equal(views[0].image, MADE.views[0].image)
 
 
-def test_study_of_poses(tmp_path, igsr_here, calls, monkeypatch):
+def test_study_of_poses(tmp_path, lab_here, calls, monkeypatch):
     turned = replace(
         MADE.views[0].camera, viewmat=np.diag([-1.0, -1.0, 1.0, 1.0]) @ MADE.views[0].camera.viewmat
     )
@@ -350,7 +350,7 @@ def test_study_of_poses(tmp_path, igsr_here, calls, monkeypatch):
 
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", registry.Entry(make, lambda options: True))
     study = ["study", "poses", tmp_path, "--out", tmp_path / "out", "--scene", "ring"]
-    done = igsr_here(*study, "--scene", "plain")
+    done = lab_here(*study, "--scene", "plain")
     assert done.returncode == 0, done.stderr
     assert "1 of 2: ring seed 0: 6 of 6 registered" in done.stderr
     # Five of fifteen pairs have the camera that stands on its head.
@@ -358,7 +358,7 @@ def test_study_of_poses(tmp_path, igsr_here, calls, monkeypatch):
     assert "| plain | 0 | 3 | 3 | - |" in done.stdout
     report = json.loads((tmp_path / "out/study.json").read_text())
     assert report["protocol"] == {"name": "poses", "estimator": "colmap", "seeds": 1}
-    foreign = igsr_here(*study, "--views", "3")
+    foreign = lab_here(*study, "--views", "3")
     assert foreign.returncode == 2
     assert "No such option: --views" in foreign.stderr
-    refused(igsr_here(*study, "--estimator", "magic"), "estimator must be")
+    refused(lab_here(*study, "--estimator", "magic"), "estimator must be")

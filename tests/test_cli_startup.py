@@ -61,7 +61,6 @@ def test_importing_igsr_imports_neither_numpy_nor_torch():
         "igsr._internal",
         "igsr._internal.extras",
         "igsr._internal.lazy_exports",
-        "igsr._internal.moved_modules",
         "igsr.errors",
     }
 
@@ -176,7 +175,7 @@ def test_threads_are_checked(count, igsr_here, places):
 
 @pytest.mark.parametrize(
     ("words", "wanted"),
-    [("igsr ", set(commands())), ("igsr export --f", {"--format"}), ("igsr study t", {"table2"})],
+    [("igsr ", set(commands())), ("igsr export --f", {"--format"}), ("igsr weights f", {"fetch"})],
 )
 def test_shells_complete_commands_and_options(words, wanted):
     done = subprocess.run(

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 
 import igsr
 from igsr.capture import Capture, View
+from igsr.capture.write_cameras import write_cameras
 from igsr.capture.write_colmap import write_colmap
 from igsr.cli import app
 from igsr.cli.view import write_for_viewer
-from igsr.report import write_cameras
 
 #: Stands in for splat-view: keeps its arguments and what --cameras names, which is gone afterwards,
 #: beside itself, and ends with 3.

@@ -21,12 +21,12 @@ from igsr.denoiser import (
     warping,
 )
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
-from igsr.denoiser.training import pairs
-from igsr.denoiser.training.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
-from igsr.denoiser.training.pair_renders import rendered_pairs
-from igsr.denoiser.training.pairs import FITTED_RENDERED, make_pairs
 from igsr.denoiser.warping import CONSIDERED
 from igsr.evaluation.scores import BLACK
+from igsr_lab.denoiser import pairs
+from igsr_lab.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
+from igsr_lab.denoiser.pair_renders import rendered_pairs
+from igsr_lab.denoiser.pairs import FITTED_RENDERED, make_pairs
 
 
 def camera(x=0.0, size=32, focal=40.0):
@@ -378,7 +378,7 @@ def test_bad_arguments_of_pairs(tmp_path, options, message):
 
 def test_pairs_can_be_imported_first():
     """Studies make pairs too; neither may need the other to be there already."""
-    subprocess.run([sys.executable, "-c", "import igsr.denoiser.training.pairs"], check=True)
+    subprocess.run([sys.executable, "-c", "import igsr_lab.denoiser.pairs"], check=True)
 
 
 def test_a_large_picture_is_looked_up_in_bands_of_rows(monkeypatch):

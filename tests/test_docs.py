@@ -35,18 +35,18 @@ from typer.main import get_command
 import igsr
 from igsr.cli import app
 from igsr.pose.colmap import Colmap
+from igsr_lab import __main__ as lab
 
 #: How many blocks of a page are not run. A further one is a decision, not an accident.
 NOT_RUN = {
     "docs/guides/blocks.md": 1,
     "README.md": 2,
     "docs/getting-started.md": 3,
-    "docs/guides/cameras.md": 5,
+    "docs/guides/cameras.md": 4,
     "docs/guides/denoising.md": 3,
     "docs/guides/installation.md": 2,
     "docs/guides/levels.md": 1,
     "docs/guides/smaller-scenes.md": 1,
-    "docs/guides/synthetic-captures.md": 1,
     "docs/guides/viewing.md": 5,
 }
 #: Values in place of those on the page, so that runs are short.
@@ -62,7 +62,7 @@ OF_OTHERS = {"--locked", "--path", "--release", "--nocapture", "--grid", "--wind
 #: Pages that tell of splat-view's options, and of options as they were.
 OTHER_OPTIONS = ("docs/guides/viewing.md", "CHANGELOG.md")
 #: Folders whose files name pages of docs/ in comments and messages.
-NAMING = ("py", "crates", "tests", "examples", "benches")
+NAMING = ("py", "crates", "tests", "examples")
 
 
 # ---- links -------------------------------------------------------------------------------------
@@ -114,9 +114,9 @@ def test_the_site_builds_without_a_warning_and_has_every_command(tmp_path: Path)
     )
     assert built.returncode == 0, built.stdout + built.stderr
     page = (tmp_path / "site" / "reference" / "command-line.html").read_text(encoding="utf-8")
-    for name in _commands_by_name():
+    for name in (name for name in _commands_by_name() if name.startswith("igsr")):
         assert f'id="{name.replace(" ", "-")}"' in page, name
-    assert (tmp_path / "site" / "reference" / "changelog.html").read_text().count("<li>") > 10
+    assert (tmp_path / "site" / "reference" / "changelog.html").read_text().count("<li>") > 5
 
 
 # ---- commands ----------------------------------------------------------------------------------
@@ -129,7 +129,15 @@ def _commands_by_name() -> dict[str, Any]:
     )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return dict(module.walk())
+    return {**dict(module.walk()), **dict(module.walk("lab", lab.app))}
+
+
+def _commands(block: Block) -> list[list[str]]:
+    """The commands of a block, with "lab" for "python -m igsr_lab"."""
+    return [
+        ["lab", *words[3:]] if words[:3] == ["python", "-m", "igsr_lab"] else words
+        for words in documentation.commands(block.code)
+    ]
 
 
 def _without_process_options(words: list[str]) -> list[str]:
@@ -141,7 +149,7 @@ def _without_process_options(words: list[str]) -> list[str]:
 
 
 def _named_command(words: list[str]) -> tuple[str, Any]:
-    """The command that words such as "igsr study table2 DATA" name, and its name."""
+    """The command that words such as "python -m igsr_lab study table2 DATA" name, and its name."""
     known = _commands_by_name()
     words = _without_process_options(words)
     name = " ".join(words[:2])
@@ -176,14 +184,15 @@ def _parse(words: list[str]) -> None:
             member, inner, rest = command.resolve_command(context, rest)
             below(inner, member, rest, context)
 
-    below(get_command(app), "igsr", words[1:], None)
+    below(get_command(app if words[0] == "igsr" else lab.app), words[0], words[1:], None)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != "CHANGELOG.md"])
 def test_commands_and_options_exist(page: str) -> None:
     """In blocks and in the text, also where they have placeholders."""
     wrong = []
-    spans = [span for span in documentation.inline_code(page) if span.startswith("igsr ")]
+    code = [span.replace("python -m igsr_lab", "lab") for span in documentation.inline_code(page)]
+    spans = [span for span in code if span.startswith(("igsr ", "lab "))]
     lines = [(page, span.replace("[", " ").replace("]", " ").split()) for span in spans]
     for block in documentation.blocks(page):
         if block.language == "sh":
@@ -192,13 +201,13 @@ def test_commands_and_options_exist(page: str) -> None:
             compile(block.code, block.place, "exec")
     targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for place, words in lines:
-        # "igsr denoise pairs|train|apply" and "igsr COMMAND" stand for several.
-        if words[0] == "igsr" and len(words) > 1 and re.fullmatch(r"[a-z-]+", words[1]):
+        # "python -m igsr_lab pairs|train|apply" and "igsr COMMAND" stand for several.
+        if words[0] in ("igsr", "lab") and len(words) > 1 and re.fullmatch(r"[a-z-]+", words[1]):
             wrong += [f"{place}: {option}" for option in _unknown_options(words)]
         elif words[0] == "make":
             wrong += [f"{place}: {w}" for w in words[1:] if "=" not in w and w not in targets]
         else:
-            files = [w for w in words if re.fullmatch(r"(tests|examples|benches)/\S+\.py", w)]
+            files = [w for w in words if re.fullmatch(r"(tests|examples)/\S+\.py", w)]
             wrong += [f"{place}: {file}" for file in files if not (ROOT / file).is_file()]
     assert not wrong
 
@@ -215,7 +224,7 @@ def test_options_in_the_text_exist(page: str) -> None:
 
 def _shell(block: Block) -> list[list[str]]:
     try:
-        return documentation.commands(block.code)
+        return _commands(block)
     except ValueError:
         assert block.not_run, f"{block.place} is no plain list of commands"
         return []
@@ -229,7 +238,7 @@ def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
     for block in told:
         print(f"{block.place} is not run: {block.not_run}")
         for words in _shell(block):
-            if words[0] == "igsr" and words[1] != "view":
+            if words[0] in ("igsr", "lab") and words[1] != "view":
                 _parse(words)
     counts = {page: sum(block.page == page for block in told) for page in TYPED}
     assert {page: count for page, count in counts.items() if count} == NOT_RUN
@@ -248,7 +257,7 @@ def test_code_blocks_run(page: str, world: Path, capsys: pytest.CaptureFixture[s
         elif block.language == "python":
             exec(compile(block.code, block.place, "exec"), names)
         else:
-            for words in documentation.commands(block.code):
+            for words in _commands(block):
                 _run(words, block.place)
         ran += 1
     capsys.readouterr()
@@ -256,14 +265,14 @@ def test_code_blocks_run(page: str, world: Path, capsys: pytest.CaptureFixture[s
 
 
 def _run(words: list[str], place: str) -> None:
-    if words[0] == "igsr":
+    if words[0] in ("igsr", "lab"):
         said = io.StringIO()
         with (
             contextlib.redirect_stdout(said),
             contextlib.redirect_stderr(said),
             pytest.raises(SystemExit) as ended,
         ):
-            app(_shortened(words, place))
+            (app if words[0] == "igsr" else lab.app)(_shortened(words, place))
         assert not ended.value.code, f"{place}: {' '.join(words)}\n{said.getvalue()}"
     elif words[0] == "python":
         before, sys.argv = sys.argv, _shortened(words, place)
@@ -279,7 +288,7 @@ def _shortened(words: list[str], place: str) -> list[str]:
     """The arguments of a command, with few steps and frames."""
     short = {**SHORT, "--rounds": "1"} if place.startswith(WITH_A_ROUND) else SHORT
     given = [short.get(before, word) for before, word in itertools.pairwise(words)]
-    if words[0] != "igsr":
+    if words[0] not in ("igsr", "lab"):
         return given
     options = _options(_named_command(words)[1])
     missing = [name for name in ADDED if name in options and name not in given]

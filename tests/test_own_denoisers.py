@@ -242,7 +242,7 @@ def run(*arguments):
 
 def test_denoise_apply_takes_a_name(module, scene):
     options = ("--capture", "ball", "--out", "clean", "--holdout", 4, "--backend", "cpu", "--json")
-    done = run("denoise", "apply", "ball.ply", *options, "--denoiser", "my_denoiser:make")
+    done = run("denoise", "ball.ply", *options, "--denoiser", "my_denoiser:make")
     assert done.exit_code == 0, done.output
     picture = np.asarray(Image.open(scene / "clean/photos/00.png")).astype(int)
     photo = np.asarray(Image.open(scene / "ball/photos/00.png")).astype(int)
@@ -252,7 +252,7 @@ def test_denoise_apply_takes_a_name(module, scene):
 @pytest.mark.parametrize("command", ["apply", "refine"])
 def test_the_commands_tell_what_is_wrong_with_a_name(module, scene, command):
     given = {
-        "apply": ("denoise", "apply", "ball.ply", "--capture", "ball", "--out", "out"),
+        "apply": ("denoise", "ball.ply", "--capture", "ball", "--out", "out"),
         "refine": ("refine", "ball", "--out", "out", "--steps", 5),
     }[command]
     done = run(*given, "--denoiser", "my_denoiser:fails", "--backend", "cpu")

@@ -19,9 +19,10 @@ from igsr.fitting.settings import FitSettings
 from igsr.geometry.camera_noise import Noise, noise_unit, noisy_view
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
-from igsr.study import noisy_poses, pose_noise
-from igsr.study.noisy_poses import CLEAN, PoseFit, compared, run_fit
-from igsr.study.noisy_poses import markdown as pose_table
+from igsr_lab.__main__ import app as lab_app
+from igsr_lab.study import noisy_poses, pose_noise
+from igsr_lab.study.noisy_poses import CLEAN, PoseFit, compared, run_fit
+from igsr_lab.study.noisy_poses import markdown as pose_table
 
 
 def turn(degrees, axis=(0.3, 1.0, -0.2)):
@@ -456,7 +457,7 @@ def test_options_of_other_protocols_are_refused(data, tmp_path):
         ("few-photos", ["--noise", "0.1"]),
     ]:
         result = CliRunner().invoke(
-            app, ["study", protocol, str(data), "--out", str(tmp_path), *option]
+            lab_app, ["study", protocol, str(data), "--out", str(tmp_path), *option]
         )
         assert result.exit_code == 2
         assert f"No such option: {option[0]}" in result.stderr

@@ -307,51 +307,6 @@ def test_photos_that_cannot_be_registered_are_named(tmp_path, monkeypatch):
 LONG = 100_000.0
 
 
-def as_igsr_0_1_left_it(out):
-    """Turn a folder into what igsr 0.1 leaves: the keys of its report, and its files' names."""
-    report = json.loads((out / "report.json").read_text())
-
-    def numbers(views):
-        names = {"mean_confidence": "mean_trust", "gain": "worth"}
-        return [{names.get(key, key): value for key, value in one.items()} for one in views]
-
-    rows = []
-    for row in report["rounds"]:
-        old = {key: row[key] for key in ("splats", "test", "accepted", "candidates") if key in row}
-        if "cross_validation" in row:
-            scores = row["cross_validation"]
-            old["left_out"] = {"before": scores["before"], "with": scores["after"]}
-            old |= {"views": numbers(row["selected"]), "passed": numbers(row["rejected"])}
-        rows.append(old)
-    stages = {"novel_views": "look", "cross_validate": "judge"}
-    old = {
-        "rounds": rows,
-        "stopped": "1 round is done",
-        "passed": [],
-        "seconds": {stages.get(stage, stage): LONG for stage in report["seconds"]},
-        "not_placed": report["not_registered"],
-    }
-    kept = ("photos", "splats", "seed", "version", "peak_memory_bytes", "backend", "device")
-    (out / "report.json").write_text(json.dumps(old | {key: report[key] for key in kept}))
-    for path in out.glob("rounds/*/view-*.confidence.png"):
-        path.rename(path.with_name(path.name.replace("confidence", "trust")))
-
-
-def test_a_folder_of_igsr_0_1_is_resumed_to_the_same_end(ball_photos, helped, tmp_path):
-    refine(ball_photos, 1, truthful, out=tmp_path)
-    as_igsr_0_1_left_it(tmp_path)
-    refined = refine(ball_photos, 2, truthful, out=tmp_path, resume=True)
-    assert same(refined.splats, helped[0].splats)
-    assert set(refined.seconds) == set(helped[0].seconds)
-    for stage in ("fit", "novel_views", "cross_validate", "refit", "test"):
-        assert refined.seconds[stage] >= LONG, "what was done before took time too"
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert report["format"] == 2
-    assert set(report["seconds"]) == set(refined.seconds)
-    files = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
-    assert files == {p.relative_to(helped[1]) for p in helped[1].rglob("*") if p.is_file()}
-
-
 def test_what_it_returns_shows_itself_in_a_notebook(helped):
     refined = helped[0]
     assert repr(refined).startswith("Refined(2 of 2 rounds accepted, ")

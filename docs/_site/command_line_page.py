@@ -19,18 +19,18 @@ def commands_markdown() -> str:
     return "\n".join(line for name, command in walk() for line in _section(name, command))
 
 
-def walk() -> Iterator[tuple[str, Any]]:
-    """Every command by its full name, such as "igsr denoise train"; groups before their members."""
+def walk(root: str = "igsr", app: Any = app) -> Iterator[tuple[str, Any]]:
+    """Every command by its full name, such as "igsr weights list"; groups before their members."""
 
     def below(name: str, command: Any) -> Iterator[tuple[str, Any]]:
-        if name != "igsr":
+        if name != root:
             yield name, command
         members = command.loaded() if isinstance(command, LazyGroup) else None
         for member, inner in (members or getattr(command, "commands", {})).items():
             if not inner.hidden:
                 yield from below(f"{name} {member}", inner)
 
-    return below("igsr", get_command(app))
+    return below(root, get_command(app))
 
 
 def _section(name: str, command: Any) -> list[str]:

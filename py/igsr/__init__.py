@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from igsr._internal import moved_modules
 from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
@@ -83,5 +82,3 @@ if not TYPE_CHECKING:
             "igsr.splats": ("Splats",),
         },
     )
-
-moved_modules.install()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import sys
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -19,21 +18,17 @@ from igsr._internal.extras import naming_extra
 def lazy_exports(
     package: str,
     homes: Mapping[str, Sequence[str]],
-    moved: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """The ``__getattr__`` and ``__dir__`` of a package.
 
     Args:
         package: its ``__name__``.
         homes: public names by the module that defines them.
-        moved: names of igsr 0.1 by the module that has them now; each use of one gives a
-            ``DeprecationWarning``.
 
     The ``__getattr__`` of ``igsr`` itself raises a ``MissingExtraError`` for a name whose module
     needs an extra that is not installed.
     """
     home_of = {name: module for module, names in homes.items() for name in names}
-    moved_to = {name: module for module, names in (moved or {}).items() for name in names}
 
     def find(name: str) -> Any:
         if name in home_of:
@@ -42,14 +37,6 @@ def lazy_exports(
                 value = getattr(importlib.import_module(home_of[name]), name)
             setattr(sys.modules[package], name, value)
             return value
-        if name in moved_to:
-            warnings.warn(
-                f"{package}.{name} is now {moved_to[name]}.{name}; the old name goes with the next "
-                "release.",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            return getattr(importlib.import_module(moved_to[name]), name)
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     def names() -> list[str]:

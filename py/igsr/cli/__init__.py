@@ -62,19 +62,10 @@ class _Commands(LazyGroup):
             "igsr.cli.convert", "convert_command", "Write a splat file in another format."
         ),
         "denoise": LazyCommand(
-            "igsr.cli.denoise", "app", "Make training pairs, train the denoiser, apply it."
+            "igsr.cli.denoise", "denoise_command", "Render the views of a scene and denoise them."
         ),
         "weights": LazyCommand(
             "igsr.cli.weights", "app", "List and download the weights of pose networks."
-        ),
-        "study": LazyCommand(
-            "igsr.cli.study", "app", "Run the experiments of the literature and of docs/."
-        ),
-        "synth": LazyCommand(
-            "igsr.cli.synth", "synth_command", "Make synthetic captures with exact cameras."
-        ),
-        "bench": LazyCommand(
-            "igsr.cli.bench", "bench_command", "Measure speed and error of the backends."
         ),
     }
 

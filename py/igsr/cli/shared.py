@@ -6,7 +6,6 @@ import contextlib
 import enum
 import logging
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, overload
@@ -130,12 +129,6 @@ SeedOption = Annotated[
     int, typer.Option("--seed", help="Random seed. Results are deterministic for a given seed.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
-JobsOption = Annotated[
-    int, typer.Option("--jobs", help="How many fits run at the same time; they share the cores.")
-]
-RayOption = Annotated[
-    bool, typer.Option("--ray", help="Work on a Ray cluster (pip install 'igsr\\[ray]').")
-]
 ExampleOption = Annotated[
     bool,
     typer.Option(
@@ -204,24 +197,6 @@ def load(path: Path, holdout: int | None, max_size: int | None = None) -> Captur
 
     capture = load_capture(path, max_size)
     return capture if holdout is None else capture.with_holdout(holdout)
-
-
-class TimeLeft:
-    """An estimate of the time left, from the runs done by this process.
-
-    Runs that were finished before it started do not count.
-    """
-
-    def __init__(self) -> None:
-        self._started = time.monotonic()
-        self._before: int | None = None
-
-    def __call__(self, done: int, total: int) -> str:
-        """The time left in words, once ``done`` of ``total`` runs are finished."""
-        if self._before is None:
-            self._before = done - 1
-        each = (time.monotonic() - self._started) / (done - self._before)
-        return f"about {each * (total - done) / 60.0:.0f} min left"
 
 
 def error_console() -> Console:

@@ -2,7 +2,7 @@
 
 ``denoise`` cleans a render and gives a confidence for each pixel. It looks at what the rasterizer
 knows of the render (``render_buffers``) and at the photos, warped to its camera
-(``photo_sources``). Here is inference only; ``igsr.denoiser.training`` makes the weights.
+(``photo_sources``). Here is inference only; ``igsr_lab.denoiser`` makes the weights.
 
 Names are imported when they are first used (PEP 562), so that command lines load no torch.
 """

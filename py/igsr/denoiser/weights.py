@@ -55,7 +55,7 @@ def load_network(path: str | os.PathLike[str] | None = None) -> DenoiserNetwork:
     if path is None and not SHIPPED.is_file():
         raise IgsrError(
             "this igsr has no weights of its own for the denoiser; give --weights FILE "
-            "(denoiser= in Python), which igsr denoise train makes (docs/guides/denoising.md)"
+            "(denoiser= in Python), which python -m igsr_lab train makes (docs/guides/denoising.md)"
         )
     path = SHIPPED if path is None else Path(path)
     try:

@@ -13,10 +13,4 @@ if not TYPE_CHECKING:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {},
-        moved={
-            "igsr.evaluation.scores": (
-                *("BLACK", "WHITE", "check_masks", "default_background", "default_split"),
-                *("known_background", "over_background", "views_of_split"),
-            )
-        },
     )

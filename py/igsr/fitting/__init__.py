@@ -38,8 +38,4 @@ if not TYPE_CHECKING:
             "igsr.fitting.fit_capture": ("fit", "fit_with_cameras"),
             "igsr.fitting.settings": ("FitSettings",),
         },
-        moved={
-            "igsr.fitting.fitter": ("check_fits",),
-            "igsr.fitting.settings": ("check_whole_number",),
-        },
     )

@@ -12,10 +12,8 @@ import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from igsr import _core
-from igsr._internal.deprecation import renamed_keywords, renamed_names
 from igsr._internal.progress_bar import progress_or_bar
 from igsr.capture import Capture
 from igsr.capture.photo_checks import check_photos
@@ -37,7 +35,6 @@ from igsr.refinement.stages import NOVEL_VIEWS_WORK, Propose, Reconstruction, Se
 ENOUGH_PHOTOS = 30.0
 
 
-@renamed_keywords(look="propose", choose="select", judge="cross_validate")
 def refine(
     photos: str | os.PathLike[str] | Capture,
     rounds: int | str = AUTO,
@@ -215,7 +212,3 @@ def _check_views(capture: Capture) -> None:
         warnings.simplefilter("ignore")  # the first fit gives the warnings
         check_photos(capture.train_views)
     check_masks(capture.test_views)
-
-
-if not TYPE_CHECKING:
-    __getattr__ = renamed_names(__name__, Look="Propose", Choose="Select")

@@ -10,13 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.choices import Backend
-from igsr._internal.deprecation import renamed_names
 from igsr.capture import Camera
 from igsr.rendering.renders import render
 from igsr.splats import Splats
@@ -223,9 +221,3 @@ def _is_outside(splats: Splats, camera: Camera, distance: float, backend: Backen
     seen = render(splats, _small(camera), backend=backend)
     near = (seen.alpha > SURFACE_ALPHA) & (seen.expected_depth < CLOSE * distance)
     return bool(near.mean() <= CLOSE_SHARE and (seen.alpha > SURFACE_ALPHA).any())
-
-
-if not TYPE_CHECKING:
-    __getattr__ = renamed_names(
-        __name__, UnseenView="NovelView", unseen_views="novel_views", SEEN="LEAST_STEP"
-    )

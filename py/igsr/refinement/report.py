@@ -25,7 +25,7 @@ from igsr.evaluation.quick_scores import mean_of, quick_views, train_photos, tra
 from igsr.evaluation.scores import ScoredView, default_background
 from igsr.pose import not_placed
 from igsr.refinement.html_page import write_page
-from igsr.refinement.results import OLD_STAGES, Refined, Round, Stage
+from igsr.refinement.results import Refined, Round, Stage
 from igsr.refinement.selection import Candidate, Rejected
 from igsr.refinement.settings import RefineSettings
 from igsr.splats import Splats
@@ -124,14 +124,12 @@ def report_of(
 def seconds_so_far(out: Path) -> dict[Stage, float]:
     """What each stage took by the report in ``out``, of format 1 or 2; none if it has no such."""
     stages: tuple[Stage, ...] = get_args(Stage)
-    old_names = {new: old for old, new in OLD_STAGES.items()}
     seconds: dict[Stage, float] = {}
     try:
         found = json.loads((out / "report.json").read_text(encoding="utf-8"))["seconds"]
         for stage in stages:
-            name = stage if stage in found else old_names.get(stage, stage)
-            if name in found:
-                seconds[stage] = float(found[name])
+            if stage in found:
+                seconds[stage] = float(found[stage])
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return {}
     return {stage: value for stage, value in seconds.items() if 0.0 <= value < math.inf}

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.array_equality import ArrayEquality
-from igsr._internal.deprecation import renamed_attributes
 from igsr._internal.notebook import NotebookPicture
 from igsr.capture import Capture
 from igsr.evaluation.scores import default_background
@@ -22,8 +21,6 @@ from igsr.splats import Splats
 #: What a refinement does, in the order of a round: find cameras; fit the photos; cross-validate;
 #: render, denoise and select novel views; fit the photos and novel views; score the test views.
 Stage = Literal["pose", "fit", "cross_validate", "novel_views", "refit", "test"]
-#: Stages by the names that reports of format 1 and ``RefineProgress.doing`` have for them.
-OLD_STAGES: dict[str, Stage] = {"look": "novel_views", "judge": "cross_validate"}
 #: Mean scores by name ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim"); None where a score
 #: is not defined.
 Scores = dict[str, float | None]
@@ -74,11 +71,6 @@ class Stop:
         }[self.reason]
 
 
-def _old_stage(stage: Stage) -> str:
-    return next((old for old, new in OLD_STAGES.items() if new == stage), stage)
-
-
-@renamed_attributes(doing=("stage", _old_stage))
 @dataclass(frozen=True)
 class RefineProgress:
     """Where a refinement stands.
@@ -116,12 +108,6 @@ class HeldOutView:
     psnr_after: float
 
 
-@renamed_attributes(
-    chosen="selected",
-    passed="rejected",
-    before="validation_before",
-    left_out="validation_after",
-)
 @dataclass(frozen=True, eq=False)
 class Round:
     """What one round did.
@@ -172,11 +158,6 @@ class Round:
         return text + ("more than chance." if abs(mean) > 2.0 * error else "it may be chance.")
 
 
-def _old_message(stop: Stop | None) -> str:
-    return "" if stop is None else str(stop)
-
-
-@renamed_attributes(stopped=("stop", _old_message), passed="rejected")
 @dataclass(frozen=True, eq=False, repr=False)
 class Refined(ArrayEquality, NotebookPicture):
     """What ``refine`` returns.

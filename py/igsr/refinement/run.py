@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from igsr._internal.atomic_write import remove_unfinished
-from igsr._internal.deprecation import RenamedKeys
 from igsr._internal.part_usage import Meter, Parts
 from igsr._internal.progress_bar import BarState
 from igsr.capture import Capture, load_capture
@@ -24,7 +23,7 @@ from igsr.fitting.followed_run import FollowedRun
 from igsr.pose import check_enough_placed, find_cameras, kept_capture, photos_at
 from igsr.pose.cache import read_usage
 from igsr.refinement.report import parts_so_far, write_refinement
-from igsr.refinement.results import OLD_STAGES, Refined, RefineProgress, Stage
+from igsr.refinement.results import Refined, RefineProgress, Stage
 from igsr.refinement.settings import RefineSettings
 
 logger = logging.getLogger(__name__)
@@ -182,7 +181,7 @@ class RefineRun:
         """
         # As the report keeps them: what a resumed run reads there never counts as less.
         seconds = {name: part["seconds"] for name, part in self._parts.plain().items()}
-        refined = replace(refined, seconds=RenamedKeys(seconds, OLD_STAGES))
+        refined = replace(refined, seconds=seconds)
         if self._out is not None and (self._has_news or refined.stop is not None):
             cameras = read_usage(refined.capture.path)
             parts = {} if cameras is None else {"cameras": cameras}

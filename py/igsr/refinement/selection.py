@@ -9,12 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from igsr._internal.deprecation import renamed_attributes, renamed_names
 from igsr.denoiser import Buffers, Denoiser, Source
 from igsr.denoiser.calibration import (
     Calibration,
@@ -36,9 +34,6 @@ LEAST_CONFIDENCE = 0.15
 LEAST_GAIN = 0.0005
 
 
-@renamed_attributes(
-    picture="denoised", trust="confidence", worth="gain", mean_trust="mean_confidence"
-)
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A novel view, rendered and denoised, that may be added.
@@ -74,7 +69,6 @@ class Candidate:
         return float(self.confidence.mean())
 
 
-@renamed_attributes(worth="gain", mean_trust="mean_confidence")
 @dataclass(frozen=True, eq=False)
 class Rejected:
     """A candidate that was not selected, without its pictures."""
@@ -164,16 +158,3 @@ def select_views(candidates: Sequence[Candidate], count: int) -> list[Candidate]
 
 def _to_uint8(colors: Float32) -> npt.NDArray[np.uint8]:
     return np.rint(255.0 * colors).astype(np.uint8)
-
-
-if not TYPE_CHECKING:
-    __getattr__ = renamed_names(
-        __name__,
-        LEAST_TRUST="LEAST_CONFIDENCE",
-        LEAST_WORTH="LEAST_GAIN",
-        Passed="Rejected",
-        passed="rejected",
-        candidate="denoised_candidate",
-        trust_of="confidence_weights",
-        select="select_views",
-    )

@@ -13,5 +13,4 @@ if not TYPE_CHECKING:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {},
-        moved={"igsr.rendering.renders": ("intrinsics_of", "project", "viewmat_about")},
     )

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from igsr.errors import IgsrError
-from igsr.pose.da3.config import RESOLUTION, SIZES, TRAINED, NetworkConfig, resolution_of, size_of
+from igsr.pose.da3.config import SIZES, NetworkConfig, size_of
 from igsr.pose.da3.head import RAY_LEVEL, SHARED_NORM
 from igsr.pose.da3.network import Da3Network
 from igsr.pose.huggingface_cache import cached_snapshots
@@ -29,7 +29,7 @@ VARIABLE = "IGSR_DA3"
 #: The published models, as huggingface names them, the better first.
 PUBLISHED = ("depth-anything/DA3-BASE", "depth-anything/DA3-SMALL")
 #: Of the published models, and what is said of one that was trained by igsr.
-LICENCE, OWN = "Apache-2.0", "trained by igsr, so its maker's"
+LICENCE = "Apache-2.0"
 #: The file in a folder of a checkpoint.
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
 #: What all keys begin with.
@@ -55,7 +55,7 @@ class Checkpoint:
 
     Attributes:
         name: one of ``SIZES``.
-        config: its sizes, and the resolution that it was trained for.
+        config: its sizes.
         weights: float32, exactly the keys and shapes of a ``Da3Network`` of that size.
         unknown: keys of the file that no part of the network has, sorted; they were ignored.
     """
@@ -68,12 +68,8 @@ class Checkpoint:
 
 def stated(config: NetworkConfig) -> dict[str, str]:
     """The "name" of a network of one of the ``SIZES``, and the "licence" of its weights."""
-    name = next(
-        name
-        for name, size in SIZES.items()
-        if replace(size, resolution=config.resolution) == config
-    )
-    return {"name": name, "licence": OWN if name == TRAINED else LICENCE}
+    name = next(name for name, size in SIZES.items() if size == config)
+    return {"name": name, "licence": LICENCE}
 
 
 def find_checkpoint(named: str | Path | None = None) -> Path | None:
@@ -168,9 +164,9 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         with safe_open(path, framework="pt", device="cpu") as file:
             # Keys are read by shape before anything is read whole.
             shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
-            name, resolution = beside or (_size_of_shapes(path, shapes), RESOLUTION)
+            name = beside or _size_of_shapes(path, shapes)
             _check_larger(path, shapes)
-            config = replace(SIZES[name], resolution=resolution)
+            config = SIZES[name]
             weights, unknown = read_weights(path, file, shapes, config)
     except IgsrError:
         raise
@@ -245,8 +241,8 @@ def _weight(
     return value
 
 
-def _size_beside(path: Path) -> tuple[str, int] | None:
-    """Name and resolution by the ``config.json`` beside a checkpoint; None where there is none."""
+def _size_beside(path: Path) -> str | None:
+    """Name by the ``config.json`` beside a checkpoint; None where there is none."""
     beside = path.parent / CONFIG
     try:
         if not beside.exists():
@@ -256,7 +252,7 @@ def _size_beside(path: Path) -> tuple[str, int] | None:
         content = json.loads(beside.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise IgsrError(f"{beside} cannot be read ({error}); download it again") from error
-    return size_of(content, str(beside)), resolution_of(content, str(beside))
+    return size_of(content, str(beside))
 
 
 def _size_of_shapes(path: Path, shapes: dict[str, tuple[int, ...]]) -> str:

@@ -15,8 +15,6 @@ from igsr.errors import IgsrError
 PATCH = 14
 #: Pixels of the longer side of photos as the published sizes see them.
 RESOLUTION = 504
-#: The largest that a network may ask for: what its passes take grows with the fourth power.
-MOST_RESOLUTION = 2016
 #: Tokens along a side of the stored position embedding: photos of 518 pixels.
 POSITIONS = 37
 #: Blocks of the backbone, and the first of those that have rotary positions, normalised queries and
@@ -48,7 +46,6 @@ class NetworkConfig:
         features: channels in which the head joins its levels.
         out_channels: channels of the head's four levels, the finest first.
         camera_heads: attention heads of the camera encoder.
-        resolution: pixels of the longer side of photos as it sees them; of no weight's shape.
 
     Raises:
         IgsrError: a size is no whole number of at least 1, or does not divide into heads; or the
@@ -60,7 +57,6 @@ class NetworkConfig:
     features: int
     out_channels: tuple[int, int, int, int]
     camera_heads: int = 16
-    resolution: int = RESOLUTION
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -82,35 +78,14 @@ class NetworkConfig:
                 f"embed_dim is {self.embed_dim}, heads {self.heads} and camera_heads "
                 f"{self.camera_heads}; give a multiple of four channels to each of the heads"
             )
-        checked_resolution("resolution", self.resolution)
-
-
-def checked_resolution(name: str, value: Any) -> int:
-    """A network's resolution.
-
-    Args:
-        name: what messages call it.
-        value: of any type.
-
-    Raises:
-        IgsrError: it is no multiple of 14 from 14 to 2016.
-    """
-    if type(value) is not int or value % PATCH or not PATCH <= value <= MOST_RESOLUTION:
-        raise IgsrError(
-            f"{name} is {value!r}; give a multiple of {PATCH} from {PATCH} to {MOST_RESOLUTION}"
-        )
-    return value
 
 
 SMALL = NetworkConfig(embed_dim=384, heads=6, features=64, out_channels=(48, 96, 192, 384))
 BASE = NetworkConfig(embed_dim=768, heads=12, features=128, out_channels=(96, 192, 384, 768))
-#: The size that ``igsr weights train`` trains.
-TINY = NetworkConfig(embed_dim=128, heads=2, features=32, out_channels=(24, 48, 96, 192))
-TRAINED = "igsr-tiny"
 #: The sizes that are implemented, under the names that checkpoints give themselves.
-SIZES = {"da3-small": SMALL, "da3-base": BASE, TRAINED: TINY}
+SIZES = {"da3-small": SMALL, "da3-base": BASE}
 #: And under the names that the backbone has in a ``config.json``.
-_NET_NAMES = {"vits": "da3-small", "vitb": "da3-base", TRAINED: TRAINED}
+_NET_NAMES = {"vits": "da3-small", "vitb": "da3-base"}
 
 
 def size_of(content: Any, source: str) -> str:
@@ -152,30 +127,6 @@ def size_of(content: Any, source: str) -> str:
             if found != value:
                 raise IgsrError(_another(source, f"{part}.{name}", found, repr(value)))
     return size
-
-
-def resolution_of(content: Mapping[str, Any], source: str) -> int:
-    """The resolution of the network that a ``config.json`` describes.
-
-    Published networks are used at the one that they were trained for; one that was trained here
-    says its own.
-
-    Args:
-        content, source: as ``size_of`` takes them, and has found right.
-
-    Raises:
-        IgsrError: it is no multiple of 14 from 14 to 2016.
-    """
-    if size_of(content, source) != TRAINED:
-        return RESOLUTION
-    return checked_resolution(f"{source}: its resolution", content.get("resolution", RESOLUTION))
-
-
-def description(config: NetworkConfig) -> dict[str, Any]:
-    """What ``size_of`` and ``resolution_of`` read of a network of the size ``TRAINED``."""
-    parts = _wanted(config)
-    parts["net"]["name"] = TRAINED
-    return {"model_name": TRAINED, "config": parts, "resolution": config.resolution}
 
 
 def _wanted(config: NetworkConfig) -> dict[str, dict[str, Any]]:

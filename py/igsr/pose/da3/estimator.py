@@ -20,7 +20,6 @@ from igsr.pose.colmap.matcher import Matcher
 from igsr.pose.colmap.named_matchers import SIFT, matcher_of
 from igsr.pose.da3.chunks import chunks_of, joined
 from igsr.pose.da3.confidence import sure_pixels, trusted_depths
-from igsr.pose.da3.config import TRAINED
 from igsr.pose.da3.passes import SOURCES, Predictor
 from igsr.pose.estimate import Estimate
 from igsr.pose.fused_points import fused_points, joined_points
@@ -131,12 +130,6 @@ class Da3:
                 )
         found = self._estimate(photos, shown, same_as, aligned, lost, evidence)
         found.weights = weights
-        if weights is not None and weights["name"] == TRAINED:
-            found.warnings.append(
-                "The network was trained by 'igsr weights train': the log.jsonl beside it says how "
-                "far off it is on captures that it never saw, and deviations of cameras that rest "
-                "on it are those of published networks, not its own"
-            )
         return found
 
     def _estimate(

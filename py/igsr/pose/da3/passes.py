@@ -16,7 +16,7 @@ from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.da3.cameras import cameras_of_rays, decode_pose
-from igsr.pose.da3.config import PATCH, RESOLUTION, NetworkConfig
+from igsr.pose.da3.config import PATCH, NetworkConfig
 from igsr.pose.da3.network import Da3Network, ViewPrediction
 from igsr.pose.da3.preprocessing import Resampling, network_input, resampling_of
 from igsr.pose.network_arrays import float32_array, half_precision
@@ -139,7 +139,7 @@ class Da3Predictor:
         ]
 
     def _resamplings(self, photos: Sequence[Photo]) -> list[Resampling]:
-        return resamplings_of(photos, self.network.config.resolution)
+        return resamplings_of(photos)
 
     def _aligned(
         self, photo: Photo, resampling: Resampling, view: ViewPrediction, seed: int
@@ -173,7 +173,7 @@ class Da3Predictor:
         return AlignedPhoto(Camera(viewmat, in_photo, width, height), grid, depth, confidence)
 
 
-def resamplings_of(photos: Sequence[Photo], resolution: int = RESOLUTION) -> list[Resampling]:
+def resamplings_of(photos: Sequence[Photo]) -> list[Resampling]:
     """How the photos of a scene come to the sizes that the network sees.
 
     Photos whose size differs from the commonest by a patch at most are brought to that: photos of
@@ -181,7 +181,6 @@ def resamplings_of(photos: Sequence[Photo], resolution: int = RESOLUTION) -> lis
 
     Args:
         photos: of any sizes.
-        resolution: of the network.
 
     Raises:
         IgsrError: a photo is too narrow.
@@ -190,7 +189,7 @@ def resamplings_of(photos: Sequence[Photo], resolution: int = RESOLUTION) -> lis
     for photo in photos:
         height, width = photo.image.shape[:2]
         try:
-            resamplings.append(resampling_of(width, height, resolution))
+            resamplings.append(resampling_of(width, height))
         except IgsrError as error:
             raise IgsrError(f"{photo.name}: {error}") from error
     sizes = Counter((one.width, one.height) for one in resamplings)

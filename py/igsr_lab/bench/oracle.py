@@ -1,0 +1,210 @@
+"""The f64 reference, made fast enough to judge whole workloads, without changing its results.
+
+The reference walks all splats at every pixel. Here the picture is cut into crops, and each crop is
+given only the splats whose box meets it: beyond its ``radii`` a splat is under the alpha threshold
+and contributes nothing, so leaving it out changes no sum (but for the order of the f64 additions of
+gradients over crops). Crops run on all cores.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr import _core
+from igsr_lab.bench.scenes import Arrays, Scene
+
+#: Side of a crop in pixels: small, since its pixels walk all of its splats.
+CROP = 16
+
+Float64 = npt.NDArray[np.float64]
+
+#: What a pair of alphas may differ by, relative to the threshold, where implementations are given
+#: the same 2D splats, and where they project for themselves (docs/how-it-works/numerics.md).
+ALPHA_BAND_2D = 1e-4
+ALPHA_BAND_3D = 2e-2
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A rectangle of pixels and the splats that may touch it."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    ids: npt.NDArray[np.intp]
+
+    def of(self, picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """This part of an array [H, W, ...]."""
+        return picture[self.top : self.top + self.height, self.left : self.left + self.width]
+
+
+def crops(projected: Arrays, width: int, height: int) -> list[Crop]:
+    """The whole picture in crops, with the visible splats that may touch each."""
+    means2d, radii = projected["means2d"], projected["radii"]
+    # A pixel of margin against the rounding of f32 radii.
+    low, high = means2d - radii - 1.0, means2d + radii + 1.0
+    visible = (radii > 0).all(axis=1)
+    result = []
+    for top in range(0, height, CROP):
+        rows = np.flatnonzero(visible & (high[:, 1] >= top) & (low[:, 1] <= top + CROP))
+        row_low, row_high = low[rows, 0], high[rows, 0]
+        for left in range(0, width, CROP):
+            ids = rows[(row_high >= left) & (row_low <= left + CROP)]
+            size = (min(CROP, width - left), min(CROP, height - top))
+            result.append(Crop(left, top, *size, ids))
+    return result
+
+
+def _subset(projected: Arrays, crop: Crop) -> Arrays:
+    part = {name: np.ascontiguousarray(array[crop.ids]) for name, array in projected.items()}
+    part["means2d"] = part["means2d"] - (crop.left, crop.top)
+    return part
+
+
+def _on_all_cores(work: Callable[[Crop], Any], items: Iterable[Crop]) -> list[Any]:
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return list(pool.map(work, items))
+
+
+def picture(
+    projected: Arrays, chosen: list[Crop], shape: tuple[int, int], background: Any
+) -> Arrays:
+    """The f64 color, alpha, depth and transmittance of ``projected``; NaN outside the crops."""
+    height, width = shape
+    background = np.asarray(background, dtype=np.float64)
+
+    def work(crop: Crop) -> Arrays:
+        return _core.rasterize(
+            _subset(projected, crop),
+            width=crop.width,
+            height=crop.height,
+            background=background,
+            backend="reference",
+        )
+
+    image: Arrays = {
+        "color": np.full((height, width, 3), np.nan),
+        **{n: np.full((height, width), np.nan) for n in ("alpha", "depth", "transmittance")},
+    }
+    for crop, part in zip(chosen, _on_all_cores(work, chosen), strict=True):
+        for name, whole in image.items():
+            crop.of(whole)[...] = part[name]
+    return image
+
+
+def gradients2d(
+    projected: Arrays, chosen: list[Crop], image: Arrays, v_image: Arrays, background: Any
+) -> Arrays:
+    """The f64 gradients of the 2D splats; what lies outside the crops has no part in them."""
+    background = np.asarray(background, dtype=np.float64)
+
+    def work(crop: Crop) -> Arrays:
+        return _core.rasterize_backward(
+            _subset(projected, crop),
+            {name: np.ascontiguousarray(crop.of(whole)) for name, whole in image.items()},
+            **{
+                name: np.ascontiguousarray(crop.of(whole), dtype=np.float64)
+                for name, whole in v_image.items()
+            },
+            background=background,
+            absolute=False,
+            backend="reference",
+        )
+
+    count = len(projected["depths"])
+    total: Arrays = {}
+    for crop, part in zip(chosen, _on_all_cores(work, chosen), strict=True):
+        for name, values in part.items():
+            if name == "v_background":
+                total[name] = total.get(name, 0.0) + values
+                continue
+            if name not in total:
+                total[name] = np.zeros((count, *values.shape[1:]))
+            total[name][crop.ids] += values
+    return total
+
+
+def band(projected: Arrays, chosen: list[Crop], shape: tuple[int, int], alpha_band: float) -> Any:
+    """bool [H, W]: pixels at which an f32 implementation may rightly differ."""
+
+    def work(crop: Crop) -> npt.NDArray[np.uint8]:
+        return _core.band_pixels(
+            _subset(projected, crop), width=crop.width, height=crop.height, alpha_band=alpha_band
+        )
+
+    result = np.zeros(shape, dtype=bool)
+    for crop, part in zip(chosen, _on_all_cores(work, chosen), strict=True):
+        crop.of(result)[...] = part != 0
+    return result
+
+
+@dataclass(frozen=True)
+class PairCounts:
+    """How much work a set of 2D splats is.
+
+    Attributes:
+        tiles: (splat, 16x16 tile) pairs with at least one pixel at or above the alpha threshold.
+        pixels: (splat, pixel) pairs at or above it.
+        blended: those of them that come before their pixel stops.
+    """
+
+    tiles: int
+    pixels: int
+    blended: int
+
+
+def pair_counts(projected: Arrays, width: int, height: int) -> PairCounts:
+    """Count pairs in f64, without the renderer."""
+    order = np.argsort(projected["depths"].astype(np.float32), kind="stable")
+    rank = np.empty(len(order), dtype=np.intp)
+    rank[order] = np.arange(len(order))
+
+    def work(crop: Crop) -> tuple[int, int, int]:
+        ids = crop.ids[np.argsort(rank[crop.ids])]
+        p, q, r = (projected["factors"][ids, k].astype(np.float64)[:, None, None] for k in range(3))
+        mean = projected["means2d"][ids].astype(np.float64)
+        dx = crop.left + 0.5 + np.arange(crop.width) - mean[:, :1]
+        dy = crop.top + 0.5 + np.arange(crop.height) - mean[:, 1:]
+        u = p * dx[:, None, :] + q * dy[:, :, None]
+        v = r * dy[:, :, None]
+        alpha = projected["opacities"][ids].astype(np.float64)[:, None, None] * np.exp(
+            -0.5 * (u * u + v * v)
+        )
+        seen = alpha >= _core.ALPHA_MIN
+        through = np.cumprod(np.where(seen, 1.0 - np.minimum(alpha, _core.ALPHA_MAX), 1.0), axis=0)
+        blended = seen & (through >= _core.TRANSMITTANCE_MIN)
+        return int(seen.any(axis=(1, 2)).sum()), int(seen.sum()), int(blended.sum())
+
+    counts = _on_all_cores(work, crops(projected, width, height))
+    return PairCounts(*(sum(column) for column in zip(*counts, strict=True)))
+
+
+def project(scene: Scene, order_of: Arrays) -> Arrays:
+    """The scene's 2D splats in f64, with the depths of the backend's own f32 ``order_of``.
+
+    Splats at equal depth up to rounding have no right order, and to swap two opaque ones changes
+    pictures and gradients by much: the reference takes the backend's order, and nothing else.
+    """
+    exact = _core.project(*scene.arrays(np.float64), **scene.options(), backend="reference")
+    seen = (order_of["radii"] > 0).all(axis=1) & (exact["radii"] > 0).all(axis=1)
+    exact["depths"] = np.where(seen, order_of["depths"].astype(np.float64), exact["depths"])
+    return exact
+
+
+def gradients3d(scene: Scene, projected: Arrays, v_projected: Arrays) -> Arrays:
+    """The f64 gradients of splats and camera."""
+    return _core.project_backward(
+        *scene.arrays(np.float64),
+        projected,
+        v_projected,
+        **scene.options(),
+        backend="reference",
+    )

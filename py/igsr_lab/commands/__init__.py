@@ -1,0 +1,1 @@
+"""The commands of ``python -m igsr_lab``, a file each."""

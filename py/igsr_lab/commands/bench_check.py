@@ -1,0 +1,57 @@
+"""``python -m igsr_lab bench-check``: compare this build's speed with that of a commit.
+
+The commit is built in a temporary git worktree. The two builds take turns in one run of ``bench
+--compare``.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ROOT = Path(__file__).resolve().parents[3]
+#: Percent.
+SLOWER = 10
+
+
+def build_of(commit: str, folder: Path) -> Path:
+    """The compiled module of a commit, built with its own sources."""
+    tree = folder / "tree"
+    target = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "bench-check"
+    subprocess.run(["git", "worktree", "add", "--detach", tree, commit], cwd=ROOT, check=True)
+    try:
+        subprocess.run(
+            ["cargo", "build", "--release", "--locked", "-p", "pyo3_bindings"],
+            cwd=tree,
+            env={**os.environ, "CARGO_TARGET_DIR": str(target), "PYO3_PYTHON": sys.executable},
+            check=True,
+        )
+    finally:
+        subprocess.run(["git", "worktree", "remove", "--force", tree], cwd=ROOT, check=True)
+    built = next(
+        target / "release" / name
+        for name in ("lib_core.so", "lib_core.dylib")
+        if (target / "release" / name).is_file()
+    )
+    # Python loads a module by the end of its name.
+    return Path(shutil.copy(built, folder / "_core.abi3.so"))
+
+
+def bench_check_command(
+    commit: Annotated[
+        str, typer.Argument(metavar="COMMIT", help="The commit to compare with.")
+    ] = "HEAD~1",
+) -> None:
+    """Compare this build with that of COMMIT; the exit status is 1 if a row takes 10 % longer."""
+    with tempfile.TemporaryDirectory() as folder:
+        old = build_of(commit, Path(folder))
+        words = ["bench", "--backend", "cpu", "--compare", str(old), "--fail-above", str(SLOWER)]
+        done = subprocess.run([sys.executable, "-m", "igsr_lab", *words], check=False)
+    raise typer.Exit(done.returncode)

@@ -1,0 +1,1 @@
+"""Records the results of small seeded runs, and checks that a change leaves their bits."""

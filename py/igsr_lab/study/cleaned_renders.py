@@ -1,0 +1,208 @@
+"""What a denoiser makes of the renders of one fit, and what that scores."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.denoiser.cleaning import NetworkDenoiser
+from igsr.denoiser.weights import load_network
+from igsr.evaluation.metrics import PSNR_CAP, score
+from igsr_lab.denoiser.pair_files import Pairs, read_pairs, unpacked
+from igsr_lab.denoiser.perceptual_distance import (
+    SMALLEST_SIDE,
+    Distance,
+    SqueezeNetDistance,
+    picture_distance,
+)
+
+Float64 = npt.NDArray[np.float64]
+Picture = npt.NDArray[np.uint8]
+
+#: Scores by name; None where there is none, as where masks hide all.
+Scores = dict[str, float | None]
+#: Scores of the table; the lower is the better in the last two. "best_quarter" is the PSNR of the
+#: quarter of each view's pixels that were nearest to the truth before.
+SCORES = ("psnr", "ssim", "ms_ssim", "best_quarter", "flip", "perceptual")
+#: Edges of the confidence's bins.
+CONFIDENCE_EDGES = np.linspace(0.0, 1.0, 21)
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """One denoiser on the renders of one fit.
+
+    Attributes:
+        pairs: the renders' file.
+        weights: the denoiser's file; None scores the renders as they are.
+        features: SqueezeNet's arrays, for "perceptual"; None leaves that out.
+    """
+
+    pairs: str
+    weights: str | None
+    features: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class Confidence:
+    """Predicted confidence beside the error that remains, over the renders of one fit.
+
+    Attributes:
+        pixels: [20], pixels by bins of ``CONFIDENCE_EDGES``.
+        confidence: [20], sum of the confidence of those pixels.
+        error: [20], sum of the absolute error of their colours, in [0, 1].
+        mean_error: mean over views of the mean absolute error.
+        weighted_error: the same, each pixel weighted by its confidence.
+    """
+
+    pixels: Float64
+    confidence: Float64
+    error: Float64
+    mean_error: float
+    weighted_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """What one denoiser scores on the renders of one fit.
+
+    Attributes:
+        scores: means over views, by ``SCORES``.
+        confidence: None for renders as they are.
+    """
+
+    scores: Scores
+    confidence: Confidence | None
+
+    @staticmethod
+    def of_row(row: Mapping[str, Any]) -> Cleaned:
+        """From the row that ``run_cleaning`` made."""
+        found = row.get("confidence")
+        confidence = None if found is None else Confidence(**found)
+        return Cleaned({name: row[name] for name in SCORES}, confidence)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewToClean:
+    """One render as the study sees it.
+
+    Attributes:
+        render: uint8 [H, W, 3].
+        truth: uint8 [H, W, 3], the true picture.
+        mask: bool [H, W], where the true picture is known.
+        inputs: float32 [``CHANNELS``, H, W], what the network sees.
+    """
+
+    render: Picture
+    truth: Picture
+    mask: npt.NDArray[np.bool_]
+    inputs: npt.NDArray[np.float32]
+
+    @staticmethod
+    def of_pairs(pairs: Pairs, number: int) -> ViewToClean:
+        """One of a file's pairs."""
+        channels = pairs.inputs[number]
+        return ViewToClean(
+            _picture(channels[:3]),
+            _picture(pairs.truth[number]),
+            pairs.masks[number],
+            unpacked(channels),
+        )
+
+
+def run_cleaning(data: str, one: Cleaning) -> dict[str, Any]:
+    """Clean the renders of one fit and score them; ``data`` is unused. Returns the row."""
+    pairs = read_pairs(one.pairs)
+    denoiser = None if one.weights is None else NetworkDenoiser(load_network(one.weights))
+    distance = None if one.features is None else SqueezeNetDistance(one.features)
+    bins = _ConfidenceBins()
+    views: list[Scores] = []
+    for number in range(len(pairs.truth)):
+        view = ViewToClean.of_pairs(pairs, number)
+        if not view.mask.any():
+            continue
+        after = view.render
+        if denoiser is not None:
+            picture, confidence = denoiser.clean(view.inputs)
+            after = eight_bits(picture)
+            error = np.abs(picture - view.truth / 255.0).mean(axis=-1)
+            bins.add(confidence[view.mask].astype(np.float64), error[view.mask])
+        views.append(_scored(view, after, distance))
+    row: dict[str, Any] = {"views": views, **mean_scores(views)}
+    if denoiser is not None:
+        row["confidence"] = bins.row()
+    return row
+
+
+def mean_scores(all_scores: Iterable[Scores]) -> Scores:
+    """Mean of each score over those that have it."""
+    each = list(all_scores)
+    out: Scores = {}
+    for name in SCORES:
+        known = [value for scores in each if (value := scores.get(name)) is not None]
+        out[name] = float(np.mean(known)) if known else None
+    return out
+
+
+def eight_bits(picture: npt.NDArray[np.float32]) -> Picture:
+    """A picture in [0, 1] as uint8."""
+    return np.rint(255.0 * picture).astype(np.uint8)
+
+
+def _scored(view: ViewToClean, after: Picture, distance: Distance | None) -> Scores:
+    scores: Scores = dict(score(after, view.truth, None if view.mask.all() else view.mask))
+    scores["best_quarter"] = _best_quarter(view, after)
+    if distance is not None and min(view.mask.shape) >= SMALLEST_SIDE:
+        shown = view.mask[..., None]
+        scores["perceptual"] = picture_distance(distance, after * shown, view.truth * shown)
+    return scores
+
+
+def _best_quarter(view: ViewToClean, after: Picture) -> float:
+    """PSNR after of the quarter of the pixels that were nearest to the truth before."""
+
+    def squares(picture: Picture) -> Float64:
+        difference = picture.astype(np.float64) - view.truth
+        return np.square(difference / 255.0).mean(axis=-1)[view.mask]
+
+    before = squares(view.render)
+    best = before <= np.quantile(before, 0.25)
+    error = float(squares(after)[best].mean())
+    return PSNR_CAP if error == 0.0 else min(PSNR_CAP, -10.0 * float(np.log10(error)))
+
+
+def _picture(channels: Picture) -> Picture:
+    return np.ascontiguousarray(np.moveaxis(channels, 0, -1))
+
+
+class _ConfidenceBins:
+    """Sums over the pixels of all views, by their confidence."""
+
+    def __init__(self) -> None:
+        self.pixels, self.confidence, self.error = np.zeros((3, len(CONFIDENCE_EDGES) - 1))
+        self.views, self.mean_errors, self.weighted_errors = 0.0, 0.0, 0.0
+
+    def add(self, confidence: Float64, error: Float64) -> None:
+        """The pixels of one view: confidence [N] and absolute error [N]."""
+        bins = len(self.pixels)
+        at = np.clip(np.digitize(confidence, CONFIDENCE_EDGES) - 1, 0, bins - 1)
+        self.pixels += np.bincount(at, minlength=bins)
+        self.confidence += np.bincount(at, confidence, minlength=bins)
+        self.error += np.bincount(at, error, minlength=bins)
+        self.views += 1.0
+        self.mean_errors += float(error.mean())
+        self.weighted_errors += float(np.sum(confidence * error) / np.sum(confidence))
+
+    def row(self) -> dict[str, Any]:
+        """The fields of ``Confidence`` as JSON has them."""
+        return {
+            "pixels": self.pixels.tolist(),
+            "confidence": self.confidence.tolist(),
+            "error": self.error.tolist(),
+            "mean_error": self.mean_errors / max(self.views, 1.0),
+            "weighted_error": self.weighted_errors / max(self.views, 1.0),
+        }

@@ -1,0 +1,376 @@
+"""Procedural captures made one by one or side by side, each a folder that appears when it is whole.
+
+A capture is in the NeRF-Synthetic layout, with intrinsics for each photo::
+
+    scene_00007/
+        transforms_train.json, transforms_test.json
+        train/000.png, test/000.png         8-bit sRGB; with straight alpha for the family "object"
+        depth/train/000.npy                 float32 [H, W], z along the camera's axis, NaN for none
+        mask/train/000.png                  8-bit: where the objects are
+        scene.json                          what it shows, and all it was made from
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable
+from concurrent.futures import as_completed
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from PIL import Image
+
+from igsr._internal.atomic_write import check_writable
+from igsr._internal.ray_jobs import RayCluster
+from igsr._internal.worker_processes import worker_processes
+from igsr.errors import IgsrError
+from igsr_lab.synth.cameras import Viewpoint, draw_rig
+from igsr_lab.synth.mitsuba_scene import (
+    LoadedScene,
+    encode,
+    first_hits,
+    load_scene,
+    one_threaded_mitsuba,
+    take_photo,
+)
+from igsr_lab.synth.photographs import choose_viewpoints, exposure
+from igsr_lab.synth.surroundings import draw_description
+
+#: Goes up when the same seed begins to mean other scenes.
+RECIPE_VERSION = 2
+#: Test cameras keep this part of the rig away from its edges: they lie between the others.
+TEST_MARGIN = 0.12
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What each scene is photographed with.
+
+    Attributes:
+        size: pixels of the longer side, 16 to 4096.
+        views: photos to fit, at least 1.
+        test_views: photos to score.
+        spp: light paths per pixel, the square of a whole number, 1 to 4096.
+
+    Raises:
+        IgsrError: one is out of range.
+    """
+
+    size: int = 256
+    views: int = 24
+    test_views: int = 8
+    spp: int = 16
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _check_range("size", self.size, 16, 4096)
+        _check_range("views", self.views, 1, 10_000)
+        _check_range("test_views", self.test_views, 0, 10_000)
+        _check_range("spp", self.spp, 1, 4096)
+        if math.isqrt(self.spp) ** 2 != self.spp:
+            raise IgsrError(
+                "spp must be a square such as 9, 16 or 36 (light paths lie in rows), "
+                f"not {self.spp}."
+            )
+
+
+def _check_range(name: str, value: int, low: int, high: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise IgsrError(f"{name} must be a whole number, not {value!r}.")
+    if not low <= value <= high:
+        raise IgsrError(f"{name} must be from {low} to {high}, not {value}.")
+
+
+def synthesize(
+    out: str | os.PathLike[str],
+    scenes: int,
+    *,
+    seed: int = 0,
+    first: int = 0,
+    settings: CaptureSettings | None = None,
+    jobs: int = 1,
+    on_scene: Callable[[int, int, dict[str, Any]], None] | None = None,
+    ray: bool = False,
+) -> dict[str, Any]:
+    """Make procedural captures; those that are there already stay as they are.
+
+    Scene k of a seed is the same whatever ``scenes``, ``first`` and ``jobs`` are, bit for bit on
+    one machine with one version of Mitsuba.
+
+    Args:
+        out: folder of the scenes' folders, ``scene_00000`` and on.
+        scenes: how many.
+        seed: at least 0.
+        first: the number of the first.
+        settings: what each is photographed with.
+        jobs: scenes at a time, each in a process of one thread.
+        on_scene: called with (done, all, the scene's row) after each scene.
+        ray: scenes are made over a Ray cluster instead, whose machines see ``out`` under the same
+            path (``pip install 'igsr[ray]'``).
+
+    Returns:
+        {"out", "seed", "scenes": a row for each, in order: name, family, kind, contents, seconds
+        (None where it was there already)}.
+
+    Raises:
+        IgsrError: a number is out of range, Mitsuba or Ray is not installed, the folder cannot be
+            written, or it holds a scene of other settings.
+    """
+    settings = settings or CaptureSettings()
+    _check_range("scenes", scenes, 1, 100_000)
+    _check_range("first", first, 0, 1_000_000)
+    _check_range("seed", seed, 0, 2**63 - 1)
+    _check_range("jobs", jobs, 1, 1024)
+    with one_threaded_mitsuba():
+        pass  # what is missing is said before any work
+    folder = Path(out)
+    check_writable(folder / "scene.json")
+    rows: dict[int, dict[str, Any]] = {}
+    missing = []
+    for index in range(first, first + scenes):
+        row = _finished(folder / scene_name(index), _recipe(seed, index, settings))
+        if row is None:
+            missing.append(index)
+        else:
+            rows[index] = row
+
+    def keep(index: int, row: dict[str, Any]) -> None:
+        rows[index] = row
+        if on_scene is not None:
+            on_scene(len(rows), scenes, row)
+
+    if ray and missing:
+        _make_over_ray(folder, seed, settings, missing, keep)
+    elif jobs == 1 or len(missing) == 1:
+        for index in missing:
+            keep(index, make_scene(folder, seed, index, settings))
+    elif missing:
+        with worker_processes(min(jobs, len(missing))) as pool:
+            pending = {
+                pool.submit(make_scene, folder, seed, index, settings): index for index in missing
+            }
+            try:
+                for done in as_completed(pending):
+                    keep(pending[done], done.result())
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    return {
+        "out": str(folder),
+        "seed": seed,
+        "settings": asdict(settings),
+        "scenes": [rows[index] for index in sorted(rows)],
+    }
+
+
+def _make_over_ray(
+    folder: Path,
+    seed: int,
+    settings: CaptureSettings,
+    indices: list[int],
+    keep: Callable[[int, dict[str, Any]], None],
+) -> None:
+    """``keep`` is called with each scene as it is made, the others' of one that fails, too."""
+    folder.mkdir(parents=True, exist_ok=True)
+    make = partial(_make_named, seed, settings)
+    with RayCluster() as cluster:
+        cluster.check(folder.resolve())
+        cluster.do(
+            make,
+            str(folder.resolve()),
+            indices,
+            lambda number, row: keep(indices[number], row),
+        )
+
+
+def _make_named(seed: int, settings: CaptureSettings, folder: str, index: int) -> dict[str, Any]:
+    """``make_scene``, in the order in which work for a cluster is called."""
+    return make_scene(Path(folder), seed, index, settings)
+
+
+def is_made(
+    out: str | os.PathLike[str], index: int, *, seed: int = 0, settings: CaptureSettings
+) -> bool:
+    """Whether ``synthesize`` would find a scene there already.
+
+    Args:
+        out, seed, settings: as ``synthesize`` takes them.
+        index: the scene's number.
+
+    Raises:
+        IgsrError: the folder holds a scene of other settings, or what is no finished scene.
+    """
+    return _finished(Path(out) / scene_name(index), _recipe(seed, index, settings)) is not None
+
+
+def scene_name(index: int) -> str:
+    """The name of a scene's folder."""
+    return f"scene_{index:05d}"
+
+
+def _recipe(seed: int, index: int, settings: CaptureSettings) -> dict[str, Any]:
+    """All that a scene is made from, but for Mitsuba's version."""
+    return {"version": RECIPE_VERSION, "seed": seed, "index": index, **asdict(settings)}
+
+
+def _finished(folder: Path, recipe: dict[str, Any]) -> dict[str, Any] | None:
+    """The row of a scene that is there already; None where there is none."""
+    if not folder.exists():
+        return None
+    path = folder / "scene.json"
+    try:
+        document = json.loads(path.read_bytes())
+        row = {key: document[key] for key in ("family", "kind", "contents")}
+        made_from = document["recipe"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise IgsrError(
+            f"{path} cannot be read, so {folder} is no finished scene; delete the folder to make "
+            "the scene again."
+        ) from error
+    for key, value in recipe.items():
+        if not isinstance(made_from, dict) or made_from.get(key) != value:
+            has = made_from.get(key) if isinstance(made_from, dict) else None
+            raise IgsrError(
+                f"{folder} was made with {key} {has!r}, not {value!r}; give another --out, or "
+                "delete the folder."
+            )
+    return {"name": folder.name, **row, "seconds": None}
+
+
+def make_scene(folder: Path, seed: int, index: int, settings: CaptureSettings) -> dict[str, Any]:
+    """Make one scene in ``folder`` under a temporary name, then rename it; returns its row.
+
+    Raises:
+        IgsrError: as ``synthesize``.
+    """
+    started = time.monotonic()
+    final = folder / scene_name(index)
+    # Of this process: another may make the same scene at the same time.
+    unfinished = folder / _unfinished(final.name, os.getpid())
+    try:
+        _remove_abandoned(folder, final.name)
+        unfinished.mkdir(parents=True)
+        with one_threaded_mitsuba() as mitsuba:
+            document = _photograph(unfinished, seed, index, settings)
+            document["mitsuba"] = mitsuba.__version__
+        document["pyoidn"] = version("pyoidn")
+        _write_json(unfinished / "scene.json", document)
+        try:
+            unfinished.rename(final)
+        except OSError:
+            # The other was first, with the same bits.
+            if _finished(final, document["recipe"]) is None:
+                raise
+    except OSError as error:
+        raise IgsrError(f"Cannot write {final}: {error.strerror or error}.") from error
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    row = {key: document[key] for key in ("family", "kind", "contents")}
+    return {"name": final.name, **row, "seconds": round(time.monotonic() - started, 1)}
+
+
+def _unfinished(name: str, process: int | str) -> str:
+    """The name of a scene's folder while a process makes it."""
+    return f".{name}.{process}.unfinished"
+
+
+def _remove_abandoned(folder: Path, name: str) -> None:
+    """Remove what processes left of a scene that were killed while they made it."""
+    for path in folder.glob(_unfinished(name, "*")):
+        process = path.name.split(".")[-2]
+        if not process.isdigit() or not psutil.pid_exists(int(process)):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _photograph(folder: Path, seed: int, index: int, settings: CaptureSettings) -> dict[str, Any]:
+    """Write everything of a scene but scene.json, whose content is returned."""
+    # The scene and the photos draw from streams of their own: other settings, the same scene.
+    description = draw_description(np.random.default_rng([seed, index, 0]))
+    loaded = load_scene(description)
+    rng = np.random.default_rng([seed, index, 1])
+    rig = draw_rig(rng, description, settings.size)
+    counts = {"train": settings.views, "test": settings.test_views}
+    viewpoints = {
+        split: choose_viewpoints(
+            loaded,
+            description,
+            rig,
+            np.random.default_rng([seed, index, stream]),
+            counts[split],
+            TEST_MARGIN if split == "test" else 0.0,
+        )
+        for stream, split in enumerate(counts, start=2)
+    }
+    gain = exposure(loaded, viewpoints["train"][:3], rng)
+    taken = 0
+    for split, cameras in viewpoints.items():
+        frames = []
+        for number, viewpoint in enumerate(cameras):
+            name = f"{split}/{number:03d}"
+            _write_view(folder, name, loaded, viewpoint, settings.spp, taken, gain)
+            frames.append(_frame(name, viewpoint))
+            taken += 1
+        if frames:
+            _write_json(folder / f"transforms_{split}.json", {"frames": frames})
+    return {
+        "recipe": _recipe(seed, index, settings),
+        "family": description.family,
+        "kind": description.kind,
+        "contents": description.contents,
+        "cameras": rig.kind,
+        "lamps": len(description.lights),
+        "exposure": gain,
+        "centre": description.centre.tolist(),
+        "radius": description.radius,
+    }
+
+
+def _write_view(
+    folder: Path,
+    name: str,
+    loaded: LoadedScene,
+    viewpoint: Viewpoint,
+    samples: int,
+    seed: int,
+    gain: float,
+) -> None:
+    linear = take_photo(loaded, viewpoint, samples, seed)
+    linear[..., :3] *= gain
+    photo = encode(linear)
+    depth, is_object = first_hits(loaded, viewpoint)
+    mask = photo[..., 3] if loaded.transparent else np.where(is_object, 255, 0).astype(np.uint8)
+    for kind in ("", "depth/", "mask/"):
+        (folder / f"{kind}{name}").parent.mkdir(parents=True, exist_ok=True)
+    image = photo if loaded.transparent else np.ascontiguousarray(photo[..., :3])
+    Image.fromarray(image).save(folder / f"{name}.png")
+    np.save(folder / f"depth/{name}.npy", depth)
+    Image.fromarray(mask).save(folder / f"mask/{name}.png", optimize=True)
+
+
+def _frame(name: str, viewpoint: Viewpoint) -> dict[str, Any]:
+    return {
+        "file_path": f"./{name}",
+        "depth_file_path": f"./depth/{name}.npy",
+        "object_mask_path": f"./mask/{name}.png",
+        "w": viewpoint.width,
+        "h": viewpoint.height,
+        "fl_x": viewpoint.focal,
+        "fl_y": viewpoint.focal,
+        "cx": 0.5 * viewpoint.width,
+        "cy": 0.5 * viewpoint.height,
+        "transform_matrix": viewpoint.camera_to_world.tolist(),
+    }
+
+
+def _write_json(path: Path, document: dict[str, Any]) -> None:
+    text = json.dumps(document, indent=1, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")

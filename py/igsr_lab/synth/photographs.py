@@ -1,0 +1,84 @@
+"""Viewpoints that show something, and an exposure that suits them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from igsr_lab.synth.cameras import Rig, Viewpoint, spread
+from igsr_lab.synth.description import Description
+from igsr_lab.synth.mitsuba_scene import LoadedScene, first_hits, take_photo
+
+#: Pixels of the longer side of the small pictures by which viewpoints and exposures are judged.
+PROBE_SIZE = 40
+#: Viewpoints tried for one photo before the best of them is taken.
+ATTEMPTS = 12
+
+
+def choose_viewpoints(
+    loaded: LoadedScene,
+    description: Description,
+    rig: Rig,
+    rng: np.random.Generator,
+    count: int,
+    margin: float,
+) -> list[Viewpoint]:
+    """Cameras spread over the rig, each in the open and with the objects in its picture.
+
+    Args:
+        loaded: the scene.
+        description: of it.
+        rig: how it is photographed.
+        rng: draws positions.
+        count: how many.
+        margin: part of the rig, on every side, that is left out.
+    """
+    chosen = []
+    for position in spread(rng, count, margin):
+        best, least = None, np.inf
+        for attempt in range(ATTEMPTS):
+            shift = rng.normal(0.0, 0.04 * attempt, 2)
+            moved = np.clip(position + shift, margin, 1.0 - margin)
+            viewpoint = rig.viewpoint(rng, moved)
+            fault = _fault(loaded, description, rig, viewpoint)
+            if fault < least:
+                best, least = viewpoint, fault
+            if fault == 0.0:
+                break
+        assert best is not None
+        chosen.append(best)
+    return chosen
+
+
+def _probe(viewpoint: Viewpoint) -> Viewpoint:
+    scale = min(1.0, PROBE_SIZE / max(viewpoint.width, viewpoint.height))
+    width, height = (max(1, round(scale * n)) for n in (viewpoint.width, viewpoint.height))
+    return replace(viewpoint, width=width, height=height)
+
+
+def _fault(loaded: LoadedScene, description: Description, rig: Rig, viewpoint: Viewpoint) -> float:
+    """How bad a view is: 0 where nothing is near the lens and the objects fill enough of it."""
+    depth, is_object = first_hits(loaded, _probe(viewpoint))
+    nearest = float(np.nanmin(depth)) if np.isfinite(depth).any() else np.inf
+    share = float(is_object.mean())
+    too_near = max(0.0, 1.0 - nearest / (0.3 * rig.distance))
+    too_little = max(0.0, 1.0 - share / (0.08 if description.family == "object" else 0.06))
+    return too_near + too_little
+
+
+def exposure(loaded: LoadedScene, viewpoints: list[Viewpoint], rng: np.random.Generator) -> float:
+    """What linear colours are multiplied by, so that little is blown out and little is black."""
+    bright = []
+    for viewpoint in viewpoints:
+        linear = take_photo(loaded, _probe(viewpoint), 16, 0)
+        seen = linear[linear[..., 3] > 0.5]
+        bright.append(seen[:, :3] @ [0.2126, 0.7152, 0.0722])
+    values = np.concatenate(bright)
+    values = values[np.isfinite(values)]
+    if not len(values) or values.max() <= 0.0:
+        return 1.0
+    middle, high = np.percentile(values, [50.0, 95.0])
+    # Middle grey where it may be, as a camera meters, unless that burns out the highlights.
+    grey = 0.18 * float(np.exp(rng.normal(0.0, 0.25)))
+    return float(min(grey / max(middle, 1e-4), 1.1 / max(high, 1e-4)))

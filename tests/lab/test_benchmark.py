@@ -1,0 +1,607 @@
+"""The benchmark: workloads, oracle, rows, and that it sees a broken renderer."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes as made_up
+import torch
+from PIL import Image
+
+from igsr import _core
+from igsr._internal import peak_memory
+from igsr.errors import IgsrError
+from igsr_lab import __main__ as lab
+from igsr_lab.bench import (
+    accuracy,
+    build_pairs,
+    fit_rows,
+    growth,
+    machine,
+    oracle,
+    run,
+    scenes,
+    stage_rows,
+)
+from igsr_lab.bench.comparison import FLIP, gradient_error, picture_error
+from igsr_lab.bench.plots import plot_speed_vs_error
+from igsr_lab.bench.table import not_run_lines
+
+#: A picture and a scene on which every row takes a fraction of a second.
+SMALL = {"count": 300, "side": 40}
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture
+def igsr_bench(capsys):
+    """``python -m igsr_lab bench`` within this process: status, standard output, standard error."""
+
+    def bench(*arguments):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            lab.app(["bench", *map(str, arguments)])
+        output = capsys.readouterr()
+        return ended.value.code, output.out, output.err
+
+    return bench
+
+
+def small_scene(seed=3, **changes):
+    return replace(scenes.ball(seed, 200, 48, 40, sh_degree=1), **changes)
+
+
+def checked_row(row):
+    """Assert what every row that ran promises."""
+    assert row["ms"] > 0
+    assert row["ms_median"] >= row["ms"]
+    assert row["repeats"] >= stage_rows.MIN_REPEATS
+    assert row["peak_gflops"] > 0
+    assert row["error_of"] in ("picture", "gradients")
+    assert 0 <= row["mean_error"] <= row["max_error"] < 1e-4
+    assert 0 <= row["left_out_pixels"] <= row["band_pixels"] <= row["compared_pixels"]
+    assert row["left_out_pixels"] <= max(1, row["compared_pixels"] // 1000)
+
+
+# ---- the workloads ------------------------------------------------------------------------------
+
+
+def test_w1_is_the_workload_that_was_asked_for():
+    splats = scenes.splats2d(0)
+    counts = oracle.pair_counts(splats, 400, 400)
+    assert counts.tiles == pytest.approx(98_500, rel=0.02)
+    assert counts.pixels == pytest.approx(7.6e6, rel=0.02)
+    assert 0.9 * counts.pixels < counts.blended <= counts.pixels
+    assert 0.1 <= splats["opacities"].min() < splats["opacities"].max() <= 0.9
+
+
+def test_the_same_seed_gives_the_same_bits():
+    def everything(seed):
+        arrays = list(scenes.splats2d(seed, 50, 32, 32).values())
+        arrays += list(scenes.ball(seed, 50, 32, 32).splats.values())
+        arrays += list(scenes.upstream(seed, 8, 9).values())
+        arrays.append(growth.shot_of(seed, 20, 16).photo)
+        return [array.tobytes() for array in arrays]
+
+    assert everything(5) == everything(5)
+    assert all(a != b for a, b in zip(everything(5), everything(6), strict=True))
+
+
+def garden_file(path, **changes):
+    """A file like the fixture, with one point."""
+    arrays = {
+        "means3d": np.array([[0.0, 0.0, 2.0]], np.float32),
+        "colors": np.array([[255, 0, 51]], np.uint8),
+        "viewmats": np.eye(4, dtype=np.float32)[None],
+        "Ks": np.array([[[30.0, 0, 16], [0, 31.0, 12], [0, 0, 1]]], np.float32),
+        "height": 24,
+        "width": 32,
+    }
+    np.savez(path, **(arrays | changes))
+    return path
+
+
+def test_the_garden_takes_what_the_fixture_holds(tmp_path):
+    garden = scenes.garden(garden_file(tmp_path / "garden.npz"), 0)
+    assert (garden.width, garden.height) == (32, 24)
+    assert garden.intrinsics.tolist() == [30.0, 31.0, 16.0, 12.0]
+    np.testing.assert_allclose(garden.splats["colors"], [[1.0, 0.0, 0.2]])
+    assert (garden.splats["scales"] < 0.02).all()
+    rows = stage_rows.pipeline_rows("W2", garden, "cpu", 0, 0.0)
+    assert [row["pass"] for row in rows] == ["forward", "backward"]
+
+
+@pytest.mark.parametrize("content", [b"", b"not an archive", None])
+def test_what_is_not_the_garden_is_refused(tmp_path, content):
+    path = tmp_path / "other.npz"
+    if content is None:
+        np.savez(path, means3d=np.zeros((4, 2)), colors=np.zeros((4, 3)))
+    else:
+        path.write_bytes(content)
+    with pytest.raises(IgsrError, match=r"other\.npz"):
+        scenes.garden(path, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"width": 0}, "width"),
+        ({"width": 99999999999}, "cannot be 99999999999"),
+        ({"height": 16385}, "16384"),
+        ({"viewmats": 2.0 * np.eye(4)[None]}, "viewmat"),
+        ({"Ks": np.diag([-30.0, 31.0, 1.0])[None]}, "focal"),
+        ({"Ks": np.full((1, 3, 3), np.nan)}, "focal"),
+        ({"means3d": np.array([["a", "b", "c"]])}, "convert"),
+        ({"colors": np.array([["a", "b", "c"]])}, "convert"),
+        ({"means3d": np.full((1, 3), np.nan)}, "finite"),
+        ({"means3d": np.full((1, 3), 1e300)}, "finite"),
+        ({"means3d": np.zeros((0, 3)), "colors": np.zeros((0, 3))}, "sees none"),
+        ({"means3d": np.array([[0.0, 0.0, -2.0]])}, "sees none"),
+    ],
+)
+def test_a_garden_that_cannot_be_drawn_is_refused(tmp_path, changes, words):
+    path = garden_file(tmp_path / "other.npz", **changes)
+    with pytest.raises(IgsrError, match=words) as refused:
+        scenes.garden(path, 0)
+    assert "other.npz" in str(refused.value)
+    assert "--garden" in str(refused.value)
+
+
+# ---- the oracle ---------------------------------------------------------------------------------
+
+
+def test_culling_changes_nothing():
+    scene = small_scene(background=np.array([0.2, 0.5, 0.9], np.float32))
+    v_image = scenes.upstream(1, scene.width, scene.height)
+    comparison, _ = stage_rows.compare(scene, "reference", v_image)
+    assert comparison.picture.max == 0.0
+    assert comparison.gradients.max < 1e-12
+    assert comparison.band.of == scene.width * scene.height
+
+
+def test_the_band_of_crops_is_the_band_of_the_picture():
+    scene = small_scene()
+    exact = _core.project(*scene.arrays(np.float64), **scene.options(), backend="reference")
+    size = {"width": scene.width, "height": scene.height}
+    whole = _core.band_pixels(exact, **size, alpha_band=2e-2) != 0
+    shape = (scene.height, scene.width)
+    assert 0 < whole.sum() < whole.size
+    crops = oracle.crops(exact, *shape[::-1])
+    assert (oracle.band(exact, crops, shape, 2e-2) == whole).all()
+
+
+def test_some_crops_say_what_the_whole_says():
+    scene = small_scene()
+    exact = _core.project(*scene.arrays(np.float64), **scene.options(), backend="reference")
+    shape = (scene.height, scene.width)
+    crops = oracle.crops(exact, *shape[::-1])
+    whole = oracle.picture(exact, crops, shape, scene.background)
+    part = oracle.picture(exact, crops[2:4], shape, scene.background)
+    known = np.isfinite(part["alpha"])
+    assert known.sum() == sum(crop.width * crop.height for crop in crops[2:4])
+    assert (part["color"][known] == whole["color"][known]).all()
+
+
+# ---- errors -------------------------------------------------------------------------------------
+
+
+def test_a_broken_renderer_shows(monkeypatch):
+    sound = _core.rasterize
+
+    def broken(*arguments, backend, **options):
+        image = sound(*arguments, backend=backend, **options)
+        if backend == "cpu":
+            image["color"][7, 9, 1] += 0.01
+        return image
+
+    rows = stage_rows.rasterize_rows("cpu", 0, 0.0, **SMALL)
+    assert rows[0]["max_error"] < 2e-6
+    monkeypatch.setattr(_core, "rasterize", broken)
+    rows = stage_rows.rasterize_rows("cpu", 0, 0.0, **SMALL)
+    assert rows[0]["max_error"] == pytest.approx(0.01, rel=1e-3)
+    assert rows[0]["mean_error"] > 0.01 / SMALL["side"] ** 2
+
+
+def test_broken_gradients_show(monkeypatch):
+    sound = _core.project_backward
+
+    def broken(*arguments, backend, **options):
+        v = sound(*arguments, backend=backend, **options)
+        if backend == "cpu":
+            v["v_quats"] = 1.01 * v["v_quats"]
+        return v
+
+    monkeypatch.setattr(_core, "project_backward", broken)
+    _, backward = stage_rows.pipeline_rows("W2", small_scene(), "cpu", 0, 0.0)
+    assert backward["worst"] == "v_quats"
+    assert backward["max_error"] == pytest.approx(0.01, rel=0.01)
+
+
+def test_nan_is_no_small_error():
+    picture = {"color": np.zeros((2, 2, 3)), "alpha": np.zeros((2, 2))}
+    picture["transmittance"] = np.ones((2, 2))
+    wrong = picture | {"color": np.full((2, 2, 3), np.nan)}
+    error, _ = picture_error(wrong, picture, np.zeros((2, 2), bool), 1e-6)
+    assert error.max == np.inf
+    assert gradient_error({"v": np.array([np.nan])}, {"v": np.array([1.0])}).max == np.inf
+
+
+def test_only_pixels_of_the_band_are_left_out():
+    expected = {"color": np.zeros((1, 4, 3)), "alpha": np.zeros((1, 4))}
+    expected["transmittance"] = np.full((1, 4), 1e-2)
+    # The third blended another pair behind something opaque: only its transmittance tells.
+    got = expected | {
+        "alpha": np.array([[1e-3, 1e-9, 1e-9, 1e-5]]),
+        "transmittance": np.array([[1e-2, 1e-2, 1e-2 * (1.0 - 2.0 * FLIP), 0.9e-2]]),
+    }
+    error, band = picture_error(got, expected, np.array([[True, True, True, False]]), 1e-6)
+    assert error.max == 1e-5
+    assert band.left_out.tolist() == [[True, False, True, False]]
+    assert (band.pixels, band.of) == (3, 4)
+
+
+def test_the_loss_of_a_step_is_the_fits_own():
+    shot = growth.shot_of(2, 60, 48)
+    scene = shot.scene
+    running = fit_rows.fitter(shot, "cpu")
+    loss = running.step(1)["loss"]
+    dtype = np.float32
+    picture = _core.rasterize(
+        _core.project(*scene.arrays(dtype), **scene.options(), backend="cpu"),
+        width=scene.width,
+        height=scene.height,
+        background=scene.background,
+        backend="cpu",
+    )["color"]
+    everywhere = torch.ones(scene.height, scene.width, dtype=torch.bool)
+    expected = fit_rows.fit_loss(
+        torch.from_numpy(picture).double(), torch.from_numpy(shot.target()), everywhere
+    )
+    assert loss == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_a_photo_with_alpha_lies_over_the_background():
+    scene = small_scene(background=np.array([1.0, 0.5, 0.0], np.float32))
+    photo = np.zeros((40, 48, 4), np.uint8)
+    photo[..., 3] = 51
+    np.testing.assert_allclose(fit_rows.Shot(scene, photo).target()[0, 0], [0.8, 0.4, 0.0])
+
+
+# ---- rows ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_rows_of_stages(backend):
+    rows = stage_rows.rasterize_rows(backend, 0, 0.0, **SMALL)
+    rows += stage_rows.pipeline_rows("W2", small_scene(), backend, 0, 0.0)
+    assert [row["pass"] for row in rows] == [
+        "rasterize",
+        "rasterize_backward",
+        "forward",
+        "backward",
+    ]
+    for row in rows:
+        checked_row(row)
+    if backend == "cpu":
+        assert 0 < rows[0]["fraction_of_peak"] < 1
+    # The whole pass takes at least as long as its fastest stages together.
+    assert rows[2]["ms"] >= 0.999 * sum(rows[2]["stages_ms"].values())
+
+
+def test_rows_of_steps():
+    own, loop = fit_rows.step_rows("W3", [growth.shot_of(0, 200, 48)], "cpu", 0.0)
+    for row in (own, loop):
+        checked_row(row)
+        assert 0 <= row["picture_mean_error"] <= row["picture_max_error"] < 1e-4
+    assert (own["pass"], loop["pass"]) == ("fit step", "fit step, own loop")
+
+
+@pytest.mark.skipif(
+    not os.access(peak_memory.CLEAR_REFS, os.W_OK),
+    reason="only Linux forgets a process's peak memory",
+)
+def test_a_fit_keeps_its_memory_contract():
+    (row,) = growth.growth_rows("cpu", 0, [(100_000, 512)], 0.0)
+    checked_row(row)
+    # Parameters and moments must be somewhere.
+    assert 3 * growth.parameter_bytes(100_000) < 100_000 * row["bytes_per_splat"]
+    assert row["bytes_per_splat"] <= 1.0 * row["contract_bytes_per_splat"]
+
+
+@pytest.mark.parametrize("change", ["a device of its own", "a peak that stays"])
+def test_memory_that_cannot_be_told_is_left_out(monkeypatch, tmp_path, change):
+    if change == "a device of its own":
+        monkeypatch.setattr(growth, "runs_on_cores", lambda backend: False)
+    else:
+        monkeypatch.setattr(peak_memory, "CLEAR_REFS", tmp_path / "nowhere" / "clear_refs")
+    point = growth.measure(0, 200, 32, "cpu", 0.0)
+    monkeypatch.setattr(growth, "measure_apart", lambda *arguments: point)
+    (row,) = growth.growth_rows("cpu", 0, [(200, 32)], 0.0)
+    checked_row(row)
+    assert not [name for name in row if "bytes" in name]
+
+
+def test_a_child_that_fails_is_a_row_that_says_so(monkeypatch):
+    monkeypatch.setattr(sys, "executable", shutil.which("false"))
+    (row,) = growth.growth_rows("cpu", 0, [(10, 16)], 0.0)
+    assert "ms" not in row
+    assert "10 splats at 16 x 16 failed" in row["not_run"]
+
+
+@pytest.mark.parametrize("error", [IgsrError("It ended early."), RuntimeError("The GPU is lost.")])
+def test_a_workload_that_fails_takes_no_other_rows_with_it(monkeypatch, tmp_path, error):
+    def failing(*arguments):
+        raise error
+
+    monkeypatch.setattr(run, "growth_rows", lambda backend, seed, seconds: [{"ms": 1.0}])
+    monkeypatch.setattr(run, "pair_rows", failing)
+    monkeypatch.setattr(run, "rasterize_rows", lambda backend, seed, seconds: [{"ms": 2.0}])
+    monkeypatch.setattr(run, "capture_rows", failing)
+    monkeypatch.setattr(run, "MODEL_COUNTS", (100,))
+    capture = made_up.write_capture(tmp_path / "photos", made_up.capture(views=4, size=32))
+    settings = run.Settings(
+        ("cpu", "reference"), ("W1", "W3", "W4"), capture=capture, models=tmp_path
+    )
+    rows = run.run_benchmark(settings)["rows"]
+    reason, never = str(error), run.DOES_NOT_FIT
+    assert [(row["ms"], row["splats"], row.get("not_run")) for row in rows] == [
+        (2.0, None, None),
+        (None, 100, reason),
+        (1.0, None, None),
+        (None, growth.PAIR[0], reason),
+        (2.0, None, None),
+        (None, 100, never),
+        (None, None, never),
+    ]
+    assert all(row.keys() >= run.COLUMNS.keys() for row in rows)
+
+
+def test_models_for_w3_are_fitted_once(tmp_path):
+    capture = made_up.capture(views=4, size=32)
+    fitted = fit_rows.fitted_model
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_rows, "FIT_STEPS", 5)
+        first = fitted(capture, 200, tmp_path, 0)
+        patch.setattr(fit_rows, "fit", None)
+        again = fitted(capture, 200, tmp_path, 0)
+    assert first.means.tobytes() == again.means.tobytes()
+    # Another seed or another fit is another model.
+    paths = {fit_rows.model_path(capture, 200, tmp_path, seed) for seed in (0, 1)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_rows, "FIT_STEPS", 6)
+        paths.add(fit_rows.model_path(capture, 200, tmp_path, 0))
+    assert len(paths) == 3
+
+
+def test_a_models_folder_that_takes_no_file_is_found_before_the_work(monkeypatch, tmp_path):
+    capture = made_up.write_capture(tmp_path / "photos", made_up.capture(views=4, size=32))
+    monkeypatch.setattr(run, "rasterize_rows", None)
+    settings = run.Settings(
+        ("cpu",), ("W1", "W3"), capture=capture, models=Path("/dev/null/models")
+    )
+    with pytest.raises(IgsrError, match="/dev/null/models"):
+        run.run_benchmark(settings)
+
+
+def test_the_page_names_every_setting(tmp_path):
+    report = accuracy.measure_accuracy(("cpu",), 0, 0.0, scene=scenes.ball(0, 200, 24, 16, 4, 0.4))
+    assert report.keys() == {"machine", "rows"}
+    accuracy.write_accuracy(tmp_path / "accuracy.md", report)
+    page = (tmp_path / "accuracy.md").read_text(encoding="utf-8")
+    assert "384 of its 384 pixels are compared" in " ".join(page.split())
+    assert all(len(line) <= 100 for line in page.splitlines() if not line.startswith("|"))
+    for degree in range(5):
+        assert f"| SH degree {degree} | cpu |" in page
+    assert "| SH degree 4, antialiased | cpu |" in page
+    errors = [row["setting_mean_error"] for row in report["rows"][::2]]
+    # More degrees are nearer to all of them; the antialiased mode is nearer to many samples.
+    assert errors[0] > errors[3] > 0
+    assert errors[5] < errors[4]
+    with Image.open(tmp_path / accuracy.PLOT_NAME) as plot:
+        assert plot.width > 500
+
+
+# ---- two builds ---------------------------------------------------------------------------------
+
+
+def test_two_builds_take_turns(tmp_path):
+    copy = shutil.copy(_core.__file__, tmp_path / "_core.abi3.so")
+    report = build_pairs.compare_builds(Path(copy), ("cpu",), ("W1",), 0, 0.0, rounds=2)
+    assert report["machine"]["protocol"] == build_pairs.PAIR_PROTOCOL
+    assert [row["pass"] for row in report["rows"]] == ["rasterize", "rasterize_backward"]
+    for row in report["rows"]:
+        # The same code: no more apart than a busy machine makes it.
+        assert 0.2 < row["ratio_least"] <= row["ratio"] <= row["ratio_most"] < 5.0
+        assert 0.0 < row["mean_error_old"] == row["mean_error_new"] < 1e-5
+        assert row["max_error_old"] == row["max_error_new"] < 1e-4
+
+
+def test_a_build_is_used_in_place_of_the_packages_own(tmp_path):
+    copy = str(shutil.copy(_core.__file__, tmp_path / "_core.abi3.so"))
+    code = (
+        "import sys; from igsr._internal.other_build import use_build; use_build(sys.argv[1]);"
+        "from igsr_lab.bench import fit_rows, stage_rows, timed_work;"
+        "print({module._core.__file__ for module in (fit_rows, stage_rows, timed_work)});"
+        "use_build(sys.argv[1])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, copy], capture_output=True, text=True)
+    assert done.stdout.strip() == str({copy})
+    assert "in use already" in done.stderr
+
+
+def test_what_is_no_build_is_one_sentence(igsr_bench, tmp_path):
+    (tmp_path / "_core.abi3.so").write_bytes(b"not a module")
+    for file, words in (
+        (tmp_path / "_core.abi3.so", "could not be run"),
+        (tmp_path / "none.so", "no file"),
+    ):
+        status, out, err = igsr_bench("--backend", "cpu", "--workload", "W1", "--compare", file)
+        assert (status, out) == (1, "")
+        assert words in err
+        assert "--compare" in err
+
+
+def test_a_build_without_a_function_is_a_row_that_says_so(monkeypatch):
+    class Old:
+        def ask(self, name, seconds):
+            return {"failed": "AttributeError: no time_rasterize"}
+
+    rows = build_pairs._pair_rows({"workload": "W1"}, Old(), Old(), "W1 20000 400", 0.0, 2)
+    assert [row["not_run"] for row in rows] == [
+        "the old build failed: AttributeError: no time_rasterize"
+    ]
+    assert build_pairs.slower_rows(rows, 10.0) == []
+
+
+def test_a_failure_of_this_build_is_told():
+    class Fine:
+        def ask(self, name, seconds):
+            return {"fit step": [1.0, 2.0]}
+
+    class Broken:
+        def ask(self, name, seconds):
+            return {"failed": "ValueError: no"}
+
+    size = {"workload": "W4", "splats": 5, "backend": "cpu"}
+    rows = build_pairs._pair_rows(size, Fine(), Broken(), "W4 5 8", 0.0, 2)
+    assert build_pairs.slower_rows(rows, 10.0) == [
+        "W4 with 5 splats on cpu: the new build failed: ValueError: no."
+    ]
+
+
+def test_slower_builds_are_named():
+    size = {"splats": 5, "width": 8, "height": 8, "backend": "cpu", "workload": "W1"}
+    rows = [{**size, "pass": name, "ratio": ratio} for name, ratio in (("a", 0.92), ("b", 0.8))]
+    assert build_pairs.slower_rows(rows, 10.0) == [
+        "W1 b with 5 splats at 8 x 8 on cpu takes 25 % longer."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--fail-above", "10"], "--compare FILE"),
+        (["--compare", "a.so", "--fail-above", "-1"], "--fail-above"),
+        (["--compare", "a.so", "--workload", "W2"], "leave W2 and W3 out"),
+        (["--compare", "a.so", "--plot", "p.png"], "leave --plot out"),
+    ],
+)
+def test_options_that_do_not_go_together(igsr_bench, arguments, words):
+    status, out, err = igsr_bench("--backend", "cpu", *arguments)
+    assert (status, out) == (1, "")
+    assert words in err
+
+
+# ---- the command --------------------------------------------------------------------------------
+
+
+def test_bench_writes_machine_and_rows(igsr_bench, tmp_path):
+    arguments = ["--backend", "cpu", "--workload", "W1", "--workload", "W2", "--workload", "W3"]
+    files = ["--json", tmp_path / "rows.json", "--plot", tmp_path / "plot.png"]
+    status, out, err = igsr_bench(*arguments, "--seconds", "0", *files)
+    assert status == 0, err
+    report = json.loads((tmp_path / "rows.json").read_text())
+    assert report.keys() == {"machine", "rows"}
+    assert report["machine"].keys() >= {"igsr", "seed", "protocol", "threads", "peak_gflops"}
+    assert "instruction_set" in report["machine"]["backends"]["cpu"]
+    for row in report["rows"]:
+        assert row.keys() >= run.COLUMNS.keys()
+        assert (row["ms"] is None) == ("not_run" in row)
+        assert (row["max_error"] is None) == (row["mean_error"] is None) == (row["ms"] is None)
+    ran = [row for row in report["rows"] if row["ms"] is not None]
+    assert [row["pass"] for row in ran] == ["rasterize", "rasterize_backward"]
+    for row in ran:
+        checked_row(row)
+    # What lacked its file is named with the option that gives it, in the file and on the screen.
+    lines = not_run_lines(report["rows"])
+    assert len(lines) == 3
+    assert "--garden" in lines[0]
+    assert "--capture" in lines[1]
+    assert all(line in out for line in lines)
+    with Image.open(tmp_path / "plot.png") as plot:
+        assert plot.width > 500
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--garden", "nowhere.npz"], "nowhere.npz"),
+        (["--capture", "nowhere"], "nowhere"),
+        (["--seconds", "-1"], "--seconds"),
+        (["--seconds", "nan"], "--seconds"),
+        (["--seed", "-1"], "--seed"),
+        (["--json", "/dev/null/rows.json"], "rows.json"),
+    ],
+)
+def test_bad_arguments_are_one_sentence(igsr_bench, arguments, words):
+    status, out, err = igsr_bench("--backend", "cpu", "--workload", "W3", *arguments)
+    assert status == 1
+    assert out == ""
+    assert words in err
+    assert err.endswith(".\n")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "option",
+    [["--workload", "W1"], ["--garden", "a.npz"], ["--capture", "a"], ["--models", "a"]],
+)
+def test_accuracy_takes_no_options_of_workloads(igsr_bench, tmp_path, option):
+    status, out, err = igsr_bench("--accuracy", tmp_path / "page.md", *option)
+    assert (status, out) == (1, "")
+    assert err == f"--accuracy runs no workloads; leave {option[0]} out.\n"
+
+
+def test_a_workload_that_is_not_there_is_refused(igsr_bench):
+    status, _, err = igsr_bench("--workload", "W9")
+    assert status == 2
+    assert "W9" in err
+
+
+@pytest.mark.parametrize(
+    "memory", [{"bytes_per_splat": 900.0, "contract_bytes_per_splat": 760.0}, {}]
+)
+def test_growth_is_drawn(tmp_path, memory):
+    rows = [
+        {
+            "workload": "W4",
+            "pass": "fit step",
+            "backend": "cpu",
+            "splats": count,
+            "width": side,
+            "ms": 1.0 * count * side,
+            **memory,
+        }
+        for count, side in growth.points()
+    ]
+    report = {"machine": machine.describe_machine(["cpu"], 0), "rows": rows}
+    plot_speed_vs_error(tmp_path / "growth.png", report)
+    with Image.open(tmp_path / "growth.png") as plot:
+        assert plot.width > 500
+
+
+def test_the_peak_is_measured_and_wants_a_time():
+    assert _core.peak_multiply_add(0.001) > 0.1
+    for seconds in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="seconds"):
+            _core.peak_multiply_add(seconds)
+
+
+def test_the_example_with_its_own_loss_gains_on_its_start(tmp_path, monkeypatch, capsys):
+    capture = made_up.write_capture(tmp_path, made_up.capture(views=4, size=32))
+
+    def psnr_after(steps):
+        arguments = [capture, "--backend", "cpu", "--splats", 300, "--steps", steps]
+        monkeypatch.setattr(sys, "argv", ["own_loss.py", *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / "own_loss.py"), run_name="__main__")
+        return float(capsys.readouterr().out.split("PSNR ")[1].split(" dB")[0])
+
+    assert psnr_after(60) > psnr_after(1) + 1.0

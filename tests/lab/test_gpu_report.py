@@ -1,0 +1,208 @@
+"""``python -m igsr_lab bench --report``: the page and the figures that a person sends of a GPU."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import types
+
+import numpy as np
+import pytest
+import torch
+
+import igsr
+from igsr import _core
+from igsr.errors import IgsrError
+from igsr_lab import bench as benchmark
+from igsr_lab.bench import gpu_report, gsplat_rows, run, viewer_rows
+from igsr_lab.bench.growth import shot_of
+from igsr_lab.bench.scenes import upstream
+from igsr_lab.commands import gpu_check
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The ball of a report in a second."""
+    monkeypatch.setattr(gpu_report, "GROWN_COUNT", 200)
+    monkeypatch.setattr(gpu_report, "GROWN_SIDE", 32)
+    monkeypatch.setattr(gpu_report, "SMALL_BALL", (200, 32))
+    monkeypatch.setattr(gpu_report, "SIZES", ((64, 48),))
+    monkeypatch.setattr(viewer_rows, "SPLATS", 300)
+    monkeypatch.setattr(viewer_rows, "SMALL_SPLATS", 300)
+
+
+def report_of(monkeypatch, tmp_path, tests=None, workloads=("W2",)):
+    settings = benchmark.Settings(backends=("gpu",), workloads=workloads, seconds=0.0)
+    report = benchmark.device_report(settings)
+    path = tmp_path / "report.html"
+    benchmark.write_device_report(path, {**report, "tests": tests})
+    return path.read_text(), json.loads(path.with_suffix(".json").read_text())
+
+
+@pytest.mark.usefixtures("small")
+def test_the_page_has_device_limits_times_and_errors(monkeypatch, tmp_path):
+    page, figures = report_of(monkeypatch, tmp_path)
+    device = figures["device"]
+    assert device["name"] in page
+    assert device["driver_info"] in page
+    assert device["limits"]["maxStorageBuffersPerShaderStage"] == 8
+    for name, value in device["limits"].items():
+        assert f"<dt>{name}</dt><dd>{value}</dd>" in page
+    assert device["start"]["compile_ms"] > 0.0
+    passes = {row["pass"] for row in figures["rows"] if row["workload"] == "ball" and row["ms"]}
+    assert passes == {"forward", "backward"}
+    for row in figures["rows"]:
+        if row["ms"] is not None and row["workload"] != "viewer":
+            assert row["max_error"] < 1e-3
+            assert f"{row['max_error']:.1e}" in page
+    (frame,) = (row for row in figures["rows"] if row["workload"] == "viewer")
+    assert frame["ms_median"] >= frame["ms"] > 0.0
+    assert (frame["splats"], frame["width"], frame["height"]) == (300, 64, 48)
+    assert {"project", "sort"} <= frame["stages_ms"].keys()
+    assert frame["off_of_255"] <= 4
+    # What did not run says why.
+    assert "W2 on gpu not run: it needs gsplat" in page
+    if gsplat_rows.why_not():
+        assert f"ball on gsplat not run: {gsplat_rows.why_not()}" in page
+
+
+@pytest.mark.usefixtures("small")
+def test_a_software_driver_has_a_small_w4_and_its_name_says_so(monkeypatch, tmp_path):
+    ran = []
+
+    def rows(backend, seed, grid=None, seconds=0.0, name="W4"):
+        ran.append((grid, name))
+        return [run.not_run(name, backend, "only asked")]
+
+    monkeypatch.setattr(run, "growth_rows", rows)
+    monkeypatch.setattr(run, "pair_rows", lambda backend, seed, seconds: [])
+    kind = _core.gpu_report()["kind"]
+    page, _ = report_of(monkeypatch, tmp_path, workloads=("W4",))
+    if kind == gpu_report.SOFTWARE:
+        assert ran == [(run.SMALL_POINTS, "W4 small")]
+        assert "W4 small on gpu not run: only asked" in page
+    monkeypatch.setattr(gpu_report, "SOFTWARE", "none")
+    ran.clear()
+    report_of(monkeypatch, tmp_path, workloads=("W4",))
+    assert ran == [(None, "W4")]
+
+
+def test_a_viewer_that_fails_is_one_message(monkeypatch):
+    monkeypatch.setattr(viewer_rows, "SMALL_SPLATS", 10)
+    with pytest.raises(IgsrError, match=r"size: .*0x48"):
+        viewer_rows.viewer_rows((0, 48), 0, True)
+    monkeypatch.setattr(viewer_rows, "TIMEOUT", 0.0)
+    with pytest.raises(IgsrError, match="took longer than 0 s"):
+        viewer_rows.viewer_rows((64, 48), 0, True)
+
+
+@pytest.mark.usefixtures("small")
+def test_failed_tests_stand_out(monkeypatch, tmp_path):
+    tests = {"command": "cargo", "passed": 3, "failed": ["a_test"], "seconds": 1.0, "error": "<b>"}
+    page, figures = report_of(monkeypatch, tmp_path, tests)
+    assert "1 failed" in page
+    assert "a_test" in page
+    assert "&lt;b&gt;" in page
+    assert figures["tests"] == tests
+
+
+def test_without_a_device_the_page_says_why(monkeypatch, tmp_path):
+    def fails():
+        raise RuntimeError("backend gpu: no adapter answers")
+
+    monkeypatch.setattr(_core, "gpu_report", fails)
+    why = "backend gpu: no adapter answers"
+    device = gpu_report.describe_device()
+    assert device == {"name": None, "error": why}
+    machine = benchmark.run_benchmark(benchmark.Settings(("cpu",), ()))["machine"]
+    path = tmp_path / "report.html"
+    benchmark.write_device_report(path, {"device": device, "machine": machine, "rows": []})
+    assert why in path.read_text()
+
+
+def test_a_report_is_a_page(tmp_path):
+    with pytest.raises(IgsrError, match=r"ends in \.html"):
+        benchmark.json_beside(tmp_path / "report.json")
+
+
+PRINTS = """
+print("test first ... ok")
+print("test second ... noise")
+print("FAILED")
+print("test third ... ", end="", flush=True)
+"""
+
+
+def test_tests_that_do_not_end_are_ended_and_named(tmp_path):
+    # What hangs is the program of tests that cargo started, which keeps cargo's output open.
+    sign = tmp_path / "sign"
+    child = f"import time\nwhile True: open({str(sign)!r}, 'a').write('.'); time.sleep(0.02)"
+    waits = f"{PRINTS}\nimport subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    found = gpu_check.run_tests([sys.executable, "-c", waits], timeout=4.0)
+    assert found["passed"] == 1
+    assert found["failed"] == ["second", "third did not end within 4 s; nothing ran after"]
+    assert found["seconds"] >= 4.0
+    written = sign.stat().st_size
+    time.sleep(0.5)
+    assert sign.stat().st_size == written > 0, "what the command started goes on"
+
+
+def test_tests_run_one_by_one_and_say_what_failed():
+    ends = PRINTS + "print('ok'); raise SystemExit(101)"
+    found = gpu_check.run_tests([sys.executable, "-c", ends])
+    assert (found["passed"], found["failed"], found["error"]) == (2, ["second"], "")
+    assert found["command"].endswith(" -- --test-threads=1")
+    crashed = "import sys; print('test first ... ok'); sys.exit('no device')"
+    found = gpu_check.run_tests([sys.executable, "-c", crashed])
+    assert found["failed"] == ["the tests did not run"]
+    assert "no device" in found["error"]
+
+
+def made_up_gsplat(draws):
+    module = types.ModuleType("gsplat")
+    module.__version__ = "0"
+    module.rasterization = draws
+    return module
+
+
+def test_gsplat_gets_the_scene_in_its_own_terms(monkeypatch):
+    scene = shot_of(0, 30, 16).scene
+    calls = []
+
+    def draws(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **more):
+        calls.append((scales.detach(), opacities.detach(), Ks, more["backgrounds"].shape))
+        value = means.sum() + quats.sum() + scales.sum() + opacities.sum() + colors.sum()
+        return value.expand(1, height, width, 3), value.expand(1, height, width, 1), {}
+
+    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(draws))
+    rows = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
+    assert [row["pass"] for row in rows] == ["forward", "backward"]
+    assert all(row["ms"] >= 0.0 and row["backend"] == "gsplat" for row in rows)
+    scales, opacities, Ks, backgrounds = calls[0]
+    np.testing.assert_allclose(scales, np.exp(scene.splats["scales"]), rtol=1e-6)
+    assert torch.all((opacities > 0.0) & (opacities < 1.0))
+    assert Ks.shape == (1, 3, 3)
+    assert Ks[0, 0, 0] == scene.intrinsics[0]
+    assert backgrounds == (1, 3)
+    assert min(row["max_error"] for row in rows) > 1.0  # a picture of nothing, and of no splats
+
+
+def test_gsplats_rows_have_the_errors_that_igsrs_have(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(igsr.rasterization))
+    scene = shot_of(0, 30, 16).scene
+    picture, gradients = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
+    assert picture["error_of"] == "picture"
+    assert 0.0 < picture["max_error"] < 1e-5
+    assert gradients["error_of"] == "gradients"
+    assert 0.0 < gradients["max_error"] < 1e-4
+    assert gradients["worst"].startswith("v_")
+
+
+def test_a_gsplat_that_fails_is_one_message(monkeypatch):
+    def fails(**given):
+        raise TypeError("unexpected keyword")
+
+    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(fails))
+    with pytest.raises(IgsrError, match="gsplat 0 failed: unexpected keyword"):
+        gsplat_rows.gsplat_rows("ball", shot_of(0, 30, 16).scene, upstream(0, 16, 16), 0.0, "cpu")
