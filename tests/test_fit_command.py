@@ -81,7 +81,7 @@ def test_a_file_of_some_options_leaves_the_rest_to_the_preset(capture_path, tmp_
     [
         ('{"steps": 2.9}', "bad.json: steps must be a whole number, not 2.9."),
         ('{"steps": true}', "bad.json: steps must be a whole number, not true."),
-        ('{"hull": 1}', "bad.json: hull must be true or false, not 1."),
+        ('{"backdrop": 1}', "bad.json: backdrop must be true or false, not 1."),
         ('{"capture": 3}', "bad.json: capture must be a text, not 3."),
         ('{"dropout": "0.5"}', 'bad.json: dropout must be a number, not "0.5".'),
         ('{"stepz": 2}', "bad.json: there is no option 'stepz' here; leave it out."),

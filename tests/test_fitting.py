@@ -441,7 +441,6 @@ def test_a_checkpoint_of_format_1_goes_on(capture, tmp_path):
         "format": 1,
         **options,
         "dropout": 0.3,
-        "hull": False,
         "start": "auto",
         "poses": "fixed",
         "focal": "fixed",

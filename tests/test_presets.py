@@ -62,8 +62,8 @@ def test_default_follows_what_photos_tell_and_gives_way_to_the_caller():
     assert settings_for("default", noise, "high").max_splats == 125_000
     more = replace(detailed, photos=16)
     assert settings_for("default", more).max_splats == round(35_000 * 2**0.4)
-    given = preset_settings("default", 8, dropout=0.0, hull=True, steps=None)
-    assert (given["dropout"], given["hull"]) == (0.0, True)
+    given = preset_settings("default", 8, dropout=0.0, backdrop=False, steps=None)
+    assert (given["dropout"], given["backdrop"]) == (0.0, False)
     assert given["steps"] == settings_for("default", 8).steps
 
 
@@ -209,7 +209,7 @@ def test_instantsplat_starts_with_all_its_splats_and_moves_the_cameras(capture):
         ({"dropout": 0.95}, "dropout must be a number from 0 to 0.9"),
         ({"dropout": float("nan")}, "dropout must be a number from 0 to 0.9"),
         ({"dropout": True}, "dropout must be"),
-        ({"hull": "yes"}, "hull must be True or False"),
+        ({"backdrop": "yes"}, "backdrop must be True or False"),
         ({"start": "sphere"}, "start must be one of auto"),
         ({"start": "points"}, r"^made-up has no 100 points to start from; use another start\.$"),
     ],
@@ -248,14 +248,6 @@ def outside_hull(splats, capture):
         column, row = np.clip(pixel, 0, size[0] - 1).T
         empty |= seen & ~near[row, column]
     return int(empty.sum())
-
-
-def test_splats_outside_the_hull_are_removed(capture):
-    options = {"start": "random", "density": "fixed", "steps": 400, "remove_floaters": False}
-    assert outside_hull(fit(capture, hull=False, **options), capture) > 50
-    kept = fit(capture, hull=True, **options)
-    assert len(kept) > 20
-    assert outside_hull(kept, capture) == 0
 
 
 def test_starts(capture):

@@ -292,7 +292,7 @@ class Fitter:
                 returned.
             config: steps, first_step (where in the schedule the fit begins), seed, sh_degree,
                 max_splats, density ("mcmc", "original", "fixed"), learning_rate (what the first
-                half of the steps multiplies rates by), dropout, hull, background, coarse_to_fine
+                half of the steps multiplies rates by), dropout, background, coarse_to_fine
                 (the first steps are on photos of a fraction of their size), depth_weight (what the
                 loss of depths is multiplied by in the first step); poses ("fixed",
                 "joint"), focal ("fixed", "shared", "per-camera"), camera_rate (pixels per

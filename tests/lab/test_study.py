@@ -31,7 +31,6 @@ SHORT = FitSettings(
     sh_degree=0,
     density="fixed",
     dropout=0.0,
-    hull=False,
     start="random",
     coarse_to_fine=False,
     depth_weight=0.0,
@@ -129,7 +128,7 @@ def test_a_study_is_written_and_goes_on_where_it_stopped(data, tmp_path, monkeyp
 def test_a_real_fit_of_the_study(data, monkeypatch):
     from igsr.fitting import presets
 
-    short = replace(SHORT, steps=30, dropout=0.2, hull=True, start="auto")
+    short = replace(SHORT, steps=30, dropout=0.2, start="auto")
     monkeypatch.setattr(presets, "_default", lambda *_: short)
     row = run_fit(blender.load_views, str(data), Fit("ball", "76", "default", 1, "cpu"))
     assert row["psnr"] > 10.0

@@ -91,7 +91,6 @@ def fit(
     dropout: float | None = None,
     coarse_to_fine: bool | None = None,
     depth_weight: float | None = None,
-    hull: bool | None = None,
     start: Initialization | Splats | None = None,
     poses: Poses | None = None,
     focal: Focal | None = None,
@@ -145,7 +144,6 @@ def fit(
             difference to the photos; each step it falls by the same factor, to a hundredth. They
             are brought to the unit of the capture's points where tracks say how far these are. 0:
             such depths are not used at all. Else fits start from them, too.
-        hull: whether splats are removed whose center a photo with alpha shows empty.
         start: the initialization: "auto", "points", "depths", "hull", "sift", "rays", "random" or
             "sfm"; see ``igsr.fitting.initialization``. Or splats that a fit to some of the photos
             ended with: learning rates and dropout then are those of the last ``steps`` of a fit of

@@ -73,7 +73,6 @@ _DEFAULT = FitSettings(
     density="original",
     learning_rate=1.0,
     dropout=0.0,
-    hull=False,
     start="auto",
     coarse_to_fine=True,
     depth_weight=DEPTH_WEIGHT,

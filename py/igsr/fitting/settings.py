@@ -89,9 +89,6 @@ class FitSettings:
             limits=(0.0, 0.9),
         )
     )
-    hull: bool = field(
-        metadata=about("Remove splats outside the visual hull of photos with alpha.")
-    )
     start: Initialization = field(
         metadata=about(
             "Initialization: points (of the capture), depths (these and points of the photos' "

@@ -206,7 +206,6 @@ def _work(out: Path, data: str, one: PairFit) -> dict[str, Any]:
         backend=one.backend,
         seed=one.seed + one.number,
         steps=plan.steps,
-        hull=_hull(one),
         # Exact depths of rendered captures would make these fits better than those of photos.
         depth_weight=0.0,
         backdrop=False,  # holes are to be seen as such
@@ -260,11 +259,6 @@ def _size(view: View) -> tuple[int, int]:
 
 def _used(capture: Capture, all_views: bool) -> list[View]:
     return capture.views if all_views else capture.train_views
-
-
-def _hull(one: PairFit) -> bool | None:
-    """Silhouettes of wrong cameras, or as the paper had them, take nothing away."""
-    return False if one.recipe in ("noise", "paper", "scattered") else None
 
 
 def _planned(capture: Capture, one: PairFit, random: np.random.Generator) -> _Plan:

@@ -131,8 +131,7 @@ def fits(inputs: Inputs) -> Results:
         yield f"initialization rays, {name}", fitted(few, **small | {"steps": 60}, start="rays")
     yield "initialization auto, far apart", fitted(few, **small | {"steps": 60})
     yield "dropout", fitted(around, **small, density="mcmc", dropout=0.4)
-    yield "hull", fitted(around, **small, density="mcmc", hull=True)
-    yield "no dropout, no hull", fitted(around, **small, density="mcmc", dropout=0.0, hull=False)
+    yield "no dropout", fitted(around, **small, density="mcmc", dropout=0.0)
     yield "sh degree 0", fitted(around, **small | {"steps": 100}, sh_degree=0)
     yield "background", fitted(room, **small | {"steps": 100}, background=(0.2, 0.4, 0.6))
     yield "masks", fitted(inputs.bent, **small | {"steps": 350})
@@ -195,13 +194,13 @@ def weights_of(view: igsr.View) -> np.ndarray:
 
 
 def gpu_fits(inputs: Inputs) -> Results:
-    """Fits on the GPU: each density control, dropout and the hull, and joint poses."""
+    """Fits on the GPU: each density control, dropout, and joint poses."""
     if not inputs.gpu:
         return
     small: dict[str, Any] = {"backend": "gpu", "max_splats": 500, "seed": 3}
     for density, steps in (("mcmc", 420), ("original", 620), ("fixed", 60)):
         yield density, fitted(inputs.around, steps, density=density, **small)
-    yield "dropout and hull", fitted(inputs.around, 320, dropout=0.4, hull=True, **small)
+    yield "dropout", fitted(inputs.around, 320, dropout=0.4, **small)
     splats, capture = fit(inputs.room, 40, poses="joint", focal="shared", **small)
     yield "joint poses", [splats, *cameras_of(capture)]
 

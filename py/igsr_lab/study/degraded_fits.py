@@ -163,7 +163,6 @@ def run_fit(out: Path, data: str, one: DegradedFit) -> dict[str, Any]:
         seed=one.seed,
         steps=_steps(one.kind),
         # Silhouettes of wrong cameras take away what is there.
-        hull=None if one.kind in FEW else False,
         # Few photos have depths; those of rendered captures would tell a fit too much.
         depth_weight=0.0,
         backdrop=False,  # holes are to be seen as such
