@@ -1,13 +1,9 @@
-"""Settings as frozen dataclasses whose fields say what they mean and what they may be.
-
-A settings class names each setting once. Its fields carry a help text, limits and other names in
-their metadata (``about``); ``validate`` checks them and ``igsr.cli.settings_options`` makes command
-line options from them:
+"""Settings as frozen dataclasses: ``validate`` checks each field by its type and limits.
 
 >>> @dataclass(frozen=True, kw_only=True)
 ... class FitSettings:
-...     steps: int = field(metadata=about("Optimiser steps.", limits=(1, 10_000_000)))
-...     density: Literal["mcmc", "fixed"] = field(metadata=about("How splats are added."))
+...     steps: int = field(metadata=about(limits=(1, 10_000_000)))
+...     density: Literal["mcmc", "fixed"] = field(metadata=about())
 ...
 ...     def __post_init__(self) -> None:
 ...         validate(self)
@@ -33,7 +29,6 @@ _KEY = "igsr.setting"
 class _About:
     help: str
     limits: tuple[float, float] | None
-    aliases: tuple[str, ...]
     read: Callable[[str, Any], Any] | None
 
 
@@ -44,14 +39,13 @@ class Setting:
     Attributes:
         name: of the field.
         kind: int, float, bool, str or another class.
-        choices: what it may be, where its type is a ``Literal``; else empty.
-        optional: whether it may be None.
-        default: of the field; ``dataclasses.MISSING`` where it has none.
-        help: what it means, one or two sentences.
-        limits: least and most of a number, or None.
-        aliases: other names of its command line option, without dashes.
-        read: takes name and value and returns the value as it is kept, or raises IgsrError; None
-            where ``kind``, ``choices`` and ``limits`` say all.
+        choices: allowed values if the type is a ``Literal``, else empty.
+        optional: whether None is allowed.
+        default: of the field; ``dataclasses.MISSING`` if it has none.
+        help: one or two sentences for a command line option; may be empty.
+        limits: smallest and largest number, or None.
+        read: converts (name, value) to the value that is kept, or raises IgsrError; None if
+            ``kind``, ``choices`` and ``limits`` suffice.
     """
 
     name: str
@@ -61,23 +55,21 @@ class Setting:
     default: Any
     help: str
     limits: tuple[float, float] | None
-    aliases: tuple[str, ...]
     read: Callable[[str, Any], Any] | None
 
 
 def about(
-    help: str,
+    help: str = "",
     *,
     limits: tuple[float, float] | None = None,
-    aliases: tuple[str, ...] = (),
     read: Callable[[str, Any], Any] | None = None,
 ) -> Mapping[str, Any]:
-    """The metadata of a setting's field; see ``Setting``."""
-    return {_KEY: _About(help, limits, aliases, read)}
+    """Return the metadata of a setting's field; see ``Setting``."""
+    return {_KEY: _About(help, limits, read)}
 
 
 def settings_of(cls: type) -> dict[str, Setting]:
-    """The settings of a class by name, in its order. Fields without ``about`` are none."""
+    """Return the settings of a class by name. Fields without ``about`` are left out."""
     hints = typing.get_type_hints(cls)
     return {
         one.name: _setting(one, hints[one.name])
@@ -87,13 +79,12 @@ def settings_of(cls: type) -> dict[str, Setting]:
 
 
 def validate(settings: object) -> None:
-    """Check a settings object; for its ``__post_init__``.
+    """Check and normalize all settings of an object; call it in ``__post_init__``.
 
-    Numbers of other libraries (numpy) become Python's own, so that equal settings look alike
-    wherever they are written.
+    Numbers of other libraries (numpy) become Python's own.
 
     Raises:
-        IgsrError: a setting cannot be used; the message names it.
+        IgsrError: a setting has an invalid value; the message names the setting.
     """
     for name, setting in settings_of(type(settings)).items():
         # The object is frozen for all but its own construction.
@@ -101,23 +92,23 @@ def validate(settings: object) -> None:
 
 
 def checked_given(cls: type, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Those settings of ``given`` that are not None, checked one by one.
+    """Return the values of ``given`` that are not None, checked one by one.
 
     Raises:
-        IgsrError: one cannot be used, or there is none of that name.
+        IgsrError: a value is invalid, or a setting is unknown.
     """
     known = settings_of(cls)
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise IgsrError(f"there is no setting {unknown[0]}; there are {', '.join(known)}.")
+        raise IgsrError(f"unknown setting {unknown[0]}; known settings: {', '.join(known)}.")
     return {name: checked(known[name], value) for name, value in given.items() if value is not None}
 
 
 def checked(setting: Setting, value: Any) -> Any:
-    """``value`` as the setting keeps it.
+    """Check one value and return it as the setting keeps it.
 
     Raises:
-        IgsrError: the setting cannot have this value.
+        IgsrError: the value is invalid.
     """
     name = setting.name
     if value is None and setting.optional:
@@ -125,7 +116,7 @@ def checked(setting: Setting, value: Any) -> Any:
     if setting.read is not None:
         return setting.read(name, value)
     if setting.choices:
-        # Compared as text: what is no text may have a comparison of its own, as arrays do.
+        # Arrays compare elementwise, so check for text first.
         if not isinstance(value, str) or value not in setting.choices:
             raise IgsrError(f"{name} must be one of {', '.join(setting.choices)}, not {value!r}.")
         return str(value)
@@ -144,7 +135,7 @@ def checked(setting: Setting, value: Any) -> Any:
     if setting.kind is float:
         low, high = setting.limits or (-math.inf, math.inf)
         real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-        if not real or not low <= float(value) <= high:  # nan is in no range
+        if not real or not low <= float(value) <= high:  # NaN fails both comparisons
             within = "" if setting.limits is None else f" from {low:g} to {high:g}"
             raise IgsrError(f"{name} must be a number{within}, not {value!r}.")
         return float(value)
@@ -154,7 +145,7 @@ def checked(setting: Setting, value: Any) -> Any:
 
 
 def _setting(field: dataclasses.Field[Any], hint: Any) -> Setting:
-    said: _About = field.metadata[_KEY]
+    metadata: _About = field.metadata[_KEY]
     optional = False
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
@@ -169,8 +160,7 @@ def _setting(field: dataclasses.Field[Any], hint: Any) -> Setting:
         choices=choices,
         optional=optional,
         default=field.default,
-        help=said.help,
-        limits=said.limits,
-        aliases=said.aliases,
-        read=said.read,
+        help=metadata.help,
+        limits=metadata.limits,
+        read=metadata.read,
     )

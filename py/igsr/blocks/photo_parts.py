@@ -90,7 +90,6 @@ def cut_out(view: View, box: Box) -> View:
         camera=Camera(camera.viewmat, K, right - left, bottom - top),
         image=image,
         mask=part(view.mask),
-        weights=part(view.weights),
         depth=part(view.depth),
         depth_confidence=part(view.depth_confidence),
     )

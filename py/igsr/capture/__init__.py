@@ -8,6 +8,15 @@ from __future__ import annotations
 
 from igsr.capture.exposure import Exposure
 from igsr.capture.load import load_capture
-from igsr.capture.types import Camera, Capture, Points, View
+from igsr.capture.types import Camera, Capture, Points, PseudoView, View, photos_among
 
-__all__ = ["Camera", "Capture", "Exposure", "Points", "View", "load_capture"]
+__all__ = [
+    "Camera",
+    "Capture",
+    "Exposure",
+    "Points",
+    "PseudoView",
+    "View",
+    "load_capture",
+    "photos_among",
+]

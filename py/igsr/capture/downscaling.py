@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from igsr.capture.types import Camera, View
+from igsr.capture.types import Camera, PseudoView, View
 from igsr.errors import IgsrError
 
 Float64 = npt.NDArray[np.float64]
@@ -146,18 +146,18 @@ def reduced_view(view: View, width: int, height: int) -> View:
     if (width, height) == (view.camera.width, view.camera.height):
         return view
     image, mask = area_means(view.image, width, height, view.mask)
-    weights = None
-    if view.weights is not None:
-        weights = plane_area_means(view.weights, width, height).astype(np.float32)
+    weights = {}
+    if isinstance(view, PseudoView):
+        weights["weights"] = plane_area_means(view.weights, width, height).astype(np.float32)
     camera = resized_camera(view.camera, width, height)
     return replace(
         view,
         camera=camera,
         image=image,
         mask=mask,
-        weights=weights,
         depth=_resampled(view.depth, width, height),
         depth_confidence=_resampled(view.depth_confidence, width, height),
+        **weights,
     )
 
 
@@ -191,9 +191,9 @@ def halved(view: View) -> View:
         camera=replace(view.camera, width=2 * width, height=2 * height),
         image=view.image[even],
         mask=None if view.mask is None else view.mask[even],
-        weights=None if view.weights is None else view.weights[even],
         depth=None if view.depth is None else view.depth[even],
         depth_confidence=None if view.depth_confidence is None else view.depth_confidence[even],
+        **({"weights": view.weights[even]} if isinstance(view, PseudoView) else {}),
     )
     return reduced_view(whole, width, height)
 

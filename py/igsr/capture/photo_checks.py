@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from igsr.capture import View
 from igsr.capture.sharpness import blurred_photos
+from igsr.capture.types import PseudoView, View
 from igsr.errors import IgsrError
 
 #: Cameras nearer to each other than this part of the largest distance are at the same place.
@@ -38,7 +38,8 @@ def check_photos(views: list[View]) -> None:
         raise IgsrError("Every photo is black or wholly transparent; there is nothing to fit.")
     if empty:
         _warn(f"{_listed(empty)}: black or wholly transparent; leave out what shows nothing.")
-    photos = ((view.photo, view.image, view.mask) for view in views if view.weights is None)
+    shots = [view for view in views if not isinstance(view, PseudoView)]
+    photos = ((view.photo, view.image, view.mask) for view in shots)
     blurred = sorted(blurred_photos(photos))
     if blurred:
         _warn(f"{_listed(blurred)}: blurred; leave out what another photo shows sharp.")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -117,12 +117,6 @@ class View(ArrayEquality, NotebookPicture):
             lens distortion already undone.
         mask: bool [H, W], True where a pixel may be used, or None if all may. It joins the given
             mask and the pixels that undistortion could fill.
-        weights: float32 [H, W], confidence weight of each pixel in fits, finite and not negative,
-            or None for photos, whose pixels have the weight 1. A view with weights is a
-            pseudo-view: fits sample it less often than photos (at least five steps on photos for
-            one on a pseudo-view), and not at all in the last fifth of the steps.
-        background: RGB in [0, 1] behind the content of an ``image`` without alpha, where it is
-            known: fits render over it. None for photos.
         exposure: gain and offset of the photo's colors, where a fit has found them; None where they
             are not known, or are those of the scene. Scores of the view are of renders with them.
         exposure_value: how much light the photo took by its EXIF, in stops (log2 of seconds times
@@ -137,9 +131,8 @@ class View(ArrayEquality, NotebookPicture):
         pose_evidence: what the camera rests on, where igsr found it; or None.
 
     Raises:
-        IgsrError: the image, mask or weights have another dtype or shape than the camera's size
-            asks for, a weight is negative or not finite, or the background is not a colour or is
-            given for an image with alpha.
+        IgsrError: the image, mask or depth has a dtype or shape that does not fit the camera's
+            size, or a depth is negative or not finite.
     """
 
     _pictures_by: ClassVar[str] = "igsr.capture.thumbnails:view_pictures"
@@ -149,8 +142,6 @@ class View(ArrayEquality, NotebookPicture):
     split: Split
     image: np.ndarray
     mask: np.ndarray | None = None
-    weights: np.ndarray | None = None
-    background: tuple[float, float, float] | None = None
     exposure: Exposure | None = None
     exposure_value: float | None = None
     rig: str | None = None
@@ -164,10 +155,6 @@ class View(ArrayEquality, NotebookPicture):
         self._check("image", self.image, np.uint8, [(*size, 3), (*size, 4)])
         if self.mask is not None:
             self._check("mask", self.mask, np.bool_, [size])
-        if self.weights is not None:
-            self._check("weights", self.weights, np.float32, [size])
-            if not (np.isfinite(self.weights) & (self.weights >= 0.0)).all():
-                raise IgsrError(f"{self.name}: its weights must be finite and not negative")
         if self.depth is not None:
             self._check("depth", self.depth, np.float32, [size])
             if not (np.isfinite(self.depth) & (self.depth >= 0.0)).all():
@@ -178,12 +165,6 @@ class View(ArrayEquality, NotebookPicture):
                 raise IgsrError(f"{self.name}: it has depth_confidence without depth")
             if not ((self.depth_confidence >= 0.0) & (self.depth_confidence <= 1.0)).all():
                 raise IgsrError(f"{self.name}: its depth_confidence must lie in 0..1")
-        if self.background is not None:
-            color = np.asarray(self.background, np.float64)
-            if color.shape != (3,) or not ((color >= 0.0) & (color <= 1.0)).all():
-                raise IgsrError(f"{self.name}: its background must be three numbers in [0, 1]")
-            if self.image.shape[2] == 4:
-                raise IgsrError(f"{self.name}: only an image without alpha has a background")
 
     @property
     def photo(self) -> str:
@@ -193,8 +174,8 @@ class View(ArrayEquality, NotebookPicture):
     def __repr__(self) -> str:
         parts = [repr(self.name), self.split, f"{self.camera.width}x{self.camera.height}"]
         parts += ["alpha"] if self.image.shape[2] == 4 else []
-        parts += [name for name in ("mask", "weights", "depth") if getattr(self, name) is not None]
-        return f"View({', '.join(parts)})"
+        parts += [name for name in ("mask", "depth") if getattr(self, name) is not None]
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     @property
     def known_depth(self) -> np.ndarray | None:
@@ -216,6 +197,44 @@ class View(ArrayEquality, NotebookPicture):
                 f"{self.name}: its {what} is {array.dtype} {list(array.shape)} where its camera "
                 f"needs {np.dtype(dtype)} {wanted}"
             )
+
+
+@dataclass(eq=False, repr=False)
+class PseudoView(View):
+    """A made-up picture that a fit uses like a photo, such as a denoised novel view.
+
+    Fits take at least five steps on photos for one on a pseudo-view, and none on pseudo-views in
+    the last fifth of the steps.
+
+    Attributes:
+        weights: float32 [H, W], weight of each pixel beside a photo's pixel, which has 1.
+        background: RGB in [0, 1] behind the content of the image; None if it is unknown.
+
+    Raises:
+        IgsrError: the weights have another dtype or shape than the image, a weight is negative or
+            not finite, or the background is not a color or is given for an image with alpha.
+    """
+
+    weights: np.ndarray = field(kw_only=True)
+    background: tuple[float, float, float] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the pixels against the camera."""
+        super().__post_init__()
+        self._check("weights", self.weights, np.float32, [self.image.shape[:2]])
+        if not (np.isfinite(self.weights) & (self.weights >= 0.0)).all():
+            raise IgsrError(f"{self.name}: its weights must be finite and not negative")
+        if self.background is not None:
+            color = np.asarray(self.background, np.float64)
+            if color.shape != (3,) or not ((color >= 0.0) & (color <= 1.0)).all():
+                raise IgsrError(f"{self.name}: its background must be three numbers in [0, 1]")
+            if self.image.shape[2] == 4:
+                raise IgsrError(f"{self.name}: only an image without alpha has a background")
+
+
+def photos_among(views: Sequence[View]) -> list[View]:
+    """The views that are photos, not pseudo-views; all if none is a photo."""
+    return [view for view in views if not isinstance(view, PseudoView)] or list(views)
 
 
 @dataclass(eq=False, repr=False)

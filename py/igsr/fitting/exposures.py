@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from igsr.capture import Exposure, Points, View
+from igsr.capture import Exposure, Points, PseudoView, View
 from igsr.fitting.settings import ExposureMode
 
 Float64 = npt.NDArray[np.float64]
@@ -98,7 +98,7 @@ def starting_exposures(
     """
     if mode == "off":
         return None
-    photos = [view for view in views if view.weights is None]
+    photos = [view for view in views if not isinstance(view, PseudoView)]
     if any(view.exposure is not None for view in photos):
         known = [view.exposure or Exposure() for view in photos]
         error = np.full(len(photos), FITTED_ERROR)
@@ -114,7 +114,7 @@ def starting_exposures(
             error = np.sqrt(np.mean(gains.error**2, axis=1))
     pull = np.minimum(MOST_PULL, (UNIT_ERROR / np.maximum(error, 1e-9)) ** 2)
     each = iter(zip(known, pull, strict=True))
-    rows = [next(each) if view.weights is None else (None, 0.0) for view in views]
+    rows = [(None, 0.0) if isinstance(view, PseudoView) else next(each) for view in views]
     return StartingExposures([one for one, _ in rows], np.array([by for _, by in rows]))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import View
-from igsr.capture.types import Tracks
+from igsr.capture.types import PseudoView, Tracks
 
 
 def fingerprint(views: list[View], tracks: Tracks | None = None) -> str:
@@ -18,13 +18,18 @@ def fingerprint(views: list[View], tracks: Tracks | None = None) -> str:
     arrays: list[npt.NDArray[Any] | None] = []
     for view in views:
         camera = view.camera
-        arrays += [camera.viewmat, camera.K, view.image, view.mask, view.weights]
+        arrays += [camera.viewmat, camera.K, view.image, view.mask, _weights(view)]
         arrays += [view.depth, view.depth_confidence]
-        arrays.append(None if view.background is None else np.asarray(view.background))
+        background = view.background if isinstance(view, PseudoView) else None
+        arrays.append(None if background is None else np.asarray(background))
         arrays.append(None if view.rig is None else np.frombuffer(view.rig.encode(), np.uint8))
     if tracks is not None:
         arrays += [tracks.view, tracks.point, tracks.xy]
     return hash_of(arrays)
+
+
+def _weights(view: View) -> npt.NDArray[np.float32] | None:
+    return view.weights if isinstance(view, PseudoView) else None
 
 
 def hash_of(arrays: Iterable[npt.NDArray[Any] | None]) -> str:

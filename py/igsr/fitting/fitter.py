@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.choices import FitBackend
-from igsr.capture import Camera, Capture, Exposure, View
+from igsr.capture import Camera, Capture, Exposure, PseudoView, View, photos_among
 from igsr.capture.types import intrinsic_matrix
 from igsr.errors import IgsrError
 from igsr.fitting.checkpoint import GIVEN
@@ -59,7 +59,7 @@ def fitter_of(
     return _core.Fitter(
         [np.ascontiguousarray(view.image) for view in views],
         [_counting(view) for view in views],
-        [view.background for view in views],
+        [getattr(view, "background", None) for view in views],
         _schedule(views, int(settings["steps"]), int(settings.get("first_step", 0))),
         *_arrays(views, origin),
         state,
@@ -140,32 +140,24 @@ def first_splats(splats: Splats, count: int) -> Splats:
     return subset(splats, slice(count))
 
 
-def photos_among(views: list[View]) -> list[View]:
-    """The views that are photos, by which presets and initialization go; all where none is.
-
-    Views with weights are pseudo-views: they show what a fit to the photos made up.
-    """
-    return [view for view in views if view.weights is None] or views
-
-
 def _schedule(views: Sequence[View], steps: int, first: int) -> list[tuple[int, int | None]]:
     """For each view, its steps in a round and the first step that no longer takes it.
 
     The latter is None for views that stay to the end. Steps are counted from 0; a fit that enters
     the schedule late begins with ``first``.
     """
-    photos = sum(view.weights is None for view in views)
+    photos = sum(not isinstance(view, PseudoView) for view in views)
     others = len(views) - photos
     if not photos:
         return [(1, None)] * others
     each = max(1, -(-PHOTO_STEPS * others // photos))
     until = first + round((1.0 - PHOTOS_LAST) * (steps - first))
-    return [(each, None) if view.weights is None else (1, until) for view in views]
+    return [(1, until) if isinstance(view, PseudoView) else (each, None) for view in views]
 
 
 def _counting(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None:
     """What the fitter takes as a view's mask [H, W]: confidence weights where the view has them."""
-    if view.weights is None:
+    if not isinstance(view, PseudoView):
         return None if view.mask is None else np.ascontiguousarray(view.mask)
     return np.ascontiguousarray(view.weights if view.mask is None else view.weights * view.mask)
 
@@ -224,7 +216,7 @@ def fitted_exposures(views: Sequence[View], fitter: _core.Fitter) -> list[Exposu
     if arrays is None:
         return [None] * len(views)
     return [
-        None if view.weights is not None else Exposure(tuple(gain), tuple(offset))
+        None if isinstance(view, PseudoView) else Exposure(tuple(gain), tuple(offset))
         for view, gain, offset in zip(views, arrays["gains"], arrays["offsets"], strict=True)
     ]
 

@@ -10,13 +10,14 @@ any photo showing it. Scores of held-out photos therefore say which cameras they
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
+from igsr._internal.event import Event, Listener
 from igsr.capture import View
 from igsr.errors import IgsrError
 from igsr.fitting.fitter import fitted_cameras, fitter_of
@@ -35,7 +36,7 @@ def refine_cameras(
     *,
     steps: int = REFINE_STEPS,
     backend: str = "auto",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> list[View]:
     """The views with poses fitted to their photos; splats and focal lengths stay as they are.
 
@@ -49,7 +50,7 @@ def refine_cameras(
         steps: steps per view; each moves the picture by at most about a third of a pixel, at the
             end by a hundredth.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
-        progress: called with steps done and steps in all, now and then.
+        progress: called with each ``igsr.Event``.
 
     Returns:
         The views in their order, with other cameras.
@@ -81,7 +82,7 @@ def refine_cameras(
         for done in range(len(views), total + 1, len(views)):
             fitter.step(len(views))
             if progress is not None:
-                progress(done, total)
+                progress(Event("refine cameras", done, total))
     except ValueError as error:
         raise IgsrError(f"{error}.") from error
     cameras = fitted_cameras(views, fitter, splats.origin)

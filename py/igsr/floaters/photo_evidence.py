@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
-from igsr.capture import Camera, View
+from igsr.capture import Camera, PseudoView, View
 from igsr.evaluation.scores import over_background
 from igsr.rendering.renders import project
 from igsr.splats import Splats
@@ -200,7 +200,8 @@ def needed_by_others(
     random = np.random.default_rng([seed, 0xF10A])
     total, most = np.zeros(len(splats)), np.full(len(splats), -np.inf)
     for view in views:
-        behind = background if view.background is None else view.background
+        own = view.background if isinstance(view, PseudoView) else None
+        behind = background if own is None else own
         picture = _Picture(splats, view.camera, np.asarray(behind, dtype), backend)
         opacities = picture.projected["opacities"].astype(np.float64)
         photo = over_background(view.image, behind).astype(dtype) / dtype(255.0)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
-from igsr.capture import Capture, View
+from igsr.capture import Capture, PseudoView, View, photos_among
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background
 from igsr.floaters.isolation import alone
@@ -131,10 +131,10 @@ def unsupported_splats(
     Raises:
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
-    photos = [view for view in views if view.weights is None] or views
+    photos = photos_among(views)
     masks = [view.mask for view in photos]
     seen = sightings(splats, [view.camera for view in photos], backend, masks)
-    others = [view.camera for view in views if view.weights is not None]
+    others = [view.camera for view in views if isinstance(view, PseudoView)]
     unseen = seen.area + sightings(splats, others, backend).area < SHOWN
     # What photos hardly show, pseudo-views do.
     masked = ~unseen & (seen.area >= SHOWN) & (seen.counted < COUNTED * seen.area)

@@ -1,4 +1,4 @@
-"""The pose estimators by name; a new one is a file of its own and an entry here."""
+"""The pose estimators by name. A new one is a file of its own and an entry here."""
 
 from __future__ import annotations
 
@@ -17,13 +17,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Entry:
-    """How an estimator is made.
+    """An estimator.
 
     Attributes:
-        make: makes it; its parameters are the options of the estimator.
-        ready: whether it can run here with these options; "auto" takes the first that can. A
-            network without torch is ready only where its checkpoint was named, for the message that
-            says what is missing.
+        make: makes it; its parameters are the estimator's options.
+        ready: whether it can run here with these options: its packages and weights are found.
     """
 
     make: Callable[..., Estimator]
@@ -43,13 +41,13 @@ def _dust3r(
 
 def _dust3r_is_ready(options: Mapping[str, Any]) -> bool:
     if not is_installed("torch"):
-        return options.get("checkpoint") is not None
+        return False
     from igsr.pose.dust3r.checkpoint import find_checkpoint
 
     return find_checkpoint(options.get("checkpoint")) is not None
 
 
-def _colmap(matcher: str | Matcher = "sift") -> Estimator:
+def _colmap(matcher: Matcher | None = None) -> Estimator:
     from igsr.pose.colmap import Colmap
 
     return Colmap(matcher)
@@ -60,7 +58,7 @@ def _da3(
     cameras: Mapping[str, Camera] | None = None,
     cameras_from: str = "decoder",
     bundle_adjustment: bool = True,
-    matcher: str | Matcher = "sift",
+    matcher: Matcher | None = None,
 ) -> Estimator:
     with naming_extra("estimator da3"):
         from igsr.pose.da3.estimator import Da3
@@ -76,16 +74,16 @@ def _da3(
 
 def _da3_is_ready(options: Mapping[str, Any]) -> bool:
     if not is_installed("torch"):
-        return options.get("checkpoint") is not None
+        return False
     from igsr.pose.da3.checkpoint import find_checkpoint
 
     return find_checkpoint(options.get("checkpoint")) is not None
 
 
-#: In the order that "auto" tries them. Depth Anything 3 comes before COLMAP, whose cameras stand
-#: there, too, where it places all photos. COLMAP is always ready, and is last.
 ESTIMATORS = {
+    "colmap": Entry(_colmap, lambda options: True),
     "dust3r": Entry(_dust3r, _dust3r_is_ready),
     "da3": Entry(_da3, _da3_is_ready),
-    "colmap": Entry(_colmap, lambda options: True),
 }
+#: Pose networks, in the order that "auto" looks for their weights.
+NETWORKS = ("da3", "dust3r")

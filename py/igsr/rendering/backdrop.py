@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.choices import Backend
-from igsr.capture import View
+from igsr.capture import PseudoView, View
 from igsr.capture.downscaling import reduced_size, reduced_view
 from igsr.geometry.camera_paths import even_directions
 from igsr.geometry.pixel_rays import pixel_rays
@@ -64,7 +64,9 @@ def wants_backdrop(photos: Sequence[View], background: Sequence[float] | None = 
         background: RGB in [0, 1], if one was asked for.
     """
     if background is not None or any(
-        photo.image.shape[2] == 4 or photo.background is not None for photo in photos
+        photo.image.shape[2] == 4
+        or (isinstance(photo, PseudoView) and photo.background is not None)
+        for photo in photos
     ):
         return False
     hidden = [0.0 if photo.mask is None else 1.0 - photo.mask.mean() for photo in photos]

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.choices import Backend
-from igsr.capture import View
+from igsr.capture import PseudoView, View
 from igsr.splats import Splats
 from igsr.transients.regions import box_sums, dilated, eroded, labels
 from igsr.transients.witnesses import (
@@ -72,7 +72,7 @@ def find_transients(
         For each view, bool [H, W], True where it shows something transient; None where it shows
         nothing of the kind.
     """
-    which = [k for k, view in enumerate(views) if view.weights is None]
+    which = [k for k, view in enumerate(views) if not isinstance(view, PseudoView)]
     photos = small_photos(
         splats, [views[k] for k in which], [before[k] for k in which], background, backend
     )

@@ -19,9 +19,8 @@ from igsr.pose.colmap.database import image_id, list_photos
 from igsr.pose.colmap.distortion import without_distortion
 from igsr.pose.colmap.features import find_features, usable_pixels
 from igsr.pose.colmap.given_matches import matched_by
-from igsr.pose.colmap.matcher import Matcher
+from igsr.pose.colmap.matcher import Matcher, checked_matcher
 from igsr.pose.colmap.matching import matched
-from igsr.pose.colmap.named_matchers import SIFT, matcher_of
 from igsr.pose.colmap.result import estimate_of
 from igsr.pose.colmap.time_estimate import camera_seconds
 from igsr.pose.estimate import Estimate, Progress
@@ -34,17 +33,16 @@ class Colmap:
     """Finds cameras with pycolmap; see the package.
 
     Args:
-        matcher: what finds and matches features: "sift" (COLMAP's), a name of ``MATCHERS``, or a
-            ``Matcher``.
+        matcher: finds and matches features; None is COLMAP's SIFT.
 
     Raises:
-        IgsrError: there is no such matcher, or it cannot run here.
+        IgsrError: the matcher has no name, by which found cameras are kept.
     """
 
     name = "colmap"
 
-    def __init__(self, matcher: str | Matcher = SIFT) -> None:
-        self._matcher = matcher_of(matcher)
+    def __init__(self, matcher: Matcher | None = None) -> None:
+        self._matcher = checked_matcher(matcher)
 
     def __call__(
         self, photos: Sequence[Photo], *, seed: int = 0, progress: Progress | None = None
@@ -94,7 +92,7 @@ def matched_photos(
     list_photos(photos, database)
     if matcher is not None:
         return matched_by(matcher, photos, database, seed, show)
-    find_features(photos, workspace, database, show)
+    find_features(photos, database, show)
     return matched(len(photos), database, seed, show)
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
@@ -50,7 +49,7 @@ def matched_by(
     found = []
     for index, photo in enumerate(photos):
         show("features", index, count)
-        found.append(_features(matcher, photo, database.with_name(photo_file(index))))
+        found.append(_features(matcher, photo))
     show("features", count, count)
     pairs = [(a, b) for a in range(count) for b in range(a + 1, count)]
     listing = database.with_name("pairs.txt")
@@ -73,13 +72,9 @@ def matched_by(
     return database
 
 
-def _features(matcher: Matcher, photo: Photo, file: Path) -> PhotoFeatures:
-    """The features of a photo's usable pixels; the file is written and removed."""
-    Image.fromarray(np.ascontiguousarray(photo.image[..., :3])).save(file, compress_level=1)
-    try:
-        found = matcher.features(file)
-    finally:
-        file.unlink()
+def _features(matcher: Matcher, photo: Photo) -> PhotoFeatures:
+    """The features of a photo's usable pixels."""
+    found = matcher.features(np.ascontiguousarray(photo.image[..., :3]))
     xy = np.asarray(found.xy, dtype=np.float32)
     height, width = photo.image.shape[:2]
     if xy.ndim != 2 or xy.shape[1] != 2 or len(found.descriptors) != len(xy):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+
+from igsr.errors import IgsrError
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +42,19 @@ class Matcher(Protocol):
 
     name: str
 
-    def features(self, photo: Path) -> PhotoFeatures:
-        """The features of a photo, an RGB PNG file. Those of masked pixels are left out later."""
+    def features(self, image: npt.NDArray[np.uint8]) -> PhotoFeatures:
+        """The features of a photo, RGB [H, W, 3]. Those of masked pixels are removed later."""
 
     def matches(self, first: PhotoFeatures, second: PhotoFeatures) -> npt.NDArray[np.uint32]:
         """Indices into the features of both, [M, 2]; no feature is in two pairs."""
+
+
+def checked_matcher(matcher: Matcher | None) -> Matcher | None:
+    """Check that a custom matcher has a name.
+
+    Raises:
+        IgsrError: it has none.
+    """
+    if matcher is not None and not isinstance(getattr(matcher, "name", None), str):
+        raise IgsrError("matcher needs an attribute name, by which found cameras are kept")
+    return matcher

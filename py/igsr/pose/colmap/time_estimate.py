@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from igsr.pose.colmap.features import LONGEST
+from igsr.pose.colmap.features import MAX_SIDE_PX
 from igsr.pose.colmap.pairs import EXHAUSTIVE, FOLLOWING, MOST_SIMILAR
 
 #: Seconds of one core for the features of a photo of a million pixels, for matching a pair of
@@ -22,7 +22,7 @@ def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     count, pixels = len(sizes), 0.0
     for width, height in sizes:
-        scale = min(1.0, LONGEST / max(width, height))
+        scale = min(1.0, MAX_SIDE_PX / max(width, height))
         pixels += width * height * scale * scale
     pairs = count * (count - 1) / 2 if count <= EXHAUSTIVE else count * (FOLLOWING + MOST_SIMILAR)
     parallel = FEATURES * pixels / 1e6 + PAIR * pairs

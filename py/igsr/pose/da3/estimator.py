@@ -16,8 +16,7 @@ from igsr.errors import IgsrError
 from igsr.geometry.similarity import similarity_between
 from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.all_evidence import Evidence, with_all_evidence
-from igsr.pose.colmap.matcher import Matcher
-from igsr.pose.colmap.named_matchers import SIFT, matcher_of
+from igsr.pose.colmap.matcher import Matcher, checked_matcher
 from igsr.pose.da3.chunks import chunks_of, joined
 from igsr.pose.da3.confidence import sure_pixels, trusted_depths
 from igsr.pose.da3.passes import SOURCES, Predictor
@@ -61,7 +60,7 @@ class Da3:
         cameras: Mapping[str, Camera] | None = None,
         cameras_from: str = SOURCES[0],
         bundle_adjustment: bool = True,
-        matcher: str | Matcher = SIFT,
+        matcher: Matcher | None = None,
     ) -> None:
         """Keep the settings; nothing is loaded yet."""
         self.predictor = predictor
@@ -69,7 +68,7 @@ class Da3:
         self.cameras = dict(cameras or {})
         self.cameras_from = cameras_from
         self.bundle_adjustment = bundle_adjustment
-        self.matcher = matcher_of(matcher)
+        self.matcher = checked_matcher(matcher)
 
     def __call__(
         self,
