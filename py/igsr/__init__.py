@@ -1,10 +1,9 @@
 """igsr: fit a Gaussian-splat scene to a few photos.
 
 >>> import igsr
->>> capture = igsr.load_capture("photos").with_holdout(8)
->>> splats = igsr.fit(capture, steps=5000)
->>> igsr.evaluate(splats, capture).psnr
->>> splats.save("scene.ply")
+>>> result = igsr.fit("photos", holdout=8, out="out")
+>>> result.scores.psnr
+>>> result.splats.save("scene.ply")
 
 Names are imported when they are first used (PEP 562): ``import igsr`` alone imports no torch, which
 only the extra ``igsr[refine]`` installs.
@@ -18,29 +17,40 @@ from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from igsr._core import __version__
-    from igsr.capture import Camera, Capture, Exposure, Points, View, load_capture
+    from igsr.capture import (
+        Camera,
+        Capture,
+        Exposure,
+        Points,
+        PseudoView,
+        View,
+        load_capture,
+    )
     from igsr.compaction import Compaction, compact
     from igsr.denoiser import denoise
     from igsr.errors import IgsrError, MissingExtraError
     from igsr.evaluation import Scores, evaluate
-    from igsr.fitting import Progress, fit, fit_with_cameras, refine_cameras
+    from igsr.fitting import FitResult, fit, refine_cameras
     from igsr.floaters import remove_floaters
-    from igsr.pose import estimate_poses
+    from igsr.pose import find_cameras
     from igsr.refinement import Refined, refine
     from igsr.rendering import Render, render
     from igsr.rendering.exposure import apply_exposure
     from igsr.rendering.rasterization import rasterization
+    from igsr.run import Event
     from igsr.splats import Splats
 
 __all__ = [
     "Camera",
     "Capture",
     "Compaction",
+    "Event",
     "Exposure",
+    "FitResult",
     "IgsrError",
     "MissingExtraError",
     "Points",
-    "Progress",
+    "PseudoView",
     "Refined",
     "Render",
     "Scores",
@@ -50,10 +60,9 @@ __all__ = [
     "apply_exposure",
     "compact",
     "denoise",
-    "estimate_poses",
     "evaluate",
+    "find_cameras",
     "fit",
-    "fit_with_cameras",
     "load_capture",
     "rasterization",
     "refine",
@@ -67,18 +76,27 @@ if not TYPE_CHECKING:
         __name__,
         {
             "igsr._core": ("__version__",),
-            "igsr.capture": ("Camera", "Capture", "Exposure", "Points", "View", "load_capture"),
+            "igsr.capture": (
+                "Camera",
+                "Capture",
+                "Exposure",
+                "Points",
+                "PseudoView",
+                "View",
+                "load_capture",
+            ),
             "igsr.compaction": ("Compaction", "compact"),
             "igsr.denoiser": ("denoise",),
             "igsr.errors": ("IgsrError", "MissingExtraError"),
             "igsr.evaluation": ("Scores", "evaluate"),
-            "igsr.fitting": ("Progress", "fit", "fit_with_cameras", "refine_cameras"),
+            "igsr.fitting": ("FitResult", "fit", "refine_cameras"),
             "igsr.floaters": ("remove_floaters",),
-            "igsr.pose": ("estimate_poses",),
+            "igsr.pose": ("find_cameras",),
             "igsr.refinement": ("Refined", "refine"),
             "igsr.rendering": ("Render", "render"),
             "igsr.rendering.exposure": ("apply_exposure",),
             "igsr.rendering.rasterization": ("rasterization",),
+            "igsr.run": ("Event",),
             "igsr.splats": ("Splats",),
         },
     )

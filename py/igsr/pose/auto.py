@@ -81,7 +81,9 @@ def with_predicted_cameras(
         shifts.append(np.linalg.norm(right.centre - wrong.centre))
     # Per axis, from the root mean square over photos.
     rotation, shift = (float(np.sqrt(np.mean(np.square(e)) / 3.0)) for e in (turns, shifts))
-    cameras, evidence, added = list(found.cameras), [], []
+    cameras = list(found.cameras)
+    evidence: list[PoseEvidence | None] = []
+    added: list[str] = []
     given = list(found.evidence) or [None] * len(photos)
     for index, camera in enumerate(found.cameras):
         if camera is None and moved[index] is not None:

@@ -1,7 +1,4 @@
-"""Iterative refinement: fit, cross-validate, render novel views, denoise, select, refit.
-
-Names are imported when they are first used: the settings alone load neither torch nor the renderer.
-"""
+"""Iterative refinement: fit, cross-validate, render novel views, denoise, select, refit."""
 
 from __future__ import annotations
 
@@ -10,12 +7,11 @@ from typing import TYPE_CHECKING
 from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
-    from igsr.refinement.loop import refine, round_denoiser
-    from igsr.refinement.results import Refined, RefineProgress, Round, Stop, StopReason
+    from igsr.refinement.refine_photos import refine, round_denoiser
+    from igsr.refinement.results import Refined, Round, Stop, StopReason
     from igsr.refinement.settings import RefineSettings
 
 __all__ = [
-    "RefineProgress",
     "RefineSettings",
     "Refined",
     "Round",
@@ -29,10 +25,8 @@ if not TYPE_CHECKING:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "igsr.refinement.loop": ("refine", "round_denoiser"),
-            "igsr.refinement.results": (
-                *("RefineProgress", "Refined", "Round", "Stop", "StopReason"),
-            ),
+            "igsr.refinement.refine_photos": ("refine", "round_denoiser"),
+            "igsr.refinement.results": ("Refined", "Round", "Stop", "StopReason"),
             "igsr.refinement.settings": ("RefineSettings",),
         },
     )

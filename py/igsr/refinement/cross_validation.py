@@ -1,61 +1,62 @@
-"""Cross-validation of rounds: each fold is scored on photos that are held out of its fits."""
+"""Cross-validation of rounds: folds do each round and are scored on photos they hold out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
+from PIL import Image
 
 from igsr.capture import View
 from igsr.capture.downscaling import halved
-from igsr.evaluation.scores import ScoredView
-from igsr.refinement.results import HeldOutView
-from igsr.refinement.selection import Rejected
-from igsr.refinement.stages import (
-    NOVEL_VIEWS_WORK,
-    VALIDATED,
-    Reconstruction,
-    Stages,
-)
+from igsr.evaluation.scores import ScoredView, score_views
+from igsr.refinement import rounds
+from igsr.refinement.results import HELD_OUT_SIDE, HeldOutView
+from igsr.refinement.rounds import NOVEL_VIEWS_WORK, Context, Reconstruction
+from igsr.refinement.selection import Candidate, Rejected
 
-#: Fewest photos, panoramas counted as one: each fold needs two to fit.
-FEWEST_PHOTOS = 3
-#: Each fold holds out one photo in eight. Where more are held out the folds' fits are worse than
-#: the whole one, and denoised views help them where they do not help it.
-FOLDS, HOLD_OUT_EVERY = 3, 8
-#: Folds fit photos that are halved twice, so that a round that does not help costs a third of a
-#: whole fit's time; none whose shorter side then has fewer pixels than this: folds of small photos
-#: cost more, up to six fits.
-LEAST_FOLD_SIDE = 64
-#: Steps of their fits, as a part of a whole fit's, by how often the photos are halved: small ones
-#: are done learning sooner. Fewer steps on whole photos would be no model of a whole fit.
+#: Minimum number of photos, panoramas counted as one: each fold needs two to fit.
+MIN_PHOTOS = 3
+FOLDS = 3
+#: Each fold holds out every Nth photo. With more held out, the folds' fits are worse than the
+#: whole fit, and denoised views help them where they do not help it.
+HOLD_OUT_EVERY = 8
+#: Folds fit photos that are halved twice, so that a rejected round costs a third of a whole fit;
+#: photos whose shorter side would have fewer pixels than this are not halved.
+MIN_FOLD_SIDE_PX = 64
+#: Steps of the folds' fits, as a fraction of the whole fit's, by how often photos are halved.
 FOLD_STEPS = (1.0, 1.0, 0.5)
+#: Scores that decide.
+DECIDING_SCORES = ("psnr", "ssim", "flip")
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Fold:
-    """A reconstruction of some of the photos, and the photos held out of it.
+    """A reconstruction of some photos, and the photos held out of it.
 
     Attributes:
-        scored: each held-out photo and its render, with its scores.
+        fitted: the reconstruction.
+        held_out: the other photos.
+        scored: each held-out photo and its render, with scores.
     """
 
-    reconstruction: Reconstruction
+    fitted: Reconstruction
     held_out: list[View]
     scored: list[ScoredView]
 
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """What the folds say of a round.
+    """What the folds show about a round.
 
     Attributes:
-        before, after: mean scores of the held-out photos of all folds, before the round and after
-            it; empty if no fold did it.
-        held_out: the photos themselves.
-        selected: novel views that the folds added.
-        rejected: those that they did not.
+        before, after: mean scores of all held-out photos before and after the round; empty if no
+            fold did it.
+        held_out: the held-out photos.
+        selected: number of novel views that the folds added.
+        rejected: novel views that they did not add.
     """
 
     before: dict[str, float] = field(default_factory=dict)
@@ -66,109 +67,133 @@ class Validation:
 
     @property
     def accepted(self) -> bool:
-        """Whether the round makes held-out photos better."""
+        """Whether the round improves the held-out photos."""
         return bool(self.after) and combined_error(self.after) < combined_error(self.before)
 
 
-class CrossValidation:
-    """Folds that do each round themselves, and are scored on their held-out photos.
+@dataclass(frozen=True, eq=False)
+class FoldPhotos:
+    """Photos as folds fit them.
 
-    The folds are fitted when the first round is validated. They keep the views that a round adds:
-    the next round is validated from there.
+    Attributes:
+        photos: the photos, halved.
+        share: their pixels as a fraction of the original photos'.
+        steps: steps of a fold's fit as a fraction of the whole fit's.
     """
 
-    def __init__(self, stages: Stages, photos: Sequence[View]) -> None:
-        """Make the photos smaller, with as many splats per pixel."""
-        self._stages = stages
-        self._photos, self._share, self._steps = _fold_photos(photos)
-        self._folds: list[Fold] = []
-
-    def use(self, photos: Sequence[View]) -> None:
-        """Take these photos instead, which have the scene's colors; before the first round."""
-        self._photos, self._share, self._steps = _fold_photos(photos)
+    photos: list[View]
+    share: float
+    steps: float
 
     @property
-    def work(self) -> float:
-        """What fitting all folds takes, in units of a fit to all photos."""
-        return FOLDS * self._share * self._steps
+    def fit_work(self) -> float:
+        """Work of fitting all folds, in units of a fit to all photos."""
+        return FOLDS * self.share * self.steps
 
     @property
     def novel_views_work(self) -> float:
-        """What their novel views of a round take, in the same units."""
-        return FOLDS * self._share * NOVEL_VIEWS_WORK
+        """Work of all folds' novel views in a round, in the same units."""
+        return FOLDS * self.share * NOVEL_VIEWS_WORK
 
-    def validate(self) -> Validation:
-        """Held-out photos before each fold's own round and after it."""
-        self._folds = self._folds or self._fitted()
-        found = [self._stages.render_and_denoise(fold.reconstruction) for fold in self._folds]
-        selections = [self._stages.select(views) for views in found]
-        count = sum(len(selected) for selected, _ in selections)
-        not_added = [view for _, some in selections for view in some]
-        if not count:
-            return Validation(rejected=not_added)
-        before = [one for fold in self._folds for one in fold.scored]
-        for fold, views, (selected, _) in zip(self._folds, found, selections, strict=True):
-            if selected or views.added_before:
-                fitted = fold.reconstruction
-                self._stages.refit(fitted, selected, views.added_before, "cross_validate")
-                fold.scored = self._scored(fitted, fold.held_out)
-        after = [one for fold in self._folds for one in fold.scored]
-        return Validation(_means(before), _means(after), _beside(before, after), count, not_added)
 
-    def _fitted(self) -> list[Fold]:
-        """Fit the folds: no photo is held out of two, and at least one of each."""
-        names = list(dict.fromkeys(photo.photo for photo in self._photos))
-        every = min(HOLD_OUT_EVERY, len(names))
-        folds = []
-        for number in range(FOLDS):
-            # The views of a panorama are held out together.
-            out = set(names[number * every // FOLDS :: every])
-            held_out = [photo for photo in self._photos if photo.photo in out]
-            kept = [photo for photo in self._photos if photo.photo not in out]
-            fitted = self._stages.fit(f"fold{number}", kept, self._share, self._steps)
-            folds.append(Fold(fitted, held_out, self._scored(fitted, held_out)))
-        return folds
+def fold_photos(photos: Sequence[View]) -> FoldPhotos:
+    """Halve the photos as often as folds do."""
+    small, halvings = list(photos), 0
+    while halvings < len(FOLD_STEPS) - 1 and _shortest(small) >= 2 * MIN_FOLD_SIDE_PX:
+        small, halvings = [halved(photo) for photo in small], halvings + 1
+    return FoldPhotos(small, _pixels(small) / _pixels(photos), FOLD_STEPS[halvings])
 
-    def _scored(self, fitted: Reconstruction, held_out: list[View]) -> list[ScoredView]:
-        return self._stages.validated(fitted.shown, held_out)
+
+def fit_folds(context: Context, photos: Sequence[View]) -> list[Fold]:
+    """Fit the folds: each holds out at least one photo, and no photo is held out twice."""
+    small = fold_photos(photos)
+    names = list(dict.fromkeys(photo.photo for photo in small.photos))
+    every = min(HOLD_OUT_EVERY, len(names))
+    folds = []
+    for number in range(FOLDS):
+        # The views of a panorama are held out together.
+        out = set(names[number * every // FOLDS :: every])
+        held_out = [photo for photo in small.photos if photo.photo in out]
+        kept = [photo for photo in small.photos if photo.photo not in out]
+        fitted = rounds.fit_photos(context, f"fold{number}", kept, small.share, small.steps)
+        folds.append(Fold(fitted, held_out, _scored(context, fitted, held_out)))
+    return folds
+
+
+def validate(context: Context, folds: Sequence[Fold]) -> tuple[Validation, list[Fold]]:
+    """Let each fold do the round; return the verdict and the folds after it."""
+    proposals = [(fold, *_denoised(context, fold.fitted)) for fold in folds]
+    selections = [rounds.select(context, novel) for _, novel, _ in proposals]
+    not_added = [view for _, others in selections for view in others]
+    count = sum(len(selected) for selected, _ in selections)
+    if not count:
+        return Validation(rejected=not_added), list(folds)
+    before = [scored for fold in folds for scored in fold.scored]
+    new_folds = []
+    for (fold, _, again), (selected, _) in zip(proposals, selections, strict=True):
+        if selected or again:
+            fitted = rounds.refit(context, fold.fitted, selected, again, "cross_validate")
+            fold = Fold(fitted, fold.held_out, _scored(context, fitted, fold.held_out))
+        new_folds.append(fold)
+    after = [scored for fold in new_folds for scored in fold.scored]
+    compared = _compared(before, after)
+    verdict = Validation(_means(before), _means(after), compared, count, not_added)
+    return verdict, new_folds
 
 
 def combined_error(scores: dict[str, float]) -> float:
-    """Geometric mean of root squared error, 1 - SSIM and FLIP, of which lower is better.
+    """Geometric mean of root squared error, 1 - SSIM and FLIP; lower is better.
 
-    With few photos a single score may get worse by chance.
+    With few photos, a single score may get worse by chance.
     """
     errors = (10.0 ** (-scores["psnr"] / 20.0), 1.0 - scores["ssim"], scores["flip"])
     return float(np.cbrt(np.prod(errors)))
 
 
+def _denoised(context: Context, fitted: Reconstruction) -> tuple[list[Candidate], list[Candidate]]:
+    """Novel views of a fold, and those that it added before, denoised."""
+    novel = rounds.propose(context, fitted)
+    candidates = rounds.denoise(context, fitted, [*novel, *fitted.added])
+    return candidates[: len(novel)], candidates[len(novel) :]
+
+
+def _scored(context: Context, fitted: Reconstruction, held_out: list[View]) -> list[ScoredView]:
+    """Held-out photos with scores, in small pictures."""
+    scored = [
+        replace(view, photo=_small(view.photo), render=_small(view.render), mask=None)
+        for view in score_views(
+            fitted.shown, held_out, context.background, context.backend, DECIDING_SCORES
+        )
+    ]
+    context.progress.report("cross_validate")
+    return scored
+
+
 def _means(views: Sequence[ScoredView]) -> dict[str, float]:
     return {
-        name: float(np.mean([float(one.scores[name] or 0.0) for one in views]))
-        for name in VALIDATED
+        name: float(np.mean([float(view.scores[name] or 0.0) for view in views]))
+        for name in DECIDING_SCORES
     }
 
 
-def _beside(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> list[HeldOutView]:
+def _compared(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> list[HeldOutView]:
     return [
         HeldOutView(
-            one.name,
-            one.photo,
-            one.render,
-            other.render,
-            float(one.scores["psnr"] or 0.0),
-            float(other.scores["psnr"] or 0.0),
+            old.name,
+            old.photo,
+            old.render,
+            new.render,
+            float(old.scores["psnr"] or 0.0),
+            float(new.scores["psnr"] or 0.0),
         )
-        for one, other in zip(before, after, strict=True)
+        for old, new in zip(before, after, strict=True)
     ]
 
 
-def _fold_photos(photos: Sequence[View]) -> tuple[list[View], float, float]:
-    """Photos as folds fit them, their pixels as a part of the photos' own, and that of steps."""
-    small, halvings = list(photos), 0
-    while halvings < len(FOLD_STEPS) - 1 and _shortest(small) >= 2 * LEAST_FOLD_SIDE:
-        small, halvings = [halved(photo) for photo in small], halvings + 1
-    return small, _pixels(small) / _pixels(photos), FOLD_STEPS[halvings]
+def _small(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    image = Image.fromarray(picture)
+    image.thumbnail((HELD_OUT_SIDE, HELD_OUT_SIDE), Image.Resampling.BOX)
+    return np.asarray(image)
 
 
 def _shortest(photos: Sequence[View]) -> int:

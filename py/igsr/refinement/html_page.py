@@ -35,6 +35,7 @@ THUMBNAIL, PICTURE = 160, 320
 #: Stages as the page calls them.
 STAGES = {
     "cameras": "find cameras",
+    "load": "load photos",
     "fit": "fit the photos",
     "cross_validate": "cross-validate",
     "novel_views": "render and denoise novel views",

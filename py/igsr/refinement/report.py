@@ -18,16 +18,16 @@ from igsr._internal.choices import Backend
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Usage, total
 from igsr.capture import View
-from igsr.capture.write_cameras import write_cameras
 from igsr.evaluation.contact_sheet import contact_sheet, rounds_sheet, save_sheet, sheet_names
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.quick_scores import mean_of, quick_views, train_photos, train_scores
 from igsr.evaluation.scores import ScoredView, default_background
-from igsr.pose import not_placed
+from igsr.fitting.scene_files import write_scene
 from igsr.refinement.html_page import write_page
 from igsr.refinement.results import Refined, Round, Stage
 from igsr.refinement.selection import Candidate, Rejected
 from igsr.refinement.settings import RefineSettings
+from igsr.run import Run
 from igsr.splats import Splats
 
 #: Of ``report.json``. Format 1 had no number, other keys, and no settings.
@@ -42,9 +42,7 @@ ROUND_FILES = (
 )
 
 
-def write_refinement(
-    out: Path, refined: Refined, settings: RefineSettings, parts: Mapping[str, Usage] | None = None
-) -> None:
+def write_refinement(run: Run, refined: Refined, settings: RefineSettings) -> None:
     """Write a refinement as it stands.
 
     ``scene.ply`` is the last accepted model, ``cameras.json`` has the photos' cameras.
@@ -61,6 +59,8 @@ def write_refinement(
     Raises:
         IgsrError: a file cannot be written.
     """
+    assert run.out is not None
+    out = run.out
     written = [_save(refined.first, out / "rounds" / "0" / "scene.ply")]
     for number, done in enumerate(refined.rounds, 1):
         folder = out / "rounds" / str(number)
@@ -69,10 +69,10 @@ def write_refinement(
         for k, candidate in enumerate(done.selected):
             written += _write_view(folder, k, candidate)
     _remove_others(out / "rounds", set(written))
-    refined.splats.save(out / "scene.ply")
-    write_cameras(out / "cameras.json", refined.capture.train_views)
+    background = default_background(refined.capture)
+    write_scene(run, refined.splats, refined.capture, background, refined.models())
     train, shown = _scored(refined, settings.backend)
-    report = report_of(refined, settings, parts, train)
+    report = report_of(refined, settings, run.parts.used, train)
     write_json(out / "report.json", report)
     _write_views(out / "views.png", refined, shown, settings.backend)
     write_page(out / "report.html", refined, report, shown)
@@ -112,7 +112,7 @@ def report_of(
         "train": train,
         "limit": limit,
         "photos": [view.name for view in refined.capture.train_views],
-        "not_registered": not_placed(refined.capture),
+        "not_registered": list(refined.not_placed),
         "splats": len(refined.splats),
         "settings": vars(settings),
         "seed": settings.seed,

@@ -18,12 +18,12 @@ from igsr.rendering.notebook_page import NotebookPage, notebook_page
 from igsr.rendering.scene_page import PageModel, compared
 from igsr.splats import Splats
 
-#: What a refinement does, in the order of a round: find cameras; fit the photos; cross-validate;
-#: render, denoise and select novel views; fit the photos and novel views; score the test views.
-Stage = Literal["pose", "fit", "cross_validate", "novel_views", "refit", "test"]
+#: Stages: fit the photos; cross-validate; render, denoise and select novel views; fit photos and
+#: novel views; score the test views.
+Stage = Literal["fit", "cross_validate", "novel_views", "refit", "test"]
 #: Mean scores by name ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim"); None where a score
 #: is not defined.
-Scores = dict[str, float | None]
+MeanScores = dict[str, float | None]
 
 #: With fewer held-out photos, no standard error is told.
 FEWEST_FOR_ERROR = 3
@@ -63,30 +63,12 @@ class Stop:
         return {
             StopReason.ROUNDS_DONE: f"{rounds} done",
             StopReason.TOO_FEW_PHOTOS: f"cross-validation needs at least {self.count} photos",
-            StopReason.ENOUGH_PHOTOS: f"{self.count} photos see the same place, in the mean, which "
-            "leaves novel views nothing to add",
+            StopReason.ENOUGH_PHOTOS: f"every point is seen by {self.count} photos on average; "
+            "novel views would add nothing",
             StopReason.NO_NOVEL_VIEW: "there is no novel view near the photos",
             StopReason.NONE_SELECTED: f"{views} had too little confidence or gain",
             StopReason.NOT_ACCEPTED: f"round {self.count} did not improve cross-validation scores",
         }[self.reason]
-
-
-@dataclass(frozen=True)
-class RefineProgress:
-    """Where a refinement stands.
-
-    Attributes:
-        round: 0 is the fit to the photos alone.
-        stage: what it is doing.
-        done: part of all the work that there may be, in [0, 1]. A round that is not accepted ends
-            the refinement early.
-        seconds: so far.
-    """
-
-    round: int
-    stage: Stage
-    done: float
-    seconds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +116,7 @@ class Round:
     validation_after: dict[str, float]
     accepted: bool
     splats: Splats | None
-    test: Scores | None
+    test: MeanScores | None
     held_out: list[HeldOutView] = field(default_factory=list)
 
     @property
@@ -171,18 +153,19 @@ class Refined(ArrayEquality, NotebookPicture):
         stop: why there was no further round; None while there may be one.
         rejected: novel views of a round that was not begun, since none of them was selected: of
             the folds, or, if these selected some, of the whole fit.
-        seconds: that each stage but "pose" took, by its name, with the time of earlier calls that
-            this one resumed.
+        seconds: time of each stage by name, earlier runs that this one resumed included.
+        not_placed: names of the photos whose cameras were not found.
     """
 
     splats: Splats
     first: Splats
-    first_test: Scores | None
+    first_test: MeanScores | None
     capture: Capture
     rounds: list[Round]
     stop: Stop | None
     rejected: list[Rejected]
     seconds: dict[str, float]
+    not_placed: tuple[str, ...] = ()
 
     _pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:refined_pictures"
 

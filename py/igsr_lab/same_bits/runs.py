@@ -24,6 +24,7 @@ import torch
 import igsr
 from igsr import _core
 from igsr.denoiser import photo_sources, photo_support, render_buffers
+from igsr_lab.presets import preset_keywords
 from igsr_lab.same_bits.hashes import Results, digest, named_numbers, pixels, prefixed, read_json
 from igsr_lab.same_bits.photos import (
     camera_at,
@@ -137,11 +138,9 @@ def fits(inputs: Inputs) -> Results:
     yield "masks", fitted(inputs.bent, **small | {"steps": 350})
     for preset in ("3dgs", "instantsplat"):
         few = {"steps": 350, "max_splats": 1200, "seed": 5}
-        yield f"preset {preset}", fitted(around, **few, preset=preset)
+        yield f"preset {preset}", fitted(around, **preset_keywords(preset, around) | few)
     weighted = [
-        replace(view, weights=weights_of(view), background=WHITE, image=view.image[..., :3].copy())
-        if number % 3 == 1
-        else view
+        pseudo_view(view) if number % 3 == 1 else view
         for number, view in enumerate(around.train_views)
     ]
     mixed = igsr.Capture(around.path, weighted)
@@ -152,32 +151,15 @@ def fits(inputs: Inputs) -> Results:
 
 def fitted(capture: igsr.Capture, *arguments: Any, **options: Any) -> list[Any]:
     """The splats of a fit, and the last loss that it tells."""
-    losses: list[float] = []
     options = {"backend": "cpu", **options}
-    splats, _ = fit(
-        capture, *arguments, progress=lambda now: losses.append(loss_of(now)), **options
-    )
-    return [splats, losses[-1]]
+    result = igsr.fit(capture, *arguments, **options)
+    return [result.splats, result.loss]
 
 
 def fit(capture: igsr.Capture, *arguments: Any, **options: Any) -> tuple[igsr.Splats, igsr.Capture]:
-    """Splats and fitted cameras by ``igsr.fit``, which once returned the splats alone."""
-    if hasattr(igsr, "fit_with_cameras"):
-        return igsr.fit_with_cameras(capture, *arguments, **options)
-    result: Any = igsr.fit(capture, *arguments, **options)
+    """Splats and fitted cameras by ``igsr.fit``."""
+    result = igsr.fit(capture, *arguments, **options)
     return result.splats, result.capture
-
-
-def loss_of(now: Any) -> float:
-    """The loss that a progress report tells."""
-    return now.loss if hasattr(now, "loss") else now.values.get("loss", float("nan"))
-
-
-def step_of(now: Any) -> float:
-    """The step that a progress report tells; less than none before the fit."""
-    if hasattr(now, "step"):
-        return now.step
-    return now.done if now.stage == "fit" else -1
 
 
 def opaque(view: igsr.View) -> igsr.View:
@@ -185,6 +167,15 @@ def opaque(view: igsr.View) -> igsr.View:
     alpha = view.image[..., 3:].astype(np.uint16)
     mixed = (view.image[..., :3] * alpha + 128 * (255 - alpha) + 127) // 255
     return replace(view, image=mixed.astype(np.uint8))
+
+
+def pseudo_view(view: igsr.View) -> igsr.View:
+    """A photo as a made-up picture over white."""
+    image = view.image[..., :3].copy()
+    weights = weights_of(view)
+    return igsr.PseudoView(
+        view.name, view.camera, view.split, image, view.mask, weights=weights, background=WHITE
+    )
 
 
 def weights_of(view: igsr.View) -> np.ndarray:
@@ -241,18 +232,18 @@ def resumed(inputs: Inputs) -> Results:
         ):
             if backend == "gpu":
                 options = options | {"steps": 60}
-            path = inputs.folder / f"{backend} {name}.npz"
+            path = inputs.folder / f"{backend} {name}"
             given: dict[str, Any] = {
                 "backend": backend,
                 "seed": 6,
                 "max_splats": 400,
-                "checkpoint": path,
+                "out": path,
                 **options,
             }
             at = given["steps"] // 3
 
-            def stop(now: Any, at: int = at) -> None:
-                if step_of(now) >= at:
+            def stop(event: igsr.Event, at: int = at) -> None:
+                if event.stage == "fit" and event.done >= at:
                     raise KeyboardInterrupt
 
             with contextlib.suppress(KeyboardInterrupt):
@@ -503,10 +494,18 @@ def plain_photos(inputs: Inputs) -> Results:
     # The cameras are kept, and used for photos of another size.
     run("fit", photos, "--out", out / "fit", "--steps", 60, "--max-splats", 700, "--holdout", 4)
     yield from prefixed("fit again", fit_files(out / "fit"))
-    rounds = ("--rounds", 1, "--steps", 100, "--no-cross-validate")
-    run("refine", photos, "--out", out / "refine", *rounds, *smaller, "--exposure", "on")
+    igsr.refine(
+        photos,
+        1,
+        out=out / "refine",
+        steps=100,
+        cross_validate=False,
+        max_size=160,
+        exposure="on",
+        backend="cpu",
+    )
     yield from prefixed("refine", refinement_files(out / "refine"))
-    found = igsr.estimate_poses(photos, seed=1, max_size=200)
+    found = igsr.find_cameras(photos, seed=1, max_size=200)
     yield "python", [[view.camera, view.image] for view in found.views]
 
 

@@ -182,7 +182,10 @@ def fit(
             photos, run, cameras, holdout=holdout, max_size=max_size, announce=announce
         )
         capture = loaded.capture
-        color = tuple(background) if background is not None else default_background(capture)
+        color = default_background(capture)
+        if background is not None:
+            red, green, blue = (float(channel) for channel in background)
+            color = (red, green, blue)
         if followed is not None:
             followed.show(capture, color)
         if any(view.image.shape[2] == 4 for view in capture.train_views):

@@ -1,0 +1,328 @@
+"""``refine``: fit photos; then add denoised novel views and refit, in rounds.
+
+The loop of the paper's Figure 1, with two differences. Which novel views are added, and how much
+each of their pixels counts, is decided without the true pictures. And a round is done only if
+cross-validation accepts it: if folds of the photos improve on the photos that they hold out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import warnings
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from igsr._internal.atomic_write import remove_unfinished
+from igsr._internal.choices import FitBackend
+from igsr._internal.event import Listener
+from igsr.capture import Capture
+from igsr.capture.overview import Overview
+from igsr.capture.photo_checks import check_photos
+from igsr.capture.photo_folder import FRAMES
+from igsr.denoiser import Denoiser, NetworkDenoiser, load_network
+from igsr.errors import IgsrError
+from igsr.evaluation.scores import check_masks, default_background
+from igsr.fitting.announcement import announcement
+from igsr.fitting.fitter import check_fits
+from igsr.fitting.followed_run import FollowedRun
+from igsr.fitting.photo_support import support_of
+from igsr.fitting.presets import Quality, default_max_size
+from igsr.fitting.settings import ExposureMode, TransientMode
+from igsr.pose import AUTO as AUTO_ESTIMATOR
+from igsr.pose import CameraSettings, load_photos
+from igsr.refinement import rounds as steps_of_rounds
+from igsr.refinement.cross_validation import (
+    MIN_PHOTOS,
+    Fold,
+    Validation,
+    fit_folds,
+    fold_photos,
+    validate,
+)
+from igsr.refinement.novel_views import novel_views
+from igsr.refinement.progress import RefineProgress
+from igsr.refinement.report import parts_so_far, write_refinement
+from igsr.refinement.results import Refined, Round, Stop, StopReason
+from igsr.refinement.rounds import (
+    NOVEL_VIEWS_WORK,
+    Context,
+    Propose,
+    Reconstruction,
+    Select,
+    fit_all,
+    make_context,
+    score_test_views,
+)
+from igsr.refinement.selection import Rejected, select_views
+from igsr.refinement.settings import AUTO, RefineSettings
+from igsr.run import Run, open_run
+
+#: "auto" does no round if this many photos see the same place: rounds gained nothing there.
+ENOUGH_PHOTOS = 30.0
+
+
+def refine(
+    photos: str | os.PathLike[str] | Capture,
+    rounds: int | str = AUTO,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    steps: int | None = None,
+    quality: Quality = "normal",
+    exposure: ExposureMode = "off",
+    transients: TransientMode = "auto",
+    cross_validate: bool = True,
+    denoiser: Denoiser | None = None,
+    propose: Propose = novel_views,
+    select: Select = select_views,
+    seed: int = 0,
+    backend: FitBackend = "auto",
+    holdout: int | None = None,
+    max_size: int | None = None,
+    estimator: str = AUTO_ESTIMATOR,
+    estimator_options: Mapping[str, Any] | None = None,
+    frames: int = FRAMES,
+    allow_missing: bool = False,
+    resume: bool = False,
+    progress: Listener | None = None,
+) -> Refined:
+    """Fit photos, and improve the fit with denoised novel views.
+
+    Args:
+        photos: a capture; or a path: a folder of photos or a video, whose cameras are found if it
+            has none.
+        rounds: maximum number of rounds; "auto" stops when a round does not help, after four
+            rounds, or at once if 30 photos see the same place.
+        out: folder for scene.ply, scene.html, cameras.json, report.html, report.json, views.png,
+            rounds/, checkpoints/, and cameras.npz with found cameras; written after every round.
+            None writes nothing.
+        steps: number of optimizer steps of each fit; None chooses by the photos.
+        quality: "draft", "normal" or "high": size of photos, number of steps and splats.
+        exposure: "on", "off" or "auto": whether the first fit optimizes exposures, as ``igsr.fit``;
+            later fits see the photos without them.
+        transients: "on", "off" or "auto": whether the first fit masks transient objects, as
+            ``igsr.fit``; later fits use its masks.
+        cross_validate: accept a round only if it improves cross-validation scores.
+        denoiser: denoises novel views; None is ``round_denoiser()``.
+        propose: proposes the cameras of novel views.
+        select: selects the denoised views to add.
+        seed: random seed; the result is deterministic for a given seed, backend and instruction
+            set.
+        backend: "auto" (a real GPU if there is one, else the CPU), "cpu" or "gpu".
+        holdout, max_size, estimator, estimator_options, frames, allow_missing: as ``igsr.fit``.
+        resume: continue from the checkpoints in ``out``. Without, checkpoints of an earlier run
+            are removed.
+        progress: called with each ``igsr.Event``; an exception ends the run, and what is done
+            stays in ``out``. In an interactive session, None shows a progress bar.
+
+    Raises:
+        IgsrError: as ``igsr.fit``.
+        RuntimeError: backend "gpu" was asked for and no adapter answers.
+    """
+    settings = RefineSettings(
+        rounds=rounds,
+        steps=steps,
+        backend=backend,
+        seed=seed,
+        cross_validate=cross_validate,
+        exposure=exposure,
+        transients=transients,
+        quality=quality,
+    )
+    name: Any = check_fits(backend)["backend"]
+    max_size = default_max_size(name, quality) if max_size is None else max_size
+    cameras = CameraSettings(estimator, dict(estimator_options or {}), seed, frames, allow_missing)
+    denoiser = denoiser or round_denoiser()
+    with ExitStack() as ending, open_run(out, progress, resume=resume) as run:
+
+        def announce(seen: Overview, cameras_known: bool) -> None:
+            if run.is_followed:
+                for sentence in announcement(
+                    seen,
+                    holdout=holdout,
+                    max_size=max_size,
+                    quality=quality,
+                    given={"steps": steps},
+                    backend=name,
+                    cameras_known=cameras_known,
+                    rounds=settings.most_rounds,
+                ):
+                    run.note(sentence)
+
+        followed = None
+        if run.out is not None:
+            followed = ending.enter_context(FollowedRun(run.out))
+            run.add_listener(followed)
+        loaded = load_photos(
+            photos, run, cameras, holdout=holdout, max_size=max_size, announce=announce
+        )
+        capture = loaded.capture
+        _check_views(capture)
+        checkpoints = _prepared_folder(run)
+        if followed is not None:
+            followed.show(capture, default_background(capture))
+        context = make_context(
+            capture,
+            settings,
+            name,
+            denoiser,
+            propose,
+            select,
+            checkpoints,
+            resume,
+            RefineProgress(run, _work(capture, settings)),
+        )
+        return _refined(context, run, tuple(loaded.not_placed))
+
+
+def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDenoiser:
+    """The denoiser of ``refine``'s rounds.
+
+    It applies uncertain changes, too: confidence weights say how much each counts.
+
+    Args:
+        weights: a ``.safetensors`` file; None is the denoiser that comes with igsr.
+
+    Raises:
+        IgsrError: as ``igsr.denoiser.load_network``.
+    """
+    return NetworkDenoiser(load_network(weights), doubt=0.0)
+
+
+def _refined(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refined:
+    """Fit all photos, and do rounds until one is rejected or none is left."""
+    context, whole = fit_all(context)
+    test = score_test_views(context, whole.shown)
+    refined = Refined(whole.shown, whole.shown, test, context.capture, [], None, [], {}, not_placed)
+    folds: list[Fold] = []
+    while refined.stop is None:
+        refined = _written(context, run, refined)
+        context.progress.round += 1
+        stop = _stop_before(context, whole)
+        if stop is not None:
+            refined = replace(refined, stop=stop)
+            break
+        validated = Validation()
+        if context.settings.cross_validate:
+            # Before the whole fit renders anything, so that a rejected round costs less.
+            folds = folds or fit_folds(context, whole.photos)
+            validated, folds = validate(context, folds)
+            if not validated.selected:
+                refined = _without_round(refined, validated.rejected)
+                break
+            if not validated.accepted:
+                refined = _with_round(refined, validated, [], [], None, None)
+                stop = Stop(StopReason.NOT_ACCEPTED, context.progress.round)
+                refined = replace(refined, stop=stop)
+                break
+        novel = steps_of_rounds.propose(context, whole)
+        candidates = steps_of_rounds.denoise(context, whole, [*novel, *whole.added])
+        again = candidates[len(novel) :]
+        selected, rejected = steps_of_rounds.select(context, candidates[: len(novel)])
+        if not selected:
+            refined = _without_round(refined, rejected)
+            break
+        whole = steps_of_rounds.refit(context, whole, selected, again, "refit")
+        test = score_test_views(context, whole.shown)
+        refined = _with_round(refined, validated, selected, rejected, whole, test)
+    return _written(context, run, refined)
+
+
+def _stop_before(context: Context, whole: Reconstruction) -> Stop | None:
+    """Why there is no further round; None if there is one."""
+    settings = context.settings
+    if context.progress.round > settings.most_rounds:
+        return Stop(StopReason.ROUNDS_DONE, settings.most_rounds)
+    seen_by = support_of(whole.photos).seen_by
+    if settings.rounds == AUTO and seen_by >= ENOUGH_PHOTOS:
+        return Stop(StopReason.ENOUGH_PHOTOS, round(seen_by))
+    if settings.cross_validate and len({view.photo for view in whole.photos}) < MIN_PHOTOS:
+        return Stop(StopReason.TOO_FEW_PHOTOS, MIN_PHOTOS)
+    return None
+
+
+def _with_round(
+    refined: Refined,
+    validated: Validation,
+    selected: list[Any],
+    rejected: list[Rejected],
+    whole: Reconstruction | None,
+    test: dict[str, float | None] | None,
+) -> Refined:
+    """The result with one more round; ``whole`` is None if it was rejected."""
+    done = Round(
+        selected,
+        rejected,
+        validated.before,
+        validated.after,
+        whole is not None,
+        None if whole is None else whole.shown,
+        test,
+        validated.held_out,
+    )
+    splats = refined.splats if whole is None else whole.shown
+    return replace(refined, splats=splats, rounds=[*refined.rounds, done])
+
+
+def _without_round(refined: Refined, rejected: list[Rejected]) -> Refined:
+    """The result if the next round selects no novel view."""
+    if not rejected:
+        return replace(refined, stop=Stop(StopReason.NO_NOVEL_VIEW))
+    stop = Stop(StopReason.NONE_SELECTED, len(rejected))
+    return replace(refined, stop=stop, rejected=rejected)
+
+
+def _written(context: Context, run: Run, refined: Refined) -> Refined:
+    """Write the result so far, unless the folder already holds it; return it with its times."""
+    seconds = {name: part["seconds"] for name, part in run.parts.plain().items()}
+    refined = replace(refined, seconds=seconds)
+    if run.out is not None and (context.progress.has_news or refined.stop is not None):
+        write_refinement(run, refined, context.settings)
+    return refined
+
+
+def _work(capture: Capture, settings: RefineSettings) -> float:
+    """The maximum work of a refinement, in units of a fit to all photos."""
+    fits, novel = 1.0, NOVEL_VIEWS_WORK
+    if settings.cross_validate:
+        small = fold_photos(capture.train_views)
+        fits, novel = fits + small.fit_work, novel + small.novel_views_work
+    return fits + settings.most_rounds * (fits + novel)
+
+
+def _prepared_folder(run: Run) -> Path | None:
+    """Remove what an earlier run left, or read its times to resume; the checkpoints' folder."""
+    if run.out is None:
+        return None
+    checkpoints = run.out / "checkpoints"
+    for folder in (run.out, checkpoints, *run.out.glob("rounds/[0-9]*")):
+        remove_unfinished(folder)
+    if run.resume:
+        for name, usage in parts_so_far(run.out).items():
+            run.parts.add(name, usage)
+        return checkpoints
+    # A later resume must not use fits of an earlier run.
+    with contextlib.suppress(OSError):
+        (run.out / "report.json").unlink()
+    for fit in ("whole", "fold[0-9]"):
+        for pattern in (f"{fit}.npz", f"{fit}-round[0-9]*.npz"):
+            for path in checkpoints.glob(pattern):
+                path.unlink(missing_ok=True)
+    return checkpoints
+
+
+def _check_views(capture: Capture) -> None:
+    """Check the photos before files of an earlier run are removed.
+
+    Raises:
+        IgsrError: there is nothing to fit, or photos or masks cannot be used.
+    """
+    if not capture.train_views:
+        raise IgsrError(f"{capture.path} has no train views to fit.")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the first fit gives the warnings
+        check_photos(capture.train_views)
+    check_masks(capture.test_views)
