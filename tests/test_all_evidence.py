@@ -22,7 +22,7 @@ from igsr.pose.all_evidence import with_all_evidence
 from igsr.pose.colmap import Colmap
 from igsr.pose.da3.estimator import Da3
 from igsr.pose.da3.preprocessing import resampling_of
-from igsr.pose.find_cameras import chosen_estimator
+from igsr.pose.find import chosen_estimator
 from igsr.pose.registry import ESTIMATORS
 
 COUNT = 5

@@ -21,7 +21,7 @@ from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.colmap import Colmap
 from igsr.pose.colmap.loma import Loma
 from igsr.pose.colmap.matcher import PhotoFeatures
-from igsr.pose.find_cameras import made_by_of
+from igsr.pose.find import made_by_of
 
 #: Cameras whose photos are of noise: only the matches tell where they stand.
 CAMERAS = [rooms.camera(angle) for angle in np.linspace(-1.0, 1.0, 5)]

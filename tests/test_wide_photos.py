@@ -25,7 +25,7 @@ from igsr.capture.wide_photos import WideFisheye, field_of_view, whole_sphere
 from igsr.capture.write_colmap import write_colmap
 from igsr.capture.write_transforms import write_transforms
 from igsr.errors import IgsrError
-from igsr.pose.find_cameras import estimate
+from igsr.pose.find import estimate
 
 WIDTH = 256
 SIDES = ["front", "right", "back", "left", "up", "down"]

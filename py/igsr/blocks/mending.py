@@ -64,7 +64,7 @@ def mending_task(
     shots = [manifest.shots[index] for index in across]
     settings: dict[str, Any] = {
         name: options.settings[name]
-        for name in ("preset", "quality", "seed", "background")
+        for name in ("quality", "seed", "background")
         if name in options.settings
     }
     task = FitTask(

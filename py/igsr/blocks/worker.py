@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
-from igsr._internal.choices import Backend, FitBackend
+from igsr._internal.choices import Backend
+from igsr._internal.event import Event
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Meter
 from igsr._internal.worker_processes import in_a_process
@@ -31,18 +32,18 @@ from igsr.blocks.tasks import (
     load_splats,
     save_splats,
 )
-from igsr.capture import Capture, View
+from igsr.capture import Capture, View, photos_among
 from igsr.capture.described import DescribedCapture
 from igsr.capture.downscaling import reduced_size, resized_camera
 from igsr.capture.types import Points
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import BLACK, default_background, score_views
 from igsr.fitting.checkpoint import load_checkpoint
-from igsr.fitting.fit_capture import fit_with_cameras
-from igsr.fitting.fitter import photos_among, without_exposures
+from igsr.fitting.fit_capture import fit_capture
+from igsr.fitting.fitter import without_exposures
 from igsr.fitting.photo_support import PhotoSupport, support_of
 from igsr.fitting.presets import settings_for
-from igsr.fitting.run import Progress
+from igsr.fitting.result import FitResult
 from igsr.fitting.settings import FitSettings
 from igsr.rendering.renders import project, render
 from igsr.splats import Splats, joined, subset
@@ -53,7 +54,7 @@ Float64 = npt.NDArray[np.float64]
 #: Photos that are held whole at a time while parts of them are cut out.
 AT_A_TIME = 8
 #: Seconds between two reports of progress.
-TELL_EVERY = 1.0
+WRITE_EVERY_S = 1.0
 
 
 def in_own_process(capture: str, task: FitTask) -> dict[str, Any]:
@@ -165,24 +166,24 @@ def _fit(
             one thing knows it by the place that all photos look at; here there is none.)
     """
     checkpoint = task.folder / CHECKPOINT
-    seen: list[Progress] = []
+    has_begun = False
     attempt = 1 + attempts(task.folder)
-    tell = _teller(task.folder / PROGRESS, attempt)
+    write_progress = _progress_writer(task.folder / PROGRESS, attempt)
 
-    def progress(now: Progress) -> None:
-        seen[:] = [now]
-        tell(now)
+    def report(event: Event) -> None:
+        nonlocal has_begun
+        has_begun = True
+        write_progress(event)
 
-    def run(resume: bool) -> tuple[Splats, Capture]:
+    def run(resume: bool) -> FitResult:
         keywords = {**chosen, **task.settings, **more, "max_splats": most}
-        keywords.pop("backdrop", None)
-        return fit_with_cameras(
+        keywords["backdrop"] = False  # blocks are joined, and each would have its own
+        return fit_capture(
             capture,
-            progress=progress,
-            backend=cast(FitBackend, task.backend),
+            report=report,
+            backend=task.backend,
             checkpoint=checkpoint,
             resume=resume,
-            backdrop=False,  # blocks are joined: each would have a sphere of its own
             **keywords,
         )
 
@@ -196,34 +197,32 @@ def _fit(
     most = max(1 if start is None else len(start), round(task.splats_part * usual.max_splats))
     resumed_from = _step_of(checkpoint)
     try:
-        splats, fitted = run(resume=resumed_from is not None)
+        result = run(resume=resumed_from is not None)
     except IgsrError:
-        if resumed_from is None or seen:
+        if resumed_from is None or has_begun:
             raise
         resumed_from = None  # the checkpoint was of another fit, or another instruction set
-        splats, fitted = run(resume=False)
-    last = seen[-1]
+        result = run(resume=False)
     about = {
         "max_splats": most,
         "splats_part": task.splats_part,
-        "steps": last.steps,
+        "steps": result.settings.steps,
         "dropout": task.settings.get("dropout", chosen["dropout"]),
         "density": task.settings.get("density", chosen["density"]),
-        "loss": last.loss if np.isfinite(last.loss) else None,
-        "start": last.started[0],
-        "removed": dict(last.removed or {}),
-        "masked": {name: round(part, 5) for name, part in last.transients.items()},
+        "loss": result.loss if np.isfinite(result.loss) else None,
+        "start": result.started[0],
+        "removed": dict(result.removed),
+        "masked": {name: round(part, 5) for name, part in result.masked.items()},
         "resumed_from": resumed_from,
         "attempts": attempt,
     }
-    return splats, fitted, about
+    return result.splats, result.capture, about
 
 
 def _usual_settings(task: FitTask, support: PhotoSupport) -> FitSettings:
     """The settings of the task, and of its preset for photos that tell this."""
-    given = {k: v for k, v in task.settings.items() if k not in ("preset", "quality", "start")}
-    preset, quality = task.settings.get("preset", "default"), task.settings.get("quality", "normal")
-    return settings_for(preset, support, quality, **given)
+    given = {k: v for k, v in task.settings.items() if k not in ("quality", "start")}
+    return settings_for(support, task.settings.get("quality", "normal"), **given)
 
 
 def depths_of_scene(views: Sequence[View], scene: Splats, backend: str) -> Float64:
@@ -277,23 +276,31 @@ def attempts(folder: Path) -> int:
         return 0
 
 
-def _teller(path: Path, attempt: int) -> Callable[[Progress | None], None]:
-    """Writes where a fit stands, for the view of all blocks; the run counts and not the file."""
-    told = [time.monotonic()]
+def _progress_writer(path: Path, attempt: int) -> Callable[[Event], None]:
+    """A listener that writes a fit's progress, for the view of all blocks; errors are ignored."""
     about = {"attempt": attempt, "host": socket.gethostname(), "process": os.getpid()}
+    written_at = time.monotonic()
 
-    def tell(now: Progress | None) -> None:
-        if now is not None and time.monotonic() - told[0] < TELL_EVERY:
-            return
-        told[0] = time.monotonic()
-        news: dict[str, Any] = {"step": 0, "steps": 0, "splats": 0, "work": 0.0}
-        if now is not None:
-            news = {"step": now.step, "steps": now.steps, "splats": now.splats, "work": now.work}
+    def write(progress: dict[str, Any]) -> None:
         with contextlib.suppress(OSError, IgsrError):
-            write_json(path, {**news, **about})
+            write_json(path, {**progress, **about})
 
-    tell(None)
-    return tell
+    def report(event: Event) -> None:
+        nonlocal written_at
+        if time.monotonic() - written_at < WRITE_EVERY_S:
+            return
+        written_at = time.monotonic()
+        write(
+            {
+                "step": int(event.done),
+                "steps": int(event.total),
+                "splats": int(event.values["splats"]),
+                "work": event.part,
+            }
+        )
+
+    write({"step": 0, "steps": 0, "splats": 0, "work": 0.0})
+    return report
 
 
 def shown_by(splats: Splats, views: list[View], backend: str) -> Bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -146,7 +146,7 @@ def reduced_view(view: View, width: int, height: int) -> View:
     if (width, height) == (view.camera.width, view.camera.height):
         return view
     image, mask = area_means(view.image, width, height, view.mask)
-    weights = {}
+    weights: dict[str, Any] = {}
     if isinstance(view, PseudoView):
         weights["weights"] = plane_area_means(view.weights, width, height).astype(np.float32)
     camera = resized_camera(view.camera, width, height)
@@ -186,6 +186,9 @@ def halved(view: View) -> View:
     """
     width, height = view.camera.width // 2, view.camera.height // 2
     even = (slice(2 * height), slice(2 * width))
+    weights: dict[str, Any] = {}
+    if isinstance(view, PseudoView):
+        weights["weights"] = view.weights[even]
     whole = replace(
         view,
         camera=replace(view.camera, width=2 * width, height=2 * height),
@@ -193,7 +196,7 @@ def halved(view: View) -> View:
         mask=None if view.mask is None else view.mask[even],
         depth=None if view.depth is None else view.depth[even],
         depth_confidence=None if view.depth_confidence is None else view.depth_confidence[even],
-        **({"weights": view.weights[even]} if isinstance(view, PseudoView) else {}),
+        **weights,
     )
     return reduced_view(whole, width, height)
 

@@ -49,9 +49,6 @@ class _Commands(LazyGroup):
             "Show scenes in a window, one alone or two side by side.",
             _PASSED_ON,
         ),
-        "export": LazyCommand(
-            "igsr.cli.export", "export_command", "Write a capture for COLMAP or nerfstudio."
-        ),
         "compact": LazyCommand(
             "igsr.cli.compact", "compact_command", "Make a scene smaller within a limit on PSNR."
         ),
@@ -59,7 +56,7 @@ class _Commands(LazyGroup):
             "igsr.cli.clean", "clean_command", "Remove floaters: splats that photos do not support."
         ),
         "convert": LazyCommand(
-            "igsr.cli.convert", "convert_command", "Write a splat file in another format."
+            "igsr.cli.convert", "convert_command", "Write splats or a capture in another format."
         ),
         "denoise": LazyCommand(
             "igsr.cli.denoise", "denoise_command", "Render the views of a scene and denoise them."

@@ -5,13 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from igsr import _core
 from igsr._internal.atomic_write import check_writable
 from igsr.cli.error_messages import error_messages, print_message, warning_messages
-from igsr.cli.shared import (
-    BackendChoice,
+from igsr.cli.options import (
     BackendOption,
     BackgroundOption,
     HoldoutOption,
@@ -21,11 +18,10 @@ from igsr.cli.shared import (
     SeedOption,
     background_color,
     load,
-    output_console,
-    print_json,
-    removed_line,
+    option,
     resolved,
 )
+from igsr.cli.output import output_console, print_json, removed_line
 from igsr.errors import IgsrError
 from igsr.splats import Splats
 
@@ -38,7 +34,7 @@ def clean_command(
     scene: SceneArgument,
     capture_path: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--capture",
             metavar="CAPTURE",
             help="The photos that SCENE was fitted to, with their cameras: remove what no photo "
@@ -50,7 +46,7 @@ def clean_command(
     max_size: MaxSizeOption = None,
     out: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--out",
             metavar="FILE",
             help="The clean scene, in any format that igsr writes. Default: SCENE's name with "
@@ -59,7 +55,7 @@ def clean_command(
     ] = None,
     seed: SeedOption = 0,
     background: BackgroundOption = None,
-    backend: BackendOption = BackendChoice.auto,
+    backend: BackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Remove floaters from SCENE: splats that photos do not support, or that stand alone."""

@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
-from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBar
+from typing import Annotated
 
 from igsr._internal.atomic_write import check_writable
 from igsr._internal.json_file import write_json
+from igsr._internal.progress_bar import progress_bar
 from igsr.cli.error_messages import error_messages
-from igsr.cli.shared import (
+from igsr.cli.options import (
     BackgroundOption,
-    FitBackendChoice,
     FitBackendOption,
     HoldoutOption,
     JsonOption,
     SceneArgument,
     SeedOption,
     background_color,
-    error_console,
     load,
-    output_console,
-    print_json,
+    option,
     resolved,
-    stopped,
 )
-from igsr.compaction import DEFAULT_STEPS, CompactProgress, compact, write_plot
+from igsr.cli.output import output_console, print_json
+from igsr.compaction import DEFAULT_STEPS, compact, write_plot
 from igsr.errors import IgsrError
 from igsr.splats import Splats
 
@@ -41,11 +33,11 @@ def compact_command(
     scene: SceneArgument,
     max_loss: Annotated[
         str,
-        typer.Option("--max-loss", metavar="DB", help="PSNR that may be lost, such as 0.1dB."),
+        option("--max-loss", metavar="DB", help="PSNR that may be lost, such as 0.1dB."),
     ] = "0.1dB",
     capture_path: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--capture",
             metavar="CAPTURE",
             help="Photos of the scene: fine-tune on them and measure the loss on held-out photos. "
@@ -55,7 +47,7 @@ def compact_command(
     holdout: HoldoutOption = None,
     psnr: Annotated[
         float | None,
-        typer.Option(
+        option(
             "--psnr",
             help="Without --capture: the PSNR of SCENE on its photos, against which a change "
             "counts. Default: that of the report.json beside SCENE, else 30.",
@@ -63,7 +55,7 @@ def compact_command(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--out",
             metavar="PLY",
             help="The smaller scene; its curve of size and PSNR goes beside it as .json and .png. "
@@ -72,18 +64,18 @@ def compact_command(
     ] = None,
     sh_degree: Annotated[
         int | None,
-        typer.Option(
+        option(
             "--sh-degree",
             help="Spherical-harmonics degree of the smaller scene. A higher degree needs fewer "
             "splats with more bytes each. Default: SCENE's, or lower where that loses little.",
         ),
     ] = None,
     steps: Annotated[
-        int, typer.Option("--steps", help="Fine-tuning steps of each candidate.")
+        int, option("--steps", help="Fine-tuning steps of each candidate.")
     ] = DEFAULT_STEPS,
     seed: SeedOption = 0,
     background: BackgroundOption = None,
-    backend: FitBackendOption = FitBackendChoice.auto,
+    backend: FitBackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Make SCENE smaller: the fewest splats that lose at most --max-loss of PSNR."""
@@ -104,7 +96,7 @@ def compact_command(
         curve, plot = target.with_suffix(".json"), target.with_suffix(".png")
         for path in (target, curve, plot):
             check_writable(path)
-        with _compact_bar(shown=not as_json) as show:
+        with progress_bar(shown=not as_json) as show:
             compaction = compact(
                 splats,
                 limit,
@@ -157,29 +149,3 @@ def _reported_psnr(path: Path) -> float | None:
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return psnr if isinstance(psnr, float) and 0.0 < psnr < 100.0 else None
-
-
-@contextlib.contextmanager
-def _compact_bar(shown: bool) -> Iterator[Callable[[CompactProgress], None]]:
-    """A progress bar on stderr for each candidate size, with its time left."""
-    bar = ProgressBar(
-        TextColumn("size {task.fields[trial]}: {task.fields[what]}"),
-        BarColumn(bar_width=30),
-        TextColumn("step {task.completed}/{task.total}"),
-        TimeRemainingColumn(compact=True),
-        console=error_console(),
-        disable=not shown,
-    )
-    tasks: dict[int, Any] = {}
-    with stopped(bar):
-
-        def show(now: CompactProgress) -> None:
-            bar.start()
-            if now.trial not in tasks:
-                what = f"{now.splats} splats, SH {now.sh_degree}"
-                tasks[now.trial] = bar.add_task(
-                    "compact", total=now.steps, trial=now.trial, what=what
-                )
-            bar.update(tasks[now.trial], completed=now.step)
-
-        yield show

@@ -9,43 +9,34 @@ import typer
 
 from igsr.cli.denoiser_option import DenoiserOption, chosen_denoiser
 from igsr.cli.error_messages import error_messages
-from igsr.cli.shared import (
-    BackendChoice,
+from igsr.cli.options import (
     BackendOption,
     JsonOption,
-    SplitChoice,
+    SplitName,
     load,
-    output_console,
+    option,
     picture_name,
-    print_json,
     resolved,
 )
+from igsr.cli.output import output_console, print_json
 
 
 def denoise_command(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Splats (.ply).")],
     capture_path: Annotated[
         Path,
-        typer.Option(
-            "--capture", metavar="CAPTURE", help="The photos that the splats were fitted to."
-        ),
+        option("--capture", metavar="CAPTURE", help="The photos that the splats were fitted to."),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the pictures.")],
+    out: Annotated[Path, option("--out", metavar="DIR", help="Folder for the pictures.")],
     holdout: Annotated[
-        int | None, typer.Option("--holdout", help="Hold out every Nth photo for testing.")
+        int | None, option("--holdout", help="Hold out every Nth photo for testing.")
     ] = None,
     split: Annotated[
-        SplitChoice | None,
-        typer.Option(
-            "--split", help="Views to render. Default: the held-out views, if there are any."
-        ),
-    ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option("--weights", metavar="FILE", help="A denoiser. Default: igsr's own."),
+        SplitName | None,
+        option("--split", help="Views to render. Default: test, if there are any."),
     ] = None,
     denoiser_name: DenoiserOption = None,
-    backend: BackendOption = BackendChoice.auto,
+    backend: BackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Render views and denoise them: NAME.png, and NAME.confidence.png (white: confident)."""
@@ -54,7 +45,6 @@ def denoise_command(
 
     from igsr._internal.atomic_write import atomic_write
     from igsr.denoiser import (
-        Denoiser,
         NetworkDenoiser,
         denoise,
         load_network,
@@ -71,15 +61,14 @@ def denoise_command(
     from igsr.splats import Splats
 
     with error_messages():
-        if denoiser_name is not None:
-            denoiser: Denoiser = chosen_denoiser(denoiser_name, weights)
-        else:
-            denoiser = NetworkDenoiser(load_network(weights))
+        denoiser = chosen_denoiser(
+            denoiser_name, lambda weights: NetworkDenoiser(load_network(weights))
+        )
         splats = Splats.load(scene).without_backdrop()  # holes are to be seen as such
         capture = load(capture_path, holdout)
         background, behind = default_background(capture), known_background(capture.views)
         on = resolved(backend)
-        views = views_of_split(capture, split.value if split else default_split(capture))
+        views = views_of_split(capture, split or default_split(capture))
         photos = capture.train_views
         support = photo_support(splats, photos, on)
         sources = photo_sources(splats, photos, background, on)

@@ -1,35 +1,42 @@
-"""The option that names a denoiser of one's own."""
+"""The option that chooses a denoiser."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from igsr.errors import IgsrError
+from igsr.cli.options import ADVANCED, option
 
 if TYPE_CHECKING:
     from igsr.denoiser import Denoiser
 
+#: Suffix of weights of igsr's network.
+WEIGHTS_SUFFIX = ".safetensors"
+
 DenoiserOption = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--denoiser",
-        metavar="MODULE:FACTORY",
-        help="A denoiser of your own: a function of a Python module or file that makes it.",
+        metavar="FILE|MODULE:FACTORY",
+        help="Weights (.safetensors), or a function that makes a denoiser.",
+        panel=ADVANCED,
     ),
 ]
 
 
-def chosen_denoiser(name: str, weights: Path | None) -> Denoiser:
-    """The denoiser of that name.
+def chosen_denoiser(named: str | None, from_weights: Callable[[Path | None], Denoiser]) -> Denoiser:
+    """The denoiser of ``--denoiser``; igsr's own if it is None.
+
+    Args:
+        named: a file of weights, or "module:factory".
+        from_weights: makes igsr's denoiser from a file of weights, or from its own.
 
     Raises:
-        IgsrError: ``weights`` are given, too, or as ``igsr.denoiser.named_denoiser``.
+        IgsrError: as ``igsr.denoiser.load_network`` and ``igsr.denoiser.named_denoiser``.
     """
-    if weights is not None:
-        raise IgsrError("--weights is for igsr's denoiser; give it or --denoiser, not both")
+    if named is None or named.endswith(WEIGHTS_SUFFIX):
+        return from_weights(None if named is None else Path(named))
     from igsr.denoiser import named_denoiser
 
-    return named_denoiser(name)
+    return named_denoiser(named)

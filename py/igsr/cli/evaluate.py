@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated
 
-import typer
 from rich.table import Table
 
 from igsr import _core
+from igsr._internal.event import Event
+from igsr._internal.progress_bar import progress_bar
 from igsr.cli.error_messages import error_messages
-from igsr.cli.shared import (
-    BackendChoice,
+from igsr.cli.options import (
     BackendOption,
     BackgroundOption,
     CaptureArgument,
@@ -18,17 +19,19 @@ from igsr.cli.shared import (
     JsonOption,
     MaxSizeOption,
     SceneArgument,
-    SplitChoice,
+    SplitName,
     background_color,
     load,
-    output_console,
-    print_json,
-    protocol_line,
+    option,
     resolved,
-    score_line,
-    scored,
 )
-from igsr.evaluation.scores import default_background, default_split
+from igsr.cli.output import output_console, print_json, protocol_line, score_line
+from igsr.evaluation.scores import (
+    default_background,
+    default_split,
+    evaluate,
+    views_of_split,
+)
 from igsr.splats import Splats
 
 
@@ -38,11 +41,10 @@ def eval_command(
     holdout: HoldoutOption = None,
     max_size: MaxSizeOption = None,
     split: Annotated[
-        SplitChoice | None,
-        typer.Option("--split", help="Views to score. Default: test if there are any, else train."),
+        SplitName | None, option("--split", help="Views to score. Default: test, if any.")
     ] = None,
     background: BackgroundOption = None,
-    backend: BackendOption = BackendChoice.auto,
+    backend: BackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Score SCENE against the photos of CAPTURE."""
@@ -51,8 +53,18 @@ def eval_command(
         splats = Splats.load(scene)
         capture = load(capture_path, holdout, max_size)
         color = background_color(background) or default_background(capture)
-        chosen = split.value if split is not None else default_split(capture)
-        scores, _ = scored(splats, capture, chosen, color, name, shown=not as_json)
+        chosen = split or default_split(capture)
+        views = views_of_split(capture, chosen)
+        with progress_bar(shown=not as_json) as show:
+            done = itertools.count(1)
+            scores = evaluate(
+                splats,
+                capture,
+                chosen,
+                color,
+                name,
+                lambda scored: show(Event("score", next(done), len(views))),
+            )
         scores["protocol"]["holdout"] = holdout
     report = {**scores, "splats": len(splats), **_core.backend_info(name)}
     if as_json:

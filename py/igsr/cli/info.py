@@ -11,7 +11,8 @@ import typer
 
 from igsr import _core
 from igsr.cli.error_messages import error_messages
-from igsr.cli.shared import JsonOption, MaxSizeOption, output_console, print_json
+from igsr.cli.options import JsonOption, MaxSizeOption
+from igsr.cli.output import output_console, print_json
 from igsr.splats import SPLAT_ENDINGS, Splats
 
 

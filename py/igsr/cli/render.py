@@ -5,27 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import Backend
 from igsr.capture import Camera, Capture, load_capture
 from igsr.cli.error_messages import error_messages
-from igsr.cli.shared import (
+from igsr.cli.options import (
     NAMED_COLORS,
-    BackendChoice,
     BackendOption,
     BackgroundOption,
     JsonOption,
     MaxSizeOption,
     SceneArgument,
     background_color,
-    output_console,
+    option,
     picture_name,
-    print_json,
     resolved,
 )
+from igsr.cli.output import output_console, print_json
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background
 from igsr.geometry.camera_paths import orbit
@@ -36,15 +33,15 @@ from igsr.splats import Splats
 def render_command(
     scene: SceneArgument,
     out: Annotated[
-        Path, typer.Option("--out", help="Folder for the pictures; with --orbit, an .mp4 file.")
+        Path, option("--out", help="Folder for the pictures; with --orbit, an .mp4 file.")
     ],
     cameras: Annotated[
         Path | None,
-        typer.Option("--cameras", metavar="CAPTURE", help="Render from the cameras of a capture."),
+        option("--cameras", metavar="CAPTURE", help="Render from the cameras of a capture."),
     ] = None,
     orbit_frames: Annotated[
         int | None,
-        typer.Option(
+        option(
             "--orbit",
             metavar="FRAMES",
             help="Write a video of an orbit around the scene; with --cameras, at their distance.",
@@ -52,14 +49,14 @@ def render_command(
     ] = None,
     exr: Annotated[
         bool,
-        typer.Option(
+        option(
             "--exr",
             help="Write EXR, not PNG: 32-bit floats R, G, B, A and Z (expected depth).",
         ),
     ] = False,
     background: BackgroundOption = None,
     max_size: MaxSizeOption = None,
-    backend: BackendOption = BackendChoice.auto,
+    backend: BackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Render SCENE to PNG or EXR pictures, or to a video around it."""

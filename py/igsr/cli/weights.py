@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from igsr.cli.error_messages import error_messages, print_message
-from igsr.cli.shared import JsonOption, output_console, print_json
+from igsr.cli.options import JsonOption
+from igsr.cli.output import output_console, print_json
 from igsr.pose.huggingface_cache import cache_folder
 from igsr.pose.weights import KNOWN, fetch_weights, known_weights, weights_path
 

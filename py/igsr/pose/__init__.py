@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from igsr.pose.find_cameras import AUTO, CameraSettings, find_cameras
-from igsr.pose.load_photos import LoadedPhotos, load_photos
+from igsr.pose.find import AUTO, CameraSettings, find_cameras
+from igsr.pose.load import LoadedPhotos, load_photos
 
 __all__ = ["AUTO", "CameraSettings", "LoadedPhotos", "find_cameras", "load_photos"]

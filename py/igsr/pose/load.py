@@ -16,7 +16,7 @@ from igsr.capture.overview import Overview, look_at
 from igsr.capture.photo_folder import photo_sizes
 from igsr.errors import IgsrError
 from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
-from igsr.pose.find_cameras import AUTO, CameraSettings, estimated_cameras, photos_at
+from igsr.pose.find import AUTO, CameraSettings, estimated_cameras, photos_at
 from igsr.pose.found_cameras import FoundCameras
 from igsr.pose.registry import ESTIMATORS, NETWORKS
 from igsr.run import Run
