@@ -18,58 +18,10 @@ from typer.testing import CliRunner
 import igsr
 from igsr.cli import app
 from igsr.denoiser import Buffers, SingleStepDenoiser, Source, denoise, named_denoiser
-from igsr.denoiser.calibration import (
-    LEAST_CLAIMED,
-    SMALLEST,
-    Calibration,
-    calibrate,
-    confidence_of,
-    error_of,
-)
-from igsr.refinement import cross_validation, stages
-from igsr.refinement.results import StopReason
+from igsr.denoiser.confidence import MIN_CLAIMED_ERROR, confidence_of, error_of
 from igsr.refinement.selection import confidence_weights
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "difix_denoiser.py"
-
-
-# ---- calibration ---------------------------------------------------------------------------------
-
-
-def made_up_errors(power, factor, pixels=20_000):
-    """Claims, and errors whose mean is a power law of them."""
-    random = np.random.default_rng(0)
-    claimed = np.exp(random.uniform(np.log(0.01), np.log(0.3), pixels)).astype(np.float32)
-    return claimed, (factor * claimed**power * random.exponential(1.0, pixels)).astype(np.float32)
-
-
-@pytest.mark.parametrize(("power", "factor"), [(1.0, 2.5), (1.0, 0.4), (0.5, 0.2), (1.3, 1.0)])
-def test_what_claims_mean_is_found(power, factor):
-    claimed, measured = made_up_errors(power, factor)
-    found = calibrate([claimed[:500], claimed[500:]], [measured[:500], measured[500:]])
-    some = np.array([0.02, 0.1, 0.25], np.float32)
-    assert found.expected(some) == pytest.approx(factor * some**power, rel=0.1)
-
-
-def test_claims_that_say_nothing_get_the_mean_error():
-    claimed, measured = made_up_errors(0.0, 0.1)
-    found = calibrate([claimed], [measured])
-    assert found.power == pytest.approx(0.0, abs=0.05)
-    assert found.expected(claimed).mean() == pytest.approx(0.1, rel=0.05)
-    # Claims the wrong way round are not turned round.
-    found = calibrate([claimed], [0.01 / claimed])
-    assert found.power == 0.0
-
-
-def test_masked_pixels_and_few_of_them_teach_nothing():
-    claimed, measured = made_up_errors(1.0, 3.0)
-    spoiled = measured.copy()
-    spoiled[::2] = np.nan
-    assert calibrate([claimed], [spoiled]).factor == pytest.approx(3.0, rel=0.1)
-    assert calibrate([claimed[:900]], [measured[:900]]) == Calibration()
-    assert calibrate([], []) == Calibration()
-    exact = calibrate([np.zeros(5000, np.float32)], [np.zeros(5000, np.float32)])
-    assert exact.expected(np.zeros(3, np.float32)) == pytest.approx(SMALLEST)
 
 
 def test_confidence_and_error_are_inverse():
@@ -78,84 +30,16 @@ def test_confidence_and_error_are_inverse():
     assert confidence_of(errors)[2] == pytest.approx(0.5)
 
 
-# ---- without confidence --------------------------------------------------------------------------
-
-
 def test_a_picture_alone_gets_a_confidence_by_its_changes():
     color = np.full((24, 32, 3), 0.5, np.float32)
     picture = color.copy()
     picture[:, 16:] = 0.8
     cleaned, confidence = denoise(color, denoiser=lambda render, photos: picture)
     assert cleaned is picture
-    assert confidence[:, :12] == pytest.approx(float(confidence_of(np.float32(LEAST_CLAIMED))))
+    assert confidence[:, :12] == pytest.approx(float(confidence_of(np.float32(MIN_CLAIMED_ERROR))))
     assert confidence[:, 20:].max() < 0.2
     with pytest.raises(igsr.IgsrError, match=r"made a picture \[12, 32, 3\] of a render"):
         denoise(color, denoiser=lambda render, photos: picture[::2])
-
-
-@pytest.mark.usefixtures("small_fits")
-def test_rounds_by_a_denoiser_without_confidence_help(ball_photos):
-    """It knows the scene, so its changes are right: cross-validation tells that they count."""
-    refined = refine(ball_photos, 1, lambda buffers, photos: truthful(buffers, photos)[0])
-    assert refined.rounds[0].accepted
-    assert refined.rounds[0].test["psnr"] > refined.first_test["psnr"]
-    selected = refined.rounds[0].selected
-    assert np.mean([one.mean_confidence for one in selected]) > 0.5
-
-
-@pytest.mark.usefixtures("small_fits")
-def test_each_fold_is_calibrated_by_the_others_and_the_whole_by_all_before_the_round(
-    ball_photos, monkeypatch
-):
-    told, asked, order = [], [], []
-    errors, calibrated = stages.Stages.denoising_errors, cross_validation._calibrated
-    refit, applied = stages.Stages.refit, stages.DenoisedViews.calibrated
-
-    def errors_of(self, fold, photos):
-        order.append("errors")
-        told.append(errors(self, fold, photos))
-        return told[-1]
-
-    def calibration(some):
-        asked.append([next(k for k, one in enumerate(told) if one is part) for part in some])
-        made = calibrated(some)
-        names[id(made)] = asked[-1]
-        kept.append(made)
-        return made
-
-    def used(self, calibration):
-        by.append(names[id(calibration)])
-        return applied(self, calibration)
-
-    def refitted(self, *arguments):
-        order.append("refit")
-        return refit(self, *arguments)
-
-    names, kept, by = {}, [], []
-    monkeypatch.setattr(stages.Stages, "denoising_errors", errors_of)
-    monkeypatch.setattr(stages.Stages, "refit", refitted)
-    monkeypatch.setattr(stages.DenoisedViews, "calibrated", used)
-    monkeypatch.setattr(cross_validation, "_calibrated", calibration)
-    refine(ball_photos, 1, lambda buffers, photos: truthful(buffers, photos)[0])
-    assert by == [[1, 2], [0, 2], [0, 1], [0, 1, 2]]
-    assert order == ["errors"] * 3 + ["refit"] * 4
-
-
-@pytest.mark.usefixtures("small_fits")
-def test_one_whose_changes_are_wrong_is_found_out(ball_photos):
-    """Cross-validation lowers the weight of changes that make renders worse."""
-
-    def noisy(buffers, photos):
-        noise = np.random.default_rng(0).normal(0.0, 0.2, buffers.color.shape)
-        return np.clip(buffers.color + noise, 0.0, 1.0).astype(np.float32)
-
-    without = refine(ball_photos, 1, noisy, cross_validate=False)
-    checked = refine(ball_photos, 1, noisy)
-    assert without.rounds[0].accepted
-    if checked.rounds:
-        assert not checked.rounds[0].accepted
-    else:
-        assert checked.stop.reason is StopReason.NONE_SELECTED
 
 
 @pytest.mark.usefixtures("small_fits")

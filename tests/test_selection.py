@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from igsr.denoiser import Buffers
-from igsr.denoiser.calibration import HALF_CONFIDENCE_ERROR
+from igsr.denoiser.confidence import HALF_CONFIDENCE_ERROR
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.selection import (
     LEAST_CONFIDENCE,

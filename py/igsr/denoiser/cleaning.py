@@ -13,7 +13,7 @@ from torch import Tensor
 
 from igsr.denoiser.architecture import MULTIPLE
 from igsr.denoiser.buffers import Buffers
-from igsr.denoiser.calibration import claimed_by_change, confidence_of
+from igsr.denoiser.confidence import claimed_by_change, confidence_of
 from igsr.denoiser.inputs import COLOR, PHOTOS, network_inputs
 from igsr.denoiser.network import REACH, DenoiserNetwork
 from igsr.denoiser.warping import Source, Warped, warp_photos
@@ -137,23 +137,6 @@ def denoise(
             used, ``denoiser`` returns arrays of another size, or the shipped weights cannot be
             read.
     """
-    picture, confidence = picture_and_confidence(render, photos, denoiser)
-    if confidence is None:
-        given = _buffers(render)
-        confidence = confidence_of(claimed_by_change(given.color, picture))
-    return picture, confidence
-
-
-def picture_and_confidence(
-    render: Buffers | Render | npt.NDArray[Any],
-    photos: Sequence[Source] = (),
-    denoiser: Denoiser | None = None,
-) -> tuple[Float32, Float32 | None]:
-    """As ``denoise``, but with no confidence where the denoiser gives none.
-
-    Raises:
-        IgsrError: as ``denoise``.
-    """
     others = [type(photo).__name__ for photo in photos if not isinstance(photo, Source)]
     if others:
         raise IgsrError(f"photos must be of igsr.denoiser.photo_sources, not {others[0]}")
@@ -175,6 +158,8 @@ def picture_and_confidence(
             + ("" if confidence is None else f" and a confidence {list(confidence.shape)}")
             + f" of a render of {list(size)} pixels"
         )
+    if confidence is None:
+        confidence = confidence_of(claimed_by_change(given.color, picture))
     return picture, confidence
 
 

@@ -9,14 +9,12 @@ import numpy as np
 
 from igsr.capture import View
 from igsr.capture.downscaling import halved
-from igsr.denoiser.calibration import Calibration, calibrate
 from igsr.evaluation.scores import ScoredView
 from igsr.refinement.results import HeldOutView
 from igsr.refinement.selection import Rejected
 from igsr.refinement.stages import (
     NOVEL_VIEWS_WORK,
     VALIDATED,
-    DenoisingErrors,
     Reconstruction,
     Stages,
 )
@@ -77,10 +75,6 @@ class CrossValidation:
 
     The folds are fitted when the first round is validated. They keep the views that a round adds:
     the next round is validated from there.
-
-    Attributes:
-        calibration: what the changes of a denoiser without confidence mean, by the held-out photos
-            of all folds as they were before the last round that was validated.
     """
 
     def __init__(self, stages: Stages, photos: Sequence[View]) -> None:
@@ -88,7 +82,6 @@ class CrossValidation:
         self._stages = stages
         self._photos, self._share, self._steps = _fold_photos(photos)
         self._folds: list[Fold] = []
-        self.calibration = Calibration()
 
     def use(self, photos: Sequence[View]) -> None:
         """Take these photos instead, which have the scene's colors; before the first round."""
@@ -105,23 +98,9 @@ class CrossValidation:
         return FOLDS * self._share * NOVEL_VIEWS_WORK
 
     def validate(self) -> Validation:
-        """Held-out photos before each fold's own round and after it.
-
-        Where the denoiser gives no confidence, each fold's round is calibrated by the other folds'
-        photos: its own are for scores.
-        """
+        """Held-out photos before each fold's own round and after it."""
         self._folds = self._folds or self._fitted()
         found = [self._stages.render_and_denoise(fold.reconstruction) for fold in self._folds]
-        if not all(views.have_confidence for views in found):
-            errors = [
-                self._stages.denoising_errors(fold.reconstruction, fold.held_out)
-                for fold in self._folds
-            ]
-            self.calibration = _calibrated(errors)
-            found = [
-                views.calibrated(_calibrated(errors[:k] + errors[k + 1 :]))
-                for k, views in enumerate(found)
-            ]
         selections = [self._stages.select(views) for views in found]
         count = sum(len(selected) for selected, _ in selections)
         not_added = [view for _, some in selections for view in some]
@@ -161,11 +140,6 @@ def combined_error(scores: dict[str, float]) -> float:
     """
     errors = (10.0 ** (-scores["psnr"] / 20.0), 1.0 - scores["ssim"], scores["flip"])
     return float(np.cbrt(np.prod(errors)))
-
-
-def _calibrated(errors: Sequence[list[DenoisingErrors]]) -> Calibration:
-    pictures = [one for of_fold in errors for one in of_fold]
-    return calibrate([one.claimed for one in pictures], [one.measured for one in pictures])
 
 
 def _means(views: Sequence[ScoredView]) -> dict[str, float]:

@@ -165,8 +165,6 @@ def _round(
             return replace(refined, rounds=[*refined.rounds, done], stop=stop)
 
     views = stages.render_and_denoise(whole)
-    if validation is not None and not views.have_confidence:
-        views = views.calibrated(validation.calibration)
     selected, rejected = stages.select(views)
     if not selected:
         return _ended_before(refined, rejected)

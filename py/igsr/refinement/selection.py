@@ -8,19 +8,13 @@ it would change, where its weights are high.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from igsr.denoiser import Buffers, Denoiser, Source
-from igsr.denoiser.calibration import (
-    Calibration,
-    claimed_by_change,
-    confidence_of,
-    error_of,
-)
-from igsr.denoiser.cleaning import picture_and_confidence
+from igsr.denoiser import Buffers, Denoiser, Source, denoise
+from igsr.denoiser.confidence import error_of
 from igsr.refinement.novel_views import NovelView
 
 Float32 = npt.NDArray[np.float32]
@@ -46,12 +40,6 @@ class Candidate:
             has 1.
         gain: mean over the pixels of confidence weight times absolute change by denoising, in
             units of the colours' range.
-        claimed: float32 [H, W], the absolute error that a denoiser without confidence is taken to
-            claim of each pixel, in units of the colours' range; None where it gives a confidence.
-        change: float32 [H, W], mean absolute change of each pixel's colours by denoising, in units
-            of their range; None where it is not known.
-        wanted: float32 [H, W] in [0, 1], how much of what a pixel shows belongs to the scene; None
-            where all does.
     """
 
     view: NovelView
@@ -59,9 +47,6 @@ class Candidate:
     denoised: npt.NDArray[np.uint8]
     confidence: Float32
     gain: float
-    claimed: Float32 | None = None
-    change: Float32 | None = None
-    wanted: Float32 | None = None
 
     @property
     def mean_confidence(self) -> float:
@@ -100,40 +85,13 @@ def denoised_candidate(
     Raises:
         IgsrError: as ``igsr.denoise``.
     """
-    denoised, given = picture_and_confidence(buffers, photos, denoiser)
-    claimed = None if given is not None else claimed_by_change(buffers.color, denoised)
-    certainty = given if claimed is None else confidence_of(claimed)
-    assert certainty is not None
-    wanted = None
-    if buffers.support is not None and not all(photo.usable.all() for photo in photos):
-        wanted = np.clip(buffers.support, 0.0, 1.0)
-    render = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
-    change = np.abs(denoised - render).mean(axis=-1)
-    confidence, gain = _weights_and_gain(certainty, change, wanted)
-    pictures = _to_uint8(render), _to_uint8(denoised)
-    return Candidate(view, *pictures, confidence, gain, claimed, change, wanted)
-
-
-def calibrated_candidate(candidate: Candidate, calibration: Calibration) -> Candidate:
-    """A candidate with the confidence weights and the gain that its denoiser's changes mean.
-
-    One of a denoiser that gives a confidence stays as it is.
-    """
-    if candidate.claimed is None or candidate.change is None:
-        return candidate
-    confidence, gain = _weights_and_gain(
-        calibration.confidence(candidate.claimed), candidate.change, candidate.wanted
-    )
-    return replace(candidate, confidence=confidence, gain=gain)
-
-
-def _weights_and_gain(
-    certainty: Float32, change: Float32, wanted: Float32 | None
-) -> tuple[Float32, float]:
+    denoised, certainty = denoise(buffers, photos, denoiser)
     confidence = confidence_weights(certainty)
-    if wanted is not None:
-        confidence = confidence * wanted
-    return confidence, float((confidence * change).mean())
+    if buffers.support is not None and not all(photo.usable.all() for photo in photos):
+        confidence = confidence * np.clip(buffers.support, 0.0, 1.0)
+    render = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
+    gain = float((confidence * np.abs(denoised - render).mean(axis=-1)).mean())
+    return Candidate(view, _to_uint8(render), _to_uint8(denoised), confidence, gain)
 
 
 def confidence_weights(certainty: Float32) -> Float32:

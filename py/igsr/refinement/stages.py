@@ -12,8 +12,6 @@ from PIL import Image
 from igsr._internal.choices import FitBackend
 from igsr.capture import Camera, Capture, View
 from igsr.denoiser import Denoiser, photo_support, render_buffers
-from igsr.denoiser.calibration import Calibration, claimed_by_change
-from igsr.denoiser.cleaning import picture_and_confidence
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import (
     METRICS,
@@ -21,7 +19,6 @@ from igsr.evaluation.scores import (
     default_background,
     evaluate,
     known_background,
-    over_background,
     score_views,
 )
 from igsr.fitting.fit_capture import Progress, fit_with_cameras
@@ -37,15 +34,12 @@ from igsr.refinement.run import STOPPED, RefineRun
 from igsr.refinement.selection import (
     Candidate,
     Rejected,
-    calibrated_candidate,
     denoised_candidate,
     rejected,
 )
 from igsr.refinement.settings import RefineSettings
 from igsr.rendering.backdrop import wants_backdrop, with_backdrop
 from igsr.splats import Splats
-
-Float32 = npt.NDArray[np.float32]
 
 #: Novel views rendered in a round, and how many of them are added at most.
 CANDIDATES, SELECTED = 24, 16
@@ -94,31 +88,6 @@ class DenoisedViews:
 
     candidates: list[Candidate]
     added_before: list[Candidate]
-
-    @property
-    def have_confidence(self) -> bool:
-        """Whether the denoiser gave a confidence."""
-        return all(one.claimed is None for one in (*self.candidates, *self.added_before))
-
-    def calibrated(self, calibration: Calibration) -> DenoisedViews:
-        """The same views; where the denoiser gave no confidence, with what its changes mean."""
-        return DenoisedViews(
-            [calibrated_candidate(one, calibration) for one in self.candidates],
-            [calibrated_candidate(one, calibration) for one in self.added_before],
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class DenoisingErrors:
-    """Errors of the denoised render of a photo, in units of the colours' range.
-
-    Attributes:
-        claimed: float32 [H, W], by how much the denoiser changed each pixel's surroundings.
-        measured: float32 [H, W], its absolute error against the photo; NaN where a mask hides it.
-    """
-
-    claimed: Float32
-    measured: Float32
 
 
 class Stages:
@@ -213,35 +182,6 @@ class Stages:
             self._run.tell("novel_views")
         self._run.work_done(NOVEL_VIEWS_WORK * reconstruction.share)
         return DenoisedViews(denoised[: len(novel)], denoised[len(novel) :])
-
-    def denoising_errors(
-        self, reconstruction: Reconstruction, photos: Sequence[View]
-    ) -> list[DenoisingErrors]:
-        """How wrong denoised renders are from where photos were taken that were not fitted.
-
-        What is claimed is what a denoiser without confidence is taken to claim.
-        """
-        splats, fitted, backend = (
-            reconstruction.splats,
-            reconstruction.photos,
-            self._settings.backend,
-        )
-        support = photo_support(splats, fitted, backend)
-        sources = NearSources(splats, fitted, self._background, backend)
-        found = []
-        for photo in photos:
-            buffers = render_buffers(
-                splats, photo.camera, support, self._background_of_views, backend
-            )
-            near = sources.of(photo.camera)
-            picture, _ = picture_and_confidence(buffers, near, self._denoiser)
-            truth = over_background(photo.image, self._background).astype(np.float32) / 255.0
-            measured = np.abs(picture - truth).mean(axis=-1)
-            if photo.mask is not None:
-                measured = np.where(photo.mask, measured, np.float32(np.nan))
-            found.append(DenoisingErrors(claimed_by_change(buffers.color, picture), measured))
-            self._run.tell("cross_validate")
-        return found
 
     def select(self, views: DenoisedViews) -> tuple[list[Candidate], list[Rejected]]:
         """The candidates to add, and the others."""

@@ -44,7 +44,7 @@ def plot_confidence(path: Path, confidence: dict[str, Any]) -> None:
     """Mean absolute error by predicted confidence, beside what the confidence claims."""
     from matplotlib.figure import Figure
 
-    from igsr.denoiser.calibration import HALF_CONFIDENCE_ERROR
+    from igsr.denoiser.confidence import HALF_CONFIDENCE_ERROR
 
     predicted = np.asarray(confidence["confidence"])
     figure = Figure(figsize=(6.0, 4.2), layout="constrained")
