@@ -223,5 +223,5 @@ def test_without_weights_of_its_own_igsr_says_what_to_give(monkeypatch, tmp_path
     from igsr.denoiser import weights
 
     monkeypatch.setattr(weights, "SHIPPED", tmp_path / "denoiser.safetensors")
-    with pytest.raises(igsr.IgsrError, match=r"without the denoiser's weights; give --weights FILE"):
+    with pytest.raises(igsr.IgsrError, match=r"without the denoiser's weights.*--weights"):
         load_network()

@@ -8,7 +8,7 @@ from typing import Any
 from igsr.capture.downscaling import reduced_size
 from igsr.capture.overview import Overview
 from igsr.cli.error_messages import print_message
-from igsr.evaluation.quick_scores import MOST_TRAIN
+from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.fitting.photo_support import PhotoSupport, detail_of_files
 from igsr.fitting.presets import Quality, settings_for
 from igsr.fitting.time_estimate import fit_seconds, other_seconds, timed_steps, times_usual
@@ -61,7 +61,7 @@ def announce(
     held_out = len(seen.sizes) - train
     # Photos with alpha are fitted from their hull, and those with depths from these.
     swept = settings.start in ("auto", "depths") and seen.channels < 4 and not seen.depths
-    scored = held_out + min(photos, MOST_TRAIN)
+    scored = held_out + min(photos, MAX_TRAIN_PHOTOS)
     # The rest runs on the CPU in any case; a GPU's steps do not tell how fast that is.
     times = times_usual(step, alpha) if backend == "cpu" else 1.0
     fit += other_seconds(photos if swept else 0, scored, pixels, times)

@@ -12,8 +12,8 @@ import numpy as np
 from igsr._internal.choices import Backend
 from igsr.capture import Camera, Capture, View
 from igsr.errors import IgsrError
-from igsr.evaluation import metrics
-from igsr.evaluation.scores import default_background, over_background
+from igsr.evaluation.quick_scores import quick_views
+from igsr.evaluation.scores import default_background
 from igsr.geometry.camera_paths import cameras_around
 from igsr.rendering.renders import render
 from igsr.splats import Splats
@@ -67,24 +67,16 @@ class Validation:
     protocol: dict[str, Any] = field(repr=False)
 
     def score(self, splats: Splats, backend: Backend) -> ValidationScore:
-        """Score ``splats`` on the validation views: 8-bit pictures, masked pixels do not count."""
-        pairs = [
-            (render(splats, view.camera, self.background, backend).to_uint8(), view)
-            for view in self.validation_views
-        ]
-        scored = [
-            (picture, over_background(view.image, self.background), view.mask)
-            for picture, view in pairs
-        ]
-        psnrs = [metrics.psnr(*images) for images in scored]
+        """Score ``splats`` on the validation views."""
+        views = quick_views(splats, self.validation_views, self.background, backend)
+        scores = [view.scores for view in views]
+        psnrs = [float(score["psnr"] or 0.0) for score in scores]
         psnr = float(np.mean(psnrs))
         if self.against_photos:
             loss = self.model_psnr - psnr
         else:
             loss = float(np.mean([loss_of_change(psnr, self.model_psnr) for psnr in psnrs]))
-        return ValidationScore(
-            loss, psnr, float(np.mean([metrics.ssim(*images) for images in scored]))
-        )
+        return ValidationScore(loss, psnr, float(np.mean([score["ssim"] for score in scores])))
 
 
 def loss_of_change(psnr: float, model_psnr: float) -> float:

@@ -45,7 +45,7 @@ def named_denoiser(name: str) -> Denoiser:
             f"denoiser: {name} must return a function of a render and photos, "
             f"not {type(denoiser).__name__}"
         )
-    return denoiser  # type: ignore[no-any-return]
+    return denoiser
 
 
 def _module(name: str) -> Any:
