@@ -1,4 +1,4 @@
-"""Compaction: prune the splats that contribute least, fine-tune the rest, validate the loss."""
+"""Compaction: prune the splats that contribute least, and fine-tune the remaining ones."""
 
 from igsr.compaction.contribution import Contribution, contribution
 from igsr.compaction.plot_curve import write_plot

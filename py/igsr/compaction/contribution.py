@@ -18,7 +18,7 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Contribution:
-    """Contribution of splats to the renders of some cameras. All float64 [N], 0 where not visible.
+    """Contribution of splats to the renders of some cameras. All float64 [N], 0 if invisible.
 
     Attributes:
         weight: visible area, summed over pictures, pixels.
