@@ -107,7 +107,7 @@ def convert_command(
 
 
 def _write_levels(scene: Path, target: Path, levels: int, as_json: bool) -> None:
-    from igsr.viewing.level_files import INDEX, write_levels
+    from igsr.rendering.levels import INDEX, write_levels
 
     if target.resolve() == Path.cwd().resolve():
         raise IgsrError(f"{target} is the folder that the command runs in; name another")
@@ -132,8 +132,8 @@ def _write_page(
     capture: Path | None,
     background: tuple[float, float, float] | None,
 ) -> list[str]:
+    from igsr.rendering.run_folder import background_beside, cameras_beside, cameras_of
     from igsr.rendering.scene_page import write_scene_page
-    from igsr.rendering.scene_surroundings import background_beside, cameras_beside, cameras_of
 
     seen = cameras_beside(scene) if capture is None else cameras_of(capture)
     color = background or background_beside(scene) or (0.0, 0.0, 0.0)
