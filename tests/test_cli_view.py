@@ -176,13 +176,13 @@ def test_the_viewer_of_the_package_is_started_and_nothing_beside_takes_its_place
 
 def test_the_package_has_the_program_splat_view():
     found = importlib.metadata.entry_points(group="console_scripts", name="splat-view")
-    assert [entry.value for entry in found] == ["igsr.viewing.window:main"]
+    assert [entry.value for entry in found] == ["igsr.rendering.window:main"]
     for words, status, text in (
         (["--version"], 0, f"splat-view {igsr.__version__}"),
         (["--nonsense"], 1, "--nonsense"),
     ):
         result = subprocess.run(
-            [sys.executable, "-m", "igsr.viewing.window", *words],
+            [sys.executable, "-m", "igsr.rendering.window", *words],
             capture_output=True,
             text=True,
             timeout=60,

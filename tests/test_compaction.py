@@ -49,8 +49,8 @@ def beads(colors, opacities, depths):
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch):
     """Without a capture: fewer and smaller pictures than users get, for the time it takes."""
-    monkeypatch.setattr(validation, "AROUND", 15)
-    monkeypatch.setattr(validation, "AROUND_SIDE", 56)
+    monkeypatch.setattr(validation, "AROUND_CAMERAS", 15)
+    monkeypatch.setattr(validation, "AROUND_SIDE_PX", 56)
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +280,7 @@ def test_scenes_and_captures_that_cannot_be_used(photos):
     lone = igsr.Capture(capture.path, capture.views[:1])
     with pytest.raises(igsr.IgsrError, match="one held-out view"):
         igsr.compact(model, 0.1, lone, backend="cpu")
-    with pytest.raises(igsr.IgsrError, match="leave psnr or capture out"):
+    with pytest.raises(igsr.IgsrError, match="give psnr or capture, not both"):
         igsr.compact(model, 0.1, capture, psnr=30.0, backend="cpu")
 
 

@@ -8,9 +8,9 @@ import igsr
 from igsr.capture import Camera
 from igsr.denoiser import Buffers, NetworkDenoiser, cleaning, denoise, load_network, save_network
 from igsr.denoiser.architecture import Architecture
-from igsr.denoiser.cleaning import DOUBT, SMALLEST_CHANGE
+from igsr.denoiser.cleaning import DOUBT, MIN_CHANGE
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
-from igsr.denoiser.network import FIRST_LOGIT, REACH, DenoiserNetwork
+from igsr.denoiser.network import INITIAL_LOGIT, REACH_PX, DenoiserNetwork
 from igsr.denoiser.warping import Source
 from igsr.rendering.renders import Render
 
@@ -36,7 +36,7 @@ def test_a_new_network_changes_little(photos):
     expected, weights = inputs[:, :COLOR].clone(), torch.ones(2, 1, 9, 14)
     for k in range(CHOICES - 1 if photos == "none" else 0, CHOICES):
         at = COLOR + BUFFERS + k * PHOTO
-        weight = np.exp(FIRST_LOGIT) * valid[:, k : k + 1]
+        weight = np.exp(INITIAL_LOGIT) * valid[:, k : k + 1]
         expected += weight * inputs[:, at : at + COLOR]
         weights += weight
     assert torch.allclose(image, expected / weights, atol=1e-6)
@@ -68,20 +68,20 @@ def test_what_the_architecture_leaves_out_does_not_matter():
 
 def test_an_output_depends_on_pixels_within_reach_only():
     made = network(Architecture(4, (2, 2, 4)))
-    inputs = torch.rand(1, CHANNELS, 16, 2 * REACH + 32)
+    inputs = torch.rand(1, CHANNELS, 16, 2 * REACH_PX + 32)
     changed = inputs.clone()
     changed[..., :8] = 0.0
     with torch.inference_mode():
         difference = (made(inputs)[0] - made(changed)[0]).abs().amax(dim=(0, 1, 2))
     assert difference[:40].max() > 0.0
-    assert difference[8 + REACH :].max() == 0.0
+    assert difference[8 + REACH_PX :].max() == 0.0
 
 
 def test_tiles_give_what_the_whole_gives(monkeypatch):
     color = np.random.default_rng(0).uniform(size=(50, 230, 3)).astype(np.float32)
     cleaner = NetworkDenoiser(network(Architecture(4, (2, 2, 4))))
     whole = cleaner(Buffers(color), [])
-    monkeypatch.setattr(cleaning, "TILE", 40)
+    monkeypatch.setattr(cleaning, "TILE_PX", 40)
     tiled = cleaner(Buffers(color), [])
     for a, b in zip(whole, tiled, strict=True):
         assert np.abs(a - b).max() < 1e-5
@@ -101,7 +101,7 @@ def test_any_size_comes_out_as_it_went_in(size):
 
 def test_a_change_that_nobody_sees_is_not_made():
     color = np.random.default_rng(0).uniform(0.1, 0.9, size=(20, 20, 3)).astype(np.float32)
-    for brighter, same in ((0.9 * SMALLEST_CHANGE, True), (1.1 * SMALLEST_CHANGE, False)):
+    for brighter, same in ((0.9 * MIN_CHANGE, True), (1.1 * MIN_CHANGE, False)):
         picture, _ = denoise(color, denoiser=NetworkDenoiser(brightening(brighter, 1e-3)))
         assert np.array_equal(picture, color) is same
 
@@ -152,9 +152,9 @@ def test_renders_of_all_kinds_are_taken():
     photo = Source(camera, floats, ones > 0.0, ones)
     with pytest.raises(igsr.IgsrError, match=r"must be of igsr\.denoiser\.photo_sources"):
         denoise(Buffers(floats), ["photo.png"], denoiser=cleaner)
-    with pytest.raises(igsr.IgsrError, match="only where render has a camera"):
+    with pytest.raises(igsr.IgsrError, match="photos need a render with a camera"):
         denoise(drawn, [photo], denoiser=cleaner)
-    with pytest.raises(igsr.IgsrError, match=r"the denoiser made a picture \[4, 9, 3\]"):
+    with pytest.raises(igsr.IgsrError, match=r"the denoiser returned a picture \[4, 9, 3\]"):
         denoise(floats, denoiser=lambda render, _: (floats[::2], ones))
     with pytest.raises(igsr.IgsrError, match="render must be uint8 or float"):
         denoise(np.zeros((2, 2, 3), np.int64), denoiser=cleaner)
@@ -188,10 +188,10 @@ def test_damaged_files_of_weights_are_refused_in_a_sentence(tmp_path):
 
     for length in (0, 4, 100, len(whole) - 1):
         path.write_bytes(whole[:length])
-        refused("is no whole .safetensors file")
+        refused("is not a complete .safetensors file")
     save_file(weights, path)
-    refused("does not say which network it is of")
-    unsaid = "does not say which network it is of"
+    refused("does not record its architecture")
+    unsaid = "does not record its architecture"
     for wrong, why in (
         ("[]", unsaid),
         ('{"width": 4}', unsaid),
@@ -214,7 +214,7 @@ def test_damaged_files_of_weights_are_refused_in_a_sentence(tmp_path):
     save_file(weights | {"head.bias": weights["head.bias"] * float("nan")}, path, metadata=about)
     refused("head.bias holds a NaN")
     save_file(weights | {"more": torch.zeros(3)}, path, metadata=about)
-    refused("holds the weight more")
+    refused("has an unknown weight more")
     path.unlink()
     refused("does not exist")
 
@@ -223,5 +223,5 @@ def test_without_weights_of_its_own_igsr_says_what_to_give(monkeypatch, tmp_path
     from igsr.denoiser import weights
 
     monkeypatch.setattr(weights, "SHIPPED", tmp_path / "denoiser.safetensors")
-    with pytest.raises(igsr.IgsrError, match=r"no weights of its own.*--weights FILE"):
+    with pytest.raises(igsr.IgsrError, match=r"without the denoiser's weights.*--weights"):
         load_network()

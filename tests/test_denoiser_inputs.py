@@ -21,7 +21,7 @@ from igsr.denoiser import (
     warping,
 )
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
-from igsr.denoiser.warping import CONSIDERED
+from igsr.denoiser.warping import MAX_SOURCES
 from igsr.evaluation.scores import BLACK
 from igsr_lab.denoiser import pairs
 from igsr_lab.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
@@ -154,7 +154,7 @@ def test_hidden_masked_and_missing_photos_are_not_valid():
 def test_of_many_photos_those_that_look_from_nearest_are_looked_up():
     truth, depth = plane_photo(camera())
     buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
-    near = [source(x) for x in np.linspace(-0.4, 0.4, CONSIDERED)]
+    near = [source(x) for x in np.linspace(-0.4, 0.4, MAX_SOURCES)]
     far = [source(x) for x in (-1.2, 1.2, 1.5)]
     few, many = warped_of(buffers, near, 3), warped_of(buffers, [far[0], *near, *far[1:]], 3)
     assert few.valid[0].any()
@@ -388,7 +388,7 @@ def test_a_large_picture_is_looked_up_in_bands_of_rows(monkeypatch):
     view = scenes.ring_camera(0.1, 40)
     buffers = render_buffers(scene, view, photo_support(scene, photos, "cpu"), backend="cpu")
     whole = warp_photos(view, buffers.depth, buffers.alpha, sources, PHOTOS)
-    monkeypatch.setattr(warping, "BAND", 7 * 40)
+    monkeypatch.setattr(warping, "BAND_PIXELS", 7 * 40)
     bands = warp_photos(view, buffers.depth, buffers.alpha, sources, PHOTOS)
     assert whole.valid.any()
     for name in ("color", "valid", "angle"):

@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 import igsr
 from igsr.cli import app
 from igsr.floaters import photo_evidence, removal
-from igsr.floaters.isolation import alone
 from igsr.floaters.photo_evidence import needed_by_others, sightings
-from igsr.floaters.removal import stray_splats, unsupported_splats
+from igsr.floaters.removal import alone, stray_splats, unsupported_splats
 from igsr.splats import subset
 
 BLACK = (0.0, 0.0, 0.0)
@@ -69,7 +68,7 @@ def test_sightings_count_who_shows_a_splat_and_who_shows_it_before_the_surface(b
 
 
 def test_needed_by_others_is_the_growth_of_the_squared_error(monkeypatch):
-    monkeypatch.setattr(photo_evidence, "PROBES", 2000)
+    monkeypatch.setattr(photo_evidence, "PROBES_PER_PHOTO", 2000)
     views = scenes.capture(views=3, size=32, scene=scenes.splats(8, seed=5)).views
     model = scenes.splats(8, degree=1)
     model.opacities[:] = np.linspace(-1.0, 1.0, 8)  # below the clamp at 0.99
@@ -140,7 +139,7 @@ def test_what_photos_hardly_show_behind_masks_is_left_to_pseudo_views():
     views = scenes.capture(views=6, scene=scene).views
     masked = with_masks_of(views, scene, ball)
     cameras = [view.camera for view in views]
-    assert 0.0 < sightings(scene, cameras, "cpu").area[-1] < photo_evidence.SHOWN
+    assert 0.0 < sightings(scene, cameras, "cpu").area[-1] < photo_evidence.MIN_AREA_PX
     pseudo = [replace(view, weights=np.ones((48, 48), np.float32)) for view in views]
     many = [*masked, *(pseudo * 40)]
     kinds = unsupported_splats(scene, many, BLACK, backend="cpu")
@@ -181,7 +180,7 @@ def test_photos_that_are_not_asked_keep_what_they_show(monkeypatch):
     seen = sightings(speck, [view.camera for view in views], "cpu")
     assert seen.shown[0] > 1
     assert unsupported_splats(model, views, BLACK, backend="cpu")["floating"][-1]
-    monkeypatch.setattr(removal, "MOST_ASKED", 1)
+    monkeypatch.setattr(removal, "MAX_NEED_PHOTOS", 1)
     elsewhere = scenes.ring_camera(0.0, centre=(50.0, 0.0, 0.0))
     photos = [replace(views[0], camera=elsewhere), *views]
     assert not unsupported_splats(model, photos, BLACK, backend="cpu")["floating"][-1]

@@ -14,8 +14,8 @@ import scenes
 import igsr
 from igsr.capture import Camera
 from igsr.capture.types import intrinsic_matrix
-from igsr.viewing.found_models import check_shown, found_models
-from igsr.viewing.level_files import level_within, write_levels
+from igsr.rendering.levels import level_within, write_levels
+from igsr.rendering.live_models import check_viewable, live_models
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")
 
@@ -128,11 +128,11 @@ def test_chunks_are_sog_as_another_decoder_reads_it(levels):
 
 def test_the_page_shows_the_finest_level_that_it_holds(levels, monkeypatch):
     out, written = levels
-    check_shown(out)
-    (found,) = found_models(out)
+    check_viewable(out)
+    (found,) = live_models(out)
     assert (found.path.name, found.label) == ("lod-meta.json", "out")
     assert len(found.load()) == written.counts[0]
-    (alone,) = found_models(out / "lod-meta.json")
+    (alone,) = live_models(out / "lod-meta.json")
     assert alone.load() == found.load()
     coarse = level_within(out / "lod-meta.json", written.counts[0] - 1)
     assert len(coarse) == written.counts[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from igsr.evaluation.limits import REPRODUCED, WORTH_IT, LimitKind, limit_of
+from igsr.evaluation.limits import MIN_GAIN_DB, REPRODUCED_DB, LimitKind, limit_of
 
 SPLATS, PHOTOS = LimitKind.splats_and_steps, LimitKind.photos
 CAMERAS, NOTHING = LimitKind.cameras, LimitKind.nothing
@@ -30,7 +30,7 @@ def test_the_longest_of_three_lengths_names_the_limit(train, held_out, refined, 
     assert f"{train:.1f} dB" in limit.sentence
     assert f"{held_out:.1f} dB" in limit.sentence
     words = {SPLATS: "more splats and steps would help most", PHOTOS: "more photos would help most"}
-    words |= {CAMERAS: "better cameras would help most", NOTHING: "nothing that more splats"}
+    words |= {CAMERAS: "better cameras would help most", NOTHING: "would add little"}
     for other, text in words.items():
         assert (text in limit.sentence) == (other is kind)
 
@@ -39,15 +39,15 @@ def test_what_helps_second_is_said_where_it_is_worth_it():
     assert "more photos would, too" in limit_of(22.2, 17.1).sentence
     assert "too" not in limit_of(22.0, 21.0).sentence
     assert "more splats and steps would, too" in limit_of(26.0, 18.0).sentence
-    assert "too" not in limit_of(REPRODUCED - WORTH_IT / 2.0, 17.0).sentence
+    assert "too" not in limit_of(REPRODUCED_DB - MIN_GAIN_DB / 2.0, 17.0).sentence
 
 
 def test_thresholds():
-    just_under = WORTH_IT - 0.01
-    assert limit_of(REPRODUCED - just_under, REPRODUCED - just_under).kind is NOTHING
-    assert limit_of(REPRODUCED - WORTH_IT, REPRODUCED - WORTH_IT).kind is SPLATS
+    just_under = MIN_GAIN_DB - 0.01
+    assert limit_of(REPRODUCED_DB - just_under, REPRODUCED_DB - just_under).kind is NOTHING
+    assert limit_of(REPRODUCED_DB - MIN_GAIN_DB, REPRODUCED_DB - MIN_GAIN_DB).kind is SPLATS
     assert limit_of(40.0, 40.0 - just_under).kind is NOTHING
-    assert limit_of(40.0, 40.0 - WORTH_IT).kind is PHOTOS
+    assert limit_of(40.0, 40.0 - MIN_GAIN_DB).kind is PHOTOS
 
 
 def test_without_held_out_photos_it_says_what_can_be_said():

@@ -13,7 +13,6 @@ from torchmetrics.functional.image import (
 )
 
 from igsr.evaluation import metrics
-from igsr.evaluation.left_half import left_half_scores
 
 
 def picture(seed=0, height=40, width=52):
@@ -157,40 +156,3 @@ def test_color_correction_is_fitted_to_pixels_that_count_and_are_not_clipped():
     inner[12:, 12:] = True
     mended = metrics.color_corrected(white_patch, photo)
     assert metrics.psnr(mended, photo, inner) > 38
-
-
-def test_the_left_half_finds_the_exposure_that_the_right_half_is_scored_with():
-    photo = (picture(height=48, width=57) * 0.6 + 40).astype(np.uint8)
-    mixed = photo @ np.array([[0.7, 0.1, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.6]]) + 12.0
-    render = mixed.astype(np.uint8)
-    found = left_half_scores(render, photo)
-    assert metrics.psnr(render, photo) < 25
-    assert found["lh_psnr"] > 45
-    assert found["lh_ssim"] > 0.99
-    # Nothing is learned from the right half: an error there stays, one on the left changes the map.
-    spoiled = render.copy()
-    spoiled[:, 28:] = np.clip(spoiled[:, 28:] + 30.0, 0, 255).astype(np.uint8)
-    right = left_half_scores(spoiled, photo)
-    assert right["lh_psnr"] < 20
-    exact = np.concatenate([render[:, :28], photo[:, 28:]], axis=1)
-    assert left_half_scores(exact, photo)["lh_psnr"] < 20
-
-
-def test_the_left_half_minds_masks_and_clipped_pixels():
-    photo = (picture(height=48, width=56) * 0.6 + 40).astype(np.uint8)
-    render = (photo * 0.8).astype(np.uint8)
-    mask = np.ones(photo.shape[:2], dtype=bool)
-    mask[:20] = False
-    spoiled = render.copy()
-    spoiled[:20] = 90
-    assert left_half_scores(spoiled, photo, mask)["lh_psnr"] > 45
-    assert left_half_scores(spoiled, photo)["lh_psnr"] < 40
-    clipped = render.copy()
-    clipped[:20, :28] = 255
-    assert left_half_scores(clipped, photo)["lh_psnr"] > 45
-    # Without pixels to fit a map to, the render stays as it is.
-    mask[:, :28] = False
-    plain = metrics.psnr(render[:, 28:], photo[:, 28:], mask[:, 28:].copy())
-    assert left_half_scores(render, photo, mask)["lh_psnr"] == pytest.approx(plain)
-    mask[:, 28:] = False
-    assert left_half_scores(render, photo, mask) == {"lh_psnr": None, "lh_ssim": None}

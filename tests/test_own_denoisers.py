@@ -38,7 +38,7 @@ def test_a_picture_alone_gets_a_confidence_by_its_changes():
     assert cleaned is picture
     assert confidence[:, :12] == pytest.approx(float(confidence_of(np.float32(MIN_CLAIMED_ERROR))))
     assert confidence[:, 20:].max() < 0.2
-    with pytest.raises(igsr.IgsrError, match=r"made a picture \[12, 32, 3\] of a render"):
+    with pytest.raises(igsr.IgsrError, match=r"returned a picture \[12, 32, 3\] for a render"):
         denoise(color, denoiser=lambda render, photos: picture[::2])
 
 
@@ -205,7 +205,7 @@ def test_large_renders_are_cleaned_small_and_keep_their_detail():
 
 
 def test_models_and_sizes_that_do_not_fit_are_told():
-    with pytest.raises(igsr.IgsrError, match=r"made \[1, 3, 8, 8\] of \[1, 3, 16, 16\]"):
+    with pytest.raises(igsr.IgsrError, match=r"returned \[1, 3, 8, 8\] for \[1, 3, 16, 16\]"):
         SingleStepDenoiser(lambda render, photo: render[..., ::2, ::2])(
             Buffers(np.zeros((16, 16, 3), np.float32)), []
         )

@@ -19,7 +19,7 @@ from igsr._internal.part_usage import Parts, Usage
 from igsr.capture import Capture
 from igsr.evaluation import evaluate, metrics, report_page, score_views
 from igsr.evaluation.contact_sheet import contact_sheet, error_picture, sheet_names
-from igsr.evaluation.quick_scores import MOST_TRAIN, train_photos, train_scores
+from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS, train_photos, train_scores
 from igsr.evaluation.scores import BLACK, ScoredView, over_background
 from igsr.fitting.fit_page import write_fit_page
 from igsr.fitting.fit_report import FinishedFit, FitScores, fit_report
@@ -150,7 +150,7 @@ def test_fitted_photos_are_scored_at_most_ten_evenly_spaced():
     views = [replace(view, split="train") for view in made.views]
     capture = Capture(made.path, views)
     names = [view.name for view in train_photos(capture)]
-    assert len(names) == MOST_TRAIN == 10
+    assert len(names) == MAX_TRAIN_PHOTOS == 10
     assert (names[0], names[-1]) == (views[0].name, views[-1].name)
     scores = train_scores(splats, capture, BLACK, "reference")
     assert (scores["views"], scores["of"]) == (10, 25)
@@ -194,7 +194,7 @@ def test_a_fits_page_escapes_what_it_shows(tmp_path, monkeypatch):
         raise igsr.IgsrError("no")
 
     # A scene that is too large, or that pages cannot hold, is linked to.
-    for name, value in (("MOST_COMPARED", 4), ("scene_page", refuse)):
+    for name, value in (("MAX_COMPARED_SPLATS", 4), ("scene_page", refuse)):
         with monkeypatch.context() as patch:
             patch.setattr(report_page, name, value)
             write_fit_page(tmp_path / "report.html", report, splats, capture, sheet)

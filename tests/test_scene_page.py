@@ -12,7 +12,7 @@ import scenes
 from scene_pages import BACKGROUND, MEAN, check_pictures, drawn, model, named, opened, three_cameras
 
 import igsr
-from igsr.rendering import scene_packing
+from igsr.rendering import scene_model
 from igsr.rendering.renders import render
 from igsr.rendering.scene_page import PageCamera, scene_page, write_scene_page
 
@@ -58,7 +58,7 @@ def test_splats_far_out_do_not_make_the_others_coarse(browser, tmp_path):
 
 @pytest.mark.parametrize("count", [400, 3000])
 def test_large_models_share_harmonics(browser, tmp_path, monkeypatch, count):
-    monkeypatch.setattr(scene_packing, "PALETTE_FROM", 300)
+    monkeypatch.setattr(scene_model, "PALETTE_FROM", 300)
     splats = model(3, count, antialiased=True)
     # Real models have rows that are alike; white noise has none.
     random = np.random.default_rng(0)

@@ -13,8 +13,8 @@ from igsr.capture.write_cameras import write_cameras
 from igsr.cli import app
 from igsr.cli.scene_page_option import write_page
 from igsr.rendering.renders import render
+from igsr.rendering.run_folder import background_beside, cameras_beside
 from igsr.rendering.scene_page import write_scene_page
-from igsr.rendering.scene_surroundings import background_beside, cameras_beside
 
 
 def convert(*words):

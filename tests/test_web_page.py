@@ -222,7 +222,7 @@ def test_names_are_text(browser, tmp_path):
 def test_pages_that_would_be_large_show_the_last_model_alone(monkeypatch):
     models = [PageModel(str(k), splats) for k, splats in enumerate(ROUNDS)]
     assert scene_page.compared(models) == models
-    monkeypatch.setattr(scene_page, "MOST_COMPARED", 1199)
+    monkeypatch.setattr(scene_page, "MAX_COMPARED_SPLATS", 1199)
     assert scene_page.compared(models) == models[-1:]
 
 

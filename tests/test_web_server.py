@@ -23,9 +23,9 @@ from web_views import asked, served, state_of, with_token
 import igsr
 from igsr.capture.write_cameras import write_cameras
 from igsr.fitting.followed_run import FollowedRun
-from igsr.viewing import run_news, shown
-from igsr.viewing.run_news import run_background, run_progress, run_scores
-from igsr.viewing.server import is_own, open_server
+from igsr.rendering import live_view, run_folder
+from igsr.rendering.live_server import is_loopback, open_server
+from igsr.rendering.run_folder import run_background, run_progress, run_scores
 
 SECRET = b"nobody but the owner reads this"
 
@@ -137,7 +137,7 @@ def test_a_hundred_requests_at_once_pack_a_model_once(scene, monkeypatch):
         time.sleep(0.2)
         return b"x" * 3_000_000
 
-    monkeypatch.setattr(shown, "_packed", pack)
+    monkeypatch.setattr(live_view, "_packed", pack)
     with served(scene) as server, ThreadPoolExecutor(100) as pool:
         answers = list(pool.map(lambda _: with_token(server, "model?id=scene"), range(100)))
     assert {(status, len(content)) for status, content in answers} == {(200, 3_000_000)}
@@ -145,7 +145,7 @@ def test_a_hundred_requests_at_once_pack_a_model_once(scene, monkeypatch):
 
 
 def test_browsers_that_leave_and_say_nothing_are_survived(scene, monkeypatch, caplog):
-    monkeypatch.setattr(shown, "_packed", lambda found: b"x" * 20_000_000)
+    monkeypatch.setattr(live_view, "_packed", lambda found: b"x" * 20_000_000)
     with served(scene) as server:
         silent = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(20)]
         for one in silent:
@@ -167,14 +167,14 @@ def test_a_port_that_is_taken_is_said(scene):
     with served(scene) as server:
         taken = server.server_port
         with pytest.raises(igsr.IgsrError, match=f"port {taken} .*--port"):
-            open_server(server.shown, "127.0.0.1", taken)
+            open_server(server.view, "127.0.0.1", taken)
         with pytest.raises(igsr.IgsrError, match=r"Cannot listen at 192\.0\.2\.1"):
-            open_server(server.shown, "192.0.2.1", 0)
+            open_server(server.view, "192.0.2.1", 0)
 
 
 def test_addresses_that_other_computers_reach_are_told():
-    assert all(map(is_own, ["127.0.0.1", "127.1.2.3", "::1", "localhost"]))
-    assert not any(map(is_own, ["0.0.0.0", "::", "192.168.1.2", "box", ""]))
+    assert all(map(is_loopback, ["127.0.0.1", "127.1.2.3", "::1", "localhost"]))
+    assert not any(map(is_loopback, ["0.0.0.0", "::", "192.168.1.2", "box", ""]))
 
 
 # ---- what is found -------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ def test_a_fit_and_its_checkpoint(tmp_path):
         assert seen[0]["run"] == {"text": "step 1", "done": 0.5}
         state = state_of(server)
         assert [one["label"] for one in state["models"]] == ["being fitted"]
-        found = shown.found_models(folder)[0].load()
+        found = live_view.live_models(folder)[0].load()
         assert found.means.tobytes() == fitted.means.tobytes()
         around = json.loads(with_token(server, "surroundings")[1])
         assert around["background"] == [1.0, 0.5, 0.0]
@@ -328,9 +328,11 @@ def test_a_run_that_is_silent_is_said(tmp_path, monkeypatch):
     os.utime(folder / "progress.json", (time.time() - 1200, time.time() - 1200))
     assert "no news for 20 min" in run_progress(tmp_path)["text"]
     (tmp_path / "report.json").write_text('{"psnr": 20, "ssim": 0.5, "protocol": {}}')
-    assert run_scores(tmp_path).rows == [], "it is an earlier run's"
+    assert run_scores(tmp_path)["rows"] == [], "it is an earlier run's"
     (folder / "progress.json").unlink()
-    assert run_scores(tmp_path).rows == [["fitted photos", "20.00", "0.5000", run_news.DASH]]
+    assert run_scores(tmp_path)["rows"] == [
+        ["fitted photos", "20.00", "0.5000", run_folder.MISSING]
+    ]
 
 
 # ---- the command ---------------------------------------------------------------------------------

@@ -11,14 +11,14 @@ import subprocess
 import threading
 import urllib.request
 
-from igsr.viewing.server import open_server
-from igsr.viewing.shown import Shown
+from igsr.rendering.live_server import open_server
+from igsr.rendering.live_view import LiveView
 
 
 @contextlib.contextmanager
 def served(*paths, cameras=None):
     """A server of paths, at a port that is free."""
-    with open_server(Shown(paths, cameras), "127.0.0.1", 0) as server:
+    with open_server(LiveView(paths, cameras), "127.0.0.1", 0) as server:
         # It looks ten times as often as usual whether it shall end.
         thread = threading.Thread(target=server.serve_forever, args=(0.05,))
         thread.start()

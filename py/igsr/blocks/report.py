@@ -17,7 +17,7 @@ from igsr.blocks.seams import loaded_in_parts
 from igsr.blocks.task_making import name_of
 from igsr.capture import Capture
 from igsr.capture.exposure import Exposure
-from igsr.evaluation.quick_scores import MOST_TRAIN
+from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.evaluation.scores import METRICS, default_background, evaluate
 from igsr.splats import Splats
 
@@ -36,8 +36,8 @@ def held_out_scores(
     split = "test" if manifest.of_split("test") else "train"
     photos = manifest.of_split(split)
     count = len(photos)
-    if split == "train" and count > MOST_TRAIN:
-        photos = [photos[int(i)] for i in np.linspace(0, count - 1, MOST_TRAIN).round()]
+    if split == "train" and count > MAX_TRAIN_PHOTOS:
+        photos = [photos[int(i)] for i in np.linspace(0, count - 1, MAX_TRAIN_PHOTOS).round()]
     across = {manifest.shots[index].name for index in photos if plan.across[index]}
     rows: list[dict[str, Any]] = []
     protocol: dict[str, Any] = {}

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from igsr import _core
 from igsr.blocks.cells import Cell, Ground
 from igsr.capture.downscaling import reduced_size, resized_camera
 from igsr.capture.types import Camera, Points
-from igsr.rendering.renders import project
+from igsr.rendering.splat_weights import splat_weights
 from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
@@ -45,35 +44,11 @@ def shown_shares(
     shares = np.zeros((len(cameras), len(cells)))
     for row, camera in zip(shares, cameras, strict=True):
         small = resized_camera(camera, *reduced_size(camera.width, camera.height, ASKED_SIZE))
-        weights = shown_weights(plain, small, backend)
+        # Gradients may be negative by rounding.
+        weights = np.maximum(splat_weights(plain, small, backend).astype(np.float64), 0.0)
         seen = np.flatnonzero(weights)  # few of a large scene's
         row[:] = weights[seen] @ inside[seen] / max(float(weights[seen].sum()), 1e-9)
     return np.clip(shares, 0.0, 1.0)
-
-
-def shown_weights(splats: Splats, camera: Camera, backend: str) -> Float64:
-    """What each splat counts for in a picture, float64 [N]: its part of each pixel, summed up.
-
-    That is the slope of the picture's sum by the splat's color: one pass back, for any number of
-    splats.
-    """
-    dtype = _core.working_dtype(backend)
-    drawn = project(splats, camera, backend)
-    size = {"width": camera.width, "height": camera.height}
-    black = np.zeros(3, dtype)
-    picture = _core.rasterize(drawn, **size, background=black, backend=backend)
-    planes = (camera.height, camera.width)
-    slopes = _core.rasterize_backward(
-        drawn,
-        picture,
-        v_color=np.ones((*planes, 3), dtype),
-        v_alpha=np.zeros(planes, dtype),
-        v_depth=np.zeros(planes, dtype),
-        background=black,
-        absolute=False,
-        backend=backend,
-    )
-    return np.maximum(slopes["v_colors"][:, 0].astype(np.float64), 0.0)
 
 
 def tracked_shares(

@@ -114,8 +114,8 @@ def _converted_scene(
     check_writable(target)
     splats = Splats.load(source)
     if is_page:
+        from igsr.rendering.run_folder import background_beside, cameras_beside, cameras_of
         from igsr.rendering.scene_page import write_scene_page
-        from igsr.rendering.scene_surroundings import background_beside, cameras_beside, cameras_of
 
         shown = cameras_beside(source) if cameras is None else cameras_of(cameras)
         color = background or background_beside(source) or (0.0, 0.0, 0.0)
@@ -135,7 +135,7 @@ def _converted_scene(
 
 
 def _levels(source: Path, target: Path, levels: int) -> tuple[dict[str, Any], list[str]]:
-    from igsr.viewing.level_files import INDEX, write_levels
+    from igsr.rendering.levels import INDEX, write_levels
 
     if target.resolve() == Path.cwd().resolve():
         raise IgsrError(f"{target} is the folder that the command runs in; name another")

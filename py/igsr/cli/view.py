@@ -27,7 +27,7 @@ from igsr.cli.web_view import has_display, serve_web_view
 from igsr.errors import IgsrError
 
 #: The viewer.
-PROGRAM = (sys.executable, "-m", "igsr.viewing.window")
+PROGRAM = (sys.executable, "-m", "igsr.rendering.window")
 #: Nothing in the folder that the command was typed in takes the place of a module.
 ENVIRONMENT = {"PYTHONSAFEPATH": "1"}
 #: Options of the viewer that open no window.

@@ -32,22 +32,22 @@ def serve_web_view(
     Raises:
         IgsrError: a scene is not there, or the server cannot listen.
     """
-    from igsr.viewing.found_models import check_shown, found_models
-    from igsr.viewing.server import is_own, open_server
-    from igsr.viewing.shown import Shown
+    from igsr.rendering.live_models import check_viewable, live_models
+    from igsr.rendering.live_server import is_loopback, open_server
+    from igsr.rendering.live_view import LiveView
 
     options = [word for word in scenes if word.startswith("-")]
     if options:
         raise IgsrError(f"{options[0]} is an option of splat-view, not of the browser view")
     paths = [Path(scene) for scene in scenes]
     for path in paths:
-        check_shown(path)
-        if not found_models(path):
+        check_viewable(path)
+        if not live_models(path):
             print_message(f"{path} has no model yet; the page shows it as soon as there is one.")
     with tempfile.TemporaryDirectory(prefix="igsr-view-") as folder:
         cameras = readable_cameras(Path(folder))
-        with open_server(Shown(paths, cameras), host, port) as server:
-            _announce(server.url, server.server_port, is_open=not is_own(host))
+        with open_server(LiveView(paths, cameras), host, port) as server:
+            _announce(server.url, server.server_port, is_open=not is_loopback(host))
             # Ctrl-C is how it is meant to end.
             with contextlib.suppress(KeyboardInterrupt):
                 server.serve_forever()

@@ -1,12 +1,11 @@
-"""Compaction: prune the splats that contribute least, fine-tune the rest, validate the loss."""
+"""Compaction: prune the splats that contribute least, and fine-tune the remaining ones."""
 
 from igsr.compaction.contribution import Contribution, contribution
 from igsr.compaction.plot_curve import write_plot
-from igsr.compaction.search import DEFAULT_STEPS, Compaction, CompactProgress, compact
+from igsr.compaction.search import DEFAULT_STEPS, Compaction, compact
 
 __all__ = [
     "DEFAULT_STEPS",
-    "CompactProgress",
     "Compaction",
     "Contribution",
     "compact",

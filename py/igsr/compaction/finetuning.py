@@ -1,4 +1,4 @@
-"""Fine-tuning of pruned models: the remaining splats make up for the removed ones."""
+"""Fine-tuning of pruned models."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from igsr.errors import IgsrError
 from igsr.fitting.fitter import fitter_of
 from igsr.splats import PARAMETERS, Splats
 
-#: Parameters of splats with the optimiser's moments, as ``_core.Fitter`` takes and returns them.
+#: Parameters of splats with the optimizer's moments, as ``_core.Fitter`` takes and returns them.
 State = dict[str, npt.NDArray[Any]]
 
-#: A fit from scratch adds one SH degree after so many steps. Fine-tuning begins where all degrees
-#: are in use, or it would first unlearn the higher ones.
+#: Steps after which a fit adds an SH degree. Fine-tuning starts at a step that has all degrees.
 STEPS_PER_DEGREE = 1000
-#: Steps between two looks at Ctrl-C and calls of the progress callback.
+#: Steps between progress callbacks and checks for Ctrl-C.
 CHUNK_STEPS = 10
 MOMENTS = ("first_", "second_")
 
 
 def fresh_state(splats: Splats) -> State:
-    """The optimiser state of ``splats`` before the first step: all moments zero."""
+    """Make an optimizer state with zero moments."""
     state: State = {name: np.ascontiguousarray(getattr(splats, name)) for name in PARAMETERS}
     for moment in MOMENTS:
         state |= {moment + name: np.zeros_like(state[name]) for name in PARAMETERS}
@@ -35,12 +34,12 @@ def fresh_state(splats: Splats) -> State:
 
 
 def subset(state: State, indices: npt.NDArray[np.intp]) -> State:
-    """The splats at ``indices`` [M] and their moments."""
+    """Select the splats at ``indices`` [M] and their moments."""
     return {name: array[indices] for name, array in state.items() if name != "step"}
 
 
 def with_sh_degree(state: State, degree: int) -> State:
-    """The state with SH bands up to ``degree``: higher ones cut, missing ones zero."""
+    """Remove SH bands above ``degree``, or add zero bands up to it."""
     bands = (degree + 1) ** 2
     changed = {f"{prefix}sh" for prefix in ("", *MOMENTS)}
 
@@ -52,7 +51,7 @@ def with_sh_degree(state: State, degree: int) -> State:
 
 
 def splats_of(state: State, origin: npt.NDArray[np.float64]) -> Splats:
-    """The splats of a state."""
+    """Return the splats of a state."""
     return Splats(**{name: state[name] for name in PARAMETERS}, origin=origin, antialiased=False)
 
 
@@ -66,24 +65,24 @@ def refined(
     backend: str,
     on_steps: Callable[[int], None],
 ) -> State:
-    """Fine-tune ``state`` to ``views``; the number of splats stays.
+    """Fine-tune ``state`` to ``views`` without changing the number of splats.
 
     Args:
-        state: where to start; finite, at least one splat.
-        origin: [3] float64, what the means are relative to, world units.
-        views: what to fit to; those with alpha over a new random colour in each step.
-        steps: optimiser steps.
-        settle: whether the learning rate of the means decays to its final value; otherwise it
-            hardly decays, since another pruning round follows.
-        seed: of the order of views and the colours.
+        state: the start; finite, at least one splat.
+        origin: float64 [3], of the means, world units.
+        views: photos; photos with alpha are over a new random color in each step.
+        steps: optimizer steps.
+        settle: whether the learning rate of the means decays to its final value; False hardly
+            decays it, since another pruning round follows.
+        seed: of the order of views and the colors.
         backend: "auto", "cpu" or "gpu".
-        on_steps: called with the steps done.
+        on_steps: called with the number of steps done.
 
     Raises:
-        IgsrError: the views or splats cannot be used; the message names what.
+        IgsrError: the views or splats cannot be used; the message names the reason.
     """
     degree = round(state["sh"].shape[1] ** 0.5) - 1
-    # The learning rates are those of a fit from its last third on: they suit a nearly right model.
+    # The learning rates of the last third of a fit suit a nearly correct model.
     first = max(STEPS_PER_DEGREE * degree, -(-steps // 2))
     settings = {
         "steps": first + steps if settle else 3 * (first + steps),

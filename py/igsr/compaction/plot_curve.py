@@ -7,15 +7,17 @@ from typing import Any
 
 from igsr._internal.atomic_write import atomic_write
 
-#: Colours that stay apart in print and for the colour-blind (Okabe and Ito).
-WITHIN, BEYOND, CHOSEN = "#0072b2", "#d55e00", "#009e73"
+# Distinct in print and for color-blind readers (Okabe and Ito).
+WITHIN_COLOR = "#0072b2"
+BEYOND_COLOR = "#d55e00"
+RESULT_COLOR = "#009e73"
 
 
 def write_plot(path: Path, report: dict[str, Any]) -> None:
-    """Write a PNG of the curve of ``Compaction.report``: loss against splats and against bytes.
+    """Plot the loss against the number of splats and against bytes, as PNG.
 
     Args:
-        path: of the PNG.
+        path: the file to write.
         report: ``Compaction.report``.
 
     Raises:
@@ -47,7 +49,7 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
             zorder=1,
         )
         for row in report["curve"]:
-            color = WITHIN if row["loss"] <= report["max_loss"] else BEYOND
+            color = WITHIN_COLOR if row["loss"] <= report["max_loss"] else BEYOND_COLOR
             face = color if row["settled"] else "none"
             axis.plot(row[key] * unit, row["loss"], "o", color=color, markerfacecolor=face)
             if row["sh_degree"] != result["sh_degree"]:
@@ -64,14 +66,16 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
             "o",
             markersize=13,
             markerfacecolor="none",
-            markeredgecolor=CHOSEN,
+            markeredgecolor=RESULT_COLOR,
             markeredgewidth=2,
             label="result",
         )
-        axis.plot([], [], "o", color=WITHIN, label="fine-tuned to the end")
-        axis.plot([], [], "o", color=WITHIN, markerfacecolor="none", label="after a pruning round")
+        axis.plot([], [], "o", color=WITHIN_COLOR, label="fine-tuned to the end")
+        axis.plot(
+            [], [], "o", color=WITHIN_COLOR, markerfacecolor="none", label="after a pruning round"
+        )
         axis.axhline(
-            report["max_loss"], color=BEYOND, linestyle="--", linewidth=1, label="--max-loss"
+            report["max_loss"], color=BEYOND_COLOR, linestyle="--", linewidth=1, label="--max-loss"
         )
         axis.set_xscale("log")
         axis.set_xlabel(label)

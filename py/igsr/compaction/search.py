@@ -6,8 +6,8 @@ import math
 import numbers
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.choices import Backend, FitBackend
-from igsr._internal.progress_bar import BarState, progress_or_bar
+from igsr._internal.event import Event, Listener
 from igsr.capture import Capture
 from igsr.compaction.contribution import contribution
 from igsr.compaction.finetuning import (
@@ -34,53 +34,29 @@ from igsr.compaction.validation import (
     self_validation,
 )
 from igsr.errors import IgsrError
-from igsr.fitting.fit_capture import check_fits
+from igsr.fitting.fitter import check_fits
+from igsr.run import open_run
 from igsr.splats import MAX_SH_DEGREE, Splats
 
-#: Fraction of the splats that a pruning round keeps. Many small rounds lose less than one large.
-KEEP = 0.8
-#: A pruning round is followed by ``steps`` divided by this.
-DESCENT_PART = 4
-#: Fine-tuning to the end recovers at most this much of the loss, dB; the search stops beyond it.
-RECOVERABLE = 0.5
+#: Fraction of the splats that a pruning round keeps; many small rounds lose less than a large one.
+KEPT_FRACTION = 0.8
+#: Fine-tuning steps after a pruning round are ``steps`` divided by this.
+ROUND_STEPS_DIVISOR = 4
+#: Loss that further fine-tuning can recover, dB.
+RECOVERABLE_DB = 0.5
 DEFAULT_STEPS = 4000
 
 
 @dataclass(frozen=True)
-class CompactProgress:
-    """Progress of a compaction.
-
-    Attributes:
-        trial: number of the current candidate model, from 1.
-        splats: its number of splats.
-        sh_degree: its SH degree.
-        step: fine-tuning steps done, of ``steps``.
-        steps: fine-tuning steps of this candidate.
-    """
-
-    trial: int
-    splats: int
-    sh_degree: int
-    step: int
-    steps: int
-
-
-def _bar_state(now: CompactProgress) -> BarState:
-    return BarState(
-        now.step, now.steps, f"size {now.trial}: {now.splats} splats, SH {now.sh_degree}"
-    )
-
-
-@dataclass(frozen=True)
 class Compaction:
-    """The smallest model found, and the curve of all sizes tried.
+    """Result of a compaction.
 
     Attributes:
-        splats: the model.
-        report: "max_loss", "whole" and "result" (rows of "curve"), "curve" (a row per size tried,
+        splats: the smallest model within the loss.
+        report: "max_loss", "whole" and "result" (rows of "curve"), "curve" (a row per candidate,
             the original model first: "splats", "sh_degree", "bytes", "loss", "psnr", "ssim",
-            "settled": whether it was fine-tuned to the end, "seconds"), "protocol", "steps",
-            "seed", "backend", "device", "instruction_set", "version". Losses and PSNR in dB.
+            "settled": whether fine-tuning was complete, "seconds"), "protocol", "steps", "seed",
+            "backend", "device", "instruction_set", "version". Losses and PSNR in dB.
     """
 
     splats: Splats
@@ -98,36 +74,35 @@ def compact(
     seed: int = 0,
     background: Sequence[float] | None = None,
     backend: FitBackend = "auto",
-    progress: Callable[[CompactProgress], bool | None] | None = None,
+    progress: Listener | None = None,
 ) -> Compaction:
     """Find the smallest model that loses at most ``max_loss`` dB against ``splats``.
 
     Each round prunes the fifth of the splats that contribute least
-    (``igsr.compaction.contribution``) and fine-tunes the others, until the loss is more than
-    fine-tuning can recover. From there upwards, models are fine-tuned to the end until one is
-    within the loss. At that size, lower SH degrees are tried.
+    (``igsr.compaction.contribution``) and fine-tunes the remaining ones, until the loss is more
+    than fine-tuning can recover. Then models are fine-tuned completely, the smallest first, until
+    one is within the loss. At that size, lower SH degrees are tried.
 
-    Deterministic for a given seed on one backend and instruction set.
+    The result is deterministic for a given seed, backend and instruction set.
 
     Args:
-        splats: the original model; splats that are not finite are never drawn and do not count.
-        max_loss: dB of PSNR that may be lost, in (0, 100). With a capture the loss is the
-            original model's PSNR minus the smaller one's on held-out photos: the test views, or
-            every eighth train view where there are none. Without a capture it is
+        splats: the original model; splats that are not finite do not count.
+        max_loss: maximum loss of PSNR, dB, in (0, 100). With a capture it is the original model's
+            PSNR minus the smaller model's on held-out photos: the test views, or every eighth
+            train view if there are none. Without a capture it is
             10 log10(1 + MSE of the change / MSE of the model), on renders of the original model
             from cameras around it.
         capture: the photos that the model was fitted to.
-        psnr: without a capture, the PSNR assumed of the original model, dB; 30 if None.
-        sh_degree: of the smaller model, 0-4: a higher one needs fewer splats but more bytes for
-            each. None is the original model's; lower ones are tried at the size found.
-        steps: fine-tuning steps of a model that may be the result; a quarter of them after each
-            pruning round.
+        psnr: assumed PSNR of the original model without a capture, dB; None is 30.
+        sh_degree: of the smaller model, 0-4; a higher degree needs fewer splats with more bytes
+            each. None starts at the original model's and tries lower ones at the size found.
+        steps: fine-tuning steps of a final candidate; a quarter of them after each pruning round.
         seed: of everything random.
-        background: RGB in [0, 1] behind validation renders; None is white where photos have
-            alpha, black where they have none, grey without a capture.
+        background: RGB in [0, 1] behind validation renders; None is gray without a capture, white
+            if photos have alpha, else black.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
-        progress: called every few fine-tuning steps; returning False ends it with an ``IgsrError``.
-            In an interactive session, None shows a progress bar.
+        progress: called with each ``igsr.Event``; an exception ends the search. In an interactive
+            session, None shows a progress bar.
 
     Raises:
         IgsrError: an argument cannot be used; the message names it.
@@ -138,7 +113,7 @@ def compact(
     if splats.antialiased:
         raise IgsrError("Antialiased splats cannot be compacted: fits render without antialiasing.")
     name = _core.resolve_backend(backend)
-    # Photos show nearly nothing of a backdrop: by what they show it would go.
+    # A backdrop would be pruned, since photos show little of it.
     bare = splats.without_backdrop()
     finite = subset(fresh_state(bare), np.flatnonzero(bare.finite))
     whole = splats_of(finite, splats.origin)
@@ -148,8 +123,10 @@ def compact(
         validation = self_validation(whole, background, psnr, name)
     else:
         validation = photo_validation(whole, capture, background, name)
-    with progress_or_bar(progress, "compact", _bar_state) as report:
-        search = _Search(validation, whole.origin, max_loss, sh_degree, steps, seed, name, report)
+    with open_run(None, progress) as run:
+        search = _Search(
+            validation, whole.origin, max_loss, sh_degree, steps, seed, name, run.report
+        )
         best = search.run(whole)
     return Compaction(
         splats_of(best.state, whole.origin).with_backdrop_of(splats),
@@ -169,7 +146,7 @@ def compact(
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A model with its optimiser state, and its row of the curve."""
+    """A model with its optimizer state, and its row of the curve."""
 
     state: State
     row: dict[str, Any]
@@ -179,32 +156,21 @@ class _Candidate:
         return len(self.state["means"])
 
 
+@dataclass
 class _Search:
-    """The curve so far and what is the same for all trials."""
+    """The settings of a search, and its curve so far."""
 
-    def __init__(
-        self,
-        validation: Validation,
-        origin: npt.NDArray[np.float64],
-        max_loss: float,
-        sh_degree: int | None,
-        steps: int,
-        seed: int,
-        backend: Backend,
-        progress: Callable[[CompactProgress], bool | None] | None,
-    ) -> None:
-        self.validation = validation
-        self.origin = origin
-        self.max_loss = max_loss
-        self.sh_degree = sh_degree
-        self.steps = steps
-        self.seed = seed
-        self.backend = backend
-        self.progress = progress
-        self.curve: list[dict[str, Any]] = []
+    validation: Validation
+    origin: npt.NDArray[np.float64]
+    max_loss: float
+    sh_degree: int | None
+    steps: int
+    seed: int
+    backend: Backend
+    report: Listener
+    curve: list[dict[str, Any]] = field(default_factory=list)
 
     def run(self, whole: Splats) -> _Candidate:
-        """The smallest model within the loss."""
         started, state = time.perf_counter(), fresh_state(whole)
         rounds = self._prune_rounds(self._record(state, self._score(state), True, started))
         best, too_small = self._smallest_within_loss(rounds)
@@ -213,11 +179,11 @@ class _Search:
         return best if self.sh_degree is not None else self._lower_sh_degree(best)
 
     def _prune_rounds(self, whole: _Candidate) -> list[_Candidate]:
-        """Smaller and smaller models, down to the first beyond recovery."""
+        """Prune until the loss cannot be recovered."""
         rounds = [whole]
-        steps = max(1, self.steps // DESCENT_PART)
+        steps = max(1, self.steps // ROUND_STEPS_DIVISOR)
         while rounds[-1].count > 1 and self._within_reach(rounds[-1].row["loss"]):
-            count = max(1, int(KEEP * rounds[-1].count))
+            count = max(1, int(KEPT_FRACTION * rounds[-1].count))
             start = rounds[-1]
             if self.sh_degree is not None:
                 start = replace(start, state=with_sh_degree(start.state, self.sh_degree))
@@ -225,7 +191,7 @@ class _Search:
         return rounds
 
     def _smallest_within_loss(self, rounds: list[_Candidate]) -> tuple[_Candidate, int | None]:
-        """From below, the first model within the loss, and the size of the one before."""
+        """Find the smallest model within the loss, and the next smaller size."""
         too_small = None
         for candidate in reversed(rounds):
             if self._within_loss(candidate):
@@ -240,7 +206,7 @@ class _Search:
         return rounds[0], too_small
 
     def _between(self, rounds: list[_Candidate], best: _Candidate, too_small: int) -> _Candidate:
-        """A last candidate half way (geometric mean) to the size that is too small."""
+        """Try the geometric mean of the best size and the next smaller one."""
         count = round(math.sqrt(best.count * too_small))
         if not too_small < count < best.count:
             return best
@@ -249,7 +215,7 @@ class _Search:
         return candidate if self._within_loss(candidate) else best
 
     def _lower_sh_degree(self, best: _Candidate) -> _Candidate:
-        """The same number of splats with the lowest SH degree that the loss allows."""
+        """Lower the SH degree as far as the loss allows."""
         while (degree := best.row["sh_degree"] - 1) >= 0:
             state = with_sh_degree(best.state, degree)
             if not self._within_reach(self._score(state).loss):
@@ -266,21 +232,20 @@ class _Search:
         return bool(candidate.row["loss"] <= self.max_loss)
 
     def _within_reach(self, loss: float) -> bool:
-        return loss <= self.max_loss + RECOVERABLE
+        return loss <= self.max_loss + RECOVERABLE_DB
 
     def _refined_candidate(
         self, start: _Candidate, count: int, steps: int, settle: bool
     ) -> _Candidate:
-        """``start`` with its ``count`` most important splats, fine-tuned."""
+        """Fine-tune the ``count`` most important splats of ``start``."""
         started = time.perf_counter()
         number = len(self.curve)
         degree = round(start.state["sh"].shape[1] ** 0.5) - 1
 
         def on_steps(step: int) -> None:
-            if self.progress is None:
-                return
-            if self.progress(CompactProgress(number, count, degree, step, steps)) is False:
-                raise IgsrError("The compaction was stopped.")
+            message = f"size {number}: {count} splats, SH {degree}"
+            values = {"splats": count, "sh_degree": degree, "trial": number}
+            self.report(Event("compact", step, steps, message, values=values))
 
         on_steps(0)
         state = start.state
@@ -288,10 +253,10 @@ class _Search:
             cameras = [view.camera for view in self.validation.train_views]
             splats = splats_of(state, self.origin)
             importance = contribution(splats, cameras, self.seed, self.backend).importance
-            # Stable: equal importance must not depend on the sorting of one machine.
+            # Stable, so that ties give the same result on all machines.
             most = np.argsort(-importance, kind="stable")[:count]
             state = subset(state, np.sort(most))
-        # A seed of its own, or every candidate would see the photos in the same order.
+        # Each candidate has another seed, so that they see the photos in different orders.
         seed = int(np.random.default_rng([self.seed, number]).integers(2**63))
         after = refined(
             state,
@@ -303,7 +268,7 @@ class _Search:
             self.backend,
             on_steps,
         )
-        # A few steps of fitting can make a model worse that is already very near: keep the better.
+        # A few steps can make a model worse that is already very good.
         score, state = min(
             ((self._score(either), either) for either in (after, state)),
             key=lambda scored: scored[0].loss,
@@ -317,10 +282,14 @@ class _Search:
         self, state: State, score: ValidationScore, settled: bool, started: float
     ) -> _Candidate:
         model = splats_of(state, self.origin)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "scene.ply"
+            model.save(path)
+            size = path.stat().st_size
         row = {
             "splats": len(model),
             "sh_degree": model.sh_degree,
-            "bytes": _bytes(model),
+            "bytes": size,
             "loss": score.loss,
             "psnr": score.psnr,
             "ssim": score.ssim,
@@ -329,14 +298,6 @@ class _Search:
         }
         self.curve.append(row)
         return _Candidate(state, row)
-
-
-def _bytes(splats: Splats) -> int:
-    """Size of the file that ``splats`` are saved as."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scene.ply"
-        splats.save(path)
-        return path.stat().st_size
 
 
 def _check_arguments(
@@ -354,7 +315,7 @@ def _check_arguments(
         if not real or not 0.0 < float(value) < 100.0:  # type: ignore[arg-type]
             raise IgsrError(f"{name} must be a number of dB above 0 and below 100, not {value!r}.")
     if psnr is not None and capture is not None:
-        raise IgsrError("psnr is measured on the capture's photos; leave psnr or capture out.")
+        raise IgsrError("psnr is measured on the capture's photos; give psnr or capture, not both.")
     limits = [("steps", steps, 1, 10_000_000), ("seed", seed, 0, 2**63 - 1)]
     if sh_degree is not None:
         limits.append(("sh_degree", sh_degree, 0, MAX_SH_DEGREE))

@@ -1,10 +1,10 @@
-"""The views that smaller models are fine-tuned to and validated on: photos, or own renders."""
+"""Training and validation views of a compaction: photos, or renders of the original model."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,22 +12,22 @@ import numpy as np
 from igsr._internal.choices import Backend
 from igsr.capture import Camera, Capture, View
 from igsr.errors import IgsrError
-from igsr.evaluation import metrics
-from igsr.evaluation.scores import default_background, over_background
+from igsr.evaluation.quick_scores import quick_views
+from igsr.evaluation.scores import default_background
 from igsr.geometry.camera_paths import cameras_around
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
-#: Without test views, every eighth train view is held out, as in the protocol of LLFF and 3DGS.
-HOLDOUT = 8
-#: Without a capture: cameras around the model, the side of their renders in pixels, and every
-#: Nth of them is held out.
-AROUND = 50
-AROUND_SIDE = 400
+#: Without test views, every eighth train view is held out, as in LLFF and 3DGS.
+PHOTO_HOLDOUT = 8
+#: Number of cameras around the model without a capture.
+AROUND_CAMERAS = 50
+AROUND_SIDE_PX = 400
+#: Every fifth camera around the model is held out.
 AROUND_HOLDOUT = 5
-#: PSNR assumed of a model without a report, dB: a usual fit on held-out views.
-DEFAULT_PSNR = 30.0
-GREY = (0.5, 0.5, 0.5)
+#: Assumed PSNR of a model, dB: typical for held-out views.
+DEFAULT_PSNR_DB = 30.0
+GRAY = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class ValidationScore:
     """Scores of a smaller model on the validation views.
 
     Attributes:
-        loss: dB of PSNR lost against the original model; negative where it is better.
-        psnr: dB against the photos, or against the original model's renders; mean over the views.
-        ssim: likewise.
+        loss: loss of PSNR against the original model, dB; negative if the smaller one is better.
+        psnr: mean over the views, against photos or the original model's renders, dB.
+        ssim: mean over the views.
     """
 
     loss: float
@@ -47,16 +47,15 @@ class ValidationScore:
 
 @dataclass(frozen=True)
 class Validation:
-    """Views to fine-tune to and views to validate on; no view is in both.
+    """Disjoint views to fine-tune to and to validate on.
 
     Attributes:
-        train_views: what smaller models are fine-tuned to.
-        validation_views: what they are scored on.
-        background: RGB in [0, 1] behind the validation renders.
-        model_psnr: dB of the original model: measured against the photos, or assumed without a
-            capture.
-        against_photos: whether the views are photos, not renders of the original model.
-        protocol: all this in words and numbers, for the report.
+        train_views: to fine-tune smaller models to.
+        validation_views: to score them on.
+        background: RGB in [0, 1] behind validation renders.
+        model_psnr: PSNR of the original model, measured against the photos or assumed, dB.
+        against_photos: whether the views are photos; else renders of the original model.
+        protocol: the protocol, for the report.
     """
 
     train_views: list[View]
@@ -67,30 +66,22 @@ class Validation:
     protocol: dict[str, Any] = field(repr=False)
 
     def score(self, splats: Splats, backend: Backend) -> ValidationScore:
-        """Score ``splats`` on the validation views: 8-bit pictures, masked pixels do not count."""
-        pairs = [
-            (render(splats, view.camera, self.background, backend).to_uint8(), view)
-            for view in self.validation_views
-        ]
-        scored = [
-            (picture, over_background(view.image, self.background), view.mask)
-            for picture, view in pairs
-        ]
-        psnrs = [metrics.psnr(*images) for images in scored]
+        """Score ``splats`` on the validation views."""
+        views = quick_views(splats, self.validation_views, self.background, backend)
+        scores = [view.scores for view in views]
+        psnrs = [float(score["psnr"] or 0.0) for score in scores]
         psnr = float(np.mean(psnrs))
         if self.against_photos:
             loss = self.model_psnr - psnr
         else:
             loss = float(np.mean([loss_of_change(psnr, self.model_psnr) for psnr in psnrs]))
-        return ValidationScore(
-            loss, psnr, float(np.mean([metrics.ssim(*images) for images in scored]))
-        )
+        return ValidationScore(loss, psnr, float(np.mean([score["ssim"] for score in scores])))
 
 
 def loss_of_change(psnr: float, model_psnr: float) -> float:
-    """PSNR in dB that a model of ``model_psnr`` loses if its renders change by ``psnr``.
+    """Estimate the loss of PSNR, dB, of a model if its renders change by ``psnr``.
 
-    The change is assumed to be independent of the model's own error, so that their squares add up:
+    Assumes that the change is independent of the model's error, so that their squares add up:
     10 log10(1 + MSE of the change / MSE of the model).
     """
     return 10.0 * math.log10(1.0 + 10.0 ** ((model_psnr - psnr) / 10.0))
@@ -99,13 +90,13 @@ def loss_of_change(psnr: float, model_psnr: float) -> float:
 def photo_validation(
     splats: Splats, capture: Capture, background: Sequence[float] | None, backend: Backend
 ) -> Validation:
-    """Validation on photos: the test views, or held-out train views where there are none.
+    """Validate on photos: the test views, or held-out train views if there are none.
 
     Raises:
-        IgsrError: there are not at least one view to train on and one to validate on.
+        IgsrError: it has no view to train on, or none to validate on.
     """
     if not capture.test_views and len(capture.views) >= 2:
-        capture = capture.with_holdout(min(HOLDOUT, len(capture.views)))
+        capture = capture.with_holdout(min(PHOTO_HOLDOUT, len(capture.views)))
     if not capture.test_views or not capture.train_views:
         raise IgsrError(
             f"{capture.path} needs at least one train view and one held-out view; "
@@ -114,65 +105,45 @@ def photo_validation(
     color = _triple(default_background(capture) if background is None else background)
     unscored = Validation(capture.train_views, capture.test_views, color, 0.0, True, {})
     psnr = unscored.score(splats, backend).psnr
-    return Validation(
-        unscored.train_views,
-        unscored.validation_views,
-        color,
-        psnr,
-        True,
-        {
-            "against": "photos",
-            "capture": str(capture.path),
-            "loss": "PSNR of the original model minus PSNR of the smaller one, against photos, "
-            "means over the validation views",
-            "model_psnr": psnr,
-            **_protocol(unscored),
-        },
-    )
+    protocol = {
+        "against": "photos",
+        "capture": str(capture.path),
+        "loss": "PSNR of the original model minus PSNR of the smaller one, against photos, "
+        "means over the validation views",
+        "model_psnr": psnr,
+        **_protocol(unscored),
+    }
+    return replace(unscored, model_psnr=psnr, protocol=protocol)
 
 
 def self_validation(
     splats: Splats, background: Sequence[float] | None, psnr: float | None, backend: Backend
 ) -> Validation:
-    """Validation on renders of the original model, from cameras all around it.
+    """Validate on renders of the original model, from cameras around it.
 
     Raises:
-        IgsrError: there are no finite splats to look at.
+        IgsrError: no splat is finite.
     """
-    color = _triple(GREY if background is None else background)
-    cameras = cameras_around(splats, AROUND, AROUND_SIDE)
-    train_views = [
-        View(f"around/{i}", camera, "train", _picture_with_alpha(splats, camera, backend))
-        for i, camera in enumerate(cameras)
-        if i % AROUND_HOLDOUT
-    ]
-    validation_views = [
-        View(
-            f"around/{i}",
-            camera,
-            "test",
-            render(splats, camera, color, backend).to_uint8(),
-        )
-        for i, camera in enumerate(cameras)
-        if i % AROUND_HOLDOUT == 0
-    ]
-    model_psnr = DEFAULT_PSNR if psnr is None else psnr
+    color = _triple(GRAY if background is None else background)
+    train_views, validation_views = [], []
+    for i, camera in enumerate(cameras_around(splats, AROUND_CAMERAS, AROUND_SIDE_PX)):
+        if i % AROUND_HOLDOUT:
+            picture = _picture_with_alpha(splats, camera, backend)
+            train_views.append(View(f"around/{i}", camera, "train", picture))
+        else:
+            picture = render(splats, camera, color, backend).to_uint8()
+            validation_views.append(View(f"around/{i}", camera, "test", picture))
+    model_psnr = DEFAULT_PSNR_DB if psnr is None else psnr
     validation = Validation(train_views, validation_views, color, model_psnr, False, {})
-    return Validation(
-        train_views,
-        validation_views,
-        color,
-        model_psnr,
-        False,
-        {
-            "against": "renders of the original model, from cameras around it",
-            "loss": "10 log10(1 + MSE against the original model / MSE of the original model), "
-            "mean over the validation views",
-            "model_psnr": model_psnr,
-            "model_psnr_from": "default" if psnr is None else "given",
-            **_protocol(validation),
-        },
-    )
+    protocol = {
+        "against": "renders of the original model, from cameras around it",
+        "loss": "10 log10(1 + MSE against the original model / MSE of the original model), "
+        "mean over the validation views",
+        "model_psnr": model_psnr,
+        "model_psnr_from": "default" if psnr is None else "given",
+        **_protocol(validation),
+    }
+    return replace(validation, protocol=protocol)
 
 
 def _protocol(validation: Validation) -> dict[str, Any]:
@@ -190,7 +161,7 @@ def _triple(color: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _picture_with_alpha(splats: Splats, camera: Camera, backend: Backend) -> Any:
-    """uint8 [H, W, 4], straight alpha, so that fine-tuning sees where the model is transparent."""
+    """A render, uint8 [H, W, 4], straight alpha, so that fine-tuning keeps transparency."""
     picture = render(splats, camera, (0.0, 0.0, 0.0), backend)
     coverage = np.clip(picture.alpha, 1e-6, 1.0)[..., None]
     straight = np.clip(np.nan_to_num(picture.color) / coverage, 0.0, 1.0)

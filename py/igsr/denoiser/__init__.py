@@ -1,10 +1,10 @@
-"""The denoiser: takes floaters, blur and holes out of renders of scenes with few photos.
+"""The denoiser: removes floaters, blur and holes from renders of scenes with few photos.
 
-``denoise`` cleans a render and gives a confidence for each pixel. It looks at what the rasterizer
-knows of the render (``render_buffers``) and at the photos, warped to its camera
-(``photo_sources``). Here is inference only; ``igsr_lab.denoiser`` makes the weights.
+``denoise`` cleans a render, and returns a confidence for each pixel. It uses the rasterizer's
+buffers (``render_buffers``) and the photos, warped to the render's camera (``photo_sources``).
+``igsr_lab.denoiser`` trains the weights.
 
-Names are imported when they are first used (PEP 562), so that command lines load no torch.
+Names are imported on first use (PEP 562), so that command lines do not load torch.
 """
 
 from __future__ import annotations

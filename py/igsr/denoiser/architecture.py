@@ -1,4 +1,4 @@
-"""Which network a denoiser has. Free of torch, so that the command line can show its defaults."""
+"""Settings of a denoiser's network. Free of torch, so that a command line can show its defaults."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from igsr.errors import IgsrError
 
 #: Pictures are padded to multiples of this: one step of pixel shuffle and two of the U-Net.
 MULTIPLE = 8
-#: No wider or deeper network is built.
-MOST_WIDTH, MOST_BLOCKS = 256, 32
-#: Ways to look at the photos.
-PHOTO_WAYS = ("concatenated", "attention", "none")
+MAX_WIDTH = 256
+MAX_BLOCKS = 32
+#: Ways to combine the photos.
+PHOTO_MODES = ("concatenated", "attention", "none")
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """What distinguishes one network from another; stored beside its weights.
+    """Settings of a network, stored in its file of weights.
 
     Attributes:
-        width: channels at half resolution; twice and four times as many below.
-        blocks: blocks at a half (each way), a quarter (each way) and an eighth of the resolution.
-        residual: add the output to a mean of the render and the warped photos, with weights that
-            are predicted for each pixel. False takes the output as the picture.
-        buffers: look at the rasterizer's buffers.
-        photos: "concatenated", "attention" (per pixel over the photos, in place of a fixed order)
-            or "none", which leaves the background alone to choose beside the render.
+        width: channels at half resolution; doubled at each lower resolution.
+        blocks: number of blocks at 1/2 (each way), 1/4 (each way) and 1/8 of the resolution.
+        residual: whether to add the output to a mean of the render and the warped photos, weighted
+            per pixel by predicted weights. False takes the output as the picture.
+        buffers: whether to use the rasterizer's buffers.
+        photos: "concatenated", "attention" (over the photos of each pixel, without a fixed order)
+            or "none", which uses only the render and the background.
 
     Raises:
         IgsrError: a setting cannot be used; the message names it.
@@ -38,14 +38,13 @@ class Architecture:
     photos: str = "concatenated"
 
     def __post_init__(self) -> None:
-        """Check what could be mistyped."""
-        if self.photos not in PHOTO_WAYS:
-            raise IgsrError(f"photos must be one of {', '.join(PHOTO_WAYS)}, not {self.photos!r}.")
-        if type(self.width) is not int or self.width % 2 or not 2 <= self.width <= MOST_WIDTH:
-            raise IgsrError(f"width must be even, from 2 to {MOST_WIDTH}, not {self.width!r}.")
-        counts = [type(count) is int and 0 <= count <= MOST_BLOCKS for count in self.blocks]
+        if self.photos not in PHOTO_MODES:
+            raise IgsrError(f"photos must be one of {', '.join(PHOTO_MODES)}, not {self.photos!r}.")
+        if type(self.width) is not int or self.width % 2 or not 2 <= self.width <= MAX_WIDTH:
+            raise IgsrError(f"width must be even, from 2 to {MAX_WIDTH}, not {self.width!r}.")
+        counts = [type(count) is int and 0 <= count <= MAX_BLOCKS for count in self.blocks]
         if len(counts) != 3 or not all(counts):
-            raise IgsrError(f"blocks must be three from 0 to {MOST_BLOCKS}, not {self.blocks!r}.")
+            raise IgsrError(f"blocks must be three from 0 to {MAX_BLOCKS}, not {self.blocks!r}.")
         for name in ("residual", "buffers"):
             if type(getattr(self, name)) is not bool:
                 raise IgsrError(f"{name} must be True or False, not {getattr(self, name)!r}.")

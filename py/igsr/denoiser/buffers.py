@@ -1,4 +1,4 @@
-"""What the rasterizer knows of a render beside its colours: depth, normals, support by photos."""
+"""Buffers of a render for the denoiser: color, depth, normals, and support by photos."""
 
 from __future__ import annotations
 
@@ -14,37 +14,38 @@ from igsr.capture import Camera, View
 from igsr.errors import IgsrError
 from igsr.rendering.normals import facing_normals
 from igsr.rendering.renders import project, viewmat_about
+from igsr.rendering.splat_weights import splat_weights
 from igsr.splats import Splats
 
 Float32 = npt.NDArray[np.float32]
 
-#: A splat counts as seen by a photo if it adds as much to it as this many fully covered pixels.
-SEEN_WEIGHT = 0.05
-#: Below this alpha, means over what a pixel shows are of nothing.
-EMPTY = 1e-3
+BLACK = (0.0, 0.0, 0.0)
+#: A photo sees a splat whose visible area is more than this, pixels.
+MIN_SEEN_AREA_PX = 0.05
+#: Pixels of a lower alpha are empty.
+MIN_ALPHA = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Buffers:
-    """One rendered view. All float32, pixel centres at +0.5; zero where nothing is drawn.
+    """One rendered view. All arrays float32, pixel centers at +0.5; zero in empty pixels.
 
-    Only the colour must be there: what another renderer does not know is None.
+    Only ``color`` is required; None marks buffers that another renderer does not have.
 
     Attributes:
         color: [H, W, 3] over the background, not clamped.
         alpha: [H, W], accumulated opacity in [0, 1].
         depth: [H, W], mean z along the camera's axis, world units.
-        depth_deviation: [H, W], standard deviation of z among what the pixel blends, in units of
-            its depth: high where it shows no surface.
+        depth_deviation: [H, W], standard deviation of z among the splats of a pixel, in units of
+            its depth: high in pixels without a surface.
         normal: [H, W, 3], mean unit normal in the camera frame (OpenCV axes), facing the camera.
         footprint: [H, W], log2 of the splats' mean standard deviation in pixels.
-        support: [H, W], mean number of photos that see the splats shown.
-        camera: the view's.
-        background: [3], the colour that stands behind the scene, in [0, 1]; None where there is
-            none, as behind photos without alpha.
+        support: [H, W], mean number of photos that see the splats.
+        camera: of the view.
+        background: [3], RGB in [0, 1]; None for photos without alpha, which show their own.
 
     Raises:
-        IgsrError: an array has another shape than the colour's picture, or is not of floats.
+        IgsrError: an array does not have the picture's shape, or is not of floats.
     """
 
     color: Float32
@@ -58,7 +59,6 @@ class Buffers:
     background: Float32 | None = None
 
     def __post_init__(self) -> None:
-        """Check that all are of one picture."""
         if self.color.ndim != 3 or self.color.shape[2] != 3 or 0 in self.color.shape:
             raise IgsrError(f"color must be [H, W, 3], not {list(self.color.shape)}")
         if not np.issubdtype(self.color.dtype, np.floating):
@@ -85,14 +85,14 @@ def render_buffers(
     background: Sequence[float] | None = None,
     backend: str = "auto",
 ) -> Buffers:
-    """Render a view with everything the denoiser looks at.
+    """Render a view with all buffers that the denoiser uses.
 
     Args:
         splats: the scene.
         camera: pinhole camera, OpenCV axes, world frame of the capture.
-        support: [N], of ``photo_support``.
-        background: RGB in [0, 1] that stands behind the scene, where photos have alpha; None draws
-            over black, which stands for nothing.
+        support: [N], from ``photo_support``.
+        background: RGB in [0, 1] if photos have alpha; None if they show their own background,
+            and then renders are over black.
         backend: "auto", "cpu", "gpu" or "reference".
 
     Raises:
@@ -103,7 +103,7 @@ def render_buffers(
     dtype = _core.working_dtype(backend)
     projected = project(splats, camera, backend)
 
-    def drawn(colors: Float32, behind: Sequence[float]) -> dict[str, Float32]:
+    def drawn(colors: Float32, behind: Sequence[float] = BLACK) -> dict[str, Float32]:
         image = _core.rasterize(
             projected | {"colors": colors.astype(dtype)},
             width=camera.width,
@@ -113,21 +113,23 @@ def render_buffers(
         )
         return {name: value.astype(np.float32, copy=False) for name, value in image.items()}
 
-    image = drawn(projected["colors"], (0.0, 0.0, 0.0) if background is None else background)
+    image = drawn(projected["colors"], BLACK if background is None else background)
     alpha = image["alpha"]
-    weight = np.divide(1.0, alpha, out=np.zeros_like(alpha), where=alpha > EMPTY)
+    filled = alpha > MIN_ALPHA
+    weight = np.divide(1.0, alpha, out=np.zeros_like(alpha), where=filled)
     depth = image["depth"] * weight
 
     viewmat = viewmat_about(splats.origin, camera.viewmat)
-    # What is not drawn may lie anywhere, at a depth of zero too.
+    # Splats that are not drawn may have any depth, zero included.
     seen = (np.asarray(projected["radii"]).reshape(len(splats), 2) > 0).all(axis=1)
     z = np.where(seen, projected["depths"], 1.0).astype(np.float32)
     sizes = np.exp(splats.scales.mean(axis=1)) * np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / z
-    middle = float(np.median(depth[alpha > EMPTY])) if (alpha > EMPTY).any() else 1.0
+    # The second moment of z is taken about the median depth, to avoid cancellation.
+    median = float(np.median(depth[filled])) if filled.any() else 1.0
     features = np.stack(
-        [np.log2(np.maximum(sizes, 1e-3)), np.square(z - middle) / middle**2, support], axis=1
+        [np.log2(np.maximum(sizes, 1e-3)), np.square(z - median) / median**2, support], axis=1
     )
-    features = drawn(features.astype(np.float32), (0.0, 0.0, 0.0))["color"] * weight[..., None]
+    features = drawn(features.astype(np.float32))["color"] * weight[..., None]
     normals = facing_normals(
         torch.from_numpy(splats.means),
         torch.from_numpy(splats.quats),
@@ -135,18 +137,16 @@ def render_buffers(
         torch.from_numpy(viewmat.astype(np.float32)),
         torch.from_numpy(seen),
     ).numpy() @ viewmat[:3, :3].T.astype(np.float32)
-    normal = drawn(normals, (0.0, 0.0, 0.0))["color"] * weight[..., None]
 
-    # The second moment is taken about the picture's middle depth, or it would cancel.
-    variance = features[..., 1] * middle**2 - np.square(depth - middle)
+    variance = features[..., 1] * median**2 - np.square(depth - median)
     nonzero = np.maximum(depth, np.float32(1e-12))
-    deviation = np.where(alpha > EMPTY, np.sqrt(np.maximum(variance, 0.0)) / nonzero, 0.0)
+    deviation = np.where(filled, np.sqrt(np.maximum(variance, 0.0)) / nonzero, 0.0)
     return Buffers(
         color=image["color"],
         alpha=alpha,
         depth=depth,
         depth_deviation=deviation.astype(np.float32),
-        normal=normal,
+        normal=drawn(normals)["color"] * weight[..., None],
         footprint=features[..., 0],
         support=features[..., 2],
         camera=camera,
@@ -155,39 +155,20 @@ def render_buffers(
 
 
 def photo_support(splats: Splats, photos: Sequence[View], backend: str = "auto") -> Float32:
-    """Number of photos [N] that see each splat: that it adds more to than ``SEEN_WEIGHT`` pixels.
+    """Count the photos that see each splat.
 
     Args:
         splats: the scene.
-        photos: their cameras say what they see; pixels that their masks leave out see nothing.
+        photos: masked pixels see nothing.
         backend: "auto", "cpu", "gpu" or "reference".
 
+    Returns:
+        float32 [N].
+
     Raises:
-        IgsrError, RuntimeError: as ``render_buffers``.
+        ValueError, RuntimeError: as ``render_buffers``.
     """
-    backend = _core.resolve_backend(backend)
-    dtype = _core.working_dtype(backend)
     count = np.zeros(len(splats), np.float32)
     for photo in photos:
-        camera = photo.camera
-        projected = project(splats, camera, backend)
-        black = np.zeros(3, dtype)
-        image = _core.rasterize(
-            projected, width=camera.width, height=camera.height, background=black, backend=backend
-        )
-        counted = np.ones_like(image["color"])
-        if photo.mask is not None:
-            counted *= photo.mask[..., None]
-        # The derivative of a colour by a splat's colour is the splat's weight in it.
-        gradients = _core.rasterize_backward(
-            projected,
-            image,
-            v_color=counted,
-            v_alpha=np.zeros_like(image["alpha"]),
-            v_depth=np.zeros_like(image["alpha"]),
-            background=black,
-            absolute=False,
-            backend=backend,
-        )
-        count += gradients["v_colors"][:, 0] > SEEN_WEIGHT
+        count += splat_weights(splats, photo.camera, backend, photo.mask) > MIN_SEEN_AREA_PX
     return count

@@ -32,8 +32,8 @@ def error_of(confidence: Float32) -> Float32:
 def claimed_by_change(render: Float32, picture: Float32) -> Float32:
     """Estimate the error of a denoised picture that comes without a confidence.
 
-    Where a denoiser changes much, much was wrong, and part of that remains: the estimate is the
-    mean absolute change around each pixel, plus ``MIN_CLAIMED_ERROR``.
+    Large changes mean large errors, and part of an error remains: the estimate is the mean absolute
+    change around each pixel, plus ``MIN_CLAIMED_ERROR``.
 
     Args:
         render: float [H, W, 3], before denoising.

@@ -1,4 +1,4 @@
-"""Denoisers of others, by name: ``module:factory``, or ``file.py:factory``."""
+"""Denoisers by name: ``module:factory`` or ``file.py:factory``."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from igsr.errors import IgsrError
 
 
 def named_denoiser(name: str) -> Denoiser:
-    """The denoiser that a factory makes.
+    """Import a module and call its factory of a denoiser.
 
-    The module is imported, so it runs: name only what you trust.
+    The module's code runs; name only modules that you trust.
 
     Args:
-        name: ``MODULE:FACTORY`` of a module that Python finds, or of a ``.py`` file. The factory is
-            called without arguments and returns the denoiser (``Denoiser``).
+        name: ``MODULE:FACTORY`` of an installed module or a ``.py`` file. The factory takes no
+            arguments and returns a ``Denoiser``.
 
     Raises:
-        IgsrError: there is no such module or factory, or it fails, or makes nothing callable.
+        IgsrError: the module or factory is missing or fails, or returns something else.
     """
     module_name, separator, factory_name = name.rpartition(":")
     if not separator or not module_name or not factory_name:
@@ -32,20 +32,19 @@ def named_denoiser(name: str) -> Denoiser:
     except IgsrError:
         raise
     except Exception as error:
-        raise IgsrError(f"denoiser: {module_name} cannot be imported: {_said(error)}") from error
+        raise IgsrError(f"denoiser: {module_name} cannot be imported: {_shown(error)}") from error
     factory = getattr(module, factory_name, None)
     if not callable(factory):
         raise IgsrError(f"denoiser: {module_name} has no function {factory_name}")
     try:
-        made = factory()
+        denoiser = factory()
     except Exception as error:
-        raise IgsrError(f"denoiser: {name} failed: {_said(error)}") from error
-    if not callable(made):
+        raise IgsrError(f"denoiser: {name} failed: {_shown(error)}") from error
+    if not callable(denoiser):
         raise IgsrError(
             f"denoiser: {name} must return a function of a render and photos, "
-            f"not {type(made).__name__}"
+            f"not {type(denoiser).__name__}"
         )
-    denoiser: Denoiser = made
     return denoiser
 
 
@@ -56,14 +55,14 @@ def _module(name: str) -> Any:
     if not path.is_file():
         raise IgsrError(f"denoiser: there is no file {path}")
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        raise IgsrError(f"denoiser: {path} cannot be imported")
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # Classes of the module are looked up there, by dataclasses for one.
+    # Dataclasses look up their module there.
     sys.modules.setdefault(path.stem, module)
     spec.loader.exec_module(module)
     return module
 
 
-def _said(error: Exception) -> str:
+def _shown(error: Exception) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -1,8 +1,8 @@
-"""The network: a small U-Net that predicts what to add to a render and how wrong that still is.
+"""The network: a small U-Net that predicts a correction of a render and the remaining error.
 
-Its blocks are those of NAFNet (Chen et al. 2022: depthwise convolutions and gates in place of
-activations) without their pooling over the whole picture: what comes out at a pixel depends on the
-pixels within ``REACH`` of it alone, so that tiles of a large picture give what the whole would.
+Its blocks are NAFNet's (Chen et al. 2022: depthwise convolutions, gates instead of activations)
+without pooling over the whole picture. An output depends only on pixels within ``REACH_PX``, so
+large pictures can be processed in tiles.
 """
 
 from __future__ import annotations
@@ -14,17 +14,19 @@ from torch import Tensor, nn
 from igsr.denoiser.architecture import MULTIPLE, Architecture
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO, PHOTOS
 
-#: Pixels in each direction that an output may depend on; a multiple of ``MULTIPLE``.
-REACH = 96
-#: Errors are predicted as logarithms within these bounds, in units of the colours' range.
-LEAST_LOG_ERROR, MOST_LOG_ERROR = -7.0, 0.0
-#: What blocks add at the start, as a part of what they compute. NAFNet's begin at 0, as the
-#: identity, and take hundreds of steps to wake.
-FIRST_SCALE = 0.3
-#: Added to the variance that features are divided by.
-NORM_FLOOR = 1e-6
-#: At the start a warped photo counts this much beside the render (as a logit).
-FIRST_LOGIT = -2.0
+#: Receptive field in each direction, pixels; a multiple of ``MULTIPLE``.
+REACH_PX = 96
+#: Bounds of the predicted logarithm of the error; colors range from 0 to 1.
+MIN_LOG_ERROR = -7.0
+MAX_LOG_ERROR = 0.0
+#: Predicted logarithm of the error before training: about a twentieth of the range.
+INITIAL_LOG_ERROR = -3.0
+#: Initial scale of the residual branches. NAFNet starts at 0, which costs hundreds of steps.
+INITIAL_SCALE = 0.3
+#: Epsilon of the layer norms.
+NORM_EPSILON = 1e-6
+#: Initial logit of a warped photo; the render's is 0.
+INITIAL_LOGIT = -2.0
 
 
 def _gate(x: Tensor) -> Tensor:
@@ -35,21 +37,21 @@ def _gate(x: Tensor) -> Tensor:
 class _Block(nn.Module):
     """NAFNet's block.
 
-    What looks at single pixels is linear over the last dimension: with the channels last in memory
-    that takes a third less time than convolutions of one pixel.
+    Pointwise layers are linear over the last dimension: a third faster than 1x1 convolutions when
+    channels are last in memory.
     """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm1 = nn.LayerNorm(channels, eps=NORM_FLOOR)
+        self.norm1 = nn.LayerNorm(channels, eps=NORM_EPSILON)
         self.expand1 = nn.Linear(channels, 2 * channels)
         self.depthwise = nn.Conv2d(2 * channels, 2 * channels, 3, padding=1, groups=2 * channels)
         self.project1 = nn.Linear(channels, channels)
-        self.norm2 = nn.LayerNorm(channels, eps=NORM_FLOOR)
+        self.norm2 = nn.LayerNorm(channels, eps=NORM_EPSILON)
         self.expand2 = nn.Linear(channels, 2 * channels)
         self.project2 = nn.Linear(channels, channels)
-        self.scale1 = nn.Parameter(torch.full((channels,), FIRST_SCALE))
-        self.scale2 = nn.Parameter(torch.full((channels,), FIRST_SCALE))
+        self.scale1 = nn.Parameter(torch.full((channels,), INITIAL_SCALE))
+        self.scale2 = nn.Parameter(torch.full((channels,), INITIAL_SCALE))
 
     def forward(self, x: Tensor) -> Tensor:
         x = x.permute(0, 2, 3, 1)
@@ -62,7 +64,7 @@ class _Block(nn.Module):
 
 
 class _PhotoAttention(nn.Module):
-    """One photo's features per pixel: a mean over the photos, weighted by how well they fit."""
+    """Attention over the photos of each pixel."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -80,15 +82,14 @@ class _PhotoAttention(nn.Module):
 
 
 class DenoiserNetwork(nn.Module):
-    """Channels of ``network_inputs`` to a picture and the logarithm of its expected error.
+    """Predict a picture and the logarithm of its expected error from ``network_inputs``.
 
     Args:
-        architecture: which network.
-        dropout: in training, part of the features at the lowest resolution that is left out.
+        architecture: settings; None is the default.
+        dropout: fraction of the features at the lowest resolution to drop in training.
     """
 
     def __init__(self, architecture: Architecture | None = None, dropout: float = 0.0) -> None:
-        """Build the layers; the last begins at zero, so that little but the render comes out."""
         super().__init__()
         self.architecture = architecture or Architecture()
         width, (half, quarter, eighth) = self.architecture.width, self.architecture.blocks
@@ -107,6 +108,7 @@ class DenoiserNetwork(nn.Module):
         self.from_quarter = nn.Conv2d(2 * width, 4 * width, 1)
         self.up_half = nn.Sequential(*(_Block(width) for _ in range(half)))
         self.tail = nn.Conv2d(width, 4 * (COLOR + 1 + CHOICES), 3, padding=1)
+        # An untrained network returns nearly the render.
         for parameter in self.tail.parameters():
             nn.init.zeros_(parameter)
 
@@ -114,11 +116,11 @@ class DenoiserNetwork(nn.Module):
         """Denoise.
 
         Args:
-            inputs: [B, ``CHANNELS``, H, W] of any size, as ``network_inputs`` makes them.
+            inputs: [B, ``CHANNELS``, H, W] of any size, from ``network_inputs``.
 
         Returns:
             The picture [B, 3, H, W], not clamped, and the natural logarithm of the expected
-            absolute error of its colours [B, 1, H, W].
+            absolute error of its colors [B, 1, H, W].
         """
         if inputs.shape[1] != CHANNELS:
             raise ValueError(f"inputs must have {CHANNELS} channels, not {inputs.shape[1]}")
@@ -143,17 +145,13 @@ class DenoiserNetwork(nn.Module):
         out = F.pixel_shuffle(self.tail(half), 2)[..., :height, :width]
         image = out[:, :COLOR]
         if self.architecture.residual:
-            image = image + _mixed(mixed, out[:, COLOR + 1 :] + FIRST_LOGIT)
-        # At the start every picture is taken to be wrong by about a twentieth of the range.
-        log_error = (out[:, COLOR : COLOR + 1] - 3.0).clamp(LEAST_LOG_ERROR, MOST_LOG_ERROR)
-        return image, log_error
+            image = image + _mixed(mixed, out[:, COLOR + 1 :] + INITIAL_LOGIT)
+        log_error = out[:, COLOR : COLOR + 1] + INITIAL_LOG_ERROR
+        return image, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
 
 
 def _mixed(inputs: Tensor, logits: Tensor) -> Tensor:
-    """Means [B, 3, H, W] of the render and the photos that are valid, by ``logits`` of the photos.
-
-    The render's own logit is 0.
-    """
+    """Mean colors [B, 3, H, W] of the render, with logit 0, and of the valid photos."""
     photos = inputs[:, COLOR + BUFFERS :].unflatten(1, (CHOICES, PHOTO))
     logits = logits.masked_fill(photos[:, :, COLOR] < 0.5, -torch.inf)
     weights = F.pad(logits, (0, 0, 0, 0, 1, 0)).softmax(dim=1)

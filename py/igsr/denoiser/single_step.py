@@ -1,8 +1,7 @@
-"""Networks that make a picture from a render and one photo in a single step, as denoisers.
+"""Denoisers from networks that turn a render and one photo into a picture in a single step.
 
-Single-step diffusion refiners work so (Wu et al., "Difix3D+: Improving 3D Reconstructions with
-Single-Step Diffusion Models", CVPR 2025): they take a render and the nearest photo, and give no
-confidence.
+An example are single-step diffusion refiners (Wu et al., "Difix3D+: Improving 3D Reconstructions
+with Single-Step Diffusion Models", CVPR 2025). They give no confidence.
 """
 
 from __future__ import annotations
@@ -23,15 +22,18 @@ Float32 = npt.NDArray[np.float32]
 
 
 class SingleStepDenoiser:
-    """A denoiser of a function from a render and a photo to a picture.
+    """A denoiser from a function of a render and a photo.
 
     Args:
         model: takes a render and a photo, both float32 [1, 3, H, W] in [0, 1], and returns a
-            picture [1, 3, H, W] in [0, 1]. The photo is None where there is none.
-        multiple: sides of what the model gets are multiples of this; borders are repeated.
-        longest: longest side of what the model gets, pixels; larger renders are reduced, and what
-            the model changes is enlarged. None leaves the size.
-        device: where the model is, such as "cuda".
+            picture [1, 3, H, W] in [0, 1]. The photo is None without photos.
+        multiple: pictures are padded to multiples of this, in pixels, by repeating the border.
+        longest: maximum longest side of the model's pictures, pixels. Larger renders are reduced,
+            and the changes are enlarged. None keeps the size.
+        device: of the model, such as "cuda".
+
+    Raises:
+        IgsrError: ``multiple`` or ``longest`` is not positive.
     """
 
     def __init__(
@@ -41,18 +43,13 @@ class SingleStepDenoiser:
         longest: int | None = None,
         device: str = "cpu",
     ) -> None:
-        """Keep what is given.
-
-        Raises:
-            IgsrError: ``multiple`` or ``longest`` is not positive.
-        """
         if multiple < 1 or (longest is not None and longest < multiple):
             raise IgsrError("multiple must be at least 1, and longest at least multiple")
         self._model, self._multiple, self._longest = model, multiple, longest
         self._device = torch.device(device)
 
     def __call__(self, render: Buffers, photos: Sequence[Source]) -> Float32:
-        """The model's picture, float32 [H, W, 3] in [0, 1]; see ``igsr.denoise``.
+        """Return the model's picture, float32 [H, W, 3] in [0, 1]; see ``igsr.denoise``.
 
         Raises:
             IgsrError: the model returns another shape.
@@ -65,27 +62,27 @@ class SingleStepDenoiser:
         photo = self._nearest(render, photos)
         with torch.inference_mode():
             small = _resized(whole, size)
+            padded = self._padded(small)
             near = None if photo is None else self._padded(_resized(photo, size))
-            made = self._model(self._padded(small), near)
-            if made.shape != self._padded(small).shape:
+            output = self._model(padded, near)
+            if output.shape != padded.shape:
                 raise IgsrError(
-                    f"the denoiser's model made {list(made.shape)} of "
-                    f"{list(self._padded(small).shape)}"
+                    f"the denoiser's model returned {list(output.shape)} for {list(padded.shape)}"
                 )
-            change = made[..., : size[0], : size[1]].float() - small
+            change = output[..., : size[0], : size[1]].float() - small
             picture = (whole + _resized(change, (height, width))).clamp(0.0, 1.0)
         array: Float32 = picture[0].permute(1, 2, 0).contiguous().cpu().numpy()
         return array
 
     def _nearest(self, render: Buffers, photos: Sequence[Source]) -> Tensor | None:
-        """The photo that is taken from nearest, and in the most alike direction."""
+        """The photo with the nearest position and most similar direction."""
         if render.camera is None or not photos:
             return None
-        forward, centre = render.camera.viewmat[2, :3], render.camera.centre
-        apart = [float(np.linalg.norm(photo.camera.centre - centre)) for photo in photos]
-        reach = max(apart) or 1.0
-        turned = [1.0 - float(photo.camera.viewmat[2, :3] @ forward) for photo in photos]
-        nearest = int(np.argmin([a / reach + t for a, t in zip(apart, turned, strict=True)]))
+        forward, center = render.camera.viewmat[2, :3], render.camera.centre
+        distances = [float(np.linalg.norm(photo.camera.centre - center)) for photo in photos]
+        scale = max(distances) or 1.0
+        turns = [1.0 - float(photo.camera.viewmat[2, :3] @ forward) for photo in photos]
+        nearest = int(np.argmin([d / scale + t for d, t in zip(distances, turns, strict=True)]))
         color = torch.from_numpy(np.ascontiguousarray(photos[nearest].color))
         return color.permute(2, 0, 1)[None].to(self._device)
 

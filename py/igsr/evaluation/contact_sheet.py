@@ -14,20 +14,24 @@ from igsr._internal.atomic_write import atomic_write
 from igsr.evaluation.metrics import flip_map
 from igsr.evaluation.scores import ScoredView
 
-#: Most views on a contact sheet.
+#: Maximum number of views on a contact sheet.
 MAX_SHEET_VIEWS = 8
-#: An absolute error of this size (of 1) is drawn white, so that small errors show.
+#: Absolute errors of at least this, of 1, are white, so that small errors are visible.
 ERROR_WHITE = 0.25
-#: Longest side of one picture on the sheet, pixels.
-PANEL_SIDE = 360
-LABEL_HEIGHT = 24
-GAP = 6
+#: Longest side of one picture on the sheet.
+PANEL_SIDE_PX = 360
+#: Minimum width of one picture with its label.
+MIN_PANEL_WIDTH_PX = 190
+LABEL_HEIGHT_PX = 24
+GAP_PX = 6
 PAPER = (18, 18, 20)
 INK = (235, 235, 235)
+#: Gray of masked pixels in pictures of errors.
+MASKED_GRAY = 96
 
 
 def sheet_names(names: Sequence[str]) -> set[str]:
-    """The evenly spaced names that a contact sheet shows."""
+    """Choose evenly spaced names for a contact sheet."""
     if len(names) <= MAX_SHEET_VIEWS:
         return set(names)
     indices = np.linspace(0, len(names) - 1, MAX_SHEET_VIEWS).round().astype(int)
@@ -35,23 +39,17 @@ def sheet_names(names: Sequence[str]) -> set[str]:
 
 
 def error_picture(scored: ScoredView) -> npt.NDArray[np.uint8]:
-    """Absolute error averaged over the channels in false colour, uint8 [H, W, 3].
+    """Draw the absolute error of a render, averaged over the channels, in false color.
 
-    Black is no error, white is ``ERROR_WHITE`` or more (matplotlib's "inferno"); pixels outside
-    the mask, which do not count, are grey.
+    Returns:
+        uint8 [H, W, 3]: matplotlib's "inferno" up to ``ERROR_WHITE``; masked pixels are gray.
     """
-    from matplotlib import colormaps
-
     difference = np.abs(scored.render.astype(np.float32) - scored.photo).mean(axis=2) / 255.0
-    shade = np.clip(difference / ERROR_WHITE, 0.0, 1.0)
-    picture = np.asarray(colormaps["inferno"](shade, bytes=True))[..., :3].copy()
-    if scored.mask is not None:
-        picture[~scored.mask] = 96
-    return picture
+    return _false_color(difference / ERROR_WHITE, "inferno", scored)
 
 
 def contact_sheet(views: Sequence[ScoredView]) -> Image.Image:
-    """Photo, render and error of each view side by side, labelled with its name and PSNR."""
+    """Draw photo, render and error of each view, labeled with its name and PSNR."""
     return _sheet(
         [
             [
@@ -65,22 +63,29 @@ def contact_sheet(views: Sequence[ScoredView]) -> Image.Image:
 
 
 def flip_picture(scored: ScoredView) -> npt.NDArray[np.uint8]:
-    """FLIP error of each pixel in false colour, uint8 [H, W, 3].
+    """Draw the FLIP error of each pixel in false color.
 
-    Black is no error, the lightest yellow 1 (matplotlib's "magma", as FLIP's authors show it);
-    pixels outside the mask, which do not count, are grey.
+    Returns:
+        uint8 [H, W, 3]: matplotlib's "magma" from 0 to 1; masked pixels are gray.
     """
+    errors = flip_map(scored.render, scored.photo, scored.mask)
+    return _false_color(errors, "magma", scored)
+
+
+def _false_color(
+    errors: npt.NDArray[np.float32], colormap: str, scored: ScoredView
+) -> npt.NDArray[np.uint8]:
     from matplotlib import colormaps
 
-    errors = flip_map(scored.render, scored.photo, scored.mask)
-    picture = np.asarray(colormaps["magma"](np.clip(errors, 0.0, 1.0), bytes=True))[..., :3].copy()
+    colors = colormaps[colormap](np.clip(errors, 0.0, 1.0), bytes=True)
+    picture = np.asarray(colors)[..., :3].copy()
     if scored.mask is not None:
-        picture[~scored.mask] = 96
+        picture[~scored.mask] = MASKED_GRAY
     return picture
 
 
-def flip_sheet(views: Sequence[ScoredView], side: int = PANEL_SIDE) -> Image.Image:
-    """Photo, render and FLIP error of each view side by side, a row for each.
+def flip_sheet(views: Sequence[ScoredView], side: int = PANEL_SIDE_PX) -> Image.Image:
+    """Draw photo, render and FLIP error of each view, one view per row.
 
     Args:
         views: at least one.
@@ -101,7 +106,7 @@ def flip_sheet(views: Sequence[ScoredView], side: int = PANEL_SIDE) -> Image.Ima
 
 
 def rounds_sheet(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> Image.Image:
-    """Photo, render of the first fit and render after the last round, of each view."""
+    """Draw each photo with its render after the first fit and after the last round."""
     return _sheet(
         [
             [
@@ -117,30 +122,29 @@ def rounds_sheet(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> I
 def _sheet(
     rows_of_panels: Sequence[Sequence[tuple[npt.NDArray[np.uint8], str]]],
     columns: int | None = None,
-    side: int = PANEL_SIDE,
+    side: int = PANEL_SIDE_PX,
 ) -> Image.Image:
-    """Pictures of each view side by side, each under its label."""
     if not rows_of_panels:
         raise ValueError("views: a contact sheet needs at least one")
     if columns is None:
-        # One column of triples grows too tall to look at from about three views on.
+        # A single column of many views would be too tall.
         columns = 1 if len(rows_of_panels) <= 3 else 2
     blocks = [_block(panels, side) for panels in rows_of_panels]
     column_width = max(block.width for block in blocks)
     rows = [blocks[i : i + columns] for i in range(0, len(blocks), columns)]
     row_heights = [max(block.height for block in row) for row in rows]
-    width = columns * column_width + (columns + 1) * 2 * GAP
-    sheet = Image.new("RGB", (width, sum(row_heights) + (len(rows) + 1) * 2 * GAP), PAPER)
-    top = 2 * GAP
+    width = columns * column_width + (columns + 1) * 2 * GAP_PX
+    sheet = Image.new("RGB", (width, sum(row_heights) + (len(rows) + 1) * 2 * GAP_PX), PAPER)
+    top = 2 * GAP_PX
     for row, height in zip(rows, row_heights, strict=True):
         for column, block in enumerate(row):
-            sheet.paste(block, (2 * GAP + column * (column_width + 2 * GAP), top))
-        top += height + 2 * GAP
+            sheet.paste(block, (2 * GAP_PX + column * (column_width + 2 * GAP_PX), top))
+        top += height + 2 * GAP_PX
     return sheet
 
 
 def save_sheet(path: Path, sheet: Image.Image) -> None:
-    """Write a contact sheet as PNG, whole or not at all.
+    """Write a contact sheet as PNG.
 
     Raises:
         IgsrError: the file cannot be written.
@@ -150,27 +154,25 @@ def save_sheet(path: Path, sheet: Image.Image) -> None:
 
 
 def _block(panels: Sequence[tuple[npt.NDArray[np.uint8], str]], side: int) -> Image.Image:
-    """The pictures of one view, of one size, with a line of text above each."""
+    """Pictures of one view side by side, each under its label."""
     height, width = panels[0][0].shape[:2]
     shrink = min(1.0, side / max(height, width))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     font = ImageFont.load_default(size=14)
-    # A thumbnail of 16 pixels still needs room for its label.
-    panel_width = max(size[0], 190)
-    count = len(panels)
-    full = count * panel_width + (count - 1) * GAP
-    block = Image.new("RGB", (full, LABEL_HEIGHT + size[1]), PAPER)
+    panel_width = max(size[0], MIN_PANEL_WIDTH_PX)
+    block_width = len(panels) * (panel_width + GAP_PX) - GAP_PX
+    block = Image.new("RGB", (block_width, LABEL_HEIGHT_PX + size[1]), PAPER)
     draw = ImageDraw.Draw(block)
     for index, (picture, label) in enumerate(panels):
-        left = index * (panel_width + GAP)
+        left = index * (panel_width + GAP_PX)
         draw.text((left, 2), _shortened(label, font, panel_width), fill=INK, font=font)
         small = Image.fromarray(picture).resize(size, Image.Resampling.BOX)
-        block.paste(small, (left, LABEL_HEIGHT))
+        block.paste(small, (left, LABEL_HEIGHT_PX))
     return block
 
 
 def _shortened(text: str, font: Any, width: int) -> str:
-    """The text, or its end behind an ellipsis: the end of a path is what tells views apart."""
+    """The text, or its end after an ellipsis, since paths differ at the end."""
     if font.getlength(text) <= width:
         return text
     while len(text) > 1 and font.getlength("…" + text) > width:

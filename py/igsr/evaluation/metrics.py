@@ -1,9 +1,8 @@
-"""Metrics of a render and its photo: PSNR, SSIM, MS-SSIM, FLIP; the first two color-corrected, too.
+"""Metrics of a render against its photo: PSNR, SSIM, MS-SSIM, FLIP, color-corrected PSNR and SSIM.
 
-Every function takes two uint8 pictures [H, W, 3], sRGB-encoded: the 8-bit picture is scored, not
-the renderer's floats. ``mask`` (bool [H, W], True for pixels that count) limits the score to a
-part of the picture. Both pictures are set to black outside it first, so that windows over its edge
-see the same in both.
+All functions take two sRGB pictures, uint8 [H, W, 3], and an optional mask, bool [H, W], True for
+pixels that count. Masked pixels are set to black in both pictures first, so that windows over the
+mask's edge are equal there.
 """
 
 from __future__ import annotations
@@ -21,22 +20,22 @@ Planes = npt.NDArray[np.float64]
 #: The Gaussian window of SSIM (Wang et al. 2004), as the 3DGS papers use it.
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
-#: Rows that SSIM is computed for at a time.
+#: Rows per strip of SSIM, so that the strip's planes stay in the cache.
 SSIM_ROWS = 16
-#: The five scales of MS-SSIM (Wang et al. 2003) halve the picture four times, and the window must
-#: still fit into the smallest.
+#: Shortest side for MS-SSIM: its window must fit after four halvings (Wang et al. 2003).
 MS_SSIM_MIN_SIDE = SSIM_WINDOW * 2**4
-#: Exponents of the scales, from full size on.
+#: Exponents of the five scales, full size first.
 MS_SSIM_EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-#: PSNR of identical 8-bit pictures is infinite, which JSON cannot hold and a mean cannot use.
+#: PSNR of equal pictures, dB: infinity has no mean and is not valid JSON.
 PSNR_CAP = 100.0
-#: Color correction: repetitions, and how far from 0 and 1 a channel counts as not clipped.
-CORRECTIONS, CLIPPED = 5, 0.5 / 255.0
-#: Pixels whose features are held at a time: so few that BLAS takes one thread for them. Waking
-#: others takes longer than the product.
-PART = 1 << 12
-#: What ``score`` gives.
-NAMES = ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim")
+#: Iterations of the color correction.
+CORRECTIONS = 5
+#: Channels within this distance of 0 or 1 are clipped.
+CLIP_MARGIN = 0.5 / 255.0
+#: Pixels per matrix product: few enough for BLAS to use one thread, which is faster.
+PRODUCT_PIXELS = 1 << 12
+#: Names of the metrics, in the order of tables.
+METRICS = ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim")
 
 
 def _checked(render: Image, photo: Image, mask: Mask | None) -> tuple[Image, Image, Mask | None]:
@@ -57,18 +56,11 @@ def _checked(render: Image, photo: Image, mask: Mask | None) -> tuple[Image, Ima
         )
     if not mask.any():
         raise ValueError("mask has no pixel that counts")
-    outside = ~mask
-    render, photo = render.copy(), photo.copy()
-    render[outside] = 0
-    photo[outside] = 0
-    return render, photo, mask
+    return render * mask[..., None], photo * mask[..., None], mask
 
 
 def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, -10 log10 of the mean squared error on [0, 1].
-
-    The mean runs over the three channels and the pixels that count. Equal pictures give 100 dB.
-    """
+    """Compute the peak signal-to-noise ratio in dB over all channels; 100 for equal pictures."""
     render, photo, mask = _checked(render, photo, mask)
     difference = (render.astype(np.float64) - photo) / 255.0
     squared = difference**2
@@ -77,20 +69,16 @@ def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
 
 
 def ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
-    """Structural similarity (Wang et al. 2004) in the convention of the 3DGS papers.
+    """Compute the structural similarity (Wang et al. 2004) as the 3DGS papers do.
 
-    11 x 11 Gaussian window with sigma 1.5, per channel on [0, 1], C1 = 0.01^2, C2 = 0.03^2, the
-    border padded with zeros, the map averaged over channels and the pixels that count.
+    11 x 11 Gaussian window with sigma 1.5, per channel on [0, 1], C1 = 0.01^2, C2 = 0.03^2, zero
+    padding.
     """
     render, photo, mask = _checked(render, photo, mask)
-    height, width = photo.shape[:2]
     pad = SSIM_WINDOW // 2
-
-    def padded(picture: Image) -> Planes:
-        return np.pad(_planes(picture), ((0, 0), (pad, pad), (pad, pad)))
-
-    per_pixel = np.empty((height, width))
-    for rows, light, lights, shared, spread in _windowed(padded(render), padded(photo)):
+    x, y = (np.pad(_planes(z), ((0, 0), (pad, pad), (pad, pad))) for z in (render, photo))
+    per_pixel = np.empty(photo.shape[:2])
+    for rows, light, lights, shared, spread in _windowed(x, y):
         per_pixel[rows] = ((light * shared) / (lights * spread)).mean(axis=0)
     return float(per_pixel.mean() if mask is None else per_pixel[mask].mean())
 
@@ -101,16 +89,14 @@ def _planes(picture: Image) -> Planes:
 
 
 def _windowed(x: Planes, y: Planes) -> Iterator[tuple[slice, Planes, Planes, Planes, Planes]]:
-    """The terms of SSIM at each place that the whole window fits at, in strips of rows.
-
-    Strips whose planes stay in the cache take a third of the time.
+    """Compute the terms of SSIM, in strips of rows.
 
     Args:
         x, y: float64 [C, H + 10, W + 10] in [0, 1].
 
     Yields:
-        The strip of the H rows, and numerator and denominator of luminance, then of contrast and
-        structure, float64 [C, strip, W] each.
+        A slice of the H rows; numerator and denominator of the luminance term, then of the
+        contrast and structure term, float64 [C, rows, W] each.
     """
     offset = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     window = np.exp(-(offset**2) / (2.0 * SSIM_SIGMA**2))
@@ -145,14 +131,13 @@ def _windowed(x: Planes, y: Planes) -> Iterator[tuple[slice, Planes, Planes, Pla
 
 
 def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float | None:
-    """Multi-scale SSIM (Wang et al. 2003) in the convention of torchmetrics, on [0, 1].
+    """Compute the multi-scale SSIM (Wang et al. 2003) as torchmetrics does.
 
-    Five scales, 11 x 11 Gaussian window with sigma 1.5, negative terms as 0. It has no per-pixel
-    map, so a mask only blackens both pictures outside; the black part counts as equal.
+    Five scales, 11 x 11 Gaussian window with sigma 1.5, negative terms set to 0. There is
+    no map per pixel, so masked pixels count as equal.
 
     Returns:
-        The score, or None where the shorter side is under 176 pixels: the smallest scale would
-        no longer hold the window.
+        The score, or None if the shorter side is less than 176 pixels.
     """
     render, photo, _ = _checked(render, photo, mask)
     if min(photo.shape[:2]) < MS_SSIM_MIN_SIDE:
@@ -160,7 +145,7 @@ def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float | No
     x, y = _planes(render), _planes(photo)
     product = 1.0
     for scale, exponent in enumerate(MS_SSIM_EXPONENTS):
-        # Contrast where the whole window is inside; at the last scale SSIM, with mirrored borders.
+        # Contrast and structure without padding; at the last scale SSIM, with mirrored borders.
         is_last = scale == len(MS_SSIM_EXPONENTS) - 1
         if is_last:
             pad = SSIM_WINDOW // 2
@@ -170,94 +155,81 @@ def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float | No
             terms = (light * shared) / (lights * spread) if is_last else shared / spread
             total += float(terms.sum())
             count += terms.size
-        # Far-off renders reach negative terms, which have no fractional power.
+        # Negative numbers have no fractional power.
         product *= max(0.0, total / count) ** exponent
         x, y = _halved(x), _halved(y)
     return product
 
 
 def _halved(planes: Planes) -> Planes:
-    """Means of 2 x 2 pixels; an odd last row or column is left out."""
+    """Means of 2 x 2 pixels; an odd last row or column is dropped."""
     channels, height, width = planes.shape
     even = planes[:, : height // 2 * 2, : width // 2 * 2]
     return np.asarray(even.reshape(channels, height // 2, 2, width // 2, 2).mean(axis=(2, 4)))
 
 
 def flip_map(render: Image, photo: Image, mask: Mask | None = None) -> npt.NDArray[np.float32]:
-    """LDR-FLIP error of each pixel (Andersson et al. 2020), float32 [H, W], 0 = equal, 1 = worst.
-
-    flip-evaluator's defaults: sRGB pictures seen at 67 pixels per degree (0.7 m from a 0.7 m
-    wide 4K monitor). With a mask, both pictures are black outside.
-    """
-    import flip_evaluator
-
-    render, photo, _ = _checked(render, photo, mask)
-    error_map, _, _ = flip_evaluator.evaluate(
-        photo.astype(np.float32) / 255.0,
-        render.astype(np.float32) / 255.0,
-        "LDR",
-        inputsRGB=True,
-        applyMagma=False,
-        computeMeanError=False,
-    )
-    return np.asarray(error_map, np.float32).reshape(photo.shape[0], photo.shape[1], -1)[..., 0]
+    """Compute the LDR-FLIP error of each pixel, float32 [H, W]; see ``flip``."""
+    return _flip(*_checked(render, photo, mask)[:2], compute_mean=False)[0]
 
 
 def flip(render: Image, photo: Image, mask: Mask | None = None) -> float:
-    """Mean LDR-FLIP error (Andersson et al. 2020), 0 = equal, 1 = worst.
+    """Compute the mean LDR-FLIP error (Andersson et al. 2020): 0 for equal pictures, at worst 1.
 
-    flip-evaluator's defaults: sRGB pictures seen at 67 pixels per degree (0.7 m from a 0.7 m
-    wide 4K monitor). With a mask, the mean of the error map over the pixels that count.
+    flip-evaluator's defaults: 67 pixels per degree (0.7 m from a 0.7 m wide 4K monitor).
     """
+    render, photo, mask = _checked(render, photo, mask)
+    error_map, mean = _flip(render, photo, compute_mean=True)
+    return mean if mask is None else float(error_map[mask].mean())
+
+
+def _flip(render: Image, photo: Image, compute_mean: bool) -> tuple[npt.NDArray[np.float32], float]:
     import flip_evaluator
 
-    render, photo, mask = _checked(render, photo, mask)
     error_map, mean, _ = flip_evaluator.evaluate(
         photo.astype(np.float32) / 255.0,
         render.astype(np.float32) / 255.0,
         "LDR",
         inputsRGB=True,
         applyMagma=False,
-        computeMeanError=True,
+        computeMeanError=compute_mean,
     )
-    if mask is None:
-        return float(mean)
-    return float(np.asarray(error_map).reshape(photo.shape[0], photo.shape[1], -1)[mask].mean())
+    per_pixel = np.asarray(error_map, np.float32).reshape(*photo.shape[:2], -1)[..., 0]
+    return per_pixel, float(mean)
 
 
 def color_corrected(render: Image, photo: Image, mask: Mask | None = None) -> Image:
-    """The render with the photo's colors: mapped by a quadratic polynomial of R, G and B.
+    """Map the render's colors to the photo's by a quadratic polynomial of R, G and B.
 
-    Each channel is fitted to the photo's by least squares over pixels that are clipped in neither
-    picture, five times, each on the result of the last. What is left are errors that no exposure,
-    white balance or tone curve explains. As ``color_correct`` of Mip-NeRF 360's code (Barron et al.
-    2022, multinerf ``internal/image.py``) and of gsplat, whose cc_psnr is of such pictures, but
-    rounded to 8 bits.
+    This removes differences of exposure, white balance and tone. Each channel is fitted by least
+    squares to pixels that are not clipped in either picture, five times, each time on the previous
+    result. The method is ``color_correct`` of Mip-NeRF 360 (Barron et al. 2022, multinerf
+    ``internal/image.py``) and of gsplat's cc_psnr, but rounds to 8 bits.
 
     Args:
         render: uint8 [H, W, 3].
         photo: uint8 [H, W, 3].
-        mask: bool [H, W], True for pixels to fit the map to; all are mapped.
+        mask: bool [H, W], True for pixels to fit to; all pixels are mapped.
 
     Returns:
-        uint8 [H, W, 3]. A channel with too few pixels to fit a map to stays as it is.
+        uint8 [H, W, 3]. Channels with too few pixels to fit to do not change.
     """
     render, photo, mask = _checked(render, photo, mask)
-    wanted, start = (_planes(picture).reshape(3, -1) for picture in (photo, render))
-    open_in_both = ~(_clipped(wanted) | _clipped(start))
+    target, colors = (_planes(picture).reshape(3, -1) for picture in (photo, render))
+    unclipped = ~(_clipped(target) | _clipped(colors))
     if mask is not None:
-        open_in_both &= mask.reshape(-1)
-    colors = start
-    parts = [slice(at, at + PART) for at in range(0, colors.shape[1], PART)]
+        unclipped &= mask.reshape(-1)
+    starts = range(0, colors.shape[1], PRODUCT_PIXELS)
+    parts = [slice(start, start + PRODUCT_PIXELS) for start in starts]
     for _ in range(CORRECTIONS):
         squares, products = np.zeros((3, 10, 10)), np.zeros((3, 10))
-        usable = open_in_both & ~_clipped(colors)
+        usable = unclipped & ~_clipped(colors)
         for part in parts:
             features = _quadratic(colors[:, part])
             for channel in range(3):
                 kept = features * usable[channel, part]
                 squares[channel] += kept @ features.T
-                products[channel] += kept @ wanted[channel, part]
+                products[channel] += kept @ target[channel, part]
         weights = np.zeros((3, 10))
         for channel in range(3):
             if usable[channel].sum() < 10:
@@ -271,35 +243,36 @@ def color_corrected(render: Image, photo: Image, mask: Mask | None = None) -> Im
 
 
 def _clipped(colors: Planes) -> Mask:
-    return np.asarray((colors < CLIPPED) | (colors > 1.0 - CLIPPED))
+    return np.asarray((colors < CLIP_MARGIN) | (colors > 1.0 - CLIP_MARGIN))
 
 
 def _quadratic(colors: Planes) -> Planes:
-    """Products of two channels, the channels, and 1, of colors [3, P]: float64 [10, P]."""
+    """Monomials of colors [3, P] up to degree 2, float64 [10, P]."""
     red, green, blue = colors
     products = (red * red, red * green, red * blue, green * green, green * blue, blue * blue)
     return np.stack([*products, red, green, blue, np.ones_like(red)])
 
 
 def score(
-    render: Image, photo: Image, mask: Mask | None = None, names: Sequence[str] = NAMES
+    render: Image, photo: Image, mask: Mask | None = None, names: Sequence[str] = METRICS
 ) -> dict[str, float | None]:
-    """Metrics of one picture.
-
-    ``psnr``, ``ssim``, ``ms_ssim`` (or None) and ``flip`` of the render as it is; ``cc_psnr`` and
-    ``cc_ssim`` of the render after ``color_corrected``.
+    """Compute several metrics of one picture.
 
     Args:
-        render, photo, mask: as each metric takes them.
-        names: those wanted; others are not computed.
+        render: uint8 [H, W, 3].
+        photo: uint8 [H, W, 3].
+        mask: bool [H, W], True for pixels that count.
+        names: metrics to compute, of ``METRICS``; "cc_psnr" and "cc_ssim" are of the render after
+            ``color_corrected``.
+
+    Returns:
+        The scores by name; "ms_ssim" is None for small pictures.
     """
     metrics = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "flip": flip}
-    found = {name: metric(render, photo, mask) for name, metric in metrics.items() if name in names}
-    if any(name.startswith("cc_") for name in names):
+    scores = {name: metrics[name](render, photo, mask) for name in metrics if name in names}
+    corrected_names = [name for name in ("psnr", "ssim") if f"cc_{name}" in names]
+    if corrected_names:
         corrected = color_corrected(render, photo, mask)
-        found |= {
-            f"cc_{name}": metrics[name](corrected, photo, mask)
-            for name in ("psnr", "ssim")
-            if f"cc_{name}" in names
-        }
-    return found
+        for name in corrected_names:
+            scores[f"cc_{name}"] = metrics[name](corrected, photo, mask)
+    return scores

@@ -1,7 +1,6 @@
-"""What the pages of ``report.html`` share: templates, pictures and cameras.
+"""Shared parts of ``report.html`` pages: templates, pictures and cameras.
 
-A page is one file with everything inside. It extends ``templates/page.html.jinja``; all text is
-escaped.
+A page is one self-contained file that extends ``templates/page.html.jinja``; all text is escaped.
 """
 
 from __future__ import annotations
@@ -24,29 +23,28 @@ from igsr.evaluation.contact_sheet import ERROR_WHITE, error_picture
 from igsr.evaluation.scores import ScoredView
 from igsr.rendering.notebook_page import framed
 from igsr.rendering.scene_page import (
-    MOST_COMPARED,
+    MAX_COMPARED_SPLATS,
     PageCamera,
     PageModel,
     compared,
     scene_page,
 )
 
-#: Longest side of pictures beside each other, pixels.
+#: Longest side of pictures shown side by side.
 BESIDE = 480
-#: Height of the scene, pixels.
-SCENE_HEIGHT = 560
-#: How the page's script draws cameras, by the first number of each.
+SCENE_HEIGHT_PX = 560
+#: Kinds of cameras, which the page's script draws differently.
 PHOTO, ADDED, REJECTED = 0, 1, 2
 
 
 def write_template(path: Path, templates: Path, name: str, variables: Mapping[str, Any]) -> None:
-    """Write a page, whole or not at all; it needs nothing but a browser.
+    """Write a page.
 
     Args:
-        path: where to.
-        templates: folder of the page's own template.
+        path: the file to write.
+        templates: folder of the page's template.
         name: of the template.
-        variables: what is put into it.
+        variables: of the template.
 
     Raises:
         IgsrError: the file cannot be written.
@@ -61,12 +59,12 @@ def write_template(path: Path, templates: Path, name: str, variables: Mapping[st
     )
     text = environment.get_template(name).render(variables)
     with atomic_write(path) as temporary:
-        # A file may be named by bytes that are no text.
+        # File names may contain bytes that are not text.
         temporary.write_text(text, encoding="utf-8", errors="xmlcharrefreplace")
 
 
 def beside(views: Sequence[ScoredView]) -> list[dict[str, Any]]:
-    """Photo, render and error of each view, as the template has them.
+    """Prepare photo, render and error of each view for the template.
 
     Args:
         views: with "psnr" among their scores.
@@ -90,73 +88,80 @@ def scene_frame(
     background: Sequence[float],
     title: str,
 ) -> str | None:
-    """The scene to turn, as HTML of a frame; None where it cannot be within a report.
-
-    It cannot where it has more than ``MOST_COMPARED`` splats, which make a page of some 10 MB, or
-    where the page's format cannot hold it: the report stands without.
+    """Embed an interactive view of the scene in a report.
 
     Args:
-        models: the last is shown, and compared with the others where there is room for them.
-        cameras: of the photos that were fitted, to which the page jumps; see ``fitted_cameras``.
+        models: the last one is shown, and compared with earlier ones if they fit.
+        cameras: of the fitted photos, from ``fitted_cameras``.
         background: RGB in [0, 1] behind the splats.
         title: of the page, and the name of its screenshots.
+
+    Returns:
+        HTML of a frame; None if the scene has more than ``MAX_COMPARED_SPLATS`` splats (about
+        10 MB) or cannot be packed.
     """
     shown = compared(models)
-    if sum(len(one.splats) for one in shown) > MOST_COMPARED:
+    if sum(len(one.splats) for one in shown) > MAX_COMPARED_SPLATS:
         return None
     try:
         page, _ = scene_page(shown, cameras, background, title, compares=True)
     except IgsrError:
         return None
-    return framed(page, SCENE_HEIGHT)
+    return framed(page, SCENE_HEIGHT_PX)
 
 
 def fitted_cameras(capture: Capture) -> list[PageCamera]:
-    """The cameras of the photos that were fitted."""
+    """Return the cameras of the train views."""
     return [PageCamera(view.name, view.camera) for view in capture.train_views]
 
 
 def part_rows(
     parts: Mapping[str, Mapping[str, Any]], names: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Rows of the table of seconds and memory.
+    """Return the rows of the table of time and memory.
 
     Args:
-        parts: the usage of each part, as reports have it.
-        names: what the page calls parts, where that differs.
+        parts: usage of each part, from the report.
+        names: display names of parts; the default is the part's name.
     """
     return [{"name": names.get(name, name), **usage} for name, usage in parts.items()]
 
 
 def number(value: float | None, digits: int) -> str:
-    """A score with so many decimals; "-" where there is none."""
+    """Format a score with ``digits`` decimals; "-" for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def drawn_cameras(
     kinds: Sequence[tuple[int, Sequence[Camera]]], size_of: Sequence[Camera]
 ) -> list[tuple[int, list[list[float]]]]:
-    """What the page's script draws: a kind, and a camera's centre and corners, [5, 3].
-
-    Coordinates are relative to the middle of some cameras' centres, of which the farthest is at
-    distance 1.
+    """Compute the camera frustums that the page's script draws.
 
     Args:
-        kinds: cameras of each kind, drawn in this order.
-        size_of: the cameras that place and size are taken from; at least one.
+        kinds: cameras by kind, in drawing order.
+        size_of: cameras that define the coordinates: their mean center is the origin, and the
+            farthest center has distance 1. At least one.
+
+    Returns:
+        The kind of each camera, and its center and picture corners, [5, 3].
     """
-    centres = np.stack([camera.centre for camera in size_of])
-    middle = centres.mean(axis=0)
-    size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-9)
+    centers = np.stack([camera.centre for camera in size_of])
+    origin = centers.mean(axis=0)
+    size = max(float(np.linalg.norm(centers - origin, axis=1).max()), 1e-9)
     return [
-        (kind, np.round((_frustum(camera, 0.18 * size) - middle) / size, 4).tolist())
+        (kind, np.round((_frustum(camera, 0.18 * size) - origin) / size, 4).tolist())
         for kind, cameras in kinds
         for camera in cameras
     ]
 
 
 def jpeg(picture: npt.NDArray[np.uint8], longest: int) -> str:
-    """A picture, uint8 [H, W] or [H, W, 3], as a JPEG of at most so many pixels, in base64."""
+    """Encode a picture, uint8 [H, W] or [H, W, 3], as JPEG in base64.
+
+    Args:
+        picture: the picture.
+        longest: maximum longest side, pixels.
+    """
     image = Image.fromarray(picture)
     image.thumbnail((longest, longest), Image.Resampling.BOX)
     file = io.BytesIO()
@@ -165,7 +170,7 @@ def jpeg(picture: npt.NDArray[np.uint8], longest: int) -> str:
 
 
 def _frustum(camera: Camera, depth: float) -> npt.NDArray[np.float64]:
-    """The camera's centre and its picture's corners at a depth, [5, 3], world."""
+    """The camera's center and its picture's corners at a depth, [5, 3], world frame."""
     K, w, h = camera.K, camera.width, camera.height
     corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
     rays = np.concatenate([(corners - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((4, 1))], axis=1)

@@ -15,13 +15,11 @@ from igsr._internal.choices import Backend, Split
 from igsr.capture import Capture, View
 from igsr.errors import IgsrError
 from igsr.evaluation import metrics
+from igsr.evaluation.metrics import METRICS
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
 logger = logging.getLogger(__name__)
-
-#: Names of the metrics, in the order of tables.
-METRICS = ("psnr", "ssim", "ms_ssim", "flip", "cc_psnr", "cc_ssim")
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
@@ -33,9 +31,9 @@ class ScoredView(ArrayEquality):
 
     Attributes:
         name: the view's name in the capture.
-        photo: uint8 [H, W, 3], composited over the background if it had alpha.
+        photo: uint8 [H, W, 3], over the background if it has alpha.
         render: uint8 [H, W, 3].
-        mask: bool [H, W], True for pixels that counted, or None if all did.
+        mask: bool [H, W], True for pixels that count; None if all count.
         scores: "psnr" in dB, "ssim", "ms_ssim" (None if the picture is too small), "flip", and
             "cc_psnr" and "cc_ssim" after color correction.
     """
@@ -66,13 +64,12 @@ class ViewScores(TypedDict):
 
 
 class Protocol(TypedDict, total=False):
-    """How views were scored, for reports.
+    """Evaluation protocol, for reports.
 
-    ``split`` is "test" or "train", ``views`` their number, ``background`` RGB in [0, 1];
-    ``pixels``, ``ssim``, ``flip`` and
-    ``color_correction`` are in words. Commands add ``holdout``: every
-    ``holdout``-th view is held out for testing; and ``of``, where the views are evenly spaced ones
-    of as many.
+    ``split`` is "test" or "train", ``views`` the number of views, ``background`` RGB in [0, 1];
+    ``pixels``, ``ssim``, ``flip`` and ``color_correction`` are descriptions. Commands add
+    ``holdout`` (every ``holdout``-th view is a test view) and ``of`` (number of views that the
+    scored ones, evenly spaced, were taken from).
     """
 
     split: str
@@ -87,10 +84,9 @@ class Protocol(TypedDict, total=False):
 
 
 class Scores(dict[str, Any]):
-    """What ``evaluate`` returns: mean scores over the views of a split, and the scores of each.
+    """Mean scores over the views of a split, and the scores of each view.
 
-    It is a dictionary, so ``scores["psnr"]``, ``{**scores}`` and ``json.dumps(scores)`` work. Its
-    items are typed attributes too: ``scores.psnr``.
+    A dictionary whose items are also typed attributes: ``scores["psnr"]`` is ``scores.psnr``.
     """
 
     @property
@@ -116,7 +112,7 @@ class Scores(dict[str, Any]):
 
     @property
     def cc_psnr(self) -> float:
-        """PSNR in dB after color correction, which takes exposure and white balance out."""
+        """PSNR in dB after color correction, which removes exposure and white balance."""
         return float(self["cc_psnr"])
 
     @property
@@ -126,7 +122,7 @@ class Scores(dict[str, Any]):
 
     @property
     def protocol(self) -> Protocol:
-        """How the views were scored."""
+        """The evaluation protocol."""
         protocol: Protocol = self["protocol"]
         return protocol
 
@@ -146,17 +142,17 @@ class Scores(dict[str, Any]):
 
 
 def default_background(capture: Capture) -> tuple[float, float, float]:
-    """White if photos have alpha, as papers score NeRF Synthetic; else black. RGB in [0, 1]."""
+    """Return white if photos have alpha, as in papers on NeRF Synthetic; else black."""
     return known_background(capture.views) or BLACK
 
 
 def known_background(views: Sequence[View]) -> tuple[float, float, float] | None:
-    """White if photos have alpha; None if they show their own background. RGB in [0, 1]."""
+    """Return white if photos have alpha; None if they show their own background."""
     return WHITE if any(view.image.shape[2] == 4 for view in views) else None
 
 
 def default_split(capture: Capture) -> Split:
-    """The split to score: "test" if the capture has test views, else "train"."""
+    """Return "test" if the capture has test views, else "train"."""
     return "test" if capture.test_views else "train"
 
 
@@ -170,7 +166,7 @@ def over_background(
         background: RGB in [0, 1].
 
     Returns:
-        uint8 [H, W, 3]; an image without alpha is returned as it is.
+        uint8 [H, W, 3]; an image without alpha is returned unchanged.
     """
     if image.shape[2] == 3:
         return image
@@ -181,17 +177,17 @@ def over_background(
 
 
 def views_of_split(capture: Capture, split: Split) -> list[View]:
-    """The capture's "train" or "test" views.
+    """Return the capture's "train" or "test" views.
 
     Raises:
-        IgsrError: there are none, or ``split`` is another name.
+        IgsrError: the split has no views, or ``split`` is another name.
     """
     if split not in ("train", "test"):
         raise IgsrError(f'split must be "train" or "test", not {split!r}.')
     views = capture.test_views if split == "test" else capture.train_views
     if not views:
-        mend = "; hold some out (--holdout 8) or score the train views" if split == "test" else ""
-        raise IgsrError(f"{capture.path} has no {split} views{mend}.")
+        fix = "; hold some out (--holdout 8) or score the train views" if split == "test" else ""
+        raise IgsrError(f"{capture.path} has no {split} views{fix}.")
     return views
 
 
@@ -200,22 +196,22 @@ def score_views(
     views: Sequence[View],
     background: Sequence[float],
     backend: Backend = "auto",
-    names: Sequence[str] = metrics.NAMES,
+    names: Sequence[str] = METRICS,
 ) -> Iterator[ScoredView]:
-    """Render and score views one by one, so that only what the caller keeps stays in memory.
+    """Render and score views, one at a time to save memory.
 
     Args:
         splats: the scene.
         views: the photos with their cameras.
-        background: RGB in [0, 1], behind renders and behind photos with alpha.
+        background: RGB in [0, 1] behind renders and photos with alpha.
         backend: "auto", "cpu", "gpu" or "reference".
-        names: of the scores that are wanted.
+        names: metrics to compute.
 
     Yields:
         Each view with its scores.
 
     Raises:
-        IgsrError: as ``check_masks``, before anything is rendered.
+        IgsrError: a mask leaves no pixel to score; raised before the first render.
     """
     check_masks(views)
     for view in views:
@@ -228,13 +224,16 @@ def score_views(
 def render_of(
     splats: Splats, view: View, background: Sequence[float], backend: Backend = "auto"
 ) -> metrics.Image:
-    """A view's render in 8 bits, uint8 [H, W, 3], with the view's exposure where that is known.
+    """Render a view in 8 bits, with the view's exposure if it is known.
 
     Args:
         splats: the scene.
-        view: its camera, and its exposure, are the render's.
+        view: the view with its camera and exposure.
         background: RGB in [0, 1].
         backend: "auto", "cpu", "gpu" or "reference".
+
+    Returns:
+        uint8 [H, W, 3].
     """
     picture = render(splats, view.camera, background, backend)
     if view.exposure is not None:
@@ -252,7 +251,7 @@ def check_masks(views: Sequence[View]) -> None:
     """
     for view in views:
         if view.mask is not None and not view.mask.any():
-            raise IgsrError(f"{view.name}: its mask leaves no pixel to score; leave it out.")
+            raise IgsrError(f"{view.name}: its mask leaves no pixel to score; remove the view.")
 
 
 def evaluate(
@@ -265,19 +264,19 @@ def evaluate(
 ) -> Scores:
     """Score ``splats`` on the views of one split.
 
-    Scores are of the 8-bit pictures (see ``igsr.evaluation.metrics``). Masked pixels do not count.
-    A view whose ``exposure`` is known, as that of a fitted photo, is compared with a render of that
-    exposure. Nothing is learned from held-out photos but for "cc_psnr" and "cc_ssim", whose name
-    says so: there the render's colors are mapped to the photo's first.
-    Photos with alpha are composited over ``background``, which is also behind the renders.
+    Scores compare 8-bit pictures (see ``igsr.evaluation.metrics``); masked pixels do not count. A
+    view with a known ``exposure``, such as a fitted photo, is compared with a render of that
+    exposure. Only "cc_psnr" and "cc_ssim" use the held-out photos themselves: they map the render's
+    colors to the photo's first.
 
     Args:
         splats: the scene.
         capture: the photos and cameras.
         split: "test" or "train".
-        background: RGB in [0, 1]; None is white if photos have alpha, else black.
+        background: RGB in [0, 1] behind renders and photos with alpha; None is white if photos
+            have alpha, else black.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu" or "reference".
-        on_view: called with each view once it is scored, for progress and contact sheets.
+        on_view: called with each scored view, for progress and contact sheets.
 
     Returns:
         Means over the views, and the scores of each view.
@@ -305,10 +304,10 @@ def evaluate(
         )
         if on_view is not None:
             on_view(scored)
-    means = {
-        name: float(np.mean(values)) if (values := _known(row[name] for row in rows)) else None
-        for name in METRICS
-    }
+    means: dict[str, float | None] = {}
+    for name in METRICS:
+        values = [row[name] for row in rows if row[name] is not None]
+        means[name] = float(np.mean(values)) if values else None
     protocol = {
         "split": split,
         "views": len(rows),
@@ -320,7 +319,3 @@ def evaluate(
         "color_correction": "quadratic map to each photo, least squares (Mip-NeRF 360)",
     }
     return Scores(**means, protocol=protocol, views=rows)
-
-
-def _known(values: Iterator[float | None]) -> list[float]:
-    return [value for value in values if value is not None]

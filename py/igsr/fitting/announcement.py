@@ -7,7 +7,7 @@ from typing import Any
 
 from igsr.capture.downscaling import reduced_size
 from igsr.capture.overview import Overview
-from igsr.evaluation.quick_scores import MOST_TRAIN
+from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.fitting.photo_support import PhotoSupport, detail_of_files
 from igsr.fitting.presets import Quality, settings_for
 from igsr.fitting.time_estimate import fit_seconds, other_seconds, timed_steps, times_usual
@@ -55,7 +55,7 @@ def announcement(
     held_out = len(seen.sizes) - photos
     # Photos with alpha start from their hull, photos with depths from these.
     swept = settings.start in ("auto", "depths") and not has_alpha and not seen.depths
-    scored = held_out + min(photos, MOST_TRAIN)
+    scored = held_out + min(photos, MAX_TRAIN_PHOTOS)
     # Scores and depth maps run on the CPU; a GPU's steps do not say how fast it is.
     times = times_usual(step, has_alpha) if backend == "cpu" else 1.0
     fit += other_seconds(photos if swept else 0, scored, pixels, times)

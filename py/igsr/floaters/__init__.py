@@ -1,4 +1,4 @@
-"""Floaters: splats that no photo shows, that masks hide, before the surface, or alone."""
+"""Removal of floaters: splats that no photo supports."""
 
 from igsr.floaters.removal import Cleaned, remove_floaters
 

@@ -1,21 +1,19 @@
 """``rasterization``: the renderer as a differentiable torch function, called like gsplat's.
 
 Argument names, defaults, shapes and the returned triple follow gsplat 1.5 and its development
-branch of 2026. A gsplat user switches by changing an import, and gsplat's strategies run on it.
-Arguments that this renderer does not support are refused by name.
+branch of 2026, so that gsplat's users change an import, and gsplat's strategies run on it.
 
-Two autograd functions do the work, one per half of the pipeline: ``_Project`` and ``_Rasterize``.
-Between them are ``means2d`` (density control reads ``meta["means2d"].grad``) and ``factors``, the
-upper-triangular factor of each conic. It has the information of a covariance, without its
-cancellation for long needles. Everything that gsplat offers around them (further channels, normals,
-backgrounds and masks per pixel) is composed of the two in torch.
+Two autograd functions do the work: ``_Project`` and ``_Rasterize``. Between them are ``means2d``
+(density control reads ``meta["means2d"].grad``) and ``factors``, the upper-triangular factor of
+each conic, which avoids the cancellation that a covariance has for long needles. Further channels,
+normals, and backgrounds and masks per pixel are composed of the two in torch.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -32,12 +30,11 @@ from igsr.rendering.rasterization_arguments import FLOAT32_MAX, check_arguments
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 
-#: Colour channels that one pass of the kernels draws.
-GROUP = 3
-#: Render modes whose picture shows the colours.
+#: Color channels that one pass of the kernels draws.
+CHANNELS_PER_PASS = 3
 COLOR_MODES = ("RGB", "RGB+D", "RGB+ED")
 
-#: What passes from ``_Project`` to ``_Rasterize``; the last carries no gradient.
+#: Outputs of ``_Project``; "radii" has no gradient.
 DIFFERENTIABLE = ("means2d", "factors", "depths", "colors", "opacities")
 PROJECTED = (*DIFFERENTIABLE, "radii")
 IMAGE = ("color", "alpha", "depth", "transmittance")
@@ -45,7 +42,7 @@ IMAGE = ("color", "alpha", "depth", "transmittance")
 
 @dataclass(frozen=True)
 class _Settings:
-    """Arguments that both halves need and autograd does not track."""
+    """Arguments without gradients that both halves need."""
 
     width: int
     height: int
@@ -58,45 +55,24 @@ class _Settings:
 
 
 def _array(tensor: Tensor, dtype: Any) -> npt.NDArray[Any]:
-    """A tensor as an array in host memory: its own memory if it is contiguous, there, and of that
-    dtype."""
+    """The tensor as a contiguous array in host memory; a copy only if necessary."""
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=dtype)
 
 
 def _tensor(array: npt.NDArray[Any], like: Tensor) -> Tensor:
-    """An array as a tensor with the device and dtype of ``like``; its own memory if it can be.
+    """The array as a tensor with the device and dtype of ``like``; a copy only if necessary.
 
-    A number too large for float32, such as the gradient of a splat of 1e38 units, becomes one whose
-    sum over a thousand cameras is still finite.
+    Numbers too large for float32, such as the gradient of a splat of 1e38 units, are clipped so
+    that their sum over a thousand cameras is finite.
     """
     if array.dtype == np.float64 and like.dtype == torch.float32:
-        limit = float(np.finfo(np.float32).max) / 1024.0
+        limit = FLOAT32_MAX / 1024.0
         array = array.clip(-limit, limit)
     return torch.from_numpy(array).to(like)
 
 
-def _project_options(viewmat: Tensor, K: Tensor, settings: _Settings) -> dict[str, Any]:
-    return {
-        "sh_degree": settings.sh_degree,
-        "raw_parameters": False,
-        "viewmat": _array(viewmat, np.float64),
-        "intrinsics": _array(K, np.float64)[[0, 1, 0, 1], [0, 1, 2, 2]],
-        "width": settings.width,
-        "height": settings.height,
-        "near": settings.near,
-        "far": settings.far,
-        "eps2d": settings.eps2d,
-        "antialiased": settings.antialiased,
-        "backend": settings.backend,
-    }
-
-
-def _projected_arrays(projected: Iterable[Tensor], dtype: Any) -> dict[str, npt.NDArray[Any]]:
-    return {name: _array(t, dtype) for name, t in zip(PROJECTED, projected, strict=True)}
-
-
 class _Project(torch.autograd.Function):
-    """Splats and one camera to 2D Gaussians."""
+    """Project splats to the 2D Gaussians of one camera."""
 
     @staticmethod
     def forward(
@@ -111,19 +87,29 @@ class _Project(torch.autograd.Function):
         settings: _Settings,
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
+        names = ("means", "quats", "scales", "opacities", "colors")
+        splats = (means, quats, scales, opacities, colors)
         inputs: dict[str, Any] = {
-            "means": _array(means, dtype),
-            "quats": _array(quats, dtype),
-            "scales": _array(scales, dtype),
-            "opacities": _array(opacities, dtype),
-            "colors": _array(colors, dtype),
+            name: _array(tensor, dtype) for name, tensor in zip(names, splats, strict=True)
         }
-        options = _project_options(viewmat, K, settings)
+        options: dict[str, Any] = {
+            "sh_degree": settings.sh_degree,
+            "raw_parameters": False,
+            "viewmat": _array(viewmat, np.float64),
+            "intrinsics": _array(K, np.float64)[[0, 1, 0, 1], [0, 1, 2, 2]],
+            "width": settings.width,
+            "height": settings.height,
+            "near": settings.near,
+            "far": settings.far,
+            "eps2d": settings.eps2d,
+            "antialiased": settings.antialiased,
+            "backend": settings.backend,
+        }
         projected = _core.project(**inputs, **options)
         outputs = tuple(_tensor(projected[name], means) for name in PROJECTED)
-        # The arrays share memory with these tensors. autograd notices changes in place only of
-        # tensors that are saved here; backward() then refuses.
-        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmat, K, *outputs)
+        # The arrays share memory with these tensors. autograd detects changes in place only of
+        # tensors that are saved here; backward() then raises.
+        ctx.save_for_backward(*splats, viewmat, K, *outputs)
         ctx.inputs, ctx.options, ctx.projected = inputs, options, projected
         ctx.mark_non_differentiable(*outputs[len(DIFFERENTIABLE) :])
         return outputs
@@ -142,9 +128,8 @@ class _Project(torch.autograd.Function):
         )
         v_fx, v_fy, v_cx, v_cy = v["v_intrinsics"]
         v_K = np.array([[v_fx, 0.0, v_cx], [0.0, v_fy, v_cy], [0.0, 0.0, 0.0]])
-        names = ("v_means", "v_quats", "v_scales", "v_opacities", "v_colors")
         return (
-            *(_tensor(v[name], means) for name in names),
+            *(_tensor(v[f"v_{name}"], means) for name in ctx.inputs),
             _tensor(v["v_viewmat"], viewmat),
             _tensor(v_K, K),
             None,
@@ -152,7 +137,7 @@ class _Project(torch.autograd.Function):
 
 
 class _Rasterize(torch.autograd.Function):
-    """2D Gaussians to one picture."""
+    """Draw 2D Gaussians."""
 
     @staticmethod
     def forward(
@@ -163,10 +148,10 @@ class _Rasterize(torch.autograd.Function):
         *projected: Tensor,
     ) -> tuple[Tensor, ...]:
         dtype = _core.working_dtype(settings.backend)
-        # Gradients of outputs that the loss does not use come as None, not as zeros.
+        # Gradients of unused outputs come as None, not as zeros.
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(background, *projected)
-        ctx.projected = _projected_arrays(projected, dtype)
+        ctx.projected = {n: _array(t, dtype) for n, t in zip(PROJECTED, projected, strict=True)}
         ctx.keep_absolute = keep_absolute
         ctx.background, ctx.backend = _array(background, dtype), settings.backend
         ctx.image = _core.rasterize(
@@ -188,7 +173,7 @@ class _Rasterize(torch.autograd.Function):
         v_transmittance: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
         background = ctx.saved_tensors[0]
-        if v_transmittance is not None:  # it is 1 - alpha
+        if v_transmittance is not None:  # transmittance is 1 - alpha
             v_alpha = -v_transmittance if v_alpha is None else v_alpha - v_transmittance
         v_image = {
             f"v_{name}": np.zeros_like(ctx.image[name])
@@ -228,129 +213,63 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int | None = _core.TILE_SIZE,
     backgrounds: Tensor | None = None,
     render_mode: RenderMode = "RGB",
-    sparse_grad: bool = False,
     absgrad: bool = False,
     rasterize_mode: RasterizeMode = "classic",
-    channel_chunk: int = 32,
-    distributed: bool = False,
-    camera_model: Literal["pinhole"] = "pinhole",
-    segmented: bool = False,
-    covars: Tensor | None = None,
-    with_ut: bool = False,
-    with_eval3d: bool = False,
-    radial_coeffs: Tensor | None = None,
-    tangential_coeffs: Tensor | None = None,
-    thin_prism_coeffs: Tensor | None = None,
-    ftheta_coeffs: Any = None,
-    rolling_shutter: Any = None,
-    viewmats_rs: Tensor | None = None,
-    macro_tile: bool = False,
-    return_normals: bool = False,
-    global_z_order: bool = True,
-    rays: Tensor | None = None,
-    lidar_coeffs: Any = None,
-    external_distortion_coeffs: Any = None,
-    ut_params: Any = None,
-    extra_signals: Tensor | None = None,
-    extra_signals_sh_degree: int | None = None,
-    renderer_config: Any = None,
-    nht_params: Any = None,
     backend: Backend = "auto",
     masks: Tensor | None = None,
     render_normals: bool = False,
+    **unsupported: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians from C cameras, differentiably.
 
     ``rasterization(**splats.to_torch(), viewmats=..., Ks=..., width=..., height=...)`` renders
-    ``Splats``. Arguments behind ``height`` are keyword-only.
+    ``Splats``.
 
     Gradients reach ``means``, ``quats``, ``scales``, ``opacities``, ``colors``, ``viewmats``,
     ``Ks`` (fx, fy, cx, cy) and ``backgrounds``. Splat tensors are float32; with backend
-    "reference" they may all be float64, and then everything is computed and returned in it.
-    Cameras are float32 or float64.
+    "reference" they may all be float64, and the results are, too. Cameras are float32 or float64.
 
-    Tensors may be on any torch device (all on one); the result is on it too. The kernels take
-    arrays in host memory (from which backend "gpu" feeds its own device). Contiguous tensors on the
-    CPU are used in place. Others are copied in each call, for every camera: this many bytes in
-    float32, with P = ceil(D / 3) passes (one for "D" and "ED"; one more for ``render_normals``
-    with colours):
-
-        forward     to the host    44 + 12 K per splat (K = 1 for direct colors), and then
-                                   48 P per splat (per drawn splat if ``packed``)
-                    to the device  48 per splat, and then 24 P per pixel
-        backward    to the host    at most 20 P per pixel (color 12, alpha 4, depth 4; what the
-                                   loss does not use is not copied), and then 40 per splat
-                    to the device  40 P per splat (8 more with ``absgrad``; per drawn splat if
-                                   ``packed``), and then 44 + 12 K per splat
+    All tensors are on one torch device, and the results are on it. The kernels take arrays in host
+    memory: tensors that are not contiguous on the CPU are copied for each camera.
 
     Args:
-        means: [N, 3] centres, world frame.
-        quats: [N, 4] rotations w x y z, normalised inside.
-        scales: [N, 3] standard deviations in world units (not logarithms; a splat with a negative
-            one is not drawn).
-        opacities: [N] in [0, 1] (not logits).
-        colors: [N, D] or [C, N, D] colors or other features, any D >= 1; with ``sh_degree``,
-            [N, K, 3] or [C, N, K, 3] spherical-harmonics coefficients with
-            K >= (sh_degree + 1)^2, and D = 3. Channels are drawn three at a time; every three
-            cost a whole pass over the 2D splats.
+        means: [N, 3] centers, world frame.
+        quats: [N, 4] rotations w x y z, normalized internally.
+        scales: [N, 3] standard deviations, world units, not logarithms. Splats with a negative one
+            are not drawn.
+        opacities: [N] in [0, 1], not logits.
+        colors: [N, D] or [C, N, D] colors or other features, D >= 1; with ``sh_degree``, [N, K, 3]
+            or [C, N, K, 3] spherical-harmonics coefficients, K >= (sh_degree + 1)^2, and D = 3.
+            Three channels take one pass over the 2D splats.
         viewmats: [C, 4, 4] rigid world-to-camera matrices, OpenCV axes.
-        Ks: [C, 3, 3] pinhole matrices in pixels without skew; pixel centres at +0.5.
+        Ks: [C, 3, 3] pinhole matrices without skew, pixels; pixel centers at +0.5.
         width: of the picture, pixels.
         height: of the picture, pixels.
-        near_plane: world units; splats whose centre has a camera-space z below it are not drawn.
-        far_plane: likewise above it; may be inf.
-        radius_clip: splats whose ``radii`` are both at most this many pixels are not drawn.
-        eps2d: variance in square pixels added to every projected Gaussian.
-        sh_degree: spherical-harmonics degree to evaluate, 0-4, or None for direct colors.
-        packed: True (gsplat's default) returns per-splat ``meta`` entries only for the nnz
-            visible (camera, splat) pairs, [nnz, ...] with ``camera_ids`` and ``gaussian_ids``;
-            False returns them [C, N, ...], zero ``radii`` meaning not visible. The picture does
-            not depend on it; pass the strategy's ``packed`` the same value, as with gsplat.
-        backgrounds: [C, D] color behind the splats, or [C, height, width, D], one per pixel; None
-            is black. Depth and normals have no background.
-        render_mode: "RGB"; "D" accumulated depth; "ED" expected depth (accumulated / alpha, 0
-            where alpha is 0); "RGB+D", "RGB+ED" with the depth as last channel.
-        absgrad: True leaves in ``meta["means2d"].absgrad``, after ``backward()``, the sum over
-            pixels of the absolute gradients of ``means2d``, shaped like it, for
-            ``DefaultStrategy(absgrad=True)``. They are known within one pass only: it needs at
-            most three channels, and no ``render_normals``.
-        rasterize_mode: "classic", or "antialiased": opacities times
-            sqrt(det(S) / det(S + eps2d I)) with S the projected 2D covariance (Mip-Splatting's 2D
-            filter); ``meta["opacities"]`` are those.
-        channel_chunk: accepted as in gsplat 1.5; it has no effect.
+        near_plane: splats with a smaller camera-space z are not drawn, world units.
+        far_plane: splats with a larger camera-space z are not drawn; may be inf.
+        radius_clip: splats with both ``radii`` at most this are not drawn, pixels.
+        eps2d: variance added to projected Gaussians, square pixels.
+        sh_degree: spherical-harmonics degree to evaluate, 0-4; None for direct colors.
+        packed: whether ``meta`` has entries per splat only for the nnz visible (camera, splat)
+            pairs, [nnz, ...], with ``camera_ids`` and ``gaussian_ids``; else [C, N, ...] with zero
+            ``radii`` for invisible splats. Give gsplat's strategies the same value.
+        backgrounds: [C, D] colors behind the splats, or [C, height, width, D]; None is black.
+            Depth and normals have no background.
+        render_mode: "RGB"; "D" accumulated depth; "ED" expected depth (accumulated / alpha, 0 if
+            alpha is 0); "RGB+D" and "RGB+ED" with the depth as last channel.
+        absgrad: whether ``backward()`` leaves the sum over pixels of the absolute gradients of
+            ``means2d`` in ``meta["means2d"].absgrad``, for ``DefaultStrategy(absgrad=True)``.
+            Needs at most three channels and no ``render_normals``.
+        rasterize_mode: "classic", or "antialiased": opacities, also in ``meta``, are multiplied by
+            sqrt(det(S) / det(S + eps2d I)) with S the 2D covariance (Mip-Splatting's 2D filter).
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu", "reference".
-        masks: [C, height, width] bool; where False the pixel shows the background, its alpha,
-            depth and normal are 0, and it passes no gradient to the splats and the camera. These
-            are the tile masks of gsplat's ``rasterize_to_pixels``, per pixel; they save no time.
-        render_normals: True adds ``meta["render_normals"]``.
-        tile_size: of gsplat 1.5; only its default is accepted.
-        sparse_grad: of gsplat 1.5; only its default is accepted.
-        distributed: of gsplat 1.5; only its default is accepted.
-        camera_model: of gsplat 1.5; only its default is accepted.
-        segmented: of gsplat 1.5; only its default is accepted.
-        covars: of gsplat 1.5; only its default is accepted.
-        with_ut: of gsplat 1.5; only its default is accepted.
-        with_eval3d: of gsplat 1.5; only its default is accepted.
-        radial_coeffs: of gsplat 1.5; only its default is accepted.
-        tangential_coeffs: of gsplat 1.5; only its default is accepted.
-        thin_prism_coeffs: of gsplat 1.5; only its default is accepted.
-        ftheta_coeffs: of gsplat 1.5; only its default is accepted.
-        rolling_shutter: of gsplat 1.5; only its default is accepted.
-        viewmats_rs: of gsplat 1.5; only its default is accepted.
-        macro_tile: of gsplat's development branch; only its default is accepted.
-        return_normals: of gsplat's development branch; only its default is accepted.
-        global_z_order: of gsplat's development branch; only its default is accepted.
-        rays: of gsplat's development branch; only its default is accepted.
-        lidar_coeffs: of gsplat's development branch; only its default is accepted.
-        external_distortion_coeffs: of gsplat's development branch; only its default is accepted.
-        ut_params: of gsplat's development branch; only its default is accepted.
-        extra_signals: of gsplat's development branch; only its default is accepted.
-        extra_signals_sh_degree: of gsplat's development branch; only its default is accepted.
-        renderer_config: of gsplat's development branch; only its default is accepted.
-        nht_params: of gsplat's development branch; only its default is accepted.
+        masks: bool [C, height, width]; False pixels show the background, have alpha, depth and
+            normal 0, and no gradient. gsplat's ``rasterize_to_pixels`` has such masks for tiles.
+        render_normals: whether ``meta`` has ``render_normals``.
+        unsupported: gsplat's other arguments; only their default is accepted. ``channel_chunk``
+            has no effect.
 
     Returns:
         ``render_colors`` [C, height, width, X] with X = D, 1 or D + 1 by ``render_mode``,
@@ -358,120 +277,121 @@ def rasterization(
         ``retain_grad()`` before ``backward()``), ``radii`` (int32 pixels, x and y, rounded up),
         ``depths``, ``conics`` (xx, xy, yy), ``opacities``, ``batch_ids``, ``camera_ids``,
         ``gaussian_ids``, ``width``, ``height``, ``tile_size``, ``tile_width``, ``tile_height``,
-        ``n_batches``, ``n_cameras`` (gsplat's lists of tiles, ``isect_ids`` and the like, are
-        not there); and ``render_normals`` [C, height, width, 3] if asked for: the shortest axis
-        of each splat, turned to face the camera, in the world frame, accumulated with the weights
-        of the colors (so at most alpha long), as gsplat's ``rasterization_2dgs`` returns it.
+        ``n_batches``, ``n_cameras``, but not gsplat's lists of tiles; and if asked for,
+        ``render_normals`` [C, height, width, 3]: the splats' shortest axes, facing the camera, in
+        the world frame, accumulated like colors, as in gsplat's ``rasterization_2dgs``.
 
     Raises:
-        ValueError: an argument has the wrong type, dtype, shape, device or value, or is one of
-            gsplat's that is not supported. The message begins with the argument's name.
+        ValueError: an argument has the wrong type, dtype, shape, device or value, or is not
+            supported. The message begins with the argument's name.
+        TypeError: an argument is unknown.
         RuntimeError: backend "gpu" was asked for and no adapter answers; or, in ``backward()``,
-            a tensor that it needs was changed in place since.
+            a tensor that it needs was changed in place.
     """
     check_arguments(locals())
-    backend = _core.resolve_backend(backend)
-    antialiased = rasterize_mode == "antialiased"
     settings = _Settings(
         width,
         height,
         near_plane,
         min(far_plane, FLOAT32_MAX),
         eps2d,
-        antialiased,
+        rasterize_mode == "antialiased",
         sh_degree,
-        backend,
+        _core.resolve_backend(backend),
     )
-    cameras = len(viewmats)
     channels = colors.shape[-1]
     per_camera_colors = colors.dim() == (3 if sh_degree is None else 4)
     further: Tensor | None = None
-    if sh_degree is None and channels != GROUP:
+    if sh_degree is None and channels != CHANNELS_PER_PASS:
         colors, further = _grouped(colors)
         if render_mode not in COLOR_MODES:
             further = None
 
     views, ids = [], []
-    for c in range(cameras):
-        of_camera = (means, quats, scales, opacities, colors[c] if per_camera_colors else colors)
-        outputs = _Project.apply(*of_camera, viewmats[c], Ks[c], settings)
+    for c in range(len(viewmats)):
+        of_camera = (colors[c] if per_camera_colors else colors, viewmats[c], Ks[c])
+        outputs = _Project.apply(means, quats, scales, opacities, *of_camera, settings)
         view = dict(zip(PROJECTED, outputs, strict=True))
         if radius_clip > 0.0:
             radii = view["radii"]
-            # gsplat compares the whole numbers that ``meta`` has.
+            # gsplat compares the rounded radii.
             view["radii"] = radii * (torch.ceil(radii) > radius_clip).any(dim=-1, keepdim=True)
         if further is not None:
             view["further"] = further[c] if per_camera_colors else further
-        if packed or render_normals:
-            drawn = view["radii"].amin(dim=-1) > 0
-        if render_normals:
+        drawn = view["radii"].amin(dim=-1) > 0 if packed or render_normals else None
+        if drawn is not None and render_normals:
             view["normals"] = facing_normals(means, quats, scales, viewmats[c], drawn)
-        if packed:
+        if drawn is not None and packed:
             ids.append(drawn.nonzero().squeeze(1))
             view = {name: per_splat.index_select(0, ids[-1]) for name, per_splat in view.items()}
         views.append(view)
 
-    # The graph has one tensor for all cameras: the strategies read its gradient.
+    # The graph has one tensor for all cameras, since the strategies read its gradient.
     joined = {name: _joined([view[name] for view in views], packed) for name in PROJECTED}
     means2d = joined["means2d"]
-    counts = [len(view["means2d"]) for view in views]
-    ends = list(itertools.accumulate(counts))
-    segments = [slice(end - n, end) for end, n in zip(ends, counts, strict=True)]
-    drawings = [
-        _draw(
-            {**view, "means2d": means2d[segments[c] if packed else c]},
-            None if backgrounds is None else backgrounds[c],
-            None if masks is None else masks[c],
-            channels,
-            render_mode,
-            settings,
-            _absgrad_keeper(means2d, segments[c] if packed else c) if absgrad else None,
+    ends = list(itertools.accumulate(len(view["means2d"]) for view in views))
+    drawings = []
+    for c, view in enumerate(views):
+        segment = slice(ends[c] - len(view["means2d"]), ends[c]) if packed else c
+        drawings.append(
+            _draw(
+                {**view, "means2d": means2d[segment]},
+                None if backgrounds is None else backgrounds[c],
+                None if masks is None else masks[c],
+                channels,
+                render_mode,
+                settings,
+                _absgrad_keeper(means2d, segment) if absgrad else None,
+            )
         )
-        for c, view in enumerate(views)
-    ]
     pictures, alphas, normals = zip(*drawings, strict=True)
-
-    p, q, r = joined["factors"].unbind(dim=-1)
-    meta: dict[str, Any] = {
-        "batch_ids": None,
-        "camera_ids": None,
-        "gaussian_ids": None,
-        # The cast of inf to int32 is undefined, and no useful radius is that large.
-        "radii": torch.ceil(joined["radii"]).clamp(max=2.0**30).to(torch.int32),
-        "means2d": means2d,
-        "depths": joined["depths"],
-        "conics": torch.stack([p * p, p * q, q * q + r * r], dim=-1),
-        "opacities": joined["opacities"],
-        "width": width,
-        "height": height,
-        "tile_size": _core.TILE_SIZE,
-        "tile_width": math.ceil(width / _core.TILE_SIZE),
-        "tile_height": math.ceil(height / _core.TILE_SIZE),
-        "n_batches": 1,
-        "n_cameras": cameras,
-    }
-    if packed:
-        meta["gaussian_ids"] = torch.cat(ids)
-        camera_ids = torch.arange(cameras, device=means.device)
-        meta["camera_ids"] = camera_ids.repeat_interleave(torch.tensor(counts).to(means.device))
-        meta["batch_ids"] = torch.zeros_like(meta["camera_ids"])
+    meta = _meta(joined, ids if packed else None, settings, len(views))
     if render_normals:
         meta["render_normals"] = torch.stack(normals)
     return _joined(list(pictures), packed=False), torch.stack(alphas), meta
 
 
+def _meta(
+    joined: dict[str, Tensor], ids: list[Tensor] | None, settings: _Settings, cameras: int
+) -> dict[str, Any]:
+    """gsplat's ``meta``; ``ids`` are those of each camera's visible splats if packed."""
+    p, q, r = joined["factors"].unbind(dim=-1)
+    meta: dict[str, Any] = {
+        "batch_ids": None,
+        "camera_ids": None,
+        "gaussian_ids": None,
+        # Clamped, since a cast of inf to int32 is undefined.
+        "radii": torch.ceil(joined["radii"]).clamp(max=2.0**30).to(torch.int32),
+        "means2d": joined["means2d"],
+        "depths": joined["depths"],
+        "conics": torch.stack([p * p, p * q, q * q + r * r], dim=-1),
+        "opacities": joined["opacities"],
+        "width": settings.width,
+        "height": settings.height,
+        "tile_size": _core.TILE_SIZE,
+        "tile_width": math.ceil(settings.width / _core.TILE_SIZE),
+        "tile_height": math.ceil(settings.height / _core.TILE_SIZE),
+        "n_batches": 1,
+        "n_cameras": cameras,
+    }
+    if ids is not None:
+        device = joined["means2d"].device
+        counts = torch.tensor([len(of_camera) for of_camera in ids]).to(device)
+        meta["gaussian_ids"] = torch.cat(ids)
+        meta["camera_ids"] = torch.arange(cameras, device=device).repeat_interleave(counts)
+        meta["batch_ids"] = torch.zeros_like(meta["camera_ids"])
+    return meta
+
+
 def _joined(tensors: list[Tensor], packed: bool) -> Tensor:
-    """Tensors of all cameras: concatenated if packed, else stacked along a new dimension."""
-    if len(tensors) == 1:  # nothing to copy
+    """Concatenate the cameras' tensors if packed, else stack them."""
+    if len(tensors) == 1:  # without a copy
         return tensors[0] if packed else tensors[0][None]
     return torch.cat(tensors) if packed else torch.stack(tensors)
 
 
 def _absgrad_keeper(means2d: Tensor, of_camera: int | slice) -> Callable[[Tensor], None]:
-    """A function for the backward pass that writes a camera's part of ``means2d.absgrad``.
-
-    ``means2d`` comes before the pass in the graph, so a reference to it makes no cycle.
-    """
+    """A callback of the backward pass that writes a camera's part of ``means2d.absgrad``."""
 
     def keep(absolute: Tensor) -> None:
         if not hasattr(means2d, "absgrad"):
@@ -482,17 +402,19 @@ def _absgrad_keeper(means2d: Tensor, of_camera: int | slice) -> Callable[[Tensor
 
 
 def _grouped(colors: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Colors [..., D] as the first three channels and the others, padded with zeros.
+    """Split colors [..., D] into the first three channels and further ones, padded with zeros.
 
-    The first three go through the projection, which does not draw a splat that is not finite. NaN
-    in the others is carried over to them, to have the same effect.
+    The projection drops splats whose first three channels are not finite, so NaN in further ones is
+    added to them.
     """
     channels = colors.shape[-1]
-    if channels <= GROUP:
-        return torch.nn.functional.pad(colors, (0, GROUP - channels)), None
-    first, others = colors.split([GROUP, channels - GROUP], dim=-1)
-    zero_or_nan = (others.detach() * 0.0).sum(dim=-1, keepdim=True)
-    return first + zero_or_nan, torch.nn.functional.pad(others, (0, -channels % GROUP))
+    missing = CHANNELS_PER_PASS - channels
+    if missing >= 0:
+        return torch.nn.functional.pad(colors, (0, missing)), None
+    first, further = colors.split([CHANNELS_PER_PASS, -missing], dim=-1)
+    zero_or_nan = (further.detach() * 0.0).sum(dim=-1, keepdim=True)
+    padding = (0, -channels % CHANNELS_PER_PASS)
+    return first + zero_or_nan, torch.nn.functional.pad(further, padding)
 
 
 def _draw(
@@ -504,20 +426,20 @@ def _draw(
     settings: _Settings,
     keep_absolute: Callable[[Tensor], None] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """One camera's picture [H, W, X], alpha [H, W, 1] and normals [H, W, 3], if asked for.
+    """Draw one camera's picture [H, W, X], alpha [H, W, 1] and normals [H, W, 3], if asked for.
 
-    ``background`` is [D] or [H, W, D], ``mask`` [H, W]. Every group of three channels is a pass of
-    its own over the same 2D splats; autograd adds up their gradients.
+    ``background`` is [D] or [H, W, D], ``mask`` [H, W]. Each group of three channels is a pass over
+    the same 2D splats; autograd adds their gradients.
     """
     in_color = render_mode in COLOR_MODES
     groups = [view["colors"]]
     if "further" in view:
-        groups += view["further"].split(GROUP, dim=-1)
+        groups += view["further"].split(CHANNELS_PER_PASS, dim=-1)
     color_groups = len(groups) if in_color else 0
     if "normals" in view:
         groups = [*groups[:color_groups], view["normals"]]
 
-    behind = view["means2d"].new_zeros(GROUP * len(groups))
+    behind = view["means2d"].new_zeros(CHANNELS_PER_PASS * len(groups))
     if background is not None and in_color and background.dim() == 1:
         behind = torch.nn.functional.pad(background, (0, len(behind) - channels))
     passes = [
@@ -527,25 +449,24 @@ def _draw(
             keep_absolute,
             *(group if name == "colors" else view[name] for name in PROJECTED),
         )
-        for group, group_behind in zip(groups, behind.split(GROUP), strict=True)
+        for group, group_behind in zip(groups, behind.split(CHANNELS_PER_PASS), strict=True)
     ]
-    # These are the same in every pass, so the gradient through one pass is complete.
+    # Alpha and depth are equal in all passes, so the gradient of one pass is complete.
     _, alpha, depth, transmittance = (image[..., None] for image in passes[0])
 
     pieces = [color for color, *_ in passes[:color_groups]]
-    if in_color and channels % GROUP:
-        pieces[-1] = pieces[-1][..., : channels % GROUP]
+    if in_color and channels % CHANNELS_PER_PASS:
+        pieces[-1] = pieces[-1][..., : channels % CHANNELS_PER_PASS]
     if render_mode.endswith("ED"):
-        # The depth is 0 where nothing is drawn; elsewhere alpha is at least 1/255.
+        # Depth is 0 in empty pixels; in other pixels alpha is at least 1/255.
         depth = depth / alpha.clamp(min=1e-3)
     if render_mode != "RGB":
         pieces.append(depth)
-    # A copy, which the caller may change: the backward pass needs the pieces.
+    # A copy, since the backward pass needs the pieces and the caller may change the picture.
     picture = torch.cat(pieces, dim=-1) if len(pieces) > 1 else pieces[0].clone()
     normals = passes[-1][0] if "normals" in view else None
 
     if background is not None and in_color:
-        # The depth has no background.
         background = torch.nn.functional.pad(background, (0, picture.shape[-1] - channels))
         if background.dim() == 3:
             picture = picture + transmittance * background

@@ -54,7 +54,7 @@ NEAR_PART = 0.05
 UP = (0.0, -1.0, 0.0)
 #: Pages with more splats in all leave out the models that the last is compared with: two or three
 #: times as many bytes would be too many to send.
-MOST_COMPARED = 300_000
+MAX_COMPARED_SPLATS = 300_000
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def live_page(title: str) -> str:
 
 def compared(models: Sequence[PageModel]) -> list[PageModel]:
     """The models that a page has room for: all, or the last alone."""
-    fits = sum(len(one.splats) for one in models) <= MOST_COMPARED
+    fits = sum(len(one.splats) for one in models) <= MAX_COMPARED_SPLATS
     return list(models) if fits else [models[-1]]
 
 

@@ -72,7 +72,7 @@ def _told(words: list[str]) -> str:
     paths = os.pathsep.join(path for path in sys.path if path)
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "igsr.viewing.window", *words],
+            [sys.executable, "-m", "igsr.rendering.window", *words],
             capture_output=True,
             text=True,
             timeout=TIMEOUT,

@@ -26,7 +26,7 @@ import igsr
 from igsr.capture import Camera, View, load_capture
 from igsr.capture.write_cameras import write_cameras
 from igsr.evaluation.metrics import psnr, ssim
-from igsr.viewing.level_files import INDEX, level_within, write_levels
+from igsr.rendering.levels import INDEX, level_within, write_levels
 
 #: How many times as far.
 FAR = (1, 2, 4, 8, 16)
@@ -178,7 +178,8 @@ def main() -> None:
     print(f"convert --lod 5: {seconds:.0f} s, {kilobytes / 1024:.0f} MB")
     index = json.loads((folder / INDEX).read_text())
     print(f"levels {index['counts']}, {len(index['filenames'])} files")
-    view, shot = [sys.executable, "-m", "igsr.viewing.window"], ["--backend", "cpu", "--screenshot"]
+    view = [sys.executable, "-m", "igsr.rendering.window"]
+    shot = ["--backend", "cpu", "--screenshot"]
     for camera, place in enumerate(("street", "above")):
         seen_from = ["--cameras", str(args.out / "cameras.json"), "--camera", str(camera)]
         # The truth is the mean of 16 pixels for each: far splats are smaller than one.

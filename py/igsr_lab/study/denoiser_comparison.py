@@ -15,7 +15,7 @@ from typing import Any
 
 from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run, file_hash, finished_runs
-from igsr.denoiser.cleaning import DOUBT, SMALLEST_CHANGE, NetworkDenoiser
+from igsr.denoiser.cleaning import DOUBT, MIN_CHANGE, NetworkDenoiser
 from igsr.denoiser.weights import SHIPPED, load_network
 from igsr.errors import IgsrError
 from igsr_lab.denoiser.pair_files import read_pairs
@@ -213,7 +213,7 @@ def _cleaned(
         "weights": None if weights is None else file_hash(weights),
         "doubt": DOUBT,
         # Older runs have this name.
-        "unseen_change": SMALLEST_CHANGE,
+        "unseen_change": MIN_CHANGE,
         "perceptual": None if features is None else file_hash(features),
     }
     runs = [

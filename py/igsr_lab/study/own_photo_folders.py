@@ -16,7 +16,7 @@ from igsr._internal.worker_processes import in_a_process
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import photo_sizes
 from igsr.errors import IgsrError
-from igsr.evaluation.quick_scores import MOST_TRAIN
+from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.fitting.presets import Preset, default_max_size, preset_settings
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
 from igsr_lab.study.own_photos_runs import (
@@ -76,7 +76,7 @@ def own_photos(
         known_cameras: use cameras that lie beside the photos, where there are some.
         features: SqueezeNet's arrays (.npz), to score a perceptual distance as well.
         left_half: score held-out photos' right halves, too, with the exposure that is found on
-            their left halves (``igsr.evaluation.left_half``).
+            their left halves (``igsr_lab.study.left_half``).
         backend: what fits and renders.
         jobs: runs at a time, each with its share of the cores.
         on_run: called with (done, all, row) after the cameras of a scene, and after each fit.
@@ -161,7 +161,7 @@ def own_photos(
         "max_size": max_size,
         "score_size": score_size,
         "cameras": "known where there are some, else found" if known_cameras else "found",
-        "train": f"at most {MOST_TRAIN} fitted photos of each scene, evenly spaced",
+        "train": f"at most {MAX_TRAIN_PHOTOS} fitted photos of each scene, evenly spaced",
         "refined": "held-out cameras aligned to the fitted ones where those moved, then each "
         "fitted to its photo, splats frozen",
         "backend": _core.backend_info(backend),

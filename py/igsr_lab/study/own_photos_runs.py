@@ -19,9 +19,8 @@ from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import FRAMES
 from igsr.errors import IgsrError
 from igsr.evaluation.contact_sheet import flip_sheet, save_sheet, sheet_names
-from igsr.evaluation.left_half import LEFT_HALF, left_half_scores
 from igsr.evaluation.limits import limit_of
-from igsr.evaluation.quick_scores import psnr_and_ssim, train_photos
+from igsr.evaluation.quick_scores import quick_views, train_photos
 from igsr.evaluation.scores import METRICS, ScoredView, default_background, score_views
 from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.pose_refinement import refine_cameras
@@ -34,6 +33,7 @@ from igsr_lab.denoiser.perceptual_distance import (
     SqueezeNetDistance,
     picture_distance,
 )
+from igsr_lab.study.left_half import LEFT_HALF, left_half_scores
 
 #: Pictures on a sheet have at most so many pixels on their longest side: fog must be seen.
 SHEET_SIDE = 640
@@ -161,11 +161,11 @@ def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
             to_fitted = similarity_between(was, are)
             test = [replace(view, camera=to_fitted.camera(view.camera)) for view in test]
         refined = refine_cameras(splats, test, background, backend=one.backend)
-        again = psnr_and_ssim(splats, refined, background, one.backend)
+        again = _psnr_and_ssim(splats, refined, background, one)
         for view, (psnr, ssim) in zip(row["views"], again, strict=True):
             view |= {"psnr_refined": psnr, "ssim_refined": ssim}
         train = [replace(view, exposure=exposures[view.name]) for view in train]
-        of_train = psnr_and_ssim(splats, train, background, one.backend)
+        of_train = _psnr_and_ssim(splats, train, background, one)
         row["psnr_refined"], row["ssim_refined"] = _means(again)
         row["train_psnr"], row["train_ssim"] = _means(of_train)
     row["limit"] = limit_of(row["train_psnr"], row["psnr"], row["psnr_refined"]).plain()
@@ -210,6 +210,13 @@ def _held_out_scores(
         known = [row[name] for row in rows if row.get(name) is not None]
         means[name] = float(np.mean(known)) if known else None
     return {**means, "views": rows}
+
+
+def _psnr_and_ssim(
+    splats: Splats, views: list[View], background: tuple[float, float, float], one: OwnFit
+) -> list[tuple[float, float]]:
+    scored = quick_views(splats, views, background, one.backend)
+    return [(float(v.scores["psnr"] or 0.0), float(v.scores["ssim"] or 0.0)) for v in scored]
 
 
 def _means(pairs: list[tuple[float, float]]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-// Splats from the page's packed bytes (scene_packing.py), as they go to the GPU: still in 8 bits.
+// Splats from the page's packed bytes (scene_model.py), as they go to the GPU: still in 8 bits.
 //
 // The frame is that of a .spz, y up and z back; the painter turns cameras to it.
 

@@ -1,7 +1,6 @@
-"""The server of ``igsr view --web``.
+"""The HTTP server of ``igsr view --web``, on Python's own ``http.server``.
 
-It is Python's own ``http.server``: a page and four kinds of answers to GET, whose names never reach
-a file system, need no more, and nothing has to be installed.
+It answers five kinds of GET requests; their names are never used as paths.
 """
 
 from __future__ import annotations
@@ -20,24 +19,23 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qs
 
 from igsr.errors import IgsrError
-from igsr.viewing.shown import Shown
+from igsr.rendering.live_view import LiveView
 
 logger = logging.getLogger(__name__)
 
-#: The usual port; if it is taken, one of the next.
+#: The default port, and how many to try if it is taken.
 PORT = 8765
-NEXT_PORTS = 20
-#: Requests that are answered at once, and how long one more waits for its turn, seconds.
-MOST_AT_ONCE = 64
-WAIT = 10.0
-#: A client that is silent for so long has gone, seconds.
-SILENCE = 30.0
-#: Bytes that are sent at once.
-PIECE = 1 << 16
+PORTS_TO_TRY = 20
+MAX_CONCURRENT_REQUESTS = 64
+#: Further requests are dropped after this time.
+QUEUE_TIMEOUT_S = 10.0
+#: Silent clients are dropped after this time.
+CLIENT_TIMEOUT_S = 30.0
+CHUNK_BYTES = 1 << 16
 
 
-def is_own(host: str) -> bool:
-    """Whether an address is one that other computers cannot reach."""
+def is_loopback(host: str) -> bool:
+    """Return whether other computers cannot reach an address."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -45,28 +43,26 @@ def is_own(host: str) -> bool:
 
 
 class ViewServer(ThreadingHTTPServer):
-    """Answers who has the token.
+    """A server that answers requests with its token.
 
     Attributes:
-        shown: what is shown.
-        token: the first part of every address.
+        view: answers the requests.
+        token: the first part of every path.
+
+    Raises:
+        OSError: the port is taken, or the host is not an address of this computer.
     """
 
     daemon_threads = True
-    # A browser asks for much at once; five, the default, would be turned away under load.
+    # The default backlog of 5 drops requests of a browser under load.
     request_queue_size = 128
-    # Another program's port is not to be shared with it.
+    # On Windows this would share a port with another program.
     allow_reuse_address = sys.platform != "win32"
 
-    def __init__(self, shown: Shown, host: str, port: int) -> None:
-        """Listen.
-
-        Raises:
-            OSError: the port is taken, or the host is none of this computer's addresses.
-        """
-        self.shown = shown
+    def __init__(self, view: LiveView, host: str, port: int) -> None:
+        self.view = view
         self.token = secrets.token_urlsafe(16)
-        self._turns = threading.BoundedSemaphore(MOST_AT_ONCE)
+        self._slots = threading.BoundedSemaphore(MAX_CONCURRENT_REQUESTS)
         if ":" in host:
             self.address_family = socket.AF_INET6
         super().__init__((host, port), _Handler)
@@ -80,47 +76,47 @@ class ViewServer(ThreadingHTTPServer):
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/{self.token}/"
 
     def server_bind(self) -> None:
-        """Bind without asking for this computer's full name, which may take seconds."""
+        """Bind without looking up the host's full name, which may take seconds."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def process_request(self, request: object, client_address: object) -> None:
-        """Answer in a thread of its own, when it is its turn."""
-        if not self._turns.acquire(timeout=WAIT):
+        """Answer in a new thread, as soon as fewer than the maximum are running."""
+        if not self._slots.acquire(timeout=QUEUE_TIMEOUT_S):
             self.shutdown_request(request)  # type: ignore[arg-type]
             return
         try:
             super().process_request(request, client_address)  # type: ignore[arg-type]
-        except RuntimeError:  # there is no thread to be had
-            self._turns.release()
+        except RuntimeError:  # no thread can be started
+            self._slots.release()
             raise
 
     def process_request_thread(self, request: object, client_address: object) -> None:
-        """Answer, and let another have its turn."""
+        """Answer, and free the slot."""
         try:
             super().process_request_thread(request, client_address)  # type: ignore[arg-type]
         finally:
-            self._turns.release()
+            self._slots.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A browser that went away is no error."""
+        """Log errors, except those of browsers that disconnect."""
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             logger.exception("a request failed")
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers one request. It speaks HTTP/1.0: no connection stays open between two of them."""
+    """Answers one request, over HTTP/1.0: connections are not kept open."""
 
-    timeout = SILENCE
+    timeout = CLIENT_TIMEOUT_S
     server: ViewServer
     server_version, sys_version = "igsr", ""
 
     def do_GET(self) -> None:
-        """Answer a request that has the token; refuse any other."""
+        """Answer a request if it has the token."""
         path, _, query = self.path.partition("?")
         token, slash, name = path.removeprefix("/").partition("/")
         if not hmac.compare_digest(token.encode(), self.server.token.encode()):
-            message = "This address has no token, or an old one; igsr view printed the right one."
+            message = "This address has no token or an old one; use the one that igsr view printed."
             self._answer_text(HTTPStatus.FORBIDDEN, message)
         elif not slash:
             self.send_response(HTTPStatus.MOVED_PERMANENTLY)
@@ -128,31 +124,32 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", "0")
             self.end_headers()
         else:
-            self._answer_name(name, {key: one[-1] for key, one in parse_qs(query).items()})
+            query_values = {key: values[-1] for key, values in parse_qs(query).items()}
+            self._answer_name(name, query_values)
 
     def log_message(self, *_: object) -> None:
-        """Log nothing: addresses have the token."""
+        """Log nothing, since addresses contain the token."""
 
-    def _answer_name(self, name: str, asked: dict[str, str]) -> None:
-        shown = self.server.shown
+    def _answer_name(self, name: str, query: dict[str, str]) -> None:
+        view = self.server.view
         try:
             if name == "":
-                page = shown.page().encode("utf-8", errors="xmlcharrefreplace")
+                page = view.page().encode("utf-8", errors="xmlcharrefreplace")
                 self._answer("text/html; charset=utf-8", page)
             elif name == "state":
-                self._answer_json(shown.state())
+                self._answer_json(view.state())
             elif name == "surroundings":
-                self._answer_json(shown.surroundings())
+                self._answer_json(view.surroundings())
             elif name == "model":
-                self._answer("application/octet-stream", shown.model(asked["id"]))
-            elif name == "photo" and asked["number"].isdecimal():
-                self._answer("image/jpeg", shown.photo(int(asked["number"])))
+                self._answer("application/octet-stream", view.model(query["id"]))
+            elif name == "photo" and query["number"].isdecimal():
+                self._answer("image/jpeg", view.photo(int(query["number"])))
             else:
                 raise KeyError(name)
         except IgsrError as error:
             self._answer_text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
         except KeyError:
-            self._answer_text(HTTPStatus.NOT_FOUND, "There is no such thing here.")
+            self._answer_text(HTTPStatus.NOT_FOUND, "This address does not exist.")
 
     def _answer_json(self, value: object) -> None:
         self._answer("application/json", json.dumps(value, allow_nan=False).encode())
@@ -167,30 +164,30 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
-        # The address has the token.
+        # The address contains the token.
         self.send_header("Referrer-Policy", "no-referrer")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.end_headers()
-        # In pieces: the time-out is that of a piece, and a large model may take long.
-        for start in range(0, len(content), PIECE):
-            self.wfile.write(content[start : start + PIECE])
+        # In chunks, since the timeout applies to each write.
+        for start in range(0, len(content), CHUNK_BYTES):
+            self.wfile.write(content[start : start + CHUNK_BYTES])
 
 
-def open_server(shown: Shown, host: str, port: int | None) -> ViewServer:
-    """A server that listens, and answers once ``serve_forever`` is called.
+def open_server(view: LiveView, host: str, port: int | None) -> ViewServer:
+    """Open a server; ``serve_forever`` answers requests.
 
     Args:
-        shown: what is shown.
+        view: answers the requests.
         host: address of this computer to listen at.
-        port: None takes ``PORT``, or the next one that is free.
+        port: None takes ``PORT``, or the next free one.
 
     Raises:
-        IgsrError: the port is taken, or the address is none of this computer's.
+        IgsrError: the port is taken, or the address is not of this computer.
     """
-    ports = range(PORT, PORT + NEXT_PORTS) if port is None else (port,)
+    ports = range(PORT, PORT + PORTS_TO_TRY) if port is None else (port,)
     for number in ports:
         try:
-            return ViewServer(shown, host, number)
+            return ViewServer(view, host, number)
         except OSError as error:
             reason = error.strerror or str(error)
     raise IgsrError(

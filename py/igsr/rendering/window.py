@@ -9,8 +9,8 @@ from igsr import _core
 
 
 def main() -> None:
-    """Do what the command line asks for; ``splat-view --help`` lists what it takes."""
-    # Python's own handler would wait for the window to be closed.
+    """Run the viewer with the command line's arguments; see ``splat-view --help``."""
+    # Python's own handler would run only after the window is closed.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.stdout.flush()
     sys.exit(_core.run_viewer(sys.argv[1:]))

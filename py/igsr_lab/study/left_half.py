@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from igsr.evaluation.metrics import CLIPPED, Image, Mask, psnr, ssim
+from igsr.evaluation.metrics import CLIP_MARGIN, Image, Mask, psnr, ssim
 
 #: What ``left_half_scores`` gives.
 LEFT_HALF = ("lh_psnr", "lh_ssim")
@@ -40,7 +40,7 @@ def left_half_scores(
     usable = counts.copy()
     usable[:, middle:] = False
     for picture in (colors, wanted):
-        usable &= ((picture >= CLIPPED) & (picture <= 1.0 - CLIPPED)).all(axis=2)
+        usable &= ((picture >= CLIP_MARGIN) & (picture <= 1.0 - CLIP_MARGIN)).all(axis=2)
     rows = np.column_stack([colors[usable], np.ones(usable.sum())])
     if len(rows) >= FEWEST:
         affine = np.linalg.lstsq(rows, wanted[usable])[0]

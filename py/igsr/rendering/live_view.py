@@ -1,0 +1,210 @@
+"""Answers to the page of ``igsr view --web``: state, surroundings, models and photos."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from igsr.errors import IgsrError
+from igsr.rendering.live_models import LiveModel, live_models
+from igsr.rendering.run_folder import (
+    CAMERAS,
+    VIEW,
+    Color,
+    cameras_of,
+    run_background,
+    run_progress,
+    run_scores,
+)
+from igsr.rendering.scene_model import embedded_model
+from igsr.rendering.scene_page import PageCamera, described_model, live_page, surroundings
+
+#: Number of packed models to keep: the page shows two, and may return to others.
+MAX_PACKED_MODELS = 4
+BLACK = (0.0, 0.0, 0.0)
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
+#: Maximum longest side of the photos that the page gets.
+MAX_PHOTO_SIDE_PX = 1600
+
+
+@dataclass(frozen=True)
+class _Surroundings:
+    version: str
+    cameras: list[tuple[PageCamera, Path | None]]  # with their photos
+    background: Color
+
+
+class LiveView:
+    """A view of files and folders that may change.
+
+    Args:
+        paths: splat files, and folders of fits and refinements; at least one.
+        cameras: a ``cameras.json`` with photos in its folder, instead of those of ``paths``.
+    """
+
+    def __init__(self, paths: Sequence[Path], cameras: Path | None = None) -> None:
+        self._paths = list(paths)
+        self._cameras = cameras
+        self._surroundings: _Surroundings | None = None
+        self._packed: OrderedDict[tuple[str, str], bytes] = OrderedDict()
+        # Concurrent requests for a model pack it once.
+        self._packing = threading.Lock()
+
+    @property
+    def title(self) -> str:
+        """The page's title."""
+        return " and ".join(path.resolve().name or str(path) for path in self._paths)
+
+    def page(self) -> str:
+        """Return the page as HTML."""
+        return live_page(self.title)
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that may change; the page asks once a second."""
+        models = self._models()
+        folder = next((path for path in self._paths if path.is_dir()), None)
+        return {
+            "title": self.title,
+            "run": None if folder is None else run_progress(folder),
+            "scores": {"head": [], "rows": []} if folder is None else run_scores(folder),
+            "models": [
+                {"id": model.id, "label": model.label, "version": model.version} for model in models
+            ],
+            "newest": models[-1].id if models else "",
+            "surroundings": self._surroundings_version(),
+        }
+
+    def surroundings(self) -> dict[str, Any]:
+        """Return cameras, those with photos first, up axis and background."""
+        now = self._current_surroundings()
+        answer = surroundings([camera for camera, _ in now.cameras], now.background)
+        for number, (_, photo) in enumerate(now.cameras):
+            if photo is not None:
+                address = f"photo?number={number}&version={now.version}"
+                answer["cameras"][number]["photo"] = address
+        return answer
+
+    def photo(self, number: int) -> bytes:
+        """Return the photo of a camera as JPEG.
+
+        Raises:
+            KeyError: there is no photo of this number.
+            IgsrError: the photo cannot be read.
+        """
+        cameras = self._current_surroundings().cameras
+        path = cameras[number][1] if 0 <= number < len(cameras) else None
+        if path is None:
+            raise KeyError(number)
+        return _jpeg(path)
+
+    def model(self, id: str) -> bytes:
+        """Return a model for the page: the length of a JSON text (u32), the text, packed splats.
+
+        Raises:
+            KeyError: there is no model of this id.
+            IgsrError: the model cannot be read.
+        """
+        model = {one.id: one for one in self._models()}[id]
+        key = (model.id, model.version)
+        with self._packing:
+            packed = self._packed.pop(key, None) or _packed(model)
+            self._packed[key] = packed
+            while len(self._packed) > MAX_PACKED_MODELS:
+                self._packed.popitem(last=False)
+        return packed
+
+    def _models(self) -> list[LiveModel]:
+        if len(self._paths) == 1:
+            return live_models(self._paths[0])
+        models = []
+        for number, path in enumerate(self._paths):
+            name = path.resolve().name
+            for model in live_models(path):
+                label = f"{name}: {model.label}" if path.is_dir() else name
+                models.append(replace(model, id=f"{number}-{model.id}", label=label))
+        return models
+
+    def _folders(self) -> list[Path]:
+        return [path if path.is_dir() else path.parent for path in self._paths]
+
+    def _camera_files(self) -> list[Path]:
+        if self._cameras is not None:
+            return [self._cameras]
+        folders = self._folders()
+        return [file for f in folders for file in (f / VIEW / CAMERAS, f / CAMERAS)]
+
+    def _surroundings_version(self) -> str:
+        stamps = []
+        for file in self._camera_files():
+            try:
+                stamps.append(str(file.stat().st_mtime_ns))
+            except OSError:
+                stamps.append("")
+        return "-".join([*stamps, *(f"{channel:g}" for channel in self._background())])
+
+    def _background(self) -> Color:
+        colors = (run_background(folder) for folder in self._folders())
+        return next((color for color in colors if color is not None), BLACK)
+
+    def _current_surroundings(self) -> _Surroundings:
+        version = self._surroundings_version()
+        if self._surroundings is None or self._surroundings.version != version:
+            cameras = [camera for file in self._camera_files() for camera in _cameras(file)]
+            cameras.sort(key=lambda camera: camera[1] is None)
+            self._surroundings = _Surroundings(version, cameras, self._background())
+        return self._surroundings
+
+
+def _cameras(file: Path) -> list[tuple[PageCamera, Path | None]]:
+    """The cameras of a ``cameras.json`` and their photos; none if it cannot be read."""
+    try:
+        cameras = cameras_of(file) if file.is_file() else []
+    except IgsrError:
+        return []
+    return [(camera, _photo(file.parent, camera.name)) for camera in cameras]
+
+
+def _photo(folder: Path, name: str) -> Path | None:
+    """The photo of an untrusted name, only if it is inside ``folder``."""
+    if not name.lower().endswith(PHOTO_SUFFIXES) or "\0" in name:
+        return None
+    try:
+        inside = os.path.realpath(folder)
+        path = os.path.realpath(os.path.join(inside, name))
+        if os.path.commonpath([inside, path]) != inside or not os.path.isfile(path):
+            return None
+    except (OSError, ValueError):
+        return None
+    return Path(path)
+
+
+def _jpeg(path: Path) -> bytes:
+    size = (MAX_PHOTO_SIDE_PX, MAX_PHOTO_SIDE_PX)
+    try:
+        with Image.open(path, formats=("JPEG", "PNG")) as photo:
+            photo.draft("RGB", size)
+            small = photo.convert("RGB")
+        small.thumbnail(size)
+        file = io.BytesIO()
+        small.save(file, format="JPEG", quality=90)
+    # Pillow raises many kinds of errors for damaged or large files.
+    except Exception as error:
+        raise IgsrError(f"{path} cannot be shown: {error}.") from error
+    return file.getvalue()
+
+
+def _packed(model: LiveModel) -> bytes:
+    embedded = embedded_model(model.load())
+    if embedded.count == 0:
+        raise IgsrError(f"{model.path.name} has no splats.")
+    described = json.dumps({"label": model.label, **described_model(embedded)}).encode()
+    return len(described).to_bytes(4, "little") + described + embedded.packed
