@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from igsr.capture import Camera, Capture, View
+from igsr.fitting import fit_capture
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
@@ -130,3 +131,28 @@ def project_call():
         "antialiased": False,
         "backend": "cpu",
     }
+
+
+def fit(capture, steps=None, **options):
+    """The splats of a fit, without files or scores; see ``fit_capture``."""
+    return fit_capture(capture, steps=steps, **options).splats
+
+
+def fit_with_cameras(capture, steps=None, **options):
+    """The splats of a fit, and the capture with fitted cameras, exposures and masks."""
+    result = fit_capture(capture, steps=steps, **options)
+    return result.splats, result.capture
+
+
+class Stop(Exception):
+    """Raised by listeners that end a run."""
+
+
+def stop_at(step):
+    """A listener that ends a fit at a step."""
+
+    def listener(event):
+        if event.stage == "fit" and event.done >= step:
+            raise Stop
+
+    return listener

@@ -180,13 +180,13 @@ def test_few_splats_and_scenes_without_a_size_have_none(monkeypatch):
 def test_fits_of_photographs_end_with_one_and_go_on_without_it():
     photos, _ = before_sky()
     options = {"steps": 40, "backend": "cpu", "max_splats": 300, "seed": 3}
-    bare = igsr.fit(photos, backdrop=False, **options)
-    whole = igsr.fit(photos, **options)
+    bare = scenes.fit(photos, backdrop=False, **options)
+    whole = scenes.fit(photos, **options)
     assert bare.backdrop_splats == 0
     assert same(whole.without_backdrop(), bare)
     assert same(whole, with_backdrop(bare, photos.train_views, "cpu"))
-    on = igsr.fit(photos, start=whole, **options)
-    assert same(on, igsr.fit(photos, start=bare, **options))
+    on = scenes.fit(photos, start=whole, **options)
+    assert same(on, scenes.fit(photos, start=bare, **options))
     assert on.backdrop_splats == COUNT
 
 
@@ -209,7 +209,7 @@ def test_what_is_cut_out_and_what_has_a_background_gets_none():
         (photos, {"background": (0.2, 0.5, 0.8)}),
         (photos, {"preset": "3dgs"}),
     ):
-        assert igsr.fit(capture, **options, **more).backdrop_splats == 0
+        assert scenes.fit(capture, **options, **more).backdrop_splats == 0
 
 
 def test_a_refinement_writes_and_scores_it_and_its_rounds_look_without_it(monkeypatch):

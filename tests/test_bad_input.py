@@ -305,10 +305,10 @@ def test_core_names_arrays_of_the_wrong_kind():
 
 def test_a_fit_says_what_it_takes(tmp_path):
     with pytest.raises(igsr.IgsrError, match=r"capture must be a Capture, not str; igsr\.load"):
-        igsr.fit("photos")
+        scenes.fit("photos")
     capture = scenes.capture(views=2, size=24)
     with pytest.raises(igsr.IgsrError, match="backend must be auto, cpu or gpu, not 'tpu'"):
-        igsr.fit(capture, steps=1, backend="tpu")
+        scenes.fit(capture, steps=1, backend="tpu")
 
 
 @pytest.mark.parametrize("command", ["fit", "refine"])

@@ -273,12 +273,12 @@ def _stderr(folder, out, *words):
 
 def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
     capture = igsr.load_capture(folder)
-    splats = igsr.fit(capture, steps=40, max_splats=500, backend="cpu")
+    splats = scenes.fit(capture, steps=40, max_splats=500, backend="cpu")
     middle = len(splats) // 2
     start, frozen = subset(splats, np.arange(len(splats)) < middle), None
     frozen = subset(splats, np.arange(len(splats)) >= middle)
     checkpoint = tmp_path / "checkpoint.npz"
-    fitted = igsr.fit(
+    fitted = scenes.fit(
         capture,
         steps=40,
         max_splats=900,
@@ -304,7 +304,7 @@ def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
         ({"frozen": replace(frozen, antialiased=True)}, "frozen has antialiased splats"),
     ):
         with pytest.raises(igsr.IgsrError, match=message):
-            igsr.fit(capture, steps=5, backend="cpu", **(usual | changed))
+            scenes.fit(capture, steps=5, backend="cpu", **(usual | changed))
 
 
 def test_seams_that_show_are_mended(tmp_path, monkeypatch):

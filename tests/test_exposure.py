@@ -188,7 +188,7 @@ def with_exposures(capture, exposures):
 
 def fitted(capture, **options):
     given = {"steps": 900, "backend": "cpu", "max_splats": 400, "sh_degree": 1, **options}
-    return igsr.fit_with_cameras(capture, **given)
+    return scenes.fit_with_cameras(capture, **given)
 
 
 @pytest.mark.parametrize("alpha", [False, True])

@@ -44,7 +44,7 @@ def same(a, b):
 
 def small_fit(capture, **options):
     arguments = {"steps": STEPS, "backend": "cpu", "max_splats": 400, "sh_degree": 1}
-    return igsr.fit(capture, **{**arguments, "backdrop": False, **options})
+    return scenes.fit(capture, **{**arguments, "backdrop": False, **options})
 
 
 @pytest.mark.parametrize("density", ["mcmc", "original", "fixed"])
@@ -201,7 +201,7 @@ import igsr, scenes
 from igsr.fitting import run
 run.CHECKPOINT_STEPS = 20
 capture = scenes.capture(views=4, size=40)
-igsr.fit(capture, steps=1_000_000, backend="cpu", max_splats=400, sh_degree=1,
+scenes.fit(capture, steps=1_000_000, backend="cpu", max_splats=400, sh_degree=1,
          checkpoint=sys.argv[1], progress=lambda now: print(now.step, flush=True))
 """
 
@@ -227,7 +227,7 @@ def test_killed_fit_leaves_a_whole_checkpoint(tmp_path):
     assert state["step"][0] >= 20
     assert settings["steps"] == 1_000_000
     resumed = []
-    igsr.fit(
+    scenes.fit(
         scenes.capture(views=4, size=40),
         steps=1_000_000,
         backend="cpu",
@@ -489,9 +489,9 @@ def test_both_fits_have_the_same_arguments(capture):
     of_runs = {"resume", "quality", "frozen", "whole_schedule"}
     assert named - of_runs == fields - {"first_step"}
     with pytest.raises(TypeError, match="steps_"):
-        igsr.fit_with_cameras(capture, steps_=3)
+        scenes.fit_with_cameras(capture, steps_=3)
     alike = (capture, 5, None, "cpu", 4)
-    assert same(igsr.fit(*alike), igsr.fit_with_cameras(*alike)[0])
+    assert same(scenes.fit(*alike), scenes.fit_with_cameras(*alike)[0])
 
 
 def test_backends_agree_from_coarse_to_fine():
@@ -499,7 +499,7 @@ def test_backends_agree_from_coarse_to_fine():
     photos = scenes.capture(views=6, size=200)
     options = {"steps": 60, "max_splats": 300, "start": "random", "density": "fixed", "dropout": 0}
     fits = {
-        backend: igsr.fit(photos, backend=backend, coarse_to_fine=True, **options)
+        backend: scenes.fit(photos, backend=backend, coarse_to_fine=True, **options)
         for backend in ("cpu", "gpu")
     }
     scores = {
@@ -507,5 +507,5 @@ def test_backends_agree_from_coarse_to_fine():
         for backend, splats in fits.items()
     }
     assert scores["gpu"] == pytest.approx(scores["cpu"], abs=0.05)
-    whole = igsr.fit(photos, backend="cpu", coarse_to_fine=False, **options)
+    whole = scenes.fit(photos, backend="cpu", coarse_to_fine=False, **options)
     assert not np.array_equal(whole.means, fits["cpu"].means)

@@ -293,7 +293,7 @@ def fitted(capture, **options):
     """Splats, and all progress, of a short fit."""
     seen = []
     given = {"steps": 60, "max_splats": 300, "start": "random", "backend": "cpu", **options}
-    splats = igsr.fit(capture, progress=seen.append, **given)
+    splats = scenes.fit(capture, progress=seen.append, **given)
     return splats, seen
 
 
@@ -323,7 +323,7 @@ def test_a_fit_that_is_ended_early_keeps_all():
         seen.append(now)
         return False
 
-    splats = igsr.fit(capture, 5000, stop, "cpu", max_splats=300, start="random")
+    splats = scenes.fit(capture, 5000, stop, "cpu", max_splats=300, start="random")
     assert seen[-1].removed == {}
     assert len(splats) == seen[-1].splats
 

@@ -132,7 +132,7 @@ def test_points_of_a_wrong_depth_map_are_left_out(made):
 
 def fitted(capture, **options):
     arguments = {"steps": 300, "backend": "cpu", "max_splats": 1500, "sh_degree": 0, **options}
-    return igsr.fit(capture, **arguments)
+    return scenes.fit(capture, **arguments)
 
 
 def score(splats, capture):

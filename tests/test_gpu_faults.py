@@ -86,10 +86,10 @@ def test_a_device_lost_in_mid_fit_keeps_the_checkpoint_and_the_next_call_works(t
             _core.lose_gpu()
 
     with pytest.raises(RuntimeError, match="was lost") as caught:
-        igsr.fit(capture, **settings, progress=lose)
+        scenes.fit(capture, **settings, progress=lose)
     assert re.search(rf"{re.escape(str(checkpoint))} keeps step [1-9]\d\d", str(caught.value))
-    resumed = igsr.fit(capture, **settings, resume=True)
-    whole = igsr.fit(capture, **{**settings, "checkpoint": None})
+    resumed = scenes.fit(capture, **settings, resume=True)
+    whole = scenes.fit(capture, **{**settings, "checkpoint": None})
     np.testing.assert_array_equal(resumed.means, whole.means)
 
 
@@ -97,6 +97,6 @@ def test_out_of_memory_in_a_fit_is_one_message_and_a_smaller_call_works():
     _core.inject_gpu_faults(["memory"])
     capture = made_up_capture(views=4)
     with pytest.raises(RuntimeError, match="is out of memory; use fewer splats"):
-        igsr.fit(capture, steps=2000, seed=0, backend="gpu", max_splats=200_000)
-    splats = igsr.fit(capture, steps=20, seed=0, backend="gpu", max_splats=100)
+        scenes.fit(capture, steps=2000, seed=0, backend="gpu", max_splats=200_000)
+    splats = scenes.fit(capture, steps=20, seed=0, backend="gpu", max_splats=100)
     assert len(splats) > 0

@@ -17,7 +17,7 @@ def resident():
     return int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6
 
 def fitted(steps):
-    igsr.fit(
+    scenes.fit(
         capture, steps=steps, backend="gpu", max_splats=300, sh_degree=1, density="fixed",
         start="random", transients="off", remove_floaters=False,
     )

@@ -137,7 +137,7 @@ def test_too_many_photos_and_unknown_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(IgsrError, match="needs a name"):
         Colmap(object())
     with pytest.raises(IgsrError, match="matcher is no option of dust3r"):
-        igsr.estimate_poses(photos(2), "dust3r", matcher="sift")
+        igsr.find_cameras(photos(2), "dust3r", matcher="sift")
 
 
 def test_found_cameras_know_their_matcher() -> None:

@@ -314,7 +314,7 @@ def test_a_fit_takes_odd_photos_among_good_ones() -> None:
         replace(capture.views[1], name="black.png", image=np.zeros_like(first.image)),
     ]
     with pytest.warns(UserWarning, match=r"black\.png: black or wholly transparent"):
-        splats = igsr.fit(
+        splats = scenes.fit(
             replace(capture, views=capture.views + odd),
             steps=10,
             max_splats=200,

@@ -38,7 +38,7 @@ def test_good_photos_are_not_talked_about(views):
 
 def test_one_photo_works_and_says_what_it_cannot(views):
     with pytest.warns(UserWarning, match="one photo only"):
-        splats = igsr.fit(Capture("one", views[1:2]), steps=20, backend="cpu", max_splats=200)
+        splats = scenes.fit(Capture("one", views[1:2]), steps=20, backend="cpu", max_splats=200)
     assert np.isfinite(splats.means).all()
 
 

@@ -259,7 +259,7 @@ def test_a_video_of_one_frame_is_one_photo(tmp_path: Path) -> None:
     write_video(tmp_path / "clip.mp4", film(1, {0}))
     assert [one.name for one in load_photos(tmp_path)] == ["clip.mp4/000000.png"]
     with pytest.raises(IgsrError, match=r"2 photos at least; there is only clip\.mp4/000000\.png"):
-        igsr.estimate_poses(tmp_path, "colmap")
+        igsr.find_cameras(tmp_path, "colmap")
 
 
 def test_video_is_turned_as_its_file_says(tmp_path: Path) -> None:

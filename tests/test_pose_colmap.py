@@ -95,7 +95,7 @@ def test_same_seed_same_bits_and_nothing_said(
 
 def test_distortion_is_found_and_undone() -> None:
     bent = rooms.photos(CAMERAS[1:5], k=-0.12)
-    capture = igsr.estimate_poses(bent, "colmap")
+    capture = igsr.find_cameras(bent, "colmap")
     assert pose_accuracy([v.camera for v in capture.views], CAMERAS[1:5])["RTA@5"] == 1.0
     for view, true in zip(capture.views, CAMERAS[1:5], strict=True):
         assert view.camera.K[0, 0] == pytest.approx(200.0, rel=0.03)
@@ -138,21 +138,21 @@ def test_two_photos_with_a_focal_length_from_exif() -> None:
 def test_what_shows_something_else_is_named_and_the_rest_kept(photos: list[Photo]) -> None:
     stranger = replace(rooms.photos([CAMERAS[2]], seed=7)[0], name="garden/other.png")
     with pytest.warns(UserWarning, match=r"4 of 5 photos .* garden/other\.png\.$"):
-        capture = igsr.estimate_poses([*photos[1:3], stranger, *photos[3:5]], "colmap")
+        capture = igsr.find_cameras([*photos[1:3], stranger, *photos[3:5]], "colmap")
     assert [view.name for view in capture.views] == ["1.png", "2.png", "3.png", "4.png"]
     assert capture.train_views == capture.views
     with pytest.raises(igsr.IgsrError, match=r"No cameras found: the 2 photos \(1\.png"):
-        igsr.estimate_poses([photos[1], stranger], "colmap")
+        igsr.find_cameras([photos[1], stranger], "colmap")
     away = [CAMERAS[2], rooms.camera(np.pi)]  # back to back: no common view
     with pytest.raises(igsr.IgsrError, match="too few matches"):
-        igsr.estimate_poses(rooms.photos(away), "colmap")
+        igsr.find_cameras(rooms.photos(away), "colmap")
     blank = [Photo(f"{i}.png", np.full((60, 80, 3), 200, dtype=np.uint8)) for i in range(3)]
     with pytest.raises(igsr.IgsrError, match="too few matches"):
-        igsr.estimate_poses(blank, "colmap")
+        igsr.find_cameras(blank, "colmap")
     with pytest.raises(
         igsr.IgsrError, match=r"two photos at least|from 2 photos at least; .*1\.png"
     ):
-        igsr.estimate_poses(photos[1:2], "colmap")
+        igsr.find_cameras(photos[1:2], "colmap")
 
 
 def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,7 +183,7 @@ def test_of_many_photos_the_time_is_said(monkeypatch: pytest.MonkeyPatch) -> Non
         pytest.warns(UserWarning, match=r"COLMAP needs about \d+ minutes for 500 photos"),
         pytest.raises(igsr.IgsrError, match="the 500 photos"),
     ):
-        igsr.estimate_poses(tiny, "colmap")
+        igsr.find_cameras(tiny, "colmap")
 
 
 def test_photos_that_look_alike_are_found_in_the_database(photos: list[Photo], tmp_path: Path):
@@ -219,7 +219,7 @@ def test_auto_takes_given_cameras_then_a_checkpoint_then_colmap(
     plain = registry.Entry(lambda: make_estimator(calls, "colmap")(), lambda options: True)
     monkeypatch.setitem(registry.ESTIMATORS, "colmap", plain)
     with pytest.warns(UserWarning, match=r"^A warning\.$"):
-        capture = igsr.estimate_poses(photos[:3], seed=4)
+        capture = igsr.find_cameras(photos[:3], seed=4)
     assert calls == [{"name": "colmap", "checkpoint": None, "seed": 4}]
     np.testing.assert_array_equal(capture.views[1].image, photos[1].image)
     assert capture.views[1].camera is CAMERAS[1]
@@ -234,21 +234,21 @@ def test_auto_takes_given_cameras_then_a_checkpoint_then_colmap(
         pose.estimate(photos[:3], seed=-1)
     views = [View(f"{i}.png", CAMERAS[i], "train", photos[i].image) for i in range(2)]
     write_transforms(Capture(tmp_path, views), tmp_path / "given")
-    assert len(igsr.estimate_poses(tmp_path / "given").views) == 2
+    assert len(igsr.find_cameras(tmp_path / "given").views) == 2
     assert len(calls) == 2  # the cameras that are there are taken
     with pytest.warns(UserWarning, match="A warning"):
-        igsr.estimate_poses(tmp_path / "given", "colmap")
+        igsr.find_cameras(tmp_path / "given", "colmap")
     assert len(calls) == 3  # or found anew where an estimator is named
 
 
 def test_files_and_photos_in_a_list(photos: list[Photo], tmp_path: Path) -> None:
     Image.fromarray(photos[0].image).save(tmp_path / "a.png")
     with pytest.raises(igsr.IgsrError, match="mixes files and Photo objects"):
-        igsr.estimate_poses([tmp_path / "a.png", photos[1]])
+        igsr.find_cameras([tmp_path / "a.png", photos[1]])
     with pytest.raises(igsr.IgsrError, match="two photos of one name"):
-        igsr.estimate_poses([photos[1], photos[1]])
+        igsr.find_cameras([photos[1], photos[1]])
     with pytest.raises(igsr.IgsrError, match=r"there is only a\.png"):
-        igsr.estimate_poses([tmp_path / "a.png"])
+        igsr.find_cameras([tmp_path / "a.png"])
 
 
 def test_accuracy_by_hand() -> None:

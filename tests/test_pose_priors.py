@@ -173,7 +173,7 @@ def test_exact_cameras_with_tracks_stay_where_a_fit_would_move_them(made):
     points = tracked(capture.train_views, means)
     errors = []
     for given in (Capture(capture.path, capture.views, points), capture):
-        _, fitted = igsr.fit_with_cameras(given, **OPTIONS)
+        _, fitted = scenes.fit_with_cameras(given, **OPTIONS)
         errors.append(pose_errors([view.camera for view in fitted.train_views], true)["rotation"])
     held, free = errors
     assert held < 0.1 * free, errors
@@ -184,15 +184,15 @@ def test_a_held_fit_resumes_with_its_own_tracks_alone(made, tmp_path):
     given = Capture(capture.path, capture.views, tracked(capture.train_views, means, noise=0.3))
     checkpoint = tmp_path / "checkpoint.npz"
     options = OPTIONS | {"steps": 90, "focal": "shared"}
-    whole, cameras_whole = igsr.fit_with_cameras(given, **options)
-    igsr.fit(given, checkpoint=checkpoint, progress=lambda now: now.step < 40, **options)
-    part, cameras_part = igsr.fit_with_cameras(given, checkpoint=checkpoint, resume=True, **options)
+    whole, cameras_whole = scenes.fit_with_cameras(given, **options)
+    scenes.fit(given, checkpoint=checkpoint, progress=lambda now: now.step < 40, **options)
+    part, cameras_part = scenes.fit_with_cameras(given, checkpoint=checkpoint, resume=True, **options)
     np.testing.assert_array_equal(whole.means, part.means)
     for a, b in zip(cameras_whole.views, cameras_part.views, strict=True):
         np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
         np.testing.assert_array_equal(a.camera.K, b.camera.K)
     with pytest.raises(igsr.IgsrError, match="other photos, masks, cameras, tracks"):
-        igsr.fit(capture, checkpoint=checkpoint, resume=True, **options)
+        scenes.fit(capture, checkpoint=checkpoint, resume=True, **options)
 
 
 def least_ratio(found, expected, rows):

@@ -128,7 +128,7 @@ def test_joint_poses_undo_much_of_what_is_wrong():
     made = scenes.capture(views=16, size=128, alpha=True, scene=scene)
     given = wrong(made)
     options = {"steps": 900, "backend": "cpu", "max_splats": 1500, "sh_degree": 0}
-    splats, fitted = igsr.fit_with_cameras(given, poses="joint", **options)
+    splats, fitted = scenes.fit_with_cameras(given, poses="joint", **options)
     train = [view.camera for view in made.train_views]
     before = pose_errors([view.camera for view in given.train_views], train)
     after = pose_errors([view.camera for view in fitted.train_views], train)
@@ -142,7 +142,7 @@ def test_joint_poses_undo_much_of_what_is_wrong():
     )
     assert drift.scale == pytest.approx(1.0, abs=1e-3)
     assert np.allclose(drift.rotation, np.eye(3), atol=3e-3)
-    fixed = igsr.fit(given, **options)
+    fixed = scenes.fit(given, **options)
     scores = [
         igsr.evaluate(model, Capture(made.path, views), background=BLACK, backend="cpu")["psnr"]
         for model, views in [
@@ -164,7 +164,7 @@ def test_a_shared_focal_length_is_found(made):
         for view in made.views
     ]
     given = Capture(made.path, views)
-    _, fitted = igsr.fit_with_cameras(
+    _, fitted = scenes.fit_with_cameras(
         given, steps=900, backend="cpu", max_splats=600, focal="shared"
     )
     focal = [view.camera.K[0, 0] for view in fitted.train_views]
@@ -183,14 +183,14 @@ def test_a_resumed_joint_fit_ends_with_the_same_bits(made, tmp_path):
         "poses": "joint",
         "focal": "per-camera",
     }
-    whole, cameras_whole = igsr.fit_with_cameras(wrong(made), **options)
+    whole, cameras_whole = scenes.fit_with_cameras(wrong(made), **options)
     checkpoint = tmp_path / "checkpoint.npz"
 
     def stop(now):
         return now.step < 130
 
-    igsr.fit(wrong(made), checkpoint=checkpoint, progress=stop, **options)
-    part, cameras_part = igsr.fit_with_cameras(
+    scenes.fit(wrong(made), checkpoint=checkpoint, progress=stop, **options)
+    part, cameras_part = scenes.fit_with_cameras(
         wrong(made), checkpoint=checkpoint, resume=True, **options
     )
     assert np.array_equal(whole.means, part.means)
@@ -198,7 +198,7 @@ def test_a_resumed_joint_fit_ends_with_the_same_bits(made, tmp_path):
         assert np.array_equal(a.camera.viewmat, b.camera.viewmat)
         assert np.array_equal(a.camera.K, b.camera.K)
     with pytest.raises(igsr.IgsrError, match=r"was made with poses"):
-        igsr.fit(wrong(made), checkpoint=checkpoint, resume=True, **(options | {"poses": "fixed"}))
+        scenes.fit(wrong(made), checkpoint=checkpoint, resume=True, **(options | {"poses": "fixed"}))
 
 
 def test_a_fit_stopped_while_cameras_are_looked_for_keeps_its_checkpoint(tmp_path):
@@ -211,19 +211,19 @@ def test_a_fit_stopped_while_cameras_are_looked_for_keeps_its_checkpoint(tmp_pat
         steps.append(now.step)
         return len(steps) > 1
 
-    first, _ = igsr.fit_with_cameras(made, checkpoint=checkpoint, progress=stop_once, **options)
+    first, _ = scenes.fit_with_cameras(made, checkpoint=checkpoint, progress=stop_once, **options)
     assert steps == [0], "nothing runs on"
-    resumed = igsr.fit(made, checkpoint=checkpoint, resume=True, **options)
+    resumed = scenes.fit(made, checkpoint=checkpoint, resume=True, **options)
     assert not np.array_equal(first.means, resumed.means)
     again = []
-    igsr.fit(made, checkpoint=checkpoint, resume=True, progress=again.append, **options)
+    scenes.fit(made, checkpoint=checkpoint, resume=True, progress=again.append, **options)
     assert [(now.step, now.splats) for now in again] == [(60, len(resumed))], "it was complete"
 
 
 def test_one_photo_keeps_its_camera():
     made = scenes.capture(views=2, size=128)
     with pytest.warns(UserWarning, match="photo"):
-        _, fitted = igsr.fit_with_cameras(made, steps=20, max_splats=200, poses="joint")
+        _, fitted = scenes.fit_with_cameras(made, steps=20, max_splats=200, poses="joint")
     (view,) = fitted.train_views
     assert np.allclose(view.camera.viewmat, made.train_views[0].camera.viewmat, atol=1e-9)
 
@@ -239,7 +239,7 @@ def test_warnings_point_to_who_called():
 def test_a_damaged_camera_state_is_refused(made, tmp_path):
     options = {"steps": 40, "backend": "cpu", "max_splats": 300, "poses": "joint"}
     checkpoint = tmp_path / "checkpoint.npz"
-    igsr.fit(made, checkpoint=checkpoint, **options)
+    scenes.fit(made, checkpoint=checkpoint, **options)
     with np.load(checkpoint) as archive:
         good = dict(archive)
     for name, change in [
@@ -252,13 +252,13 @@ def test_a_damaged_camera_state_is_refused(made, tmp_path):
     ]:
         np.savez(checkpoint, **good | {name: change(good[name])})
         with pytest.raises(igsr.IgsrError, match="checkpoint"):
-            igsr.fit(made, checkpoint=checkpoint, resume=True, **options)
+            scenes.fit(made, checkpoint=checkpoint, resume=True, **options)
 
 
 @pytest.mark.parametrize(("name", "value"), [("poses", "free"), ("focal", "one"), ("poses", 3)])
 def test_unknown_choices_are_named(made, name, value):
     with pytest.raises(igsr.IgsrError, match=f"{name} must be one of"):
-        igsr.fit(made, steps=1, **{name: value})
+        scenes.fit(made, steps=1, **{name: value})
 
 
 def test_the_command_writes_cameras_that_load_again(made, tmp_path):

@@ -34,7 +34,7 @@ def capture():
 
 def fit(capture, **options):
     arguments = {"steps": 200, "backend": "cpu", "max_splats": 400, "sh_degree": 0, **options}
-    return igsr.fit(capture, **arguments)
+    return scenes.fit(capture, **arguments)
 
 
 def support(photos, seen_by=8.0, apart=5.0, pixels=100_000.0):
@@ -183,7 +183,7 @@ def test_detail_is_of_a_few_photos_and_the_same_from_files(tmp_path):
 def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
     from igsr.fitting.checkpoint import load_checkpoint
 
-    igsr.fit(capture, steps=3, backend="cpu", checkpoint=tmp_path / "a.npz")
+    scenes.fit(capture, steps=3, backend="cpu", checkpoint=tmp_path / "a.npz")
     _, settings = load_checkpoint(tmp_path / "a.npz")
     expected = preset_settings("default", support_of(capture.train_views), steps=3)
     del expected["remove_floaters"], expected["backdrop"]  # nothing of them reaches the checkpoint
@@ -192,7 +192,7 @@ def test_few_photos_are_fitted_with_the_settings_for_few(capture, tmp_path):
 
 
 def test_instantsplat_starts_with_all_its_splats_and_moves_the_cameras(capture):
-    splats, fitted = igsr.fit_with_cameras(
+    splats, fitted = scenes.fit_with_cameras(
         capture, preset="instantsplat", steps=60, backend="cpu", max_splats=777
     )
     assert len(splats) == 777

@@ -70,10 +70,10 @@ def test_a_bar_that_never_moved_never_shows(capsys):
 def test_a_fit_shows_a_bar_in_a_session_and_none_in_a_script(monkeypatch, capsys):
     capture = scenes.capture(views=4, size=24)
     options = {"steps": 5, "backend": "cpu", "max_splats": 50}
-    igsr.fit(capture, **options)
+    scenes.fit(capture, **options)
     assert capsys.readouterr().err == ""
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
-    igsr.fit(capture, **options)
+    scenes.fit(capture, **options)
     assert "fit 5/5" in capsys.readouterr().err
-    igsr.fit(capture, progress=lambda now: None, **options)
+    scenes.fit(capture, progress=lambda now: None, **options)
     assert capsys.readouterr().err == ""

@@ -22,7 +22,7 @@ def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(ball_photos):
         views = [replace(view, **fields) for view in ball_photos.train_views]
         made = igsr.Capture(ball_photos.path, views)
         # From given splats: masks also have a say in the first ones of a fit.
-        return igsr.fit(made, steps=20, backend="cpu", start=BALL)
+        return scenes.fit(made, steps=20, backend="cpu", start=BALL)
 
     size = (40, 40)
     left = np.ones(size, np.float32)
@@ -49,7 +49,7 @@ def test_a_picture_of_small_weights_counts_less_than_a_photo(ball_photos):
         weighed = replace(white, weights=np.full((40, 40), weight, np.float32))
         pair = [black, weighed, replace(black, name="side.png", camera=side)]
         pair = [view if view.weights is not None else replace(view, weights=ones) for view in pair]
-        splats = igsr.fit(
+        splats = scenes.fit(
             igsr.Capture(ball_photos.path, pair),
             steps=200,
             backend="cpu",
@@ -64,17 +64,17 @@ def test_a_picture_of_small_weights_counts_less_than_a_photo(ball_photos):
 
 def test_a_warm_start_goes_on_from_splats(ball_photos):
     options = {"backend": "cpu", "remove_floaters": False}
-    first = igsr.fit(ball_photos, steps=100, **options)
-    on = igsr.fit(ball_photos, steps=50, start=first, **options)
+    first = scenes.fit(ball_photos, steps=100, **options)
+    on = scenes.fit(ball_photos, steps=50, start=first, **options)
     before, after = (igsr.evaluate(s, ball_photos, "train")["psnr"] for s in (first, on))
     assert after > before
     assert len(on) >= len(first)
     with pytest.raises(igsr.IgsrError, match="sh_degree must be the same, not 3"):
-        igsr.fit(ball_photos, steps=5, backend="cpu", start=first, sh_degree=3)
+        scenes.fit(ball_photos, steps=5, backend="cpu", start=first, sh_degree=3)
     with pytest.raises(igsr.IgsrError, match="give at least one, and no more than max_splats"):
-        igsr.fit(ball_photos, steps=5, backend="cpu", start=first, max_splats=2)
+        scenes.fit(ball_photos, steps=5, backend="cpu", start=first, max_splats=2)
     with pytest.raises(igsr.IgsrError, match="antialiased"):
-        igsr.fit(ball_photos, steps=5, backend="cpu", start=replace(first, antialiased=True))
+        scenes.fit(ball_photos, steps=5, backend="cpu", start=replace(first, antialiased=True))
 
 
 @pytest.mark.filterwarnings("ignore:.*one and the same camera")
@@ -94,7 +94,7 @@ def test_novel_views_change_neither_settings_nor_initialization(ball_photos):
             seen.append(now)
             return False
 
-        igsr.fit(igsr.Capture(ball_photos.path, some), backend="cpu", progress=stop)
+        scenes.fit(igsr.Capture(ball_photos.path, some), backend="cpu", progress=stop)
         return seen[0].steps, seen[0].started
 
     assert begun(photos + views) == begun(photos)
@@ -111,9 +111,9 @@ def test_a_round_fits_photos_and_novel_views_from_the_initialization(ball_photos
         )
     given = [*views[:9], *(replace(view, background=WHITE) for view in views[9:])]
     seed = seed_of_round(SEED, 1)
-    fitted = igsr.fit(igsr.Capture(ball_photos.path, given), STEPS, backend="cpu", seed=seed)
+    fitted = scenes.fit(igsr.Capture(ball_photos.path, given), STEPS, backend="cpu", seed=seed)
     assert same(fitted, refined.rounds[0].splats)
-    other = igsr.fit(igsr.Capture(ball_photos.path, given), STEPS, backend="cpu", seed=SEED)
+    other = scenes.fit(igsr.Capture(ball_photos.path, given), STEPS, backend="cpu", seed=SEED)
     assert not same(other, fitted)
 
 
@@ -136,10 +136,10 @@ def test_novel_views_are_sampled_less_often_and_not_at_the_end(ball_photos, monk
 def test_a_short_fit_that_goes_on_samples_novel_views(ball_photos):
     photos = ball_photos.train_views[:2]
     view = replace(ball_photos.train_views[2], weights=np.ones((40, 40), np.float32))
-    start = igsr.fit(igsr.Capture(ball_photos.path, photos), 20, backend="cpu")
+    start = scenes.fit(igsr.Capture(ball_photos.path, photos), 20, backend="cpu")
 
     def gone_on(view):
         given = igsr.Capture(ball_photos.path, [*photos, view])
-        return igsr.fit(given, 20, backend="cpu", start=start)
+        return scenes.fit(given, 20, backend="cpu", start=start)
 
     assert not same(gone_on(view), gone_on(replace(view, image=255 - view.image)))

@@ -228,7 +228,7 @@ OPTIONS = {
 
 
 def fitted(capture, **options):
-    return igsr.fit_with_cameras(capture, **{**OPTIONS, **options})
+    return scenes.fit_with_cameras(capture, **{**OPTIONS, **options})
 
 
 def test_a_static_capture_has_the_bits_of_a_fit_that_does_not_look(static):

@@ -116,11 +116,11 @@ def test_a_folder_of_screenshots_is_an_error(tmp_path: Path, photos: list[Photo]
     for index in range(4):
         Image.fromarray(screenshot("", index).image).save(tmp_path / f"{index}.png")
     with pytest.raises(IgsrError, match=r"0 is left .*0\.png, 1\.png, 2\.png and 1 more: .*screen"):
-        igsr.estimate_poses(tmp_path, "colmap")
+        igsr.find_cameras(tmp_path, "colmap")
     # One photo among them does not make two.
     Image.fromarray(photos[0].image).save(tmp_path / "photo.png")
     with pytest.raises(IgsrError, match=r"2 photos at least, and 1 is left"):
-        igsr.estimate_poses(tmp_path, "colmap")
+        igsr.find_cameras(tmp_path, "colmap")
 
 
 def test_exif_says_that_it_is_a_screenshot(tmp_path: Path, photos: list[Photo]) -> None:

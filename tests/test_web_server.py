@@ -197,7 +197,7 @@ def test_a_fit_and_its_checkpoint(tmp_path):
         followed.tell("find cameras", 0.0)
         assert state_of(server)["run"] == {"text": "find cameras", "done": 0.0}
         followed.show(made, (1.0, 0.5, 0.0))
-        fitted = igsr.fit(
+        fitted = scenes.fit(
             made,
             6,
             look,

@@ -451,7 +451,7 @@ def test_panoramas_are_placed_as_rigs(tmp_path: Path) -> None:
     for index, viewmat in enumerate(stands):
         photo = room.photo(viewmat, (width, width // 2), room.panorama(width), 2)
         save(tmp_path / f"photos/{index}.png", photo)
-    found = igsr.estimate_poses(tmp_path / "photos", "colmap")
+    found = igsr.find_cameras(tmp_path / "photos", "colmap")
     assert len(found.views) == 30
     centres = np.stack([view.camera.centre for view in found.views[::6]])
     true = np.stack([np.linalg.inv(viewmat)[:3, 3] for viewmat in stands])
@@ -475,7 +475,7 @@ def test_panoramas_are_placed_as_rigs(tmp_path: Path) -> None:
 
 def test_a_joint_fit_moves_whole_panoramas(capture: Path) -> None:
     loaded = load_capture(capture, 32)
-    _, fitted = igsr.fit_with_cameras(
+    _, fitted = scenes.fit_with_cameras(
         loaded, steps=60, seed=0, backend="cpu", poses="joint", start="random", max_splats=500
     )
     moved = 0.0
@@ -489,7 +489,7 @@ def test_a_joint_fit_moves_whole_panoramas(capture: Path) -> None:
             np.testing.assert_allclose(within[0], within[1], atol=1e-9)
     assert moved > 1e-4
     with pytest.raises(IgsrError, match='focal lengths follow from its size; leave focal "fixed"'):
-        igsr.fit(loaded, steps=2, focal="shared")
+        scenes.fit(loaded, steps=2, focal="shared")
 
 
 def test_folds_hold_whole_panoramas_out(capture: Path) -> None:

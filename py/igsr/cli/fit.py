@@ -91,7 +91,15 @@ def fit_command(
         Literal["mcmc", "original", "fixed"] | None,
         option("--density", help="Density control.", panel=ADVANCED),
     ] = None,
-    start: Annotated[Start, option("--start", help="Initialization.", panel=ADVANCED)] = "auto",
+    start: Annotated[
+        Start,
+        option(
+            "--start",
+            metavar="NAME",
+            help="Initialization: auto, points, depths, hull, sift, rays or random.",
+            panel=ADVANCED,
+        ),
+    ] = "auto",
     background: BackgroundOption = None,
     seed: SeedOption = 0,
     blocks: Annotated[
