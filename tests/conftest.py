@@ -9,6 +9,7 @@ import pytest
 import refinements
 
 from igsr import cli
+from igsr.refinement import rounds
 from igsr_lab import __main__ as lab
 
 # Its numbers are megabytes that are not here: it is run where a folder of them is named.
@@ -30,44 +31,41 @@ def example_path() -> Path:
     return Path(__file__).parent.parent / "examples" / "tea_table"
 
 
-@pytest.fixture
-def small_fits():
-    """Fits within a refinement are short; see ``refinements.small_fits``."""
-    with refinements.small_fits():
-        yield
-
-
 @pytest.fixture(scope="session")
 def ball_photos():
-    """The capture that refinements are tested on."""
-    return refinements.capture()
+    """Nine photos of a ball to fit, and three to test."""
+    return refinements.capture(12)
 
 
 @pytest.fixture(scope="session")
-def helped(ball_photos, tmp_path_factory):
-    """A refinement of two rounds that help: what it returns, its folder, its progress."""
+def few_photos():
+    """Three photos of a ball to fit, and two to test."""
+    return refinements.capture(5)
+
+
+@pytest.fixture(scope="session")
+def helped(few_photos, tmp_path_factory):
+    """A refinement of two accepted rounds, its folder and its events."""
     out = tmp_path_factory.mktemp("helped")
-    seen = []
-    with refinements.small_fits():
-        refined = refinements.refine(
-            ball_photos, 2, refinements.truthful, out=out, progress=seen.append
-        )
-    return refined, out, seen
+    events = []
+    refined = refinements.refine(
+        few_photos, 2, refinements.truthful, out=out, progress=events.append
+    )
+    assert [done.accepted for done in refined.rounds] == [True, True]
+    return refined, out, events
 
 
 @pytest.fixture
 def rendered(monkeypatch):
-    """The reconstructions that refinements render novel views of, in their order."""
-    from igsr.refinement.stages import Stages
-
+    """The reconstructions that refinements render novel views of, in order."""
     seen = []
-    real = Stages.render_and_denoise
+    propose = rounds.propose
 
-    def watched(stages, reconstruction):
-        seen.append(reconstruction)
-        return real(stages, reconstruction)
+    def watched(context, fitted):
+        seen.append(fitted)
+        return propose(context, fitted)
 
-    monkeypatch.setattr(Stages, "render_and_denoise", watched)
+    monkeypatch.setattr(rounds, "propose", watched)
     return seen
 
 

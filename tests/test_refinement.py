@@ -1,4 +1,4 @@
-"""The loop: rounds that it accepts and others, why it stops, cross-validation, arguments."""
+"""Rounds that are accepted or not, why a refinement stops, cross-validation, arguments."""
 
 from __future__ import annotations
 
@@ -7,153 +7,155 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from refinements import SEED, contented, lying, refine, same, truthful, unsure
+from refinements import contented, lying, refine, same, truthful, unsure
 
 import igsr
-from igsr.fitting import fitter, presets
+from igsr.fitting import presets
 from igsr.fitting.photo_support import support_of
 from igsr.fitting.presets import settings_for
-from igsr.refinement import cross_validation, stages
-from igsr.refinement.cross_validation import CrossValidation, combined_error
+from igsr.pose import find
+from igsr.refinement import cross_validation, rounds
+from igsr.refinement.cross_validation import combined_error, fold_photos
 from igsr.refinement.results import Stop, StopReason
-from igsr.refinement.run import RefineRun
-from igsr.refinement.selection import select_views
+from igsr.refinement.selection import LEAST_CONFIDENCE, select_views
 
-SHIPPED_PHOTO_STEPS = fitter.PHOTO_STEPS
-
-
-pytestmark = pytest.mark.usefixtures("small_fits")
-
-
-def test_rounds_that_help_are_accepted_and_make_views_better(helped):
-    refined, _, seen = helped
-    assert [one.accepted for one in refined.rounds] == [True, True]
-    assert refined.stop == Stop(StopReason.ROUNDS_DONE, 2)
-    first = refined.rounds[0]
-    for name, sign in (("psnr", 1), ("ssim", 1), ("flip", -1)):
-        assert sign * first.validation_after[name] > sign * first.validation_before[name]
-    for one in refined.rounds:  # a second round may lose a little of one score for another's gain
-        assert combined_error(one.validation_after) < combined_error(one.validation_before)
-        assert 0 < len(one.selected) <= len(one.selected) + len(one.rejected) <= stages.CANDIDATES
-    psnr = [refined.first_test["psnr"], *(one.test["psnr"] for one in refined.rounds)]
-    # On three photos, a second round's own gain is chance (seeds 0 to 7: -0.3 to +0.5 dB, 0.0 in
-    # the mean); what rounds give over none is not.
-    assert psnr[0] + 0.1 < psnr[1]
-    assert psnr[0] + 0.1 < psnr[2]
-    done = [now.done for now in seen]
-    assert done == sorted(done)
-    assert done[-1] <= 1.0
-    assert {now.stage for now in seen} == {"fit", "novel_views", "cross_validate", "refit", "test"}
+SEEDS = range(5)
+#: Stages of a refinement's events.
+STAGES = {
+    "fit photos",
+    "cross-validate",
+    "denoise novel views",
+    "refit with novel views",
+    "score test views",
+}
 
 
-def test_a_round_helps_with_as_many_steps_on_photos_as_igsr_has(ball_photos, helped, monkeypatch):
-    monkeypatch.setattr(fitter, "PHOTO_STEPS", SHIPPED_PHOTO_STEPS)
+@pytest.fixture(scope="module")
+def by_truth(few_photos):
+    """Refinements by a truthful denoiser, with several seeds."""
+    return [refine(few_photos, 2, truthful, seed=seed) for seed in SEEDS]
+
+
+def test_a_round_is_accepted_if_and_only_if_the_combined_error_falls(by_truth, few_photos):
+    by_lies = [refine(few_photos, 1, lying, seed=seed, steps=100) for seed in SEEDS]
+    for done in (done for refined in (*by_truth, *by_lies) for done in refined.rounds):
+        before, after = (
+            combined_error(done.validation_before),
+            combined_error(done.validation_after),
+        )
+        assert done.accepted == (after < before)
+        assert (done.splats is not None) == (done.test is not None) == done.accepted
+        assert bool(done.selected) == done.accepted
+    assert all(refined.rounds[0].accepted for refined in by_truth)
+    assert not any(done.accepted for refined in by_lies for done in refined.rounds)
+
+
+def test_rounds_by_a_truthful_denoiser_improve_test_views_on_average(by_truth):
     gains = []
-    for seed in (SEED, SEED + 1, SEED + 2):
-        refined = refine(ball_photos, 1, truthful, seed=seed)
-        assert same(refined.first, helped[0].first) is (seed == SEED)
-        (one,) = refined.rounds
-        assert not same(refined.splats, helped[0].rounds[0].splats)
-        # None of a round that is not accepted.
-        gains.append(one.test["psnr"] - refined.first_test["psnr"] if one.accepted else 0.0)
-    # On three photos a round gives 0.0 to 0.7 dB by the seed; seeds 0 to 7: one of none, 0.3 in the
-    # mean.
-    assert sum(gain != 0.0 for gain in gains) >= 2
-    assert np.mean(gains) > 0.1
+    for refined in by_truth:
+        last = [done for done in refined.rounds if done.accepted][-1]
+        gains.append(last.test["psnr"] - refined.first_test["psnr"])
+        assert same(refined.splats, last.splats)
+    assert np.mean(gains) > 0.1, gains
 
 
-def test_a_round_that_does_not_help_is_not_accepted(ball_photos, helped, tmp_path):
-    refined = refine(ball_photos, "auto", lying, out=tmp_path)
-    assert [one.accepted for one in refined.rounds] == [False]
+def test_events_cover_all_stages_and_count_up_to_the_end(helped):
+    refined, _, events = helped
+    assert refined.stop == Stop(StopReason.ROUNDS_DONE, 2)
+    for done in refined.rounds:
+        assert done.selected
+        assert len(done.selected) + len(done.rejected) <= rounds.CANDIDATES
+    stages = [event for event in events if event.path is None]
+    assert {event.stage for event in stages} == STAGES
+    parts = [event.part for event in stages]
+    assert parts == sorted(parts)
+    assert 0.9 < parts[-1] <= 1.0
+    assert [event.values["round"] for event in stages][-1] == 2
+
+
+def test_after_a_rejected_round_the_first_fit_remains(few_photos, helped, rendered, tmp_path):
+    refined = refine(few_photos, "auto", lying, out=tmp_path)
+    assert [done.accepted for done in refined.rounds] == [False]
     assert refined.stop == Stop(StopReason.NOT_ACCEPTED, 1)
     assert refined.splats is refined.first
     assert same(refined.splats, helped[0].first)
-    assert refined.rounds[0].splats is refined.rounds[0].test is None
+    # The whole fit renders nothing: a rejected round costs what its folds cost.
+    assert [fitted.name for fitted in rendered] == ["fold0", "fold1", "fold2"]
     page = (tmp_path / "report.html").read_text()
     drawn = json.loads(page.split('id="cameras">')[1].split("</script>")[0])
-    kinds = [kind for kind, _ in drawn]
-    assert (kinds.count(0), kinds.count(1), kinds.count(2)) == (9, 0, 0)
+    assert [kind for kind, _ in drawn] == [0, 0, 0], "photos alone, no novel view"
 
 
-def test_a_round_that_is_not_accepted_renders_nothing_of_the_whole_fit(ball_photos, rendered):
-    """It costs what its folds cost."""
-    assert refine(ball_photos, 1, lying, steps=40).stop == Stop(StopReason.NOT_ACCEPTED, 1)
-    assert [one.name for one in rendered] == ["fold0", "fold1", "fold2"]
-
-
-def test_nothing_is_fitted_twice_where_there_is_nothing_to_add(ball_photos, helped, monkeypatch):
-    monkeypatch.setattr(stages.Stages, "refit", lambda *_: pytest.fail("it is fitted again"))
-    refined = refine(ball_photos, "auto", unsure)
-    assert not refined.rounds
-    assert refined.stop == Stop(StopReason.NONE_SELECTED, len(refined.rejected))
-    assert same(refined.splats, helped[0].first)
-    content = refine(ball_photos, "auto", contented)
-    assert not content.rounds
-    assert content.stop.reason is StopReason.NONE_SELECTED
-    assert len(content.rejected) > 5
-    assert all(one.gain == 0.0 for one in content.rejected)
-    none = refine(ball_photos, 0, truthful)
+def test_without_a_selected_view_nothing_is_fitted_again(few_photos, helped, monkeypatch):
+    monkeypatch.setattr(rounds, "refit", lambda *_: pytest.fail("it was fitted again"))
+    doubted, unchanged = (refine(few_photos, "auto", denoiser) for denoiser in (unsure, contented))
+    assert all(view.mean_confidence < LEAST_CONFIDENCE for view in doubted.rejected)
+    assert all(view.gain == 0.0 for view in unchanged.rejected)
+    for refined in (doubted, unchanged):
+        assert refined.rounds == []
+        assert refined.stop == Stop(StopReason.NONE_SELECTED, len(refined.rejected))
+        assert len(refined.rejected) > 5
+        assert same(refined.splats, helped[0].first)
+    none = refine(few_photos, 0, truthful)
     assert none.stop == Stop(StopReason.ROUNDS_DONE, 0)
     assert same(none.splats, helped[0].first)
-    two = igsr.Capture(ball_photos.path, ball_photos.train_views[:2])
-    assert refine(two, 1, truthful).stop == Stop(StopReason.TOO_FEW_PHOTOS, 3)
 
 
-def test_one_panorama_is_too_few_to_hold_any_out(ball_photos):
-    """Its views are held out together."""
-    of_one = [replace(view, rig="panorama.jpg") for view in ball_photos.train_views]
-    refined = refine(igsr.Capture(ball_photos.path, of_one), 1, truthful, steps=40)
-    assert refined.stop == Stop(StopReason.TOO_FEW_PHOTOS, 3)
+def test_views_of_one_panorama_are_held_out_together_and_count_as_one_photo(ball_photos):
+    panorama = [replace(view, rig="panorama.jpg") for view in ball_photos.train_views]
+    for views in (ball_photos.train_views[:2], panorama):
+        refined = refine(igsr.Capture(ball_photos.path, views), 1, truthful, steps=40)
+        assert refined.stop == Stop(StopReason.TOO_FEW_PHOTOS, 3)
 
 
-def test_folds_are_fitted_as_all_photos_are(ball_photos, monkeypatch):
-    """The folds have fewer photos, further apart, but are fitted with the settings for all."""
+def test_folds_are_fitted_with_the_settings_for_all_photos(ball_photos, monkeypatch):
     photos = ball_photos.train_views
-    assert len(photos) == 9
-    monkeypatch.setattr(presets, "WIDE_APART", support_of(photos).apart + 0.1)
+    monkeypatch.setattr(presets, "WIDE_APART_DEG", support_of(photos).apart + 0.1)
     monkeypatch.setattr(presets, "SH2_PHOTOS", support_of(photos).seen_by)
-    monkeypatch.setattr(presets, "MOST_DROPOUT", 0.9)
-    dropout = settings_for("default", support_of(photos)).dropout
-    assert settings_for("default", support_of(photos[::2])).dropout != dropout
-    settings = []
-    real = stages.fit_with_cameras
+    monkeypatch.setattr(presets, "MAX_DROPOUT", 0.9)
+    dropout = settings_for(support_of(photos)).dropout
+    assert settings_for(support_of(photos[::2])).dropout != dropout
+    fits = []
+    fit_capture = rounds.fit_capture
 
-    def watched(made, **given):
-        settings.append((len(made.views), given["density"], given["sh_degree"], given["dropout"]))
-        return real(made, **given)
+    def watched(capture, **given):
+        fits.append((len(capture.views), given["density"], given["sh_degree"], given["dropout"]))
+        return fit_capture(capture, **given)
 
-    monkeypatch.setattr(stages, "fit_with_cameras", watched)
+    monkeypatch.setattr(rounds, "fit_capture", watched)
     refine(ball_photos, 1, lying, steps=40)
-    assert [photos for photos, *_ in settings][:3] == [9, 7, 8]
-    assert {tuple(some) for _, *some in settings} == {("original", 2, dropout)}
+    assert [count for count, *_ in fits][:4] == [9, 7, 8, 8]
+    assert {tuple(settings) for _, *settings in fits} == {("original", 2, dropout)}
 
 
-def test_what_masks_hide_has_no_weight(ball_photos):
-    """Photos of one half alone: what only the other half would have shown has no weight."""
+def test_pixels_behind_masks_get_no_weight(ball_photos):
+    """Photos of one half: novel views have no weight where only the other half would show."""
     half = np.zeros((40, 40), np.bool_)
     half[:, :20] = True
-    views = [replace(view, mask=half) for view in ball_photos.train_views]
-    confidences = []
-    real = select_views
-
-    def select(found, count):
-        confidences.append([one.confidence for one in found])
-        return real(found, count)
+    masked = [replace(view, mask=half) for view in ball_photos.train_views]
 
     def sure(buffers, photos):
         return truthful(buffers, photos)[0], np.full(buffers.color.shape[:2], 1.0, np.float32)
 
-    given = {"cross_validate": False, "select": select}
-    refine(igsr.Capture(ball_photos.path, views), 1, sure, **given)
-    refine(igsr.Capture(ball_photos.path, ball_photos.train_views), 1, sure, **given)
-    masked, whole = (np.stack(some) for some in confidences)
-    assert (whole == whole.max()).all(), "without masks what the denoiser says counts"
-    assert masked.min() == 0.0
-    assert 0.1 < (masked > 0.5).mean() < 0.9
+    def confidence(views):
+        seen = []
+
+        def select(found, count):
+            seen.extend(candidate.confidence for candidate in found)
+            return select_views(found, count)
+
+        photos = igsr.Capture(ball_photos.path, views)
+        refine(photos, 1, sure, cross_validate=False, select=select)
+        return np.stack(seen)
+
+    whole, some = confidence(ball_photos.train_views), confidence(masked)
+    assert (whole == whole.max()).all(), "without masks, the denoiser's confidence counts"
+    assert some.min() == 0.0
+    assert 0.1 < (some > 0.5).mean() < 0.9
 
 
 @pytest.mark.parametrize(
-    ("rounds", "options", "message"),
+    ("max_rounds", "options", "message"),
     [
         ("many", {}, 'rounds must be a whole number or "auto"'),
         (-1, {}, "rounds must not be negative"),
@@ -167,71 +169,70 @@ def test_what_masks_hide_has_no_weight(ball_photos):
         (1, {"seed": -1}, "seed must be from 0 to"),
     ],
 )
-def test_bad_arguments(ball_photos, rounds, options, message, monkeypatch, tmp_path):
+def test_bad_arguments(few_photos, max_rounds, options, message, monkeypatch, tmp_path):
     earlier = tmp_path / "checkpoints/whole.npz"
     earlier.parent.mkdir()
     earlier.write_bytes(b"of an earlier run")
     given = options if "resume" in options else {**options, "out": tmp_path}
-    with pytest.raises(igsr.IgsrError, match=message):
-        refine(ball_photos, rounds, truthful, **given)
+    monkeypatch.setattr(find, "estimated_cameras", lambda *_: pytest.fail("cameras were sought"))
+    for photos in (few_photos, "a folder"):
+        with pytest.raises(igsr.IgsrError, match=message):
+            refine(photos, max_rounds, truthful, **given)
     assert earlier.is_file()
-    searched = lambda *_: pytest.fail("cameras are looked for")  # noqa: E731
-    monkeypatch.setattr(RefineRun, "find_cameras", searched)
-    with pytest.raises(igsr.IgsrError, match=message):
-        refine("a folder", rounds, truthful, **options)
 
 
-def test_photos_that_cannot_be_fitted_or_scored_are_told_before_anything_is_done(
-    ball_photos, monkeypatch, tmp_path
+@pytest.mark.parametrize(
+    ("split", "message"), [("train", "no pixel to fit"), ("test", "no pixel to score")]
+)
+def test_unusable_photos_end_it_before_files_are_removed(
+    few_photos, split, message, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(stages, "fit_with_cameras", lambda *_, **__: pytest.fail("it is fitted"))
+    monkeypatch.setattr(rounds, "fit_capture", lambda *_, **__: pytest.fail("it was fitted"))
     earlier = tmp_path / "checkpoints/whole.npz"
     earlier.parent.mkdir()
     earlier.write_bytes(b"of an earlier run")
     nothing = np.zeros((40, 40), np.bool_)
-    for split, message in (("train", "no pixel to fit"), ("test", "no pixel to score")):
-        views = [replace(v, mask=nothing) if v.split == split else v for v in ball_photos.views]
-        with pytest.raises(igsr.IgsrError, match=message):
-            refine(igsr.Capture(ball_photos.path, views), 1, truthful, out=tmp_path)
+    views = [replace(v, mask=nothing) if v.split == split else v for v in few_photos.views]
+    with pytest.raises(igsr.IgsrError, match=message):
+        refine(igsr.Capture(few_photos.path, views), 1, truthful, out=tmp_path)
     assert earlier.is_file()
 
 
 @pytest.mark.parametrize("count", [3, 4, 6, 9])
-def test_each_fold_holds_out_photos_that_no_other_does(ball_photos, count, monkeypatch):
-    fewer = igsr.Capture(ball_photos.path, ball_photos.train_views[:count])
+def test_no_photo_is_held_out_by_two_folds(ball_photos, count, monkeypatch):
+    names = {view.name for view in ball_photos.train_views[:count]}
     held_out = []
-    real = CrossValidation._fitted
+    fit_photos = rounds.fit_photos
 
-    def watched(validation):
-        folds = real(validation)
-        held_out.extend([view.name for view in fold.held_out] for fold in folds)
-        photos = [len(fold.held_out) + len(fold.reconstruction.photos) for fold in folds]
-        assert photos == 3 * [count]
-        return folds
+    def watched(context, fold, photos, *rest):
+        held_out.append(names - {photo.name for photo in photos})
+        return fit_photos(context, fold, photos, *rest)
 
-    monkeypatch.setattr(CrossValidation, "_fitted", watched)
-    refine(fewer, 1, lying, steps=40)
+    monkeypatch.setattr(rounds, "fit_photos", watched)
+    fewer = igsr.Capture(ball_photos.path, ball_photos.train_views[:count])
+    (done,) = refine(fewer, 1, lying, steps=40).rounds
     assert len(held_out) == 3
     assert all(held_out)
-    names = [name for of_fold in held_out for name in of_fold]
-    assert len(set(names)) == len(names)
+    reported = [view.name for view in done.held_out]
+    assert len(reported) == len(set(reported)) == sum(map(len, held_out))
+    assert set(reported) == set.union(*held_out)
 
 
 def test_folds_of_smaller_photos_have_as_many_splats_per_pixel(ball_photos, monkeypatch):
-    monkeypatch.setattr(cross_validation, "LEAST_FOLD_SIDE", 16)
+    monkeypatch.setattr(cross_validation, "MIN_FOLD_SIDE_PX", 16)
     counts = []
-    real = CrossValidation._fitted
+    fit_photos = rounds.fit_photos
 
-    def watched(validation):
-        folds = real(validation)
-        counts.extend(len(fold.reconstruction.splats) for fold in folds)
-        return folds
+    def watched(*given):
+        fitted = fit_photos(*given)
+        counts.append(len(fitted.splats))
+        return fitted
 
-    monkeypatch.setattr(CrossValidation, "_fitted", watched)
-    whole, folds = len(refine(ball_photos, 1, lying, steps=400).first), counts
-    assert len(folds) == 3
-    assert 250 < whole <= 1000
-    assert all(0 < fold <= 250 for fold in folds)
+    monkeypatch.setattr(rounds, "fit_photos", watched)
+    refined = refine(ball_photos, 1, lying, steps=400)
+    assert len(counts) == 3
+    assert 250 < len(refined.first) <= 1000
+    assert all(0 < count <= 250 for count in counts)
 
 
 @pytest.mark.parametrize(
@@ -241,14 +242,13 @@ def test_folds_fit_photos_that_are_halved_at_most_twice(side, small, steps):
     image = np.zeros((side, 2 * side, 3), np.uint8)
     K = np.array([[side, 0.0, side], [0.0, side, side / 2], [0.0, 0.0, 1.0]])
     camera = igsr.Camera(np.eye(4), K, 2 * side, side)
-    photos = [igsr.View(f"{k}.png", camera, "train", image) for k in range(3)]
-    made, share, part = cross_validation._fold_photos(photos)
-    assert {photo.camera.height for photo in made} == {small}
-    assert share == pytest.approx((small / side) ** 2, rel=0.02)
-    assert part == steps
+    folds = fold_photos([igsr.View(f"{k}.png", camera, "train", image) for k in range(3)])
+    assert {photo.camera.height for photo in folds.photos} == {small}
+    assert folds.share == pytest.approx((small / side) ** 2, rel=0.02)
+    assert folds.steps == steps
 
 
-def test_a_round_is_validated_by_three_errors_together():
+def test_three_scores_together_decide_about_a_round():
     def error(psnr, ssim, flip):
         return combined_error({"psnr": psnr, "ssim": ssim, "flip": flip})
 

@@ -1,4 +1,4 @@
-"""How fits take novel views: by their weights, and less often than photos."""
+"""How fits use novel views: by their weights, and less often than photos."""
 
 from __future__ import annotations
 
@@ -7,139 +7,147 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from refinements import BALL, SEED, STEPS, WHITE, same
+from refinements import BALL, STEPS, WHITE, same
 
 import igsr
-from igsr.fitting import fitter
-from igsr.refinement.stages import seed_of_round
+from igsr import _core
+from igsr.fitting import fit_capture
+from igsr.fitting.inputs import prepare
+from igsr.refinement.rounds import seed_of_round
 from igsr.rendering.renders import render
 
-pytestmark = pytest.mark.usefixtures("small_fits")
+ONES = np.ones((40, 40), np.float32)
 
 
-def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(ball_photos):
-    def fitted(**fields):
-        views = [replace(view, **fields) for view in ball_photos.train_views]
-        made = igsr.Capture(ball_photos.path, views)
-        # From given splats: masks also have a say in the first ones of a fit.
-        return scenes.fit(made, steps=20, backend="cpu", start=BALL)
+def pseudo(view, weights=ONES, **fields):
+    """A photo as a pseudo-view, with other fields."""
+    view = replace(view, **fields)
+    return igsr.PseudoView(
+        view.name, view.camera, view.split, view.image, view.mask, weights=weights
+    )
 
-    size = (40, 40)
-    left = np.ones(size, np.float32)
+
+def test_weights_of_one_are_as_none_and_weights_of_zero_as_a_mask(ball_photos):
+    photos = ball_photos.train_views
+    left = ONES.copy()
     left[:, :20] = 0.0
-    assert same(fitted(), fitted(weights=np.ones(size, np.float32)))
-    assert same(fitted(mask=left > 0), fitted(weights=left))
-    assert not same(fitted(), fitted(weights=left))
+
+    def fitted(views):
+        # From splats: masks also influence the initialization.
+        return scenes.fit(igsr.Capture(ball_photos.path, views), 20, backend="cpu", start=BALL)
+
+    whole = fitted(photos)
+    half = fitted([pseudo(view, left) for view in photos])
+    assert same(whole, fitted([pseudo(view) for view in photos]))
+    assert same(half, fitted([replace(view, mask=left > 0) for view in photos]))
+    assert not same(whole, half)
     with pytest.raises(igsr.IgsrError, match="weights must be finite and not negative"):
-        replace(ball_photos.views[0], weights=-left)
+        pseudo(photos[0], -left)
     with pytest.raises(igsr.IgsrError, match="weights"):
-        replace(ball_photos.views[0], weights=left[1:])
+        pseudo(photos[0], left[1:])
 
 
 @pytest.mark.filterwarnings("ignore:.*one and the same camera", "ignore:.*black or wholly")
-def test_a_picture_of_small_weights_counts_less_than_a_photo(ball_photos):
-    """Two pictures of one camera that disagree: the splats side with the heavier."""
+def test_of_two_pictures_that_disagree_the_one_of_larger_weight_wins(ball_photos):
     view = ball_photos.train_views[0]
-    white = replace(view, name="white.png", image=np.full((40, 40, 3), 255, np.uint8))
-    black = replace(view, name="black.png", image=np.zeros((40, 40, 3), np.uint8))
-    side = scenes.ring_camera(1.0, 40)
-    ones = np.ones((40, 40), np.float32)  # or photos would come up more often
-    means = []
-    for weight in (0.1, 1.0):
-        weighed = replace(white, weights=np.full((40, 40), weight, np.float32))
-        pair = [black, weighed, replace(black, name="side.png", camera=side)]
-        pair = [view if view.weights is not None else replace(view, weights=ones) for view in pair]
-        splats = scenes.fit(
-            igsr.Capture(ball_photos.path, pair),
-            steps=200,
-            backend="cpu",
-            start=BALL,
-            sh_degree=BALL.sh_degree,
-            dropout=0.0,
-            backdrop=False,
-        )
-        means.append(render(splats, view.camera, backend="cpu").color.mean())
-    assert means[0] < 0.5 * means[1]
+    white = np.full((40, 40, 3), 255, np.uint8)
+    black = pseudo(view, name="black.png", image=np.zeros((40, 40, 3), np.uint8))
+    side = pseudo(black, name="side.png", camera=scenes.ring_camera(1.0, 40))
+
+    def brightness(weight):
+        bright = pseudo(view, weight * ONES, name="white.png", image=white)
+        photos = igsr.Capture(ball_photos.path, [black, bright, side])
+        options = {"start": BALL, "sh_degree": 1, "dropout": 0.0, "backdrop": False}
+        splats = scenes.fit(photos, 200, backend="cpu", **options)
+        return render(splats, view.camera, backend="cpu").color.mean()
+
+    assert brightness(0.1) < 0.5 * brightness(1.0)
 
 
-def test_a_warm_start_goes_on_from_splats(ball_photos):
+def test_a_fit_continues_from_splats(ball_photos):
     options = {"backend": "cpu", "remove_floaters": False}
-    first = scenes.fit(ball_photos, steps=100, **options)
-    on = scenes.fit(ball_photos, steps=50, start=first, **options)
-    before, after = (igsr.evaluate(s, ball_photos, "train")["psnr"] for s in (first, on))
+    first = scenes.fit(ball_photos, 100, **options)
+    last = scenes.fit(ball_photos, 50, start=first, **options)
+    before, after = (igsr.evaluate(s, ball_photos, "train")["psnr"] for s in (first, last))
     assert after > before
-    assert len(on) >= len(first)
-    with pytest.raises(igsr.IgsrError, match="sh_degree must be the same, not 3"):
-        scenes.fit(ball_photos, steps=5, backend="cpu", start=first, sh_degree=3)
-    with pytest.raises(igsr.IgsrError, match="give at least one, and no more than max_splats"):
-        scenes.fit(ball_photos, steps=5, backend="cpu", start=first, max_splats=2)
-    with pytest.raises(igsr.IgsrError, match="antialiased"):
-        scenes.fit(ball_photos, steps=5, backend="cpu", start=replace(first, antialiased=True))
+    assert len(last) >= len(first)
+    antialiased = replace(first, antialiased=True)
+    for start, settings, message in (
+        (first, {"sh_degree": 3}, "sh_degree must be the same, not 3"),
+        (first, {"max_splats": 2}, "give at least one and at most max_splats"),
+        (antialiased, {}, "antialiased"),
+    ):
+        with pytest.raises(igsr.IgsrError, match=message):
+            scenes.fit(ball_photos, 5, start=start, backend="cpu", **settings)
 
 
 @pytest.mark.filterwarnings("ignore:.*one and the same camera")
 def test_novel_views_change_neither_settings_nor_initialization(ball_photos):
     photos = ball_photos.train_views[:3]
-    weights = np.ones((40, 40), np.float32)
     views = [
-        replace(view, name=f"{k}-{view.name}", weights=weights)
-        for k in range(3)
-        for view in ball_photos.train_views
+        pseudo(view, name=f"{k}-{view.name}") for k in range(3) for view in ball_photos.train_views
     ]
 
-    def begun(some):
-        seen = []
-
-        def stop(now):
-            seen.append(now)
-            return False
-
-        scenes.fit(igsr.Capture(ball_photos.path, some), backend="cpu", progress=stop)
-        return seen[0].steps, seen[0].started
+    def begun(views):
+        capture = igsr.Capture(ball_photos.path, views)
+        started = fit_capture(capture, steps=1, backend="cpu").started
+        return prepare(capture, backend="cpu").settings, started
 
     assert begun(photos + views) == begun(photos)
     assert begun(views) != begun(photos)
 
 
-def test_a_round_fits_photos_and_novel_views_from_the_initialization(ball_photos, helped):
-    refined = helped[0]
-    views = list(refined.capture.train_views)
-    for k, one in enumerate(refined.rounds[0].selected):
-        camera, picture = one.view.camera, one.denoised
-        views.append(
-            igsr.View(f"whole-round1-{k}.png", camera, "train", picture, None, one.confidence)
+def test_a_round_fits_photos_and_novel_views_from_the_initialization(helped):
+    capture, done = helped[0].capture, helped[0].rounds[0]
+    views = [
+        igsr.PseudoView(
+            f"whole-round1-{k}.png",
+            candidate.view.camera,
+            "train",
+            candidate.denoised,
+            weights=candidate.confidence,
+            background=WHITE,
         )
-    given = [*views[:9], *(replace(view, background=WHITE) for view in views[9:])]
-    seed = seed_of_round(SEED, 1)
-    fitted = scenes.fit(igsr.Capture(ball_photos.path, given), STEPS, backend="cpu", seed=seed)
-    assert same(fitted, refined.rounds[0].splats)
-    other = scenes.fit(igsr.Capture(ball_photos.path, given), STEPS, backend="cpu", seed=SEED)
-    assert not same(other, fitted)
+        for k, candidate in enumerate(done.selected)
+    ]
+    photos = igsr.Capture(capture.path, [*capture.train_views, *views])
+    fitted = scenes.fit(photos, STEPS, backend="cpu", seed=seed_of_round(0, 1))
+    assert same(fitted, done.splats)
+    assert not same(scenes.fit(photos, STEPS, backend="cpu", seed=0), fitted)
 
 
 def test_novel_views_are_sampled_less_often_and_not_at_the_end(ball_photos, monkeypatch):
+    photo, other = ball_photos.train_views[:2]
+    view = pseudo(photo, name="novel.png", camera=scenes.ring_camera(1.0, 40))
+    second = replace(view, name="second.png", camera=scenes.ring_camera(2.0, 40))
+
+    def schedule(*views, steps=1000, **options):
+        """For each view, how often it comes in a round, and the step that ends its use."""
+        seen = []
+
+        def record(images, masks, backgrounds, schedule, *rest):
+            seen.append(schedule)
+            raise scenes.Stop
+
+        monkeypatch.setattr(_core, "Fitter", record)
+        with pytest.raises(scenes.Stop):
+            scenes.fit(igsr.Capture(ball_photos.path, list(views)), steps, backend="cpu", **options)
+        return seen[0]
+
+    assert schedule(photo, view, second, other) == [(5, None), (1, 800), (1, 800), (5, None)]
+    assert schedule(photo, other, view) == [(3, None), (3, None), (1, 800)]
+    assert schedule(photo, other) == schedule(view, second) == [(1, None), (1, None)]
+    # Two photos have 500 steps: the last 100 of them have their own last fifth.
+    assert schedule(photo, other, view, steps=100, start=BALL)[-1] == (1, 480)
+
+
+def test_a_short_fit_that_continues_samples_novel_views(ball_photos):
     photos = ball_photos.train_views[:2]
-    views = [replace(view, weights=np.ones((40, 40), np.float32)) for view in photos]
-    monkeypatch.setattr(fitter, "PHOTO_STEPS", 5)
-    monkeypatch.setattr(fitter, "PHOTOS_LAST", 0.2)
-
-    def schedule(*views, first=0):
-        return fitter._schedule(views, 1000, first)
-
-    assert schedule(photos[0], *views, photos[1]) == [(5, None), (1, 800), (1, 800), (5, None)]
-    assert schedule(*photos, views[0]) == [(3, None), (3, None), (1, 800)]
-    assert schedule(*photos) == schedule(*views) == [(1, None), (1, None)]
-    # A fit that enters the schedule late has its own last fifth.
-    assert schedule(*photos, views[0], first=900)[-1] == (1, 980)
-
-
-def test_a_short_fit_that_goes_on_samples_novel_views(ball_photos):
-    photos = ball_photos.train_views[:2]
-    view = replace(ball_photos.train_views[2], weights=np.ones((40, 40), np.float32))
+    view = pseudo(ball_photos.train_views[2])
     start = scenes.fit(igsr.Capture(ball_photos.path, photos), 20, backend="cpu")
 
-    def gone_on(view):
-        given = igsr.Capture(ball_photos.path, [*photos, view])
-        return scenes.fit(given, 20, backend="cpu", start=start)
+    def continued(view):
+        capture = igsr.Capture(ball_photos.path, [*photos, view])
+        return scenes.fit(capture, 20, backend="cpu", start=start)
 
-    assert not same(gone_on(view), gone_on(replace(view, image=255 - view.image)))
+    assert not same(continued(view), continued(replace(view, image=255 - view.image)))
