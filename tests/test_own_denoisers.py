@@ -1,4 +1,4 @@
-"""Denoisers of one's own: by name, without confidence, and of a single-step network."""
+"""Custom denoisers: without confidence, by name, and from a single-step network."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ import scenes
 import torch
 from PIL import Image
 from refinements import refine, truthful
-from typer.testing import CliRunner
 
 import igsr
-from igsr.cli import app
 from igsr.denoiser import Buffers, SingleStepDenoiser, Source, denoise, named_denoiser
 from igsr.denoiser.confidence import MIN_CLAIMED_ERROR, confidence_of, error_of
 from igsr.refinement.selection import confidence_weights
@@ -30,7 +28,7 @@ def test_confidence_and_error_are_inverse():
     assert confidence_of(errors)[2] == pytest.approx(0.5)
 
 
-def test_a_picture_alone_gets_a_confidence_by_its_changes():
+def test_a_picture_without_confidence_gets_that_of_its_changes():
     color = np.full((24, 32, 3), 0.5, np.float32)
     picture = color.copy()
     picture[:, 16:] = 0.8
@@ -42,17 +40,15 @@ def test_a_picture_alone_gets_a_confidence_by_its_changes():
         denoise(color, denoiser=lambda render, photos: picture[::2])
 
 
-@pytest.mark.usefixtures("small_fits")
-def test_a_confidence_that_is_given_is_kept(ball_photos):
-    def sure(buffers, photos):
+def test_a_refinement_uses_the_confidence_of_the_denoiser(few_photos):
+    def denoiser(buffers, photos):
         return truthful(buffers, photos)[0], np.full(buffers.color.shape[:2], 0.6, np.float32)
 
-    selected = refine(ball_photos, 1, sure).rounds[0].selected
+    selected = refine(few_photos, 1, denoiser, cross_validate=False).rounds[0].selected
+    assert selected
     weight = confidence_weights(np.full((1, 1), 0.6, np.float32))[0, 0]
-    assert [one.mean_confidence for one in selected] == pytest.approx([weight] * len(selected))
-
-
-# ---- by name -------------------------------------------------------------------------------------
+    for candidate in selected:
+        assert candidate.mean_confidence == pytest.approx(weight)
 
 
 @pytest.fixture
@@ -91,7 +87,7 @@ def test_a_factory_is_found_by_module_or_file(module, module_name):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("my_denoiser", "must be MODULE:FACTORY"),
         (":make", "must be MODULE:FACTORY"),
@@ -106,8 +102,8 @@ def test_a_factory_is_found_by_module_or_file(module, module_name):
         ("my_denoiser:nothing", "must return a function of a render and photos, not NoneType"),
     ],
 )
-def test_names_that_make_no_denoiser_are_told(module, name, said):
-    with pytest.raises(igsr.IgsrError, match=said):
+def test_bad_names_are_errors(module, name, message):
+    with pytest.raises(igsr.IgsrError, match=message):
         named_denoiser(name)
 
 
@@ -120,46 +116,42 @@ def scene(tmp_path):
     return tmp_path
 
 
-def run(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def test_denoise_apply_takes_a_name(module, scene):
+def test_the_command_denoise_takes_a_name(module, scene, igsr_here):
     options = ("--capture", "ball", "--out", "clean", "--holdout", 4, "--backend", "cpu", "--json")
-    done = run("denoise", "ball.ply", *options, "--denoiser", "my_denoiser:make")
-    assert done.exit_code == 0, done.output
+    done = igsr_here("denoise", "ball.ply", *options, "--denoiser", "my_denoiser:make")
+    assert done.returncode == 0, done.stderr
     picture = np.asarray(Image.open(scene / "clean/photos/00.png")).astype(int)
     photo = np.asarray(Image.open(scene / "ball/photos/00.png")).astype(int)
     assert np.abs(picture - (255 - photo[..., :3])).mean() < 12.0
 
 
-@pytest.mark.parametrize("command", ["apply", "refine"])
-def test_the_commands_tell_what_is_wrong_with_a_name(module, scene, command):
-    given = {
-        "apply": ("denoise", "ball.ply", "--capture", "ball", "--out", "out"),
-        "refine": ("refine", "ball", "--out", "out", "--steps", 5),
-    }[command]
-    done = run(*given, "--denoiser", "my_denoiser:fails", "--backend", "cpu")
-    assert done.exit_code == 1
-    assert "no weights here" in done.output
-    done = run(*given, "--denoiser", "my_denoiser:make", "--weights", "w.safetensors")
-    assert done.exit_code == 1
-    assert "not both" in done.output
-    assert not (scene / "out").exists()
-
-
-def test_refine_takes_a_name(module, scene):
-    done = run(
-        "refine", "ball", "--out", "out", "--steps", 30, "--rounds", 1, "--backend", "cpu",
-        "--denoiser", "my_denoiser:make", "--no-html", "--json",
-    )  # fmt: skip
-    assert done.exit_code == 0, done.output
+def test_the_command_refine_takes_a_name(module, scene, igsr_here):
+    done = igsr_here(
+        *("refine", "ball", "--out", "out", "--steps", 30, "--rounds", 1, "--backend", "cpu"),
+        *("--denoiser", "my_denoiser:make"),
+    )
+    assert done.returncode == 0, done.stderr
     report = json.loads((scene / "out/report.json").read_text())
-    # A negative of the scene improves nothing: there is the fit alone.
-    assert not any(one.get("accepted", False) for one in report["rounds"])
+    # A negative of the scene improves nothing.
+    assert not any(done.get("accepted", False) for done in report["rounds"])
 
 
-# ---- single-step networks ------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("denoise", "ball.ply", "--capture", "ball", "--out", "out"),
+        ("refine", "ball", "--out", "out", "--steps", 5),
+    ],
+)
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("my_denoiser:fails", "no weights here"), ("missing.safetensors", "missing.safetensors")],
+)
+def test_the_commands_report_a_bad_denoiser(module, scene, command, name, message, igsr_here):
+    done = igsr_here(*command, "--denoiser", name, "--backend", "cpu")
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert not (scene / "out").exists()
 
 
 def source(offset, color):
@@ -188,7 +180,7 @@ def test_the_model_gets_the_nearest_photo_and_padded_pictures():
     assert seen[-1][1] is None
 
 
-def test_large_renders_are_cleaned_small_and_keep_their_detail():
+def test_large_renders_are_denoised_small_and_keep_their_detail():
     sizes = []
 
     def model(render, photo):
@@ -204,7 +196,7 @@ def test_large_renders_are_cleaned_small_and_keep_their_detail():
     assert np.isfinite(SingleStepDenoiser(model)(Buffers(broken), [])).all()
 
 
-def test_models_and_sizes_that_do_not_fit_are_told():
+def test_bad_models_and_sizes_are_errors():
     with pytest.raises(igsr.IgsrError, match=r"returned \[1, 3, 8, 8\] for \[1, 3, 16, 16\]"):
         SingleStepDenoiser(lambda render, photo: render[..., ::2, ::2])(
             Buffers(np.zeros((16, 16, 3), np.float32)), []
@@ -246,7 +238,7 @@ class DifixPipeline:
 
 
 def test_the_example_adapts_difix(tmp_path, monkeypatch):
-    """With a made-up pipeline of its interface: half-way to the photo."""
+    """A made-up pipeline with its interface goes half-way to the photo."""
     (tmp_path / "pipeline_difix.py").write_text(PIPELINE)
     torch.save(torch.tensor(0.5), tmp_path / "gain.pt")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -262,6 +254,6 @@ def test_the_example_adapts_difix(tmp_path, monkeypatch):
     assert confidence.max() < 0.25
 
 
-def test_without_difix_the_example_says_what_is_missing():
+def test_without_difix_the_example_names_the_missing_module():
     with pytest.raises(igsr.IgsrError, match="No module named 'pipeline_difix'"):
         named_denoiser(f"{EXAMPLE}:make")
