@@ -63,3 +63,7 @@ def in_a_process(work: Callable[..., T], *arguments: Any) -> T:
             raise WorkerLostError(
                 "A process ended without a result; the machine may have run out of memory."
             ) from error
+        except KeyboardInterrupt:
+            for process in pool._processes.values():
+                process.kill()  # leaving the pool would wait until the work is done
+            raise

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from types import FrameType
 
 import typer
 
 from igsr.errors import IgsrError
 
-#: Exit status after Ctrl-C: 128 + SIGINT, as shells report it.
+#: Exit status after Ctrl-C and SIGTERM: 128 plus the signal, as shells report it.
 INTERRUPTED = 130
+TERMINATED = 143
 
 #: Environment variable that asks for the traceback behind an error message. ``igsr --debug`` sets
 #: it, so that worker processes see it too.
 DEBUG_VARIABLE = "IGSR_DEBUG"
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a command as Ctrl-C does."""
 
 
 def debugging() -> bool:
@@ -28,21 +36,25 @@ def debugging() -> bool:
 
 @contextlib.contextmanager
 def error_messages(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Iterator[None]:
-    """Turn errors that a user can mend into one message on stderr and a non-zero exit status.
+    """Turn errors that a user can fix into one message on stderr and a non-zero exit status.
 
     Other exceptions are bugs and pass through with their traceback.
 
     Args:
-        interrupted: the message after Ctrl-C, made when it is needed.
+        interrupted: makes the message after Ctrl-C or SIGTERM.
 
     Raises:
-        typer.Exit: with status 1, or ``INTERRUPTED`` after Ctrl-C.
+        typer.Exit: with status 1, ``INTERRUPTED`` or ``TERMINATED``.
     """
     try:
-        yield
-    except KeyboardInterrupt:
+        with _sigterm_raises():
+            yield
+    except typer.Exit:  # a RuntimeError
+        raise
+    except KeyboardInterrupt as error:
         _report(interrupted())
-        raise typer.Exit(INTERRUPTED) from None
+        code = TERMINATED if isinstance(error, Terminated) else INTERRUPTED
+        raise typer.Exit(code) from None
     except (IgsrError, RuntimeError) as error:  # the renderer's RuntimeErrors are the GPU's
         _report(str(error))
         raise typer.Exit(1) from None
@@ -53,6 +65,23 @@ def error_messages(interrupted: Callable[[], str] = lambda: "Interrupted.") -> I
     except MemoryError:
         _report("There is not enough memory for this; use fewer or smaller photos or splats")
         raise typer.Exit(1) from None
+
+
+@contextlib.contextmanager
+def _sigterm_raises() -> Iterator[None]:
+    """Raise ``Terminated`` when the process gets SIGTERM."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python handles signals in the main thread only
+        return
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 @contextlib.contextmanager

@@ -123,6 +123,8 @@ def fit_command(
     last_step = 0
 
     def interrupted() -> str:
+        if blocks is not None or ray is not None:
+            return "Interrupted; the same command continues."
         if not last_step:
             return "Interrupted before the first step."
         return (

@@ -52,11 +52,12 @@ class LazyGroup(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for; a missing extra is named. See ``TyperGroup``."""
-        try:
-            return super().invoke(ctx)
-        except ModuleNotFoundError as error:
-            with error_messages(), naming_extra(f"igsr {ctx.invoked_subcommand}"):
-                raise error
+        with error_messages():
+            try:
+                return super().invoke(ctx)
+            except ModuleNotFoundError:
+                with naming_extra(f"igsr {ctx.invoked_subcommand}"):
+                    raise
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that ``args`` names and import it; see ``TyperGroup``."""

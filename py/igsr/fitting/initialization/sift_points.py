@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.capture import Camera, View
 
 Float64 = npt.NDArray[np.float64]
@@ -117,8 +118,7 @@ def _features(view: View) -> tuple[Float64, Float32]:
 def _sift(grey: npt.NDArray[np.uint8]) -> tuple[Float32, Float32]:
     """Keypoints [N, 4] (column and row in pixels, size, turn) and descriptors [N, 128]."""
     # It takes longer to import than all of igsr, and only this initialization needs it.
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     try:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import PoseEvidence, intrinsic_matrix
@@ -91,8 +92,7 @@ def adjusted(
         seed: random seed.
         show: called with "mapping", how much is done, and how much there is.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     options = mapping_options(len(starts), STEPS[-1], seed, matches)
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(matches) as opened:
@@ -162,8 +162,7 @@ def _set_cameras(
     lenses: Mapping[int, Sequence[float]],
 ) -> None:
     """Place the photos in a model that has none placed."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     focals: dict[int, list[float]] = {}
     for i, camera in starts.items():
         if image_id(i) not in model.images:
@@ -204,8 +203,7 @@ class _State:
 
     def refine(self, pixels: float) -> None:
         """Move the model's cameras and points to where they fit best."""
-        import pycolmap
-
+        pycolmap = load_pycolmap()
         bundle, seen, ids = self._arrays()
         if not len(ids):
             return

@@ -18,6 +18,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.load_pycolmap import load_pycolmap
+
 #: COLMAP's numbers of two photos, the smaller first.
 Pair: TypeAlias = tuple[int, int]
 
@@ -39,8 +41,7 @@ BORDER = 10.0
 
 def links(database: Path) -> dict[Pair, npt.NDArray[np.uint32]]:
     """Matches [M, 2] of each pair of photos that has some, as indices of their features."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as opened:
         ids, geometries = opened.read_two_view_geometries()
         return {
@@ -52,8 +53,7 @@ def links(database: Path) -> dict[Pair, npt.NDArray[np.uint32]]:
 
 def leave_out(database: Path, pairs: Iterable[Pair]) -> None:
     """Remove the matches of pairs from a database."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as opened:
         for a, b in sorted(pairs):
             opened.update_two_view_geometry(a, b, pycolmap.TwoViewGeometry())

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import Photo
 
@@ -33,8 +34,7 @@ def list_photos(photos: Sequence[Photo], database: Path) -> None:
     Left to feature extraction, they are numbered as its threads end, and nothing after comes out
     the same twice.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as opened:
         number = 0
         for rig, group in enumerate(_groups(photos), start=1):
@@ -57,8 +57,7 @@ def list_photos(photos: Sequence[Photo], database: Path) -> None:
 
 
 def _camera(photo: Photo, number: int) -> Any:
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     height, width = photo.image.shape[:2]
     focal = photo.focal if photo.focal is not None else GUESSED_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(number, "SIMPLE_RADIAL", focal, width, height)
@@ -72,8 +71,7 @@ def _camera(photo: Photo, number: int) -> Any:
 
 def _rig(number: int, photos: Sequence[Photo], cameras: Sequence[int]) -> Any:
     """A rig of one camera, or of the views of a panorama, whose directions are known."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     rig = pycolmap.Rig(rig_id=number)
     sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera) for camera in cameras]
     rig.add_ref_sensor(sensors[0])
@@ -86,8 +84,7 @@ def _rig(number: int, photos: Sequence[Photo], cameras: Sequence[int]) -> Any:
 
 def known_cameras(database: Path) -> set[int]:
     """Numbers of the cameras whose intrinsics are known exactly: those of panoramas' views."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as opened:
         rigs = opened.read_all_rigs()
     return {int(sensor.id) for rig in rigs if rig.num_sensors() > 1 for sensor in rig.sensor_ids()}

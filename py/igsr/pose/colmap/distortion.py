@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+from igsr._internal.load_pycolmap import load_pycolmap
+
 #: Squared errors may grow by this factor for lenses to count as free of distortion: photos that are
 #: not resampled stay sharp, and from few photos a distortion is often no more than a wrong focal.
 DISTORTION_WORTH = 1.02
@@ -12,8 +14,7 @@ DISTORTION_WORTH = 1.02
 
 def without_distortion(model: Any) -> Any:
     """The model adjusted to lenses without distortion where that fits nearly as well."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     if all(camera.params[3] == 0.0 for camera in model.cameras.values()):
         return model
     pinhole = copy.deepcopy(model)

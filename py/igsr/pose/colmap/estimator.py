@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.attempts import mapped
@@ -112,8 +113,7 @@ def guarded(seed: int) -> Iterator[None]:
     Raises:
         IgsrError: COLMAP fails.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     pycolmap.set_random_seed(seed)

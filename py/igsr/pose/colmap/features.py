@@ -21,6 +21,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.database import image_id
@@ -42,8 +43,7 @@ Extract: TypeAlias = Callable[[npt.NDArray[np.uint8]], Features]
 
 def find_features(photos: Sequence[Photo], database: Path, show: Progress) -> None:
     """Write the SIFT features of photos to COLMAP's database, which lists the photos."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     sift = pycolmap.FeatureExtractorType.SIFT
     with pycolmap.Database.open(database) as opened:
         for index, (keypoints, descriptors) in enumerate(_features(photos)):
@@ -112,8 +112,7 @@ def _inside(
 
 
 def _sift(gray: npt.NDArray[np.uint8]) -> Features:
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = MAX_SIDE_PX
     options.use_gpu = False
@@ -153,8 +152,7 @@ def _sift_process() -> Iterator[Extract]:
 
 def serve() -> None:
     """Extract features of pickled arrays from stdin until it ends; write them to stdout."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process by its stdin
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     while True:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.database import image_id, photo_file
@@ -38,8 +39,7 @@ def matched_by(
     Raises:
         IgsrError: there are too many photos to compare all, or the matcher's arrays cannot be used.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     count = len(photos)
     if count > EXHAUSTIVE:
         raise IgsrError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.pose.colmap.database import known_cameras
 from igsr.pose.colmap.evidence import Evidence
 from igsr.pose.estimate import Progress
@@ -14,8 +15,7 @@ def map_photos(
     count: int, database: Path, evidence: Evidence, seed: int, show: Progress
 ) -> Any | None:
     """The model with most of ``count`` photos, or None if no two can be placed."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     models = pycolmap.ReconstructionManager()
     with pycolmap.Database.open(database) as opened:
         pipeline = pycolmap.IncrementalPipeline(
@@ -31,8 +31,7 @@ def extend(
     model: Any, count: int, database: Path, evidence: Evidence, seed: int, show: Progress
 ) -> None:
     """Add photos to a model, in place, with points that its own photos have by new matches."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     options = mapping_options(count, evidence, seed, database)
     mapper_options, triangulation = options.get_mapper(), options.get_triangulation()
     with pycolmap.Database.open(database) as opened:
@@ -59,8 +58,7 @@ def mapping_options(count: int, evidence: Evidence, seed: int, database: Path) -
 
     Intrinsics of panoramas' views, which are known, stay as they are.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     # Sums over threads come in any order, and with them the last bits.
@@ -96,8 +94,7 @@ class _Placed:
 
 
 def _tell(pipeline: Any, placed: _Placed) -> None:
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     events = pycolmap.IncrementalPipelineCallback
     pipeline.add_callback(int(events.INITIAL_IMAGE_PAIR_REG_CALLBACK), placed.first_two)
     pipeline.add_callback(int(events.NEXT_IMAGE_REG_CALLBACK), placed.one_more)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.pose.colmap.database import image_id, photo_file
 from igsr.pose.colmap.epipolar import Constraint, EpipolarLine, Plane
 from igsr.pose.colmap.guided_matching import Features, comparable, guided_matches
@@ -38,8 +39,7 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
     Returns:
         The new database, beside the other. Its focal lengths are those of ``features``.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     database = features.with_name("matched.db")
     shutil.copyfile(features, database)
     pairs = pairs_to_match(count, database)
@@ -71,8 +71,7 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
 
 def with_focal_lengths(matches: Path, seed: int) -> Path:
     """A copy of a database of matches, with focal lengths from all its pairs together."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     database = matches.with_name(f"calibrated_{matches.name}")
     shutil.copyfile(matches, database)
     calibration = pycolmap.ViewGraphCalibrationOptions()
@@ -83,8 +82,7 @@ def with_focal_lengths(matches: Path, seed: int) -> Path:
 
 def with_matches(matches: Path) -> set[int]:
     """Indices of photos that have matches with any other; those without cannot be placed."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     found: set[int] = set()
     with pycolmap.Database.open(matches) as opened:
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
@@ -104,8 +102,7 @@ def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) 
     Returns:
         The new database, beside the other; None if no pair has gained a match.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     database = matches.with_name("guided.db")
     shutil.copyfile(matches, database)
     images = {image_id(index) for index in wanted}
@@ -139,8 +136,7 @@ def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) 
 
 def _constraint(geometry: Any) -> Constraint | None:
     """What guides further matches of a pair, or None if its geometry is not known."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     kinds = pycolmap.TwoViewGeometryConfiguration
     lines = [int(kind) for kind in (kinds.CALIBRATED, kinds.UNCALIBRATED)]
     planes = [int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)]

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.pose.colmap.database import photo_file
 
 #: Up to this many photos, every pair is matched.
@@ -50,8 +51,7 @@ def in_tiles(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
 
 def largest_features(count: int, database: Path) -> list[npt.NDArray[np.float32]]:
     """Descriptors of length 1 of each photo's largest features."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     largest_of = []
     with pycolmap.Database.open(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.capture import Camera
 from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.colmap.database import image_id
@@ -79,8 +80,7 @@ def matched_by_prediction(
         seed: of the verification.
         show: called with "matching", pairs done and all pairs.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     database = matches.with_name("predicted.db")
     shutil.copyfile(matches, database)
     options = pycolmap.TwoViewGeometryOptions()
@@ -126,8 +126,7 @@ def without_contradictions(matches: Path, photos: Sequence[AlignedPhoto | None])
         matches: the database of the photos.
         photos: as for ``matched_by_prediction``.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     database = matches.with_name("agreeing.db")
     shutil.copyfile(matches, database)
     with pycolmap.Database.open(database) as opened:
@@ -211,8 +210,7 @@ def _lines(one: Camera, other: Camera) -> npt.NDArray[np.float64]:
 
 
 def _camera(camera: Camera) -> Any:
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     K = camera.K
     return pycolmap.Camera(
         model="PINHOLE",

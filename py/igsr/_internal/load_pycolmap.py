@@ -1,0 +1,23 @@
+"""Import pycolmap without its handler of SIGTERM."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from typing import Any
+
+
+def load_pycolmap() -> Any:
+    """Import pycolmap, and keep the process's handler of SIGTERM.
+
+    The logging library in pycolmap replaces it by one that prints a native stack trace.
+    """
+    is_first = "pycolmap" not in sys.modules
+    handler = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    # Python sets handlers in the main thread only.
+    if is_first and handler and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+    return pycolmap
