@@ -17,7 +17,8 @@ def load_pycolmap() -> Any:
     handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
-    # Python sets handlers in the main thread only.
-    if is_first and handler and threading.current_thread() is threading.main_thread():
+    # Python sets handlers in the main thread only; None is a handler that Python did not set.
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if is_first and in_main_thread and handler is not None:
         signal.signal(signal.SIGTERM, handler)
     return pycolmap
