@@ -8,7 +8,7 @@ from math import prod
 import torch
 from dust3r_networks import hashed
 
-from igsr.pose.da3.config import NetworkConfig
+from igsr.pose.da3.backbone import NetworkConfig
 from igsr.pose.da3.network import Da3Network
 
 #: Twelve blocks as the published sizes have, with little in each.

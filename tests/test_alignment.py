@@ -10,16 +10,14 @@ from pointmaps import CONFIDENCE, PointmapScene, all_pairs
 
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
-from igsr.geometry.similarity import Similarity, apply, similarity_between, similarity_of_points
+from igsr.geometry.similarity import Similarity, similarity_between, similarity_of_points
 from igsr.pose.alignment import AlignedPhoto, PairPrediction, PhotoToAlign, align
-from igsr.pose.alignment import observations as observations_module
-from igsr.pose.alignment.absolute_pose import searched_focal
-from igsr.pose.alignment.confidence import trusted_pixels
-from igsr.pose.alignment.focal import weiszfeld_focal
-from igsr.pose.alignment.initial_alignment import start
+from igsr.pose.alignment import predictions as predictions_module
+from igsr.pose.alignment.camera_solvers import searched_focal, weiszfeld_focal
+from igsr.pose.depth_maps import trusted_pixels
+from igsr.pose.alignment.initial_alignment import components, spanning_tree, start
 from igsr.pose.alignment.objective import Objective
-from igsr.pose.alignment.observations import observe, strong_edges
-from igsr.pose.alignment.spanning_tree import components, spanning_tree
+from igsr.pose.alignment.predictions import observe, overlapping_edges
 from igsr.pose.grid import Grid
 
 
@@ -91,7 +89,7 @@ def test_depths_are_those_of_the_scene_in_the_world_of_the_cameras():
         np.testing.assert_array_equal(photo.confidence, CONFIDENCE)
         xyz, index = photo.world_points()
         assert len(index) == photo.depth.size
-        np.testing.assert_allclose(apply(world, xyz.T).T, truth, atol=1e-3)
+        np.testing.assert_allclose(world.apply(xyz.T).T, truth, atol=1e-3)
 
 
 def test_the_world_is_the_camera_frame_of_a_photo():
@@ -145,9 +143,9 @@ def test_fifty_photos_in_a_sliding_window():
 
 
 def test_thinned_grids_still_give_every_depth(monkeypatch):
-    monkeypatch.setattr(observations_module, "MOST_POINTS", 3_000)
+    monkeypatch.setattr(predictions_module, "MAX_POINTS", 3_000)
     scene = PointmapScene(4)
-    edges = strong_edges(scene.predictions())
+    edges = overlapping_edges(scene.predictions())
     photo = observe(edges, scene.photos()).photos[0]
     assert len(photo.pixels) < 200
     assert_exact(align(scene.predictions(), scene.photos(), steps=0), scene)
@@ -425,7 +423,7 @@ def test_arguments_are_checked():
 def test_the_gradient_is_that_of_the_loss():
     scene = PointmapScene(3, sizes=((64, 96),))
     photos = scene.photos(viewmat=lambda i: scene.cameras[i].viewmat if i == 0 else None)
-    observations = observe(strong_edges(scene.predictions(spoil=depth_noise(0.05))), photos)
+    observations = observe(overlapping_edges(scene.predictions(spoil=depth_noise(0.05))), photos)
     placement, depths = start(observations, photos, seed=0)
     objective = Objective(observations, placement, depths, photos)
     random = np.random.default_rng(0)
@@ -454,13 +452,13 @@ def test_similarity_with_a_third_of_the_points_wrong():
     rotation *= np.sign(np.linalg.det(rotation))
     truth = Similarity(2.5, rotation, np.array([1.0, -2.0, 7.0]))
     points = random.normal(size=(3, 300))
-    others = apply(truth, points)
+    others = truth.apply(points)
     others[:, :100] += random.normal(size=(3, 100)) + 2.0
     found = similarity_of_points(points, others, np.ones(300))
     assert abs(found.scale / truth.scale - 1) < 1e-3
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-3)
     line = np.outer([1.0, 2.0, 3.0], random.normal(size=300))
-    assert similarity_of_points(line, apply(truth, line), np.ones(300)) is None
+    assert similarity_of_points(line, truth.apply(line), np.ones(300)) is None
     assert similarity_of_points(points, others, np.zeros(300)) is None
 
 

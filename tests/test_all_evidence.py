@@ -21,7 +21,7 @@ from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.all_evidence import with_all_evidence
 from igsr.pose.colmap import Colmap
 from igsr.pose.da3.estimator import Da3
-from igsr.pose.da3.preprocessing import resampling_of
+from igsr.pose.da3.prediction import resampling_of
 from igsr.pose.find_cameras import chosen_estimator
 from igsr.pose.registry import ESTIMATORS
 
@@ -81,7 +81,7 @@ def predicted(truth, degrees=3.0, moved=0.2):
 @pytest.fixture
 def colmap_places_none(monkeypatch):
     """What COLMAP's mapper places counts as too little: the network's cameras are the start."""
-    monkeypatch.setattr(all_evidence, "FEWEST_PLACED", 99)
+    monkeypatch.setattr(all_evidence, "MIN_PLACED", 99)
 
 
 def together(photos, start, seed=0):
@@ -140,7 +140,7 @@ def test_the_same_seed_gives_the_same_bits(truth, photos, colmap_places_none):
 
 @pytest.mark.parametrize("fewest", [3, 99])
 def test_a_photo_without_matches_keeps_its_prediction(truth, photos, monkeypatch, fewest):
-    monkeypatch.setattr(all_evidence, "FEWEST_PLACED", fewest)
+    monkeypatch.setattr(all_evidence, "MIN_PLACED", fewest)
     blank = replace(photos[2], image=np.full_like(photos[2].image, 128))
     shown = [*photos[:2], blank, *photos[3:]]
     start = predicted(truth)
@@ -202,7 +202,7 @@ def test_a_wrong_depth_of_one_photo_moves_no_other(truth, photos, colmap_places_
 def test_an_adjustment_that_leads_far_away_is_not_taken(
     truth, photos, monkeypatch, colmap_places_none
 ):
-    monkeypatch.setattr(all_evidence, "FARTHEST", 0.5)
+    monkeypatch.setattr(all_evidence, "MAX_ANGLE", 0.5)
     start = predicted(truth)
     found = together(photos, start)
     assert rests_on(found) == ["network"] * COUNT

@@ -20,13 +20,13 @@ from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
 from igsr.pose import FoundCameras, estimate, read_found
 from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.da3 import passes
-from igsr.pose.da3.chunks import chunks_of, joined
-from igsr.pose.da3.confidence import trusted_depths
-from igsr.pose.da3.config import BASE, SIZES
+from igsr.pose.da3 import prediction
+from igsr.pose.da3.passes import joined_passes, passes_of
+from igsr.pose.depth_maps import trusted_depths
+from igsr.pose.da3.backbone import BASE
+from igsr.pose.da3.checkpoint import SIZES
 from igsr.pose.da3.estimator import Da3, with_shared_focals
-from igsr.pose.da3.passes import Da3Predictor, memory_of_pass, resamplings_of
-from igsr.pose.da3.preprocessing import resampling_of
+from igsr.pose.da3.prediction import Da3Predictor, memory_of_pass, resampling_of, resamplings_of
 
 SIZE = 64
 

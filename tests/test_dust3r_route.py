@@ -17,13 +17,12 @@ from igsr.capture.write_colmap import write_colmap
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
-from igsr.pose import fused_points as fused_points_module
+from igsr.pose import depth_maps
 from igsr.pose import registry
-from igsr.pose.alignment import TRUSTED, PairPrediction
-from igsr.pose.dust3r import estimator as estimator_module
-from igsr.pose.dust3r.dense_depth import with_dense_depth
-from igsr.pose.dust3r.estimator import Dust3r
-from igsr.pose.dust3r.prediction import DenseGrid, DensePrediction, DustPredictor
+from igsr.pose.alignment import PairPrediction
+
+from igsr.pose.dust3r.estimator import Dust3r, with_dense_depth
+from igsr.pose.dust3r.prediction import DenseGrid, DenseMap, DustPredictor
 from igsr.pose.grid import Grid
 from igsr.rendering.renders import render
 
@@ -146,7 +145,7 @@ def test_points_lie_on_the_scene_with_its_colours(scene, estimate):
     nearest = np.linalg.norm(xyz[:, None] - truth[None], axis=2)
     assert nearest.min(axis=1).max() < 1e-2
     assert len(xyz) > 0.5 * len(truth)
-    assert points.confidence.min() > TRUSTED
+    assert points.confidence.min() > depth_maps.MIN_CONFIDENCE
     column, row = GRID.photo_pixels().astype(int).T
     colors = np.concatenate(
         [
@@ -236,7 +235,7 @@ def test_devices_have_focal_lengths_of_their_own(scene):
 
 
 def test_points_are_bounded(scene, monkeypatch):
-    monkeypatch.setattr(fused_points_module, "MOST_POINTS", 50)
+    monkeypatch.setattr(depth_maps, "MAX_POINTS", 50)
     points = Dust3r(scene.predictor)(scene.photos).points
     assert len(points.xyz) == len(points.rgb) == len(points.confidence) == 50
     assert len(np.unique(points.confidence)) > 1  # of more than one photo

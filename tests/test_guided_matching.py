@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from igsr.pose.colmap import guided_matching
-from igsr.pose.colmap.epipolar import EpipolarLine, Plane
+from igsr.pose.colmap.guided_matching import EpipolarLine, Plane
 from igsr.pose.colmap.guided_matching import comparable, guided_matches
 
 H = np.array([[0.9, 0.1, 20.0], [-0.1, 1.0, 5.0], [1e-4, 0.0, 1.0]])
@@ -59,7 +59,7 @@ def one_by_one(xy, a, other_xy, b, allowed) -> set[tuple[int, int]]:
 
 @pytest.mark.parametrize("rows", [7, 512])
 def test_matches_are_those_of_the_definition(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guided_matching, "ROWS_AT_ONCE", rows)
+    monkeypatch.setattr(guided_matching, "BATCH_FEATURES", rows)
     xy, a, other_xy, b, F = two_photos()
     # Features that are clearly most like one of the other photo, which has a better partner.
     noise = np.random.default_rng(4).normal(0, 12, (100, 128))

@@ -8,8 +8,7 @@ import typer
 
 from igsr.cli.error_messages import error_messages, print_message
 from igsr.cli.shared import JsonOption, output_console, print_json
-from igsr.pose.huggingface_cache import cache_folder
-from igsr.pose.weights import KNOWN, fetch_weights, known_weights, weights_path
+from igsr.pose.weights import KNOWN, cache_folder, fetch_weights, known_weights, weights_path
 
 app = typer.Typer(
     help="List, download and find the weights of pose networks.", no_args_is_help=True
