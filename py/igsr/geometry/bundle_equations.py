@@ -28,8 +28,7 @@ RIDGE = 1e-9
 class Equations:
     """Linearized errors of M observations, R rows each.
 
-    The C columns are those of ``normal`` that an observation depends on; the last one is that of
-    the errors themselves.
+    An observation depends on C columns of the normal equations; the last one has the errors.
     """
 
     point: Int64  # [M], from 0 without gaps

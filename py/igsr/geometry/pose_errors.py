@@ -124,7 +124,11 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> di
 
 
 def rotation_angle(rotation: Float64) -> float:
-    """Degrees of a rotation matrix [3, 3], accurate also for small angles."""
+    """The angle of a rotation in degrees, accurate also for small angles.
+
+    Args:
+        rotation: float64 [3, 3], a rotation matrix.
+    """
     sine = 0.5 * np.linalg.norm(
         [
             rotation[2, 1] - rotation[1, 2],

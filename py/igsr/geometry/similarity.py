@@ -52,12 +52,20 @@ class Similarity:
         return Similarity(scale, rotation, -scale * rotation @ self.translation)
 
     def apply(self, points: Float64) -> Float64:
-        """Map points [3, N]."""
+        """Map points to the target world.
+
+        Args:
+            points: [3, N].
+        """
         mapped: Float64 = self.scale * self.rotation @ points + self.translation[:, None]
         return mapped
 
     def camera(self, camera: Camera) -> Camera:
-        """Map a camera to the target world, where it sees the same picture."""
+        """Map a camera to the target world; it sees the same picture there.
+
+        Args:
+            camera: in the source world.
+        """
         viewmat = np.eye(4)
         viewmat[:3, :3] = camera.viewmat[:3, :3] @ self.rotation.T
         center = self.scale * self.rotation @ camera.centre + self.translation
@@ -134,7 +142,7 @@ def similarity_between(cameras: Sequence[Camera], others: Sequence[Camera]) -> S
     """Estimate the similarity that best aligns ``cameras`` to ``others``, pair by pair.
 
     The rotation best aligns both the viewing axes and the offsets of the centers from their mean
-    (Procrustes); scale and translation are those of the centers. A single camera, and cameras at
+    (Procrustes); scale and translation come from the centers. A single camera, and cameras at
     one place, keep their scale.
 
     Args:

@@ -91,16 +91,13 @@ def trusted_pixels(
 ) -> list[Bool | None]:
     """Find the confident pixels of DUSt3R that do not float in front of other photos' surfaces.
 
-    A pixel in front of what another photo shows is wrong if it is the less confident of the two
+    A pixel in front of another photo's surface is wrong if it is the less confident of the two
     (``clean_pointcloud`` of DUSt3R's code). Confidences are the original ones, so the order of
     photos does not matter.
 
     Args:
         photos: None for photos without a camera.
         pairs: indices of photos to compare, in both directions.
-
-    Returns:
-        bool [h, w] per photo.
     """
     trusted = [
         None
@@ -127,13 +124,7 @@ def trusted_pixels(
 def trusted_depths(photos: Sequence[AlignedPhoto | None]) -> list[Bool | None]:
     """Find the confident pixels of Depth Anything 3, off edges, on which other photos agree.
 
-    Its confidence is not calibrated: it ranks the pixels of a photo, and says no more.
-
-    Args:
-        photos: in one world; None for photos without a camera.
-
-    Returns:
-        bool [h, w] per photo.
+    Its confidence is not calibrated: it only ranks the pixels of a photo.
     """
     known = {i: photo for i, photo in enumerate(photos) if photo is not None}
     needed = 2 if len(known) >= MIN_PHOTOS_FOR_TWO else 1
@@ -186,16 +177,7 @@ def fused_points(
     aligned: Sequence[AlignedPhoto | None],
     trusted: Sequence[Bool | None],
 ) -> Points | None:
-    """Fuse the trusted pixels of all photos to at most ``MAX_POINTS`` points.
-
-    Args:
-        photos: for the colors.
-        aligned: cameras and depths of these photos, or None.
-        trusted: bool [h, w] per photo, or None.
-
-    Returns:
-        Points with raw confidence; None if no pixel is trusted.
-    """
+    """Fuse the trusted pixels of all photos to at most ``MAX_POINTS`` points."""
     xyz, rgb, confidence = [], [], []
     for photo, placed, mask in zip(photos, aligned, trusted, strict=True):
         if placed is None or mask is None:
@@ -218,13 +200,9 @@ def fused_points(
 
 
 def joined_points(tracked: Points | None, fused: Points | None) -> Points | None:
-    """Join points of features with points of depth maps.
+    """Join points of features, with tracks, and points of depth maps, with confidence.
 
     Only the order of confidences counts; points of features rank above points of depth maps.
-
-    Args:
-        tracked: of features, with tracks, or None.
-        fused: of depth maps, with confidence, or None.
     """
     if tracked is None or fused is None or fused.confidence is None:
         return fused if tracked is None else tracked

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture.photo_folder import Photo
-from igsr.errors import IgsrError
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -28,10 +27,6 @@ class Grid:
         scale_y: photo pixels per row.
         offset_x: photo pixels left of the grid.
         offset_y: photo pixels above the grid.
-
-    Raises:
-        IgsrError: height or width is not a positive integer, a scale is not positive and finite,
-            or an offset is not finite.
     """
 
     height: int
@@ -41,18 +36,6 @@ class Grid:
     offset_x: float
     offset_y: float
 
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        for name in ("height", "width"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-                raise IgsrError(f"a grid's {name} is {value!r}; give a whole number of at least 1")
-        for name in ("scale_x", "scale_y", "offset_x", "offset_y"):
-            value = getattr(self, name)
-            if not np.isfinite(value) or (name.startswith("scale") and value <= 0.0):
-                wanted = "positive" if name.startswith("scale") else "finite"
-                raise IgsrError(f"a grid's {name} is {value!r}; give a {wanted} number")
-
     def over_photo(self, plane: np.ndarray, width: int, height: int) -> np.ndarray:
         """Resample a plane of the grid to the whole photo, at about the grid's resolution.
 
@@ -61,7 +44,7 @@ class Grid:
             width, height: of the photo, pixels.
 
         Returns:
-            [H, W]: each value is that of the nearest pixel of the grid, 0 outside the grid.
+            [H, W]: the values of the nearest pixels of the grid, 0 outside the grid.
         """
         rows, columns = (
             np.floor((((np.arange(count) + 0.5) * size / count) - offset) / scale).astype(np.int64)

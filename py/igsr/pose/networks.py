@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,7 @@ MAX_CONFIG_BYTES = 100_000
 
 Rotation = tuple[Tensor, Tensor]
 Network = TypeVar("Network", bound=nn.Module)
+Config = TypeVar("Config")
 
 
 class Mlp(nn.Module):
@@ -99,6 +101,21 @@ def float32_array(tensor: Tensor) -> npt.NDArray[np.float32]:
     return array
 
 
+@dataclass(frozen=True, eq=False)
+class Checkpoint(Generic[Config]):
+    """A checked checkpoint.
+
+    Attributes:
+        config: sizes of the network.
+        weights: float32, exactly the keys and shapes of a network of these sizes.
+        unknown: sorted keys of the file that the network does not have.
+    """
+
+    config: Config
+    weights: dict[str, Tensor]
+    unknown: list[str]
+
+
 def exists(path: Path, folder: bool = False) -> bool:
     """Whether a path is a file, or a folder; False for names that neither can have."""
     try:
@@ -128,18 +145,12 @@ def config_of(path: Path) -> dict[str, Any] | None:
 
 
 def named_checkpoint(named: str | Path | None, variable: str, advice: str) -> Path | None:
-    """The path that the user names, by argument or by environment variable.
+    """The file that the user names, by argument or by environment variable; None if not named.
 
-    Args:
-        named: the argument.
-        variable: name of the environment variable.
-        advice: end of the error message.
-
-    Returns:
-        The file; of a folder, its ``model.safetensors``. None if the user names none.
+    Of a folder, it is ``model.safetensors``.
 
     Raises:
-        IgsrError: there is no such file.
+        IgsrError: there is no such file; the message ends with ``advice``.
     """
     for source, value in (("checkpoint", named), (variable, os.environ.get(variable))):
         if value:
@@ -152,13 +163,7 @@ def named_checkpoint(named: str | Path | None, variable: str, advice: str) -> Pa
 
 
 def checked_weight(path: Path, key: str, value: Any, shape: Sequence[int]) -> Tensor:
-    """A tensor of a checkpoint as float32.
-
-    Args:
-        path: the checkpoint, for messages.
-        key: of the tensor, for messages.
-        value: the stored value, of any type.
-        shape: that the network needs.
+    """Check a stored value against the shape that the network needs, and convert it to float32.
 
     Raises:
         IgsrError: it is not a plain tensor of floats, or has another shape.
@@ -178,28 +183,31 @@ def checked_weight(path: Path, key: str, value: Any, shape: Sequence[int]) -> Te
     return value.detach().to(torch.float32).contiguous()
 
 
-def with_weights(
-    network: Network, weights: dict[str, Tensor], unknown: list[str], path: Path, device: str | None
-) -> Network:
-    """Put weights into a network and move it to a device; a warning names ignored keys.
+def without_weights(make: Callable[[Config], Network], config: Config) -> Network:
+    """Make a network on the meta device, which takes no memory."""
+    with torch.device("meta"):
+        return make(config).eval()
 
-    Args:
-        network: without weights.
-        weights: by key.
-        unknown: keys of the file that the network does not have.
-        path: the checkpoint, for messages.
-        device: such as "cpu" or "cuda:1"; None for "cuda" if available, else "cpu".
+
+def with_weights(
+    make: Callable[[Config], Network],
+    checkpoint: Checkpoint[Config],
+    path: str | Path,
+    device: str | None,
+) -> Network:
+    """Make a network with the weights of a checkpoint; a warning names ignored keys.
 
     Raises:
         IgsrError: the device cannot be used.
     """
-    if unknown:
+    if checkpoint.unknown:
         warnings.warn(
             f"{path}: keys that the network does not have were ignored: "
-            f"{listed(unknown, MAX_NAMED_KEYS)}.",
+            f"{listed(checkpoint.unknown, MAX_NAMED_KEYS)}.",
             stacklevel=3,
         )
-    network.load_state_dict(weights, assign=True)
+    network = without_weights(make, checkpoint.config)
+    network.load_state_dict(checkpoint.weights, assign=True)
     network.requires_grad_(False)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     try:

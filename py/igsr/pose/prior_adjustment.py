@@ -1,6 +1,6 @@
 """Bundle adjustment with a network's prediction as a prior on cameras and depths.
 
-Features decide where they determine the cameras, the prediction where they do not: for example, two
+Features decide if they determine the cameras, otherwise the prediction does: for example, two
 photos alone determine no distance to a third one. Cauchy losses limit the influence of outliers, so
 one wrong camera or depth map moves no other.
 """
@@ -143,7 +143,7 @@ def covariances(
     """
     problem = _Problem(seen, predicted, spread, 1.0, bundle.log_focals)
     equations, prior = problem.linearized(bundle)
-    # Deviations of observations are estimated, those of the prediction are known.
+    # Deviations of observations are estimated; the prediction's are known.
     for rows in (equations.value[:, :2], equations.of_point[:, :2]):
         rows /= problem.deviation(bundle)
     normal = (without_points(equations) + prior)[:-1, :-1]

@@ -1,6 +1,6 @@
 """Weights of pose networks: which exist, under which license, and how to download them.
 
-Files are kept in huggingface_hub's cache, where other programs find them too. That library (the
+Files are kept in huggingface_hub's cache, which other programs share. That library (the
 extra ``weights``) downloads them and resumes dropped connections. Their hashes are checked here.
 """
 
@@ -18,7 +18,7 @@ from igsr.errors import IgsrError
 
 #: Environment variable that forbids downloads, unless it is 0.
 OFFLINE = "IGSR_OFFLINE"
-#: Environment variable with the server's address, by default that of huggingface.co.
+#: Environment variable with the server's address, by default huggingface.co.
 ENDPOINT = "HF_ENDPOINT"
 _HASHED_BYTES = 1 << 20
 _FILES = ("model.safetensors", "config.json")
@@ -103,11 +103,7 @@ def cache_folder() -> Path:
 
 
 def cached_snapshots(model: str) -> list[Path]:
-    """Folders of a model's cached revisions, the current one first, then by name.
-
-    Args:
-        model: such as "owner/name".
-    """
+    """Folders of the cached revisions of "owner/name", the current one first, then by name."""
     folder = _model_folder(model)
     try:
         current = (folder / "refs" / "main").read_text(errors="replace").strip()
@@ -134,9 +130,6 @@ def known_weights(name: str) -> Weights:
 def weights_path(name: str) -> Path:
     """Find the file of weights in the cache; nothing is downloaded.
 
-    Args:
-        name: in ``KNOWN``.
-
     Raises:
         IgsrError: the name is not in ``KNOWN``, or the weights are not in the cache.
     """
@@ -151,12 +144,6 @@ def fetch_weights(name: str) -> Path:
     """Download weights to the cache and check their hashes, also of files that are already there.
 
     Incomplete files are removed, as are files whose hash differs from the server's.
-
-    Args:
-        name: in ``KNOWN``.
-
-    Returns:
-        The file of the weights.
 
     Raises:
         IgsrError: the name is not in ``KNOWN``, igsr does not download these weights, downloads

@@ -95,12 +95,7 @@ def absolute_pose(
 def searched_focal(
     points: Float64, pixels: Float64, confidence: Float64, size: tuple[int, int], seed: int
 ) -> tuple[float, int] | None:
-    """Try focal lengths with ``absolute_pose``.
-
-    Returns:
-        The focal length in pixels with the most inliers, and their number; None if no pose is
-        found.
-    """
+    """The focal length in pixels for which ``absolute_pose`` has the most inliers, and these."""
     height, width = size
     best: tuple[float, int] | None = None
     for focal in max(size) * TRIED_FOCALS:
@@ -149,17 +144,11 @@ def intrinsics_of(
     placed: Mapping[int, Placed],
     seed: int,
 ) -> dict[int, Float64]:
-    """Estimate the initial intrinsics [3, 3] of photos; those that cannot be found are left out.
+    """Estimate the initial intrinsics [3, 3] of photos; unknown ones are left out.
 
     The focal length of a group comes from the pointmaps of its photos, each in the photo's own
     frame on its best edge. Without these, focal lengths are tried, and the one with the most
-    inliers in any of its photos is taken.
-
-    Args:
-        observations: of the photos.
-        photos: all of them.
-        placed: points of each photo in the world.
-        seed: of RANSAC.
+    inliers in any of its photos is taken. ``placed`` has the points of each photo in the world.
     """
     groups: dict[Hashable, list[int]] = {}
     result = {}

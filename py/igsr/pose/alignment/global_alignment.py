@@ -23,7 +23,6 @@ from igsr.pose.alignment.predictions import (
     Observations,
     PairPrediction,
     PhotoToAlign,
-    checked_predictions,
     observe,
     overlapping_edges,
     usable_confidence,
@@ -91,13 +90,10 @@ def align(
         progress: called as progress("alignment", done, total).
 
     Raises:
-        IgsrError: a prediction does not match its photos, steps is not a whole number of at least
-            0, or no two photos overlap.
+        IgsrError: no two photos overlap.
     """
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 0:
-        raise IgsrError(f"steps is {steps!r}; give a whole number that is not negative")
     edges, observations, initial, depths = _initialized(
-        overlapping_edges(checked_predictions(photos, predictions)), photos, seed
+        overlapping_edges(predictions), photos, seed
     )
     # Optimize with the cameras' mean at zero and the median depth at one.
     unit = float(np.median(np.concatenate(list(depths.values()))))

@@ -62,14 +62,10 @@ def components(photos: int, edges: Sequence[tuple[int, int]]) -> list[list[int]]
 
 
 def spanning_tree(edges: npt.NDArray[np.int64], scores: Float64) -> list[tuple[int, bool]]:
-    """The spanning tree with the highest scores, in the order of Prim's algorithm.
-
-    Args:
-        edges: [E, 2], directed, of connected photos; the better direction counts.
-        scores: [E].
+    """The spanning tree of edges [E, 2] with the highest scores [E], by Prim's algorithm.
 
     Returns:
-        Per edge of the tree its index, and whether its first photo was reached before.
+        Per edge of the tree, in order, its index, and whether its first photo was reached before.
     """
     order = np.argsort(-scores, kind="stable")
     reached = {int(edges[order[0], 0])}
@@ -90,14 +86,9 @@ def start(
 ) -> tuple[Placement, dict[int, Float64]] | list[int]:
     """Estimate initial cameras, edges, and the depths [P] of every photo's pixels.
 
-    Args:
-        observations: of connected photos.
-        photos: all of them. Fixed poses define the world frame.
-        seed: of RANSAC.
-
     Returns:
-        The placement and depths; or the indices of edges to leave out, since they contradict the
-        others or determine no camera.
+        The placement and depths of connected photos; or the indices of edges to leave out, since
+        they contradict others or determine no camera.
     """
     placed, poses, failed = _along_the_tree(observations)
     if failed:

@@ -5,7 +5,7 @@
 
 X_i(p) = C_i + R_i d_i(p) (x, y, 1) is the world point of a pixel, q_e(p) its prediction on edge e,
 and c_e(p) the raw confidence (Wang et al. 2024, equation 5; the logarithm and the two means are
-those of the published code).
+as in the published code).
 """
 
 from __future__ import annotations

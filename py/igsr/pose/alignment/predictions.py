@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr.capture.photo_folder import Photo
-from igsr.capture.types import Camera, intrinsic_matrix, nearest_rigid
-from igsr.errors import IgsrError
+from igsr.capture.types import intrinsic_matrix
 from igsr.geometry.similarity import is_spread
 from igsr.pose.grid import Grid, thinned
 
@@ -76,12 +75,9 @@ class Predictor(Protocol):
         pairs: Sequence[tuple[int, int]],
         progress: Callable[[str, int, int], None] | None = None,
     ) -> tuple[list[Grid], list[PairPrediction]]:
-        """The grid of every photo, and predictions for pairs.
+        """The grid of every photo, and predictions for pairs of their indices (first, second).
 
-        Args:
-            photos: in the order that ``pairs`` counts them.
-            pairs: (first, second).
-            progress: called as progress("pairs", done, total).
+        ``progress`` is called with "pairs", done and total.
         """
         ...
 
@@ -99,9 +95,6 @@ class PhotoToAlign:
         viewmat: float64 [4, 4], world to camera, fixed; None to be estimated.
         intrinsics: float64 [3, 3], pixels of the photo, fixed; None to estimate one focal length,
             with the principal point in the photo's center.
-
-    Raises:
-        IgsrError: the pose is not rigid, or intrinsics or size are invalid.
     """
 
     name: str
@@ -112,55 +105,9 @@ class PhotoToAlign:
     viewmat: np.ndarray | None = None
     intrinsics: np.ndarray | None = None
 
-    def __post_init__(self) -> None:
-        """Check and normalize the fields."""
-        if self.viewmat is not None:
-            viewmat = nearest_rigid(self.viewmat, f"the pose of {self.name}")
-            object.__setattr__(self, "viewmat", viewmat)
-        intrinsics = np.eye(3) if self.intrinsics is None else self.intrinsics
-        try:
-            camera = Camera(np.eye(4), intrinsics, self.width, self.height)
-        except IgsrError as error:
-            raise IgsrError(f"{self.name}: {error}") from error
-        if self.intrinsics is not None:
-            object.__setattr__(self, "intrinsics", camera.K)
-
     def centered(self, focal: float) -> Float64:
         """Intrinsics [3, 3] with a focal length in pixels, principal point in the center."""
         return intrinsic_matrix(focal, focal, self.width / 2, self.height / 2)
-
-
-def checked_predictions(
-    photos: Sequence[PhotoToAlign], predictions: Sequence[PairPrediction]
-) -> list[PairPrediction]:
-    """Check predictions and convert their arrays to float32.
-
-    Raises:
-        IgsrError: a prediction does not name two of the photos, or an array does not have the
-            shape of its photo's grid.
-    """
-    checked = []
-    for pair in predictions:
-        pair_name = f"the prediction for photos {pair.first} and {pair.second}"
-        if pair.first == pair.second or not all(0 <= i < len(photos) for i in pair.photos):
-            raise IgsrError(
-                f"{pair_name} must be for two different photos, counted from 0 to {len(photos) - 1}"
-            )
-        arrays: dict[str, Any] = {}
-        for side, photo in (("first", pair.first), ("second", pair.second)):
-            size = (photos[photo].grid.height, photos[photo].grid.width)
-            for kind, shape in (("points", (*size, 3)), ("confidence", size)):
-                name = f"{side}_{kind}"
-                array = np.asarray(getattr(pair, name))
-                if array.shape != shape or not np.issubdtype(array.dtype, np.floating):
-                    raise IgsrError(
-                        f"{pair_name} has {name} {array.dtype} {list(array.shape)}, but the "
-                        f"photo's grid needs float32 {list(shape)}"
-                    )
-                with np.errstate(over="ignore"):
-                    arrays[name] = array.astype(np.float32, copy=False)
-        checked.append(PairPrediction(int(pair.first), int(pair.second), **arrays))
-    return checked
 
 
 @dataclass(frozen=True, eq=False)

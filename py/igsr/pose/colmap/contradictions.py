@@ -1,7 +1,7 @@
 """Detect wrong matches between places that look alike, by the matches that are missing.
 
 A pattern that an object has twice, or two doors of one make, give matches that agree with the
-geometry of a pair, and a model that places photos of one side among those of another. Such a model
+geometry of a pair, and a model that places photos of one side on another side. Such a model
 contradicts itself: by its cameras, photos see the same points from nearly the same direction, but
 they share few of them (Zach et al., "What Can Missing Correspondences Tell Us About 3D Structure
 and Motion?", CVPR 2008), and those few lie in one place, the pattern. (Photos of other light or

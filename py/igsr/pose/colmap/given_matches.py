@@ -28,8 +28,8 @@ def matched_by(
 
     Args:
         matcher: of features.
-        photos: those of the database.
-        database: of the photos, without features; it is changed.
+        photos: of the database.
+        database: without features; it is changed.
         seed: of the verification.
         show: called with "features" and "matching", done and total.
 

@@ -135,10 +135,6 @@ def guided_matches(
 ) -> npt.NDArray[np.uint32]:
     """Match features that are each other's best within a constraint and pass the ratio test.
 
-    Args:
-        first, second: of two photos.
-        constraint: from the first photo to the second.
-
     Returns:
         Indices into both, uint32 [M, 2], ascending in the first, none twice.
     """

@@ -1,7 +1,7 @@
 """The backbone of Depth Anything 3: a DINOv2 transformer with blocks that attend to all views.
 
-Depth Anything 3 (arXiv 2511.10647), section 3; DINOv2 (Oquab et al. 2023). Module names are those
-of the checkpoints' keys. Views are a list of token arrays, so that they may differ in size.
+Depth Anything 3 (arXiv 2511.10647), section 3; DINOv2 (Oquab et al. 2023). Module names are as
+in the checkpoints. Views are a list of token arrays, so that they may differ in size.
 """
 
 from __future__ import annotations
@@ -60,17 +60,9 @@ BASE = NetworkConfig(embed_dim=768, heads=12, features=128, out_channels=(96, 19
 
 
 class Block(nn.Module):
-    """Attention, then an MLP, each scaled per channel and added to its input.
-
-    Args:
-        dim: channels.
-        heads: of the attention.
-        norm_eps: of the norms before attention and MLP.
-        normalized: whether queries and keys are normalized.
-    """
+    """Attention, then an MLP, each scaled per channel and added to its input."""
 
     def __init__(self, dim: int, heads: int, norm_eps: float, normalized: bool) -> None:
-        """Make the layers."""
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
         self.attn = _Attention(dim, heads, normalized)
@@ -82,13 +74,9 @@ class Block(nn.Module):
     def forward(
         self, views: Sequence[Tensor], rotations: Sequence[Rotation] | None = None
     ) -> list[Tensor]:
-        """Update views, whose tokens attend to all tokens of all views.
+        """Update views float32 [T, C], whose tokens attend to all tokens of all views.
 
         All but the attention runs for one view at a time, which bounds memory.
-
-        Args:
-            views: float32 [T, C] each; T may differ.
-            rotations: of each view's queries and keys, or None.
         """
         parts = [
             self.attn.parts(self.norm1(view), None if rotations is None else rotations[n])
@@ -149,14 +137,9 @@ class ViewFeatures:
 
 
 class Transformer(nn.Module):
-    """Compute features of all views of a pass.
-
-    Args:
-        config: the sizes.
-    """
+    """Compute features of all views of a pass."""
 
     def __init__(self, config: NetworkConfig) -> None:
-        """Make the layers."""
         super().__init__()
         dim = config.embed_dim
         self.head_dim = dim // config.heads
@@ -256,14 +239,10 @@ class Transformer(nn.Module):
 
 
 def reference_view(tokens: Tensor) -> int:
-    """Choose the reference view ("saddle_balanced" in the published code).
+    """Choose the reference view by the class tokens [S, C] of views, as "saddle_balanced".
 
-    Args:
-        tokens: float [S, C], the class token of each view.
-
-    Returns:
-        The index of the view that is closest to the middle of the range of three measures: its
-        mean similarity to the other views, and the length and the variance of its token.
+    It is closest to the middle of the range of three measures: its mean similarity to other views,
+    and the length and the variance of its token.
     """
     tokens = tokens.float()
     lengths = tokens.norm(dim=-1)

@@ -39,15 +39,9 @@ MIN_RAY_Z = 1e-4
 def decode_pose(
     encoding: npt.ArrayLike | Tensor, height: int, width: int
 ) -> tuple[Float64, Float64]:
-    """Convert pose encodings to cameras.
+    """Convert pose encodings [S, 9] to world-to-camera [S, 3, 4] and intrinsics [S, 3, 3], pixels.
 
-    Args:
-        encoding: float [S, 9].
-        height, width: of the views, pixels.
-
-    Returns:
-        World to camera float64 [S, 3, 4], and intrinsics float64 [S, 3, 3] in pixels. A field of
-        view of 0, or of pi and more, gives a focal length of 500 000 sides.
+    A field of view of 0, or of pi and more, gives a focal length of 500 000 sides.
     """
     numbers = _numpy(encoding)
     # w comes last.
@@ -66,15 +60,12 @@ def encode_pose(
     intrinsics: npt.ArrayLike | Tensor,
     sizes: Sequence[tuple[int, int]],
 ) -> Tensor:
-    """Convert cameras to pose encodings, without their principal points.
+    """Convert cameras to pose encodings float64 [S, 9], without their principal points.
 
     Args:
-        viewmats: float [S, 4, 4] or [S, 3, 4], world to camera.
-        intrinsics: float [S, 3, 3], pixels.
+        viewmats: [S, 4, 4] or [S, 3, 4], world to camera.
+        intrinsics: [S, 3, 3], pixels.
         sizes: height and width of each view, pixels.
-
-    Returns:
-        float64 [S, 9], quaternions of length 1 with w not negative.
     """
     w2c = _numpy(viewmats)[:, :3]
     rotation, K = w2c[:, :, :3].swapaxes(1, 2), _numpy(intrinsics)
@@ -86,14 +77,10 @@ def encode_pose(
 
 
 def normalized_viewmats(viewmats: npt.ArrayLike | Tensor) -> Float64:
-    """Map cameras to the frame of the first and to the unit of the network's training.
+    """Map world-to-camera [S, 4, 4] to the frame of the first and the unit of the training.
 
-    Args:
-        viewmats: float [S, 4, 4], world to camera.
-
-    Returns:
-        float64 [S, 4, 4]: the first is the identity. The median distance of all centers from the
-        first (the lower one of an even number) is 1, unless it was below 0.1.
+    The median distance of all centers from the first (the lower one of an even number) becomes 1,
+    unless it was below 0.1.
     """
     world = _numpy(viewmats)
     relative: Float64 = world @ np.linalg.inv(world[0])
@@ -124,9 +111,8 @@ def cameras_of_rays(
         samples: int [samples, 8], ranks of rays in the order of their confidence; by default drawn
             from the most confident 30 %.
         seed: of the samples.
-        official: compute as the published code, whose principal point is that of the lower
-            triangular factor, which is only right in the center, and which divides by a z near 0
-            for views across the reference.
+        official: compute as the published code, which takes the principal point from the lower
+            triangular factor, and divides by a z near 0 for views across the reference.
 
     Returns:
         World to camera float64 [S, 3, 4], and intrinsics float64 [S, 3, 3] in pixels.
@@ -185,12 +171,7 @@ def _turn_ahead(directions: Float64, weights: Float64) -> Float64:
 def _homography(
     places: Float64, targets: Float64, weights: Float64, samples: npt.NDArray[np.int64]
 ) -> Float64 | None:
-    """The homography [3, 3] from places [N, 2] to targets [N, 2] with the most weight of inliers.
-
-    Args:
-        places, targets, weights: [N, 2], [N, 2], [N].
-        samples: [samples, 8], indices of N.
-    """
+    """The homography [3, 3] from places [N, 2] to targets [N, 2] with the most inlier weight."""
     # The rows [N, 2, 9] of the direct linear transform.
     whole = np.pad(places, ((0, 0), (0, 1)), constant_values=1.0)
     nothing = np.zeros_like(whole)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,15 @@ from igsr.errors import IgsrError
 from igsr.pose.da3.backbone import BASE, FIRST_GLOBAL, OUTPUT_BLOCKS, SMALL, NetworkConfig
 from igsr.pose.da3.head import RAY_LEVEL, SHARED_NORM
 from igsr.pose.da3.network import Da3Network
-from igsr.pose.networks import checked_weight, config_of, exists, named_checkpoint, with_weights
+from igsr.pose.networks import (
+    Checkpoint,
+    checked_weight,
+    config_of,
+    exists,
+    named_checkpoint,
+    with_weights,
+    without_weights,
+)
 from igsr.pose.weights import cached_snapshots
 
 #: Environment variable that names a checkpoint.
@@ -46,36 +53,14 @@ _LARGER = re.compile(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """A checked checkpoint.
-
-    Attributes:
-        name: one of ``SIZES``.
-        config: its sizes.
-        weights: float32, exactly the keys and shapes of a ``Da3Network`` of that size.
-        unknown: sorted keys of the file that the network does not have.
-    """
-
-    name: str
-    config: NetworkConfig
-    weights: dict[str, Tensor]
-    unknown: list[str]
-
-
 def find_checkpoint(named: str | Path | None = None) -> Path | None:
-    """Find a checkpoint: the named one, else that of IGSR_DA3, else a cached one.
+    """Find a checkpoint: the named one, else IGSR_DA3, else a cached one.
 
-    The cache is that of huggingface_hub, searched for BASE, then SMALL. Nothing is downloaded.
-
-    Args:
-        named: a safetensors file, a folder with ``model.safetensors``, or None.
-
-    Returns:
-        The safetensors file.
+    A named checkpoint is a safetensors file or a folder with ``model.safetensors``. The cache is
+    huggingface_hub's. Nothing is downloaded.
 
     Raises:
-        IgsrError: the named checkpoint, or that of IGSR_DA3, does not exist.
+        IgsrError: the named checkpoint, or IGSR_DA3, does not exist.
     """
     advice = "name a checkpoint of Depth Anything 3, or get one by 'igsr weights fetch'"
     path = named_checkpoint(named, VARIABLE, advice)
@@ -89,25 +74,16 @@ def find_checkpoint(named: str | Path | None = None) -> Path | None:
 
 
 def load_network(path: str | Path, device: str | None = None) -> Da3Network:
-    """Load a network, ready to predict; a warning names ignored keys.
-
-    Args:
-        path: a safetensors file, or a folder with ``model.safetensors``.
-        device: such as "cpu" or "cuda:1"; by default "cuda" if available.
+    """Load a network to a device, by default "cuda" if available, else "cpu".
 
     Raises:
         IgsrError: as ``load_checkpoint``, or the device cannot be used.
     """
-    checkpoint = load_checkpoint(path)
-    network = _without_weights(checkpoint.config)
-    return with_weights(network, checkpoint.weights, checkpoint.unknown, Path(path), device)
+    return with_weights(Da3Network, load_checkpoint(path), path, device)
 
 
-def load_checkpoint(path: str | Path) -> Checkpoint:
-    """Read and check a checkpoint; nothing in its files is run or imported.
-
-    Args:
-        path: as for ``load_network``.
+def load_checkpoint(path: str | Path) -> Checkpoint[NetworkConfig]:
+    """Read and check a safetensors file, or a folder with ``model.safetensors``.
 
     Raises:
         IgsrError: the file is missing, damaged or of another network, or lacks a key or has it in
@@ -140,25 +116,15 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         raise
     except Exception as error:  # the library raises more than its own exception
         raise IgsrError(f"{path} is damaged or not safetensors; download it again") from error
-    return Checkpoint(name, SIZES[name], weights, unknown)
+    return Checkpoint(SIZES[name], weights, unknown)
 
 
 def read_weights(
     path: Path, file: Any, shapes: Mapping[str, tuple[int, ...]], config: NetworkConfig
 ) -> tuple[dict[str, Tensor], list[str]]:
-    """Read the weights of a network, and list the keys that it does not have.
-
-    Args:
-        path: for messages.
-        file: an open safetensors file.
-        shapes: per key of the file.
-        config: the sizes.
-
-    Raises:
-        IgsrError: as ``load_checkpoint``.
-    """
+    """Read the weights of a network from an open file, and list the keys that it does not have."""
     weights, used = {}, set()
-    for key, tensor in _without_weights(config).state_dict().items():
+    for key, tensor in without_weights(Da3Network, config).state_dict().items():
         stored = _stored_keys(key, shapes)
         values = [_weight(path, file, shapes, one, tuple(tensor.shape)) for one in stored]
         if any(not torch.equal(values[0], value) for value in values[1:]):
@@ -224,12 +190,8 @@ def size_of(content: Mapping[str, Any], source: str) -> str:
 
     The file names Python classes, which are compared and not imported.
 
-    Args:
-        content: of the file.
-        source: name of the file, for messages.
-
     Raises:
-        IgsrError: the content is incomplete, or a name or number is that of another network.
+        IgsrError: the content is incomplete, or a name or number belongs to another network.
     """
 
     def check(name: str, value: Any, matches: bool, wanted: str) -> None:
@@ -256,7 +218,7 @@ def size_of(content: Mapping[str, Any], source: str) -> str:
     net = part("net").get("name")
     check("net.name", net, isinstance(net, str) and net in _NET_NAMES, " or ".join(_NET_NAMES))
     size = _NET_NAMES[str(net)]
-    check("net.name", net, named in (None, size), f"that of {named}")
+    check("net.name", net, named in (None, size), f"the one for {named}")
     for name, (class_name, numbers) in _described(SIZES[size]).items():
         if name == "cam_enc" and name not in parts:
             continue  # only needed for known cameras
@@ -296,8 +258,3 @@ def _described(config: NetworkConfig) -> dict[str, tuple[str, dict[str, Any]]]:
         "cam_enc": ("CameraEnc", {"dim_out": dim}),
         "cam_dec": ("CameraDec", {"dim_in": 2 * dim}),
     }
-
-
-def _without_weights(config: NetworkConfig) -> Da3Network:
-    with torch.device("meta"):
-        return Da3Network(config).eval()

@@ -65,7 +65,6 @@ class Da3:
         bundle_adjustment: bool = True,
         matcher: str | Matcher = SIFT,
     ) -> None:
-        """Keep the settings; nothing is loaded yet."""
         self.predictor = predictor
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.cameras = dict(cameras or {})
@@ -260,7 +259,7 @@ def with_shared_focals(
     The network predicts one for each photo and direction, which differ by some percent.
 
     Args:
-        photos: those of one device, size and EXIF focal length are of one camera.
+        photos: one camera took all photos of one device, size and EXIF focal length.
         aligned: the same photos, or None.
     """
 

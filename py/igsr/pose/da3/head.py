@@ -1,7 +1,7 @@
 """The head of Depth Anything 3: depth, confidence and rays of one view's pixels from its features.
 
 A dense prediction transformer (Ranftl et al. 2021) with two chains over the same levels, for depth
-and for rays (arXiv 2511.10647, section 3). Module names are those of the checkpoints' keys. The
+and for rays (arXiv 2511.10647, section 3). Module names are as in the checkpoints. The
 head always runs in float32, and for one view at a time.
 """
 
@@ -21,21 +21,16 @@ POSITION_AMPLITUDE = 0.1
 LAST_CHANNELS = 32
 #: Direction, origin and confidence of a ray.
 RAY_CHANNELS = 7
-#: The level of the ray chain whose outputs are used; the others are for training.
+#: The level of the ray chain whose outputs are used; others are for training.
 RAY_LEVEL = 3
 #: The published networks share one norm between the outputs of all levels.
 SHARED_NORM = "scratch.output_conv2_aux.{}.2"
 
 
 class DualHead(nn.Module):
-    """Predict depth and rays of a view.
-
-    Args:
-        config: the sizes.
-    """
+    """Predict depth and rays of a view."""
 
     def __init__(self, config: NetworkConfig) -> None:
-        """Make the layers that are used; checkpoints have more."""
         super().__init__()
         dim, features = 2 * config.embed_dim, config.features
         fine, middle, _, coarsest = config.out_channels
@@ -146,12 +141,7 @@ def _resized(maps: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _with_positions(maps: Tensor, aspect: float) -> Tensor:
-    """Add embeddings of the pixels' positions to maps [1, c, h, w], in place.
-
-    Args:
-        maps: c is a multiple of four.
-        aspect: width over height of the network's input, in pixels.
-    """
+    """Add position embeddings to maps [1, c, h, w] of an input of some width over height."""
     channels, height, width = maps.shape[1:]
     diagonal = (aspect**2 + 1.0) ** 0.5
     quarter = channels // 4

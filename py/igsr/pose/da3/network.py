@@ -1,6 +1,6 @@
 """Depth Anything 3: depths, rays and cameras of all views of a scene (arXiv 2511.10647, section 3).
 
-Module names are those of the checkpoints' keys.
+Module names are as in the checkpoints.
 """
 
 from __future__ import annotations
@@ -81,14 +81,9 @@ class CameraEncoder(nn.Module):
 
 
 class Da3Network(nn.Module):
-    """The network for any number of views.
-
-    Args:
-        config: the sizes.
-    """
+    """The network for any number of views."""
 
     def __init__(self, config: NetworkConfig) -> None:
-        """Make the layers."""
         super().__init__()
         self.config = config
         self.backbone = nn.ModuleDict({"pretrained": Transformer(config)})
@@ -137,7 +132,5 @@ class Da3Network(nn.Module):
                 view = features.pop(0)
                 depth, confidence, ray, ray_confidence = self.head(view, rays)
                 encoding = self.cam_dec(view.token)
-                predictions.append(
-                    ViewPrediction(depth, confidence, ray, ray_confidence, encoding)
-                )
+                predictions.append(ViewPrediction(depth, confidence, ray, ray_confidence, encoding))
         return predictions

@@ -29,9 +29,6 @@ def passes_of(count: int, most: int) -> list[list[int]]:
     Args:
         count: number of photos.
         most: maximum number of photos of a pass, at least 2.
-
-    Returns:
-        Ascending indices of each pass.
     """
     if count <= most:
         return [list(range(count))]
@@ -50,14 +47,11 @@ def passes_of(count: int, most: int) -> list[list[int]]:
 def joined_passes(
     passes: Sequence[dict[int, AlignedPhoto]],
 ) -> tuple[dict[int, AlignedPhoto], list[int]]:
-    """Map all passes to the world of the first one.
-
-    Args:
-        passes: photos by index, each pass in its own world.
+    """Map all passes, each with its photos by index, to the world of the first one.
 
     Returns:
-        The photos by index, as the first pass that contains them predicts them; and the ascending
-        indices of photos that could not be joined.
+        The photos by index, as in the first pass that contains them; and the indices of photos
+        that could not be joined.
     """
     world: dict[int, AlignedPhoto] = {}
     lost: set[int] = set()

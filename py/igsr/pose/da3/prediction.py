@@ -1,6 +1,6 @@
 """Run Depth Anything 3 on photos: cameras, depths and confidences in one world per pass.
 
-The filters are those of OpenCV, which the models were trained with: area means to shrink, cubic
+The filters are OpenCV's, which the models were trained with: area means to shrink, cubic
 convolution without antialiasing to enlarge. Each is two matrices in float64, for rows and columns.
 """
 
@@ -90,10 +90,6 @@ def resampling_of(width: int, height: int, resolution: int = RESOLUTION) -> Resa
 
     The longer side is scaled to the resolution; then both sides are resized to the nearest
     multiples of 14, which changes the aspect.
-
-    Args:
-        width, height: of the photo, pixels.
-        resolution: pixels of the longer side, at least 14.
 
     Raises:
         IgsrError: the photo is too narrow.
@@ -190,11 +186,7 @@ class Predictor(Protocol):
     """Predicts cameras and depths of photos, as the network does."""
 
     def most_photos(self, photos: Sequence[Photo]) -> int:
-        """Maximum number of the photos in one pass.
-
-        Raises:
-            IgsrError: not even two fit into memory.
-        """
+        """Maximum number of photos in one pass."""
         ...
 
     def __call__(
@@ -218,17 +210,9 @@ class Da3Predictor:
 
     On CUDA devices the backbone runs in half precision (bfloat16, else float16), the rest in
     float32.
-
-    Args:
-        network: with weights, on its device.
-        cameras_from: "decoder" or "rays".
-
-    Raises:
-        IgsrError: ``cameras_from`` is neither.
     """
 
     def __init__(self, network: Da3Network, cameras_from: str = SOURCES[0]) -> None:
-        """Keep the network."""
         if cameras_from not in SOURCES:
             raise IgsrError(f"cameras_from is {cameras_from!r}; give {' or '.join(SOURCES)}")
         self.network = network
@@ -236,7 +220,11 @@ class Da3Predictor:
         self.device = next(network.parameters()).device
 
     def most_photos(self, photos: Sequence[Photo]) -> int:
-        """As ``Predictor``; limited by the device's free memory, and by the time of a pass."""
+        """Maximum number of photos by the device's free memory, and by the time of a pass.
+
+        Raises:
+            IgsrError: two photos do not fit into memory.
+        """
         on_cpu = self.device.type == "cpu"
         free = available_memory() if on_cpu else torch.cuda.mem_get_info(self.device)[0]
         pixels = max(one.width * one.height for one in resamplings_of(photos))
@@ -254,11 +242,6 @@ class Da3Predictor:
     def __call__(
         self, photos: Sequence[Photo], cameras: Sequence[Camera] | None, seed: int
     ) -> list[AlignedPhoto | None]:
-        """As ``Predictor``.
-
-        Raises:
-            IgsrError: the predictions are not finite.
-        """
         resamplings = resamplings_of(photos)
         inputs = [
             torch.from_numpy(network_input(on_white(photo.image), one)).to(self.device)
@@ -310,13 +293,7 @@ class Da3Predictor:
 
 
 def memory_of_pass(config: NetworkConfig, photos: int, pixels: int) -> int:
-    """Maximum bytes of a pass, without the weights.
-
-    Args:
-        config: sizes of the network.
-        photos: of the pass.
-        pixels: of the largest photo, after resampling.
-    """
+    """Maximum bytes of a pass of photos with at most so many pixels, without the weights."""
     tokens = pixels // PATCH**2 + 1
     backbone = photos * tokens * config.embed_dim * FLOATS_PER_TOKEN
     results = photos * pixels * 5

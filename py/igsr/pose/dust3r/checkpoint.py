@@ -12,17 +12,23 @@ import re
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors.torch import load_file
-from torch import Tensor
 
 from igsr.errors import IgsrError
 from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig
-from igsr.pose.networks import checked_weight, config_of, exists, named_checkpoint, with_weights
+from igsr.pose.networks import (
+    Checkpoint,
+    checked_weight,
+    config_of,
+    exists,
+    named_checkpoint,
+    with_weights,
+    without_weights,
+)
 from igsr.pose.weights import cached_snapshots
 
 #: Environment variable that names a checkpoint.
@@ -67,32 +73,14 @@ _UNUSED = re.compile(r"mask_token|downstream_head[12]\.dpt\.scratch\.layer_rn\.[
 _license_shown = False
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """A checked checkpoint.
-
-    Attributes:
-        config: its sizes.
-        weights: float32, exactly the keys and shapes of a ``Dust3rNetwork`` of these sizes.
-        unknown: sorted keys of the file that the network does not have.
-    """
-
-    config: NetworkConfig
-    weights: dict[str, Tensor]
-    unknown: list[str]
-
-
 def find_checkpoint(named: str | Path | None = None) -> Path | None:
-    """Find a checkpoint: the named file, else that of IGSR_DUST3R, else a cached one.
+    """Find a checkpoint: the named file, else IGSR_DUST3R, else a cached one.
 
-    The caches are those of ``torch.hub`` (``checkpoints/NAME.pth``) and of huggingface_hub
+    The caches belong to ``torch.hub`` (``checkpoints/NAME.pth``) and to huggingface_hub
     (``models--naver--NAME``). Nothing is downloaded.
 
-    Args:
-        named: a file, or None.
-
     Raises:
-        IgsrError: the named file, or that of IGSR_DUST3R, does not exist.
+        IgsrError: the named file, or IGSR_DUST3R, does not exist.
     """
     path = named_checkpoint(named, VARIABLE, "name a checkpoint of DUSt3R, or none")
     if path is not None:
@@ -107,13 +95,9 @@ def find_checkpoint(named: str | Path | None = None) -> Path | None:
 
 
 def load_network(path: Path, device: str | None = None) -> Dust3rNetwork:
-    """Load a network, ready to predict.
+    """Load a network to a device, by default "cuda" if available, else "cpu".
 
-    A warning shows the license of the weights once per process; another names ignored keys.
-
-    Args:
-        path: a ``.pth`` file of torch.save, or ``.safetensors`` next to a ``config.json``.
-        device: such as "cpu" or "cuda:1"; by default "cuda" if available.
+    A warning shows the license of the weights once per process.
 
     Raises:
         IgsrError: as ``load_checkpoint``, or the device cannot be used.
@@ -123,17 +107,13 @@ def load_network(path: Path, device: str | None = None) -> Dust3rNetwork:
     if not _license_shown:
         warnings.warn(LICENSE, stacklevel=2)
         _license_shown = True
-    network = _without_weights(checkpoint.config)
-    return with_weights(network, checkpoint.weights, checkpoint.unknown, path, device)
+    return with_weights(Dust3rNetwork, checkpoint, path, device)
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
-    """Read and check a checkpoint; nothing in the file is run or evaluated.
+def load_checkpoint(path: Path) -> Checkpoint[NetworkConfig]:
+    """Read and check a ``.pth`` file of torch.save, or ``.safetensors`` next to a ``config.json``.
 
     Float32 weights of torch.save are mapped into memory.
-
-    Args:
-        path: as for ``load_network``.
 
     Raises:
         IgsrError: the file is missing or damaged, holds anything but tensors and text, is of
@@ -146,7 +126,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     config, stored = read(path)
     if not all(isinstance(key, str) for key in stored):
         raise IgsrError(f"{path} has keys that are not text; use the published checkpoint")
-    wanted = _without_weights(config).state_dict()
+    wanted = without_weights(Dust3rNetwork, config).state_dict()
     weights = {}
     for key, tensor in wanted.items():
         value = stored.get(key)
@@ -158,11 +138,6 @@ def load_checkpoint(path: Path) -> Checkpoint:
         weights[key] = checked_weight(path, key, value, tensor.shape)
     unknown = sorted(k for k in stored if k not in wanted and not _UNUSED.fullmatch(k))
     return Checkpoint(config, weights, unknown)
-
-
-def _without_weights(config: NetworkConfig) -> Dust3rNetwork:
-    with torch.device("meta"):
-        return Dust3rNetwork(config).eval()
 
 
 @contextlib.contextmanager

@@ -55,7 +55,6 @@ class Dust3r:
         graph: str | None = None,
         cameras: Mapping[str, Camera] | None = None,
     ) -> None:
-        """Keep the settings; nothing is loaded yet."""
         self.predictor = predictor
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.graph = graph
@@ -98,7 +97,7 @@ class Dust3r:
             if placed is None or mask is None:
                 continue
             mask &= placed.grid.usable(photo)
-            # Known cameras are in the world of the others only if at least one was aligned.
+            # Known cameras are in the world of the rest only if at least one was aligned.
             if photo.name in self.cameras:
                 known = self.cameras
         return Estimate(
@@ -157,7 +156,7 @@ def default_graph(photos: int) -> str:
 
 
 def pair_graph(graph: str, photos: int) -> list[tuple[int, int]]:
-    """List the pairs of photos in both orders, sorted; the graphs are those of DUSt3R's code.
+    """List the pairs of photos in both orders, sorted; DUSt3R's code has the same graphs.
 
     Args:
         graph: "complete": all pairs; "swin-K": each photo with the next K, wrapping around;
@@ -206,10 +205,6 @@ def with_dense_depth(photo: AlignedPhoto, dense: DenseMap) -> AlignedPhoto:
 
     Both have the same edges, so their ratio is smooth: it is interpolated between the samples, and
     edges stay as sharp as the network predicts them.
-
-    Args:
-        photo: aligned on the samples.
-        dense: its own map.
     """
     own = np.where(dense.confidence > 1.0, dense.depth, 0.0).astype(np.float64)
     at_samples = own[dense.rows, dense.columns]

@@ -1,7 +1,7 @@
 """The network of DUSt3R: a ViT encoder, two decoders that attend to each other, a head for each.
 
-Wang et al., CVPR 2024, section 3.1. The blocks are those of CroCo v2 (Weinzaepfel et al., ICCV
-2023); the DPT head is that of Ranftl et al. 2021. Module names are those of the checkpoints' keys.
+Wang et al., CVPR 2024, section 3.1. The blocks come from CroCo v2 (Weinzaepfel et al., ICCV
+2023), the DPT head from Ranftl et al. 2021. Module names are as in the checkpoints.
 The heads run in float32 even if the rest runs in half precision.
 """
 
@@ -56,7 +56,6 @@ class NetworkConfig:
     decoder_heads: int = 12
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if self.head not in ("dpt", "linear"):
             raise IgsrError(f"head is {self.head!r}; a DUSt3R network has 'dpt' or 'linear'")
         for name, low, high in (
@@ -82,7 +81,7 @@ class NetworkConfig:
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """Inputs of the heads: 0 is the encoder's output, n that of the decoder's block n."""
+        """Inputs of the heads: 0 is the output of the encoder, n of block n of the decoder."""
         depth = self.decoder_depth
         return (0, depth * 2 // 4, depth * 3 // 4, depth) if self.head == "dpt" else (depth,)
 
@@ -121,14 +120,9 @@ class PointMaps:
 
 
 class Dust3rNetwork(nn.Module):
-    """Predict the points of two photos.
-
-    Args:
-        config: the sizes.
-    """
+    """Predict the points of two photos."""
 
     def __init__(self, config: NetworkConfig) -> None:
-        """Make the layers, with random weights."""
         super().__init__()
         self.config = config
         patches = nn.Conv2d(3, config.encoder_dim, PATCH, stride=PATCH)
@@ -144,11 +138,7 @@ class Dust3rNetwork(nn.Module):
         self.downstream_head1, self.downstream_head2 = _head(config), _head(config)
 
     def encode(self, images: Tensor) -> Tokens:
-        """Encode photos of one shape, independently of each other.
-
-        Args:
-            images: [B, 3, H, W] in [-1, 1]; H and W are multiples of 16.
-        """
+        """Encode photos [B, 3, H, W] in [-1, 1]; H and W are multiples of 16."""
         patches = self.patch_embed["proj"](images)
         rows, columns = patches.shape[-2:]
         rotation = self._rotation("encoder", rows, columns, images.device)
@@ -159,13 +149,9 @@ class Dust3rNetwork(nn.Module):
         return Tokens(self.enc_norm(features), rows, columns)
 
     def decode(self, first: Tokens, second: Tokens) -> tuple[PointMaps, PointMaps]:
-        """Predict the points of pairs of encoded photos in the camera frames of the first ones.
+        """Predict maps of B first and of B second photos, in the camera frames of the first ones.
 
-        Args:
-            first, second: B photos each; the shapes of first and second may differ.
-
-        Returns:
-            The maps of the first photos and of the second photos.
+        The shapes of the first and of the second photos may differ.
         """
         device = first.features.device
         rotations = [self._rotation("decoder", t.rows, t.columns, device) for t in (first, second)]

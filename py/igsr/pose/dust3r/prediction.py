@@ -162,11 +162,7 @@ class DenseMap:
 
 @dataclass(frozen=True)
 class DenseGrid(Grid):
-    """The grid of a photo's predictions, with its dense map.
-
-    Attributes:
-        dense: None if the photo is the first of no pair.
-    """
+    """The grid of a photo's predictions, with its dense map if it is the first of a pair."""
 
     dense: DenseMap | None = None
 
@@ -175,14 +171,9 @@ class DustPredictor:
     """DUSt3R as the predictor of the alignment.
 
     On CUDA devices encoder and decoders run in half precision (bfloat16, else float16), the heads
-    in float32.
-
-    Args:
-        network: with weights, on its device.
-    """
+    in float32."""
 
     def __init__(self, network: Dust3rNetwork) -> None:
-        """Keep the network."""
         self.network = network
 
     def __call__(
@@ -191,28 +182,14 @@ class DustPredictor:
         pairs: Sequence[tuple[int, int]],
         progress: Callable[[str, int, int], None] | None = None,
     ) -> tuple[list[Grid], list[PairPrediction]]:
-        """Predict the pointmaps of ordered pairs of photos.
+        """As ``Predictor``: a ``DenseGrid`` per photo, and a prediction per pair, in that order.
 
-        Masked and transparent pixels have confidence 1, that is no weight.
-
-        Args:
-            photos: of any sizes.
-            pairs: indices of photos; the points of both are in the first one's frame. Sorted pairs
-                take the least memory, since photos are forgotten after their last pair.
-            progress: called as progress("pairs", done, total).
-
-        Returns:
-            A ``DenseGrid`` per photo, and a prediction per pair, in the pairs' order.
+        Masked and transparent pixels have confidence 1, that is no weight. Sorted pairs take the
+        least memory, since photos are forgotten after their last pair.
 
         Raises:
-            IgsrError: a pair does not name two photos, a photo is too narrow, or the predictions
-                are not finite.
+            IgsrError: a photo is too narrow, or the predictions are not finite.
         """
-        for pair in pairs:
-            if len(set(pair)) != 2 or not all(0 <= photo < len(photos) for photo in pair):
-                raise IgsrError(
-                    f"pairs holds {pair}; give two different indices of the {len(photos)} photos"
-                )
         views = [_View(photo, self.network.config.image_size) for photo in photos]
         encoded = _EncodedPhotos(self.network, views, pairs)
         predictions: list[PairPrediction] = []
@@ -326,7 +303,7 @@ def stride_for(side: int) -> int:
 def grid_samples(side: int, stride: int) -> range:
     """Sampled pixels of an even ``side``: an even number, symmetric about the center.
 
-    So the center of a grid is that of the network's input, its principal point.
+    So the center of a grid is the center of the input, its principal point.
     """
     count = ((side - 1) // stride + 1) // 2 * 2
     start = (side - 1 - (count - 1) * stride) // 2
