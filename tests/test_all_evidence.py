@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
+from scenes import perturbed_camera
 
-from igsr.capture import Camera
 from igsr.capture.types import PoseEvidence
 from igsr.capture.write_cameras import write_cameras
 from igsr.errors import IgsrError
@@ -28,32 +28,11 @@ from igsr.pose.registry import ESTIMATORS
 COUNT = 5
 
 
-def depths(camera, pixels):
-    """Depths [P] of the room's walls at pixels [P, 2] of a camera."""
-    slopes = (pixels - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]
-    rays = np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0) @ camera.viewmat[:3, :3]
-    nearest = np.full(len(rays), np.inf)
-    for normal, offset, _, _ in rooms.WALLS:
-        with np.errstate(divide="ignore"):
-            distance = (offset - camera.centre @ normal) / (rays @ np.array(normal))
-        nearest = np.where((distance > 0) & (distance < nearest), distance, nearest)
-    return nearest
-
-
 def turned(camera, degrees, moved, seed):
-    """A camera with a wrong rotation, place and focal length."""
-    random = np.random.default_rng(seed)
-    axis = random.normal(size=3)
-    x, y, z = np.radians(degrees) * axis / np.linalg.norm(axis)
-    rotation = np.linalg.qr(np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))[0]
-    rotation *= np.sign(np.diag(rotation))
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation @ camera.viewmat[:3, :3]
-    centre = camera.centre + moved * random.normal(size=3) / np.sqrt(3)
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    """A camera with a wrong rotation, center and focal length."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= 1.05
-    return Camera(viewmat, K, camera.width, camera.height)
+    return replace(perturbed_camera(camera, degrees, moved, seed), K=K)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +50,7 @@ def predicted(truth, degrees=3.0, moved=0.2):
     result = []
     for i, camera in enumerate(truth):
         grid = resampling_of(camera.width, camera.height, 252).grid()
-        depth = depths(camera, grid.photo_pixels()).reshape(grid.height, grid.width)
+        depth = rooms.depths(camera, grid.photo_pixels()).reshape(grid.height, grid.width)
         depth = (depth * (1.0 + 0.05 * (-1) ** i)).astype(np.float32)
         sure = np.full(depth.shape, 2.0, np.float32)
         result.append(AlignedPhoto(turned(camera, degrees, moved, i), grid, depth, sure))
@@ -97,7 +76,7 @@ def check_depths(found, truth):
     """Depths agree with the cameras, whatever the unit."""
     scale = similarity_between(found.cameras, truth).scale
     for one, camera in zip(found.photos, truth, strict=True):
-        exact = depths(camera, one.grid.photo_pixels()).reshape(one.depth.shape)
+        exact = rooms.depths(camera, one.grid.photo_pixels()).reshape(one.depth.shape)
         assert np.median(scale * one.depth / exact) == pytest.approx(1.0, abs=0.01)
 
 

@@ -332,14 +332,6 @@ def test_masked_pixels_have_no_confidence(network, photos):
     assert np.array_equal(found.first_points, whole.first_points)
 
 
-def test_the_same_photos_give_the_same_bits(network, photos):
-    pairs = pair_graph("swin-1", 4)
-    runs = [DustPredictor(network)(photos, pairs)[1] for _ in range(2)]
-    for one, other in zip(*runs, strict=True):
-        assert np.array_equal(one.first_points, other.first_points)
-        assert np.array_equal(one.second_confidence, other.second_confidence)
-
-
 def test_predictions_that_are_not_finite(photos):
     network = hashed_network(SMALL)
     assert DustPredictor(network)(photos, [])[1] == []

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import ring_camera
+from scenes import perturbed_camera, ring_camera
 
 from igsr.geometry.bundle_equations import Equations
 from igsr.geometry.pose_errors import pose_accuracy, pose_errors
@@ -44,21 +44,8 @@ def scene(shown_by, per_group=30, seed=0):
     return Bundle(TRUTH, lenses, points, np.zeros(COUNT)), seen
 
 
-def off(camera, seed, degrees=1.5, moved=0.1):
-    """A camera with an error."""
-    random = np.random.default_rng(seed)
-    x, y, z = np.radians(degrees) * random.normal(size=3) / np.sqrt(3.0)
-    turn = np.linalg.qr(np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))[0]
-    turn *= np.sign(np.diag(turn))
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = turn @ camera.viewmat[:3, :3]
-    centre = camera.centre + moved * random.normal(size=3) / np.sqrt(3.0)
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
-    return replace(camera, viewmat=viewmat)
-
-
-def predicted(**more):
-    return [off(camera, k, **more) for k, camera in enumerate(TRUTH)]
+def predicted(degrees=1.5, moved=0.1):
+    return [perturbed_camera(camera, degrees, moved, k) for k, camera in enumerate(TRUTH)]
 
 
 def started(bundle, cameras, seed=3):
@@ -155,7 +142,7 @@ def test_a_wrong_prediction_has_no_influence():
     wanted = predicted()
     right = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
     start = started(bundle, list(wanted))
-    wanted[2] = off(TRUTH[2], 9, degrees=40.0, moved=2.0)
+    wanted[2] = perturbed_camera(TRUTH[2], 40.0, 2.0, 9)
     found = adjusted_bundle(start, seen, wanted, SPREAD, 1.0)
     a, b = (pose_errors(one.cameras, TRUTH) for one in (right, found))
     assert b["rotation"] < a["rotation"] + 0.05
