@@ -193,25 +193,6 @@ def test_an_invalid_camera_is_not_registered():
     assert "Not registered: 01.png. Depth Anything 3 predicts no valid camera" in found.warnings[0]
 
 
-def test_identical_photos_have_the_same_camera():
-    cameras, photos = scene(3)
-    copies = [photos[0], replace(photos[0], name="copy.png"), *photos[1:]]
-    predictor = ExactPredictor(cameras, photos)
-    found = unadjusted(predictor)(copies)
-    assert predictor.shown == [["00.png", "01.png", "02.png"]]
-    np.testing.assert_array_equal(found.cameras[0].viewmat, found.cameras[1].viewmat)
-    check_cameras([found.cameras[i] for i in (0, 2, 3)], cameras)
-
-
-def test_only_identical_photos():
-    _, photos = scene(1)
-    copies = [replace(photos[0], name=f"{n}.png") for n in range(3)]
-    with pytest.raises(IgsrError, match=r"at least 2 different photos; all are the same as 0\.png"):
-        unadjusted(ExactPredictor([], []))(copies)
-    with pytest.raises(IgsrError, match=r"at least 2 different photos$"):
-        unadjusted(ExactPredictor([], []))(photos)
-
-
 def test_cameras_at_one_place_give_a_warning():
     cameras, photos = scene(3)
     here = []

@@ -284,8 +284,12 @@ def test_the_dense_map_is_the_most_confident_one(monkeypatch, network, photos):
         own = grid.dense
         of_photo = [n for n, pair in enumerate(pairs) if pair[0] == i]
         sampled = predictions[max(of_photo, key=lambda n: scores[n])]
-        assert np.array_equal(own.depth[own.rows, own.columns], sampled.first_points[..., 2])
-        assert np.array_equal(own.confidence[own.rows, own.columns], sampled.first_confidence)
+        assert np.array_equal(
+            own.depth[np.ix_(own.rows, own.columns)], sampled.first_points[..., 2]
+        )
+        assert np.array_equal(
+            own.confidence[np.ix_(own.rows, own.columns)], sampled.first_confidence
+        )
         assert sampled.first_points.shape == (grid.height, grid.width, 3)
         assert max(grid.height, grid.width) <= 20
         for samples, count, scale, offset, whole_scale, whole_offset in (
@@ -294,7 +298,7 @@ def test_the_dense_map_is_the_most_confident_one(monkeypatch, network, photos):
             (own.rows, grid.height, grid.scale_y, grid.offset_y,
              own.grid.scale_y, own.grid.offset_y),
         ):  # fmt: skip
-            pixel = np.arange(own.grid.width + own.grid.height)[samples][:count] + 0.5
+            pixel = np.array(samples) + 0.5
             expected = pixel * whole_scale + whole_offset
             np.testing.assert_allclose((np.arange(count) + 0.5) * scale + offset, expected)
     assert grids[3].dense is None

@@ -241,10 +241,10 @@ def test_dense_depths_keep_the_edges_of_the_pointmap(scene):
     depth = np.where(np.arange(24) < 11, 2.0, 5.0) * np.ones((20, 1))
     confidence = np.full((20, 24), 4.0, np.float32)
     confidence[3, 3] = 1.0
-    rows = columns = slice(0, None, 2)
+    rows, columns = range(0, 20, 2), range(0, 24, 2)
     dense = DenseMap(depth.astype(np.float32), confidence, fine, rows, columns)
     camera = Camera(np.eye(4), np.array([[50.0, 0, 24], [0, 50, 20], [0, 0, 1]]), 48, 40)
-    aligned = (3.0 * depth[rows, columns]).astype(np.float32)
+    aligned = (3.0 * depth[np.ix_(rows, columns)]).astype(np.float32)
     aligned[4, 4] = np.nan
     sure = np.full((10, 12), 6.0, np.float32)
     photo = with_dense_depth(AlignedPhoto(camera, coarse, aligned, sure), dense)
@@ -266,8 +266,8 @@ def test_a_predictor_that_keeps_dense_maps_gives_dense_depths(scene):
             depth = np.repeat(np.repeat(kept.first_points[..., 2], 2, axis=0), 2, axis=1)
             sure = np.repeat(np.repeat(kept.first_confidence, 2, axis=0), 2, axis=1)
             whole = Grid(2 * GRID.height, 2 * GRID.width, 1.0, 1.0, 4.0, 2.0)
-            samples = slice(0, None, 2)
-            map_of = DenseMap(depth, sure, whole, samples, samples)
+            rows, columns = range(0, depth.shape[0], 2), range(0, depth.shape[1], 2)
+            map_of = DenseMap(depth, sure, whole, rows, columns)
             dense.append(DenseGrid(**vars(grids[i]), dense=map_of))
         return dense, predictions
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from igsr.capture import Camera
-from igsr.capture.photo_folder import FEWEST, Photo
+from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.geometry.similarity import similarity_between
 from igsr.pose.all_evidence import Evidence, with_all_evidence
@@ -82,22 +81,17 @@ class Da3:
         """Find the cameras of photos, or depths for known cameras.
 
         Photos of one device, size and EXIF focal length, upright or not, share their focal length;
-        principal points are in the center. Identical photos get the same camera.
+        principal points are in the center.
 
         Args:
-            photos: at least two that differ.
+            photos: at least two.
             seed: of the samples of rays and the verification of matches.
             progress: called as progress("passes", done, total), then with COLMAP's stages.
 
         Raises:
-            IgsrError: there are fewer than two different photos, cameras are known of only some
-                photos, of other photos or for another size, no checkpoint is found, a photo is too
-                narrow, or two photos do not fit into memory.
+            IgsrError: cameras are known of only some photos, of other photos or for another size,
+                no checkpoint is found, a photo is too narrow, or two photos do not fit into memory.
         """
-        different, same_as = _different(photos)
-        if len(different) < FEWEST:
-            only = f"; all are the same as {photos[0].name}" if len(photos) > 1 else ""
-            raise IgsrError(f"Finding cameras needs at least {FEWEST} different photos{only}")
         check_given_cameras(self.cameras, photos)
         missing = [photo.name for photo in photos if photo.name not in self.cameras]
         if self.cameras and missing:
@@ -106,12 +100,11 @@ class Da3:
                 "all photos or of none"
             )
         predictor, weights = (self.predictor, None) if self.predictor else self._network()
-        shown = [photos[i] for i in different]
-        plan = passes_of(len(shown), predictor.most_photos(shown))
+        plan = passes_of(len(photos), predictor.most_photos(photos))
         total, done = sum(len(part) for part in plan), 0
         passes = []
         for part in plan:
-            passes.append(self._predicted(predictor, part, shown, seed))
+            passes.append(self._predicted(predictor, part, photos, seed))
             done += len(part)
             if progress is not None:
                 progress("passes", done, total)
@@ -120,26 +113,26 @@ class Da3:
             world = {i: one for each in reversed(passes) for i, one in each.items()}
         else:
             world, lost = joined_passes(passes)
-        aligned = [world.get(i) for i in range(len(shown))]
+        aligned = [world.get(i) for i in range(len(photos))]
         evidence = None
         if not self.cameras:
-            aligned = with_shared_focals(shown, aligned)
+            aligned = with_shared_focals(photos, aligned)
             if self.bundle_adjustment:
                 confident = [None if one is None else confident_pixels(one) for one in aligned]
                 evidence = with_all_evidence(
-                    shown, aligned, confident, NETWORK, self.matcher, seed, progress
+                    photos, aligned, confident, NETWORK, self.matcher, seed, progress
                 )
-        estimate = self._estimate(photos, shown, same_as, aligned, evidence)
-        estimate.warnings = self._warnings(shown, aligned, lost, evidence)
+        estimate = self._estimate(photos, aligned, evidence)
+        estimate.warnings = self._warnings(photos, aligned, lost, evidence)
         estimate.weights = weights
         return estimate
 
     def _predicted(
-        self, predictor: Predictor, part: Sequence[int], shown: Sequence[Photo], seed: int
+        self, predictor: Predictor, part: Sequence[int], photos: Sequence[Photo], seed: int
     ) -> dict[int, AlignedPhoto]:
         """Predict a pass; with known cameras, in their world."""
-        photos = [shown[i] for i in part]
-        known = [self.cameras[photo.name] for photo in photos] if self.cameras else None
+        shown = [photos[i] for i in part]
+        known = [self.cameras[photo.name] for photo in shown] if self.cameras else None
         centers = np.array([camera.centre for camera in known or ()])
         # Tolerate only rounding: coordinates may be millions of meters, as in map projections.
         if len(centers) and np.ptp(centers, axis=0).max() <= 1e-9 * np.abs(centers).max():
@@ -147,11 +140,11 @@ class Da3:
                 "the known cameras of a pass all stand at one place, which sets no scale; leave "
                 "cameras out"
             )
-        predicted = predictor(photos, known, seed)
+        predicted = predictor(shown, known, seed)
         placed = {i: one for i, one in zip(part, predicted, strict=True) if one is not None}
         if not known or not placed:
             return placed
-        cameras = {i: self.cameras[shown[i].name] for i in placed}
+        cameras = {i: self.cameras[photos[i].name] for i in placed}
         similarity = similarity_between(
             [placed[i].camera for i in placed], [cameras[i] for i in placed]
         )
@@ -160,8 +153,6 @@ class Da3:
     def _estimate(
         self,
         photos: Sequence[Photo],
-        shown: Sequence[Photo],
-        same_as: Sequence[int],
         aligned: Sequence[AlignedPhoto | None],
         evidence: Evidence | None,
     ) -> Estimate:
@@ -169,30 +160,28 @@ class Da3:
         if evidence is not None:
             cameras, aligned = evidence.cameras, evidence.photos
         trusted = trusted_depths(aligned)
-        for photo, placed, mask in zip(shown, aligned, trusted, strict=True):
+        for photo, placed, mask in zip(photos, aligned, trusted, strict=True):
             if placed is not None and mask is not None:
                 mask &= placed.grid.usable(photo)
-        of_photos = [aligned[i] for i in same_as]
+        if self.cameras:
+            cameras = [self.cameras[photo.name] for photo in photos]
         return Estimate(
-            cameras=[
-                self.cameras[photo.name] if self.cameras else cameras[i]
-                for photo, i in zip(photos, same_as, strict=True)
-            ],
+            cameras=cameras,
             points=joined_points(
                 None if evidence is None else evidence.points,
-                fused_points(shown, aligned, trusted),
+                fused_points(photos, aligned, trusted),
             ),
-            depths=[None if one is None else one.depth for one in of_photos],
-            trusted=[trusted[i] for i in same_as],
+            depths=[None if one is None else one.depth for one in aligned],
+            trusted=list(trusted),
             warnings=[],
-            grids=[None if one is None else one.grid for one in of_photos],
-            lenses=[] if evidence is None else [evidence.lenses[i] for i in same_as],
-            evidence=[] if evidence is None else [evidence.evidence[i] for i in same_as],
+            grids=[None if one is None else one.grid for one in aligned],
+            lenses=[] if evidence is None else evidence.lenses,
+            evidence=[] if evidence is None else evidence.evidence,
         )
 
     def _warnings(
         self,
-        shown: Sequence[Photo],
+        photos: Sequence[Photo],
         aligned: Sequence[AlignedPhoto | None],
         lost: Sequence[int],
         evidence: Evidence | None,
@@ -203,8 +192,8 @@ class Da3:
             # Features may place photos for which the network predicts no camera.
             missing &= {i for i, one in enumerate(evidence.cameras) if one is None}
             warnings += evidence.warnings
-        not_joined = [shown[i].name for i in lost if i in missing]
-        no_camera = [shown[i].name for i in sorted(missing.difference(lost))]
+        not_joined = [photos[i].name for i in lost if i in missing]
+        no_camera = [photos[i].name for i in sorted(missing.difference(lost))]
         if no_camera:
             warnings.append(
                 f"Not registered: {listed(no_camera)}. Depth Anything 3 predicts no valid camera "
@@ -279,19 +268,3 @@ def with_shared_focals(
             one = replace(one, camera=replace(one.camera, K=K))
         result.append(one)
     return result
-
-
-def _different(photos: Sequence[Photo]) -> tuple[list[int], list[int]]:
-    """Indices of different photos, and for each photo the one of them that it equals."""
-    first: dict[Hashable, int] = {}
-    different: list[int] = []
-    same_as: list[int] = []
-    for i, photo in enumerate(photos):
-        content = hashlib.sha256(photo.image.tobytes()).digest()
-        masked = None if photo.mask is None else np.packbits(photo.mask).tobytes()
-        key = photo.image.shape, content, masked
-        if key not in first:
-            first[key] = len(different)
-            different.append(i)
-        same_as.append(first[key])
-    return different, same_as

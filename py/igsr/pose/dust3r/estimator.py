@@ -207,12 +207,10 @@ def with_dense_depth(photo: AlignedPhoto, dense: DenseMap) -> AlignedPhoto:
     edges stay as sharp as the network predicts them.
     """
     own = np.where(dense.confidence > 1.0, dense.depth, 0.0).astype(np.float64)
-    at_samples = own[dense.rows, dense.columns]
+    at_samples = own[np.ix_(dense.rows, dense.columns)]
     known = np.isfinite(photo.depth) & (at_samples > 0.0)
     ratio = np.divide(photo.depth, at_samples, out=np.zeros_like(at_samples), where=known)
-    height, width = own.shape
-    down = _interpolation(dense.rows, height, photo.depth.shape[0])
-    across = _interpolation(dense.columns, width, photo.depth.shape[1])
+    down, across = map(_interpolation, (dense.rows, dense.columns), own.shape)
     share = down @ known @ across.T
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (own * (down @ ratio @ across.T) / share).astype(np.float32)
@@ -222,8 +220,8 @@ def with_dense_depth(photo: AlignedPhoto, dense: DenseMap) -> AlignedPhoto:
     return replace(photo, grid=dense.grid, depth=depth, confidence=confidence)
 
 
-def _interpolation(samples: slice, size: int, count: int) -> Float64:
-    """Linear interpolation [size, count] from ``count`` samples to ``size`` pixels."""
+def _interpolation(samples: range, size: int) -> Float64:
+    """Linear interpolation [size, samples] from samples to ``size`` pixels."""
     position = (np.arange(size) - samples.start) / samples.step
-    position = np.clip(position, 0.0, count - 1.0)
-    return np.maximum(1.0 - np.abs(position[:, None] - np.arange(count)), 0.0)
+    position = np.clip(position, 0.0, len(samples) - 1.0)
+    return np.maximum(1.0 - np.abs(position[:, None] - np.arange(len(samples))), 0.0)

@@ -150,14 +150,14 @@ class DenseMap:
         depth: float32 [H, W], z of the points, in the unit of that pair.
         confidence: float32 [H, W], raw; 1 for pixels that must not be used.
         grid: position of the map in the photo.
-        rows, columns: of the samples that the pair's prediction has.
+        rows, columns: of the samples in the pair's prediction.
     """
 
     depth: Float32
     confidence: Float32
     grid: Grid
-    rows: slice
-    columns: slice
+    rows: range
+    columns: range
 
 
 @dataclass(frozen=True)
@@ -221,18 +221,22 @@ class DustPredictor:
                     if score > scores[first]:
                         scores[first] = score
                         depth = points[0][..., 2].copy()
-                        dense[first] = pair_views[0].dense(depth, confidences[0])
-                    samples = (
-                        view.sampled(array)
-                        for view, arrays in zip(
-                            pair_views, zip(points, confidences, strict=True), strict=True
+                        view = pair_views[0]
+                        dense[first] = DenseMap(
+                            depth, confidences[0], view.whole, view.rows, view.columns
                         )
+                    samples = (
+                        array[np.ix_(view.rows, view.columns)]
+                        for view, *arrays in zip(pair_views, points, confidences, strict=True)
                         for array in arrays
                     )
                     predictions.append(PairPrediction(*pair, *samples))
                 if progress is not None:
                     progress("pairs", len(predictions), len(pairs))
-        grids: list[Grid] = [view.grid(own) for view, own in zip(views, dense, strict=True)]
+        grids: list[Grid] = [
+            DenseGrid(**vars(view.crop.grid(view.columns, view.rows)), dense=own)
+            for view, own in zip(views, dense, strict=True)
+        ]
         return grids, predictions
 
 
@@ -247,16 +251,6 @@ class _View:
         self.rows, self.columns = (grid_samples(side, stride) for side in self.shape)
         self.whole = self.crop.grid(range(self.crop.width), range(self.crop.height))
         self.hidden = ~self.whole.usable(photo)
-
-    def sampled(self, array: Float32) -> Float32:
-        # A copy: a view would keep the whole array.
-        return array[_slice(self.rows), _slice(self.columns)].copy()
-
-    def dense(self, depth: Float32, confidence: Float32) -> DenseMap:
-        return DenseMap(depth, confidence, self.whole, _slice(self.rows), _slice(self.columns))
-
-    def grid(self, dense: DenseMap | None) -> DenseGrid:
-        return DenseGrid(**vars(self.crop.grid(self.columns, self.rows)), dense=dense)
 
 
 class _EncodedPhotos:
@@ -308,10 +302,6 @@ def grid_samples(side: int, stride: int) -> range:
     count = ((side - 1) // stride + 1) // 2 * 2
     start = (side - 1 - (count - 1) * stride) // 2
     return range(start, start + count * stride, stride)
-
-
-def _slice(samples: range) -> slice:
-    return slice(samples.start, samples.stop, samples.step)
 
 
 def _batches(
