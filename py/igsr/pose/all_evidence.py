@@ -63,23 +63,14 @@ FEATURES_ALONE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Cameras and depths by all evidence, in one world.
-
-    Attributes:
-        cameras: per photo; None if it is not placed.
-        photos: per photo with its camera and depths; None if its depths are unknown.
-        lenses: per photo, as ``Estimate``.
-        points: of features, with tracks, or None.
-        evidence: per photo, what its camera rests on; None if it is not placed.
-        warnings: for the user.
-    """
+    """Cameras and depths by all evidence, in one world; None for photos that are not placed."""
 
     cameras: list[Camera | None]
-    photos: list[AlignedPhoto | None]
-    lenses: list[Lens | None]
-    points: Points | None
+    photos: list[AlignedPhoto | None]  # with depths; also None if these are unknown
+    lenses: list[Lens | None]  # as ``Estimate``
+    points: Points | None  # of features, with tracks
     evidence: list[PoseEvidence | None]
-    warnings: list[str]
+    warnings: list[str]  # for the user
 
 
 def with_all_evidence(

@@ -37,19 +37,12 @@ MIN_PHOTOS_FOR_TWO = 5
 
 @dataclass(frozen=True, eq=False)
 class AlignedPhoto:
-    """A photo with its camera and depth map.
+    """A photo with its camera and depth map."""
 
-    Attributes:
-        camera: in pixels of the photo.
-        grid: position of depth and confidence in the photo.
-        depth: float32 [h, w], z-depth in world units, NaN if unknown.
-        confidence: float32 [h, w], raw confidence of the network; 1 means none.
-    """
-
-    camera: Camera
-    grid: Grid
-    depth: Float32
-    confidence: Float32
+    camera: Camera  # in pixels of the photo
+    grid: Grid  # position of depth and confidence in the photo
+    depth: Float32  # [h, w], z-depth in world units, NaN if unknown
+    confidence: Float32  # [h, w], raw confidence of the network; 1 means none
 
     def world_points(self) -> tuple[Float64, Int64]:
         """World points [M, 3] of the pixels with known depth, and their flat indices [M]."""

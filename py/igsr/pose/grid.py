@@ -19,22 +19,14 @@ class Grid:
     """Position of a network's pixel grid in a photo.
 
     photo coordinates = grid coordinates * scale + offset, both with pixel centers at +0.5.
-
-    Attributes:
-        height: rows of the grid.
-        width: columns of the grid.
-        scale_x: photo pixels per column.
-        scale_y: photo pixels per row.
-        offset_x: photo pixels left of the grid.
-        offset_y: photo pixels above the grid.
     """
 
     height: int
     width: int
-    scale_x: float
-    scale_y: float
-    offset_x: float
-    offset_y: float
+    scale_x: float  # photo pixels per column
+    scale_y: float  # photo pixels per row
+    offset_x: float  # photo pixels left of the grid
+    offset_y: float  # photo pixels above the grid
 
     def over_photo(self, plane: np.ndarray, width: int, height: int) -> np.ndarray:
         """Resample a plane of the grid to the whole photo, at about the grid's resolution.

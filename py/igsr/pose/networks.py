@@ -103,17 +103,11 @@ def float32_array(tensor: Tensor) -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint(Generic[Config]):
-    """A checked checkpoint.
+    """A checked checkpoint."""
 
-    Attributes:
-        config: sizes of the network.
-        weights: float32, exactly the keys and shapes of a network of these sizes.
-        unknown: sorted keys of the file that the network does not have.
-    """
-
-    config: Config
-    weights: dict[str, Tensor]
-    unknown: list[str]
+    config: Config  # sizes of the network
+    weights: dict[str, Tensor]  # float32, exactly the keys and shapes of that network
+    unknown: list[str]  # sorted keys of the file that the network does not have
 
 
 def exists(path: Path, folder: bool = False) -> bool:

@@ -47,50 +47,30 @@ MIN_DEVIATION_PX = 0.05
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard deviations of a network's cameras.
+    """Standard deviations of a network's cameras."""
 
-    Attributes:
-        rotation: radians.
-        centre: world units.
-    """
-
-    rotation: float
-    centre: float
+    rotation: float  # radians
+    centre: float  # world units
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Observations of points in photos.
+    """Observations of points in photos."""
 
-    Attributes:
-        view: int64 [M], index of the photo's camera.
-        point: int64 [M], index of the point; every point is observed.
-        xy: float64 [M, 2], pixels, without lens distortion.
-        depth: float64 [M], predicted z-depth, world units; NaN if there is none.
-    """
-
-    view: Int64
-    point: Int64
-    xy: Float64
-    depth: Float64
+    view: Int64  # [M], index of the photo's camera
+    point: Int64  # [M], index of the point; every point is observed
+    xy: Float64  # [M, 2], pixels, without lens distortion
+    depth: Float64  # [M], predicted z-depth, world units; NaN if there is none
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """V cameras and P points.
+    """V cameras and P points."""
 
-    Attributes:
-        cameras: with one focal length for both directions.
-        lenses: int64 [V]: cameras of one number share their focal length.
-        points: float64 [P, 3], world frame.
-        scales: float64 [V], logarithm of the factor by which each photo's predicted depths are too
-            small.
-    """
-
-    cameras: Sequence[Camera]
-    lenses: Int64
-    points: Float64
-    scales: Float64
+    cameras: Sequence[Camera]  # with one focal length for both directions
+    lenses: Int64  # [V]: cameras of one number share their focal length
+    points: Float64  # [P, 3], world frame
+    scales: Float64  # [V], logarithms of the factors that correct each photo's predicted depths
 
     @property
     def log_focals(self) -> Float64:

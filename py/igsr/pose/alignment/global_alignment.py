@@ -46,21 +46,13 @@ ADAM_EPSILON = 1e-15
 
 @dataclass(eq=False)
 class Alignment:
-    """Result of the alignment.
+    """Result of the alignment."""
 
-    Attributes:
-        photos: None for unregistered ones.
-        pairs: the aligned ordered pairs.
-        start_loss: initial objective, in units of the median depth.
-        loss: final objective.
-        warnings: messages that name unregistered photos.
-    """
-
-    photos: list[AlignedPhoto | None]
-    pairs: list[tuple[int, int]]
-    start_loss: float
-    loss: float
-    warnings: list[str]
+    photos: list[AlignedPhoto | None]  # None for unregistered ones
+    pairs: list[tuple[int, int]]  # the aligned ordered pairs
+    start_loss: float  # initial objective, in units of the median depth
+    loss: float  # final objective
+    warnings: list[str]  # name unregistered photos
 
 
 def align(

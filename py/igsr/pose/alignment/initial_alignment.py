@@ -24,17 +24,11 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(eq=False)
 class Placement:
-    """Cameras and edges in one world frame.
+    """Cameras and edges in one world frame."""
 
-    Attributes:
-        viewmats: float64 [4, 4] per photo, world to camera.
-        intrinsics: float64 [3, 3] per photo, pixels of the photo.
-        edges: per edge, from its stored frame (``Observations``) to the world.
-    """
-
-    viewmats: dict[int, Float64]
-    intrinsics: dict[int, Float64]
-    edges: list[Similarity]
+    viewmats: dict[int, Float64]  # [4, 4] per photo, world to camera
+    intrinsics: dict[int, Float64]  # [3, 3] per photo, pixels of the photo
+    edges: list[Similarity]  # per edge, from its stored frame (``Observations``) to the world
 
     def mapped(self, world: Similarity) -> Placement:
         """Map to another world frame."""

@@ -48,15 +48,6 @@ class Objective:
 
     Rotations are Gibbs vectors (axis times the tangent of half the angle) after the initial
     rotation; depths, focal lengths and scales are logarithms of ratios. All begin at zero.
-
-    Attributes:
-        edge_turns: float64 [E, 3].
-        edge_moves: float64 [E, 3], world units.
-        edge_scales: float64 [E].
-        turns: float64 [N, 3], of the photos in the order of their indices.
-        moves: float64 [N, 3], world units.
-        focals: float64 [G], one per group of photos whose focal length is free.
-        depths: float32 [sum of P], of all photos.
     """
 
     def __init__(
@@ -125,20 +116,11 @@ class Objective:
         self.edge_turns, self.edge_moves = zeros(edge_count, 3), zeros(edge_count, 3)
         self.edge_scales = zeros(edge_count)
         self.turns, self.moves = zeros(count, 3), zeros(count, 3)
-        self.focals = zeros(len(free_groups))
-        self.depths = torch.zeros(begin, dtype=torch.float32, requires_grad=True)
-
-    @property
-    def parameters(self) -> list[Tensor]:
-        """All parameters."""
-        return [
-            self.edge_turns,
-            self.edge_moves,
-            self.edge_scales,
-            self.turns,
-            self.moves,
-            self.focals,
-            self.depths,
+        self.focals = zeros(len(free_groups))  # one per group of photos whose focal length is free
+        self.depths = torch.zeros(begin, dtype=torch.float32, requires_grad=True)  # of all photos
+        self.parameters = [
+            *(self.edge_turns, self.edge_moves, self.edge_scales),
+            *(self.turns, self.moves, self.focals, self.depths),
         ]
 
     def edges(self) -> tuple[Tensor, Tensor]:

@@ -34,23 +34,15 @@ class PairPrediction:
     """Pointmaps of an ordered pair of photos (DUSt3R, Wang et al. 2024).
 
     All points are in the camera frame of ``first``, OpenCV axes, in an arbitrary unit per pair.
-    Values that are not finite are ignored.
-
-    Attributes:
-        first: index of the photo whose camera frame this is.
-        second: index of the other photo.
-        first_points: float32 [h, w, 3], on the grid of photo ``first``.
-        first_confidence: float32 [h, w], raw: above 1, where 1 means none.
-        second_points: float32 [h2, w2, 3], on the grid of photo ``second``.
-        second_confidence: float32 [h2, w2].
+    Raw confidence is above 1, where 1 means none. Values that are not finite are ignored.
     """
 
-    first: int
-    second: int
-    first_points: np.ndarray
-    first_confidence: np.ndarray
-    second_points: np.ndarray
-    second_confidence: np.ndarray
+    first: int  # index of the photo whose camera frame this is
+    second: int  # index of the other photo
+    first_points: np.ndarray  # float32 [h, w, 3], on the grid of photo ``first``
+    first_confidence: np.ndarray  # float32 [h, w]
+    second_points: np.ndarray  # float32 [h2, w2, 3], on the grid of photo ``second``
+    second_confidence: np.ndarray  # float32 [h2, w2]
 
     @property
     def photos(self) -> tuple[int, int]:
@@ -86,24 +78,17 @@ class Predictor(Protocol):
 class PhotoToAlign:
     """A photo before the alignment.
 
-    Attributes:
-        name: for messages.
-        height: rows of the photo.
-        width: columns of the photo.
-        grid: position of its predictions in the photo.
-        group: photos of one group without intrinsics share their focal length; None is a group.
-        viewmat: float64 [4, 4], world to camera, fixed; None to be estimated.
-        intrinsics: float64 [3, 3], pixels of the photo, fixed; None to estimate one focal length,
-            with the principal point in the photo's center.
+    Photos of one group (None is a group, too) without intrinsics share their focal length; their
+    principal points are in the center.
     """
 
-    name: str
+    name: str  # for messages
     height: int
     width: int
-    grid: Grid
+    grid: Grid  # position of its predictions in the photo
     group: Hashable = None
-    viewmat: np.ndarray | None = None
-    intrinsics: np.ndarray | None = None
+    viewmat: np.ndarray | None = None  # float64 [4, 4], world to camera, fixed; or None
+    intrinsics: np.ndarray | None = None  # float64 [3, 3], pixels, fixed; or None
 
     def centered(self, focal: float) -> Float64:
         """Intrinsics [3, 3] with a focal length in pixels, principal point in the center."""
@@ -112,34 +97,21 @@ class PhotoToAlign:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A prediction for two photos that overlap.
-
-    Attributes:
-        prediction: of the pair.
-        score: product of the photos' mean confidences, as in DUSt3R.
-    """
+    """A prediction for two photos that overlap."""
 
     prediction: PairPrediction
-    score: float
+    score: float  # product of the photos' mean confidences, as in DUSt3R
 
 
 @dataclass(eq=False)
 class PhotoObservations:
-    """Predictions of K edges for P pixels of one photo.
+    """Predictions of K edges for P pixels of one photo."""
 
-    Attributes:
-        points: float32 [K, 3, P], each in the stored frame of its edge.
-        confidence: float32 [K, P], raw; 1 for points that must not be used.
-        edges: [K], indices of the edges.
-        is_first: [K], whether the photo is the edge's first.
-        pixels: float64 [P, 2], photo coordinates.
-    """
-
-    points: Float32
-    confidence: Float32
-    edges: npt.NDArray[np.int64]
-    is_first: npt.NDArray[np.bool_]
-    pixels: Float64
+    points: Float32  # [K, 3, P], each in the stored frame of its edge
+    confidence: Float32  # [K, P], raw; 1 for points that must not be used
+    edges: npt.NDArray[np.int64]  # [K]
+    is_first: npt.NDArray[np.bool_]  # [K], whether the photo is the edge's first
+    pixels: Float64  # [P, 2], photo coordinates
 
 
 @dataclass(eq=False)
@@ -148,22 +120,14 @@ class Observations:
 
     Points of an edge are stored as (point - center) / unit, so that similarities rotate about the
     middle of the points, and all scales and translations are of about one size.
-
-    Attributes:
-        edges: [E, 2], first and second photo of each edge.
-        rows: [E, 2], the row of each edge in ``photos[first]`` and ``photos[second]``.
-        scores: [E].
-        centers: float64 [E, 3], in the unit of the prediction.
-        units: float64 [E], positive.
-        photos: by index; only photos with an edge.
     """
 
-    edges: npt.NDArray[np.int64]
-    rows: npt.NDArray[np.int64]
-    scores: Float64
-    centers: Float64
-    units: Float64
-    photos: dict[int, PhotoObservations]
+    edges: npt.NDArray[np.int64]  # [E, 2], first and second photo of each edge
+    rows: npt.NDArray[np.int64]  # [E, 2], rows of each edge in ``photos[first]`` and ``[second]``
+    scores: Float64  # [E]
+    centers: Float64  # [E, 3], in the unit of the prediction
+    units: Float64  # [E], positive
+    photos: dict[int, PhotoObservations]  # by index; only photos with an edge
 
     def camera(self, edge: int) -> Float64:
         """The camera center [3] of an edge's first photo, in the edge's stored frame."""

@@ -37,15 +37,10 @@ class Constraint(Protocol):
 
 @dataclass(frozen=True)
 class EpipolarLine:
-    """Correspondences lie on each other's epipolar lines.
+    """Correspondences lie on each other's epipolar lines."""
 
-    Attributes:
-        F: fundamental matrix, float64 [3, 3]: second^T F first = 0.
-        pixels: maximum Sampson distance.
-    """
-
-    F: Float64
-    pixels: float
+    F: Float64  # fundamental matrix [3, 3]: second^T F first = 0
+    pixels: float  # maximum Sampson distance
 
     def forbid(self, first: Float32, second: Float32, scores: Float32) -> None:
         lines, others = _homogeneous(first) @ self.F.T, _homogeneous(second) @ self.F
@@ -71,17 +66,11 @@ class EpipolarLine:
 
 @dataclass(frozen=True)
 class Plane:
-    """Correspondences are mapped to each other by a homography.
+    """Correspondences are mapped to each other by a homography."""
 
-    Attributes:
-        H: homography, float64 [3, 3].
-        pixels: maximum distance in the target photo.
-        back: whether it maps from the second photo to the first.
-    """
-
-    H: Float64
-    pixels: float
-    back: bool = False
+    H: Float64  # [3, 3]
+    pixels: float  # maximum distance in the target photo
+    back: bool = False  # whether it maps from the second photo to the first
 
     def forbid(self, first: Float32, second: Float32, scores: Float32) -> None:
         source, target = (second, first) if self.back else (first, second)
@@ -107,15 +96,13 @@ def _homogeneous(places: Float32) -> Float64:
 class Features:
     """Features of a photo, prepared for comparison.
 
-    Attributes:
-        xy: float32 [N, 2], pixels.
-        left, right: float32 [N, 130]: the product of a row of ``left`` and a row of another photo's
-            ``right`` is the negative squared distance of their descriptors.
+    The product of a row of ``left`` and a row of another photo's ``right`` is the negative squared
+    distance of their descriptors.
     """
 
-    xy: Float32
-    left: Float32
-    right: Float32
+    xy: Float32  # [N, 2], pixels
+    left: Float32  # [N, 130]
+    right: Float32  # [N, 130]
 
 
 def comparable(xy: npt.ArrayLike, descriptors: npt.NDArray[np.uint8]) -> Features:

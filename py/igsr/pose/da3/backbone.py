@@ -38,21 +38,13 @@ RESAMPLING_OFFSET = 0.1
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes of a network.
+    """Sizes of a network."""
 
-    Attributes:
-        embed_dim: channels of the backbone.
-        heads: attention heads of the backbone.
-        features: channels in which the head fuses its levels.
-        out_channels: channels of the head's four levels, the finest first.
-        camera_heads: attention heads of the camera encoder.
-    """
-
-    embed_dim: int
-    heads: int
-    features: int
-    out_channels: tuple[int, int, int, int]
-    camera_heads: int = 16
+    embed_dim: int  # channels of the backbone
+    heads: int  # attention heads of the backbone
+    features: int  # channels in which the head fuses its levels
+    out_channels: tuple[int, int, int, int]  # channels of the head's levels, the finest first
+    camera_heads: int = 16  # attention heads of the camera encoder
 
 
 SMALL = NetworkConfig(embed_dim=384, heads=6, features=64, out_channels=(48, 96, 192, 384))
@@ -122,16 +114,10 @@ class _Attention(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class ViewFeatures:
-    """Output of the backbone for one view.
+    """Output of the backbone for one view of rows * columns tokens."""
 
-    Attributes:
-        levels: four arrays float32 [rows * columns, 2 C], row by row, for the head.
-        token: float32 [2 C], for the camera decoder.
-        rows, columns: size of the token grid.
-    """
-
-    levels: list[Tensor]
-    token: Tensor
+    levels: list[Tensor]  # four of float32 [rows * columns, 2 C], row by row, for the head
+    token: Tensor  # float32 [2 C], for the camera decoder
     rows: int
     columns: int
 

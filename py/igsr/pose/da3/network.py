@@ -25,20 +25,15 @@ CAMERA_DEPTH = 4
 class ViewPrediction:
     """Predictions for one view of H x W pixels (gh = H / 14, gw = W / 14).
 
-    Attributes:
-        depth: float32 [H, W], z-depth in an arbitrary unit per pass, positive.
-        confidence: float32 [H, W], above 1, not calibrated.
-        rays: float32 [8 gh, 8 gw, 6], direction (with z of 1 in the camera) and origin in the
-            pass's world frame, at the pixel centers of that grid; None if not computed.
-        ray_confidence: float32 [8 gh, 8 gw], above 1; None if not computed.
-        pose_encoding: float32 [9], see ``igsr.pose.da3.cameras``.
+    A ray is its direction (with z of 1 in the camera) and origin in the pass's world frame, at the
+    pixel centers of a grid of 8 gh x 8 gw. Confidences are not calibrated.
     """
 
-    depth: Tensor
-    confidence: Tensor
-    rays: Tensor | None
-    ray_confidence: Tensor | None
-    pose_encoding: Tensor
+    depth: Tensor  # float32 [H, W], z-depth in an arbitrary unit per pass, positive
+    confidence: Tensor  # float32 [H, W], above 1
+    rays: Tensor | None  # float32 [8 gh, 8 gw, 6]; None if not computed
+    ray_confidence: Tensor | None  # float32 [8 gh, 8 gw], above 1; None if not computed
+    pose_encoding: Tensor  # float32 [9], see ``igsr.pose.da3.cameras``
 
 
 class CameraDecoder(nn.Module):

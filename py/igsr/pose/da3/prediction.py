@@ -58,17 +58,11 @@ SOURCES = ("decoder", "rays")
 
 @dataclass(frozen=True)
 class Resampling:
-    """How a photo is resampled for the network.
-
-    Attributes:
-        photo_width, photo_height: pixels of the photo.
-        scaled_width, scaled_height: pixels after scaling, which keeps the aspect.
-        width, height: pixels after resizing, multiples of 14.
-    """
+    """How a photo is resampled for the network: scaled, then resized to multiples of 14."""
 
     photo_width: int
     photo_height: int
-    scaled_width: int
+    scaled_width: int  # with the aspect of the photo
     scaled_height: int
     width: int
     height: int

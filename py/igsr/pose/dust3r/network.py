@@ -88,14 +88,9 @@ class NetworkConfig:
 
 @dataclass(frozen=True, eq=False)
 class Tokens:
-    """Tokens of a batch of photos of one shape.
+    """Tokens of a batch of photos of one shape."""
 
-    Attributes:
-        features: [B, rows * columns, C], row by row.
-        rows, columns: size of the token grid.
-    """
-
-    features: Tensor
+    features: Tensor  # [B, rows * columns, C], row by row
     rows: int
     columns: int
 
@@ -107,16 +102,10 @@ class Tokens:
 
 @dataclass(frozen=True, eq=False)
 class PointMaps:
-    """A point for every pixel of a batch of photos.
+    """A point for every pixel of a batch of photos, in an arbitrary unit per pair."""
 
-    Attributes:
-        points: float32 [B, H, W, 3], in the camera frame of the pair's first photo (OpenCV axes),
-            in an arbitrary unit per pair.
-        confidence: float32 [B, H, W], above 1.
-    """
-
-    points: Tensor
-    confidence: Tensor
+    points: Tensor  # float32 [B, H, W, 3], in the camera frame of the pair's first photo
+    confidence: Tensor  # float32 [B, H, W], above 1
 
 
 class Dust3rNetwork(nn.Module):

@@ -38,22 +38,15 @@ NO_CONFIDENCE = np.float32(1.0)
 
 @dataclass(frozen=True)
 class Crop:
-    """The part of a resized photo that the network sees.
-
-    Attributes:
-        photo_width, photo_height: pixels of the photo.
-        resized_width, resized_height: pixels of the resized photo.
-        left, top: first column and row of the part in the resized photo.
-        width, height: pixels of the part, multiples of 16.
-    """
+    """The part of a resized photo that the network sees; all sizes in pixels."""
 
     photo_width: int
     photo_height: int
     resized_width: int
     resized_height: int
-    left: int
-    top: int
-    width: int
+    left: int  # first column of the part in the resized photo
+    top: int  # first row
+    width: int  # of the part, a multiple of 16
     height: int
 
     def grid(self, columns: range, rows: range) -> Grid:
@@ -143,20 +136,14 @@ def network_input(photo: Photo, crop: Crop) -> Float32:
 class DenseMap:
     """The most confident pointmap of a photo in its own frame, at the network's resolution.
 
-    Of the pairs in which the photo is the first, it is that with the highest product of mean
-    confidences, the score by which the alignment ranks pairs.
-
-    Attributes:
-        depth: float32 [H, W], z of the points, in the unit of that pair.
-        confidence: float32 [H, W], raw; 1 for pixels that must not be used.
-        grid: position of the map in the photo.
-        rows, columns: of the samples in the pair's prediction.
+    Of the pairs with this photo first, it has the highest product of mean confidences, the score by
+    which the alignment ranks pairs.
     """
 
-    depth: Float32
-    confidence: Float32
-    grid: Grid
-    rows: range
+    depth: Float32  # [H, W], z of the points, in the unit of that pair
+    confidence: Float32  # [H, W], raw; 1 for pixels that must not be used
+    grid: Grid  # position of the map in the photo
+    rows: range  # of the samples in the pair's prediction
     columns: range
 
 
