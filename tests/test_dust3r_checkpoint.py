@@ -104,13 +104,7 @@ def test_safetensors_with_a_config(tmp_path):
         assert torch.equal(checkpoint.weights[key], weight.half().float())
     path.write_bytes(path.read_bytes()[:-10])
     assert "damaged" in refusal(path)
-    for text in (
-        "[]",
-        "{",
-        "[" * 5000,
-        '{"enc_depth": 1}',
-        json.dumps({**config, "dec_depth": 1e9}),
-    ):
+    for text in ("[]", '{"enc_depth": 1}', json.dumps({**config, "dec_depth": 1e9})):
         (tmp_path / "config.json").write_text(text)
         assert "config.json" in refusal(path)
 
@@ -294,26 +288,13 @@ def test_where_checkpoints_are_searched(caches, monkeypatch):
     assert find_checkpoint() == expected
     expected = touched(caches / f"torch/hub/checkpoints/{large}.pth")
     assert find_checkpoint() == expected
-    mine = touched(caches / "mine.pth")
+    mine, named = touched(caches / "mine.pth"), touched(caches / "named.pth")
     monkeypatch.setenv("IGSR_DUST3R", str(mine))
     assert find_checkpoint() == mine
-    named = touched(caches / "named.pth")
     assert find_checkpoint(named) == named
-    with pytest.raises(IgsrError, match=r"checkpoint names .*gone\.pth"):
-        find_checkpoint(caches / "gone.pth")
-    with pytest.raises(IgsrError, match="checkpoint names"):
-        find_checkpoint("a\0b")
     monkeypatch.setenv("IGSR_DUST3R", str(caches / "gone.pth"))
     with pytest.raises(IgsrError, match=r"IGSR_DUST3R names .*gone\.pth"):
         find_checkpoint()
-
-
-def test_a_missing_device(tmp_path):
-    path = saved(tmp_path / "a.pth")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(IgsrError, match="device 'toaster'"):
-            load_network(path, "toaster")
 
 
 @pytest.mark.parametrize(

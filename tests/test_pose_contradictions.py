@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import rooms
 
+from igsr.capture.photo_folder import Photo
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.colmap.attempts import mapped
 from igsr.pose.colmap.contradictions import (
@@ -125,31 +126,34 @@ def test_the_weakest_links_are_left_out() -> None:
     assert links_between_parts({**strengths, (3, 4): 200}, {(2, 5)}) == set()
 
 
-def alike(monkeypatch: pytest.MonkeyPatch, patch: int = 64) -> None:
-    """Copy a part of the walls of room 0 to room 1."""
-    original = rooms.texture
+def show(*progress: object) -> None:
+    pass
 
-    def texture(seed: int, size: int = 256) -> np.ndarray:
-        walls = original(seed, size)
-        if seed >= 10:
-            walls[:patch, :patch] = original(seed - 10, size)[:patch, :patch]
-        return walls
 
-    monkeypatch.setattr(rooms, "texture", texture)
+def matches_of(photos: list[Photo], folder: Path) -> Path:
+    features = folder / "features.db"
+    list_photos(photos, features)
+    find_features(photos, folder, features, show)
+    return matched(len(photos), features, 0, show)
 
 
 def test_two_rooms_that_look_alike_are_kept_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alike(monkeypatch)
+    # A part of the walls of room 0 is also in room 1.
+    original = rooms.texture
+
+    def texture(seed: int) -> np.ndarray:
+        walls = original(seed)
+        if seed >= 10:
+            walls[:64, :64] = original(seed - 10)[:64, :64]
+        return walls
+
+    monkeypatch.setattr(rooms, "texture", texture)
     cameras = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 5)]
     photos = [*rooms.photos(cameras), *rooms.photos(cameras[1:], seed=1)]
-    features = tmp_path / "features.db"
-    show = lambda *arguments: None  # noqa: E731
     with guarded(0):
-        list_photos(photos, features)
-        find_features(photos, tmp_path, features, show)
-        matches = matched(len(photos), features, 0, show)
+        matches = matches_of(photos, tmp_path)
         across = {pair for pair in links(matches) if pair[0] <= 5 < pair[1]}
         assert across
         wrong = map_photos(9, with_focal_lengths(matches, 0), STEPS[0], 0, show)
@@ -178,12 +182,8 @@ def test_photos_of_another_season_stay_in_one_model(
         rooms, "texture", lambda seed: 0.6 * original(seed) + 0.4 * original(seed + 100)
     )
     photos += rooms.photos(cameras[1::2])
-    features = tmp_path / "features.db"
-    show = lambda *arguments: None  # noqa: E731
     with guarded(0):
-        list_photos(photos, features)
-        find_features(photos, tmp_path, features, show)
-        found = mapped(6, matched(6, features, 0, show), 0, show)
+        found = mapped(6, matches_of(photos, tmp_path), 0, show)
     assert found.alike == 0
     estimate = estimate_of(photos, found)
     accuracy = pose_accuracy(estimate.cameras, [*cameras[::2], *cameras[1::2]])
