@@ -118,7 +118,7 @@ def _features(view: View) -> Features:
 
 def _extract_sift(gray: npt.NDArray[np.uint8]) -> tuple[Float32, Float32]:
     """Keypoints [N, 4] (column and row in pixels, size, orientation) and descriptors [N, 128]."""
-    import pycolmap  # slow to import
+    pycolmap = load_pycolmap()
 
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
