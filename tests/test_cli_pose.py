@@ -112,7 +112,7 @@ def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, igsr_h
     assert len(colors) > 50, "five cameras, each of its own color"
     again = igsr_here("pose", photos, "--out", tmp_path / "plain")
     assert "5 of 6 photos placed by auto" in again.stdout
-    assert_fails(igsr_here("pose", photos, "--out", out), out, "holds something already")
+    assert_fails(igsr_here("pose", photos, "--out", out), out, "is not empty")
     assert len(calls) == 2
 
 
@@ -161,7 +161,7 @@ def test_convert_writes_a_capture_in_another_format(given, tmp_path, igsr_here, 
     cameras = [view.camera for view in igsr.load_capture(out).views]
     errors = pose_accuracy(cameras, [view.camera for view in MADE.views])
     assert errors["ATE"] < 1e-9
-    assert_fails(igsr_here("convert", given, out, "--to", form), "holds something already")
+    assert_fails(igsr_here("convert", given, out, "--to", form), "is not empty")
 
 
 def test_fit_finds_cameras_once_and_keeps_them(photos, calls, tmp_path, igsr_here):

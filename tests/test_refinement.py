@@ -11,7 +11,7 @@ from refinements import contented, lying, refine, same, truthful, unsure
 
 import igsr
 from igsr.fitting import presets
-from igsr.fitting.photo_support import support_of
+from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import settings_for
 from igsr.pose import find
 from igsr.refinement import cross_validation, rounds
@@ -110,11 +110,12 @@ def test_views_of_one_panorama_are_held_out_together_and_count_as_one_photo(ball
 
 def test_folds_are_fitted_with_the_settings_for_all_photos(ball_photos, monkeypatch):
     photos = ball_photos.train_views
-    monkeypatch.setattr(presets, "WIDE_APART_DEG", support_of(photos).apart + 0.1)
-    monkeypatch.setattr(presets, "SH2_PHOTOS", support_of(photos).seen_by)
+    measured = photo_statistics(photos)
+    monkeypatch.setattr(presets, "MCMC_SPACING_DEG", measured.spacing + 0.1)
+    monkeypatch.setattr(presets, "SH2_PHOTOS", measured.overlap)
     monkeypatch.setattr(presets, "MAX_DROPOUT", 0.9)
-    dropout = settings_for(support_of(photos)).dropout
-    assert settings_for(support_of(photos[::2])).dropout != dropout
+    dropout = settings_for(measured).dropout
+    assert settings_for(photo_statistics(photos[::2])).dropout != dropout
     fits = []
     fit_capture = rounds.fit_capture
 
