@@ -1,23 +1,21 @@
-"""What ``import igsr`` and quick commands import, and the options before the command."""
+"""Start of the command: imported modules, help texts, and the options before the command."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 
 import pytest
 import scenes
-import typer
 
-import igsr
 from igsr import cli
 from igsr.cli.lazy_group import load_command
 
-#: Each takes longer to import than a quick command may take to run.
+#: Modules that take longer to import than a quick command may take.
 SLOW = ("torch", "torchmetrics", "matplotlib", "pycolmap", "av", "mitsuba", "scipy")
 
 #: Runs a command as ``igsr`` does, then prints the modules that were imported.
@@ -34,7 +32,7 @@ print("rooms", *sorted(name for name in sys.modules if name.startswith("igsr."))
 
 
 def imported(code, *arguments):
-    """Top-level modules, and modules of igsr, that are imported after some code ran."""
+    """Top-level modules, and modules of igsr, that some code imports."""
     done = subprocess.run(
         [sys.executable, "-c", TRACED.format(code=code), *map(str, arguments)],
         capture_output=True,
@@ -66,7 +64,7 @@ def test_importing_igsr_imports_neither_numpy_nor_torch():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "further"),
+    ("arguments", "others"),
     [
         (["--help"], ("numpy", "PIL")),
         (["--version"], ("PIL", "rich")),
@@ -74,53 +72,52 @@ def test_importing_igsr_imports_neither_numpy_nor_torch():
         (["info", "{capture}"], ()),
         (["convert", "{scene}", "{target}"], ("PIL",)),
         (["info", "--help"], ("PIL",)),
+        (["fit", "--help"], ()),
+        (["refine", "--help"], ()),
     ],
 )
-def test_quick_commands_import_nothing_slow(arguments, further, places):
+def test_quick_commands_import_nothing_slow(arguments, others, places):
     arguments = [argument.format(**places) for argument in arguments]
     modules, _ = imported("from igsr.cli import main; main()", *arguments)
-    assert not modules & {*SLOW, *further}
+    assert not modules & {*SLOW, *others}
 
 
 def commands():
-    return cli._Commands.table
+    """Every command by the words that name it."""
+    for name, entry in cli._Commands.table.items():
+        command = load_command(name, entry)
+        for sub, subcommand in getattr(command, "commands", {}).items():
+            yield pytest.param([name, sub], subcommand, id=f"{name}-{sub}")
+        yield pytest.param([name], command, id=name)
 
 
-@pytest.mark.parametrize("name", commands())
-def test_every_command_of_the_table_is_there(name):
-    command = load_command(name, commands()[name])
-    assert command.name == name
-    assert command.help
-    assert len(commands()[name].help) <= 80
+@pytest.mark.parametrize(("words", "command"), list(commands()))
+def test_help_fits_80_columns(words, command, igsr_here, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = igsr_here(*words, "--help").stdout
+    assert max(map(len, text.splitlines())) <= 80
+    assert command.name == words[-1]
+    for name in (name for parameter in command.params for name in parameter.opts):
+        if name.startswith("--"):
+            assert re.search(rf"(?<![\w-]){name}(?![\w-])", text), f"{name} is cut off"
+    first_panel = text.partition("─ Options ─")[2].partition("╰")[0]
+    assert 1 <= len(re.findall(r"^│[ *]+--", first_panel, re.MULTILINE)) <= 12
 
 
-def test_the_table_has_every_module_of_commands():
-    folder = os.path.dirname(cli.__file__)
-    files = {name[:-3] for name in os.listdir(folder) if name.endswith(".py")}
-    of_commands = {
-        name
-        for name in files - {"__init__", "__main__"}
-        if hasattr(importlib.import_module(f"igsr.cli.{name}"), "app")
-        or hasattr(importlib.import_module(f"igsr.cli.{name}"), f"{name}_command")
-        or name == "evaluate"
-    }
-    assert {entry.module for entry in commands().values()} == {
-        f"igsr.cli.{name}" for name in of_commands
-    }
-
-
-def test_help_lists_every_command_and_a_slip_is_told(igsr_here):
-    help_text = igsr_here("--help").stdout
-    for name in commands():
-        assert f" {name} " in help_text
-    slip = igsr_here("rendr")
-    assert slip.returncode == 2
-    assert "render" in slip.stderr
+def test_help_lists_the_commands_and_a_typo_gets_a_suggestion(igsr_here):
+    text = igsr_here("--help").stdout
+    places = [text.index(f" {name} ") for name in cli._Commands.table]
+    assert places == sorted(places)
+    assert all(len(entry.help) <= 80 for entry in cli._Commands.table.values())
+    assert "--install-completion" in text
+    typo = igsr_here("rendr")
+    assert typo.returncode == 2
+    assert "render" in typo.stderr
 
 
 @pytest.fixture
 def clean_environment(monkeypatch):
-    """Options of the process set variables: gone after the test."""
+    """Restore the variables and the logger that options of the process change."""
     for name in ("IGSR_DEBUG", *cli.process_options.THREAD_VARIABLES):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
@@ -135,11 +132,11 @@ def test_debug_shows_the_traceback_behind_a_message(igsr_here, clean_environment
     monkeypatch.setenv("IGSR_DEBUG", "0")
     assert igsr_here("info", "nowhere.ply").stderr == quiet.stderr
     monkeypatch.setenv("IGSR_DEBUG", "1")
-    told = igsr_here("info", "nowhere.ply")
-    assert told.returncode == quiet.returncode == 1
-    assert told.stderr.startswith("Traceback")
-    assert "splats.py" in told.stderr
-    assert told.stderr.endswith(quiet.stderr)
+    detailed = igsr_here("info", "nowhere.ply")
+    assert detailed.returncode == quiet.returncode == 1
+    assert detailed.stderr.startswith("Traceback")
+    assert "splats.py" in detailed.stderr
+    assert detailed.stderr.endswith(quiet.stderr)
     monkeypatch.delenv("IGSR_DEBUG")
     assert igsr_here("--debug", "info", "nowhere.ply").stderr.startswith("Traceback")
     assert os.environ["IGSR_DEBUG"] == "1"  # for worker processes
@@ -147,14 +144,14 @@ def test_debug_shows_the_traceback_behind_a_message(igsr_here, clean_environment
 
 def test_verbose_logs_to_stderr(igsr_here, clean_environment, places):
     quiet = igsr_here("info", places["capture"], "--json")
-    told = igsr_here("-v", "info", places["capture"], "--json")
-    assert json.loads(told.stdout) == json.loads(quiet.stdout)
+    verbose = igsr_here("-v", "info", places["capture"], "--json")
+    assert json.loads(verbose.stdout) == json.loads(quiet.stdout)
     assert "igsr.capture" not in quiet.stderr
-    assert "igsr.capture" in told.stderr
-    assert "3 views" in told.stderr
+    assert "igsr.capture" in verbose.stderr
+    assert "3 views" in verbose.stderr
 
 
-def test_threads_are_set_for_all_that_starts_them(clean_environment, igsr_here, places):
+def test_threads_are_set_for_all_libraries(clean_environment, igsr_here, places):
     import torch
 
     before = torch.get_num_threads()
@@ -174,10 +171,14 @@ def test_threads_are_checked(count, igsr_here, places):
 
 
 @pytest.mark.parametrize(
-    ("words", "wanted"),
-    [("igsr ", set(commands())), ("igsr export --f", {"--format"}), ("igsr weights f", {"fetch"})],
+    ("words", "expected"),
+    [
+        ("igsr ", set(cli._Commands.table)),
+        ("igsr convert --t", {"--to"}),
+        ("igsr weights f", {"fetch"}),
+    ],
 )
-def test_shells_complete_commands_and_options(words, wanted):
+def test_shells_complete_commands_and_options(words, expected):
     done = subprocess.run(
         [sys.executable, "-c", "from igsr.cli import app; app(prog_name='igsr')"],
         env={
@@ -190,23 +191,4 @@ def test_shells_complete_commands_and_options(words, wanted):
         text=True,
         timeout=60,
     )
-    assert wanted <= set(done.stdout.split()), done.stderr
-
-
-def test_completion_is_offered(igsr_here):
-    assert "--install-completion" in igsr_here("--help").stdout
-
-
-def test_test_every_is_holdout(igsr_here, places):
-    scene, capture = places["scene"], places["capture"]
-    old, new = (
-        igsr_here("eval", scene, capture, option, 2, "--backend", "cpu", "--json").stdout
-        for option in ("--holdout", "--test-every")
-    )
-    assert json.loads(old) == json.loads(new)
-    assert json.loads(new)["protocol"]["split"] == "test"
-
-
-def test_typer_keeps_what_the_lazy_group_overrides():
-    assert typer.main.get_command(cli.app).list_commands(None) == list(commands())
-    assert igsr.__version__
+    assert expected <= set(done.stdout.split()), done.stderr

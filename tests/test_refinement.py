@@ -111,7 +111,7 @@ def test_views_of_one_panorama_are_held_out_together_and_count_as_one_photo(ball
 def test_folds_are_fitted_with_the_settings_for_all_photos(ball_photos, monkeypatch):
     photos = ball_photos.train_views
     measured = photo_statistics(photos)
-    monkeypatch.setattr(presets, "MCMC_SPACING_DEG", measured.spacing + 0.1)
+    monkeypatch.setattr(presets, "MCMC_SPACING_DEG", measured.spacing_deg + 0.1)
     monkeypatch.setattr(presets, "SH2_PHOTOS", measured.overlap)
     monkeypatch.setattr(presets, "MAX_DROPOUT", 0.9)
     dropout = settings_for(measured).dropout
