@@ -1,4 +1,4 @@
-"""``igsr view``: starts splat-view with cameras it can read. Without a display: test_web_server."""
+"""``igsr view`` with a display: starts splat-view with cameras that it can read."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from igsr.capture.write_colmap import write_colmap
 from igsr.cli import app
 from igsr.cli.view import write_for_viewer
 
-#: Stands in for splat-view: keeps its arguments and what --cameras names, which is gone afterwards,
-#: beside itself, and ends with 3.
+#: Stands in for splat-view: copies its arguments and the folder of --cameras, which is temporary,
+#: next to itself, and exits with status 3.
 STAND_IN = f"""#!{sys.executable}
 import json, pathlib, shutil, sys
 own = pathlib.Path(__file__).parent
@@ -35,7 +35,7 @@ if "--cameras" in sys.argv:
 sys.exit(3)
 """
 
-#: The same camera and name as in the viewer's tests, which read the file.
+#: A file that the viewer's own tests read.
 VIEWERS_FILE = Path(__file__).parents[1] / "crates" / "splat_view" / "tests" / "cameras.json"
 
 
@@ -65,7 +65,7 @@ def kept_cameras(stand_in):
     return json.loads((stand_in / "kept" / "cameras.json").read_text())
 
 
-def test_scenes_and_options_are_passed_on_and_the_exit_status_comes_back(stand_in):
+def test_scenes_options_and_the_exit_status_are_passed_on(stand_in):
     given = ["a dir", "--camera", "3", "b.ply", "--near", "0.5"]
     result = view(*given)
     assert words(stand_in) == given
@@ -74,7 +74,7 @@ def test_scenes_and_options_are_passed_on_and_the_exit_status_comes_back(stand_i
 
 
 @pytest.mark.parametrize("layout", ["transforms", "colmap"])
-def test_cameras_and_photos_of_any_capture_are_handed_over(tmp_path, stand_in, layout):
+def test_cameras_and_photos_of_any_capture_are_passed_on(tmp_path, stand_in, layout):
     path = scenes.write_capture(tmp_path / "transforms", scenes.capture(views=3, size=40))
     if layout == "colmap":
         write_colmap(igsr.load_capture(path), tmp_path / "colmap")
@@ -98,7 +98,7 @@ def test_cameras_and_photos_of_any_capture_are_handed_over(tmp_path, stand_in, l
         np.testing.assert_array_equal(photo, one.image)
 
 
-def test_large_photos_are_handed_over_smaller(tmp_path):
+def test_large_photos_are_passed_on_at_a_smaller_size(tmp_path):
     camera = scenes.ring_camera(0.0)
     large = igsr.Camera(camera.viewmat, camera.K, 1700, 850)
     one = View("../a.jpg", large, "train", np.zeros((850, 1700, 3), np.uint8))
@@ -106,21 +106,20 @@ def test_large_photos_are_handed_over_smaller(tmp_path):
     (frame,) = json.loads((tmp_path / "out" / "cameras.json").read_text())["frames"]
     assert (frame["w"], frame["h"]) == (1700, 850)
     assert Image.open(tmp_path / "out" / frame["file_path"]).size == (1600, 800)
-    # A name leads nowhere else.
+    # Names do not lead out of the folder.
     assert sorted(tmp_path.iterdir()) == [tmp_path / "out"]
 
 
-def test_the_capture_kept_beside_a_scene_is_found_unless_the_fit_wrote_cameras(tmp_path, stand_in):
-    out = tmp_path / "out"
-    scenes.write_capture(out / "capture", scenes.capture(views=2, size=16))
+def test_cameras_in_the_folder_of_a_scene_are_found(tmp_path, stand_in):
+    out = scenes.write_capture(tmp_path / "out", scenes.capture(views=2, size=16))
     for scene in (out, out / "scene.ply"):
         view(scene)
         assert words(stand_in)[:2] == [str(scene), "--cameras"]
         assert len(kept_cameras(stand_in)["frames"]) == 2
+    # The viewer finds and reads a cameras.json itself.
     (out / "cameras.json").write_text("{}")
     view(out)
     assert words(stand_in) == [str(out)]
-    # One that the viewer reads is named, not read.
     for named in (out, out / "cameras.json"):
         view("other.ply", "--cameras", named)
         assert words(stand_in) == ["other.ply", "--cameras", str(out / "cameras.json")]
@@ -130,10 +129,10 @@ def test_a_capture_that_cannot_be_read_is_an_error_only_if_it_was_named(tmp_path
     broken = tmp_path / "out"
     broken.mkdir()
     (broken / "transforms.json").write_text("{")
-    beside = view(broken)
+    found = view(broken)
     assert words(stand_in) == [str(broken)]
-    assert "transforms.json is not valid JSON" in beside.stderr
-    assert "no cameras are shown" in beside.stderr
+    assert "transforms.json is not valid JSON" in found.stderr
+    assert "no cameras are shown" in found.stderr
     (stand_in / "words").unlink()
     for named, reason in ((broken, "transforms.json is not valid JSON"), ("nowhere", "nowhere")):
         result = view("scene.ply", "--cameras", named)
@@ -142,7 +141,7 @@ def test_a_capture_that_cannot_be_read_is_an_error_only_if_it_was_named(tmp_path
     assert not (stand_in / "words").exists()
 
 
-def test_igsr_writes_the_cameras_that_the_viewer_s_tests_read(tmp_path):
+def test_igsr_writes_the_cameras_file_of_the_viewers_tests(tmp_path):
     (frame,) = json.loads(VIEWERS_FILE.read_text())["frames"]
     viewmat = np.linalg.inv(np.array(frame["transform_matrix"]) * [1, -1, -1, 1])
     K = np.array([[110.0, 0.0, 60.0], [0.0, 100.0, 35.0], [0.0, 0.0, 1.0]])
@@ -155,7 +154,7 @@ def test_igsr_writes_the_cameras_that_the_viewer_s_tests_read(tmp_path):
     assert written == {"camera_model": "PINHOLE", "frames": [frame]}
 
 
-def test_the_viewer_of_the_package_is_started_and_nothing_beside_takes_its_place(tmp_path):
+def test_the_viewer_imports_no_module_from_the_current_folder(tmp_path):
     scenes.splats().save(tmp_path / "scene.ply")
     (tmp_path / "igsr.py").write_text("raise SystemExit('the folder was searched for modules')")
     environment = {**os.environ, "PYTHONSAFEPATH": "1"}

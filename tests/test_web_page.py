@@ -1,4 +1,4 @@
-"""The page of ``igsr view --web`` in a real browser: it follows what changes, and compares."""
+"""The page of ``igsr view --web`` in a browser: follows a run and compares models."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from scene_pages import MEAN, drawn, model, named, three_cameras
 from web_views import served
 
 import igsr
+from igsr._internal.event import Event
 from igsr.capture.write_cameras import write_cameras
 from igsr.fitting.followed_run import FollowedRun
 from igsr.rendering import scene_page
@@ -19,9 +20,9 @@ from igsr.rendering.renders import render
 from igsr.rendering.scene_page import PageModel, write_scene_page
 
 BLACK = (0.0, 0.0, 0.0)
-#: Three models that no one takes for one another.
+#: Three models that look different.
 ROUNDS = [model(0, 300), model(1), model(2, 500)]
-#: Where the view is, in the world.
+#: Position and direction of the view in the world.
 WORLD = """(({ main, viewpoint }) => {
   const { position, forward } = viewpoint.between(main.scene, { origin: [0, 0, 0], unit: 1 });
   return [...position, ...forward];
@@ -30,7 +31,7 @@ WORLD = """(({ main, viewpoint }) => {
 
 @pytest.fixture(autouse=True)
 def left(browser):
-    """Pages that ask a server are left with it."""
+    """Leave the page when its server ends."""
     yield
     browser.leave()
 
@@ -48,7 +49,7 @@ def picture(splats, camera):
 
 
 def write_round(folder, number):
-    """What a refinement has written after a round."""
+    """Write the files of a refinement after a round."""
     rounds = [{"splats": 300, "test": {"psnr": 20.0 + k}, "accepted": True} for k in range(number)]
     ROUNDS[number].save(folder / "rounds" / str(number) / "scene.ply")
     rounds.append({"splats": 300, "test": {"psnr": 20.0 + number}, "accepted": True})
@@ -68,7 +69,7 @@ def choose(browser, id, value):
     )
 
 
-def test_it_shows_round_after_round_without_a_reload(browser, tmp_path):
+def test_the_page_shows_new_rounds_without_a_reload(browser, tmp_path):
     views = [igsr.View("a.png", camera, "train", np.zeros((144, 160, 3), np.uint8))
              for camera in three_cameras()]  # fmt: skip
     with served(tmp_path) as server:
@@ -101,11 +102,11 @@ def test_it_shows_round_after_round_without_a_reload(browser, tmp_path):
         choose(browser, "shown", "round-0")
         wait_for(browser, "window.igsr.viewer.main.scene.count === 300")
         assert np.abs(drawn(browser, camera) - picture(ROUNDS[0], camera)).mean() <= MEAN
-        # A round of a new run: what is shown follows its file.
+        # A new run replaces the file of a round.
         ROUNDS[1].save(tmp_path / "rounds" / "0" / "scene.ply")
         wait_for(browser, "window.igsr.viewer.main.scene.count === 400")
         kept = browser.run("[...window.igsr.models.kept.values()].map((one) => one.scene.count)")
-        assert sorted(kept) == [400, 400, 500], "what has been replaced is let go"
+        assert sorted(kept) == [400, 400, 500], "replaced models are freed"
         assert browser.problems == []
         own = server.url.rsplit("/", 2)[0]
         assert all(url.startswith((own, f"blob:{own}", "data:")) for url in browser.requests)
@@ -150,13 +151,13 @@ def test_two_rounds_at_a_divider(browser, tmp_path):
     assert browser.problems == []
 
 
-def test_a_photo_lies_on_its_render(browser, tmp_path):
+def test_a_photo_is_aligned_with_its_render(browser, tmp_path):
     camera = three_cameras()[0]
     photo = picture(ROUNDS[1], camera).astype(np.uint8)
     capture = igsr.Capture(tmp_path, [igsr.View("a/b.png", camera, "test", photo)])
     followed = FollowedRun(tmp_path)
     followed.show(capture, BLACK)
-    followed.tell("fit", 0.5)
+    followed(Event("fit", part=0.5))
     ROUNDS[1].save(tmp_path / "scene.ply")
     screens = {}
     with served(tmp_path) as server:
@@ -187,7 +188,7 @@ def test_a_photo_lies_on_its_render(browser, tmp_path):
         assert exact < 0.8 * np.abs(shifted - screens[0])[middle].mean()
 
 
-def test_a_damaged_file_is_said_and_what_is_shown_stays(browser, tmp_path):
+def test_a_damaged_file_is_an_error_and_the_shown_model_stays(browser, tmp_path):
     scene = tmp_path / "scene.ply"
     ROUNDS[0].save(scene)
     with served(scene) as server:
@@ -206,10 +207,10 @@ def test_a_damaged_file_is_said_and_what_is_shown_stays(browser, tmp_path):
     assert browser.run("window.igsr.viewer.main.scene.count") == 400
 
 
-def test_names_are_text(browser, tmp_path):
+def test_names_are_escaped(browser, tmp_path):
     name = "<img src=x onerror='window.broken = true'>"
     (tmp_path / name).mkdir()
-    FollowedRun(tmp_path / name).tell(name, 0.1)
+    FollowedRun(tmp_path / name)(Event(name, part=0.1))
     ROUNDS[0].save(tmp_path / name / "scene.ply")
     with served(tmp_path / name) as server:
         browser.open(server.url)
@@ -219,7 +220,7 @@ def test_names_are_text(browser, tmp_path):
         assert browser.problems == []
 
 
-def test_pages_that_would_be_large_show_the_last_model_alone(monkeypatch):
+def test_large_pages_show_the_last_model_alone(monkeypatch):
     models = [PageModel(str(k), splats) for k, splats in enumerate(ROUNDS)]
     assert scene_page.compared(models) == models
     monkeypatch.setattr(scene_page, "MAX_COMPARED_SPLATS", 1199)

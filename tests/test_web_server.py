@@ -1,4 +1,4 @@
-"""The server of ``igsr view --web``: who is answered, what is found, and what it survives."""
+"""The server of ``igsr view --web``: access, models and photos, bad requests, the command."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ from scene_pages import model
 from web_views import asked, served, state_of, with_token
 
 import igsr
+from igsr._internal.event import Event
 from igsr.capture.write_cameras import write_cameras
+from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.followed_run import FollowedRun
 from igsr.rendering import live_view, run_folder
 from igsr.rendering.live_server import is_loopback, open_server
 from igsr.rendering.run_folder import run_background, run_progress, run_scores
 
-SECRET = b"nobody but the owner reads this"
+SECRET = b"private"
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +39,8 @@ def scene(tmp_path_factory):
     return path
 
 
-# ---- who is answered -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["", "state", "surroundings", "model?id=scene", "photo?number=0"])
-def test_without_the_token_nothing_is_answered(scene, name):
+def test_requests_without_the_token_are_refused(scene, name):
     with served(scene) as server:
         right = server.token
         for wrong in (
@@ -83,7 +82,7 @@ def test_without_the_token_nothing_is_answered(scene, name):
         "static/../secret.txt",
     ],
 )
-def test_names_are_no_paths(tmp_path, scene, name):
+def test_names_are_not_paths(tmp_path, scene, name):
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "scene.ply").write_bytes(scene.read_bytes())
@@ -115,7 +114,7 @@ def test_photos_outside_of_the_folder_are_not_shown(tmp_path):
         assert with_token(server, "photo?number=1")[0] == 404
 
 
-def test_a_photo_that_is_damaged_is_said(tmp_path):
+def test_a_damaged_photo_is_an_error(tmp_path):
     made = scenes.capture(views=1, size=8)
     (tmp_path / "in.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
     view = igsr.View("in.png", made.views[0].camera, "train", made.views[0].image)
@@ -124,9 +123,6 @@ def test_a_photo_that_is_damaged_is_said(tmp_path):
         status, content = with_token(server, "photo?number=0")
         assert status == 422
         assert b"in.png cannot be shown" in content
-
-
-# ---- what it survives ----------------------------------------------------------------------------
 
 
 def test_a_hundred_requests_at_once_pack_a_model_once(scene, monkeypatch):
@@ -144,7 +140,7 @@ def test_a_hundred_requests_at_once_pack_a_model_once(scene, monkeypatch):
     assert len(packed) == 1
 
 
-def test_browsers_that_leave_and_say_nothing_are_survived(scene, monkeypatch, caplog):
+def test_clients_that_disconnect_or_send_nothing_do_no_harm(scene, monkeypatch, caplog):
     monkeypatch.setattr(live_view, "_packed", lambda found: b"x" * 20_000_000)
     with served(scene) as server:
         silent = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(20)]
@@ -154,7 +150,7 @@ def test_browsers_that_leave_and_say_nothing_are_survived(scene, monkeypatch, ca
             leaving = socket.create_connection(("127.0.0.1", server.server_port))
             leaving.sendall(f"GET /{server.token}/model?id=scene HTTP/1.0\r\n\r\n".encode())
             leaving.recv(1000)
-            # It goes without a word.
+            # It closes the connection at once.
             leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             leaving.close()
         assert state_of(server)["newest"] == "scene"
@@ -163,7 +159,7 @@ def test_browsers_that_leave_and_say_nothing_are_survived(scene, monkeypatch, ca
     assert caplog.records == []
 
 
-def test_a_port_that_is_taken_is_said(scene):
+def test_a_port_in_use_is_an_error(scene):
     with served(scene) as server:
         taken = server.server_port
         with pytest.raises(igsr.IgsrError, match=f"port {taken} .*--port"):
@@ -172,12 +168,9 @@ def test_a_port_that_is_taken_is_said(scene):
             open_server(server.view, "192.0.2.1", 0)
 
 
-def test_addresses_that_other_computers_reach_are_told():
+def test_loopback_addresses():
     assert all(map(is_loopback, ["127.0.0.1", "127.1.2.3", "::1", "localhost"]))
     assert not any(map(is_loopback, ["0.0.0.0", "::", "192.168.1.2", "box", ""]))
-
-
-# ---- what is found -------------------------------------------------------------------------------
 
 
 def test_a_fit_and_its_checkpoint(tmp_path):
@@ -186,27 +179,21 @@ def test_a_fit_and_its_checkpoint(tmp_path):
     folder.mkdir()
     with served(folder) as server:
         assert state_of(server)["models"] == []
-        seen = []
-
-        def look(now):
-            followed.tell(f"step {now.step}", 0.5)
-            if not seen:
-                seen.append(state_of(server))
-
+        states = []
         followed = FollowedRun(folder)
-        followed.tell("find cameras", 0.0)
+        followed(Event("find cameras", part=0.0))
         assert state_of(server)["run"] == {"text": "find cameras", "done": 0.0}
         followed.show(made, (1.0, 0.5, 0.0))
-        fitted = scenes.fit(
-            made,
-            6,
-            look,
-            "cpu",
-            remove_floaters=False,
-            backdrop=False,
-            checkpoint=folder / "checkpoint.npz",
-        )
-        assert seen[0]["run"] == {"text": "step 1", "done": 0.5}
+
+        def listener(event):
+            followed(event)
+            states.append(state_of(server))
+
+        options = {"remove_floaters": False, "backdrop": False, "report": listener}
+        checkpoint = folder / "checkpoint.npz"
+        fitted = fit_capture(made, steps=6, backend="cpu", checkpoint=checkpoint, **options).splats
+        assert states[0]["run"]["text"].startswith("fit 1 of 6, loss ")
+        assert 0.0 < states[0]["run"]["done"] < 1.0
         state = state_of(server)
         assert [one["label"] for one in state["models"]] == ["being fitted"]
         found = live_view.live_models(folder)[0].load()
@@ -223,18 +210,19 @@ def test_a_fit_and_its_checkpoint(tmp_path):
         pixels = np.asarray(Image.open(tmp_path / "photo.jpg")).astype(int)
         assert np.abs(pixels - made.views[4].image).mean() < 12
         fitted.save(folder / "scene.ply")
-        followed.close()
+        with followed:
+            pass  # the run ends
         state = state_of(server)
         assert [one["label"] for one in state["models"]] == ["scene"]
         assert state["run"] is None
 
 
-def test_a_scene_that_lay_there_before_says_so(tmp_path):
+def test_scenes_of_an_earlier_run_are_labeled(tmp_path):
     model().save(tmp_path / "scene.ply")
     os.utime(tmp_path / "scene.ply", (1e9, 1e9))
     followed = FollowedRun(tmp_path)
     followed.show(scenes.capture(views=2, size=8), (0.0, 0.0, 0.0))
-    followed.tell("begins", 0.0)
+    followed(Event("fit", part=0.0))
     (tmp_path / "checkpoint.npz").write_bytes(b"damaged")
     with served(tmp_path) as server:
         state = state_of(server)
@@ -287,7 +275,7 @@ def test_a_refinement_has_rounds_and_their_scores(tmp_path):
         assert state_of(server)["newest"] == "round-10"
 
 
-def test_two_paths_are_told_apart(tmp_path, scene):
+def test_two_scenes_have_their_own_models(tmp_path, scene):
     model(0).save(tmp_path / "other.spz")
     with served(scene, tmp_path / "other.spz") as server:
         models = state_of(server)["models"]
@@ -309,7 +297,7 @@ def test_two_paths_are_told_apart(tmp_path, scene):
         "[" * 100_000,
     ],
 )
-def test_files_of_a_run_are_untrusted(tmp_path, text):
+def test_damaged_files_of_a_run_are_ignored(tmp_path, text):
     (tmp_path / "view").mkdir()
     for name in ("report.json", "view/progress.json", "view/run.json", "view/cameras.json"):
         (tmp_path / name).write_text(text)
@@ -320,7 +308,7 @@ def test_files_of_a_run_are_untrusted(tmp_path, text):
     assert run_background(tmp_path) is None
 
 
-def test_a_run_that_is_silent_is_said(tmp_path, monkeypatch):
+def test_a_run_without_news_is_labeled(tmp_path, monkeypatch):
     folder = tmp_path / "view"
     folder.mkdir()
     (folder / "progress.json").write_text('{"text": "fit", "done": 7}')
@@ -328,14 +316,11 @@ def test_a_run_that_is_silent_is_said(tmp_path, monkeypatch):
     os.utime(folder / "progress.json", (time.time() - 1200, time.time() - 1200))
     assert "no news for 20 min" in run_progress(tmp_path)["text"]
     (tmp_path / "report.json").write_text('{"psnr": 20, "ssim": 0.5, "protocol": {}}')
-    assert run_scores(tmp_path)["rows"] == [], "it is an earlier run's"
+    assert run_scores(tmp_path)["rows"] == [], "the report is of an earlier run"
     (folder / "progress.json").unlink()
     assert run_scores(tmp_path)["rows"] == [
         ["fitted photos", "20.00", "0.5000", run_folder.MISSING]
     ]
-
-
-# ---- the command ---------------------------------------------------------------------------------
 
 
 def started(tmp_path, *words):
@@ -348,7 +333,7 @@ def started(tmp_path, *words):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # Where the tests run in the background of a shell, children would ignore Ctrl-C.
+        # Children of a shell's background jobs ignore Ctrl-C.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
@@ -357,9 +342,9 @@ def started(tmp_path, *words):
 @pytest.mark.parametrize(
     ("options", "notices"),
     [
-        (["--web"], ["Ctrl-C ends it."]),
-        ([], ["There is no display", "Ctrl-C ends it."]),
-        (["--web", "--host", "0.0.0.0"], ["is open to other computers", "Ctrl-C ends it."]),
+        (["--web"], ["Press Ctrl-C to stop."]),
+        ([], ["There is no display", "Press Ctrl-C to stop."]),
+        (["--web", "--host", "0.0.0.0"], ["is open to other computers", "Press Ctrl-C to stop."]),
     ],
 )
 def test_the_command_serves_until_ctrl_c(tmp_path, scene, options, notices):
@@ -387,13 +372,13 @@ def test_the_command_serves_until_ctrl_c(tmp_path, scene, options, notices):
         (["no.ply", "--web"], "There is no file or folder no.ply"),
         (["no.ply"], "There is no file or folder no.ply"),
         (["SCENE", "--web", "--camera", "3"], "--camera is an option of splat-view"),
-        (["SCENE", "--camera", "3"], "--camera is for the window, and there is no display"),
+        (["SCENE", "--camera", "3"], "--camera needs a window, and there is no display"),
         (["DAMAGED", "--web"], "damaged.ply"),
         (["SCENE", "--web", "--host", "192.0.2.1"], "Cannot listen at 192.0.2.1"),
         (["SCENE", "--web", "--cameras", "no"], "no"),
     ],
 )
-def test_mistakes_are_said(tmp_path, scene, words, message):
+def test_wrong_arguments_are_errors(tmp_path, scene, words, message):
     (tmp_path / "damaged.ply").write_text("no splats")
     named = {"SCENE": scene, "DAMAGED": tmp_path / "damaged.ply"}
     process = started(tmp_path, *(named.get(word, word) for word in words))
