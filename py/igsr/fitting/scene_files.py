@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Sequence
 
@@ -49,7 +50,8 @@ def write_scene(
         notes = write_scene_page(run.out / PAGE, shown, cameras, background, title)
     except IgsrError as error:
         warn_user(f"{PAGE} is not written: {error}")
-        (run.out / PAGE).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            (run.out / PAGE).unlink()  # of an earlier run
     else:
         for note in notes:
             logger.info("%s: %s", PAGE, note)
