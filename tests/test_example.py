@@ -1,4 +1,4 @@
-"""The example capture that igsr brings along, and ``--example``."""
+"""The example photos that come with igsr, and ``--example``."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ import scenes
 import igsr
 from igsr import _core
 from igsr.capture.example import write_example
-from igsr.cli.refine import _some_photos
+
+FIT = ["--steps", "4", "--backend", "cpu", "--json"]
 
 
-def test_it_is_the_eight_photos_that_refine_takes_of_the_capture_in_the_repository(
-    tmp_path, example_path
-):
+def test_it_has_eight_photos_of_the_capture_in_the_repository(tmp_path, example_path):
     written = igsr.load_capture(write_example(tmp_path / "example"))
-    expected = _some_photos(igsr.load_capture(example_path), 8)
+    whole = igsr.load_capture(example_path)
     assert len(written.train_views) == len(written.test_views) == 8
-    for one, other in zip(written.views, expected.views, strict=True):
-        assert one.name == other.name
-        assert one.split == other.split
-        np.testing.assert_array_equal(one.camera.viewmat, other.camera.viewmat)
-        np.testing.assert_array_equal(one.camera.K, other.camera.K)
-        np.testing.assert_array_equal(one.image, other.image)
-
-
-def test_it_is_small():
+    by_name = {view.name: view for view in whole.views}
+    for view in written.views:
+        expected = by_name[view.name]
+        assert view.split == expected.split
+        np.testing.assert_array_equal(view.camera.viewmat, expected.camera.viewmat)
+        np.testing.assert_array_equal(view.camera.K, expected.camera.K)
+        np.testing.assert_array_equal(view.image, expected.image)
+    names = [view.name for view in whole.train_views]
+    gaps = np.diff([names.index(view.name) for view in written.train_views])
+    assert gaps.min() >= len(names) // 8, "evenly spaced"
     assert sum(map(len, _core.example_files().values())) < 1_000_000
 
 
-def test_files_that_are_there_stay_and_damaged_ones_are_mended(tmp_path):
+def test_damaged_files_are_replaced_and_others_stay(tmp_path):
     folder = write_example(tmp_path / "example")
     photo = folder / "train" / "002.png"
     whole = photo.read_bytes()
-    kept = folder / "test" / "000.png"
-    before = kept.stat().st_mtime_ns
+    other = folder / "test" / "000.png"
+    before = other.stat().st_mtime_ns
     photo.write_bytes(whole[:100])
     write_example(folder)
     assert photo.read_bytes() == whole
-    assert kept.stat().st_mtime_ns == before
+    assert other.stat().st_mtime_ns == before
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
@@ -51,38 +51,28 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["fit", "refine"])
-def test_photos_or_the_example_must_be_given_and_not_both(tmp_path, igsr_here, command):
-    argument = "CAPTURE" if command == "fit" else "PHOTOS"
+def test_either_photos_or_the_example_must_be_given(tmp_path, igsr_here, command):
     none = igsr_here(command, "--out", tmp_path / "out")
     assert none.returncode == 1
-    assert none.stderr.strip() == (
-        f"{argument} is missing; name a folder of photos, or give --example."
-    )
+    assert none.stderr == "PHOTOS is missing; name a folder of photos, or give --example.\n"
     both = igsr_here(command, "photos", "--example", "--out", tmp_path / "out")
     assert both.returncode == 1
     assert "photos or --example" in both.stderr
     assert not (tmp_path / "out").exists()
 
 
-def test_a_fit_of_the_example_is_run_again_from_its_report_and_scored_again(tmp_path, igsr_here):
-    options = ["--steps", "4", "--backend", "cpu", "--no-html", "--json"]
-    first = igsr_here("fit", "--example", "--out", tmp_path / "a", *options)
+def test_a_fit_of_the_example_can_be_scored_again(tmp_path, igsr_here):
+    first = igsr_here("fit", "--example", "--out", tmp_path, *FIT)
     assert first.returncode == 0, first.stderr
     report = json.loads(first.stdout)
-    assert report["settings"]["capture"] == str(tmp_path / "a" / "example")
-    # The report names its photos, too.
-    recorded = ["--config", tmp_path / "a" / "report.json"]
-    again = igsr_here("fit", *recorded, "--out", tmp_path / "b", "--no-html", "--json")
-    assert again.returncode == 0, again.stderr
-    assert json.loads(again.stdout)["psnr"] == report["psnr"]
-    of_first = [tmp_path / "a" / "scene.ply", tmp_path / "a" / "example"]
-    scored = igsr_here("eval", *of_first, "--backend", "cpu", "--json")
-    assert json.loads(scored.stdout)["psnr"] == pytest.approx(report["psnr"])
+    assert report["settings"]["capture"] == str(tmp_path / "example")
+    files = [tmp_path / "scene.ply", tmp_path / "example"]
+    scores = igsr_here("eval", *files, "--backend", "cpu", "--json")
+    assert json.loads(scores.stdout)["psnr"] == pytest.approx(report["psnr"])
 
 
-def test_other_photos_are_still_fitted(tmp_path, igsr_here):
+def test_other_photos_are_fitted_without_the_example(tmp_path, igsr_here):
     capture = scenes.write_capture(tmp_path / "capture", scenes.capture(views=3, size=32))
-    options = ["--steps", "2", "--backend", "cpu", "--no-html", "--json"]
-    result = igsr_here("fit", capture, "--out", tmp_path / "out", *options)
+    result = igsr_here("fit", capture, "--out", tmp_path / "out", *FIT)
     assert result.returncode == 0, result.stderr
     assert not (tmp_path / "out" / "example").exists()

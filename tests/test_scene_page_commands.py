@@ -1,4 +1,4 @@
-"""``scene.html`` from the command line: ``igsr convert`` and ``igsr fit`` write it."""
+"""``scene.html``, as ``igsr convert`` and ``igsr fit`` write it."""
 
 from __future__ import annotations
 
@@ -6,27 +6,21 @@ import numpy as np
 import pytest
 import scenes
 from scene_pages import BACKGROUND, MEAN, check_pictures, drawn, model, three_cameras
-from typer.testing import CliRunner
 
 import igsr
 from igsr.capture.write_cameras import write_cameras
-from igsr.cli import app
-from igsr.cli.scene_page_option import write_page
 from igsr.rendering.renders import render
 from igsr.rendering.run_folder import background_beside, cameras_beside
 from igsr.rendering.scene_page import write_scene_page
 
 
-def convert(*words):
-    return CliRunner().invoke(app, ["convert", *map(str, words)])
-
-
-def test_splats_that_are_not_finite_are_left_out(browser, tmp_path):
+def test_non_finite_splats_are_left_out(browser, tmp_path, igsr_here):
     splats = model(2)
     splats.means[3, 1] = splats.sh[40, 5, 0] = np.nan
     splats.scales[17, 0], splats.opacities[90] = np.inf, np.nan
     splats.save(tmp_path / "scene.ply")
-    assert convert(tmp_path / "scene.ply", tmp_path / "scene.html").exit_code == 0
+    done = igsr_here("convert", tmp_path / "scene.ply", tmp_path / "scene.html")
+    assert done.returncode == 0, done.stderr
     browser.open(tmp_path / "scene.html")
     write_scene_page(tmp_path / "scene.html", splats, (), BACKGROUND)
     browser.open(tmp_path / "scene.html")
@@ -34,13 +28,16 @@ def test_splats_that_are_not_finite_are_left_out(browser, tmp_path):
     check_pictures(browser, splats, three_cameras())
 
 
-def test_convert_finds_cameras_and_background(browser, tmp_path):
+def test_convert_finds_cameras_and_background(browser, tmp_path, igsr_here):
+    def convert(*words):
+        return igsr_here("convert", tmp_path / "scene.ply", *words)
+
     made = scenes.capture(views=3, size=40)
     splats = model()
     splats.save(tmp_path / "scene.ply")
     write_cameras(tmp_path / "cameras.json", made.views)
     (tmp_path / "report.json").write_text('{"protocol": {"background": [1, 1, 1]}}')
-    assert convert(tmp_path / "scene.ply", tmp_path / "page.html").exit_code == 0
+    assert convert(tmp_path / "page.html").returncode == 0
     browser.open(tmp_path / "page.html")
     names = browser.run("[...document.getElementById('cameras').options].map((one) => one.text)")
     assert names == ["free view", *(view.name for view in made.views)]
@@ -49,20 +46,18 @@ def test_convert_finds_cameras_and_background(browser, tmp_path):
     assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
 
     elsewhere = tmp_path / "elsewhere" / "page.html"
-    words = ["--cameras", str(scenes.write_capture(tmp_path / "capture", made))]
-    words += ["--background", "0,0.5,0"]
-    assert convert(tmp_path / "scene.ply", elsewhere, *words).exit_code == 0
+    words = ["--cameras", scenes.write_capture(tmp_path / "capture", made)]
+    assert convert(elsewhere, *words, "--background", "0,0.5,0").returncode == 0
     page = elsewhere.read_text(encoding="utf-8")
     assert '"background": [0.0, 0.5, 0.0]' in page
     assert made.views[2].name in page
-
-    refused = convert(tmp_path / "scene.ply", tmp_path / "a.spz", "--cameras", "x")
-    assert refused.exit_code != 0
-    assert "--cameras is for pages" in refused.output
+    spz = convert(tmp_path / "a.spz", "--cameras", "x")
+    assert spz.returncode == 1
+    assert "--cameras is for pages" in spz.stderr
     (tmp_path / "cameras.json").write_text('{"camera_model": "PINHOLE", "frames": [{}]}')
-    without = convert(tmp_path / "scene.ply", tmp_path / "page.html")
-    assert without.exit_code == 0
-    assert "the page has no cameras" in without.output
+    without = convert(tmp_path / "page.html")
+    assert without.returncode == 0
+    assert "the page has no cameras" in without.stderr
 
 
 @pytest.mark.parametrize(
@@ -77,13 +72,13 @@ def test_convert_finds_cameras_and_background(browser, tmp_path):
         ("{", None),
     ],
 )
-def test_the_background_is_that_of_the_report(tmp_path, report, background):
+def test_the_background_comes_from_the_report(tmp_path, report, background):
     (tmp_path / "report.json").write_text(report)
     assert background_beside(tmp_path / "scene.ply") == background
 
 
 @pytest.mark.parametrize("place", ["", "rounds/0", "checkpoints"])
-def test_cameras_and_background_are_those_of_the_run_that_a_scene_is_of(tmp_path, place):
+def test_cameras_and_background_come_from_the_run_of_the_scene(tmp_path, place):
     made = scenes.capture(views=2, size=16)
     write_cameras(tmp_path / "cameras.json", made.views)
     (tmp_path / "report.json").write_text('{"protocol": {"background": [1, 0, 1]}}')
@@ -95,16 +90,12 @@ def test_cameras_and_background_are_those_of_the_run_that_a_scene_is_of(tmp_path
     assert cameras_beside(elsewhere) == []
 
 
-def test_a_fit_writes_it(browser, tmp_path):
+def test_a_fit_writes_a_page(browser, tmp_path, igsr_here):
     made = scenes.capture(views=5, size=24)
     capture, out = scenes.write_capture(tmp_path / "capture", made), tmp_path / "out"
-    words = ["fit", str(capture), "--out", str(out), "--steps", "4", "--backend", "cpu"]
-    done = CliRunner().invoke(app, [*words, "--no-html"])
-    assert done.exit_code == 0, done.output
-    assert not (out / "scene.html").exists()
-    done = CliRunner().invoke(app, [*words, "--resume"])
-    assert done.exit_code == 0, done.output
-    assert "scene.html" in done.output
+    done = igsr_here("fit", capture, "--out", out, "--steps", "4", "--backend", "cpu")
+    assert done.returncode == 0, done.stderr
+    assert "scene.html" in done.stdout
     browser.open(out / "scene.html")
     assert browser.run("window.igsr.error") is None
     assert browser.run("window.igsr.viewer.scene.cameras.length") == len(made.views)
@@ -114,7 +105,8 @@ def test_a_fit_writes_it(browser, tmp_path):
     assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
 
 
-def test_a_fit_outlives_a_page_that_cannot_be_written(tmp_path):
+def test_a_fit_warns_if_its_page_cannot_be_written(tmp_path):
     (tmp_path / "scene.html").mkdir()
     with pytest.warns(UserWarning, match=r"scene\.html is not written: Cannot write"):
-        assert not write_page(tmp_path, model(), scenes.capture(views=2, size=8))
+        igsr.fit(scenes.capture(views=3, size=16), 1, out=tmp_path, backend="cpu")
+    assert (tmp_path / "scene.ply").is_file()
