@@ -1,8 +1,7 @@
-"""Evaluation and what is left beside the splats: report.json and views.png."""
+"""Scores, and the reports of a fit: report.json, report.html and views.png."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,19 +14,20 @@ from PIL import Image
 import igsr
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.json_file import write_json
-from igsr._internal.part_usage import Parts, Usage
+from igsr._internal.part_usage import Usage
 from igsr.capture import Capture
 from igsr.evaluation import evaluate, metrics, report_page, score_views
 from igsr.evaluation.contact_sheet import contact_sheet, error_picture, sheet_names
 from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS, train_photos, train_scores
 from igsr.evaluation.scores import BLACK, ScoredView, over_background
 from igsr.fitting.fit_page import write_fit_page
-from igsr.fitting.fit_report import FinishedFit, FitScores, fit_report
+from igsr.fitting.fit_report import FitScores, fit_report
 from igsr.fitting.presets import settings_for
-from igsr.fitting.run import Progress
+from igsr.fitting.result import FitResult
+from igsr.run import Run
 
 
-def test_the_true_scene_scores_perfectly_and_another_does_not():
+def test_only_the_true_scene_scores_perfectly():
     scene = scenes.splats()
     capture = scenes.capture(views=8, scene=scene)
     scores = igsr.evaluate(scene, capture, backend="reference")
@@ -50,7 +50,7 @@ def test_alpha_photos_are_scored_over_the_background():
     capture = scenes.capture(views=8, alpha=True, scene=scene)
     for background in (None, (0.0, 0.0, 0.0), (0.1, 0.5, 0.9)):
         scores = igsr.evaluate(scene, capture, background=background, backend="reference")
-        # Straight colours and alpha each lost up to half a step of 8 bits; SH may exceed 1.
+        # Colors and alpha are each rounded to 8 bits, and SH colors above 1 are clipped.
         assert scores["psnr"] > 35
         assert scores["protocol"]["background"] == list(background or (1.0, 1.0, 1.0))
     image = np.array([[[200, 100, 0, 255], [200, 100, 0, 0], [200, 100, 0, 51]]], dtype=np.uint8)
@@ -58,7 +58,7 @@ def test_alpha_photos_are_scored_over_the_background():
     assert over.tolist() == [[[200, 100, 0], [0, 255, 255], [40, 224, 204]]]
 
 
-def test_masks_reach_the_scores():
+def test_masked_pixels_do_not_count():
     scene = scenes.splats()
     views = []
     for view in scenes.capture(views=8, scene=scene).views:
@@ -66,11 +66,11 @@ def test_masks_reach_the_scores():
         mask[:, :20] = False
         image = view.image.copy()
         image[:, :20] = 77
-        views.append(dataclasses.replace(view, image=image, mask=mask))
+        views.append(replace(view, image=image, mask=mask))
     capture = igsr.Capture(scenes.capture(views=4).path, views)
     assert igsr.evaluate(scene, capture, backend="reference")["psnr"] == metrics.PSNR_CAP
     assert "masked" in igsr.evaluate(scene, capture, backend="cpu")["protocol"]["pixels"]
-    unmasked = [dataclasses.replace(view, mask=None) for view in views]
+    unmasked = [replace(view, mask=None) for view in views]
     assert igsr.evaluate(scene, igsr.Capture(capture.path, unmasked))["psnr"] < 25
     views[0].mask = np.zeros_like(views[0].mask)
     with pytest.raises(igsr.IgsrError, match=r"00\.png"):
@@ -88,11 +88,11 @@ def scored(name="a/b.png", size=(30, 50), mask=None):
 def test_error_picture_shows_where_the_error_is():
     view = scored()
     picture = error_picture(view)
-    assert not picture[:, 10:].reshape(-1, 3).max(axis=0)[:2].any()  # black: no error
+    assert not picture[:, 10:].reshape(-1, 3).max(axis=0)[:2].any()
     assert picture[:, :10].mean() > 60
     mask = np.ones(view.photo.shape[:2], dtype=bool)
     mask[:, :10] = False
-    masked = error_picture(dataclasses.replace(view, mask=mask))
+    masked = error_picture(replace(view, mask=mask))
     assert (masked[:, :10] == 96).all()
 
 
@@ -144,7 +144,7 @@ def test_atomic_write_keeps_the_old_file_on_any_failure(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["picture.png"]
 
 
-def test_fitted_photos_are_scored_at_most_ten_evenly_spaced():
+def test_at_most_ten_fitted_photos_are_scored_evenly_spaced():
     splats = scenes.splats(10)
     made = scenes.capture(views=25, size=16, scene=splats)
     views = [replace(view, split="train") for view in made.views]
@@ -162,7 +162,7 @@ def test_fitted_photos_are_scored_at_most_ten_evenly_spaced():
         assert quick[name] == pytest.approx(whole[name], abs=1e-12)
 
 
-def test_a_fits_page_escapes_what_it_shows(tmp_path, monkeypatch):
+def test_the_page_of_a_fit_escapes_names(tmp_path, monkeypatch):
     name = '"><script>alert("photo")</script>\udcff.png'
     made = scenes.capture(views=5, size=16)
     views = [replace(view, name=f"{k}{name}") for k, view in enumerate(made.views)]
@@ -171,14 +171,15 @@ def test_a_fits_page_escapes_what_it_shows(tmp_path, monkeypatch):
     sheet = list(score_views(splats, capture.test_views, BLACK, "cpu"))
     scores = evaluate(splats, capture, "test", BLACK, "cpu")
     train = train_scores(splats, capture, BLACK, "cpu")
-    asked = {"capture": "a<b>&c", "preset": "<i>", "backend": "cpu"}
-    last = Progress(9, 9, 0.1, len(splats), ("rays", 5), 1.0, 1.0, {"backend": "cpu"})
-    lost = ["<i>lost</i>.png"]
-    fit = FinishedFit(splats, capture, settings_for("default", 3), asked, last, lost)
-    parts = Parts()
-    parts.add("<fit>", Usage(1.0, 2.0, None))
+    asked = {"capture": "a<b>&c", "start": "<i>", "backend": "cpu"}
+    device = {"backend": "cpu", "device": "a CPU", "instruction_set": "some"}
+    settings, started = settings_for(3), ("rays", 5)
+    result = FitResult(splats, capture, settings, device, started, 9, 1.0, 0.1)
+    result = replace(result, not_placed=("<i>lost</i>.png",))
+    run = Run()
+    run.parts.add("<fit>", Usage(1.0, 2.0, None))
     scored = FitScores(scores, sheet, train, {"psnr": 20.0, "ssim": 0.5, "flip": 0.1})
-    report = fit_report(fit, scored, parts)
+    report = fit_report(result, scored, run, asked)
     assert report["limit"]["camera_gain"] is not None
     write_fit_page(tmp_path / "report.html", report, splats, capture, sheet)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -193,7 +194,7 @@ def test_a_fits_page_escapes_what_it_shows(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise igsr.IgsrError("no")
 
-    # A scene that is too large, or that pages cannot hold, is linked to.
+    # The page links to scenes that it cannot hold.
     for name, value in (("MAX_COMPARED_SPLATS", 4), ("scene_page", refuse)):
         with monkeypatch.context() as patch:
             patch.setattr(report_page, name, value)
