@@ -1,35 +1,28 @@
-"""Features and matches that are not SIFT's: in COLMAP's database, verified there."""
+"""Custom matchers: their features and matches are verified by COLMAP."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import rooms
-import torch
-from PIL import Image
 
 import igsr
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.colmap import Colmap
-from igsr.pose.colmap.loma import Loma
 from igsr.pose.colmap.matcher import PhotoFeatures
-from igsr.pose.find import made_by_of
+from igsr.pose.find import CameraSettings
 
-#: Cameras whose photos are of noise: only the matches tell where they stand.
+#: Their photos are noise: only the matcher's matches determine the cameras.
 CAMERAS = [rooms.camera(angle) for angle in np.linspace(-1.0, 1.0, 5)]
 POINTS = np.random.default_rng(0).uniform([-2.0, -1.0, 2.0], [2.0, 1.0, 4.0], (300, 3))
 
 
 def photos(count: int = len(CAMERAS)) -> list[Photo]:
-    """A photo for each camera, whose first pixel is its number."""
+    """A photo for each camera; its first pixel is its number."""
     made = []
     for i in range(count):
         image = np.random.default_rng(i).integers(0, 256, (180, 240, 3)).astype(np.uint8)
@@ -40,15 +33,16 @@ def photos(count: int = len(CAMERAS)) -> list[Photo]:
 
 @dataclass
 class Known:
-    """Projects the points into the cameras, and matches those that are the same, with errors."""
+    """Projects the points into the cameras; some of its matches are wrong."""
 
     name: str = "known"
     wrong: float = 0.2
     seen: int = 0
 
-    def features(self, photo: Path) -> PhotoFeatures:
+    def features(self, image: np.ndarray) -> PhotoFeatures:
+        assert image.dtype == np.uint8
+        assert image.shape == (180, 240, 3)
         self.seen += 1
-        image = np.asarray(Image.open(photo))
         camera = CAMERAS[int(image[0, 0, 0]) % len(CAMERAS)]
         local = POINTS @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
         pixels = local @ camera.K.T
@@ -65,7 +59,7 @@ class Known:
         return np.stack([a, b], axis=1).astype(np.uint32)
 
 
-def test_cameras_are_found_from_a_matchers_matches() -> None:
+def test_cameras_are_found_from_the_matches() -> None:
     matcher = Known()
     found = Colmap(matcher)(photos(), seed=0)
     assert matcher.seen == len(CAMERAS)
@@ -106,12 +100,11 @@ def test_photos_without_matches_are_not_placed() -> None:
         np.array([0, 1]),
     ],
 )
-def test_matches_that_cannot_be_are_refused(matches: np.ndarray) -> None:
+def test_invalid_matches_are_errors(matches: np.ndarray) -> None:
     class Wrong(Known):
-        def features(self, photo: Path) -> PhotoFeatures:
-            # All 300 in the photo.
-            found = super().features(photo)
-            return replace(found, xy=np.full((300, 2), 50.0, dtype=np.float32))
+        def features(self, image: np.ndarray) -> PhotoFeatures:
+            # Put all of them into the photo.
+            return replace(super().features(image), xy=np.full((300, 2), 50.0, dtype=np.float32))
 
         def matches(self, first: PhotoFeatures, second: PhotoFeatures) -> np.ndarray:
             return matches
@@ -120,114 +113,24 @@ def test_matches_that_cannot_be_are_refused(matches: np.ndarray) -> None:
         Colmap(Wrong())(photos(2), seed=0)
 
 
-def test_features_that_cannot_be_are_refused() -> None:
+def test_invalid_features_are_errors() -> None:
     class Wrong(Known):
-        def features(self, photo: Path) -> PhotoFeatures:
-            return replace(super().features(photo), xy=np.zeros((3, 2), dtype=np.float32))
+        def features(self, image: np.ndarray) -> PhotoFeatures:
+            return replace(super().features(image), xy=np.zeros((3, 2), dtype=np.float32))
 
     with pytest.raises(IgsrError, match=r"features of 0\.png must be"):
         Colmap(Wrong())(photos(2), seed=0)
 
 
-def test_too_many_photos_and_unknown_names_are_refused(tmp_path: Path) -> None:
+def test_a_matcher_needs_a_name_and_few_photos() -> None:
     with pytest.raises(IgsrError, match=r"^matcher known compares every pair of photos: give"):
         Colmap(Known())(photos(61), seed=0)
-    with pytest.raises(IgsrError, match="matcher must be sift or loma, not 'orb'"):
-        Colmap("orb")
-    with pytest.raises(IgsrError, match="needs a name"):
-        Colmap(object())
+    with pytest.raises(IgsrError, match="needs an attribute name"):
+        Colmap(object())  # type: ignore[arg-type]
     with pytest.raises(IgsrError, match="matcher is no option of dust3r"):
-        igsr.find_cameras(photos(2), "dust3r", matcher="sift")
+        igsr.find_cameras(photos(2), "dust3r", matcher=Known())
 
 
-def test_found_cameras_know_their_matcher() -> None:
-    assert made_by_of("colmap", 0, 9, {"matcher": Known()})["options"] == {"matcher": "known"}
-    options = {"matcher": "loma", "checkpoint": Path("some") / "file.pth"}
-    assert made_by_of("colmap", 0, 9, options)["options"] == {
-        "matcher": "loma",
-        "checkpoint": str(Path("some") / "file.pth"),
-    }
-
-
-# ---- LoMa ---------------------------------------------------------------------------------------
-
-
-class Network:
-    """LoMa's calls that igsr uses, with features that know what they match."""
-
-    def __init__(self, config: Any) -> None:
-        self.cfg = SimpleNamespace(filter_threshold=0.1)
-        self.loaded = torch.hub.load_state_dict_from_url("https://example.org/a/loma.pth")
-
-    def detect_and_describe(self, image: str, num_keypoints: int) -> tuple[Any, Any, int, int]:
-        found = Known().features(Path(image))
-        width, height = found.size
-        normal = 2.0 * found.xy / np.array([width, height], dtype=np.float32) - 1.0
-        descriptors = torch.from_numpy(found.descriptors)[None]
-        return torch.from_numpy(normal)[None], descriptors, height, width
-
-    def __call__(self, xy: Any, other: Any, first: Any, second: Any) -> dict[str, Any]:
-        assert xy.abs().max() <= 1.0
-        assert other.abs().max() <= 1.0
-        return {"scores": (first == second.mT).float()}
-
-
-def filter_matches(scores: Any, threshold: float) -> tuple[Any, ...]:
-    best = scores.max(2)
-    return (torch.where(best.values > threshold, best.indices, -1),)
-
-
-@pytest.fixture
-def package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A package ``loma``, and a folder of torch.hub with its weights."""
-    top, inner = ModuleType("loma"), ModuleType("loma.loma")
-    top.LoMa, top.LoMaB, inner.filter_matches = Network, lambda: None, filter_matches
-    monkeypatch.setitem(sys.modules, "loma", top)
-    monkeypatch.setitem(sys.modules, "loma.loma", inner)
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    weights = tmp_path / "checkpoints" / "loma.pth"
-    weights.parent.mkdir()
-    torch.save({"a": torch.zeros(1)}, weights)
-    return weights
-
-
-def test_loma_finds_cameras(package: Path) -> None:
-    original = torch.hub.load_state_dict_from_url
-    found = Colmap("loma")(photos(), seed=0)
-    assert torch.hub.load_state_dict_from_url is original
-    accuracy = pose_accuracy(found.cameras, CAMERAS)
-    assert accuracy["registered"] == 5
-    assert accuracy["rotation"] < 0.1
-
-
-def test_loma_offline_without_its_weights(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("IGSR_OFFLINE", "1")
-    Loma()
-    package.unlink()
-    with pytest.raises(IgsrError, match=r"loma\.pth, and IGSR_OFFLINE is set; put https"):
-        Loma()
-
-
-class Hostile:
-    """Runs when it is unpickled."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (Path.touch, (Path("hostile"),))
-
-
-def test_lomas_weights_run_nothing(
-    package: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    torch.save({"a": Hostile()}, package)
-    original = torch.hub.load_state_dict_from_url
-    with pytest.raises(IgsrError, match="weights cannot be fetched or read"):
-        Loma()
-    assert not Path("hostile").exists()
-    assert torch.hub.load_state_dict_from_url is original
-
-
-def test_loma_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "loma", None)
-    with pytest.raises(IgsrError, match="pip install --no-deps lomatch"):
-        Colmap("loma")
+def test_kept_cameras_have_the_name_of_their_matcher() -> None:
+    settings = CameraSettings("colmap", {"matcher": Known()})
+    assert settings.made_by()["options"] == {"matcher": "known"}

@@ -1,4 +1,4 @@
-"""Photos that are missing from a first model: what is looked for, and what becomes of the model."""
+"""Attempts to place photos that the first model lacks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def silent(*arguments: object) -> None:
 
 
 class Model:
-    """Placed photos, as far as ``attempts`` asks a model for them."""
+    """Stands in for COLMAP's model."""
 
     def __init__(self, *placed: int) -> None:
         self.placed = set(placed)
@@ -44,10 +44,10 @@ class Model:
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[Any]]]:
-    """Runs ``mapped`` on eight photos with models that the test makes up."""
+    """Run ``mapped`` on eight photos with made-up models; returns its calls, too."""
 
     def with_models(
-        anew: dict[int, Model | None],
+        models: dict[int, Model | None],
         further: dict[int, set[int]],
         more: bool = True,
         with_any: set[int] | None = None,
@@ -56,8 +56,8 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[A
 
         def make(count: int, database: Path, evidence: Any, *_: object) -> Model | None:
             step = STEPS.index(evidence)
-            calls.append(("anew", step, database.name))
-            return anew.get(step)
+            calls.append(("map", step, database.name))
+            return models.get(step)
 
         def add(model: Model, count: int, database: Path, evidence: Any, *_: object) -> None:
             step = STEPS.index(evidence)
@@ -83,17 +83,17 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[A
     return with_models
 
 
-def test_what_is_placed_at_once_is_not_tried_again(run: Callable[..., Any]) -> None:
+def test_a_complete_model_is_kept(run: Callable[..., Any]) -> None:
     model, doubtful, calls = run({0: Model(*range(8))}, {})
-    assert calls == [("anew", 0, "matched.db")]
+    assert calls == [("map", 0, "matched.db")]
     assert model.num_reg_images() == 8
     assert not doubtful
 
 
-def test_a_model_that_lacks_few_photos_is_extended(run: Callable[..., Any]) -> None:
+def test_a_model_without_few_photos_is_extended(run: Callable[..., Any]) -> None:
     model, doubtful, calls = run({0: Model(0, 1, 2, 3, 4, 5)}, {1: {6}, 2: {7}})
     assert calls == [
-        ("anew", 0, "matched.db"),
+        ("map", 0, "matched.db"),
         ("extend", 1, "matched.db"),
         ("guided", [7]),
         ("extend", 2, "guided.db"),
@@ -102,13 +102,13 @@ def test_a_model_that_lacks_few_photos_is_extended(run: Callable[..., Any]) -> N
     assert not doubtful
 
 
-def test_with_lower_thresholds_it_is_made_anew_from_all_pairs(run: Callable[..., Any]) -> None:
+def test_with_lower_thresholds_all_photos_are_mapped_again(run: Callable[..., Any]) -> None:
     model, doubtful, calls = run({0: Model(*range(6)), 3: Model(*range(7))}, {2: {6}})
     assert calls[3:] == [
         ("extend", 2, "guided.db"),
         ("guided", list(range(8))),
-        ("anew", 3, "guided.db"),
-        ("anew", 4, "guided.db"),
+        ("map", 3, "guided.db"),
+        ("map", 4, "guided.db"),
     ]
     assert model.placed == set(range(7))
     assert not doubtful  # the one with more evidence is kept
@@ -117,30 +117,30 @@ def test_with_lower_thresholds_it_is_made_anew_from_all_pairs(run: Callable[...,
     assert doubtful
 
 
-def test_a_model_that_lacks_many_is_made_anew(run: Callable[..., Any]) -> None:
-    # Even where a later model lacks few, since it began with less.
+def test_a_model_without_many_photos_is_replaced(run: Callable[..., Any]) -> None:
+    # Later models are replaced, too, even if they lack few photos.
     found = {0: Model(0, 1), 1: Model(*range(6)), 2: Model(*range(7)), 3: Model(*range(8))}
     model, doubtful, calls = run(found, {})
     assert calls == [
-        ("anew", 0, "matched.db"),
-        ("anew", 1, "matched.db"),
+        ("map", 0, "matched.db"),
+        ("map", 1, "matched.db"),
         ("guided", list(range(8))),
-        ("anew", 2, "guided.db"),
-        ("anew", 3, "guided.db"),
+        ("map", 2, "guided.db"),
+        ("map", 3, "guided.db"),
     ]
     assert model is found[3]
     assert doubtful
 
 
-def test_nothing_is_done_for_photos_without_matches(run: Callable[..., Any]) -> None:
+def test_photos_without_matches_are_not_tried_again(run: Callable[..., Any]) -> None:
     model, _, calls = run({0: Model(0, 1, 2, 3)}, {}, with_any={0, 1, 2, 3})
-    assert calls == [("anew", 0, "matched.db")]
+    assert calls == [("map", 0, "matched.db")]
     assert model.num_reg_images() == 4
 
 
 def test_the_same_matches_are_not_mapped_twice(run: Callable[..., Any]) -> None:
     _, _, calls = run({0: Model(0, 1, 2, 3)}, {}, more=False)
-    assert [call[1] for call in calls if call[0] == "anew"] == [0, 1, 3, 4]
+    assert [call[1] for call in calls if call[0] == "map"] == [0, 1, 3, 4]
 
 
 def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
     features = tmp_path / "features.db"
     with guarded(0):
         list_photos(photos, features)
-        find_features(photos, tmp_path, features, silent)
+        find_features(photos, features, silent)
         matches = matched(5, features, 0, silent)
         assert with_matches(matches) == set(range(5))
         database = with_focal_lengths(matches, 0)
@@ -161,9 +161,9 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
         assert with_matches(fewer) == set(range(4))
         model = map_photos(5, with_focal_lengths(fewer, 0), STEPS[0], 0, silent)
         assert model.num_reg_images() == 4
-        told: list[tuple[int, int]] = []
-        extend(model, 5, database, STEPS[0], 0, lambda stage, done, of: told.append((done, of)))
-    assert told == [(4, 5), (5, 5)]
+        progress: list[tuple[int, int]] = []
+        extend(model, 5, database, STEPS[0], 0, lambda stage, done, of: progress.append((done, of)))
+    assert progress == [(4, 5), (5, 5)]
     found = estimate_of(photos, Mapped(model, doubtful=False, alike=0))
     accuracy = pose_accuracy(found.cameras, CAMERAS)
     assert accuracy["registered"] == 5
@@ -171,7 +171,7 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
     assert accuracy["rotation"] < 0.5
     assert found.warnings == []
 
-    # With the geometry known, more features match; pairs without a missing photo keep theirs.
+    # With known geometry more features match; pairs without a missing photo keep their matches.
     shown: list[tuple[int, int]] = []
     more = matched_along_lines(database, [4], lambda stage, done, of: shown.append((done, of)))
     before, after = inliers(database), inliers(more)
@@ -184,7 +184,7 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
 
 
 def inliers(database: Path) -> dict[tuple[int, int], int]:
-    """How many matches each pair has."""
+    """Number of matches of each pair."""
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:

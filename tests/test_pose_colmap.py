@@ -1,9 +1,13 @@
-"""Cameras found by COLMAP in photos of a made-up room, and by whatever ``auto`` chooses."""
+"""Cameras that COLMAP and the estimator "auto" find in photos of a made-up room."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,11 +16,11 @@ from made_up_tracks import projected
 from PIL import Image
 
 import igsr
-from igsr import pose
 from igsr.capture import Camera, Capture, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.write_transforms import write_transforms
 from igsr.geometry.pose_errors import pose_accuracy
+from igsr.geometry.similarity import Similarity, similarity_between
 from igsr.pose import registry
 from igsr.pose.colmap import Colmap, estimator, pairs
 from igsr.pose.colmap.attempts import Mapped
@@ -41,7 +45,7 @@ def matrices(cameras: list[Camera | None]) -> list[object]:
     return [None if c is None else (c.viewmat.tolist(), c.K.tolist()) for c in cameras]
 
 
-def test_cameras_and_points_are_right(found: Estimate) -> None:
+def test_cameras_points_and_tracks_are_right(found: Estimate) -> None:
     accuracy = pose_accuracy(found.cameras, CAMERAS)
     assert accuracy["registered"] == 6
     assert accuracy["RRA@5"] == accuracy["RTA@5"] == 1.0
@@ -51,9 +55,9 @@ def test_cameras_and_points_are_right(found: Estimate) -> None:
     for camera, true in zip(found.cameras, CAMERAS, strict=True):
         assert camera.K[0, 0] == pytest.approx(true.K[0, 0], rel=0.02)
         assert camera.K[:2, 2].tolist() == [120.0, 90.0]
-    assert not any(found.lenses)  # there is no distortion, and none is made up
-    # In the true world, the points lie on the walls.
-    to_true = igsr.geometry.similarity.similarity_between(found.cameras, CAMERAS)
+    assert not any(found.lenses), "the photos have no distortion"
+    # The points lie on the walls.
+    to_true = similarity_between(found.cameras, CAMERAS)
     xyz = to_true.scale * found.points.xyz @ to_true.rotation.T + to_true.translation
     off = [
         np.abs(xyz @ np.array(normal) - offset) / np.linalg.norm(normal)
@@ -72,10 +76,10 @@ def test_cameras_and_points_are_right(found: Estimate) -> None:
         for view, point, xy in zip(tracks.view, tracks.point, tracks.xy, strict=True)
     ]
     assert len(off) > 2 * len(distance)
-    assert np.median(off) < 1.0  # pixels
+    assert np.median(off) < 1.0
 
 
-def test_same_seed_same_bits_and_nothing_said(
+def test_the_same_seed_gives_the_same_bits_without_output(
     photos: list[Photo], found: Estimate, capfd: pytest.CaptureFixture[str]
 ) -> None:
     stages: dict[str, list[tuple[int, int]]] = {}
@@ -93,7 +97,7 @@ def test_same_seed_same_bits_and_nothing_said(
     assert capfd.readouterr() == ("", "")
 
 
-def test_distortion_is_found_and_undone() -> None:
+def test_lens_distortion_is_estimated_and_undone() -> None:
     bent = rooms.photos(CAMERAS[1:5], k=-0.12)
     capture = igsr.find_cameras(bent, "colmap")
     assert pose_accuracy([v.camera for v in capture.views], CAMERAS[1:5])["RTA@5"] == 1.0
@@ -105,7 +109,7 @@ def test_distortion_is_found_and_undone() -> None:
         assert off < 0.5 * np.abs(rooms.picture(true, k=-0.12) - straight)[inner].mean()
 
 
-def test_cameras_of_two_kinds_and_a_mask_that_hides() -> None:
+def test_masked_pixels_have_no_influence_on_photos_of_two_cameras() -> None:
     cameras, photos = [], []
     for index, angle in enumerate(np.linspace(-0.5, 0.5, 7)):
         wide = index % 2 == 0
@@ -135,7 +139,7 @@ def test_two_photos_with_a_focal_length_from_exif() -> None:
     assert found.cameras[0].K[0, 0] == 200.0
 
 
-def test_what_shows_something_else_is_named_and_the_rest_kept(photos: list[Photo]) -> None:
+def test_photos_of_another_scene_are_named_and_the_others_placed(photos: list[Photo]) -> None:
     stranger = replace(rooms.photos([CAMERAS[2]], seed=7)[0], name="garden/other.png")
     with pytest.warns(UserWarning, match=r"4 of 5 photos .* garden/other\.png\.$"):
         capture = igsr.find_cameras([*photos[1:3], stranger, *photos[3:5]], "colmap")
@@ -143,20 +147,18 @@ def test_what_shows_something_else_is_named_and_the_rest_kept(photos: list[Photo
     assert capture.train_views == capture.views
     with pytest.raises(igsr.IgsrError, match=r"No cameras found: the 2 photos \(1\.png"):
         igsr.find_cameras([photos[1], stranger], "colmap")
-    away = [CAMERAS[2], rooms.camera(np.pi)]  # back to back: no common view
+    away = [CAMERAS[2], rooms.camera(np.pi)]  # back to back
     with pytest.raises(igsr.IgsrError, match="too few matches"):
         igsr.find_cameras(rooms.photos(away), "colmap")
     blank = [Photo(f"{i}.png", np.full((60, 80, 3), 200, dtype=np.uint8)) for i in range(3)]
     with pytest.raises(igsr.IgsrError, match="too few matches"):
         igsr.find_cameras(blank, "colmap")
-    with pytest.raises(
-        igsr.IgsrError, match=r"two photos at least|from 2 photos at least; .*1\.png"
-    ):
+    with pytest.raises(igsr.IgsrError, match=r"at least 2 photos; .*1\.png"):
         igsr.find_cameras(photos[1:2], "colmap")
 
 
-def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A walk round a block of 200 photos, whose end sees its beginning again."""
+def test_few_pairs_of_many_photos_are_matched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """200 photos of a walk whose end shows its beginning again."""
     random = np.random.default_rng(0)
     places = random.normal(size=(200, 10, 128)).astype(np.float32)
     places /= np.linalg.norm(places, axis=2, keepdims=True)
@@ -173,7 +175,7 @@ def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -
     assert max(len({photo for pair in tile for photo in pair}) for tile in tiles) <= 2 * pairs.TILE
 
 
-def test_of_many_photos_the_time_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warning_says_how_long_many_photos_take(monkeypatch: pytest.MonkeyPatch) -> None:
     for step in ("list_photos", "find_features"):
         monkeypatch.setattr(estimator, step, lambda *arguments: None)
     monkeypatch.setattr(estimator, "matched", lambda *arguments: None)
@@ -186,62 +188,142 @@ def test_of_many_photos_the_time_is_said(monkeypatch: pytest.MonkeyPatch) -> Non
         igsr.find_cameras(tiny, "colmap")
 
 
-def test_photos_that_look_alike_are_found_in_the_database(photos: list[Photo], tmp_path: Path):
+def test_similar_photos_are_found_by_their_features(photos: list[Photo], tmp_path: Path):
     stranger = rooms.photos([CAMERAS[2]], seed=7)
     both = [*photos[:3], *stranger]
     database = tmp_path / "database.db"
     list_photos(both, database)
-    find_features(both, tmp_path, database, lambda *arguments: None)
+    find_features(both, database, lambda *arguments: None)
     counts = pairs.similarity(pairs.largest_features(4, database))
     assert (counts == counts.T).all()
     assert min(counts[0, 1], counts[1, 2]) >= 2 * pairs.LEAST_SIMILAR
     assert counts[:3, 3].max() < pairs.LEAST_SIMILAR
 
 
-def make_estimator(calls: list[dict[str, object]], name: str) -> object:
-    def make(checkpoint: object = None) -> object:
-        def run(photos, *, seed=0, progress=None):
-            calls.append({"name": name, "checkpoint": checkpoint, "seed": seed})
-            nothing = [None] * len(photos)
-            return Estimate(list(CAMERAS[: len(photos)]), None, nothing, nothing, ["A warning."])
+class Known:
+    """An estimator that knows the cameras of some photos, in a world of its own.
 
-        return run
+    Attributes:
+        calls: names and seeds of the estimators that were called.
+    """
 
-    return make
+    calls: ClassVar[list[tuple[str, int]]] = []
+
+    def __init__(self, name: str, placed: Sequence[int], world: Similarity | None = None) -> None:
+        self.name, self.placed, self.world = name, placed, world
+
+    def __call__(self, photos, *, seed=0, progress=None):
+        Known.calls.append((self.name, seed))
+        cameras = [
+            CAMERAS[i] if self.world is None else self.world.camera(CAMERAS[i])
+            for i in range(len(photos))
+        ]
+        placed = [camera if i in self.placed else None for i, camera in enumerate(cameras)]
+        nothing = [None] * len(photos)
+        return Estimate(placed, None, nothing, nothing, [f"A warning by {self.name}."])
 
 
-def test_auto_takes_given_cameras_then_a_checkpoint_then_colmap(
-    photos: list[Photo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[dict[str, object]] = []
-    entry = registry.Entry(make_estimator(calls, "dust3r"), lambda options: "checkpoint" in options)
-    monkeypatch.setitem(registry.ESTIMATORS, "dust3r", entry)
-    plain = registry.Entry(lambda: make_estimator(calls, "colmap")(), lambda options: True)
-    monkeypatch.setitem(registry.ESTIMATORS, "colmap", plain)
-    with pytest.warns(UserWarning, match=r"^A warning\.$"):
-        capture = igsr.find_cameras(photos[:3], seed=4)
-    assert calls == [{"name": "colmap", "checkpoint": None, "seed": 4}]
+@pytest.fixture
+def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Replace the estimators by others of the same names; those not given are not ready."""
+
+    def replace_by(**estimators: Known) -> None:
+        Known.calls.clear()
+        for name in registry.ESTIMATORS:
+            known = estimators.get(name)
+            entry = registry.Entry(lambda known=known: known, lambda _, known=known: bool(known))
+            monkeypatch.setitem(registry.ESTIMATORS, name, entry)
+
+    return replace_by
+
+
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+OTHER_WORLD = Similarity(2.5, TURN, np.array([1.0, -2.0, 3.0]))
+
+
+def test_auto_asks_no_network_if_colmap_places_all(photos, registered) -> None:
+    registered(colmap=Known("colmap", range(6)), da3=Known("da3", range(6)))
+    with pytest.warns(UserWarning, match=r"^A warning by colmap\.$"):
+        capture = igsr.find_cameras(photos, seed=4)
+    assert Known.calls == [("colmap", 4)]
+    assert matrices([view.camera for view in capture.views]) == matrices(CAMERAS)
     np.testing.assert_array_equal(capture.views[1].image, photos[1].image)
-    assert capture.views[1].camera is CAMERAS[1]
-    name, _ = pose.estimate(photos[:3], checkpoint="weights.pth")
-    assert name == "dust3r"
-    assert calls[1] == {"name": "dust3r", "checkpoint": "weights.pth", "seed": 0}
-    with pytest.raises(igsr.IgsrError, match="checkpoint is no option of colmap"):
-        pose.estimate(photos[:3], "colmap", checkpoint="weights.pth")
-    with pytest.raises(igsr.IgsrError, match="estimator must be auto, dust3r or da3 or colmap"):
-        pose.estimate(photos[:3], "magic")
-    with pytest.raises(igsr.IgsrError, match="seed is -1"):
-        pose.estimate(photos[:3], seed=-1)
+
+
+def test_auto_adds_a_networks_cameras_for_photos_that_colmap_cannot_place(
+    photos, registered
+) -> None:
+    network = Known("dust3r", range(6), OTHER_WORLD)
+    registered(colmap=Known("colmap", [0, 1, 2, 4]), dust3r=network)
+    with pytest.warns(UserWarning, match=r"Cameras of 3\.png, 5\.png are those that dust3r"):
+        capture = igsr.find_cameras(photos, seed=1)
+    assert Known.calls == [("colmap", 1), ("dust3r", 1)]
+    assert len(capture.views) == 6
+    for i, (view, true) in enumerate(zip(capture.views, CAMERAS, strict=True)):
+        if i in (0, 1, 2, 4):
+            assert matrices([view.camera]) == matrices([true]), "placed cameras stay as they are"
+            assert view.pose_evidence is None
+        else:
+            np.testing.assert_allclose(view.camera.viewmat, true.viewmat, atol=1e-6)
+            assert view.pose_evidence.rests_on == "network"
+
+
+def test_auto_without_weights_keeps_what_colmap_placed(photos, registered) -> None:
+    registered(colmap=Known("colmap", [0, 1, 3]))
+    with pytest.warns(UserWarning, match="A warning by colmap"):
+        capture = igsr.find_cameras(photos)
+    assert [view.name for view in capture.views] == ["0.png", "1.png", "3.png"]
+    assert Known.calls == [("colmap", 0)]
+
+
+def test_auto_takes_the_network_alone_if_colmap_places_too_few(photos, registered) -> None:
+    registered(colmap=Known("colmap", [0, 1]), da3=Known("da3", range(6), OTHER_WORLD))
+    with pytest.warns(UserWarning, match="A warning by da3"):
+        capture = igsr.find_cameras(photos)
+    assert matrices([view.camera for view in capture.views]) == matrices(
+        [OTHER_WORLD.camera(camera) for camera in CAMERAS]
+    )
+
+
+def test_auto_imports_no_torch_if_colmap_places_all(tmp_path: Path) -> None:
+    for photo in rooms.photos(CAMERAS[1:5]):
+        Image.fromarray(photo.image).save(tmp_path / photo.name)
+    code = (
+        "import sys, igsr; views = igsr.find_cameras(sys.argv[1]).views; "
+        "print(len(views), 'torch' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "4 False\n"
+
+
+def test_auto_uses_the_cameras_of_a_capture(photos, registered, tmp_path: Path) -> None:
+    registered(colmap=Known("colmap", range(6)))
     views = [View(f"{i}.png", CAMERAS[i], "train", photos[i].image) for i in range(2)]
     write_transforms(Capture(tmp_path, views), tmp_path / "given")
     assert len(igsr.find_cameras(tmp_path / "given").views) == 2
-    assert len(calls) == 2  # the cameras that are there are taken
+    assert Known.calls == []
     with pytest.warns(UserWarning, match="A warning"):
         igsr.find_cameras(tmp_path / "given", "colmap")
-    assert len(calls) == 3  # or found anew where an estimator is named
+    assert Known.calls == [("colmap", 0)]
 
 
-def test_files_and_photos_in_a_list(photos: list[Photo], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("estimator", "options", "message"),
+    [
+        ("colmap", {"checkpoint": "weights.pth"}, "checkpoint is no option of colmap"),
+        ("auto", {"nonsense": 1}, "nonsense is no option of auto"),
+        ("magic", {}, "estimator must be auto, colmap or dust3r or da3, not 'magic'"),
+        ("auto", {"seed": -1}, "seed is -1"),
+    ],
+)
+def test_wrong_arguments_are_errors(photos, estimator, options, message) -> None:
+    with pytest.raises(igsr.IgsrError, match=message):
+        igsr.find_cameras(photos[:3], estimator, **options)
+
+
+def test_a_list_has_files_or_photos_of_different_names(photos: list[Photo], tmp_path: Path) -> None:
     Image.fromarray(photos[0].image).save(tmp_path / "a.png")
     with pytest.raises(igsr.IgsrError, match="mixes files and Photo objects"):
         igsr.find_cameras([tmp_path / "a.png", photos[1]])
@@ -251,7 +333,7 @@ def test_files_and_photos_in_a_list(photos: list[Photo], tmp_path: Path) -> None
         igsr.find_cameras([tmp_path / "a.png"])
 
 
-def test_accuracy_by_hand() -> None:
+def test_accuracy_of_known_errors() -> None:
     """Three cameras, one turned by 10.5 degrees: two of three pairs are off by that."""
     angle = np.radians(10.5)
     turn = np.eye(4)
@@ -264,11 +346,9 @@ def test_accuracy_by_hand() -> None:
     assert accuracy["rotation"] == pytest.approx(10.5)
     # One pair is right for all of 30 thresholds, two for those from 11 degrees.
     assert accuracy["mAA@30"] == pytest.approx((1 + 2 * 20 / 30) / 3)
-    # A world of another scale and frame changes nothing.
-    pose_of_world = igsr.geometry.similarity.Similarity(
-        3.0, turn[:3, :3], np.array([1.0, 2.0, 3.0])
-    )
-    moved = [pose_of_world.camera(camera) for camera in true]
+    # Scale and frame of the world do not matter.
+    world = Similarity(3.0, turn[:3, :3], np.array([1.0, 2.0, 3.0]))
+    moved = [world.camera(camera) for camera in true]
     exact = pose_accuracy(moved, true)
     assert exact["mAA@30"] == 1.0
     assert exact["ATE"] < 1e-12

@@ -44,7 +44,7 @@ def matched_by(
     if count > EXHAUSTIVE:
         raise IgsrError(
             f"matcher {matcher.name} compares every pair of photos: give at most {EXHAUSTIVE} of "
-            f"the {count} photos, or use matcher sift"
+            f"the {count} photos, or leave the matcher out"
         )
     features = []
     for index, photo in enumerate(photos):
