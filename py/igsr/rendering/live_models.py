@@ -114,7 +114,7 @@ def check_viewable(path: Path) -> None:
     """Check that a path can be shown, now or after a run has written to it.
 
     Raises:
-        IgsrError: there is no such file or folder, or the file is not a model.
+        IgsrError: the path does not exist, or the file is not a model.
     """
     if path.is_dir():
         return

@@ -99,7 +99,7 @@ class ViewServer(ThreadingHTTPServer):
             self._slots.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Log errors, except those of browsers that disconnect."""
+        """Log an error, unless a browser disconnected."""
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             logger.exception("a request failed")
 

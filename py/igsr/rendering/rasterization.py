@@ -354,7 +354,7 @@ def rasterization(
 def _meta(
     joined: dict[str, Tensor], ids: list[Tensor] | None, settings: _Settings, cameras: int
 ) -> dict[str, Any]:
-    """gsplat's ``meta``; ``ids`` are those of each camera's visible splats if packed."""
+    """gsplat's ``meta``; if packed, ``ids`` are the visible splats of each camera."""
     p, q, r = joined["factors"].unbind(dim=-1)
     meta: dict[str, Any] = {
         "batch_ids": None,
