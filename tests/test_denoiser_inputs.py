@@ -13,15 +13,13 @@ from igsr.capture import Camera, View
 from igsr.denoiser import (
     Buffers,
     Source,
-    Warped,
     photo_sources,
     photo_support,
     render_buffers,
-    warp_photos,
     warping,
 )
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
-from igsr.denoiser.warping import MAX_SOURCES
+from igsr.denoiser.warping import MAX_SOURCES, Warped, warp_photos
 from igsr.evaluation.scores import BLACK
 from igsr_lab.denoiser import pairs
 from igsr_lab.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs

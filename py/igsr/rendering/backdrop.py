@@ -57,13 +57,9 @@ _SH_0 = 0.28209479177387814
 
 
 def wants_backdrop(photos: Sequence[View], background: Sequence[float] | None = None) -> bool:
-    """Return whether a scene needs a backdrop.
+    """Return whether a scene fitted to ``photos`` needs a backdrop.
 
     It does not if photos have alpha or masks that cut an object out, or if a background is given.
-
-    Args:
-        photos: the fitted photos.
-        background: RGB in [0, 1], if given.
     """
     if background is not None or any(
         photo.image.shape[2] == 4 or photo.background is not None for photo in photos
@@ -80,9 +76,6 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
         splats: the scene, fitted over black, without a backdrop.
         photos: the fitted photos, with the scene's colors; masked pixels do not count.
         backend: "auto", "cpu", "gpu" or "reference".
-
-    Raises:
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     if len(splats) < MIN_SPLATS:
         return splats

@@ -94,12 +94,7 @@ class LiveView:
         return answer
 
     def photo(self, number: int) -> bytes:
-        """Return the photo of a camera as JPEG.
-
-        Raises:
-            KeyError: the number is unknown.
-            IgsrError: the photo cannot be read.
-        """
+        """Return the photo of a camera as JPEG; a KeyError if there is none."""
         cameras = self._current_surroundings().cameras
         path = cameras[number][1] if 0 <= number < len(cameras) else None
         if path is None:
@@ -109,9 +104,7 @@ class LiveView:
     def model(self, id: str) -> bytes:
         """Return a model for the page: the length of a JSON text (u32), the text, packed splats.
 
-        Raises:
-            KeyError: the id is unknown.
-            IgsrError: the model cannot be read.
+        Raises a KeyError if the id is unknown.
         """
         model = {one.id: one for one in self._models()}[id]
         key = (model.id, model.version)

@@ -9,17 +9,14 @@ from torch import Tensor
 def facing_normals(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, drawn: Tensor
 ) -> Tensor:
-    """Compute the normal of each splat, with gradients of ``quats``.
+    """Compute unit normals [N, 3], world frame, with gradients of ``quats``.
 
     Args:
         means: [N, 3] centers, world frame.
         quats: [N, 4] rotations w x y z of any length.
         scales: [N, 3] standard deviations along the splat's axes.
         viewmat: [4, 4] world-to-camera.
-        drawn: bool [N]; splats that are not drawn may have any values, even NaN.
-
-    Returns:
-        [N, 3] unit normals in the world frame, zero for splats that are not drawn.
+        drawn: bool [N]; other splats may have any values, even NaN, and get zero normals.
     """
     # First, since 0 x NaN in a backward pass would be NaN.
     upright = quats.new_tensor([1.0, 0.0, 0.0, 0.0])

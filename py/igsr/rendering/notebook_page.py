@@ -38,11 +38,7 @@ def notebook_page(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     height: int = 480,
 ) -> NotebookPage:
-    """Make the result of ``Splats.show`` and ``Refined.show``.
-
-    Raises:
-        IgsrError: as ``write_scene_page``, or ``height`` is less than 1.
-    """
+    """Make the result of ``Splats.show`` and ``Refined.show``."""
     if height < 1:
         raise IgsrError(f"height must be at least 1 pixel, not {height}")
     views = [] if capture is None else capture.views

@@ -97,20 +97,7 @@ def render(
 
 
 def project(splats: Splats, camera: Camera, backend: str) -> dict[str, npt.NDArray[Any]]:
-    """Project splats to 2D Gaussians in the picture of one camera.
-
-    Args:
-        splats: the scene.
-        camera: pinhole camera, OpenCV axes, world frame of the capture.
-        backend: "cpu", "gpu" or "reference".
-
-    Returns:
-        The arrays of ``_core.project``, for ``_core.rasterize``.
-
-    Raises:
-        ValueError: the parameters cannot be drawn; the message names the argument.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
-    """
+    """Project splats to 2D Gaussians: the arrays of ``_core.project``, for ``_core.rasterize``."""
     dtype = _core.working_dtype(backend)
     parameters = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     projected: dict[str, npt.NDArray[Any]] = _core.project(

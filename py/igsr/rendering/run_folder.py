@@ -35,14 +35,7 @@ MISSING = "–"
 
 
 def cameras_of(capture: Path) -> list[PageCamera]:
-    """Read the cameras of a capture or a ``cameras.json``, without photos.
-
-    Args:
-        capture: a ``cameras.json`` of igsr, its folder, or a capture for ``load_capture``.
-
-    Raises:
-        IgsrError: the capture does not exist or cannot be read.
-    """
+    """Read the cameras of a ``cameras.json``, its folder, or any capture, without photos."""
     for path in (capture, capture / CAMERAS):
         if path.name == CAMERAS and path.is_file():
             return [PageCamera(name, camera) for name, camera in read_cameras(path)]

@@ -77,9 +77,6 @@ def embedded_model(splats: Splats) -> EmbeddedModel:
     """Pack a model for a page.
 
     Splats that are not finite, or farther than ``MAX_DISTANCE_RADII``, are left out.
-
-    Raises:
-        IgsrError: the format cannot hold the model.
     """
     center, radius = _extent(splats.without_backdrop())
     offsets = splats.means - center.astype(np.float32)

@@ -162,11 +162,7 @@ def described_model(model: EmbeddedModel) -> dict[str, Any]:
 
 
 def surroundings(cameras: Sequence[PageCamera], background: Sequence[float]) -> dict[str, Any]:
-    """Return cameras, up axis and background for the page's script.
-
-    Raises:
-        IgsrError: ``background`` is not three numbers in [0, 1].
-    """
+    """Return cameras, up axis and background for the page's script."""
     color = [float(channel) for channel in background]
     if len(color) != 3 or not all(0.0 <= channel <= 1.0 for channel in color):
         raise IgsrError("background must be three numbers in [0, 1]")

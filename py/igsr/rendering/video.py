@@ -15,18 +15,10 @@ from igsr.errors import IgsrError
 
 
 def write_video(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: int = 30) -> None:
-    """Write frames as H.264, or as MPEG-4 if H.264 is not available.
+    """Write frames, uint8 [H, W, 3], as H.264, or as MPEG-4 if H.264 is not available.
 
-    An odd last column or row is dropped, since 4:2:0 video needs even sizes.
-
-    Args:
-        path: the file; its suffix sets the container, such as ``.mp4``.
-        frames: uint8 [H, W, 3], all of one size.
-        fps: frames per second.
-
-    Raises:
-        IgsrError: the file cannot be written, its suffix is not of a video format, ``frames`` is
-            empty, or frames are smaller than 2 x 2 pixels.
+    The suffix of ``path`` sets the container. An odd last column or row is dropped, since 4:2:0
+    video needs even sizes.
     """
     import av
 
