@@ -153,20 +153,24 @@ def test_scores_are_a_dictionary_with_typed_attributes(capture):
     assert [row["name"] for row in scores.views] == [view.name for view in capture.test_views]
 
 
+def rasterized(tensors, camera, viewmat):
+    return igsr.rasterization(
+        **tensors,
+        viewmats=torch.tensor(viewmat)[None],
+        Ks=torch.tensor(camera.K)[None],
+        width=camera.width,
+        height=camera.height,
+        backend="cpu",
+    )
+
+
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (3.0, -2.0, 1.5)])
 def test_rasterization_of_to_torch_draws_what_render_draws(antialiased, origin):
     splats = dataclasses.replace(scenes.splats(degree=2, origin=origin), antialiased=antialiased)
     camera = scenes.ring_camera(0.7, centre=origin)
     expected = igsr.render(splats, camera, backend="cpu")
-    color, alpha, _ = igsr.rasterization(
-        **splats.to_torch(),
-        viewmats=torch.tensor(camera.viewmat)[None],
-        Ks=torch.tensor(camera.K)[None],
-        width=camera.width,
-        height=camera.height,
-        backend="cpu",
-    )
+    color, alpha, _ = rasterized(splats.to_torch(), camera, camera.viewmat)
     assert expected.alpha.max() > 0.5
     np.testing.assert_allclose(color[0], expected.color, atol=2e-5)
     np.testing.assert_allclose(alpha[0, ..., 0], expected.alpha, atol=2e-5)
@@ -178,14 +182,7 @@ def test_to_torch_keeps_far_scenes_precise_about_their_origin():
     camera = scenes.ring_camera(0.7, centre=far)
     viewmat = camera.viewmat.copy()
     viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin
-    color, _, _ = igsr.rasterization(
-        **splats.to_torch(origin=splats.origin),
-        viewmats=torch.tensor(viewmat)[None],
-        Ks=torch.tensor(camera.K)[None],
-        width=camera.width,
-        height=camera.height,
-        backend="cpu",
-    )
+    color, _, _ = rasterized(splats.to_torch(origin=splats.origin), camera, viewmat)
     np.testing.assert_allclose(
         color[0], igsr.render(splats, camera, backend="cpu").color, atol=2e-5
     )
@@ -202,14 +199,7 @@ def test_to_torch_gives_leaves_that_collect_gradients_and_share_no_memory():
     leaves = {name: value for name, value in tensors.items() if isinstance(value, torch.Tensor)}
     assert set(leaves) == {"means", "quats", "scales", "opacities", "colors"}
     camera = scenes.ring_camera(0.7)
-    color, _, _ = igsr.rasterization(
-        **tensors,
-        viewmats=torch.tensor(camera.viewmat)[None],
-        Ks=torch.tensor(camera.K)[None],
-        width=camera.width,
-        height=camera.height,
-        backend="cpu",
-    )
+    color, _, _ = rasterized(tensors, camera, camera.viewmat)
     assert (leaves["scales"] > 0).all()
     assert ((leaves["opacities"] > 0) & (leaves["opacities"] < 1)).all()
     color.sum().backward()

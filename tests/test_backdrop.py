@@ -37,6 +37,16 @@ def before_sky(views=6, arc=2.0 * np.pi):
     return Capture(made.path, photos, made.points), made
 
 
+@pytest.fixture
+def photos():
+    return before_sky()[0]
+
+
+@pytest.fixture
+def scene(photos):
+    return with_backdrop(BALL, photos.views, "cpu")
+
+
 def looking_away(camera):
     """A camera at the same place that looks the other way: nothing but the backdrop is there."""
     viewmat = camera.viewmat.copy()
@@ -50,9 +60,7 @@ def same(one, other, count=None):
     )
 
 
-def test_photos_that_see_through_the_scene_tell_what_is_behind_it():
-    photos, _ = before_sky()
-    scene = with_backdrop(BALL, photos.views, "cpu")
+def test_photos_that_see_through_the_scene_tell_what_is_behind_it(photos, scene):
     assert len(scene) == len(BALL) + COUNT
     assert same(scene, BALL, len(BALL))
     for view in photos.views:
@@ -95,8 +103,7 @@ def test_before_black_there_is_none():
     assert with_backdrop(BALL, before_black.views, "cpu") is BALL
 
 
-def test_masked_pixels_do_not_count():
-    photos, _ = before_sky()
+def test_masked_pixels_do_not_count(photos):
     wrong = []
     for view in photos.views:
         image, mask = view.image.copy(), np.ones(view.image.shape[:2], np.bool_)
@@ -107,16 +114,13 @@ def test_masked_pixels_do_not_count():
     assert np.abs(shown[:8].astype(int) - SKY).max() < 25
 
 
-def test_splats_without_a_finite_centre_have_none():
-    photos, _ = before_sky()
+def test_splats_without_a_finite_centre_have_none(photos):
     broken = replace(BALL, means=np.full_like(BALL.means, np.nan))
     assert with_backdrop(broken, photos.views, "cpu") is broken
 
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.splat"])
-def test_it_is_known_in_a_file_where_numbers_stay_as_they_are(tmp_path, name):
-    photos, _ = before_sky()
-    scene = with_backdrop(BALL, photos.views, "cpu")
+def test_it_is_known_in_a_file_where_numbers_stay_as_they_are(tmp_path, name, scene):
     scene.save(tmp_path / name)
     read = igsr.Splats.load(tmp_path / name)
     assert read.backdrop_splats == (COUNT if name.endswith(".ply") else 0)
@@ -125,8 +129,7 @@ def test_it_is_known_in_a_file_where_numbers_stay_as_they_are(tmp_path, name):
     assert BALL.without_backdrop() is BALL
 
 
-def test_info_tells_of_it_and_of_the_corners_of_the_rest(tmp_path, igsr_here):
-    photos, _ = before_sky()
+def test_info_tells_of_it_and_of_the_corners_of_the_rest(tmp_path, igsr_here, photos):
     for name, scene in (("bare", BALL), ("whole", with_backdrop(BALL, photos.views, "cpu"))):
         scene.save(tmp_path / f"{name}.ply")
     bare, whole = (
@@ -138,9 +141,7 @@ def test_info_tells_of_it_and_of_the_corners_of_the_rest(tmp_path, igsr_here):
 
 
 @pytest.mark.parametrize("photographs", [True, False])
-def test_floaters_are_not_looked_for_in_it_and_it_does_not_make_any(photographs):
-    photos, _ = before_sky()
-    scene = with_backdrop(BALL, photos.views, "cpu")
+def test_floaters_are_not_looked_for_in_it_and_it_does_not_make_any(photographs, photos, scene):
     capture = photos if photographs else None
     cleaned = igsr.remove_floaters(scene, capture, backend="cpu")
     bare = igsr.remove_floaters(BALL, capture, backend="cpu")
@@ -149,17 +150,13 @@ def test_floaters_are_not_looked_for_in_it_and_it_does_not_make_any(photographs)
     assert cleaned.splats.backdrop_splats == COUNT
 
 
-def test_scenes_are_framed_by_what_is_before_it():
-    photos, _ = before_sky()
-    scene = with_backdrop(BALL, photos.views, "cpu")
+def test_scenes_are_framed_by_what_is_before_it(scene):
     for one, other in zip(cameras_around(BALL, 3, 32), cameras_around(scene, 3, 32), strict=True):
         np.testing.assert_array_equal(one.viewmat, other.viewmat)
     assert embedded_model(scene).radius == embedded_model(BALL).radius
 
 
-def test_a_smaller_model_keeps_it():
-    photos, _ = before_sky()
-    scene = with_backdrop(BALL, photos.views, "cpu")
+def test_a_smaller_model_keeps_it(photos, scene):
     compact = igsr.compact(scene, 3.0, capture=photos, sh_degree=0, steps=20, backend="cpu").splats
     assert compact.backdrop_splats == COUNT
     assert compact.sh_degree == 0
@@ -167,8 +164,7 @@ def test_a_smaller_model_keeps_it():
     assert away.alpha.min() > 0.98
 
 
-def test_few_splats_and_scenes_without_a_size_have_none(monkeypatch):
-    photos, _ = before_sky()
+def test_few_splats_and_scenes_without_a_size_have_none(monkeypatch, photos):
     still = photos.views[0].camera.centre
     at_camera = replace(BALL, means=np.tile(still, (len(BALL), 1)).astype(np.float32))
     same_place = [replace(v, camera=photos.views[0].camera) for v in photos.views]
@@ -177,8 +173,7 @@ def test_few_splats_and_scenes_without_a_size_have_none(monkeypatch):
     assert with_backdrop(BALL, photos.views, "cpu") is BALL
 
 
-def test_fits_of_photographs_end_with_one_and_go_on_without_it():
-    photos, _ = before_sky()
+def test_fits_of_photographs_end_with_one_and_go_on_without_it(photos):
     options = {"steps": 40, "backend": "cpu", "max_splats": 300, "seed": 3}
     bare = igsr.fit(photos, backdrop=False, **options)
     whole = igsr.fit(photos, **options)
@@ -190,8 +185,7 @@ def test_fits_of_photographs_end_with_one_and_go_on_without_it():
     assert on.backdrop_splats == COUNT
 
 
-def test_what_is_cut_out_and_what_has_a_background_gets_none():
-    photos, _ = before_sky()
+def test_what_is_cut_out_and_what_has_a_background_gets_none(photos):
     options = {"steps": 3, "backend": "cpu"}
     assert wants_backdrop(photos.views)
     assert not wants_backdrop(scenes.capture(alpha=True).views)

@@ -14,6 +14,7 @@ import igsr
 from igsr.compaction import contribution, validation
 from igsr.compaction.validation import loss_of_change, photo_validation, self_validation
 from igsr.evaluation import metrics
+from igsr.splats import joined, subset
 
 
 def wall(count=2000, seed=0):
@@ -62,13 +63,7 @@ def photos():
     rest = [scenes.splats(count=40, degree=1, seed=seed) for seed in (1, 2, 3)]
     for useless in rest:
         useless.opacities[:] = -5.0
-    model = igsr.Splats(
-        *(
-            np.concatenate([getattr(part, name) for part in (off, *rest)])
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        )
-    )
-    return scenes.capture(views=8, size=40, alpha=True, scene=scene), model
+    return scenes.capture(views=8, size=40, alpha=True, scene=scene), joined([off, *rest])
 
 
 # ---- contribution ------------------------------------------------------------------------------
@@ -210,22 +205,14 @@ def test_what_nobody_sees_goes_without_harm():
     """Steps of fitting would only hurt a model that is validated on its own renders."""
     seen = scenes.splats(count=30, degree=1)
     inside = replace(scenes.splats(count=30, degree=1), opacities=np.full(30, -9.0, np.float32))
-    model = igsr.Splats(
-        *(
-            np.concatenate([getattr(part, name) for part in (seen, inside)])
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        )
-    )
-    report = igsr.compact(model, 1e-4, psnr=20.0, steps=4, backend="cpu").report
+    report = igsr.compact(joined([seen, inside]), 1e-4, psnr=20.0, steps=4, backend="cpu").report
     assert report["result"]["splats"] < 45
     assert report["result"]["loss"] <= 1e-4
 
 
 def test_nothing_smaller_within_the_loss_leaves_the_model(photos):
     capture, model = photos
-    needed = igsr.Splats(
-        *(getattr(model, name)[:40] for name in ("means", "quats", "scales", "opacities", "sh"))
-    )
+    needed = subset(model, slice(40))
     compaction = igsr.compact(needed, 1e-6, capture, steps=1, backend="cpu")
     assert compaction.report["result"] == compaction.report["whole"]
     np.testing.assert_array_equal(compaction.splats.means, needed.means)

@@ -2,21 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-
-import numpy as np
 import pytest
 import torch
-from scenes import torch_scene
-
-from igsr import rasterization
-
-WIDTH, HEIGHT = 24, 20
-
-
-def run(scene, **options):
-    arguments = {"sh_degree": 2, "backend": "cpu", **options}
-    return rasterization(**scene, width=WIDTH, height=HEIGHT, **arguments)
+from scenes import HEIGHT, WIDTH, torch_scene
+from scenes import rasterized as run
 
 
 def leaves(scene):
@@ -173,58 +162,3 @@ def test_cameras_of_either_precision():
     for name in ("viewmats", "Ks"):
         assert double[name].grad.dtype == torch.float64
         assert torch.equal(scene[name].grad, double[name].grad.float())
-
-
-@pytest.mark.parametrize("absgrad", [False, True])
-@pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize(("channels", "passes"), [(3, 1), (None, 1), (7, 3), (7, 4)])
-def test_what_crosses_the_bus_is_what_the_docs_say(monkeypatch, channels, passes, packed, absgrad):
-    absgrad = absgrad and passes == 1
-    count, cameras, pixels = 30, 2, WIDTH * HEIGHT
-    scene = torch_scene(count=count, cameras=cameras)
-    scene["means"][:7, 2] = -3.0
-    del scene["backgrounds"]
-    coefficients = 9
-    if channels is not None:
-        scene["colors"], coefficients = torch.rand(count, channels), 1
-    scene = leaves(scene)
-
-    # Both directions have one function each; on the CPU they share memory instead of copying.
-    module = importlib.import_module("igsr.rendering.rasterization")
-    crossed = {"to the host": 0, "to the device": 0}
-
-    def counting(direction, transfer):
-        def counted(what, *others):
-            if what.ndim > 0 and what.shape[0] > 6:  # not a camera and no background
-                crossed[direction] += 4 * int(np.prod(what.shape))
-            return transfer(what, *others)
-
-        return counted
-
-    monkeypatch.setattr(module, "_array", counting("to the host", module._array))
-    monkeypatch.setattr(module, "_tensor", counting("to the device", module._tensor))
-
-    picture, alpha, meta = run(
-        scene,
-        sh_degree=2 if channels is None else None,
-        packed=packed,
-        absgrad=absgrad,
-        render_mode="RGB+D",
-        render_normals=passes == 4,
-    )
-    drawn = len(meta["means2d"]) if packed else count * cameras
-    assert not packed or 0 < drawn < count * cameras
-    splats, parameters = count * cameras, 44 + 12 * coefficients
-    assert crossed["to the host"] == splats * parameters + 48 * passes * drawn
-    assert crossed["to the device"] == 48 * splats + 24 * passes * pixels * cameras
-
-    crossed.update({"to the host": 0, "to the device": 0})
-    loss = picture.sum() + alpha.sum()
-    if passes == 4:
-        loss = loss + meta["render_normals"].sum()
-    loss.backward()
-    # The passes behind the first are used for their colours only.
-    v_pixel = 20 + 12 * (passes - 1)
-    assert crossed["to the host"] == v_pixel * pixels * cameras + 40 * splats
-    v_drawn = 40 * passes + 8 * absgrad
-    assert crossed["to the device"] == v_drawn * drawn + splats * parameters

@@ -6,16 +6,10 @@ import gsplat
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
-from scenes import torch_scene
+from scenes import HEIGHT, WIDTH, torch_scene
+from scenes import rasterized as run
 
 from igsr import rasterization
-
-WIDTH, HEIGHT = 24, 20
-
-
-def run(scene, **options):
-    arguments = {"sh_degree": 2, "backend": "cpu", **options}
-    return rasterization(**scene, width=WIDTH, height=HEIGHT, **arguments)
 
 
 def small_scene(count=6, **options):

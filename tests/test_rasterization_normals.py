@@ -6,16 +6,11 @@ import math
 
 import pytest
 import torch
-from scenes import torch_scene
-
-from igsr import rasterization
-
-WIDTH, HEIGHT = 24, 20
+from scenes import HEIGHT, WIDTH, rasterized, torch_scene
 
 
 def run(scene, **options):
-    arguments = {"sh_degree": 2, "backend": "cpu", "render_normals": True, **options}
-    return rasterization(**scene, width=WIDTH, height=HEIGHT, **arguments)
+    return rasterized(scene, **{"render_normals": True, **options})
 
 
 def disc(shortest, quat=(1.0, 0.0, 0.0, 0.0)):
@@ -91,12 +86,7 @@ def test_normals_have_the_weights_of_the_colors_and_change_no_picture(render_mod
     towards = centres[:, None].double() - scene["means"]
     facing = (towards * normals).sum(dim=-1, keepdim=True).sign() * normals
     colors = facing.float()
-    expected, _, _ = rasterization(
-        **{**scene, "colors": colors, "backgrounds": None},
-        width=WIDTH,
-        height=HEIGHT,
-        backend="cpu",
-    )
+    expected, _, _ = rasterized({**scene, "colors": colors, "backgrounds": None}, sh_degree=None)
     assert (meta["render_normals"] - expected).abs().max() <= 2e-6
 
 
@@ -115,20 +105,3 @@ def test_gradients_of_normals_match_finite_differences():
     _, _, meta = run(scene, backend="reference")
     (from_normals,) = torch.autograd.grad(meta["render_normals"][..., 0].sum(), inputs[1])
     assert from_normals.abs().max() > 1e-3
-
-
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
-@pytest.mark.parametrize("slot", ["means", "quats", "scales", "opacities"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e38, 0.0])
-def test_what_is_not_drawn_spoils_no_normal(slot, value, backend):
-    scene = torch_scene(count=8)
-    scene[slot].view(8, -1)[3] = value
-    for tensor in scene.values():
-        tensor.requires_grad_()
-    _, _, meta = run(scene, packed=False, backend=backend)
-    assert torch.isfinite(meta["render_normals"]).all()
-    meta["render_normals"].square().sum().backward()
-    for name, tensor in scene.items():
-        # The pass of the colours is not needed for the normals, and neither are backgrounds.
-        assert tensor.grad is None or torch.isfinite(tensor.grad).all(), name
-    assert scene["quats"].grad.any()
