@@ -148,7 +148,7 @@ class Browser:
         self._ask("Input.dispatchKeyEvent", type=kind, key=key, code=code)
 
     def screenshot(self, path: Path) -> None:
-        """What the page shows, as a PNG."""
+        """Save a screenshot of the page as PNG."""
         path.write_bytes(base64.b64decode(self._ask("Page.captureScreenshot")["data"]))
 
     def _ask(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:

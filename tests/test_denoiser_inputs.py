@@ -41,7 +41,7 @@ def splats(means, scales, opacity=0.95, quats=(1.0, 0.0, 0.0, 0.0)):
     )
 
 
-def test_buffers_are_what_is_known_of_a_flat_splat():
+def test_buffers_of_a_flat_splat():
     flat = splats([[0.0, 0.0, 0.0]], [2.0, 2.0, 0.01])
     empty = np.zeros((32, 32, 3), np.uint8)
     photos = [View(f"{x}.png", camera(x), "train", empty) for x in (0.0, 0.5, 50.0)]
@@ -65,7 +65,7 @@ def test_buffers_are_what_is_known_of_a_flat_splat():
     )
 
 
-def test_depth_deviates_where_two_surfaces_are_blended():
+def test_depth_deviation_of_two_blended_surfaces():
     two = splats([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]], [3.0, 3.0, 0.01], opacity=0.5)
     buffers = render_buffers(two, camera(), np.ones(2, np.float32), backend="cpu")
     a, b = 0.5, 0.25
@@ -75,7 +75,7 @@ def test_depth_deviates_where_two_surfaces_are_blended():
     assert buffers.depth_deviation[16, 16] == pytest.approx(deviation / mean, rel=2e-3)
 
 
-def test_nothing_drawn_is_zero_everywhere():
+def test_empty_pixels_are_zero():
     behind = splats([[0.0, 0.0, -9.0], [0.0, 0.0, -4.0]], 0.1)
     buffers = render_buffers(behind, camera(), np.ones(2, np.float32), backend="cpu")
     for name in ("color", "alpha", "depth", "depth_deviation", "normal", "footprint", "support"):
@@ -94,7 +94,7 @@ def test_buffers_of_other_shapes_are_refused():
 
 
 def plane_photo(at, z=0.0):
-    """What a camera sees of the plane z, painted by a smooth function of x and y."""
+    """A camera's picture of the plane z, painted by a smooth function of x and y."""
     columns, rows = np.meshgrid(np.arange(at.width) + 0.5, np.arange(at.height) + 0.5)
     depth = z + 4.0
     x = (columns - at.K[0, 2]) / at.K[0, 0] * depth + at.centre[0]
@@ -112,7 +112,7 @@ def warped_of(buffers, sources, keep=PHOTOS):
     return warp_photos(buffers.camera, buffers.depth, buffers.alpha, sources, keep)
 
 
-def test_photos_are_looked_up_at_the_surface_nearest_direction_first():
+def test_photos_are_warped_in_the_order_of_angles():
     truth, depth = plane_photo(camera())
     buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
     warped = warped_of(buffers, [source(0.8), source(-0.3), source(0.5)])
@@ -125,7 +125,7 @@ def test_photos_are_looked_up_at_the_surface_nearest_direction_first():
     assert not warped.valid[0][:, :1].any() or not warped.valid[1][:, :1].any()
 
 
-def test_hidden_masked_and_missing_photos_are_not_valid():
+def test_occluded_masked_and_missing_photos_are_not_valid():
     truth, depth = plane_photo(camera())
     buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
     hidden = source(0.1)
@@ -143,7 +143,7 @@ def test_hidden_masked_and_missing_photos_are_not_valid():
     assert not warped_of(transparent, [source(0.1)]).valid.any(), "there is no surface"
 
 
-def test_of_many_photos_those_that_look_from_nearest_are_looked_up():
+def test_only_the_nearest_of_many_photos_are_warped():
     truth, depth = plane_photo(camera())
     buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
     near = [source(x) for x in np.linspace(-0.4, 0.4, MAX_SOURCES)]
@@ -159,7 +159,7 @@ def nothing_warped(height, width):
     return Warped(np.zeros((*empty.shape, 3), np.float32), empty > 0, empty + np.float32(np.pi))
 
 
-def test_what_is_lacking_or_not_finite_is_zero_in_the_channels():
+def test_missing_and_nonfinite_inputs_are_zero():
     color = np.full((6, 7, 3), np.nan, np.float32)
     color[0, 0] = [0.25, 7.0, -1.0]
     inputs = network_inputs(Buffers(color), nothing_warped(6, 7))
@@ -169,7 +169,7 @@ def test_what_is_lacking_or_not_finite_is_zero_in_the_channels():
     assert not inputs[COLOR:].any()
 
 
-def test_the_background_is_a_choice_where_there_is_one():
+def test_the_background_is_an_input():
     color = np.full((8, 8, 3), 0.9, np.float32)
     at = COLOR + BUFFERS + PHOTOS * 5
     behind = np.array([0.2, 0.4, 0.6], np.float32)
@@ -181,7 +181,7 @@ def test_the_background_is_a_choice_where_there_is_one():
         Buffers(color, background=behind[:2])
 
 
-def test_renders_know_the_background_that_photos_with_alpha_have():
+def test_buffers_have_the_background():
     scene, view = scenes.splats(40), scenes.ring_camera(0.0, size=24)
     seen = np.ones(40, np.float32)
     white = render_buffers(scene, view, seen, (1.0, 1.0, 1.0), "cpu")
@@ -192,7 +192,7 @@ def test_renders_know_the_background_that_photos_with_alpha_have():
     assert np.allclose(white.color, none.color + gap, atol=1e-5), "none is drawn over black"
 
 
-def test_depth_is_relative_so_that_units_do_not_matter():
+def test_depth_channels_do_not_depend_on_units():
     color, depth = plane_photo(camera())
     depth = depth + np.linspace(0, 1, 32, dtype=np.float32)[:, None]
     alpha = np.ones_like(depth)
@@ -202,7 +202,7 @@ def test_depth_is_relative_so_that_units_do_not_matter():
     assert near[COLOR + 1].std() > 0.01
 
 
-def test_a_large_picture_is_looked_up_in_bands_of_rows(monkeypatch):
+def test_warping_in_bands_equals_the_whole(monkeypatch):
     scene = scenes.splats(60)
     photos = scenes.capture(views=6, size=40, scene=scene).views
     sources = photo_sources(scene, photos, BLACK, "cpu")
@@ -216,7 +216,7 @@ def test_a_large_picture_is_looked_up_in_bands_of_rows(monkeypatch):
         assert np.array_equal(getattr(whole, name), getattr(bands, name))
 
 
-def test_no_splats_are_an_empty_picture():
+def test_no_splats_give_an_empty_picture():
     none = splats(np.zeros((0, 3)), 0.1)
     photos = scenes.capture(views=2, size=32).views
     buffers = render_buffers(none, camera(), photo_support(none, photos, "cpu"), backend="cpu")
@@ -226,7 +226,7 @@ def test_no_splats_are_an_empty_picture():
     assert np.isfinite(confidence).all()
 
 
-def test_one_far_pixel_leaves_the_depth_of_the_others():
+def test_a_far_pixel_does_not_change_other_depths():
     depth = np.full((8, 8), 2.0, np.float32)
     depth[0, 0] = 1e5
     depth[0, 1] = 0.0
@@ -239,6 +239,6 @@ def test_one_far_pixel_leaves_the_depth_of_the_others():
     assert channel[0, 1] == 0.0
 
 
-def test_a_picture_in_bytes_is_refused_as_colour():
+def test_bytes_are_refused_as_color():
     with pytest.raises(igsr.IgsrError, match="color must be of floats"):
         Buffers(color=np.zeros((8, 8, 3), np.uint8))

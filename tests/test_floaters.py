@@ -1,4 +1,4 @@
-"""Floaters: what photos say about splats, stray splats, their removal from fits, ``igsr clean``."""
+"""Floaters: evidence of photos, stray splats, removal from fits, ``igsr clean``."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def before(view, distance=1.2):
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_sightings_count_who_shows_a_splat_and_who_shows_it_before_the_surface(backend):
+def test_sightings_count_cameras_that_see_a_splat(backend):
     views = scenes.capture(views=4, scene=BALL).views
     hidden = [[0.0, 40.0, 0.0]]  # above all pictures
     model = joined([BALL, specks([before(views[0]), *hidden], size=0.02, opacity=-1.0)])
@@ -84,14 +84,14 @@ def test_masked_pixels_need_nothing():
 
 
 def with_masks_of(views, scene, splats):
-    """The views of which only those pixels count that these splats of the scene cover."""
+    """The views with masks of the pixels that these splats cover."""
     cut = subset(scene, splats)
     alphas = [igsr.render(cut, view.camera, backend="cpu").alpha for view in views]
     return [replace(view, mask=alpha > 0.05) for view, alpha in zip(views, alphas, strict=True)]
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_sightings_tell_the_area_in_pixels_that_count(backend):
+def test_sightings_measure_the_unmasked_area(backend):
     views = with_masks_of(scenes.capture(views=4, scene=BALL).views, BALL, np.arange(60) < 8)
     cameras, masks = [view.camera for view in views], [view.mask for view in views]
     seen = sightings(BALL, cameras, backend, masks)
@@ -103,8 +103,7 @@ def test_sightings_tell_the_area_in_pixels_that_count(backend):
     assert np.array_equal(everywhere.counted, everywhere.area)
 
 
-def test_what_masks_hide_is_found_and_what_some_photos_count_is_kept():
-    """Nothing corrects what a fit puts round an object whose surroundings are masked."""
+def test_masked_splats_are_found_unless_a_photo_counts_them():
     aside = specks([[0.0, -1.5, 0.0], [0.3, -1.5, 0.0]], size=0.08)
     scene = joined([BALL, aside])
     ball = np.arange(62) < 60
@@ -113,16 +112,16 @@ def test_what_masks_hide_is_found_and_what_some_photos_count_is_kept():
     kinds = unsupported_splats(scene, masked, BLACK, backend="cpu")
     assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
     assert not unsupported_splats(scene, views, BLACK, backend="cpu")["masked"].any()
-    # A person before them in half of the photos is no reason to remove what the others show.
+    # Splats that are masked in only half of the photos are kept.
     some = [*masked[:3], *views[3:]]
     assert not unsupported_splats(scene, some, BLACK, backend="cpu")["masked"].any()
-    # Pseudo-views do not tell that masks hide nothing: they show what was fitted.
+    # Pseudo-views are not evidence, since they show the fit.
     pseudo = [replace(view, weights=np.ones((48, 48), np.float32)) for view in views]
     kinds = unsupported_splats(scene, [*masked, *pseudo], BLACK, backend="cpu")
     assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
 
 
-def test_what_photos_hardly_show_behind_masks_is_left_to_pseudo_views():
+def test_tiny_masked_splats_are_left_to_pseudo_views():
     speck = specks([[0.1, -1.4, 0.0]], size=0.004, opacity=-1.0)
     scene = joined([BALL, speck])
     ball = np.arange(61) < 60
@@ -136,7 +135,7 @@ def test_what_photos_hardly_show_behind_masks_is_left_to_pseudo_views():
     assert not any(kind[-1] for kind in kinds.values())
 
 
-def test_what_no_photo_shows_and_what_only_one_photo_needs_is_found():
+def test_unseen_and_floating_splats_are_found():
     views = scenes.capture(views=6, scene=BALL).views
     unseen, floating = [0.0, 40.0, 0.0], before(views[2])
     model = joined([BALL, specks([unseen, floating], size=0.03, opacity=-1.0)])
@@ -145,7 +144,7 @@ def test_what_no_photo_shows_and_what_only_one_photo_needs_is_found():
     assert np.flatnonzero(kinds["floating"]).tolist() == [61]
 
 
-def test_a_near_thing_that_all_photos_show_is_kept():
+def test_near_objects_seen_by_all_photos_are_kept():
     """A thin veil round the ball: before it in every photo, and needed by all of them."""
     angles = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     ring = [[2.4 * np.sin(a), y, -2.4 * np.cos(a)] for a in angles for y in (-0.3, 0.0, 0.3)]
@@ -156,14 +155,14 @@ def test_a_near_thing_that_all_photos_show_is_kept():
     assert (seen.before[60:] > 0).sum() > 60
     found = unsupported_splats(scene, views, BLACK, backend="cpu")["floating"]
     assert not found[seen.shown > 1].any()
-    # Photos without the veil do not need it, those of its back side included.
+    # Photos without the veil do not need it, even from behind.
     bare = scenes.capture(views=12, scene=BALL).views
     found = unsupported_splats(scene, bare, BLACK, backend="cpu")["floating"]
     assert found.sum() > 0
     assert not found[:60].any()
 
 
-def test_photos_that_are_not_asked_keep_what_they_show(monkeypatch):
+def test_unsampled_photos_keep_their_splats(monkeypatch):
     views = scenes.capture(views=6, scene=BALL, arc=0.3).views
     speck = specks([before(views[3])], size=0.03, opacity=-1.0)
     model = joined([BALL, speck])
@@ -176,7 +175,7 @@ def test_photos_that_are_not_asked_keep_what_they_show(monkeypatch):
     assert not unsupported_splats(model, photos, BLACK, backend="cpu")["floating"][-1]
 
 
-def test_pseudo_views_keep_what_they_show_but_tell_of_no_floaters():
+def test_pseudo_views_keep_splats_but_find_no_floaters():
     views = scenes.capture(views=6, scene=BALL).views
     model = joined([BALL, specks([before(views[2])], size=0.03, opacity=-1.0)])
     pseudo = replace(views[2], weights=np.ones((48, 48), np.float32))
@@ -210,18 +209,18 @@ def plane(count=20, scale=1.0):
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_a_speck_far_from_all_others_stands_alone(scale):
+def test_an_isolated_splat_is_alone(scale):
     speck = specks([[1.0 * scale, 1.0 * scale, 30.0 * scale]], size=0.05 * scale)
     found = alone(joined([plane(scale=scale), speck]))
     assert np.flatnonzero(found).tolist() == [400]
 
 
-def test_large_splats_far_away_do_not_stand_alone():
+def test_large_distant_splats_are_not_alone():
     far = specks([[0.0, 0.0, 30.0], [20.0, 0.0, 30.0]], size=15.0)
     assert not alone(joined([plane(), far])).any()
 
 
-def test_hard_places_are_counted_without_overflow():
+def test_extreme_positions_do_not_overflow():
     hard = joined([plane(), specks([[3e38, -3e38, 0.0]]), specks([[0.0, 0.0, 1.0]], size=1e-30)])
     hard.scales[400] = 88.0
     found = alone(hard)
@@ -229,13 +228,13 @@ def test_hard_places_are_counted_without_overflow():
     assert not found[:400].any()
 
 
-def test_a_scene_of_lone_splats_keeps_them():
+def test_a_scene_of_isolated_splats_is_kept():
     lonely = specks([[10.0 * k, 0.0, 0.0] for k in range(30)])
     assert alone(lonely).all()
     assert not stray_splats(lonely)["alone"].any()
 
 
-def test_what_cannot_be_drawn_is_removed_and_renders_keep_their_bits():
+def test_removing_invisible_splats_keeps_renders_identical():
     model = joined([plane(), specks([[1.0, 1.0, 0.1]], opacity=-5.6), specks([[0.5, 0.5, 0.1]])])
     model.means[401] = np.nan
     cleaned = igsr.remove_floaters(model)
@@ -250,7 +249,7 @@ def test_what_cannot_be_drawn_is_removed_and_renders_keep_their_bits():
 # ---- removal -----------------------------------------------------------------------------------
 
 
-def test_photos_decide_and_the_scene_keeps_its_order():
+def test_removal_by_photos_keeps_the_order():
     capture = scenes.capture(views=8, scene=BALL)
     floating = specks([before(capture.views[2])], size=0.03, opacity=-1.0)
     model = joined([specks([[0.0, 40.0, 0.0]]), BALL, floating])
@@ -262,14 +261,14 @@ def test_photos_decide_and_the_scene_keeps_its_order():
     assert np.array_equal(cleaned.splats.origin, model.origin)
 
 
-def test_a_scene_of_floaters_alone_stays_whole():
+def test_a_scene_of_floaters_only_is_kept():
     capture = scenes.capture(views=4)
     cleaned = igsr.remove_floaters(specks([[0.0, 40.0, 0.0]]), capture, backend="cpu")
     assert len(cleaned.splats) == 1
     assert cleaned.removed == {"unseen": 0, "masked": 0, "floating": 0}
 
 
-def test_a_capture_without_photos_to_ask_is_refused():
+def test_a_capture_without_train_views_is_refused():
     capture = scenes.capture(views=4)
     nothing = replace(capture, views=capture.test_views)
     with pytest.raises(igsr.IgsrError, match="no train views"):
@@ -287,7 +286,7 @@ def fitted(capture, **options):
     return splats, seen
 
 
-def test_a_fit_ends_without_floaters_and_counts_them(tmp_path):
+def test_fits_remove_and_count_floaters(tmp_path):
     capture = scenes.capture(views=8, size=32, scene=BALL)
     whole, said = fitted(capture, remove_floaters=False)
     assert said[-1].removed == {}
@@ -305,7 +304,7 @@ def test_a_fit_ends_without_floaters_and_counts_them(tmp_path):
     assert math.isnan(resumed[-1].loss)
 
 
-def test_a_fit_that_is_ended_early_keeps_all():
+def test_stopped_fits_keep_floaters():
     capture = scenes.capture(views=8, size=32, scene=BALL)
     seen = []
 
@@ -334,7 +333,7 @@ def scene(tmp_path):
     return tmp_path / "scene.ply", tmp_path / "photos"
 
 
-def test_clean_removes_what_photos_do_not_show(scene, tmp_path):
+def test_clean_removes_unseen_splats(scene, tmp_path):
     path, photos = scene
     out = tmp_path / "clean.ply"
     words = ["--capture", photos, "--holdout", 4, "--out", out, "--backend", "cpu"]
@@ -351,7 +350,7 @@ def test_clean_removes_what_photos_do_not_show(scene, tmp_path):
     assert out.read_bytes() == first
 
 
-def test_clean_without_photos_goes_by_the_splats(tmp_path):
+def test_clean_without_photos_removes_stray_splats(tmp_path):
     joined([plane(), specks([[1.0, 1.0, 30.0]])]).save(tmp_path / "scene.ply")
     result = command(tmp_path / "scene.ply")
     assert result.exit_code == 0, result.output
@@ -368,7 +367,7 @@ def test_clean_without_photos_goes_by_the_splats(tmp_path):
         (["--out", "scene.xyz"], "scene.xyz"),
     ],
 )
-def test_clean_names_what_is_wrong_and_writes_nothing(scene, words, message):
+def test_clean_refuses_bad_arguments(scene, words, message):
     path, _ = scene
     before = sorted(path.parent.iterdir())
     result = command(path, *words)

@@ -36,7 +36,7 @@ def outputs(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("cell", "labels"), [(0, ["scene"]), (1, ["first fit", "round 1"])])
-def test_a_cell_shows_the_viewer(browser, tmp_path, outputs, cell, labels):
+def test_a_notebook_cell_shows_the_viewer(browser, tmp_path, outputs, cell, labels):
     (tmp_path / "book.html").write_text(WAIT + outputs[cell], encoding="utf-8")
     browser.open(tmp_path / "book.html")
     assert browser.problems == []

@@ -10,7 +10,7 @@ BACKENDS = ["cpu", "reference"]
 
 
 def feature_scene(channels, per_camera=False, dtype=torch.float32, **options):
-    """A scene with direct colours [N, D] or [C, N, D] and without backgrounds."""
+    """A scene with direct colors [N, D] or [C, N, D] and without backgrounds."""
     scene = torch_scene(dtype=dtype, **options)
     count, cameras = len(scene["means"]), len(scene["viewmats"])
     generator = torch.Generator().manual_seed(5)
@@ -39,7 +39,7 @@ def gradients(scene, loss):
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("per_camera", [False, True])
 @pytest.mark.parametrize("channels", [1, 2, 4, 7])
-def test_each_channel_is_what_it_is_alone(channels, per_camera, packed, backend):
+def test_each_channel_equals_a_render_of_it_alone(channels, per_camera, packed, backend):
     scene = feature_scene(channels, per_camera)
     backgrounds = random(2, channels)
     picture, alpha, _ = run(scene, backgrounds=backgrounds, packed=packed, backend=backend)
@@ -89,7 +89,7 @@ def test_gradients_of_channels_match_finite_differences(channels):
 
 @pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED"])
 @pytest.mark.parametrize("channels", [3, 5])
-def test_a_background_of_equal_pixels_is_a_uniform_one(channels, render_mode):
+def test_a_constant_background_image_equals_a_color(channels, render_mode):
     scene = feature_scene(channels)
     uniform = random(2, channels)
     pixels = uniform[:, None, None].repeat(1, HEIGHT, WIDTH, 1)
@@ -99,7 +99,7 @@ def test_a_background_of_equal_pixels_is_a_uniform_one(channels, render_mode):
     assert torch.equal(alpha, expected_alpha)
 
 
-def test_a_background_is_weighted_by_the_transmittance_itself():
+def test_backgrounds_are_weighted_by_the_exact_transmittance():
     # Three nearly opaque layers: 1 - alpha would be wrong in its fourth digit.
     scene = feature_scene(3, cameras=1, count=3, dtype=torch.float32)
     scene["means"] = torch.tensor([[0.0, 0, 4], [0, 0, 5], [0, 0, 6]])

@@ -1,4 +1,4 @@
-"""``rasterization(render_normals=True)``: which normal, in which frame, with which weights."""
+"""``rasterization(render_normals=True)``: the axis, the frame and the weights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def run(scene, **options):
 
 
 def disc(shortest, quat=(1.0, 0.0, 0.0, 0.0)):
-    """One big disc before the camera, thin along one of its own axes."""
+    """One big disc in front of the camera, thin along one axis."""
     scene = torch_scene(count=1, cameras=1)
     scene["means"] = torch.tensor([[0.0, 0.0, 4.0]])
     scene["scales"] = torch.full((1, 3), 0.8)
@@ -41,7 +41,7 @@ HALF = math.sqrt(0.5)
     ],
 )
 @pytest.mark.parametrize("packed", [False, True])
-def test_the_shortest_axis_facing_the_camera(shortest, quat, expected, packed):
+def test_normals_are_shortest_axes_facing_the_camera(shortest, quat, expected, packed):
     _, alpha, meta = run(disc(shortest, quat), packed=packed)
     normals = meta["render_normals"]
     assert normals.shape == (1, HEIGHT, WIDTH, 3)
@@ -75,7 +75,7 @@ def test_normals_have_the_weights_of_the_colors_and_change_no_picture(render_mod
     assert torch.equal(alpha, plain_alpha)
     assert "render_normals" not in plain_meta
 
-    # The same normals given as colours, made here another way.
+    # The same normals as colors, computed independently.
     w, x, y, z = torch.nn.functional.normalize(scene["quats"].double(), dim=-1).unbind(dim=-1)
     zero = torch.zeros_like(w)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
