@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -52,50 +52,33 @@ class Scores(dict[str, Any]):
     """Mean scores over the views of a split, and the scores of each view.
 
     A dictionary whose items are also typed attributes: ``scores["psnr"]`` is ``scores.psnr``.
+
+    Attributes:
+        psnr: peak signal-to-noise ratio in dB, at most 100; higher is better.
+        ssim: structural similarity, 1 for equal pictures; higher is better.
+        ms_ssim: multi-scale SSIM over the views that are large enough; None if none is.
+        flip: LDR-FLIP error, 0 for equal pictures; lower is better.
+        cc_psnr: PSNR in dB after color correction, which removes exposure and white balance.
+        cc_ssim: SSIM after color correction.
+        protocol: the evaluation protocol: "split", "views", "background" and descriptions.
+        views: of each view: "name", its scores by name, "width", "height" and "masked".
     """
 
-    @property
-    def psnr(self) -> float:
-        """Peak signal-to-noise ratio in dB, at most 100. Higher is better."""
-        return float(self["psnr"])
+    psnr: float
+    ssim: float
+    ms_ssim: float | None
+    flip: float
+    cc_psnr: float
+    cc_ssim: float
+    protocol: dict[str, Any]
+    views: list[dict[str, Any]]
 
-    @property
-    def ssim(self) -> float:
-        """Structural similarity, 1 for equal pictures. Higher is better."""
-        return float(self["ssim"])
+    if not TYPE_CHECKING:
 
-    @property
-    def ms_ssim(self) -> float | None:
-        """Multi-scale SSIM over the views that are large enough for it, or None if none is."""
-        value: float | None = self["ms_ssim"]
-        return value
-
-    @property
-    def flip(self) -> float:
-        """LDR-FLIP error, 0 for equal pictures. Lower is better."""
-        return float(self["flip"])
-
-    @property
-    def cc_psnr(self) -> float:
-        """PSNR in dB after color correction, which removes exposure and white balance."""
-        return float(self["cc_psnr"])
-
-    @property
-    def cc_ssim(self) -> float:
-        """SSIM after color correction."""
-        return float(self["cc_ssim"])
-
-    @property
-    def protocol(self) -> dict[str, Any]:
-        """The evaluation protocol: "split", "views", "background" and descriptions."""
-        protocol: dict[str, Any] = self["protocol"]
-        return protocol
-
-    @property
-    def views(self) -> list[dict[str, Any]]:
-        """Of each view: "name", its scores by name, "width", "height" and "masked"."""
-        views: list[dict[str, Any]] = self["views"]
-        return views
+        def __getattr__(self, name: str) -> Any:
+            if name not in Scores.__annotations__:
+                raise AttributeError(f"Scores has no attribute {name!r}")
+            return self[name]
 
     def __repr__(self) -> str:
         ms_ssim = "-" if self.ms_ssim is None else f"{self.ms_ssim:.4f}"
