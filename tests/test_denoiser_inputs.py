@@ -1,6 +1,4 @@
-"""Inputs of the denoiser: buffers of a render, photos warped to it, channels of the network."""
-
-from __future__ import annotations
+"""Inputs of the denoiser: buffers, photos warped to a render, network channels."""
 
 from dataclasses import replace
 
@@ -13,15 +11,13 @@ from igsr.capture import Camera, View
 from igsr.denoiser import (
     Buffers,
     Source,
-    Warped,
     photo_sources,
     photo_support,
     render_buffers,
-    warp_photos,
     warping,
 )
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
-from igsr.denoiser.warping import MAX_SOURCES
+from igsr.denoiser.warping import MAX_SOURCES, Warped, warp_photos
 from igsr.evaluation.scores import BLACK
 
 
@@ -50,7 +46,7 @@ def test_buffers_of_a_flat_splat():
     empty = np.zeros((32, 32, 3), np.uint8)
     photos = [View(f"{x}.png", camera(x), "train", empty) for x in (0.0, 0.5, 50.0)]
     seen = photo_support(flat, photos, "cpu")
-    assert seen.tolist() == [2.0], "the third photo does not show it"
+    assert seen.tolist() == [2.0], "the third photo looks past it"
     masked = replace(photos[0], mask=np.zeros((32, 32), np.bool_))
     assert photo_support(flat, [masked, *photos[1:]], "cpu").tolist() == [1.0]
     buffers = render_buffers(flat, camera(), seen, (1.0, 1.0, 1.0), "cpu")
@@ -64,11 +60,12 @@ def test_buffers_of_a_flat_splat():
     size = np.exp(np.log([2.0, 2.0, 0.01]).mean()) * 40.0 / 4.0
     assert buffers.footprint[middle] == pytest.approx(np.log2(size), rel=1e-4)
     assert buffers.support[middle] == pytest.approx(2.0, rel=1e-4)
-    arrays = (array for name, array in vars(buffers).items() if name != "camera")
-    assert all(np.isfinite(array).all() for array in arrays)
+    assert all(
+        np.isfinite(array).all() for name, array in vars(buffers).items() if name != "camera"
+    )
 
 
-def test_depth_deviates_where_two_surfaces_are_blended():
+def test_depth_deviation_of_two_blended_surfaces():
     two = splats([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]], [3.0, 3.0, 0.01], opacity=0.5)
     buffers = render_buffers(two, camera(), np.ones(2, np.float32), backend="cpu")
     a, b = 0.5, 0.25
@@ -78,7 +75,7 @@ def test_depth_deviates_where_two_surfaces_are_blended():
     assert buffers.depth_deviation[16, 16] == pytest.approx(deviation / mean, rel=2e-3)
 
 
-def test_buffers_are_zero_where_nothing_is_drawn():
+def test_empty_pixels_are_zero():
     behind = splats([[0.0, 0.0, -9.0], [0.0, 0.0, -4.0]], 0.1)
     buffers = render_buffers(behind, camera(), np.ones(2, np.float32), backend="cpu")
     for name in ("color", "alpha", "depth", "depth_deviation", "normal", "footprint", "support"):
@@ -86,7 +83,7 @@ def test_buffers_are_zero_where_nothing_is_drawn():
     assert np.isfinite(network_inputs(buffers, warped_of(buffers, []))).all()
 
 
-def test_arrays_of_the_wrong_shape_or_type_are_errors():
+def test_buffers_of_other_shapes_are_refused():
     color = np.zeros((4, 5, 3), np.float32)
     with pytest.raises(igsr.IgsrError, match=r"^color must be \[H, W, 3\], not \[4, 5\]$"):
         Buffers(color=color[..., 0])
@@ -94,14 +91,10 @@ def test_arrays_of_the_wrong_shape_or_type_are_errors():
         Buffers(color=color, alpha=np.zeros((5, 4), np.float32))
     with pytest.raises(igsr.IgsrError, match="camera is of a 32x32 picture, color is 5x4"):
         Buffers(color=color, camera=camera())
-    with pytest.raises(igsr.IgsrError, match="color must be of floats"):
-        Buffers(color=np.zeros((8, 8, 3), np.uint8))
-    with pytest.raises(igsr.IgsrError, match=r"background must be \[3\], not \[2\]"):
-        Buffers(color, background=np.zeros(2, np.float32))
 
 
 def plane_photo(at, z=0.0):
-    """Picture and depth of the plane z, painted by a smooth function of x and y."""
+    """A camera's picture of the plane z, painted by a smooth function of x and y."""
     columns, rows = np.meshgrid(np.arange(at.width) + 0.5, np.arange(at.height) + 0.5)
     depth = z + 4.0
     x = (columns - at.K[0, 2]) / at.K[0, 0] * depth + at.centre[0]
@@ -119,7 +112,7 @@ def warped_of(buffers, sources, keep=PHOTOS):
     return warp_photos(buffers.camera, buffers.depth, buffers.alpha, sources, keep)
 
 
-def test_photos_are_warped_to_the_surface_and_the_nearest_direction_is_first():
+def test_photos_are_warped_in_the_order_of_angles():
     truth, depth = plane_photo(camera())
     buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
     warped = warped_of(buffers, [source(0.8), source(-0.3), source(0.5)])
@@ -132,11 +125,11 @@ def test_photos_are_warped_to_the_surface_and_the_nearest_direction_is_first():
     assert not warped.valid[0][:, :1].any() or not warped.valid[1][:, :1].any()
 
 
-def test_hidden_masked_and_missing_pixels_are_not_valid():
+def test_occluded_masked_and_missing_photos_are_not_valid():
     truth, depth = plane_photo(camera())
     buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
     hidden = source(0.1)
-    hidden.depth[:, :16] = 2.0  # something hides the left half
+    hidden.depth[:, :16] = 2.0  # something stands before the left half
     warped = warped_of(buffers, [hidden])
     assert not warped.valid[0][:, :14].any()
     assert warped.valid[0][:, 18:30].all()
@@ -150,7 +143,7 @@ def test_hidden_masked_and_missing_pixels_are_not_valid():
     assert not warped_of(transparent, [source(0.1)]).valid.any(), "there is no surface"
 
 
-def test_of_many_photos_the_nearest_are_warped():
+def test_only_the_nearest_of_many_photos_are_warped():
     truth, depth = plane_photo(camera())
     buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
     near = [source(x) for x in np.linspace(-0.4, 0.4, MAX_SOURCES)]
@@ -166,7 +159,7 @@ def nothing_warped(height, width):
     return Warped(np.zeros((*empty.shape, 3), np.float32), empty > 0, empty + np.float32(np.pi))
 
 
-def test_missing_and_non_finite_inputs_are_zero_in_the_channels():
+def test_missing_and_nonfinite_inputs_are_zero():
     color = np.full((6, 7, 3), np.nan, np.float32)
     color[0, 0] = [0.25, 7.0, -1.0]
     inputs = network_inputs(Buffers(color), nothing_warped(6, 7))
@@ -176,7 +169,7 @@ def test_missing_and_non_finite_inputs_are_zero_in_the_channels():
     assert not inputs[COLOR:].any()
 
 
-def test_a_known_background_is_in_the_channels():
+def test_the_background_is_an_input():
     color = np.full((8, 8, 3), 0.9, np.float32)
     at = COLOR + BUFFERS + PHOTOS * 5
     behind = np.array([0.2, 0.4, 0.6], np.float32)
@@ -184,9 +177,11 @@ def test_a_known_background_is_in_the_channels():
     assert np.allclose(inputs[at : at + 5, 0, 0], [0.2, 0.4, 0.6, 1.0, 0.0])
     assert np.ptp(inputs[at:], axis=(1, 2)).max() == 0.0, "the same everywhere"
     assert not network_inputs(Buffers(color), nothing_warped(8, 8))[at:].any()
+    with pytest.raises(igsr.IgsrError, match=r"background must be \[3\], not \[2\]"):
+        Buffers(color, background=behind[:2])
 
 
-def test_a_render_over_a_background():
+def test_buffers_have_the_background():
     scene, view = scenes.splats(40), scenes.ring_camera(0.0, size=24)
     seen = np.ones(40, np.float32)
     white = render_buffers(scene, view, seen, (1.0, 1.0, 1.0), "cpu")
@@ -197,7 +192,7 @@ def test_a_render_over_a_background():
     assert np.allclose(white.color, none.color + gap, atol=1e-5), "none is drawn over black"
 
 
-def test_the_unit_of_depth_does_not_matter():
+def test_depth_channels_do_not_depend_on_units():
     color, depth = plane_photo(camera())
     depth = depth + np.linspace(0, 1, 32, dtype=np.float32)[:, None]
     alpha = np.ones_like(depth)
@@ -207,7 +202,7 @@ def test_the_unit_of_depth_does_not_matter():
     assert near[COLOR + 1].std() > 0.01
 
 
-def test_large_pictures_are_warped_in_bands_of_rows(monkeypatch):
+def test_warping_in_bands_equals_the_whole(monkeypatch):
     scene = scenes.splats(60)
     photos = scenes.capture(views=6, size=40, scene=scene).views
     sources = photo_sources(scene, photos, BLACK, "cpu")
@@ -231,7 +226,7 @@ def test_no_splats_give_an_empty_picture():
     assert np.isfinite(confidence).all()
 
 
-def test_one_far_pixel_does_not_change_the_depth_of_the_others():
+def test_a_far_pixel_does_not_change_other_depths():
     depth = np.full((8, 8), 2.0, np.float32)
     depth[0, 0] = 1e5
     depth[0, 1] = 0.0
@@ -242,3 +237,8 @@ def test_one_far_pixel_does_not_change_the_depth_of_the_others():
     assert channel[3, 3] == pytest.approx(1.0)
     assert channel[3, 4] == 0.0
     assert channel[0, 1] == 0.0
+
+
+def test_bytes_are_refused_as_color():
+    with pytest.raises(igsr.IgsrError, match="color must be of floats"):
+        Buffers(color=np.zeros((8, 8, 3), np.uint8))
