@@ -172,7 +172,7 @@ def test_few_pairs_of_many_photos_are_matched(monkeypatch: pytest.MonkeyPatch) -
     assert len(pairs.pairs_to_match(pairs.MAX_EXHAUSTIVE_PHOTOS, Path("database"))) == 60 * 59 // 2
     tiles = pairs.in_tiles(chosen)
     assert sorted(pair for tile in tiles for pair in tile) == chosen
-    assert max(len({photo for pair in tile for photo in pair}) for tile in tiles) <= 2 * pairs.TILE
+    assert max(len({photo for pair in tile for photo in pair}) for tile in tiles) <= 2 * pairs.TILE_PHOTOS
 
 
 def test_a_warning_says_how_long_many_photos_take(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,8 +196,8 @@ def test_similar_photos_are_found_by_their_features(photos: list[Photo], tmp_pat
     find_features(both, database, lambda *arguments: None)
     counts = pairs.similarity(pairs.largest_features(4, database))
     assert (counts == counts.T).all()
-    assert min(counts[0, 1], counts[1, 2]) >= 2 * pairs.LEAST_SIMILAR
-    assert counts[:3, 3].max() < pairs.LEAST_SIMILAR
+    assert min(counts[0, 1], counts[1, 2]) >= 2 * pairs.MIN_PRESELECTION_MATCHES
+    assert counts[:3, 3].max() < pairs.MIN_PRESELECTION_MATCHES
 
 
 class Known:

@@ -83,9 +83,7 @@ def test_the_page_shows_new_rounds_without_a_reload(browser, tmp_path):
             wait_for(browser, f"window.igsr.viewer.main?.scene.count === {len(ROUNDS[number])}")
             if number == 0:
                 wait_for(browser, "window.igsr.viewer.camera === 0")
-                browser.mouse("mousePressed", 300, 200, button="left", buttons=1, clickCount=1)
-                browser.mouse("mouseMoved", 360, 220, button="left", buttons=1)
-                browser.mouse("mouseReleased", 360, 220, button="left")
+                browser.drag((300, 200), (360, 220), "left")
                 before = browser.run(WORLD)
             wait_for(browser, f"document.getElementById('scores').rows.length === {number + 2}")
         assert browser.run(WORLD) == pytest.approx(before, abs=1e-6), "the view stays"
@@ -139,9 +137,7 @@ def test_two_rounds_at_a_divider(browser, tmp_path):
     browser.key("ArrowRight", "ArrowRight")
     assert browser.run("window.igsr.viewer.divider") == pytest.approx(0.27)
     x = 0.27 * 640
-    browser.mouse("mousePressed", x, 200, button="left", buttons=1, clickCount=1)
-    browser.mouse("mouseMoved", 480, 200, button="left", buttons=1)
-    browser.mouse("mouseReleased", 480, 200, button="left")
+    browser.drag((x, 200), (480, 200), "left")
     assert browser.run("window.igsr.viewer.divider") == pytest.approx(0.75, abs=0.01)
     after = browser.run("window.igsr.state()")
     assert after["position"] == pytest.approx(before["position"]), "the camera stays"

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+import refinements
+import scenes
 import textured_room as room
 from capture_files import opengl_pose, save, write_json
 from PIL import Image
@@ -25,7 +27,7 @@ from igsr.capture.wide_photos import WideFisheye, field_of_view, whole_sphere
 from igsr.capture.write_colmap import write_colmap
 from igsr.capture.write_transforms import write_transforms
 from igsr.errors import IgsrError
-from igsr.pose.find import estimate
+from igsr.refinement import rounds
 
 WIDTH = 256
 SIDES = ["front", "right", "back", "left", "up", "down"]
@@ -440,9 +442,8 @@ def test_a_lens_beside_photos_makes_them_fisheye(tmp_path: Path, stands: list[np
 def test_networks_refuse_panoramas_by_name(tmp_path: Path, panoramas: list[np.ndarray]) -> None:
     for name in "ab":
         save(tmp_path / f"{name}.png", panoramas[0])
-    photos = load_photos(tmp_path)
-    with pytest.raises(IgsrError, match=r"a\.png is a panorama.*--estimator colmap"):
-        estimate(photos, "dust3r")
+    with pytest.raises(IgsrError, match=r"a\.png is a panorama.*use estimator colmap"):
+        igsr.find_cameras(tmp_path, "dust3r")
 
 
 @pytest.mark.long
@@ -488,29 +489,22 @@ def test_a_joint_fit_moves_whole_panoramas(capture: Path) -> None:
             within = [pose[side] @ np.linalg.inv(pose[0]) for pose in (before, after)]
             np.testing.assert_allclose(within[0], within[1], atol=1e-9)
     assert moved > 1e-4
-    with pytest.raises(IgsrError, match='focal lengths follow from its size; leave focal "fixed"'):
+    with pytest.raises(IgsrError, match='whose focal length is known; leave focal "fixed"'):
         scenes.fit(loaded, steps=2, focal="shared")
 
 
-def test_folds_hold_whole_panoramas_out(capture: Path) -> None:
-    from igsr.refinement.cross_validation import CrossValidation
+def test_folds_hold_whole_panoramas_out(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = load_capture(capture, 32)
+    rigs = {view.rig for view in loaded.views}
+    held_out = []
+    fit_photos = rounds.fit_photos
 
-    views = load_capture(capture, 32).views
+    def watched(context: Any, fold: str, photos: list[Any], *rest: float) -> Any:
+        assert len(photos) == 18
+        held_out.append(rigs - {photo.rig for photo in photos})
+        return fit_photos(context, fold, photos, *rest)
 
-    class Stages:
-        def __init__(self) -> None:
-            self.fitted: list[list[Any]] = []
-
-        def fit(self, name: str, photos: list[Any], share: float, steps: float) -> Any:
-            self.fitted.append(photos)
-            return type("Fitted", (), {"splats": None, "shown": None})()
-
-        def validated(self, splats: Any, held_out: list[Any]) -> list[Any]:
-            return []
-
-    stages = Stages()
-    folds = CrossValidation(stages, views)._fitted()  # type: ignore[arg-type]
-    for fold, kept in zip(folds, stages.fitted, strict=True):
-        assert len(fold.held_out) == 6
-        assert len({view.rig for view in fold.held_out}) == 1
-        assert not {view.rig for view in fold.held_out} & {view.rig for view in kept}
+    monkeypatch.setattr(rounds, "fit_photos", watched)
+    refinements.refine(loaded, 1, refinements.lying, steps=10)
+    assert [len(fold) for fold in held_out] == [1, 1, 1]
+    assert len(set.union(*held_out)) == 3

@@ -104,6 +104,7 @@ def mapping_options(count: int, thresholds: Thresholds, seed: int, database: Pat
 def _report_progress(pipeline: Any, count: int, placed: int, show: Progress) -> None:
     """Report the number of placed photos while a pipeline runs."""
     pycolmap = load_pycolmap()
+
     def on_first_pair() -> None:
         nonlocal placed
         placed = max(placed, 2)
