@@ -68,9 +68,11 @@ def refine_command(
         error_messages(lambda: f"Interrupted; the same command with --resume continues in {out}."),
         warning_messages(),
     ):
-        path = photos_or_example(photos, example, out)
         from igsr.refinement import refine, round_denoiser
 
+        # Before the example is written: it may need torch, or not exist.
+        chosen = chosen_denoiser(denoiser, round_denoiser)
+        path = photos_or_example(photos, example, out)
         with progress_bar(shown=not as_json) as show:
             refined = refine(
                 path,
@@ -80,7 +82,7 @@ def refine_command(
                 quality=quality,
                 exposure=exposure,
                 transients=transients,
-                denoiser=chosen_denoiser(denoiser, round_denoiser),
+                denoiser=chosen,
                 seed=seed,
                 backend=backend,
                 holdout=holdout,
