@@ -14,9 +14,8 @@ from web_views import view_until_ctrl_c
 import igsr
 from igsr.errors import MissingExtraError
 
-#: Modules that need torch, or that only make sense beside one that does.
+#: Packages and modules that may need torch.
 OF_REFINE = (
-    "igsr_lab.bench",
     "igsr.denoiser",
     "igsr.pose.alignment",
     "igsr.pose.all_evidence",
@@ -29,11 +28,9 @@ OF_REFINE = (
     "igsr.rendering.normals",
     "igsr.rendering.rasterization",
     "igsr.rendering.rasterization_arguments",
-    "igsr_lab.study",
-    "igsr_lab.denoiser",
 )
 
-#: Imports every module, and prints those that cannot be imported without torch.
+#: Prints the modules that cannot be imported without torch.
 IMPORT_ALL = """
 import importlib, pkgutil, sys, igsr
 for module in pkgutil.walk_packages(igsr.__path__, "igsr.", onerror=lambda name: None):
@@ -49,7 +46,7 @@ for module in pkgutil.walk_packages(igsr.__path__, "igsr.", onerror=lambda name:
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
-    """The folder of a short fit to the example capture, and what the command printed."""
+    """The folder of a short fit of the example, and the printed report."""
     folder = tmp_path_factory.mktemp("fitted")
     words = ["fit", "--example", "--out", "out", "--steps", "12", "--backend", "cpu", "--json"]
     result = without_torch.igsr(folder, *words)
@@ -86,7 +83,7 @@ def test_a_fit_is_scored_and_reported(fitted):
         (["info", "out/scene.ply"], None),
         (["clean", "out/scene.ply", "--out", "clean.ply"], "clean.ply"),
         (["view", "out", "--screenshot", "window.png", "--backend", "cpu"], "window.png"),
-        (["export", "out/example", "--out", "colmap"], "colmap"),
+        (["convert", "out/example", "colmap"], "colmap"),
     ],
 )
 def test_commands_on_the_scene_work(fitted, words, made):
@@ -157,7 +154,7 @@ def test_splats_as_tensors_name_the_extra(tmp_path):
     )
 
 
-def test_only_the_rooms_of_the_extra_need_torch(tmp_path):
+def test_only_modules_of_the_extra_need_torch(tmp_path):
     result = without_torch.python(tmp_path, "-c", IMPORT_ALL)
     assert result.returncode == 0, result.stderr
     needing = result.stdout.split()
@@ -166,7 +163,7 @@ def test_only_the_rooms_of_the_extra_need_torch(tmp_path):
     assert outside == []
 
 
-def test_a_missing_extra_is_an_import_error_and_one_of_igsr():
+def test_a_missing_extra_is_an_import_error_and_an_error_of_igsr():
     error = MissingExtraError("igsr refine", "torch", "refine")
     assert isinstance(error, igsr.IgsrError)
     assert isinstance(error, ImportError)
