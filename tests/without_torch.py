@@ -10,7 +10,7 @@ from pathlib import Path
 #: Packages of the extra ``refine``, and what comes with them.
 BLOCKED = ("torch", "torchmetrics", "torchvision")
 
-#: Python runs it at its start, in child processes too.
+#: Python imports it when it starts, in child processes too.
 SITE = f"""
 import sys
 
@@ -24,10 +24,11 @@ sys.meta_path.insert(0, Blocked())
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Variables of a process without torch; a file that blocks it goes into the folder."""
+    """Variables of a process without torch; writes a file that blocks it into the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "sitecustomize.py").write_text(SITE)
-    return {**os.environ, "PYTHONPATH": str(folder)}
+    path = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
+    return {**os.environ, "PYTHONPATH": path}
 
 
 def python(folder: Path, *arguments: object, **options) -> subprocess.CompletedProcess[str]:
