@@ -161,6 +161,6 @@ def test_the_browser_view_answers_until_ctrl_c(clean, fitted):
 
 
 def test_refine_names_the_extra(clean):
-    told = clean.run("igsr", "refine", "--example", "--out", "refined", status=1)
-    assert told.stderr.strip() == "igsr refine needs torch: pip install 'igsr[refine]'."
+    result = clean.run("igsr", "refine", "--example", "--out", "refined", status=1)
+    assert result.stderr.strip() == "igsr refine needs torch: pip install 'igsr[refine]'."
     assert not (clean.folder / "refined").exists()
