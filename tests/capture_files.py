@@ -117,8 +117,8 @@ def write_colmap(
         track = pycolmap.Track()
         for image_id in range(2, len(viewmats) + 1):
             track.add_element(image_id, index)
-        colour = np.array([index, 100, 255 - index], dtype=np.uint8)
-        reconstruction.add_point3D(np.array([index, 0.5, -2.0]), track, colour)
+        color = np.array([index, 100, 255 - index], dtype=np.uint8)
+        reconstruction.add_point3D(np.array([index, 0.5, -2.0]), track, color)
     (folder / place).mkdir(parents=True, exist_ok=True)
     (reconstruction.write_text if text else reconstruction.write_binary)(folder / place)
     return reconstruction

@@ -35,7 +35,7 @@ def depths(camera, pixels):
     nearest = np.full(len(rays), np.inf)
     for normal, offset, _, _ in rooms.WALLS:
         with np.errstate(divide="ignore"):
-            distance = (offset - camera.centre @ normal) / (rays @ np.array(normal))
+            distance = (offset - camera.center @ normal) / (rays @ np.array(normal))
         nearest = np.where((distance > 0) & (distance < nearest), distance, nearest)
     return nearest
 
@@ -49,7 +49,7 @@ def turned(camera, degrees, moved, seed):
     rotation *= np.sign(np.diag(rotation))
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation @ camera.viewmat[:3, :3]
-    centre = camera.centre + moved * random.normal(size=3) / np.sqrt(3)
+    centre = camera.center + moved * random.normal(size=3) / np.sqrt(3)
     viewmat[:3, 3] = -viewmat[:3, :3] @ centre
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= 1.05
@@ -159,7 +159,7 @@ def test_a_photo_without_matches_keeps_its_prediction(truth, photos, monkeypatch
     sure, unsure = found.evidence[0], found.evidence[2]
     assert unsure.rotation > 10.0 * sure.rotation
     assert 0.5 < unsure.rotation < 4.0
-    assert 0.02 < unsure.centre / world.scale < 0.4
+    assert 0.02 < unsure.center / world.scale < 0.4
 
 
 def test_photos_that_share_nothing_are_left_alone(truth, photos):
@@ -348,7 +348,7 @@ def test_auto_takes_the_network_whose_weights_are_there(monkeypatch):
     [
         (("hope", 0.1, 0.1), "rests_on is 'hope'"),
         (("network", -1.0, 0.1), "the rotation of pose_evidence is -1.0"),
-        (("network", 0.1, np.inf), "the centre of pose_evidence is inf"),
+        (("network", 0.1, np.inf), "the center of pose_evidence is inf"),
     ],
 )
 def test_evidence_that_is_none(fields, message):

@@ -77,7 +77,7 @@ def test_behind_an_opaque_scene_it_has_the_colors_of_photos_in_its_direction():
     view = igsr.View("wall.png", camera, "train", image)
     forward = camera.viewmat[2, :3]
     wall = igsr.Splats(
-        means=(camera.centre + 2.0 * forward)[None].astype(np.float32),
+        means=(camera.center + 2.0 * forward)[None].astype(np.float32),
         quats=np.float32([[1.0, 0.0, 0.0, 0.0]]),
         scales=np.full((1, 3), 2.0, np.float32),
         opacities=np.float32([9.0]),
@@ -169,7 +169,7 @@ def test_a_smaller_model_keeps_it():
 
 def test_few_splats_and_scenes_without_a_size_have_none(monkeypatch):
     photos, _ = before_sky()
-    still = photos.views[0].camera.centre
+    still = photos.views[0].camera.center
     at_camera = replace(BALL, means=np.tile(still, (len(BALL), 1)).astype(np.float32))
     same_place = [replace(v, camera=photos.views[0].camera) for v in photos.views]
     assert with_backdrop(at_camera, same_place, "cpu") is at_camera

@@ -306,7 +306,7 @@ def test_what_is_hidden_is_not_shown():
 def test_tracks_tell_what_photos_show(town):
     capture, _ = town
     ground = ground_of([view.camera for view in capture.views])
-    places = ground.places(np.stack([view.camera.centre for view in capture.views]))
+    places = ground.places(np.stack([view.camera.center for view in capture.views]))
     cells = split_into_cells(places, 2)
     names = [view.name for view in capture.views]
     shares = tracked_shares(capture.points, names, cells, ground)

@@ -15,8 +15,8 @@ from igsr.capture import load_capture
 from igsr.errors import IgsrError
 
 
-def write_png(path: Path, pixels: np.ndarray, colour_type: int) -> None:
-    """A 16-bit PNG, which Pillow cannot write in colour."""
+def write_png(path: Path, pixels: np.ndarray, color_type: int) -> None:
+    """A 16-bit PNG, which Pillow cannot write in color."""
     height, width = pixels.shape[:2]
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
 
@@ -24,7 +24,7 @@ def write_png(path: Path, pixels: np.ndarray, colour_type: int) -> None:
         checksum = struct.pack(">I", zlib.crc32(kind + data))
         return struct.pack(">I", len(data)) + kind + data + checksum
 
-    header = struct.pack(">IIBBBBB", width, height, 16, colour_type, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 16, color_type, 0, 0, 0)
     path.write_bytes(
         b"\x89PNG\r\n\x1a\n"
         + chunk(b"IHDR", header)
@@ -53,24 +53,24 @@ def test_rgb_and_rgba_come_as_stored(tmp_path: Path) -> None:
         np.testing.assert_array_equal(loaded(tmp_path, Image.fromarray(pixels)), pixels)
 
 
-def test_greys(tmp_path: Path) -> None:
-    grey = photo(1)[..., 0]
-    expected = np.repeat(grey[..., None], 3, axis=2)
-    np.testing.assert_array_equal(loaded(tmp_path, Image.fromarray(grey)), expected)
-    bits = Image.fromarray(grey).convert("1")
+def test_grays(tmp_path: Path) -> None:
+    gray = photo(1)[..., 0]
+    expected = np.repeat(gray[..., None], 3, axis=2)
+    np.testing.assert_array_equal(loaded(tmp_path, Image.fromarray(gray)), expected)
+    bits = Image.fromarray(gray).convert("1")
     np.testing.assert_array_equal(loaded(tmp_path, bits), np.array(bits.convert("RGB")))
 
 
-def test_grey_with_alpha(tmp_path: Path) -> None:
+def test_gray_with_alpha(tmp_path: Path) -> None:
     pixels = photo(1, channels=2)
     out = loaded(tmp_path, Image.fromarray(pixels, mode="LA"))
     np.testing.assert_array_equal(out, pixels[..., [0, 0, 0, 1]])
 
 
 def test_sixteen_bits(tmp_path: Path) -> None:
-    grey = photo(1)[..., 0]
-    expected = np.repeat(grey[..., None], 3, axis=2)
-    wide = Image.fromarray(grey.astype(np.uint16) * 257)
+    gray = photo(1)[..., 0]
+    expected = np.repeat(gray[..., None], 3, axis=2)
+    wide = Image.fromarray(gray.astype(np.uint16) * 257)
     np.testing.assert_array_equal(loaded(tmp_path, wide), expected)
     np.testing.assert_array_equal(loaded(tmp_path, wide, "0.tif"), expected)
     document = write_transforms(tmp_path, 1)

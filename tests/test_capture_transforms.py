@@ -85,7 +85,7 @@ def test_opengl_axes(tmp_path: Path) -> None:
     save(tmp_path / "images/0.png", photo())
     write_json(tmp_path / "transforms.json", document)
     camera = load_capture(tmp_path).views[0].camera
-    np.testing.assert_allclose(camera.centre, [0, 0, 5])
+    np.testing.assert_allclose(camera.center, [0, 0, 5])
     np.testing.assert_allclose(camera.viewmat @ [0.25, 0.5, 1.0, 1.0], [0.25, -0.5, 4.0, 1.0])
 
 

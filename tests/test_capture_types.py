@@ -22,23 +22,23 @@ def changed(matrix: np.ndarray, row: int, column: int, value: float) -> np.ndarr
     return matrix
 
 
-def capture(names: list[str], centres: np.ndarray | None = None) -> Capture:
+def capture(names: list[str], centers: np.ndarray | None = None) -> Capture:
     views = []
     for index, name in enumerate(names):
         viewmat = np.eye(4)
-        if centres is not None:
-            viewmat[:3, 3] = -centres[index]
+        if centers is not None:
+            viewmat[:3, 3] = -centers[index]
         image = np.zeros((2, 3, 3), dtype=np.uint8)
         views.append(View(name, Camera(viewmat, K, 3, 2), "train", image))
     return Capture(Path("capture"), views)
 
 
-def test_camera_keeps_what_it_is_given_and_knows_its_centre() -> None:
+def test_camera_keeps_what_it_is_given_and_knows_its_center() -> None:
     viewmat = random_viewmats(1)[0]
     camera = Camera(viewmat, K, 48, 32)
     np.testing.assert_allclose(camera.viewmat, viewmat, atol=1e-14)
     np.testing.assert_array_equal(camera.K, K)
-    np.testing.assert_allclose(viewmat @ np.append(camera.centre, 1.0), [0, 0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(viewmat @ np.append(camera.center, 1.0), [0, 0, 0, 1], atol=1e-12)
 
 
 def test_rounded_rotation_becomes_exact() -> None:
@@ -134,10 +134,10 @@ def test_holdout_of_one_view_is_refused() -> None:
 
 
 def test_extent_is_that_of_the_training_cameras() -> None:
-    centres = np.array([[0.0, 0, 0], [2.0, 0, 0], [100.0, 0, 0]])
-    whole = capture(["a", "b", "c"], centres)
+    centers = np.array([[0.0, 0, 0], [2.0, 0, 0], [100.0, 0, 0]])
+    whole = capture(["a", "b", "c"], centers)
     whole.views[2].split = "test"
-    np.testing.assert_allclose(whole.scene_centre, [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(whole.scene_center, [1.0, 0.0, 0.0])
     assert whole.scene_extent == pytest.approx(1.1)
 
 
@@ -176,13 +176,13 @@ def test_bad_confidences_are_refused(confidence: object, words: str) -> None:
 def test_tracks_belong_to_names_and_points(
     view: list[int], point: list[int], xy: list[list[float]], words: str
 ) -> None:
-    grey = np.zeros((3, 3), dtype=np.uint8)
+    gray = np.zeros((3, 3), dtype=np.uint8)
     arrays = np.array(view), np.array(point), np.array(xy)
     with pytest.raises(IgsrError, match=words):
-        Points(np.zeros((3, 3)), grey, tracks=Tracks(["a", "b"], *arrays))
+        Points(np.zeros((3, 3)), gray, tracks=Tracks(["a", "b"], *arrays))
 
 
-def test_a_background_is_a_colour_behind_a_picture_without_alpha() -> None:
+def test_a_background_is_a_color_behind_a_picture_without_alpha() -> None:
     view = capture(["a.png"]).views[0]
     assert replace(view, background=(0.0, 0.5, 1.0)).background == (0.0, 0.5, 1.0)
     for background in ((0.0, 0.5), (0.0, 0.5, 1.5), (0.0, np.nan, 1.0)):

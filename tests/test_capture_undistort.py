@@ -26,12 +26,12 @@ def colmap_camera(model: str, scale: int = 1) -> pycolmap.Camera:
 
 def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """A smooth scene at infinity: float64 [..., 3] in 0 .. 255 for the ray (x, y, 1)."""
-    # Steep enough (7 grey levels per pixel) that half a pixel of shift would show.
+    # Steep enough (7 gray levels per pixel) that half a pixel of shift would show.
     waves = [np.sin(20.0 * x + 1.0), np.sin(18.0 * y + 2.0), np.sin(14.0 * (x + y))]
     return 127.5 + 120.0 * np.stack(waves, axis=-1)
 
 
-def pixel_centres(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+def pixel_centers(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     return np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
 
 
@@ -45,7 +45,7 @@ def test_undistorted_photo_shows_what_a_pinhole_would(model: str, tmp_path: Path
     reconstruction.cameras[7].rescale(float(scale))
     reconstruction.write_binary(tmp_path / "sparse/0")
     width, height = camera.width, camera.height
-    u, v = pixel_centres(width, height)
+    u, v = pixel_centers(width, height)
     rays = camera.cam_from_img(np.stack([u.ravel(), v.ravel()], axis=1))
     drawn = pattern(rays[:, 0], rays[:, 1]).reshape(height, width, 3)
     for index in range(3):
@@ -133,7 +133,7 @@ def test_rays_beyond_the_fold_are_masked(lens: Lens) -> None:
     assert not lens.distort(np.array([-5.0, 5.0]), np.zeros(2))[2].all()
 
 
-def test_no_colour_bleeds_from_transparent_pixels() -> None:
+def test_no_color_bleeds_from_transparent_pixels() -> None:
     image = np.zeros((HEIGHT, WIDTH, 4), dtype=np.uint8)
     image[:, : WIDTH // 2] = (200, 100, 50, 255)
     image[:, WIDTH // 2 :] = (0, 255, 0, 0)

@@ -45,7 +45,7 @@ def test_arrays_are_world_units(tmp_path: Path) -> None:
     assert np.array_equal(second, DEPTH)
 
 
-def test_whole_numbers_are_millimetres_unless_the_capture_says_otherwise(tmp_path: Path) -> None:
+def test_whole_numbers_are_millimeters_unless_the_capture_says_otherwise(tmp_path: Path) -> None:
     stored = np.round(DEPTH * 1000.0).astype(np.uint16)
     for name, unit in (("1.png", None), ("1.npy", None), ("1.tif", 0.25)):
         fields = {} if unit is None else {"depth_unit_scale_factor": unit}

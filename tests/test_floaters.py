@@ -43,7 +43,7 @@ def joined(*parts):
 def before(view, distance=1.2):
     """A place before a view's camera, between it and the ball."""
     camera = view.camera
-    return camera.centre + distance * camera.viewmat[2, :3]
+    return camera.center + distance * camera.viewmat[2, :3]
 
 
 def same(one, other):

@@ -35,7 +35,7 @@ def depth_of(camera):
     for normal, offset, _, _ in rooms.WALLS:
         along = rays @ np.array(normal)
         with np.errstate(divide="ignore"):
-            far = (offset - camera.centre @ np.array(normal)) / along
+            far = (offset - camera.center @ np.array(normal)) / along
         depth = np.where((far > 0.0) & (far < depth), far, depth)
     return depth.astype(np.float32)
 

@@ -28,7 +28,7 @@ def test_pixels_are_averages_and_the_camera_sees_the_same():
     assert np.allclose(pixel(half.camera), pixel(view(image).camera) / 2.0)
 
 
-def test_transparent_and_masked_pixels_lend_no_colour():
+def test_transparent_and_masked_pixels_lend_no_color():
     image = np.zeros((4, 4, 4))
     image[0, 0] = (200, 100, 50, 255)
     image[0, 1] = (9, 9, 9, 0)

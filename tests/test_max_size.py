@@ -59,7 +59,7 @@ def test_other_factors_count_parts_of_pixels(size: tuple[int, int]) -> None:
 
 
 def test_a_ramp_stays_the_same_ramp() -> None:
-    # The mean of a linear function over an area is its value at the middle: centres stay centres.
+    # The mean of a linear function over an area is its value at the middle: centers stay centers.
     plane = np.add.outer(3.0 * (np.arange(HEIGHT) + 0.5), 2.0 * (np.arange(WIDTH) + 0.5))
     width, height = 16, 8
     y, x = (np.arange(height) + 0.5) * HEIGHT / height, (np.arange(width) + 0.5) * WIDTH / width
@@ -198,11 +198,11 @@ def test_what_is_no_size(tmp_path: Path, size: object) -> None:
 def reduced_folder(
     capture: Path, factor: int, rounding: int = 0, names: str = "{}.png", value: int | None = None
 ) -> None:
-    """Write ``images_K`` beside a model, with photos of one grey each: K, or as given."""
+    """Write ``images_K`` beside a model, with photos of one gray each: K, or as given."""
     width, height = WIDTH // factor + rounding, HEIGHT // factor + rounding
     for index in range(3):
-        grey = np.full((height, width, 3), factor if value is None else value, dtype=np.uint8)
-        save(capture / f"images_{factor}" / names.format(index), grey)
+        gray = np.full((height, width, 3), factor if value is None else value, dtype=np.uint8)
+        save(capture / f"images_{factor}" / names.format(index), gray)
 
 
 def test_a_model_takes_the_smallest_photos_that_are_large_enough(tmp_path: Path) -> None:
@@ -275,8 +275,8 @@ def test_reduced_photos_of_other_names(tmp_path: Path) -> None:
     assert (load_capture(tmp_path, max_size=24).views[2].image == 2).all()
     # As LLFF numbers them anew.
     for index in range(3):
-        grey = np.full((HEIGHT // 4, WIDTH // 4, 3), 60 + index, dtype=np.uint8)
-        save(tmp_path / f"images_4/image{index:03d}.png", grey)
+        gray = np.full((HEIGHT // 4, WIDTH // 4, 3), 60 + index, dtype=np.uint8)
+        save(tmp_path / f"images_4/image{index:03d}.png", gray)
     views = load_capture(tmp_path, max_size=12).views
     assert [int(view.image[0, 0, 0]) for view in views] == [60, 61, 62]
     (tmp_path / "images_4/image002.png").unlink()

@@ -25,7 +25,7 @@ def turned_away(view, index):
     angle = 2.0 * np.pi * index / 3.0
     c, s = np.cos(angle), np.sin(angle)
     viewmat[:3, :3] = [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]
-    viewmat[:3, 3] = [0.0, 0.0, -1.0]  # its centre lies one unit along its own axis
+    viewmat[:3, 3] = [0.0, 0.0, -1.0]  # its center lies one unit along its own axis
     return replace(view, camera=Camera(viewmat, view.camera.K, 24, 24), name=f"{index}.png")
 
 

@@ -52,7 +52,7 @@ def off(camera, seed, degrees=1.5, moved=0.1):
     turn *= np.sign(np.diag(turn))
     viewmat = np.eye(4)
     viewmat[:3, :3] = turn @ camera.viewmat[:3, :3]
-    centre = camera.centre + moved * random.normal(size=3) / np.sqrt(3.0)
+    centre = camera.center + moved * random.normal(size=3) / np.sqrt(3.0)
     viewmat[:3, 3] = -viewmat[:3, :3] @ centre
     return replace(camera, viewmat=viewmat)
 

@@ -28,7 +28,7 @@ WALL = smooth(HEIGHT, 1200)
 
 
 def pan(places):
-    """Grey frames of a camera that pans along a wall to ``places``, in pixels."""
+    """Gray frames of a camera that pans along a wall to ``places``, in pixels."""
     return [WALL[:, round(x) : round(x) + SIDE] for x in places]
 
 

@@ -122,7 +122,7 @@ def test_a_panorama_becomes_what_pinholes_would_see(
             assert psnr(view, traced(replace(camera, K=K))) < score - 1.0
     for index, view in enumerate(views):
         place = np.linalg.inv(stands[index // 6])[:3, 3]
-        np.testing.assert_allclose(view.camera.centre, place, atol=1e-12)
+        np.testing.assert_allclose(view.camera.center, place, atol=1e-12)
     turns = np.stack([view.camera.viewmat[2, :3] for view in views[:6]])
     np.testing.assert_allclose(
         turns @ turns.T, -np.eye(6)[[2, 3, 0, 1, 5, 4]] + np.eye(6), atol=1e-9
@@ -453,20 +453,20 @@ def test_panoramas_are_placed_as_rigs(tmp_path: Path) -> None:
         save(tmp_path / f"photos/{index}.png", photo)
     found = igsr.estimate_poses(tmp_path / "photos", "colmap")
     assert len(found.views) == 30
-    centres = np.stack([view.camera.centre for view in found.views[::6]])
+    centers = np.stack([view.camera.center for view in found.views[::6]])
     true = np.stack([np.linalg.inv(viewmat)[:3, 3] for viewmat in stands])
-    a, b = centres - centres.mean(axis=0), true - true.mean(axis=0)
+    a, b = centers - centers.mean(axis=0), true - true.mean(axis=0)
     scale = np.linalg.norm(b) / np.linalg.norm(a)
     u, _, vt = np.linalg.svd(b.T @ a)
     turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    assert np.linalg.norm(scale * a @ turn.T - b, axis=1).max() < 0.01  # metres
+    assert np.linalg.norm(scale * a @ turn.T - b, axis=1).max() < 0.01  # meters
     for view in found.views:
         size = view.camera.width
         np.testing.assert_array_equal(
             view.camera.K[:2], [[size / 2, 0, size / 2], [0, size / 2, size / 2]]
         )
     for first, other in zip(found.views[::6], found.views[3::6], strict=True):
-        np.testing.assert_allclose(first.camera.centre, other.camera.centre, atol=1e-9)
+        np.testing.assert_allclose(first.camera.center, other.camera.center, atol=1e-9)
     # They are kept, and come back, as rigs.
     write_colmap(found, tmp_path / "kept")
     again = load_capture(tmp_path / "kept").with_holdout(5)

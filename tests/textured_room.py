@@ -11,7 +11,7 @@ import numpy as np
 
 Rays = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
-#: Lowest and highest corners, in metres.
+#: Lowest and highest corners, in meters.
 ROOM = np.array([[-3.0, -1.5, -2.5], [3.0, 1.2, 2.5]])
 BOXES = np.array(
     [
@@ -23,7 +23,7 @@ BOXES = np.array(
         [[0.2, -1.5, -2.3], [0.7, -0.7, -1.8]],
     ]
 )
-#: Cells of the noise per metre, and how strong each is.
+#: Cells of the noise per meter, and how strong each is.
 _OCTAVES = ((0.8, 0.55), (2.5, 0.3), (8.0, 0.15))
 
 

@@ -76,7 +76,7 @@ def cells_of(manifest: Manifest, count: int) -> tuple[Ground, list[Cell]]:
     """
     cameras = [manifest.shots[index].camera for index in manifest.of_split("train")]
     ground = ground_of(cameras)
-    places = ground.places(np.stack([camera.centre for camera in cameras]))
+    places = ground.places(np.stack([camera.center for camera in cameras]))
     return ground, split_into_cells(places, count)
 
 
@@ -105,7 +105,7 @@ def plan_blocks(
     shares = shown_shares(coarse, cameras, [*cells, *widened], ground, backend)
     names = [shot.name for shot in manifest.shots]
     tracked = tracked_shares(points, names, widened, ground)
-    places = ground.places(np.stack([camera.centre for camera in cameras]))
+    places = ground.places(np.stack([camera.center for camera in cameras]))
     near = np.stack([cell.holds(places) for cell in widened], axis=1)
     photos = photos_of_blocks(shares[:, count:], tracked, near)
     photos[[shot.split != "train" for shot in manifest.shots]] = False

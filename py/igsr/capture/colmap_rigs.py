@@ -1,6 +1,6 @@
 """Rigs of COLMAP models (version 3.12 and later): which images share a frame.
 
-Frames whose images have one centre are views of one wide photo. Other rigs, of cameras that stand
+Frames whose images have one center are views of one wide photo. Other rigs, of cameras that stand
 apart, are read as single photos: their images have poses of their own.
 
 Source of the formats: https://colmap.github.io/format.html.
@@ -22,8 +22,8 @@ Float64 = npt.NDArray[np.float64]
 
 _CAMERA = 0  # of COLMAP's types of sensors
 _COUNT, _FRAME, _DATA = struct.Struct("<Q"), struct.Struct("<II7dI"), struct.Struct("<iIQ")
-#: Centres are one if they are no further apart than this part of what all cameras are.
-_ONE_CENTRE = 1e-6
+#: Centers are one if they are no further apart than this part of what all cameras are.
+_ONE_CENTER = 1e-6
 #: Decimals to which turns within a rig are compared.
 _DECIMALS = 9
 
@@ -78,28 +78,28 @@ def _text_frames(text: str) -> list[list[int]]:
     return frames
 
 
-def shared_centres(
-    frames: Sequence[Sequence[int]], names: dict[int, str], centres: dict[int, Float64]
+def shared_centers(
+    frames: Sequence[Sequence[int]], names: dict[int, str], centers: dict[int, Float64]
 ) -> dict[int, str]:
-    """The rigs of images that share a frame and a centre: the name of the first of them.
+    """The rigs of images that share a frame and a center: the name of the first of them.
 
     Args:
         frames: the images of each frame.
         names: of the images, by number; numbers without a name are passed over.
-        centres: of their cameras.
+        centers: of their cameras.
     """
     rigs: dict[int, str] = {}
-    if not centres:
+    if not centers:
         return rigs
-    everywhere = np.stack(list(centres.values()))
+    everywhere = np.stack(list(centers.values()))
     apart = float(np.linalg.norm(everywhere - everywhere.mean(axis=0), axis=1).max())
     for frame in frames:
         here = [image for image in frame if image in names]
         if len(here) < 2:
             continue
-        place = np.stack([centres[image] for image in here])
+        place = np.stack([centers[image] for image in here])
         rounding = 1e-9 * (1.0 + float(np.abs(place[0]).max()))
-        if np.linalg.norm(place - place[0], axis=1).max() <= _ONE_CENTRE * apart + rounding:
+        if np.linalg.norm(place - place[0], axis=1).max() <= _ONE_CENTER * apart + rounding:
             first = min(names[image] for image in here)
             rigs.update(dict.fromkeys(here, first))
     return rigs

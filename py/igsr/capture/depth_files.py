@@ -15,7 +15,7 @@ from igsr.errors import IgsrError
 
 Numbers = npt.NDArray[Any]
 
-#: World units of a whole number, where the capture does not say: depth cameras write millimetres.
+#: World units of a whole number, where the capture does not say: depth cameras write millimeters.
 UNIT_OF_WHOLE_NUMBERS = 1e-3
 #: Depths beyond these are no measurement; they would leave float32 when they are multiplied.
 LEAST, MOST = 1e-20, 1e20

@@ -2,7 +2,7 @@
 
 A pixel of the smaller photo is the mean of the area that it covers, parts of pixels included. The
 photo covers the same field of view: focal lengths and principal point scale by the two sizes' ratio
-per axis, exactly, since pixel centres are at +0.5.
+per axis, exactly, since pixel centers are at +0.5.
 """
 
 from __future__ import annotations

@@ -29,12 +29,12 @@ Float64 = npt.NDArray[np.float64]
 _ROWS = 256
 #: Rows that detail is told from: the mean of so many around is taken away.
 _AROUND = 17
-#: Detail of the two edges correlates at least so much, and at least this part of what neighbouring
+#: Detail of the two edges correlates at least so much, and at least this part of what neighboring
 #: columns do. Of other pictures it is 0.1 in the root mean square.
-_LEAST_CORRELATION, _PART_OF_NEIGHBOURS = 0.4, 0.5
+_LEAST_CORRELATION, _PART_OF_NEIGHBORS = 0.4, 0.5
 #: Levels of 255 that detail has at least, in the root mean square: less is noise, and says nothing.
 _LEAST_DETAIL = 1.0
-#: The edges differ by no more than so many times what the most different of neighbouring columns do
+#: The edges differ by no more than so many times what the most different of neighboring columns do
 #: (but for one in a hundred), and so many levels.
 _JUMP, _JUMP_LEVELS = 1.5, 3.0
 #: The first or the last row, which is about one direction, varies by less than this part of what
@@ -148,30 +148,30 @@ def edges_join(image: np.ndarray) -> bool:
         image: uint8 [H, W, 3 or 4], twice as wide as high.
     """
     height = min(_ROWS, image.shape[0])
-    grey = plane_area_means(image[..., :3].mean(axis=2), 2 * height, height)
-    detail = grey - _around(grey)
+    gray = plane_area_means(image[..., :3].mean(axis=2), 2 * height, height)
+    detail = gray - _around(gray)
     # Poles are one place each, stretched over the whole width.
     rows = slice(height // 16, height - height // 16)
     columns = detail[rows]
-    neighbours = _correlations(columns[:, :-1], columns[:, 1:])
-    spread = grey.std(axis=1)
+    neighbors = _correlations(columns[:, :-1], columns[:, 1:])
+    spread = gray.std(axis=1)
     if min(spread[0], spread[-1]) > _POLE * float(np.median(spread)):
         return False
     edge = columns[:, :1], columns[:, -1:]
     if min(float(np.sqrt((side**2).mean())) for side in edge) < _LEAST_DETAIL:
         return False
     joined = float(_correlations(*edge)[0])
-    if joined < max(_LEAST_CORRELATION, _PART_OF_NEIGHBOURS * float(np.median(neighbours))):
+    if joined < max(_LEAST_CORRELATION, _PART_OF_NEIGHBORS * float(np.median(neighbors))):
         return False
-    jump = float(np.sqrt(((grey[rows, 0] - grey[rows, -1]) ** 2).mean()))
-    apart = np.sqrt((np.diff(grey[rows], axis=1) ** 2).mean(axis=0))
+    jump = float(np.sqrt(((gray[rows, 0] - gray[rows, -1]) ** 2).mean()))
+    apart = np.sqrt((np.diff(gray[rows], axis=1) ** 2).mean(axis=0))
     return jump <= _JUMP * float(np.quantile(apart, 0.99)) + _JUMP_LEVELS
 
 
-def _around(grey: Float64) -> Float64:
+def _around(gray: Float64) -> Float64:
     """The mean of ``_AROUND`` rows around each pixel."""
     half = _AROUND // 2
-    padded = np.pad(grey, ((half + 1, half), (0, 0)), mode="edge")
+    padded = np.pad(gray, ((half + 1, half), (0, 0)), mode="edge")
     sums = padded.cumsum(axis=0)
     return np.asarray((sums[_AROUND:] - sums[:-_AROUND]) / _AROUND)
 

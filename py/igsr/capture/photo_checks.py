@@ -48,8 +48,8 @@ def check_photos(views: list[View]) -> None:
             "right from that camera alone."
         )
         return
-    centres = np.stack([view.camera.centre for view in views])
-    farthest = float(np.max([rows.max() for _, rows in _distances(centres)]))
+    centers = np.stack([view.camera.center for view in views])
+    farthest = float(np.max([rows.max() for _, rows in _distances(centers)]))
     if not np.isfinite(farthest):
         return  # what such cameras do to a fit is said where its splats are placed
     if farthest == 0.0:
@@ -58,7 +58,7 @@ def check_photos(views: list[View]) -> None:
             "is right from there alone."
         )
         return
-    twice = _given_twice(views, centres, SAME_PLACE * farthest)
+    twice = _given_twice(views, centers, SAME_PLACE * farthest)
     if twice:
         _warn(f"{_listed(twice)} have one and the same camera: a view seen twice tells no more.")
     if not _any_two_share(views, farthest):
@@ -86,17 +86,17 @@ def _is_empty(view: View) -> bool:
     return not pixels[..., :3].any()
 
 
-def _distances(centres: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+def _distances(centers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Distances between places [N, 3], some rows [n, N] at a time, with the first row's number."""
-    for first in range(0, len(centres), ROWS):
+    for first in range(0, len(centers), ROWS):
         with np.errstate(over="ignore", invalid="ignore"):
-            apart = centres[first : first + ROWS, None] - centres[None]
+            apart = centers[first : first + ROWS, None] - centers[None]
             yield first, np.linalg.norm(apart, axis=2)
 
 
-def _given_twice(views: list[View], centres: np.ndarray, apart: float) -> list[str]:
+def _given_twice(views: list[View], centers: np.ndarray, apart: float) -> list[str]:
     """Names of the first two views with the same place, direction and intrinsics."""
-    for first, rows in _distances(centres):
+    for first, rows in _distances(centers):
         for i, j in np.argwhere(np.triu(rows <= apart, 1 + first)):
             a, b = views[first + i].camera, views[j].camera
             turned = np.abs(a.viewmat[:3, :3] - b.viewmat[:3, :3]).max()

@@ -99,7 +99,7 @@ def rig_shots(shot: Shot, rig: Rig) -> list[Shot]:
         rig: its views.
 
     Raises:
-        IgsrError: the photo comes with depth: distances from its centre are not read.
+        IgsrError: the photo comes with depth: distances from its center are not read.
     """
     if shot.depth_path is not None:
         raise IgsrError(
@@ -190,12 +190,12 @@ def load_pixels(image: Image.Image, path: Path) -> None:
 
 
 def _eight_bit(image: Image.Image, path: Path) -> Image.Image:
-    """A 16-bit grey image in 8 bits; any other image as it is."""
+    """A 16-bit gray image in 8 bits; any other image as it is."""
     if image.mode.startswith("I"):
-        grey = np.asarray(image)
-        if grey.min() < 0 or grey.max() > 65535:
+        gray = np.asarray(image)
+        if gray.min() < 0 or gray.max() > 65535:
             raise IgsrError(f"{path} has 32-bit pixels; save it with 8 or 16 bits")
-        return Image.fromarray(np.rint(grey / 257.0).astype(np.uint8))
+        return Image.fromarray(np.rint(gray / 257.0).astype(np.uint8))
     if image.mode == "F":
         raise IgsrError(f"{path} has floating-point pixels; save it with 8 or 16 bits")
     return image
@@ -209,7 +209,7 @@ def decoded(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode an image from ``open_image``, as stored: its EXIF orientation is not applied.
 
-    Palettes, greys, 16 bits, CMYK and the like are converted. A JPEG that is to become much smaller
+    Palettes, grays, 16 bits, CMYK and the like are converted. A JPEG that is to become much smaller
     is decoded at a half, a quarter or an eighth of its size, as long as that is at least twice the
     wanted one, and an area filter does the rest.
 
@@ -282,11 +282,11 @@ def mask_of(image: Image.Image, path: Path) -> np.ndarray:
     """
     image = _eight_bit(image, path)
     try:
-        # convert("L") of transparent images keeps the grey and drops the alpha.
-        grey = np.array(image.convert("L")).astype(np.int32)
+        # convert("L") of transparent images keeps the gray and drops the alpha.
+        gray = np.array(image.convert("L")).astype(np.int32)
     except Exception as error:
         raise IgsrError(f"{path} has pixels of the unsupported kind {image.mode}") from error
-    return 2 * grey > max(int(grey.max()), 1)
+    return 2 * gray > max(int(gray.max()), 1)
 
 
 class _Undistorters:

@@ -21,7 +21,7 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 def read_point_cloud(path: Path) -> Points | None:
     """Read positions, colors and confidences; other properties and elements are ignored.
 
-    Points without colors become grey. Confidences are ignored unless all are positive.
+    Points without colors become gray. Confidences are ignored unless all are positive.
 
     Args:
         path: the ``.ply`` file, ASCII or binary.
@@ -89,11 +89,11 @@ def read_point_cloud(path: Path) -> Points | None:
         raise IgsrError(f"{path} has a point that is not finite; remove it")
     rgb = np.full((count, 3), 128, dtype=np.uint8)
     if {"red", "green", "blue"} <= set(names):
-        colours = np.stack([columns[name] for name in ("red", "green", "blue")], axis=1)
+        colors = np.stack([columns[name] for name in ("red", "green", "blue")], axis=1)
         kinds = dict(properties)
         if order != "ascii" and kinds["red"][1] == "f":
-            colours = colours * 255.0
-        rgb = np.clip(np.nan_to_num(colours), 0, 255).astype(np.uint8)
+            colors = colors * 255.0
+        rgb = np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
     confidence = columns.get("confidence")
     if confidence is not None and not (np.isfinite(confidence) & (confidence > 0.0)).all():
         confidence = None

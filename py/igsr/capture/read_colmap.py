@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from igsr._internal.rotations import rotations_of
-from igsr.capture.colmap_rigs import read_frames, shared_centres
+from igsr.capture.colmap_rigs import read_frames, shared_centers
 from igsr.capture.depth_files import FOLDER, depth_beside
 from igsr.capture.described import DescribedCapture
 from igsr.capture.image_folders import find_images
@@ -226,10 +226,10 @@ def described_colmap(
         for image, one in zip(images, taken, strict=True)
         if one.rig is None
     }
-    shared = shared_centres(
+    shared = shared_centers(
         frames,
         {identity: shot.name for identity, shot in plain.items()},
-        {identity: shot.camera.centre for identity, shot in plain.items()},
+        {identity: shot.camera.center for identity, shot in plain.items()},
     )
     shots = []
     for image, one in zip(images, taken, strict=True):

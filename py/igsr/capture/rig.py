@@ -1,4 +1,4 @@
-"""Rigs: the pinhole views that a wide photo becomes, which share one centre.
+"""Rigs: the pinhole views that a wide photo becomes, which share one center.
 
 The views are the sides of a cube around the camera, of 90 degrees each and as many pixels per
 degree in their middle as the photo has in its own. What the photo does not show is cut off; views

@@ -34,13 +34,13 @@ def blur(image: UInt8, mask: Bool | None = None) -> float:
         mask: bool [H, W] of the pixels that count, or None.
     """
     factor = max(1, round(max(image.shape[:2]) / LONGEST))
-    grey = _reduced(image[..., :3].mean(axis=2), factor)
-    counted = np.ones(grey.shape, dtype=bool) if mask is None else _reduced(mask, factor) > 0.999
+    gray = _reduced(image[..., :3].mean(axis=2), factor)
+    counted = np.ones(gray.shape, dtype=bool) if mask is None else _reduced(mask, factor) > 0.999
     if image.shape[2] == 4:
         counted &= _reduced(image[..., 3], factor) > 254.0
     ratios = []
     for axis in (0, 1):
-        plane = grey if axis == 0 else grey.T
+        plane = gray if axis == 0 else gray.T
         used = counted if axis == 0 else counted.T
         if len(plane) <= _BLUR:
             return 0.0

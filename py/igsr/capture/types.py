@@ -28,7 +28,7 @@ class Camera(ArrayEquality):
     """A pinhole camera in OpenCV axes: x right, y down, z forward.
 
     The point (x, y, z) of the camera frame has the pixel coordinates
-    (fx x / z + cx, fy y / z + cy); pixel (column i, row j) has its centre at (i + 0.5, j + 0.5).
+    (fx x / z + cx, fy y / z + cy); pixel (column i, row j) has its center at (i + 0.5, j + 0.5).
     Cameras with the same fields are equal (``==``) and have the same hash.
 
     Attributes:
@@ -48,7 +48,7 @@ class Camera(ArrayEquality):
     height: int
 
     def __post_init__(self) -> None:
-        """Check and normalise the fields."""
+        """Check and normalize the fields."""
         object.__setattr__(self, "viewmat", nearest_rigid(self.viewmat, "viewmat"))
         object.__setattr__(self, "K", _checked_intrinsics(self.K))
         for name in ("width", "height"):
@@ -64,11 +64,11 @@ class Camera(ArrayEquality):
         fx, fy = self.K[0, 0], self.K[1, 1]
         return (
             f"Camera({self.width}x{self.height}, focal lengths {numbers((fx, fy))}, "
-            f"centre {numbers(self.centre)})"
+            f"center {numbers(self.center)})"
         )
 
     @property
-    def centre(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         """float64 [3]: the camera's position in the world frame, in world units."""
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
@@ -81,7 +81,7 @@ class PoseEvidence:
         rests_on: "features" (places that photos share), "network" (what a network predicts) or
             "both".
         rotation: standard deviation about each axis, degrees.
-        centre: standard deviation along each axis, world units.
+        center: standard deviation along each axis, world units.
 
     Raises:
         IgsrError: it rests on something else, or a deviation is negative or not finite.
@@ -89,13 +89,13 @@ class PoseEvidence:
 
     rests_on: str
     rotation: float
-    centre: float
+    center: float
 
     def __post_init__(self) -> None:
         """Check the fields."""
         if self.rests_on not in ("features", "network", "both"):
             raise IgsrError(f"rests_on is {self.rests_on!r}; give 'features', 'network' or 'both'")
-        for name in ("rotation", "centre"):
+        for name in ("rotation", "center"):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise IgsrError(
                     f"the {name} of pose_evidence is {getattr(self, name)!r}; give a finite number "
@@ -132,13 +132,13 @@ class View(ArrayEquality, NotebookPicture):
         depth_confidence: float32 [H, W], how far each depth may be trusted, in [0, 1]; None: all as
             far as any.
         rig: the name that views of one wide photo (a panorama, a fisheye photo of more than 120
-            degrees) share: they have one centre, move together and are held out together. None for
+            degrees) share: they have one center, move together and are held out together. None for
             other photos.
         pose_evidence: what the camera rests on, where igsr found it; or None.
 
     Raises:
         IgsrError: the image, mask or weights have another dtype or shape than the camera's size
-            asks for, a weight is negative or not finite, or the background is not a colour or is
+            asks for, a weight is negative or not finite, or the background is not a color or is
             given for an image with alpha.
     """
 
@@ -228,7 +228,7 @@ class Tracks(ArrayEquality):
         names: names of the photos, as ``View.name``.
         view: int64 [M], index into ``names``.
         point: int64 [M], index of the point.
-        xy: float64 [M, 2], pixel coordinates in the undistorted photo (pixel centres at +0.5).
+        xy: float64 [M, 2], pixel coordinates in the undistorted photo (pixel centers at +0.5).
 
     Raises:
         IgsrError: shapes differ, an index is out of range, or a coordinate is not finite.
@@ -390,24 +390,24 @@ class Capture(ArrayEquality, NotebookPicture):
         ]
         return Capture(self.path, views, self.points)
 
-    def _centres(self) -> np.ndarray:
+    def _centers(self) -> np.ndarray:
         views = self.train_views or self.views
-        return np.stack([view.camera.centre for view in views])
+        return np.stack([view.camera.center for view in views])
 
     @property
-    def scene_centre(self) -> np.ndarray:
-        """float64 [3]: the mean of the training cameras' centres, in world units."""
-        return np.asarray(self._centres().mean(axis=0))
+    def scene_center(self) -> np.ndarray:
+        """float64 [3]: the mean of the training cameras' centers, in world units."""
+        return np.asarray(self._centers().mean(axis=0))
 
     @property
     def scene_extent(self) -> float:
-        """1.1 times the largest distance of a training camera from ``scene_centre``, world units.
+        """1.1 times the largest distance of a training camera from ``scene_center``, world units.
 
         3DGS scales its learning rates and thresholds by this length (Kerbl et al. 2023). It is 1
         if all cameras are at the same place: 0 would freeze every fit.
         """
-        centres = self._centres()
-        extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+        centers = self._centers()
+        extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
         return extent if extent > 0.0 else 1.0
 
 

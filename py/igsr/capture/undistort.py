@@ -160,7 +160,7 @@ class Undistorter:
         width, height: the photo's size, pixels; kept.
 
     Attributes:
-        valid: bool [H, W], True where the pinhole pixel's centre lies within the photo.
+        valid: bool [H, W], True where the pinhole pixel's center lies within the photo.
 
     Raises:
         IgsrError: no pixel is valid.
@@ -172,7 +172,7 @@ class Undistorter:
         self._shape = (height, width)
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
         self.valid = np.empty((height, width), dtype=bool)
-        # Nearest upper-left photo pixel and the position between it and its neighbours.
+        # Nearest upper-left photo pixel and the position between it and its neighbors.
         self._index = np.empty((height, width), dtype=np.int64)
         self._right = np.empty((height, width), dtype=np.float32)
         self._down = np.empty((height, width), dtype=np.float32)
@@ -182,7 +182,7 @@ class Undistorter:
             xd, yd, valid = lens.distort(*np.meshgrid(x, y))
             u, v = fx * xd + cx, fy * yd + cy
             # The photo covers [0, width] x [0, height]; in its outer half pixels, sampling
-            # clamps to the outermost centres. NaN compares False.
+            # clamps to the outermost centers. NaN compares False.
             valid &= (u >= 0.0) & (u <= width) & (v >= 0.0) & (v <= height)
             self.valid[band] = valid
             column = np.clip(np.where(valid, u, 0.5) - 0.5, 0.0, width - 1)

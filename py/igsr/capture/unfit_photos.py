@@ -65,9 +65,9 @@ def is_screenshot(photo: Photo) -> bool:
     """Whether a photo has the bars and lines of text of a screen; see the module."""
     if photo.device is not None or photo.place is not None:
         return False
-    grey = photo.image[..., :3].astype(np.int16)
-    common = np.median(grey, axis=1, keepdims=True)
-    flat = (np.abs(grey - common) <= _LEVELS).all(axis=2).mean(axis=1)
+    gray = photo.image[..., :3].astype(np.int16)
+    common = np.median(gray, axis=1, keepdims=True)
+    flat = (np.abs(gray - common) <= _LEVELS).all(axis=2).mean(axis=1)
     states = np.where(flat >= _FLAT, 1, np.where(flat < _BUSY, -1, 0))
     states = states[states != 0]
     return bool((np.diff(states) == 2).sum() >= _CHANGES)
@@ -116,14 +116,14 @@ def _detail(photo: Photo, longest: int) -> Float64 | None:
     """The reduced photo without what varies slowly, of length 1; None where nothing is left."""
     height, width = photo.image.shape[:2]
     size = reduced_size(width, height, longest)
-    grey = plane_area_means(photo.image[..., :3].mean(axis=2), *size)
-    down, right = (-(-length // _SQUARE) for length in grey.shape)
+    gray = plane_area_means(photo.image[..., :3].mean(axis=2), *size)
+    down, right = (-(-length // _SQUARE) for length in gray.shape)
     padded = np.pad(
-        grey, ((0, down * _SQUARE - len(grey)), (0, right * _SQUARE - grey.shape[1])), mode="edge"
+        gray, ((0, down * _SQUARE - len(gray)), (0, right * _SQUARE - gray.shape[1])), mode="edge"
     )
     means = padded.reshape(down, _SQUARE, right, _SQUARE).mean(axis=(1, 3))
     detail = padded - np.repeat(np.repeat(means, _SQUARE, axis=0), _SQUARE, axis=1)
-    detail = detail[: len(grey), : grey.shape[1]]
+    detail = detail[: len(gray), : gray.shape[1]]
     length = float(np.linalg.norm(detail))
     # Less than a level of detail is noise, and no evidence.
     return detail / length if length > np.sqrt(detail.size) else None

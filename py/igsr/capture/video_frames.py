@@ -53,7 +53,7 @@ def sharpest_frames(path: Path, most: int) -> list[tuple[int, UInt8]]:
         if not places:
             _refuse_hdr(path, frame)
             size = _reduced(frame, SIDE, BLOCK)
-        places.append(camera_path.add(_grey(frame, size)))
+        places.append(camera_path.add(_gray(frame, size)))
         sharpness.append(_sharpness(frame))
     if not places:
         raise IgsrError(f"{path} has no frame that can be read; copy it again")
@@ -151,16 +151,16 @@ def _reduced(frame: Any, longest: int, shortest: int) -> tuple[int, int]:
     )
 
 
-def _grey(frame: Any, size: tuple[int, int]) -> UInt8:
-    """The frame in grey, at a width and height in pixels."""
-    grey: UInt8 = frame.reformat(width=size[0], height=size[1], format="gray").to_ndarray()
-    return grey
+def _gray(frame: Any, size: tuple[int, int]) -> UInt8:
+    """The frame in gray, at a width and height in pixels."""
+    gray: UInt8 = frame.reformat(width=size[0], height=size[1], format="gray").to_ndarray()
+    return gray
 
 
 def _sharpness(frame: Any) -> float:
-    grey = _grey(frame, _reduced(frame, _JUDGED, 3)).astype(np.int32)
-    inner = grey[1:-1, 1:-1]
-    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
+    gray = _gray(frame, _reduced(frame, _JUDGED, 3)).astype(np.int32)
+    inner = gray[1:-1, 1:-1]
+    laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner
     return float(laplacian.var())
 
 

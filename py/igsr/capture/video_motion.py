@@ -8,7 +8,7 @@ import numpy.typing as npt
 UInt8 = npt.NDArray[np.uint8]
 Complex = npt.NDArray[np.complex128]
 
-#: Longer side in pixels of the grey frames that are compared, and side and spacing of the blocks
+#: Longer side in pixels of the gray frames that are compared, and side and spacing of the blocks
 #: that motion is measured in.
 SIDE, BLOCK, SPACING = 240, 64, 32
 #: One step of the path: content moves by this part of the picture's longer side, in the mean over
@@ -35,34 +35,34 @@ class CameraPath:
         self._key: list[Complex | None] = []
         self._at_key = self._at = 0.0
 
-    def add(self, grey: UInt8) -> float:
+    def add(self, gray: UInt8) -> float:
         """Go on to the next frame.
 
         Args:
-            grey: uint8 [H, W], of the same size as all others, at least 64 pixels each way.
+            gray: uint8 [H, W], of the same size as all others, at least 64 pixels each way.
 
         Returns:
             Length of the path up to it, in steps; it never falls.
         """
-        blocks = _spectra(grey)
+        blocks = _spectra(gray)
         if not self._key:
             self._key = blocks
             return 0.0
-        moved = _motion(self._key, blocks) / (STEP * max(grey.shape))
+        moved = _motion(self._key, blocks) / (STEP * max(gray.shape))
         self._at = max(self._at, self._at_key + moved)
         if moved >= BACK:
             self._key, self._at_key = blocks, self._at
         return self._at
 
 
-def _spectra(grey: UInt8) -> list[Complex | None]:
+def _spectra(gray: UInt8) -> list[Complex | None]:
     """The Fourier transform of each block under a Hann window; None where it has no contrast."""
     window = np.outer(np.hanning(BLOCK), np.hanning(BLOCK))
-    height, width = grey.shape
+    height, width = gray.shape
     result: list[Complex | None] = []
     for top in _places(height):
         for left in _places(width):
-            block = grey[top : top + BLOCK, left : left + BLOCK].astype(np.float64)
+            block = gray[top : top + BLOCK, left : left + BLOCK].astype(np.float64)
             shows = block.std() >= CONTRAST
             spectrum: Complex = np.fft.rfft2((block - block.mean()) * window)
             result.append(spectrum if shows else None)

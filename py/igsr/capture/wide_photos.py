@@ -65,7 +65,7 @@ class Equirectangular:
             directions: [..., 3], of any length.
 
         Returns:
-            u, v: [...], pixels (centres at +0.5).
+            u, v: [...], pixels (centers at +0.5).
             valid: whether that is within the photo.
         """
         x, y, z = np.moveaxis(directions, -1, 0)

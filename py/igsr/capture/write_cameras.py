@@ -18,7 +18,7 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
     ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes; ``rig``, which
     views of one wide photo share; ``exposure`` where a fit has found it: ``gain`` and ``offset`` of
     R, G and B (see ``Exposure``); ``pose_evidence`` where the camera was found: what it
-    ``rests_on``, and the standard deviations of ``rotation`` (degrees) and ``centre`` (world units;
+    ``rests_on``, and the standard deviations of ``rotation`` (degrees) and ``center`` (world units;
     see ``PoseEvidence``).
 
     Raises:

@@ -66,7 +66,7 @@ def _camera_fields(camera: Camera) -> dict[str, Any]:
     K = camera.K
     pose = np.eye(4)
     pose[:3, :3] = camera.viewmat[:3, :3].T
-    pose[:3, 3] = camera.centre
+    pose[:3, 3] = camera.center
     # From x right, y down, z forward to x right, y up, z back.
     pose[:3, 1:3] *= -1.0
     return {

@@ -92,7 +92,7 @@ def _capture_info(path: Path, max_size: int | None) -> dict[str, Any]:
         "views_with_alpha": sum(view.image.shape[2] == 4 for view in capture.views),
         "views_with_mask": sum(view.mask is not None for view in capture.views),
         "points": points,
-        "scene_centre": [_known(x) for x in capture.scene_centre],
+        "scene_center": [_known(x) for x in capture.scene_center],
         "scene_extent": _known(capture.scene_extent),
     }
 

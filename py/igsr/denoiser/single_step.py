@@ -81,8 +81,8 @@ class SingleStepDenoiser:
         """The photo that is taken from nearest, and in the most alike direction."""
         if render.camera is None or not photos:
             return None
-        forward, centre = render.camera.viewmat[2, :3], render.camera.centre
-        apart = [float(np.linalg.norm(photo.camera.centre - centre)) for photo in photos]
+        forward, centre = render.camera.viewmat[2, :3], render.camera.center
+        apart = [float(np.linalg.norm(photo.camera.center - centre)) for photo in photos]
         reach = max(apart) or 1.0
         turned = [1.0 - float(photo.camera.viewmat[2, :3] @ forward) for photo in photos]
         nearest = int(np.argmin([a / reach + t for a, t in zip(apart, turned, strict=True)]))

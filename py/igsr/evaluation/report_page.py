@@ -145,7 +145,7 @@ def drawn_cameras(
         kinds: cameras of each kind, drawn in this order.
         size_of: the cameras that place and size are taken from; at least one.
     """
-    centres = np.stack([camera.centre for camera in size_of])
+    centres = np.stack([camera.center for camera in size_of])
     middle = centres.mean(axis=0)
     size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-9)
     return [
@@ -169,5 +169,5 @@ def _frustum(camera: Camera, depth: float) -> npt.NDArray[np.float64]:
     K, w, h = camera.K, camera.width, camera.height
     corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
     rays = np.concatenate([(corners - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((4, 1))], axis=1)
-    world: npt.NDArray[np.float64] = depth * rays @ camera.viewmat[:3, :3] + camera.centre
-    return np.concatenate([camera.centre[None], world])
+    world: npt.NDArray[np.float64] = depth * rays @ camera.viewmat[:3, :3] + camera.center
+    return np.concatenate([camera.center[None], world])

@@ -68,7 +68,7 @@ def _compared(views: list[View]) -> tuple[Bool, Bool]:
     count = len(views)
     agree, contradict = (np.zeros((count, count), dtype=np.bool_) for _ in range(2))
     points = [_some_points(view) for view in views]
-    centres = np.array([view.camera.centre for view in views])
+    centres = np.array([view.camera.center for view in views])
     for i in range(count):
         order = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")
         for j in (int(k) for k in order[: COMPARED + 1] if k != i):

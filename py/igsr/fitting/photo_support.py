@@ -77,7 +77,7 @@ def support_of(views: Sequence[View], depths: np.ndarray | None = None) -> Photo
 
     from igsr.geometry.focus_point import focus_point
 
-    centres = np.stack([view.camera.centre for view in views])
+    centres = np.stack([view.camera.center for view in views])
     forward = np.stack([view.camera.viewmat[2, :3] for view in views])
     K = np.stack([view.camera.K for view in views])
     sizes = np.array([(view.camera.width, view.camera.height) for view in views])

@@ -80,10 +80,10 @@ def pose_priors(
     information = priors.information.copy()
     for k, view in enumerate(views):
         known = view.pose_evidence
-        if known is None or information[k].any() or not min(known.rotation, known.centre) > 0.0:
+        if known is None or information[k].any() or not min(known.rotation, known.center) > 0.0:
             continue
         # Not ``LEFT_OPEN`` of it: a prediction is wrong by all of it, and colors may mend it.
-        deviations = np.repeat([np.radians(known.rotation), known.centre], 3)
+        deviations = np.repeat([np.radians(known.rotation), known.center], 3)
         information[k] = np.diag(1.0 / deviations**2)
     return PosePriors(views, information, priors.focal_information)
 

@@ -44,7 +44,7 @@ def noise_unit(views: Sequence[View]) -> float:
     for view in views:
         axis = view.camera.viewmat[2, :3]
         across.append(np.eye(3) - np.outer(axis, axis))
-    centres = np.stack([view.camera.centre for view in views])
+    centres = np.stack([view.camera.center for view in views])
     pulled = np.einsum("nij,nj->i", np.stack(across), centres - centres[0])
     target = centres[0] + np.linalg.lstsq(np.sum(across, axis=0), pulled, rcond=1e-6)[0]
     distance = float(np.mean(np.linalg.norm(centres - target, axis=1)))

@@ -46,7 +46,7 @@ def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
         K = _default_lens(columns, rows)
     else:
         cameras = [view.camera for view in capture.views]
-        centres = np.stack([camera.centre for camera in cameras])
+        centres = np.stack([camera.center for camera in cameras])
         target = focus_point(cameras)
         up = _unit(-np.mean([camera.viewmat[1, :3] for camera in cameras], axis=0))
         offsets = centres - target

@@ -21,7 +21,7 @@ def focus_point(cameras: list[Camera]) -> Float64:
     Returns:
         float64 [3], world frame.
     """
-    centres = np.stack([camera.centre for camera in cameras])
+    centres = np.stack([camera.center for camera in cameras])
     axes = np.stack([camera.viewmat[2, :3] for camera in cameras])
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or 1.0
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

@@ -90,8 +90,8 @@ def _absolute(
     ]
     found, true = (list(side) for side in zip(*pairs, strict=True))
     to_true = similarity_between(found, true)
-    centres = np.stack([camera.centre for camera in true])
-    aligned = np.stack([to_true.camera(camera).centre for camera in found])
+    centres = np.stack([camera.center for camera in true])
+    aligned = np.stack([to_true.camera(camera).center for camera in found])
     error = float(np.sqrt(((aligned - centres) ** 2).sum(axis=1).mean()))
     size = float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean()))
     return {
@@ -134,7 +134,7 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> di
     for camera, true_camera in zip(cameras, true_cameras, strict=True):
         aligned = to_cameras.camera(true_camera)
         angles.append(rotation_angle(camera.viewmat[:3, :3] @ aligned.viewmat[:3, :3].T))
-        distances.append(np.linalg.norm(camera.centre - aligned.centre) / to_cameras.scale)
+        distances.append(np.linalg.norm(camera.center - aligned.center) / to_cameras.scale)
     return {"rotation": float(np.mean(angles)), "centre": float(np.mean(distances))}
 
 

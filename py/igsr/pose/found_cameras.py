@@ -22,7 +22,7 @@ from igsr.errors import IgsrError
 from igsr.pose.estimate import Estimate
 
 #: Of the file; a newer program may write another.
-FORMAT = 1
+FORMAT = 2
 _ABOUT = "about"
 
 
@@ -255,7 +255,7 @@ def _weights(value: Any) -> dict[str, str] | None:
 def _evidence(fields: Any) -> PoseEvidence | None:
     if fields is None:
         return None
-    return PoseEvidence(fields["rests_on"], float(fields["rotation"]), float(fields["centre"]))
+    return PoseEvidence(fields["rests_on"], float(fields["rotation"]), float(fields["center"]))
 
 
 def _camera(arrays: dict[str, np.ndarray], index: int, size: Any) -> Camera | None:

@@ -29,7 +29,7 @@ def plot_poses(path: str | os.PathLike[str], capture: Capture) -> None:
     """
     from matplotlib.figure import Figure
 
-    centres = np.stack([view.camera.centre for view in capture.views])
+    centres = np.stack([view.camera.center for view in capture.views])
     turn = _upright([view.camera.viewmat[:3, :3] for view in capture.views])
     middle = centres.mean(axis=0)
     spread = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())

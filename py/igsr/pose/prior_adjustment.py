@@ -152,7 +152,7 @@ def spread_of(predicted: Sequence[Camera], right: Sequence[Camera]) -> tuple[flo
         np.radians(rotation_angle(a.viewmat[:3, :3] @ b.viewmat[:3, :3].T))
         for a, b in zip(predicted, right, strict=True)
     ]
-    moves = [np.linalg.norm(a.centre - b.centre) for a, b in zip(predicted, right, strict=True)]
+    moves = [np.linalg.norm(a.center - b.center) for a, b in zip(predicted, right, strict=True)]
     return float(np.median(turns)) / np.sqrt(3.0), float(np.median(moves)) / np.sqrt(3.0)
 
 
@@ -265,7 +265,7 @@ class _Problem:
     def _off(self, one: Camera, wanted: Camera) -> Float64:
         """How far a camera is from the predicted one [6], in standard deviations."""
         turn = _rotation_vector(one.viewmat[:3, :3] @ wanted.viewmat[:3, :3].T)
-        move = one.centre - wanted.centre
+        move = one.center - wanted.center
         return np.concatenate([turn / self.spread.rotation, move / self.spread.centre])
 
     def _errors(self, bundle: Bundle) -> tuple[Float64, Float64, Float64]:

@@ -75,13 +75,13 @@ def novel_views(
         for camera, distance in zip(known, distances, strict=True)
         if distance is not None
     ]
-    centres = np.array([camera.centre for camera, _ in looking]).reshape(-1, 3)
+    centres = np.array([camera.center for camera, _ in looking]).reshape(-1, 3)
     targets = np.array([_target(*one) for one in looking]).reshape(-1, 3)
     found: list[tuple[NovelView, float]] = []
     for k, (camera, distance) in enumerate(looking):
         others = [one for i, (one, _) in enumerate(looking) if i != k]
         for candidate, reach, between in _neighbourhood(camera, distance, others):
-            angle = float(_angles(targets, centres, candidate.centre).min())
+            angle = float(_angles(targets, centres, candidate.center).min())
             if angle >= LEAST_STEP * STEP:
                 found.append((NovelView(candidate, angle, between), reach))
     chosen: list[NovelView] = []
@@ -109,10 +109,10 @@ def _add_farthest(
         splats: the scene, which no view may stand inside of.
         backend: what renders.
     """
-    new = np.array([view.camera.centre for view in chosen]).reshape(-1, 3)
+    new = np.array([view.camera.center for view in chosen]).reshape(-1, 3)
     around = np.concatenate([centres, new])
     apart = np.array(
-        [_angles(_target(v.camera, d), v.camera.centre, around).min() for v, d in group]
+        [_angles(_target(v.camera, d), v.camera.center, around).min() for v, d in group]
     )
     while len(chosen) < count and len(apart) and apart.max() >= LEAST_STEP * STEP:
         best = int(np.argmax(apart))
@@ -123,7 +123,7 @@ def _add_farthest(
         chosen.append(view)
         for i, (other, its_reach) in enumerate(group):
             target = _target(other.camera, its_reach)
-            away = _angles(target, other.camera.centre, view.camera.centre)
+            away = _angles(target, other.camera.center, view.camera.center)
             apart[i] = min(apart[i], float(away))
 
 
@@ -144,7 +144,7 @@ def _neighbourhood(
 
 def _target(camera: Camera, distance: float) -> Float64:
     """The point [3], world, on a camera's axis at a distance."""
-    return np.asarray(camera.centre + distance * camera.viewmat[2, :3])
+    return np.asarray(camera.center + distance * camera.viewmat[2, :3])
 
 
 def _leaning(camera: Camera, distance: float, right: float, down: float) -> Camera:
@@ -161,7 +161,7 @@ def _leaning(camera: Camera, distance: float, right: float, down: float) -> Came
 def _towards(camera: Camera, other: Camera, distance: float, part: float) -> tuple[Camera, float]:
     """A camera on the arc between two, about what the first looks at, and its distance to that."""
     target = _target(camera, distance)
-    there = other.centre - target
+    there = other.center - target
     far = float(np.linalg.norm(there))
     start, end = -camera.viewmat[2, :3], there / far
     angle = np.arccos(np.clip(start @ end, -1.0, 1.0))
@@ -187,7 +187,7 @@ def _looking(camera: Camera, centre: Float64, target: Float64, down: Float64) ->
 
 def _angle(camera: Camera, other: Camera, distance: float) -> float:
     """Degrees between where two cameras stand, seen from what the first looks at."""
-    return float(_angles(_target(camera, distance), camera.centre, other.centre))
+    return float(_angles(_target(camera, distance), camera.center, other.center))
 
 
 def _angles(target: Float64, centre: Float64, others: Float64) -> Float64:

@@ -86,7 +86,7 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
         return splats
     evenly = np.linspace(0, len(photos) - 1, min(len(photos), MOST_ASKED)).round()
     asked = [photos[int(i)] for i in evenly]
-    cameras = np.array([photo.camera.centre for photo in photos])
+    cameras = np.array([photo.camera.center for photo in photos])
     middle = cameras.mean(axis=0)
     apart = np.linalg.norm(splats.means[splats.finite] + splats.origin - middle, axis=1)
     if not len(apart) or not 0.0 < apart.max() < np.inf:

@@ -116,7 +116,7 @@ class NoisyNetwork:
         turn = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
         viewmat = np.eye(4)
         viewmat[:3, :3] = turn @ camera.viewmat[:3, :3]
-        centre = camera.centre + noise.centre * middle * way / np.linalg.norm(way)
+        centre = camera.center + noise.center * middle * way / np.linalg.norm(way)
         viewmat[:3, 3] = -viewmat[:3, :3] @ centre
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= np.exp(noise.focal * random.normal())

@@ -113,7 +113,7 @@ def photo(boxes: np.ndarray, camera: Camera, sharp: int = 2) -> np.ndarray:
     K = camera.K
     x, y = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.viewmat[:3, :3]
-    origins = np.broadcast_to(camera.centre, rays.shape)
+    origins = np.broadcast_to(camera.center, rays.shape)
     distance, hit = seen(boxes, origins, rays)
     places = origins + np.where(hit >= -1, distance, 0.0)[:, None] * rays
     fine = colors(boxes, places, hit).reshape(height, sharp, width, sharp, 3)
@@ -177,8 +177,8 @@ def points_of(boxes: np.ndarray, views: list[View], each: int, paint=colors) -> 
         pixel = pixel[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]
         inside = ahead & (pixel > 0.0).all(axis=1) & (pixel < [camera.width, camera.height]).all(1)
         those = np.flatnonzero(inside)
-        rays = xyz[those] - camera.centre
-        origins = np.broadcast_to(camera.centre, rays.shape)
+        rays = xyz[those] - camera.center
+        origins = np.broadcast_to(camera.center, rays.shape)
         distance, _ = seen(boxes, origins, rays)
         those = those[distance > 0.999]
         view.append(np.full(len(those), index))

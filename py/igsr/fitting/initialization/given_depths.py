@@ -65,7 +65,7 @@ def given_points(
 
 
 def _nearest(k: int, views: list[View]) -> list[View]:
-    centres = np.stack([view.camera.centre for view in views])
+    centres = np.stack([view.camera.center for view in views])
     order = np.argsort(np.linalg.norm(centres - centres[k], axis=1), kind="stable")
     return [views[int(i)] for i in order if i != k][:COMPARED]
 

@@ -117,7 +117,7 @@ def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap
     small = [_reduced(view) for view in views]
     target = looked_at(views, known)
     angles = _angles(views, target)
-    centres = np.stack([view.camera.centre for view in views])
+    centres = np.stack([view.camera.center for view in views])
     sweeps: list[tuple[int, list[int], tuple[float, float], int]] = []
     for k in np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_SWEPT)).round()):
         k, view = int(k), small[int(k)]
@@ -157,7 +157,7 @@ def swept_points(
     """
     maps = depth_maps(views, known)
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    centres = np.stack([one.view.camera.centre for one in maps]) if maps else np.zeros((0, 3))
+    centres = np.stack([one.view.camera.center for one in maps]) if maps else np.zeros((0, 3))
     for k, one in enumerate(maps):
         world = one.points()
         near = np.argsort(np.linalg.norm(centres - centres[k], axis=1), kind="stable")
@@ -186,7 +186,7 @@ def _grey(view: View, usable: Bool) -> Float32:
 
 def _angles(views: list[View], target: Float64) -> Float64:
     """Degrees [V, V] between the directions that photos see the target from."""
-    rays = np.stack([view.camera.centre - target for view in views])
+    rays = np.stack([view.camera.center - target for view in views])
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
     rays = rays / np.maximum(lengths, np.finfo(np.float64).tiny)
     angles: Float64 = np.degrees(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
@@ -207,7 +207,7 @@ def _depth_range(view: View, target: Float64, known: Float64 | None) -> tuple[fl
         if inside.sum() >= POINTS_SEEN:
             low, high = np.percentile(depth[inside], [1.0, 99.0])
             return POINTS_NEAREST * float(low), POINTS_FARTHEST * float(high)
-    reach = max(float(np.linalg.norm(target - view.camera.centre)), 1e-9)
+    reach = max(float(np.linalg.norm(target - view.camera.center)), 1e-9)
     return NEAREST * reach, FARTHEST * reach
 
 

@@ -38,7 +38,7 @@ def ray_points(
     target = focus_point([view.camera for view in views])
     depths = np.geomspace(NEAREST_DEPTH, FARTHEST_DEPTH, RAY_DEPTHS)
     compared = [_softened(view) for view in views]
-    centres = np.stack([view.camera.centre for view in views])
+    centres = np.stack([view.camera.center for view in views])
     per_view = np.bincount(random.integers(len(views), size=count), minlength=len(views))
     points, colors = [], []
     for v, (view, rays) in enumerate(zip(views, per_view, strict=True)):
@@ -56,7 +56,7 @@ def ray_points(
             ],
             axis=1,
         )
-        reach = float(np.linalg.norm(target - camera.centre))
+        reach = float(np.linalg.norm(target - camera.center))
         # Jitter each ray's depths, or all points would lie on a few shells.
         jitter = np.exp(random.uniform(-0.5, 0.5, size=rays) * np.log(depths[1] / depths[0]))
         z = reach * depths[None, :] * jitter[:, None]

@@ -134,7 +134,7 @@ def _sift(grey: npt.NDArray[np.uint8]) -> tuple[Float32, Float32]:
 
 def _pairs(views: list[View]) -> list[tuple[int, int]]:
     """The pairs of photos to match, each photo with those taken nearest to it."""
-    centres = np.stack([view.camera.centre for view in views])
+    centres = np.stack([view.camera.center for view in views])
     pairs = set()
     for v in range(len(views)):
         near = np.argsort(np.linalg.norm(centres - centres[v], axis=1), kind="stable")
@@ -202,7 +202,7 @@ def _triangulated(
         return np.zeros((0, 3)), np.zeros((0, 3))
     K = np.stack([view.camera.K for view in views])[view_of]
     viewmat = np.stack([view.camera.viewmat for view in views])[view_of]
-    centre = np.stack([view.camera.centre for view in views])[view_of]
+    centre = np.stack([view.camera.center for view in views])[view_of]
     local = np.ones((len(pixels), 3))
     local[:, :2] = (pixels - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]
     ray = np.einsum("nij,ni->nj", viewmat[:, :3, :3], local)

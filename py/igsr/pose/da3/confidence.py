@@ -35,7 +35,7 @@ def trusted_depths(photos: Sequence[AlignedPhoto | None]) -> list[Bool | None]:
     known = [i for i, photo in enumerate(photos) if photo is not None]
     needed = 2 if len(known) >= MANY else 1
     trusted: list[Bool | None] = [None] * len(photos)
-    centres = {i: photo.camera.centre for i in known if (photo := photos[i]) is not None}
+    centres = {i: photo.camera.center for i in known if (photo := photos[i]) is not None}
     for i in known:
         photo = photos[i]
         assert photo is not None

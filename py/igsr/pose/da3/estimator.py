@@ -196,7 +196,7 @@ class Da3:
             )
         placed = [one for one in aligned if one is not None]
         if len(placed) > 1:
-            centres = np.stack([one.camera.centre for one in placed])
+            centres = np.stack([one.camera.center for one in placed])
             spread = float(np.linalg.norm(centres - centres[0], axis=1).max())
             if spread <= ONE_PLACE * float(np.median([np.nanmedian(one.depth) for one in placed])):
                 found.append(
@@ -255,7 +255,7 @@ class Da3:
 
 
 def _check_apart(cameras: Sequence[Camera] | None) -> None:
-    centres = np.array([camera.centre for camera in cameras or ()])
+    centres = np.array([camera.center for camera in cameras or ()])
     # Rounding of the coordinates alone: they may be of a map, millions of metres from its origin.
     if len(centres) and np.ptp(centres, axis=0).max() <= 1e-9 * np.abs(centres).max():
         raise IgsrError(
