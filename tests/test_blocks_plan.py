@@ -27,7 +27,8 @@ from igsr.blocks.task_making import coarse_task
 from igsr.blocks.tasks import BlockPart
 from igsr.blocks.worker import depths_of_points, depths_of_scene
 from igsr.capture import Camera, View
-from igsr.capture.photos import PhotoHeader, Shot
+from igsr.capture.image_files import PhotoHeader
+from igsr.capture.photos import Shot
 from igsr.capture.types import intrinsic_matrix
 from igsr.capture.undistort import Lens
 from igsr.fitting.photo_support import support_of

@@ -129,7 +129,7 @@ def test_bad_holdout_is_named(every: object) -> None:
 
 
 def test_holdout_of_one_view_is_refused() -> None:
-    with pytest.raises(IgsrError, match="one view only"):
+    with pytest.raises(IgsrError, match="one photo only"):
         capture(["a"]).with_holdout(8)
 
 
@@ -169,8 +169,8 @@ def test_bad_confidences_are_refused(confidence: object, words: str) -> None:
         ([0], [0], [[1.0, np.inf]], "two finite numbers"),
         ([2], [0], [[1.0, 2.0]], "index without a name"),
         ([-1], [0], [[1.0, 2.0]], "index without a name"),
-        ([0], [3], [[1.0, 2.0]], "none of the points"),
-        ([0], [-1], [[1.0, 2.0]], "none of the points"),
+        ([0], [3], [[1.0, 2.0]], "index without a point"),
+        ([0], [-1], [[1.0, 2.0]], "index without a point"),
     ],
 )
 def test_tracks_belong_to_names_and_points(

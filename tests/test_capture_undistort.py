@@ -10,7 +10,8 @@ import pytest
 from capture_files import HEIGHT, MODEL_PARAMS, WIDTH, photo, save, write_colmap
 
 from igsr.capture import load_capture
-from igsr.capture import read_colmap as colmap
+from igsr.capture.colmap_files import read_cameras
+from igsr.capture.read_colmap import intrinsics
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
 
@@ -80,8 +81,7 @@ def test_lens_agrees_with_colmap_to_rounding(model: str, tmp_path: Path) -> None
 
 
 def loaded_lens(folder: Path) -> tuple[Lens, np.ndarray]:
-    cameras = colmap._binary_cameras(folder / "sparse/0/cameras.bin")
-    K, lens = colmap._intrinsics(cameras[7])
+    K, lens = intrinsics(read_cameras(folder / "sparse/0/cameras.bin")[7])
     return lens, K
 
 

@@ -15,9 +15,8 @@ from PIL import Image
 
 from igsr._internal.atomic_write import atomic_folder
 from igsr.capture import Camera, Capture, Points, View, load_capture
-from igsr.capture.colmap_rigs import quaternion
 from igsr.capture.types import Tracks, intrinsic_matrix
-from igsr.capture.write_colmap import write_colmap
+from igsr.capture.write_colmap import quaternion, write_colmap
 from igsr.capture.write_transforms import write_transforms
 from igsr.errors import IgsrError
 

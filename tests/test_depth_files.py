@@ -13,9 +13,8 @@ from PIL import Image
 import igsr
 from igsr import _core
 from igsr.capture import load_capture
-from igsr.capture.depth_files import depth_beside
+from igsr.capture.depth_files import find_depth
 from igsr.capture.downscaling import halved, reduced_view, resampled_plane
-from igsr.capture.memory_check import needed_memory
 from igsr.capture.write_colmap import write_colmap as write_as_colmap
 from igsr.capture.write_transforms import write_transforms as write_as_transforms
 from igsr.errors import IgsrError
@@ -128,7 +127,7 @@ def test_depths_beside_a_colmap_model(tmp_path: Path) -> None:
     assert np.array_equal(first, DEPTH)
     assert second is None
     assert np.array_equal(third, np.full((HEIGHT, WIDTH), 1.5, np.float32))
-    assert depth_beside(tmp_path / "depths", "../transforms") is None
+    assert find_depth(tmp_path / "depths", "../transforms") is None
 
 
 @pytest.mark.parametrize("write", [write_as_colmap, write_as_transforms])
@@ -142,15 +141,6 @@ def test_depths_are_written_and_read_back(tmp_path: Path, write) -> None:
     assert third is None
     assert np.array_equal(second[:, 1::2], DEPTH[:, 1::2])
     assert (second[:, ::2] == 0.0).all()
-
-
-def test_depths_count_in_memory() -> None:
-    sizes = [(1000, 750)] * 100
-    for splats in (None, 1_000_000):
-        # Four bytes a pixel as loaded; in a fit these, and z and confidence twice.
-        extra = 100 * 1000 * 750 * (4 if splats is None else 20)
-        with_depths = needed_memory(sizes, None, splats, depths=True)
-        assert with_depths - needed_memory(sizes, None, splats) == extra
 
 
 def bad_files() -> dict[str, tuple[str, object, str]]:

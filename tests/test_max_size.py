@@ -313,7 +313,7 @@ def test_a_fit_takes_odd_photos_among_good_ones() -> None:
         reduced_view(replace(first, name="wide.png"), 23, 24),
         replace(capture.views[1], name="black.png", image=np.zeros_like(first.image)),
     ]
-    with pytest.warns(UserWarning, match=r"black\.png: black or wholly transparent"):
+    with pytest.warns(UserWarning, match=r"black\.png: black or fully transparent"):
         splats = igsr.fit(
             replace(capture, views=capture.views + odd),
             steps=10,

@@ -44,13 +44,13 @@ def test_one_photo_works_and_says_what_it_cannot(views):
 
 def test_all_poses_equal(views):
     same = [replace(view, camera=views[0].camera) for view in views]
-    with pytest.warns(UserWarning, match="All cameras stand at one place"):
+    with pytest.warns(UserWarning, match="All cameras are at one place"):
         check_photos(same)
 
 
 def test_a_camera_given_twice(views):
     twice = [*views, replace(views[2], name="again.png")]
-    with pytest.warns(UserWarning, match=r"02\.png, again\.png have one and the same camera"):
+    with pytest.warns(UserWarning, match=r"02\.png, again\.png have the same camera"):
         check_photos(twice)
     other = [*views, replace(views[2], camera=replace_focal(views[2].camera), name="zoomed.png")]
     with warnings.catch_warnings():
@@ -78,11 +78,11 @@ def test_black_and_transparent_photos(views):
     black = [replace(view, image=np.zeros_like(view.image)) for view in views]
     with pytest.raises(igsr.IgsrError, match="Every photo is black"):
         check_photos(black)
-    with pytest.warns(UserWarning, match="black or wholly transparent; leave out"):
+    with pytest.warns(UserWarning, match="black or fully transparent; leave"):
         check_photos([black[0], *views[1:]])
     clear = np.full((24, 24, 4), 255, np.uint8)
     clear[..., 3] = 0
-    with pytest.raises(igsr.IgsrError, match="wholly transparent"):
+    with pytest.raises(igsr.IgsrError, match="fully transparent"):
         check_photos([replace(view, image=clear) for view in views])
     dark = np.zeros((24, 24, 4), np.uint8)
     dark[..., 3] = 255

@@ -181,7 +181,7 @@ def test_blurred_photos_are_reported_and_not_held_out(photos: list[Photo]) -> No
     assert [view.name for view in split.test_views] == ["1.jpg", "4.jpg"]
     usual = Capture(Path("photos"), views_of(sharp)).with_holdout(4)
     assert [view.name for view in usual.test_views] == ["0.jpg", "4.jpg"]
-    with pytest.warns(UserWarning, match=r"0\.jpg, 3\.jpg: blurred; leave out"):
+    with pytest.warns(UserWarning, match=r"0\.jpg, 3\.jpg: blurred; leave"):
         check_photos(views)
     # Where all are alike, none stands out, and one is held out.
     soft = views_of([blurred(photo, photo.name) for photo in sharp])

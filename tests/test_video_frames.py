@@ -8,8 +8,14 @@ import pytest
 
 from igsr.capture import video_frames
 from igsr.capture.photo_folder import load_photos
-from igsr.capture.video_frames import FEWEST, evenly_sharp, sharpest_frames
-from igsr.capture.video_motion import SIDE, STEP, CameraPath
+from igsr.capture.video_frames import (
+    MIN_FRAMES,
+    MOTION_SIDE_PX,
+    STEP_PART,
+    CameraPath,
+    evenly_sharp,
+    sharpest_frames,
+)
 from igsr.errors import IgsrError
 
 HEIGHT = 136
@@ -29,7 +35,7 @@ WALL = smooth(HEIGHT, 1200)
 
 def pan(places):
     """Gray frames of a camera that pans along a wall to ``places``, in pixels."""
-    return [WALL[:, round(x) : round(x) + SIDE] for x in places]
+    return [WALL[:, round(x) : round(x) + MOTION_SIDE_PX] for x in places]
 
 
 def path_of(frames):
@@ -46,7 +52,7 @@ def test_a_pan_is_as_long_however_fast_it_goes(frames):
     found = path_of(pan(places))
     assert found[0] == 0.0
     assert (np.diff(found) >= 0.0).all()
-    assert found[-1] == pytest.approx(360 / (STEP * SIDE), rel=0.05)
+    assert found[-1] == pytest.approx(360 / (STEP_PART * MOTION_SIDE_PX), rel=0.05)
 
 
 def test_a_stop_adds_nothing_also_under_noise():
@@ -58,9 +64,13 @@ def test_a_stop_adds_nothing_also_under_noise():
 
 
 def test_a_cut_is_a_step_and_blank_frames_are_none():
-    frames = [*pan([0, 0]), smooth(HEIGHT, SIDE, seed=1), smooth(HEIGHT, SIDE, seed=1)]
+    frames = [
+        *pan([0, 0]),
+        smooth(HEIGHT, MOTION_SIDE_PX, seed=1),
+        smooth(HEIGHT, MOTION_SIDE_PX, seed=1),
+    ]
     assert path_of(frames).tolist() == [0.0, 0.0, 1.0, 1.0]
-    blank = np.full((HEIGHT, SIDE), 200, np.uint8)
+    blank = np.full((HEIGHT, MOTION_SIDE_PX), 200, np.uint8)
     assert path_of([blank] * 3).tolist() == [0.0, 0.0, 0.0]
     assert path_of([blank, *pan([0, 0]), blank]).tolist() == [0.0, 1.0, 1.0, 2.0]
 
@@ -71,17 +81,17 @@ def test_a_cut_is_a_step_and_blank_frames_are_none():
 def test_frames_are_spread_over_the_path_not_over_time():
     parts = np.linspace(0, 10, 20), np.full(200, 10.0), np.linspace(10, 30, 90)
     stop_and_go = np.concatenate(parts)
-    chosen = evenly_sharp(stop_and_go, np.ones(310), most=100)
+    chosen = evenly_sharp(stop_and_go, np.ones(310), max_frames=100)
     assert len(chosen) == 30
     assert np.abs(np.diff(stop_and_go[chosen]) - 1.0).max() < 0.6
-    assert len(evenly_sharp(stop_and_go, np.ones(310), most=7)) == 7
+    assert len(evenly_sharp(stop_and_go, np.ones(310), max_frames=7)) == 7
 
 
 def test_the_sharpest_frame_of_the_middle_of_a_span_is_taken():
     places = np.linspace(0.0, 20.0, 400, endpoint=False)
     sharpness = np.ones(400)
     sharpness[[29, 45, 79]] = 2.0  # the middle of span 1 and of span 2; the edge of span 3
-    chosen = evenly_sharp(places, sharpness, most=100)
+    chosen = evenly_sharp(places, sharpness, max_frames=100)
     assert len(chosen) == 20
     assert {29, 45} <= set(chosen)
     assert 79 not in chosen
@@ -89,14 +99,14 @@ def test_the_sharpest_frame_of_the_middle_of_a_span_is_taken():
 
 @pytest.mark.parametrize("count", [1, 5, 12, 300])
 def test_a_still_video_is_divided_by_time(count):
-    chosen = evenly_sharp(np.zeros(count), np.ones(count), most=100)
-    assert len(chosen) == min(count, FEWEST)
+    chosen = evenly_sharp(np.zeros(count), np.ones(count), max_frames=100)
+    assert len(chosen) == min(count, MIN_FRAMES)
     if count == 300:
         assert np.ptp(np.diff(chosen)) <= 1
 
 
 def test_a_jump_leaves_spans_without_a_frame_empty():
-    chosen = evenly_sharp(np.array([0.0, 1.0, 2.0, 30.0, 31.0]), np.ones(5), most=100)
+    chosen = evenly_sharp(np.array([0.0, 1.0, 2.0, 30.0, 31.0]), np.ones(5), max_frames=100)
     assert chosen == sorted(set(chosen))
     assert {0, 1, 2} & set(chosen)
     assert {3, 4} & set(chosen)
@@ -120,7 +130,7 @@ def test_photos_of_a_stop_and_go_video(tmp_path):
     places = np.concatenate([np.linspace(0, 150, 30), np.full(80, 150), np.linspace(150, 300, 60)])
     write(tmp_path / "walk.mp4", pan(places))
     chosen = [index for index, _ in sharpest_frames(tmp_path / "walk.mp4", 100)]
-    assert len(chosen) == pytest.approx(300 / (STEP * SIDE), abs=2)
+    assert len(chosen) == pytest.approx(300 / (STEP_PART * MOTION_SIDE_PX), abs=2)
     assert sum(32 < index < 108 for index in chosen) <= 1
     names = [photo.name for photo in load_photos(tmp_path)]
     assert names == [f"walk.mp4/{index:06d}.png" for index in chosen]

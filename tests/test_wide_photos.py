@@ -16,7 +16,7 @@ from PIL.PngImagePlugin import PngInfo
 
 import igsr
 from igsr.capture import Capture, load_capture
-from igsr.capture.find_panoramas import edges_join, panorama_of, told_by_xmp
+from igsr.capture.find_panoramas import edges_join, panorama_of, panorama_of_xmp
 from igsr.capture.overview import look_at
 from igsr.capture.photo_folder import load_photos
 from igsr.capture.rig import moved_to_side, rig_of
@@ -137,7 +137,7 @@ def test_whole_panoramas_are_held_out(capture: Path) -> None:
     assert (len(seen.sizes), seen.train_photos(3)) == (24, 12)
     assert seen.decoded == [(WIDTH, WIDTH // 2)] * 24
     one = Capture(loaded.path, loaded.views[:6])
-    with pytest.raises(IgsrError, match="one view only"):
+    with pytest.raises(IgsrError, match="one photo only"):
         one.with_holdout(2)
 
 
@@ -321,7 +321,7 @@ def xmp(**fields: object) -> str:
 
 def test_xmp_tells_a_panorama() -> None:
     sphere = {"ProjectionType": "equirectangular"}
-    whole = told_by_xmp(xmp(**sphere), 400, 200)
+    whole = panorama_of_xmp(xmp(**sphere), 400, 200)
     assert whole == whole_sphere(400, 200)
     part = {
         "FullPanoWidthPixels": 4000,
@@ -332,20 +332,20 @@ def test_xmp_tells_a_panorama() -> None:
         "CroppedAreaTopPixels": 400,
     }
     # The photo has been reduced to a tenth.
-    cropped = told_by_xmp(xmp(**sphere, **part), 300, 100)
+    cropped = panorama_of_xmp(xmp(**sphere, **part), 300, 100)
     assert cropped is not None
     assert (cropped.full_width, cropped.full_height) == (400, 200)
     assert (cropped.left, cropped.top) == (50, 40)
     u, v, valid = cropped.places(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.1]]))
     np.testing.assert_allclose([u[0], v[0]], [150.0, 60.0])
     assert valid.tolist() == [True, False, False]
-    assert told_by_xmp("", 400, 200) is None
-    assert told_by_xmp(xmp(ProjectionType="cylindrical"), 400, 200) is None
+    assert panorama_of_xmp("", 400, 200) is None
+    assert panorama_of_xmp(xmp(ProjectionType="cylindrical"), 400, 200) is None
     # Fields that cannot be true, and a photo cut from the panorama since.
     for lie in ({"FullPanoWidthPixels": "1e99"}, {"CroppedAreaTopPixels": 1500}):
-        assert told_by_xmp(xmp(**sphere, **(part | lie)), 300, 100) is None
-        assert told_by_xmp(xmp(**sphere, **(part | lie)), 400, 200) == whole
-    assert told_by_xmp(xmp(**sphere, **part), 150, 100) is None
+        assert panorama_of_xmp(xmp(**sphere, **(part | lie)), 300, 100) is None
+        assert panorama_of_xmp(xmp(**sphere, **(part | lie)), 400, 200) == whole
+    assert panorama_of_xmp(xmp(**sphere, **part), 150, 100) is None
 
 
 def test_edges_that_join(panoramas: list[np.ndarray], stands: list[np.ndarray]) -> None:

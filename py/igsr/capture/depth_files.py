@@ -1,4 +1,4 @@
-"""Files of depth: what a sensor or another program measured for each pixel of a photo."""
+"""Read and write depth files: a sensor's or program's depth of each pixel of a photo."""
 
 from __future__ import annotations
 
@@ -8,87 +8,80 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from igsr import _core
+from igsr.capture.image_files import load_pixels, open_image
 from igsr.errors import IgsrError
 
 Numbers = npt.NDArray[Any]
 
-#: World units of a whole number, where the capture does not say: depth cameras write millimeters.
+#: Default world units of a whole number: depth cameras write millimeters.
 UNIT_OF_WHOLE_NUMBERS = 1e-3
-#: Depths beyond these are no measurement; they would leave float32 when they are multiplied.
-LEAST, MOST = 1e-20, 1e20
-
-
-#: Folder of depths beside cameras that do not name their files, and what these end in.
+#: Depths outside these limits count as unknown; products with them would overflow float32.
+MIN_DEPTH = 1e-20
+MAX_DEPTH = 1e20
+#: Folder of depths, for cameras that do not name their depth files.
 FOLDER = "depths"
-SUFFIXES = (".npy", ".exr", ".png", ".tif", ".tiff")
+_SUFFIXES = (".npy", ".exr", ".png", ".tif", ".tiff")
 
 
-def depth_beside(folder: Path, name: str) -> Path | None:
-    """The file of depth of the photo ``name`` in a folder of such files, or None.
+def find_depth(folder: Path, name: str) -> Path | None:
+    """Return the depth file of the photo ``name`` in a folder, or None.
 
-    It has the photo's whole name, or the name without what it ends in, and ends in one of
-    ``SUFFIXES``.
+    It has the photo's whole name, or its name without suffix, and a suffix of a depth file.
     """
     stems = (name, posixpath.splitext(name)[0])
-    files = (folder / f"{stem}{end}" for stem in stems for end in SUFFIXES)
+    files = (folder / f"{stem}{suffix}" for stem in stems for suffix in _SUFFIXES)
     return next((file for file in files if file.is_file()), None)
 
 
 def write_depth(path: Path, depth: Numbers) -> None:
-    """Write depth [h, w] in world units as float32 ``.npy``; a missing folder is made."""
+    """Write depth [h, w] in world units as float32 ``.npy``; a missing folder is created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, depth.astype(np.float32), allow_pickle=False)
 
 
-def holds_array(path: Path) -> bool:
-    """Whether a file of depth is an array (``.npy``, OpenEXR), and no picture that Pillow reads."""
-    return path.suffix.lower() in (".npy", ".exr")
+def read_depth(path: Path, unit: float | None) -> npt.NDArray[np.float32]:
+    """Read a depth file.
 
+    Args:
+        path: an ``.npy``, an OpenEXR (channel Z, or else its only one), a 16-bit picture or a
+            32-bit float TIFF. 0, negative and non-finite numbers mean that the depth is unknown.
+        unit: world units of one number in the file; None is 0.001 for whole numbers and 1 for
+            floats.
 
-def depth_array(path: Path) -> Numbers:
-    """The numbers [h, w] of an ``.npy`` or OpenEXR file (channel Z, else its only one).
+    Returns:
+        Camera-space z [h, w] in world units, 0 for unknown depths.
 
     Raises:
         IgsrError: the file cannot be read, or holds something else.
     """
-    if path.suffix.lower() == ".npy":
-        return _npy(path)
-    try:
-        return _core.read_exr_depth(str(path))
-    except (OSError, ValueError) as error:
-        raise IgsrError(f"{path} cannot be read as depth: {error}") from error
-
-
-def depth_of(image: Image.Image, path: Path) -> Numbers:
-    """The numbers [h, w] of a 16-bit picture or a 32-bit float TIFF, whose pixels are loaded.
-
-    Raises:
-        IgsrError: it is an 8-bit picture.
-    """
-    if image.mode not in ("I", "I;16", "I;16B", "F"):
-        raise IgsrError(
-            f"{path} is an 8-bit picture, which cannot hold depth; give a 16-bit PNG, .npy or EXR"
-        )
-    return np.asarray(image).astype(np.float32 if image.mode == "F" else np.int64)
-
-
-def in_world_units(stored: Numbers, unit: float | None) -> npt.NDArray[np.float32]:
-    """Camera-space z [h, w] in world units, 0 where it is not known.
-
-    Args:
-        stored: [h, w], the file's numbers; 0, negative ones and those that are not finite say that
-            the depth is not known.
-        unit: world units of one of them; None is 0.001 for whole numbers and 1 for floats.
-    """
+    suffix = path.suffix.lower()
+    stored = _npy(path) if suffix == ".npy" else _exr(path) if suffix == ".exr" else _picture(path)
     if unit is None:
         unit = UNIT_OF_WHOLE_NUMBERS if np.issubdtype(stored.dtype, np.integer) else 1.0
     with np.errstate(over="ignore", invalid="ignore"):
         depth = stored.astype(np.float64) * unit
-    known = np.isfinite(depth) & (depth > LEAST) & (depth < MOST)
-    return np.where(known, depth, 0.0).astype(np.float32)
+    is_known = np.isfinite(depth) & (depth > MIN_DEPTH) & (depth < MAX_DEPTH)
+    return np.where(is_known, depth, 0.0).astype(np.float32)
+
+
+def _picture(path: Path) -> Numbers:
+    with open_image(path) as image:
+        load_pixels(image, path)
+        if image.mode not in ("I", "I;16", "I;16B", "F"):
+            raise IgsrError(
+                f"{path} is an 8-bit picture, which cannot hold depth; give a 16-bit PNG, .npy or "
+                "EXR"
+            )
+        return np.asarray(image).astype(np.float32 if image.mode == "F" else np.int64)
+
+
+def _exr(path: Path) -> Numbers:
+    try:
+        return _core.read_exr_depth(str(path))
+    except (OSError, ValueError) as error:
+        raise IgsrError(f"{path} cannot be read as depth: {error}") from error
 
 
 def _npy(path: Path) -> Numbers:

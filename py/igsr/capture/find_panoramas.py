@@ -1,12 +1,12 @@
 """Recognize panoramas of 360 degrees among photos.
 
-A photo is one if its XMP says so (Google's GPano, which cameras and stitchers write), or if it is
-just twice as wide as it is high and its left edge goes on at its right one. Whether edges go on is
-asked of their detail, since a sky over a lawn, or a plain ground, looks alike at both edges of any
-picture. And one pole at least must look like one place.
+A photo is a panorama if its XMP declares it (Google's GPano, which cameras and stitchers write), or
+if it is exactly twice as wide as high, its left edge continues the right one, and at least one pole
+looks like a single point. The edges are compared by their detail: a sky over a lawn, or a plain
+ground, looks alike at both edges of any picture.
 
 Source: https://developers.google.com/streetview/spherical-metadata. XMP is untrusted: it is
-searched for a few fields, never parsed as XML, and numbers that cannot be true count as missing.
+searched for a few fields, never parsed as XML, and impossible numbers count as missing.
 """
 
 from __future__ import annotations
@@ -19,116 +19,123 @@ import numpy.typing as npt
 from PIL import Image
 
 from igsr.capture.downscaling import plane_area_means
-from igsr.capture.photos import decoded, open_image
+from igsr.capture.image_files import decoded, open_image
+from igsr.capture.sharpness import row_means
 from igsr.capture.wide_photos import Equirectangular
 from igsr.errors import IgsrError
 
 Float64 = npt.NDArray[np.float64]
 
-#: Rows of the reduced photo that edges are compared in.
+#: Height of the reduced photo whose edges are compared.
 _ROWS = 256
-#: Rows that detail is told from: the mean of so many around is taken away.
-_AROUND = 17
-#: Detail of the two edges correlates at least so much, and at least this part of what neighboring
-#: columns do. Of other pictures it is 0.1 in the root mean square.
-_LEAST_CORRELATION, _PART_OF_NEIGHBORS = 0.4, 0.5
-#: Levels of 255 that detail has at least, in the root mean square: less is noise, and says nothing.
-_LEAST_DETAIL = 1.0
-#: The edges differ by no more than so many times what the most different of neighboring columns do
-#: (but for one in a hundred), and so many levels.
-_JUMP, _JUMP_LEVELS = 1.5, 3.0
-#: The first or the last row, which is about one direction, varies by less than this part of what
-#: rows do in the median.
-_POLE = 0.5
-#: A photo that spans fewer degrees than this has one pinhole: it is left as it is.
-_LEAST_DEGREES = 100.0
+#: Detail is the difference to the mean of this many rows around.
+_WINDOW_ROWS = 17
+#: Minimum correlation of the detail of the two edges (that of other pictures is 0.1 in the root
+#: mean square), also relative to the correlation of neighboring columns.
+_MIN_CORRELATION = 0.4
+_MIN_PART_OF_NEIGHBORS = 0.5
+#: Minimum root mean square of detail, in levels of 255; less is noise.
+_MIN_DETAIL_LEVELS = 1.0
+#: Maximum difference of the edges: a multiple of the 99th percentile of the differences between
+#: neighboring columns, plus levels of 255.
+_MAX_JUMP_FACTOR = 1.5
+_MAX_JUMP_LEVELS = 3.0
+#: Maximum spread of the first or last row, which shows one direction, relative to the median row.
+_MAX_POLE_SPREAD = 0.5
+#: A cropped panorama that spans fewer degrees is treated as an ordinary photo.
+_MIN_DEGREES = 100.0
+#: Relative tolerance of aspect ratios in XMP.
+_ASPECT_TOLERANCE = 0.02
 
 _FIELD = r"GPano:{name}\s*(?:=\s*[\"']|>)\s*([A-Za-z0-9.+-]+)"
+_SIZE_FIELDS = (
+    "FullPanoWidthPixels",
+    "FullPanoHeightPixels",
+    "CroppedAreaImageWidthPixels",
+    "CroppedAreaImageHeightPixels",
+    "CroppedAreaLeftPixels",
+    "CroppedAreaTopPixels",
+)
 
 
 def panorama_of(path: Path) -> Equirectangular | None:
-    """What a photo is a panorama of; None where it is none, or is not upright as stored.
+    """Recognize a panorama that is stored upright.
 
     Args:
-        path: a photo, whose header is read; its pixels too where it is twice as wide as high.
+        path: a photo; its header is read, and its pixels only if it is twice as wide as high.
+
+    Returns:
+        The panorama, or None for any other photo.
 
     Raises:
         IgsrError: it cannot be read as an image.
     """
     with open_image(path) as image:
         size, xmp = image.size, _xmp(image)
-    told = told_by_xmp(xmp, *size)
-    if told is not None:
-        return told
-    if size[0] != 2 * size[1] or size[1] < 64 or _says_another(xmp):
+    panorama = panorama_of_xmp(xmp, *size)
+    if panorama is not None:
+        return panorama
+    is_other_projection = _projection(xmp) not in (None, "equirectangular")
+    if size[0] != 2 * size[1] or size[1] < 64 or is_other_projection:
         return None
     try:
         with open_image(path) as image:
             small = min(_ROWS, size[1])
             pixels, _ = decoded(image, path, (2 * small, small))
     except IgsrError:
-        return None  # it is named as damaged where it is loaded
+        return None  # loading reports the damage
     return Equirectangular.whole(*size) if edges_join(pixels) else None
 
 
 def _xmp(image: Image.Image) -> str:
-    found = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    if isinstance(found, bytes):
-        found = found.decode("utf-8", errors="replace")
-    return found if isinstance(found, str) else ""
+    xmp = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    if isinstance(xmp, bytes):
+        xmp = xmp.decode("utf-8", errors="replace")
+    return xmp if isinstance(xmp, str) else ""
 
 
 def _text(xmp: str, name: str) -> str | None:
-    found = re.search(_FIELD.format(name=name), xmp)
-    return None if found is None else found[1]
+    match = re.search(_FIELD.format(name=name), xmp)
+    return None if match is None else match[1]
 
 
-def _says_another(xmp: str) -> bool:
+def _projection(xmp: str) -> str | None:
     kind = _text(xmp, "ProjectionType")
-    return kind is not None and kind.lower() != "equirectangular"
+    return None if kind is None else kind.lower()
 
 
-def told_by_xmp(xmp: str, width: int, height: int) -> Equirectangular | None:
-    """The panorama that a photo is by its XMP, or None.
+def panorama_of_xmp(xmp: str, width: int, height: int) -> Equirectangular | None:
+    """Return the panorama that a photo's XMP declares, or None.
 
     Args:
         xmp: the whole text, or "".
         width, height: of the photo, pixels; it may have been resized since the XMP was written.
     """
-    if (_text(xmp, "ProjectionType") or "").lower() != "equirectangular":
+    if _projection(xmp) != "equirectangular":
         return None
-    names = (
-        "FullPanoWidthPixels",
-        "FullPanoHeightPixels",
-        "CroppedAreaImageWidthPixels",
-        "CroppedAreaImageHeightPixels",
-        "CroppedAreaLeftPixels",
-        "CroppedAreaTopPixels",
-    )
-    numbers = [_number(_text(xmp, name)) for name in names]
-    if any(number is None for number in numbers):
-        # Without the part that is shown, it is all.
-        return Equirectangular.whole(width, height) if width == 2 * height else None
+    whole = Equirectangular.whole(width, height) if width == 2 * height else None
+    numbers = [_number(_text(xmp, name)) for name in _SIZE_FIELDS]
+    if None in numbers:
+        return whole
     full_width, full_height, shown_width, shown_height, left, top = (
         float(number or 0.0) for number in numbers
     )
-    whole = 0.0 < shown_width <= full_width and 0.0 < shown_height <= full_height
-    inside = left <= full_width and top + shown_height <= full_height
-    square = abs(full_width / max(full_height, 1.0) - 2.0) < 0.02
-    if not (whole and inside and square):
-        return Equirectangular.whole(width, height) if width == 2 * height else None
+    fits = 0.0 < shown_width <= full_width and 0.0 < shown_height <= full_height
+    fits = fits and left <= full_width and top + shown_height <= full_height
+    if not fits or abs(full_width / max(full_height, 1.0) - 2.0) >= _ASPECT_TOLERANCE:
+        return whole
     across, down = width / shown_width, height / shown_height
-    if abs(across / down - 1.0) > 0.02:
-        return None  # it was cropped since
-    if 360.0 * shown_width / full_width < _LEAST_DEGREES:
+    if abs(across / down - 1.0) > _ASPECT_TOLERANCE:
+        return None  # cropped after the XMP was written
+    if 360.0 * shown_width / full_width < _MIN_DEGREES:
         return None
-    everywhere = shown_width == full_width
+    is_full_circle = shown_width == full_width
     return Equirectangular(
         width,
         height,
-        float(width) if everywhere else full_width * across,
+        float(width) if is_full_circle else full_width * across,
         full_height * down,
-        0.0 if everywhere else left * across,
+        0.0 if is_full_circle else left * across,
         top * down,
     )
 
@@ -142,41 +149,32 @@ def _number(text: str | None) -> float | None:
 
 
 def edges_join(image: np.ndarray) -> bool:
-    """Whether the left edge of a picture goes on at its right one; see the module.
+    """Return whether a picture looks like a panorama of 360 degrees; see the module.
 
     Args:
         image: uint8 [H, W, 3 or 4], twice as wide as high.
     """
     height = min(_ROWS, image.shape[0])
     gray = plane_area_means(image[..., :3].mean(axis=2), 2 * height, height)
-    detail = gray - _around(gray)
-    # Poles are one place each, stretched over the whole width.
-    rows = slice(height // 16, height - height // 16)
-    columns = detail[rows]
-    neighbors = _correlations(columns[:, :-1], columns[:, 1:])
     spread = gray.std(axis=1)
-    if min(spread[0], spread[-1]) > _POLE * float(np.median(spread)):
+    if min(spread[0], spread[-1]) > _MAX_POLE_SPREAD * float(np.median(spread)):
         return False
-    edge = columns[:, :1], columns[:, -1:]
-    if min(float(np.sqrt((side**2).mean())) for side in edge) < _LEAST_DETAIL:
+    # Rows near the poles show one place, stretched over the whole width.
+    rows = slice(height // 16, height - height // 16)
+    detail = (gray - row_means(gray, _WINDOW_ROWS))[rows]
+    edges = detail[:, :1], detail[:, -1:]
+    if min(float(np.sqrt((edge**2).mean())) for edge in edges) < _MIN_DETAIL_LEVELS:
         return False
-    joined = float(_correlations(*edge)[0])
-    if joined < max(_LEAST_CORRELATION, _PART_OF_NEIGHBORS * float(np.median(neighbors))):
+    of_neighbors = float(np.median(_correlations(detail[:, :-1], detail[:, 1:])))
+    of_edges = float(_correlations(*edges)[0])
+    if of_edges < max(_MIN_CORRELATION, _MIN_PART_OF_NEIGHBORS * of_neighbors):
         return False
     jump = float(np.sqrt(((gray[rows, 0] - gray[rows, -1]) ** 2).mean()))
-    apart = np.sqrt((np.diff(gray[rows], axis=1) ** 2).mean(axis=0))
-    return jump <= _JUMP * float(np.quantile(apart, 0.99)) + _JUMP_LEVELS
-
-
-def _around(gray: Float64) -> Float64:
-    """The mean of ``_AROUND`` rows around each pixel."""
-    half = _AROUND // 2
-    padded = np.pad(gray, ((half + 1, half), (0, 0)), mode="edge")
-    sums = padded.cumsum(axis=0)
-    return np.asarray((sums[_AROUND:] - sums[:-_AROUND]) / _AROUND)
+    steps = np.sqrt((np.diff(gray[rows], axis=1) ** 2).mean(axis=0))
+    return jump <= _MAX_JUMP_FACTOR * float(np.quantile(steps, 0.99)) + _MAX_JUMP_LEVELS
 
 
 def _correlations(a: Float64, b: Float64) -> Float64:
-    """Of each two columns."""
+    """Correlation of each two columns."""
     norms = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
     return np.asarray((a * b).sum(axis=0) / np.maximum(norms, 1e-9))

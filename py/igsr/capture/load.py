@@ -1,4 +1,4 @@
-"""``load_capture``: finds out which format a capture has and reads it."""
+"""Load captures of any supported format."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import os
 import time
 from pathlib import Path
 
-from igsr.capture.described import DescribedCapture
 from igsr.capture.downscaling import check_max_size
-from igsr.capture.image_folders import reduction_of
-from igsr.capture.photos import SUFFIXES, is_file
-from igsr.capture.read_colmap import described_colmap, find_model
-from igsr.capture.read_transforms import described_split_transforms, described_transforms
+from igsr.capture.image_files import SUFFIXES, is_file
+from igsr.capture.photos import DescribedCapture
+from igsr.capture.read_colmap import describe_colmap, find_model, reduction_of
+from igsr.capture.read_transforms import describe_split_transforms, describe_transforms
 from igsr.capture.types import Capture
 from igsr.errors import IgsrError
 
@@ -22,24 +21,24 @@ logger = logging.getLogger(__name__)
 def load_capture(path: str | os.PathLike[str], max_size: int | None = None) -> Capture:
     """Load photos with known cameras.
 
-    A capture is one of, tried in this order:
+    A capture is one of the following, tried in this order:
 
     * a ``transforms.json`` (nerfstudio or instant-ngp), or a folder with one;
     * a folder with ``transforms_train.json`` and ``transforms_test.json`` (NeRF Synthetic);
     * a folder with ``images/`` and a COLMAP model in ``sparse/0``, ``sparse`` or itself;
-    * an ``images`` folder that has one of these beside it;
-    * an ``images_2``, ``images_4`` or ``images_8`` folder (photos reduced by as much) that has a
-      COLMAP model beside it.
+    * an ``images`` folder next to one of these;
+    * an ``images_2``, ``images_4`` or ``images_8`` folder (photos reduced by that factor) next to a
+      COLMAP model.
 
-    Photos of a COLMAP model are taken from the smallest of ``images`` and ``images_K`` that are not
-    smaller than ``max_size``, or, where ``images`` is missing, from the largest that there are.
+    Photos of a COLMAP model come from the smallest of ``images`` and ``images_K`` that are not
+    smaller than ``max_size`` or, without ``images``, from the largest.
 
-    Lens distortion is undone: cameras come out as pinholes with the focal lengths, principal point
-    and size of the distorted camera, and ``View.mask`` is False where the lens saw nothing.
+    Lens distortion is removed: cameras become pinholes with the focal lengths, principal point and
+    size of the distorted camera, and ``View.mask`` is False for pixels outside the lens's view.
 
-    The split is by file for NeRF Synthetic (a ``transforms_val.json`` is not read), by
-    ``train_filenames`` and ``test_filenames`` where nerfstudio's file has them, and otherwise all
-    views are for training; ``Capture.with_holdout`` splits anew.
+    The split is by file for NeRF Synthetic (a ``transforms_val.json`` is not read), and by
+    ``train_filenames`` and ``test_filenames`` if nerfstudio's file has them. Otherwise all views
+    are for training; ``Capture.with_holdout`` sets another split.
 
     Args:
         path: the folder, or its ``transforms.json``.
@@ -51,8 +50,8 @@ def load_capture(path: str | os.PathLike[str], max_size: int | None = None) -> C
         The capture, with its photos decoded.
 
     Raises:
-        IgsrError: nothing can be loaded; the message names the file and what is wrong with it. Or
-            the photos need more memory than there is; then it names the size that would fit.
+        IgsrError: the capture cannot be loaded; the message names the file and the problem. Or the
+            photos need more memory than is available; the message names the size that would fit.
     """
     started = time.monotonic()
     check_max_size(max_size)
@@ -71,33 +70,32 @@ def load_capture(path: str | os.PathLike[str], max_size: int | None = None) -> C
 
 
 def describe_capture(path: Path, max_size: int | None = None) -> DescribedCapture:
-    """Read a capture but for its photos' pixels; see ``load_capture``."""
+    """Read a capture except for its photos' pixels; see ``load_capture``."""
     if is_file(path):
         if path.suffix.lower() != ".json":
             raise IgsrError(f"{path} is no capture; give a folder or a transforms.json")
-        return described_transforms(path)
+        return describe_transforms(path)
     try:
         files = sorted(entry.name for entry in path.iterdir())
     except (OSError, ValueError) as error:
         raise IgsrError(f"{path} does not exist or cannot be read; give a capture") from error
-    found = _described_folder(path, max_size)
-    # "path/.." would follow links and leave "." where it is; the real parent is meant.
-    if found is None and path.resolve().name == "images":
-        found = _described_folder(path.resolve().parent, max_size)
-    if found is None and reduction_of(path.resolve().name) is not None:
-        found = _described_model(path.resolve().parent, max_size, path.resolve().name)
-    if found is not None:
-        return found
+    for folder in _capture_folders(path):
+        if is_file(folder / "transforms.json"):
+            return describe_transforms(folder / "transforms.json")
+        if is_file(folder / "transforms_train.json"):
+            return describe_split_transforms(folder)
+        model = find_model(folder)
+        if model is not None:
+            return describe_colmap(folder, model, max_size)
+    model = _model_of_reduced(path)
+    if model is not None:
+        return describe_colmap(path.resolve().parent, model, max_size, path.resolve().name)
     photos = [name for name in files if name.lower().endswith(SUFFIXES)]
-    if photos:
+    if photos or (path / "images").is_dir():
+        content, place = (f"{len(photos)} images", "them") if photos else ("an images folder", "it")
         raise IgsrError(
-            f"{path} holds {len(photos)} images but no cameras; put a COLMAP model (sparse/0) or a "
-            "transforms.json beside them, or find cameras with igsr pose"
-        )
-    if (path / "images").is_dir():
-        raise IgsrError(
-            f"{path} holds an images folder but no cameras; put a COLMAP model (sparse/0) or a "
-            "transforms.json beside it, or find cameras with igsr pose"
+            f"{path} holds {content} but no cameras; put a COLMAP model (sparse/0) or a "
+            f"transforms.json next to {place}, or find cameras with igsr pose"
         )
     raise IgsrError(
         f"{path} holds no images and no cameras; give a folder with a transforms.json, or with "
@@ -106,7 +104,7 @@ def describe_capture(path: Path, max_size: int | None = None) -> DescribedCaptur
 
 
 def holds_cameras(path: str | os.PathLike[str]) -> bool:
-    """Whether a path holds photos with cameras, as ``load_capture`` looks for them.
+    """Return whether a path holds photos with cameras for ``load_capture``.
 
     Args:
         path: a folder or file; it need not exist.
@@ -115,13 +113,11 @@ def holds_cameras(path: str | os.PathLike[str]) -> bool:
     if is_file(path):
         return path.suffix.lower() == ".json"
     try:
-        place = path.resolve()
+        folders = _capture_folders(path)
+        is_reduced = _model_of_reduced(path) is not None
     except (OSError, ValueError):
         return False
-    if reduction_of(place.name) is not None and find_model(place.parent) is not None:
-        return True
-    folders = [path, place.parent] if place.name == "images" else [path]
-    return any(
+    return is_reduced or any(
         is_file(folder / "transforms.json")
         or is_file(folder / "transforms_train.json")
         or find_model(folder) is not None
@@ -129,19 +125,13 @@ def holds_cameras(path: str | os.PathLike[str]) -> bool:
     )
 
 
-def _described_folder(path: Path, max_size: int | None) -> DescribedCapture | None:
-    if is_file(path / "transforms.json"):
-        return described_transforms(path / "transforms.json")
-    if is_file(path / "transforms_train.json"):
-        return described_split_transforms(path)
-    return _described_model(path, max_size)
+def _capture_folders(path: Path) -> list[Path]:
+    # Not "path/..", which follows links and cannot leave ".".
+    parent = path.resolve().parent
+    return [path, parent] if path.resolve().name == "images" else [path]
 
 
-def _described_model(
-    path: Path, max_size: int | None, folder: str | None = None
-) -> DescribedCapture | None:
-    model = find_model(path)
-    if model is None:
-        return None
-    logger.debug("%s: COLMAP model in %s", path, model)
-    return described_colmap(path, model, max_size, folder)
+def _model_of_reduced(path: Path) -> Path | None:
+    """The COLMAP model next to a folder ``images_K``."""
+    place = path.resolve()
+    return None if reduction_of(place.name) is None else find_model(place.parent)

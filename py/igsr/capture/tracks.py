@@ -1,4 +1,4 @@
-"""Confidence of points from their tracks, and tracks in undistorted photos."""
+"""Confidence of points from their tracks, and tracks in undistorted and reduced photos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from igsr.capture.undistort import Lens
 
 
 def track_confidence(length: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Confidence of points: length / (1 + error), high for points that many photos see precisely.
+    """Return the confidence of points: length / (1 + error).
 
     Args:
         length: [P], number of photos that see each point.
@@ -27,11 +27,10 @@ def track_confidence(length: np.ndarray, error: np.ndarray) -> np.ndarray:
 def straightened(
     tracks: Tracks, xyz: np.ndarray, cameras: list[Camera], lenses: list[Lens | None]
 ) -> Tracks:
-    """Move observations from the photos as taken to the undistorted photos.
+    """Move observations from photos as taken to undistorted photos.
 
     Lens models are explicit only from the ray to the pixel. So each observation is moved by the
-    distortion at its point's projection. Its reprojection error, which is all that counts, stays
-    the same to first order.
+    distortion at its point's projection, which keeps its reprojection error to first order.
 
     Args:
         tracks: in pixels of the photos as taken.
@@ -47,26 +46,26 @@ def straightened(
     for index, (camera, lens) in enumerate(zip(cameras, lenses, strict=True)):
         if lens is None or lens.is_pinhole:
             continue
-        mine = np.flatnonzero(tracks.view == index)
-        local = xyz[tracks.point[mine]] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        before = local[:, 2] > 0.0
-        x, y = local[:, :2].T / np.where(before, local[:, 2], 1.0)
+        rows = np.flatnonzero(tracks.view == index)
+        local = xyz[tracks.point[rows]] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        in_front = local[:, 2] > 0.0
+        x, y = local[:, :2].T / np.where(in_front, local[:, 2], 1.0)
         bent_x, bent_y, valid = lens.distort(x, y)
         focal = camera.K[[0, 1], [0, 1]]
-        xy[mine] -= np.stack([bent_x - x, bent_y - y], axis=1) * focal
-        keep[mine] = before & valid & np.isfinite(xy[mine]).all(axis=1)
+        xy[rows] -= np.stack([bent_x - x, bent_y - y], axis=1) * focal
+        keep[rows] = in_front & valid & np.isfinite(xy[rows]).all(axis=1)
     return Tracks(tracks.names, tracks.view[keep], tracks.point[keep], xy[keep])
 
 
 def resized(
     points: Points | None, before: Mapping[str, Camera], after: Mapping[str, Camera]
 ) -> Points | None:
-    """Points whose tracks are in pixels of photos at another size.
+    """Return points with tracks in pixels of resized photos.
 
     Args:
         points: with tracks in pixels of the photos as they were, or None.
         before, after: the cameras of the photos by name; only their sizes count. Photos that are
-            not in both stay as they are.
+            not in both keep their pixels.
     """
     if points is None or points.tracks is None:
         return points

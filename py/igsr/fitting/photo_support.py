@@ -129,7 +129,7 @@ def detail_of_files(files: Sequence[Path], max_size: int | None) -> float:
         max_size: longest side in pixels of the photos as fitted, or None.
     """
     from igsr.capture.downscaling import reduced_size
-    from igsr.capture.photos import decoded, open_image
+    from igsr.capture.image_files import decoded, open_image
     from igsr.errors import IgsrError
 
     found = []

@@ -12,10 +12,9 @@ from typing import Any
 from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
 from igsr.capture.load import holds_cameras
-from igsr.capture.memory_check import check_memory
 from igsr.capture.photo_folder import (
-    FEWEST,
     FRAMES,
+    MIN_PHOTOS,
     Photo,
     load_photos,
     photo_headers,
@@ -114,19 +113,12 @@ def find_cameras(
     chosen_estimator(estimator, options)
     if isinstance(photos, (str, os.PathLike)):
         # Before the long work, and not when the photos are loaded at that size.
-        headers = photo_headers(photos, frames)
-        check_memory(
-            headers.sizes,
-            max_size,
-            channels=headers.channels,
-            masked=True,
-            decoded=headers.decoded,
-        )
+        photo_headers(photos, frames).check_memory(max_size)
     loaded, left_out = split_unfit(photos_of(photos, frames, LONGEST))
-    if len(loaded) < FEWEST and left_out:
+    if len(loaded) < MIN_PHOTOS and left_out:
         raise IgsrError(
-            f"Cameras are found from {FEWEST} photos at least, and {len(loaded)} is left of those "
-            f"given: {' '.join(left_out)} Add photos."
+            f"Cameras are found from {MIN_PHOTOS} photos at least, and {len(loaded)} is left of "
+            f"those given: {' '.join(left_out)} Add photos."
         )
     name, found = estimate(loaded, estimator, seed=seed, progress=progress, **options)
     found.warnings = [*left_out, *found.warnings]
@@ -256,9 +248,9 @@ def estimate(
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise IgsrError(f"seed is {seed!r}; give a whole number of at least 0")
-    if len(photos) < FEWEST:
+    if len(photos) < MIN_PHOTOS:
         only = f"; there is only {photos[0].name}" if photos else ""
-        raise IgsrError(f"Cameras are found from {FEWEST} photos at least{only}; add photos")
+        raise IgsrError(f"Cameras are found from {MIN_PHOTOS} photos at least{only}; add photos")
     panorama = next((photo.place.rig for photo in photos if photo.place is not None), None)
     if panorama is not None and estimator == AUTO:
         estimator = "colmap"
@@ -270,7 +262,7 @@ def estimate(
             "--estimator colmap"
         )
     found = ESTIMATORS[estimator].make(**options)(photos, seed=seed, progress=progress)
-    if sum(camera is not None for camera in found.cameras) < FEWEST:
+    if sum(camera is not None for camera in found.cameras) < MIN_PHOTOS:
         raise IgsrError(
             f"No cameras found: the {len(photos)} photos ({photos[0].name} and others) have too "
             "few matches; take photos of one static scene that overlap more"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from igsr.capture import Camera
-from igsr.capture.photo_folder import FEWEST, Photo
+from igsr.capture.photo_folder import MIN_PHOTOS, Photo
 from igsr.errors import IgsrError
 from igsr.geometry.similarity import similarity_between
 from igsr.pose.alignment import AlignedPhoto
@@ -95,9 +95,9 @@ class Da3:
                 or two photos do not fit into memory.
         """
         different, same_as = _different(photos)
-        if len(different) < FEWEST:
+        if len(different) < MIN_PHOTOS:
             only = f"; all are the same as {photos[0].name}" if len(photos) > 1 else ""
-            raise IgsrError(f"Cameras are found from {FEWEST} different photos at least{only}")
+            raise IgsrError(f"Cameras are found from {MIN_PHOTOS} different photos at least{only}")
         self._check_cameras(photos)
         predictor, weights = (self.predictor, None) if self.predictor else self._network()
         shown = [photos[i] for i in different]
