@@ -13,8 +13,8 @@ from PIL import Image
 import igsr
 from igsr import _core
 from igsr.capture import load_capture
-from igsr.capture.depth_files import find_depth
 from igsr.capture.downscaling import halved, reduced_view, resampled_plane
+from igsr.capture.image_files import find_depth
 from igsr.capture.write_colmap import write_colmap as write_as_colmap
 from igsr.capture.write_transforms import write_transforms as write_as_transforms
 from igsr.errors import IgsrError

@@ -13,11 +13,10 @@ from scenes import capture as ball_capture
 
 import igsr
 from igsr.capture import Camera, Capture, View
-from igsr.capture.photo_checks import check_photos
+from igsr.capture.photo_checks import check_photos, is_screenshot, split_unfit
 from igsr.capture.photo_folder import Photo, load_photos
 from igsr.capture.sharpness import blur, blurred_photos
 from igsr.capture.types import intrinsic_matrix
-from igsr.capture.unfit_photos import is_screenshot, split_unfit
 from igsr.errors import IgsrError
 
 SIZE = (240, 180)

@@ -16,12 +16,18 @@ from PIL.PngImagePlugin import PngInfo
 
 import igsr
 from igsr.capture import Capture, load_capture
-from igsr.capture.find_panoramas import edges_join, panorama_of, panorama_of_xmp
 from igsr.capture.overview import look_at
 from igsr.capture.photo_folder import load_photos
 from igsr.capture.rig import moved_to_side, rig_of
 from igsr.capture.undistort import Lens
-from igsr.capture.wide_photos import WideFisheye, field_of_view, whole_sphere
+from igsr.capture.wide_photos import (
+    WideFisheye,
+    edges_join,
+    field_of_view,
+    panorama_of,
+    panorama_of_xmp,
+    whole_sphere,
+)
 from igsr.capture.write_colmap import write_colmap
 from igsr.capture.write_transforms import write_transforms
 from igsr.errors import IgsrError

@@ -1,7 +1,8 @@
 """Parse the files of a COLMAP model, text or binary: cameras, images, points3D and frames.
 
 They are parsed here and not by pycolmap, which reads a truncated file as zeros without an error and
-crashes the process on other damage. The tests compare this parser with models from pycolmap.
+crashes the process on other damage. Damage is an IgsrError here. The tests compare this parser with
+models from pycolmap.
 
 Source of the formats: https://colmap.github.io/format.html.
 """
@@ -19,28 +20,7 @@ import numpy as np
 
 from igsr.errors import IgsrError
 
-# COLMAP's camera models in the order of their numbers, to name an unsupported one.
-_MODEL_NAMES = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "OPENCV_FISHEYE",
-    "FULL_OPENCV",
-    "FOV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    "SIMPLE_DIVISION",
-    "DIVISION",
-    "SIMPLE_FISHEYE",
-    "FISHEYE",
-    "EUCM",
-    "EQUIRECTANGULAR",
-)
-# Number of parameters of each supported model.
+# Parameters of COLMAP's camera models, in the order of their numbers; None if unsupported.
 _PARAMETER_COUNTS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -49,11 +29,16 @@ _PARAMETER_COUNTS = {
     "OPENCV": 8,
     "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12,
+    "FOV": None,
     "SIMPLE_RADIAL_FISHEYE": 4,
     "RADIAL_FISHEYE": 5,
     "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": None,
+    "SIMPLE_DIVISION": None,
+    "DIVISION": None,
     "SIMPLE_FISHEYE": 3,
     "FISHEYE": 4,
+    "EUCM": None,
     "EQUIRECTANGULAR": 2,
 }
 
@@ -90,8 +75,7 @@ class ColmapImage:
     Attributes:
         identity: its number.
         name: path of its file, relative to the folder of photos.
-        quat: rotation, world to camera, wxyz.
-        translation: world to camera.
+        pose: quaternion wxyz and translation, world to camera.
         camera_id: number of its camera.
         xy: float64 [N, 2], its features, pixels.
         point_ids: int64 [N], the features' points; -1 for none.
@@ -99,50 +83,30 @@ class ColmapImage:
 
     identity: int
     name: str
-    quat: tuple[float, ...]
-    translation: tuple[float, ...]
+    pose: tuple[float, ...]
     camera_id: int
     xy: np.ndarray
     point_ids: np.ndarray
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
-    """Read ``cameras.bin`` or ``cameras.txt``: the cameras by their numbers.
-
-    Raises:
-        IgsrError: the file is damaged, or has an unsupported camera model.
-    """
+    """Read ``cameras.bin`` or ``cameras.txt``: the cameras by their numbers."""
     return _text_cameras(path) if path.suffix == ".txt" else _binary_cameras(path)
 
 
 def read_images(path: Path) -> list[ColmapImage]:
-    """Read ``images.bin`` or ``images.txt``.
-
-    Raises:
-        IgsrError: the file is damaged.
-    """
+    """Read ``images.bin`` or ``images.txt``."""
     return _text_images(path) if path.suffix == ".txt" else _binary_images(path)
 
 
 def read_points(path: Path) -> np.ndarray:
-    """Read ``points3D.bin`` or ``points3D.txt``.
-
-    Returns:
-        [P] with fields id, xyz, rgb, error (in pixels, NaN if missing) and length (of the track).
-
-    Raises:
-        IgsrError: the file is damaged.
-    """
+    """Read ``points3D.bin`` or ``points3D.txt``: [P] of ``_POINT_ROW``; a missing error is NaN."""
     rows = _text_points(path) if path.suffix == ".txt" else _binary_points(path)
     return np.array(rows, dtype=_POINT_ROW)
 
 
 def read_frames(path: Path) -> list[list[int]]:
-    """Read ``frames.bin`` or ``frames.txt`` (COLMAP 3.12): the numbers of each frame's images.
-
-    Raises:
-        IgsrError: the file is damaged.
-    """
+    """Read ``frames.bin`` or ``frames.txt`` (COLMAP 3.12): the numbers of each frame's images."""
     try:
         return _text_frames(path) if path.suffix == ".txt" else _binary_frames(path)
     except (ValueError, IndexError) as error:
@@ -152,12 +116,13 @@ def read_frames(path: Path) -> list[list[int]]:
 
 
 def _checked_parameter_count(path: Path, camera_id: int, model: str) -> int:
-    if model not in _PARAMETER_COUNTS:
+    count = _PARAMETER_COUNTS.get(model)
+    if count is None:
         raise IgsrError(
             f"{path}: camera {camera_id} has the model {model}, which is not supported; undistort "
             "the photos with COLMAP's image_undistorter or use an OPENCV model"
         )
-    return _PARAMETER_COUNTS[model]
+    return count
 
 
 def _read(path: Path) -> bytes:
@@ -231,10 +196,10 @@ class _BinaryReader:
 def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
     file = _BinaryReader(path)
     cameras = {}
+    models = dict(enumerate(_PARAMETER_COUNTS))
     for _ in file.entries():
         camera_id, number, width, height = file.unpack(CAMERA)
-        is_known = 0 <= number < len(_MODEL_NAMES)
-        model = _MODEL_NAMES[number] if is_known else f"number {number}"
+        model = models.get(number, f"number {number}")
         count = _checked_parameter_count(path, camera_id, model)
         params = file.unpack(struct.Struct(f"<{count}d"))
         cameras[camera_id] = ColmapCamera(model, width, height, params)
@@ -248,8 +213,7 @@ def _binary_images(path: Path) -> list[ColmapImage]:
         identity, *pose, camera_id = file.unpack(IMAGE)
         name = file.name()
         seen = file.table(OBSERVATION, *file.unpack(COUNT))
-        quat, translation = tuple(pose[:4]), tuple(pose[4:])
-        image = ColmapImage(identity, name, quat, translation, camera_id, seen["xy"], seen["point"])
+        image = ColmapImage(identity, name, tuple(pose), camera_id, seen["xy"], seen["point"])
         images.append(image)
     return images
 
@@ -321,7 +285,7 @@ def _text_images(path: Path) -> list[ColmapImage]:
             raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from error
         number, line = next(lines, (number + 1, ""))  # its observations, possibly none
         xy, point_ids = _text_observations(path, number, line)
-        images.append(ColmapImage(identity, name, pose[:4], pose[4:], camera_id, xy, point_ids))
+        images.append(ColmapImage(identity, name, pose, camera_id, xy, point_ids))
     return images
 
 

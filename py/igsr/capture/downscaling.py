@@ -24,11 +24,7 @@ _BAND_NUMBERS = 1 << 20
 
 
 def check_max_size(max_size: int | None) -> None:
-    """Check an option ``max_size``.
-
-    Raises:
-        IgsrError: it is neither None nor a whole number of at least 1.
-    """
+    """Raise an IgsrError unless an option is None or a whole number of at least 1."""
     if max_size is None:
         return
     is_whole = isinstance(max_size, (int, np.integer)) and not isinstance(max_size, bool)
@@ -39,11 +35,9 @@ def check_max_size(max_size: int | None) -> None:
 
 
 def reduced_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
-    """Return width and height of a photo after reduction.
+    """Return width and height of a photo whose longest side is reduced to ``max_size`` pixels.
 
-    Args:
-        width, height: of the photo, pixels.
-        max_size: maximum of its longest side, pixels; None, or more than it has, keeps the size.
+    Photos are not enlarged; None keeps the size.
     """
     longest = max(width, height)
     if max_size is None or longest <= max_size:
@@ -54,12 +48,7 @@ def reduced_size(width: int, height: int, max_size: int | None) -> tuple[int, in
 
 
 def resized_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera of the same photo at another size.
-
-    Args:
-        camera: pinhole, in pixels of the photo as it is.
-        width, height: the photo's new size, pixels.
-    """
+    """Return the pinhole camera of the same photo at another size in pixels."""
     if (width, height) == (camera.width, camera.height):
         return camera
     K = camera.K.copy()
@@ -72,13 +61,9 @@ class PixelRows(Protocol):
     """Pixels [H, W, C] that are read by rows: an array, or a photo that is converted on demand."""
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """H, W, C."""
-        ...
+    def shape(self) -> tuple[int, ...]: ...
 
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """The rows, [rows, W, C]; a slice may end beyond the last."""
-        ...
+    def __getitem__(self, rows: slice, /) -> np.ndarray: ...
 
 
 def area_means(
@@ -136,14 +121,10 @@ def plane_area_means(plane: np.ndarray, width: int, height: int) -> Float64:
 
 
 def reduced_view(view: View, width: int, height: int) -> View:
-    """Return a view with a smaller photo, camera, mask, weights and depth.
+    """Return a view reduced to a size in pixels, with its camera, mask, weights and depth.
 
     A pixel is masked if all under it were. Weights are averaged. Depth is that of the pixel in the
     middle: a mean over an edge is on no surface.
-
-    Args:
-        view: the view.
-        width, height: the smaller size in pixels, at most the larger.
     """
     if (width, height) == (view.camera.width, view.camera.height):
         return view
@@ -220,13 +201,9 @@ def _area_sums(
 ) -> Float64:
     """Sum planes over the areas that the smaller pixels cover, float64 [h, w, C].
 
-    Whole numbers are summed exactly if areas consist of whole pixels.
-
-    Args:
-        planes: returns rows of the planes, [rows, W, C].
-        shape: H and W.
-        size: h and w.
-        covered: width and height of the part that the smaller pixels cover.
+    Whole numbers are summed exactly if areas consist of whole pixels. ``planes`` returns rows of
+    the planes, [rows, W, C]; ``shape`` is H, W and ``size`` h, w; ``covered`` is the width and
+    height of the part that the smaller pixels cover.
     """
     (full_height, full_width), (height, width) = shape[:2], size
     rows, row_parts = _bounds(covered[1], height)

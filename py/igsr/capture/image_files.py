@@ -1,15 +1,21 @@
-"""Open and decode image files, which are untrusted."""
+"""Open and decode the files of photos, masks and depths, which are untrusted."""
 
 from __future__ import annotations
 
+import posixpath
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
+from igsr import _core
 from igsr.capture.downscaling import area_means
 from igsr.errors import IgsrError
+
+Numbers = npt.NDArray[Any]
 
 _HEIF_SUFFIXES = (".heic", ".heif")
 SUFFIXES = (
@@ -22,6 +28,15 @@ _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "GIF")
 
 # A file that claims more is a decompression bomb or damaged.
 _MAX_PIXELS_PER_BYTE = 10_000
+
+#: Folder of depths, for cameras that do not name their depth files.
+DEPTHS = "depths"
+_DEPTH_SUFFIXES = (".npy", ".exr", ".png", ".tif", ".tiff")
+# World units of a whole number, unless a capture gives them: depth cameras write millimeters.
+_WHOLE_NUMBER_UNIT = 1e-3
+# Depths outside these limits count as unknown; products with them would overflow float32.
+_MIN_DEPTH = 1e-20
+_MAX_DEPTH = 1e20
 
 
 def is_file(path: Path) -> bool:
@@ -68,33 +83,20 @@ def open_image(path: Path) -> Image.Image:
 
 @dataclass(frozen=True)
 class PhotoHeader:
-    """The header of a photo's file.
-
-    Attributes:
-        size: width and height, pixels, as stored (EXIF orientation not applied).
-        channels: 3, or 4 with alpha.
-    """
+    """Width and height of a photo in pixels as stored, and channels: 3, or 4 with alpha."""
 
     size: tuple[int, int]
     channels: int
 
 
 def photo_header(path: Path) -> PhotoHeader:
-    """Read the header of a photo.
-
-    Raises:
-        IgsrError: as ``open_image``.
-    """
+    """Read the header of a photo; raises as ``open_image``."""
     with open_image(path) as image:
         return PhotoHeader(image.size, 4 if _has_alpha(image) else 3)
 
 
 def load_pixels(image: Image.Image, path: Path) -> None:
-    """Decode the pixels of an image from ``open_image``.
-
-    Raises:
-        IgsrError: the file is truncated or damaged.
-    """
+    """Decode the pixels of an image from ``open_image``; damage is an IgsrError."""
     try:
         image.load()
     except Exception as error:  # as in open_image
@@ -164,14 +166,10 @@ def _pixels(image: Image.Image, path: Path) -> np.ndarray:
 
 
 def mask_of(image: Image.Image, path: Path) -> np.ndarray:
-    """Decode an image from ``open_image`` as a mask.
+    """Decode an image from ``open_image`` as a mask, bool [H, W].
 
-    Returns:
-        bool [H, W], True for pixels brighter than half of the brightest, so that masks of 0 and 1
-        mean the same as masks of 0 and 255.
-
-    Raises:
-        IgsrError: the file is truncated or damaged, or has pixels of an unsupported kind.
+    It is True for pixels brighter than half of the brightest, so that masks of 0 and 1 mean the
+    same as masks of 0 and 255.
     """
     load_pixels(image, path)
     # convert("L") of transparent images keeps the gray and drops the alpha.
@@ -198,3 +196,77 @@ def _converted(image: Image.Image, path: Path, mode: str) -> Image.Image:
         raise IgsrError(
             f"{path} has pixels of the unsupported kind {image.mode}; save it as RGB or RGBA"
         ) from error
+
+
+# --- depth ----------------------------------------------------------------------------------------
+
+
+def find_depth(folder: Path, name: str) -> Path | None:
+    """Return a photo's depth file: its name, with or without suffix, and a suffix of depth."""
+    stems = (name, posixpath.splitext(name)[0])
+    files = (folder / f"{stem}{suffix}" for stem in stems for suffix in _DEPTH_SUFFIXES)
+    return next((file for file in files if file.is_file()), None)
+
+
+def write_depth(path: Path, depth: Numbers) -> None:
+    """Write depth [h, w] in world units as float32 ``.npy``; a missing folder is created."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, depth.astype(np.float32), allow_pickle=False)
+
+
+def read_depth(path: Path, unit: float | None) -> npt.NDArray[np.float32]:
+    """Read a depth file.
+
+    Args:
+        path: an ``.npy``, an OpenEXR (channel Z, or else its only one), a 16-bit picture or a
+            32-bit float TIFF. 0, negative and non-finite numbers mean that the depth is unknown.
+        unit: world units of one number in the file; None is 0.001 for whole numbers and 1 for
+            floats.
+
+    Returns:
+        Camera-space z [h, w] in world units, 0 for unknown depths.
+
+    Raises:
+        IgsrError: the file cannot be read, or holds something else.
+    """
+    suffix = path.suffix.lower()
+    stored = _npy(path) if suffix == ".npy" else _exr(path) if suffix == ".exr" else _picture(path)
+    if unit is None:
+        unit = _WHOLE_NUMBER_UNIT if np.issubdtype(stored.dtype, np.integer) else 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = stored.astype(np.float64) * unit
+    is_known = np.isfinite(depth) & (depth > _MIN_DEPTH) & (depth < _MAX_DEPTH)
+    return np.where(is_known, depth, 0.0).astype(np.float32)
+
+
+def _picture(path: Path) -> Numbers:
+    with open_image(path) as image:
+        load_pixels(image, path)
+        if image.mode not in ("I", "I;16", "I;16B", "F"):
+            raise IgsrError(
+                f"{path} is an 8-bit picture, which cannot hold depth; give a 16-bit PNG, .npy or "
+                "EXR"
+            )
+        return np.asarray(image).astype(np.float32 if image.mode == "F" else np.int64)
+
+
+def _exr(path: Path) -> Numbers:
+    try:
+        return _core.read_exr_depth(str(path))
+    except (OSError, ValueError) as error:
+        raise IgsrError(f"{path} cannot be read as depth: {error}") from error
+
+
+def _npy(path: Path) -> Numbers:
+    try:
+        # Mapped, so that a header that claims more than the file holds reserves no memory.
+        stored = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise IgsrError(f"{path} cannot be read as depth: {error}") from error
+    if not isinstance(stored, np.ndarray) or stored.dtype.kind not in "uif":
+        raise IgsrError(f"{path} holds no numbers; give depth as a .npy array of [H, W]")
+    if stored.ndim == 3 and 1 in (stored.shape[0], stored.shape[2]):
+        stored = stored[0] if stored.shape[0] == 1 else stored[..., 0]
+    if stored.ndim != 2 or 0 in stored.shape:
+        raise IgsrError(f"{path} has shape {list(stored.shape)}; give depth as [H, W]")
+    return np.array(stored)

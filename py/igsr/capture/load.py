@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from igsr.capture.downscaling import check_max_size
@@ -56,16 +58,7 @@ def load_capture(path: str | os.PathLike[str], max_size: int | None = None) -> C
     started = time.monotonic()
     check_max_size(max_size)
     capture = describe_capture(Path(path), max_size).loaded(max_size)
-    points = "no" if capture.points is None else len(capture.points.xyz)
-    logger.info(
-        "%s: %d views (%d train, %d test), %s points, loaded in %.2f s",
-        path,
-        len(capture.views),
-        len(capture.train_views),
-        len(capture.test_views),
-        points,
-        time.monotonic() - started,
-    )
+    logger.info("%r, loaded in %.2f s", capture, time.monotonic() - started)
     return capture
 
 
@@ -79,17 +72,9 @@ def describe_capture(path: Path, max_size: int | None = None) -> DescribedCaptur
         files = sorted(entry.name for entry in path.iterdir())
     except (OSError, ValueError) as error:
         raise IgsrError(f"{path} does not exist or cannot be read; give a capture") from error
-    for folder in _capture_folders(path):
-        if is_file(folder / "transforms.json"):
-            return describe_transforms(folder / "transforms.json")
-        if is_file(folder / "transforms_train.json"):
-            return describe_split_transforms(folder)
-        model = find_model(folder)
-        if model is not None:
-            return describe_colmap(folder, model, max_size)
-    model = _model_of_reduced(path)
-    if model is not None:
-        return describe_colmap(path.resolve().parent, model, max_size, path.resolve().name)
+    describe = _reader(path)
+    if describe is not None:
+        return describe(max_size)
     photos = [name for name in files if name.lower().endswith(SUFFIXES)]
     if photos or (path / "images").is_dir():
         content, place = (f"{len(photos)} images", "them") if photos else ("an images folder", "it")
@@ -104,34 +89,29 @@ def describe_capture(path: Path, max_size: int | None = None) -> DescribedCaptur
 
 
 def holds_cameras(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path holds photos with cameras for ``load_capture``.
-
-    Args:
-        path: a folder or file; it need not exist.
-    """
+    """Return whether a path, which need not exist, holds photos with cameras."""
     path = Path(path)
     if is_file(path):
         return path.suffix.lower() == ".json"
     try:
-        folders = _capture_folders(path)
-        is_reduced = _model_of_reduced(path) is not None
+        return _reader(path) is not None
     except (OSError, ValueError):
         return False
-    return is_reduced or any(
-        is_file(folder / "transforms.json")
-        or is_file(folder / "transforms_train.json")
-        or find_model(folder) is not None
-        for folder in folders
-    )
 
 
-def _capture_folders(path: Path) -> list[Path]:
-    # Not "path/..", which follows links and cannot leave ".".
-    parent = path.resolve().parent
-    return [path, parent] if path.resolve().name == "images" else [path]
-
-
-def _model_of_reduced(path: Path) -> Path | None:
-    """The COLMAP model next to a folder ``images_K``."""
+def _reader(path: Path) -> Callable[[int | None], DescribedCapture] | None:
+    """The function that reads the capture in a folder, given ``max_size``."""
     place = path.resolve()
-    return None if reduction_of(place.name) is None else find_model(place.parent)
+    # Not "path/..", which follows links and cannot leave ".".
+    for folder in (path, place.parent) if place.name == "images" else (path,):
+        if is_file(folder / "transforms.json"):
+            return lambda _: describe_transforms(folder / "transforms.json")
+        if is_file(folder / "transforms_train.json"):
+            return lambda _: describe_split_transforms(folder)
+        model = find_model(folder)
+        if model is not None:
+            return functools.partial(describe_colmap, folder, model)
+    model = None if reduction_of(place.name) is None else find_model(place.parent)
+    if model is None:
+        return None
+    return functools.partial(describe_colmap, place.parent, model, folder=place.name)

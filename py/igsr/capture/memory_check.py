@@ -86,12 +86,7 @@ class PhotoSizes:
     def largest_size_that_fits(
         self, splats: int | None = None, available: int | None = None
     ) -> int | None:
-        """Return the longest side in pixels at which photos fit into memory; None if none does.
-
-        Args:
-            splats: as ``needed_memory``.
-            available: bytes; None is ``available_memory()``.
-        """
+        """Return the longest side in pixels at which photos fit into memory; None if none does."""
         usable = USABLE_PART * (available_memory() if available is None else available)
         longest = max((max(size) for size in self.sizes), default=1)
         if self.needed_memory(longest, splats) <= usable:
@@ -99,21 +94,12 @@ class PhotoSizes:
         fits, too_large = 0, longest // SIZE_STEP_PX + 1  # in steps
         while too_large - fits > 1:
             middle = (fits + too_large) // 2
-            if self.needed_memory(middle * SIZE_STEP_PX, splats) <= usable:
-                fits = middle
-            else:
-                too_large = middle
+            is_enough = self.needed_memory(middle * SIZE_STEP_PX, splats) <= usable
+            fits, too_large = (middle, too_large) if is_enough else (fits, middle)
         return fits * SIZE_STEP_PX or None
 
     def check_memory(self, max_size: int | None = None, splats: int | None = None) -> None:
-        """Refuse photos that do not fit into memory, and name the size at which they do.
-
-        Args:
-            max_size, splats: as ``needed_memory``.
-
-        Raises:
-            IgsrError: they do not fit.
-        """
+        """Raise an IgsrError, with the size that fits, if the photos do not fit into memory."""
         available = available_memory()
         needed = self.needed_memory(max_size, splats)
         if needed <= USABLE_PART * available:
@@ -136,11 +122,7 @@ class PhotoSizes:
         raise IgsrError(f"{problem}: give --max-size {size} ({at_size}).")
 
     def decoding_threads(self, max_size: int | None = None) -> int:
-        """Return the number of photos that memory allows to decode at once, at least one.
-
-        Args:
-            max_size: as ``needed_memory``.
-        """
+        """Return the number of photos that memory allows to decode at once, at least one."""
         alone = replace(self, masked=True, depths=False).needed_memory(max_size)
         left = USABLE_PART * available_memory() - alone
         more = int(max(0.0, left) / (DECODED_BYTES * max(1, self._largest_file)))

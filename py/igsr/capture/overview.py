@@ -28,11 +28,7 @@ class Overview(PhotoSizes):
     train: int
 
     def train_photos(self, holdout: int | None) -> int:
-        """Return the maximum number of photos to fit if every ``holdout``-th is held out.
-
-        Raises:
-            IgsrError: as ``check_holdout``.
-        """
+        """Return the maximum number of photos to fit if every ``holdout``-th is held out."""
         if holdout is None:
             return self.train
         views = self.views or [1] * len(self.sizes)

@@ -26,21 +26,13 @@ import numpy as np
 
 from igsr.capture.downscaling import area_means, check_max_size, reduced_size
 from igsr.capture.exif import TURNED, Exif, read_exif, turned_back, upright
-from igsr.capture.find_panoramas import panorama_of
-from igsr.capture.image_files import (
-    SUFFIXES,
-    decoded,
-    is_file,
-    mask_of,
-    open_image,
-    photo_header,
-)
+from igsr.capture.image_files import SUFFIXES, decoded, is_file, mask_of, open_image, photo_header
 from igsr.capture.memory_check import PhotoSizes
 from igsr.capture.read_transforms import read_lens
 from igsr.capture.rig import Rig, decoded_size, rig_of, sampled_views
 from igsr.capture.types import Camera
 from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames, video_size
-from igsr.capture.wide_photos import WideFisheye, WidePhoto
+from igsr.capture.wide_photos import WideFisheye, WidePhoto, panorama_of
 from igsr.errors import IgsrError
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
@@ -185,9 +177,6 @@ def photo_sizes(path: Path) -> dict[str, int]:
     """Return the size in bytes of each photo and video that ``load_photos`` would load, by name.
 
     A ``lens.json`` counts too, since cameras depend on it.
-
-    Raises:
-        IgsrError: there are no photos.
     """
     root, files, _ = _find_files(path)
     files = [*files, *filter(is_file, [root / LENS])]
@@ -265,12 +254,6 @@ def photo_headers(path: Paths, frames: int = FRAMES) -> PhotoSizes:
 
     Pixels are decoded only of photos that may be panoramas. The photos count as masked, since it is
     unknown whether their lenses distort.
-
-    Args:
-        path, frames: as ``load_photos``.
-
-    Raises:
-        IgsrError: there are no photos.
     """
     root, files, _ = _find_files(path)
     return replace(_sizes_of(files, frames, _read_lens(root)), masked=True)
@@ -385,11 +368,7 @@ def _views_of(
 
 
 def _mask_as_stored(path: Path, name: str, size: tuple[int, int], orientation: int) -> np.ndarray:
-    """The mask of an upright photo, turned as the photo is stored.
-
-    Raises:
-        IgsrError: it cannot be read, or has another size than the upright photo.
-    """
+    """The mask of an upright photo, turned as the photo is stored."""
     width, height = size[::-1] if orientation in TURNED else size
     with open_image(path) as image:
         if image.size != (width, height):

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from igsr._internal.choices import Split
-from igsr.capture.depth_files import read_depth
 from igsr.capture.downscaling import (
     check_max_size,
     plane_area_means,
@@ -21,7 +20,14 @@ from igsr.capture.downscaling import (
     resized_camera,
 )
 from igsr.capture.exif import read_exif
-from igsr.capture.image_files import PhotoHeader, decoded, mask_of, open_image, photo_header
+from igsr.capture.image_files import (
+    PhotoHeader,
+    decoded,
+    mask_of,
+    open_image,
+    photo_header,
+    read_depth,
+)
 from igsr.capture.memory_check import PhotoSizes
 from igsr.capture.rig import Rig, decoded_size, sampled_views
 from igsr.capture.tracks import resized
@@ -69,23 +75,13 @@ class Shot:
     depth_unit: float | None = None
 
     @property
-    def photo_size(self) -> tuple[int, int]:
-        """Width and height in pixels of the photo according to its camera, before reduction."""
-        full = self.camera if self.rig is None else self.rig.photo
-        return full.width, full.height
-
-    @property
     def is_resampled(self) -> bool:
         """Whether the view's pixels are interpolated from those of the photo."""
         return self.rig is not None or not self.lens.is_pinhole
 
 
 def rig_shots(shot: Shot, rig: Rig) -> list[Shot]:
-    """Split a wide photo into its views.
-
-    Args:
-        shot: the photo; only the pose of its camera is used.
-        rig: its views.
+    """Split a wide photo, of whose camera only the pose is used, into its views.
 
     Raises:
         IgsrError: the photo has a depth file, which wide photos do not support.
@@ -129,16 +125,7 @@ class DescribedCapture:
     points: Callable[[], Points | None]
 
     def loaded(self, max_size: int | None = None) -> Capture:
-        """Decode the photos.
-
-        Args:
-            max_size: longest side in pixels of photos as loaded; larger ones are reduced. None
-                keeps all as they are.
-
-        Raises:
-            IgsrError: a photo or the points cannot be used, or the photos need more memory than
-                is available.
-        """
+        """Decode the photos, as ``load_capture``."""
         check_max_size(max_size)
         headers = checked_headers(self.shots)
         shot_sizes(self.shots, headers).check_memory(max_size)
@@ -174,14 +161,13 @@ def checked_headers(shots: list[Shot]) -> list[PhotoHeader]:
 
 def _check_size(path: Path, size: tuple[int, int], shot: Shot, kind: str) -> None:
     """Check the size of a photo ("image") or "mask" against its camera."""
-    wanted = shot.photo_size
+    full = shot.camera if shot.rig is None else shot.rig.photo
+    wanted = full.width, full.height
     if size == wanted and (shot.factor == 1 or kind == "mask"):
         return
     # Programs round the size of a reduced photo up, down or to the nearest.
-    is_near = all(
-        abs(side - full / shot.factor) <= 1.0 for side, full in zip(size, wanted, strict=True)
-    )
-    if shot.factor > 1 and is_near:
+    off = max(abs(a - b / shot.factor) for a, b in zip(size, wanted, strict=True))
+    if shot.factor > 1 and off <= 1.0:
         return
     is_turned = kind == "image" and shot.factor == 1 and size == wanted[::-1]
     turned = " (an EXIF orientation is never applied)" if is_turned else ""
@@ -193,12 +179,7 @@ def _check_size(path: Path, size: tuple[int, int], shot: Shot, kind: str) -> Non
 
 
 def shot_sizes(shots: list[Shot], headers: list[PhotoHeader]) -> PhotoSizes:
-    """Return the sizes of photos, which determine the memory that they need.
-
-    Args:
-        shots: the photos.
-        headers: of their files, from ``checked_headers``.
-    """
+    """Return the sizes of photos, from the headers of their files (``checked_headers``)."""
     return PhotoSizes(
         sizes=[
             header.size if shot.rig is None else (shot.camera.width, shot.camera.height)
@@ -214,11 +195,7 @@ def shot_sizes(shots: list[Shot], headers: list[PhotoHeader]) -> PhotoSizes:
 
 
 def _load_views(shots: list[Shot], headers: list[PhotoHeader], max_size: int | None) -> list[View]:
-    """Load all photos of a capture on all cores, in the order given.
-
-    Raises:
-        IgsrError: a photo cannot be used; if several cannot, the message is about the first.
-    """
+    """Load all photos of a capture on all cores, in the order given."""
     cameras = {
         shot.name: resized_camera(shot.camera, *reduced_size(*header.size, max_size))
         for shot, header in zip(shots, headers, strict=True)

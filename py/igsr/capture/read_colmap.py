@@ -29,8 +29,7 @@ import numpy as np
 from igsr._internal.rotations import rotations_of
 from igsr.capture import colmap_files
 from igsr.capture.colmap_files import ColmapCamera, ColmapImage
-from igsr.capture.depth_files import FOLDER, find_depth
-from igsr.capture.image_files import SUFFIXES, is_file
+from igsr.capture.image_files import DEPTHS, SUFFIXES, find_depth, is_file
 from igsr.capture.photos import DescribedCapture, Shot, rig_shots
 from igsr.capture.rig import Rig, moved_to_side, rig_of
 from igsr.capture.tracks import straightened, track_confidence
@@ -39,14 +38,6 @@ from igsr.capture.undistort import Lens
 from igsr.capture.wide_photos import WidePhoto, whole_sphere, wide_fisheye
 from igsr.errors import IgsrError
 
-_ONE_FOCAL_LENGTH = (
-    "SIMPLE_PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "SIMPLE_FISHEYE",
-)
 _SPHERE = "EQUIRECTANGULAR"
 #: Maximum distance between centers of views of one photo, relative to that of all cameras.
 _ONE_CENTER = 1e-6
@@ -116,7 +107,7 @@ def describe_colmap(
         mask = files.masks / f"{image.name}.png"
         mask_path = mask if is_file(mask) else None
         shot = Shot(name, file, camera, lens, "train", mask_path, images_path, files.factor)
-        shot = replace(shot, depth_path=find_depth(path / FOLDER, image.name))
+        shot = replace(shot, depth_path=find_depth(path / DEPTHS, image.name))
         photos.append(_Photo(image, shot, rig))
     frames = colmap_files.read_frames(frames_path) if is_file(frames_path) else []
     shared = _shared_centers(frames, [photo for photo in photos if photo.rig is None])
@@ -155,17 +146,13 @@ def _camera(colmap: ColmapCamera, viewmat: np.ndarray) -> tuple[Camera, Lens, Ri
 
 
 def intrinsics(camera: ColmapCamera) -> tuple[np.ndarray, Lens]:
-    """Return the pinhole matrix, float64 [3, 3], and the lens of a camera.
-
-    Raises:
-        IgsrError: a parameter is not finite.
-    """
+    """Return the pinhole matrix, float64 [3, 3], and the lens of a camera."""
     params = list(camera.params)
     if not all(map(math.isfinite, params)):
         raise IgsrError("its camera has a parameter that is not finite; run COLMAP again")
     if camera.model == _SPHERE:
         return np.eye(3), Lens()
-    if camera.model in _ONE_FOCAL_LENGTH:
+    if camera.model.startswith(("SIMPLE", "RADIAL")):  # one focal length
         params.insert(1, params[0])
     K, extra = intrinsic_matrix(*params[:4]), params[4:]
     if camera.model in ("OPENCV", "FULL_OPENCV"):
@@ -178,15 +165,16 @@ def intrinsics(camera: ColmapCamera) -> tuple[np.ndarray, Lens]:
 
 
 def _viewmat(image: ColmapImage, path: Path) -> np.ndarray:
-    norm = math.hypot(*image.quat)
-    if not (math.isfinite(norm) and norm > 1e-6 and all(map(math.isfinite, image.translation))):
+    quat, translation = np.array(image.pose[:4]), image.pose[4:]
+    norm = math.hypot(*quat)
+    if not (math.isfinite(norm) and norm > 1e-6 and all(map(math.isfinite, translation))):
         raise IgsrError(
             f"{path}: the pose of {image.name} has a NaN or infinite entry or a zero quaternion; "
             "run COLMAP again"
         )
     viewmat = np.eye(4)
-    viewmat[:3, :3] = rotations_of(np.array(image.quat, np.float64) / norm)
-    viewmat[:3, 3] = image.translation
+    viewmat[:3, :3] = rotations_of(quat / norm)
+    viewmat[:3, 3] = translation
     return viewmat
 
 
@@ -244,7 +232,16 @@ def _tracks(path: Path, photos: list[_Photo], ids: np.ndarray, xyz: np.ndarray) 
             raise IgsrError(
                 f"{path}: {image.name} sees a point at no finite place; run COLMAP again"
             )
-        for shot, point, xy in _observations(photo, at[seen], image.xy[seen], xyz):
+        point, xy = at[seen], image.xy[seen]
+        observations = [(photo.shot, point, xy)]
+        if photo.rig is not None:
+            viewmat = photo.shot.camera.viewmat
+            directions = xyz[point] @ viewmat[:3, :3].T + viewmat[:3, 3]
+            observations = []
+            for side, shot in zip(photo.rig.sides, rig_shots(photo.shot, photo.rig), strict=True):
+                moved, shown = moved_to_side(xy, directions, photo.rig.photo, side.camera)
+                observations.append((shot, point[shown], moved[shown]))
+        for shot, point, xy in observations:
             views.append(np.full(len(point), len(shots), dtype=np.int64))
             points.append(point)
             places.append(xy)
@@ -254,21 +251,6 @@ def _tracks(path: Path, photos: list[_Photo], ids: np.ndarray, xyz: np.ndarray) 
     names = [shot.name for shot in shots]
     tracks = Tracks(names, *(np.concatenate(part) for part in (views, points, places)))
     return straightened(tracks, xyz, [shot.camera for shot in shots], [shot.lens for shot in shots])
-
-
-def _observations(
-    photo: _Photo, point: np.ndarray, xy: np.ndarray, xyz: np.ndarray
-) -> list[tuple[Shot, np.ndarray, np.ndarray]]:
-    """Observations of a photo: for each of its views the points, and their places."""
-    if photo.rig is None:
-        return [(photo.shot, point, xy)]
-    viewmat = photo.shot.camera.viewmat
-    directions = xyz[point] @ viewmat[:3, :3].T + viewmat[:3, 3]
-    observations = []
-    for side, shot in zip(photo.rig.sides, rig_shots(photo.shot, photo.rig), strict=True):
-        moved, shown = moved_to_side(xy, directions, photo.rig.photo, side.camera)
-        observations.append((shot, point[shown], moved[shown]))
-    return observations
 
 
 # --- photos ---------------------------------------------------------------------------------------
@@ -291,12 +273,12 @@ def _find_photos(
     folder: str | None,
     source: Path,
 ) -> _PhotoFiles:
-    """Find the folder with the smallest photos that are large enough, by ``describe_colmap``.
-
-    Raises:
-        IgsrError: a photo is missing.
-    """
-    folders = _reduced_folders(capture)
+    """Find the folder with the smallest photos that are large enough."""
+    try:
+        entries = {reduction_of(entry.name): entry for entry in capture.iterdir()}
+    except OSError:
+        entries = {}
+    folders = {factor: entry for factor, entry in entries.items() if factor and entry.is_dir()}
     full: Path | None = capture / "images"
     if not (capture / "images").is_dir():
         full = None if folders else capture
@@ -328,20 +310,10 @@ def _find_photos(
     )
 
 
-def _reduced_folders(capture: Path) -> dict[int, Path]:
-    """The folders ``images_K`` of a capture by K."""
-    try:
-        entries = list(capture.iterdir())
-    except OSError:
-        return {}
-    reductions = ((reduction_of(entry.name), entry) for entry in entries)
-    return {factor: entry for factor, entry in reductions if factor and entry.is_dir()}
-
-
 def _photos_in(
     folder: Path, full: Path | None, names: Sequence[str], same_names: bool
 ) -> list[Path] | None:
-    """The photo of each name in a folder, or None if one is missing."""
+    """The photo of each name in a folder, or None if one is missing; ``full`` has the full size."""
     files = [folder / name for name in names]
     if all(map(is_file, files)):
         return files

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import posixpath
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,11 +41,7 @@ _OMITTED_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 def describe_transforms(path: Path) -> DescribedCapture:
-    """Read a ``transforms.json`` except for its photos; paths in it are relative to its folder.
-
-    Raises:
-        IgsrError: a field is missing, malformed or out of range, or a file it names is unusable.
-    """
+    """Read a ``transforms.json`` except for its photos; paths in it are relative to its folder."""
     document = _read_json(path)
     frames = _frames(document, path)
     split_from_name = _named_splits(document, path, frames)
@@ -64,11 +61,7 @@ def describe_transforms(path: Path) -> DescribedCapture:
 
 
 def describe_split_transforms(folder: Path) -> DescribedCapture:
-    """Read ``transforms_train.json`` and, if it exists, ``transforms_test.json`` of a folder.
-
-    Raises:
-        IgsrError: as ``describe_transforms``.
-    """
+    """Read ``transforms_train.json`` and, if it exists, ``transforms_test.json`` of a folder."""
     shots = []
     for split in SPLITS:
         path = folder / f"transforms_{split}.json"
@@ -80,12 +73,7 @@ def describe_split_transforms(folder: Path) -> DescribedCapture:
 
 
 def read_cameras(path: Path) -> list[tuple[str, Camera]]:
-    """Read the photos' names and cameras of a ``cameras.json`` that igsr wrote.
-
-    Raises:
-        IgsrError: the file cannot be read, a field of a frame is missing or out of range, or a
-            lens distorts.
-    """
+    """Read the photos' names and cameras of a ``cameras.json`` that igsr wrote."""
     document = _read_json(path)
     if document.get("camera_model") != "PINHOLE":
         raise IgsrError(f"{path}: camera_model must be PINHOLE, as igsr writes it")
@@ -152,18 +140,10 @@ def _required(fields: dict[str, Any], key: str, where: str) -> Any:
 
 def _text(fields: dict[str, Any], key: str, where: str) -> str:
     value = _required(fields, key, where)
-    if not isinstance(value, str) or not value or "\0" in value or not _is_unicode(value):
+    # JSON can hold half a surrogate pair, which file names and terminals cannot.
+    if not isinstance(value, str) or not value or re.search("[\0\ud800-\udfff]", value):
         raise IgsrError(f"{where}: {key} must be a file's path, not {_shown(value)}; correct it")
     return value
-
-
-def _is_unicode(text: str) -> bool:
-    # JSON can hold half a surrogate pair, which file names and terminals cannot.
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _shown(value: Any) -> str:
@@ -265,17 +245,14 @@ def _intrinsics(
     fields: dict[str, Any], width: int, height: int, where: str
 ) -> tuple[np.ndarray, Lens]:
     if "fl_x" in fields:
-        fx = _number(fields, "fl_x", where)
+        fx = fy = _number(fields, "fl_x", where)
     elif "camera_angle_x" in fields:
-        fx = _focal_length(fields, "camera_angle_x", width, where)
+        fx = fy = _focal_length(fields, "camera_angle_x", width, where)
+        if "camera_angle_y" in fields and "fl_y" not in fields:
+            fy = _focal_length(fields, "camera_angle_y", height, where)
     else:
         raise IgsrError(f"{where}: fl_x or camera_angle_x is missing; add one of them")
-    if "fl_y" in fields:
-        fy = _number(fields, "fl_y", where)
-    elif "camera_angle_y" in fields and "fl_x" not in fields:
-        fy = _focal_length(fields, "camera_angle_y", height, where)
-    else:
-        fy = fx
+    fy = _number(fields, "fl_y", where, fy)
     cx = _number(fields, "cx", where, width / 2)
     cy = _number(fields, "cy", where, height / 2)
     for key, value in (("fl_x", fx), ("fl_y", fy)):
@@ -352,9 +329,9 @@ def _named_splits(
     Frames in ``val_filenames`` only are ignored, as a ``transforms_val.json`` is. Frames in no list
     are for training if there is no ``train_filenames``, else ignored.
     """
-    split_from_name: dict[str, Split] = {}
-    if "train_filenames" not in document and "test_filenames" not in document:
+    if not {"train_filenames", "test_filenames"} & document.keys():
         return None
+    split_from_name: dict[str, Split] = {}
     known = {_frame_name(frame, path, index) for index, frame in enumerate(frames)}
     for split in SPLITS:
         listed = document.get(f"{split}_filenames", [])
@@ -372,12 +349,9 @@ def _named_splits(
                     "test_filenames; remove one"
                 )
     if "train_filenames" not in document:
-        validation = document.get("val_filenames", [])
-        left_out = {
-            posixpath.normpath(name)
-            for name in (validation if isinstance(validation, list) else [])
-            if isinstance(name, str)
-        }
+        listed = document.get("val_filenames", [])
+        names = listed if isinstance(listed, list) else []
+        left_out = {posixpath.normpath(name) for name in names if isinstance(name, str)}
         for name in known - left_out:
             split_from_name.setdefault(name, "train")
     return split_from_name

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -52,7 +52,7 @@ class Side:
     """One pinhole view of a wide photo.
 
     Attributes:
-        name: its direction: "front", "right", "back", "left", "up" or "down".
+        name: its direction, a key of ``_SIDES``.
         camera: its camera, whose world is the frame of the photo's camera.
     """
 
@@ -64,23 +64,13 @@ class Side:
         return f"{photo}/{self.name}.png"
 
     def in_world(self, viewmat: Float64) -> Camera:
-        """Return its camera in the world.
-
-        Args:
-            viewmat: [4, 4], world to the photo's camera.
-        """
-        camera = self.camera
-        return Camera(camera.viewmat @ viewmat, camera.K, camera.width, camera.height)
+        """Return its camera in the world, given the photo camera's viewmat [4, 4]."""
+        return replace(self.camera, viewmat=self.camera.viewmat @ viewmat)
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """The views of a wide photo.
-
-    Attributes:
-        photo: the wide photo, at its full size.
-        sides: its views, at theirs.
-    """
+    """A wide photo at its full size, and its views."""
 
     photo: WidePhoto
     sides: tuple[Side, ...] = field(repr=False)
@@ -88,11 +78,7 @@ class Rig:
 
 @functools.lru_cache(maxsize=64)
 def rig_of(photo: WidePhoto) -> Rig:
-    """Return the views of a wide photo.
-
-    Raises:
-        IgsrError: it shows nothing.
-    """
+    """Return the views of a wide photo; it is an IgsrError if it shows nothing."""
     focal = max(1.0, photo.pixels_per_radian)
     size = max(2, round(2.0 * focal))
     sides = []
@@ -138,12 +124,9 @@ def _resized_cameras(rig: Rig, max_size: int | None) -> list[Camera]:
 
 
 def decoded_size(rig: Rig, size: tuple[int, int], max_size: int | None) -> tuple[int, int]:
-    """Return the size at which to decode a wide photo: width and height, pixels.
+    """Return the width and height at which to decode a wide photo, whose file has ``size`` pixels.
 
-    Args:
-        rig: its views.
-        size: of its file.
-        max_size: longest side in pixels of a view; None keeps them as they are.
+    ``max_size`` is the longest side in pixels of a view; None keeps them as they are.
     """
     photo = rig.photo
     focal = max(camera.K[0, 0] for camera in _resized_cameras(rig, max_size))
@@ -162,7 +145,7 @@ def sampled_views(
         image: uint8 [H, W, 3 or 4] of the wide photo, at its full size or that of ``decoded_size``.
         mask: bool [H, W] of it, or None. A fisheye photo without a mask is masked to the circle
             that its lens lights.
-        max_size: longest side in pixels of a view; None keeps them as they are.
+        max_size: as ``decoded_size``.
 
     Returns:
         Camera, photo and mask of each view that is not hidden, by its index in ``rig.sides``.
@@ -266,17 +249,12 @@ def moved_to_side(
             difference[:, 0] -= photo.width * np.round(difference[:, 0] / photo.width)
         return difference
 
-    step = 1e-5
-    of_photo = np.stack(
-        [
-            across_edge(in_photo(unit + step * t) - in_photo(unit - step * t))
-            for t in (first, second)
-        ],
-        axis=2,
-    )
-    of_view = np.stack(
-        [in_view(unit + step * t) - in_view(unit - step * t) for t in (first, second)], axis=2
-    )
+    def derivatives(project: Callable[[Float64], Float64]) -> Float64:
+        """Differences [M, 2, 2] of a projection along both tangents."""
+        steps = (1e-5 * first, 1e-5 * second)
+        return np.stack([project(unit + step) - project(unit - step) for step in steps], axis=2)
+
+    of_photo, of_view = across_edge(derivatives(in_photo)), derivatives(in_view)
     ahead = (unit @ camera.viewmat[2, :3]) > 1e-6
     determinant = of_photo[:, 0, 0] * of_photo[:, 1, 1] - of_photo[:, 0, 1] * of_photo[:, 1, 0]
     usable = ahead & np.isfinite(of_view).all(axis=(1, 2)) & (np.abs(determinant) > 1e-30)

@@ -12,15 +12,7 @@ from igsr.capture.undistort import Lens
 
 
 def track_confidence(length: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Return the confidence of points: length / (1 + error).
-
-    Args:
-        length: [P], number of photos that see each point.
-        error: [P], its mean reprojection error in pixels.
-
-    Returns:
-        float64 [P].
-    """
+    """Return the confidence of points by their track lengths [P] and mean errors [P] in pixels."""
     return np.asarray(length / (1.0 + error))
 
 
@@ -31,15 +23,13 @@ def straightened(
 
     Lens models are explicit only from the ray to the pixel. So each observation is moved by the
     distortion at its point's projection, which keeps its reprojection error to first order.
+    Observations of points behind the camera or outside the lens's view are dropped.
 
     Args:
         tracks: in pixels of the photos as taken.
         xyz: float64 [P, 3], the points, world frame.
         cameras: pinhole, one for each of ``tracks.names``.
         lenses: their lenses; None has no distortion.
-
-    Returns:
-        The tracks, without observations of points behind the camera or outside the lens's view.
     """
     xy = tracks.xy.copy()
     keep = np.ones(len(xy), dtype=bool)
@@ -62,10 +52,8 @@ def resized(
 ) -> Points | None:
     """Return points with tracks in pixels of resized photos.
 
-    Args:
-        points: with tracks in pixels of the photos as they were, or None.
-        before, after: the cameras of the photos by name; only their sizes count. Photos that are
-            not in both keep their pixels.
+    Only the sizes of the cameras before and after, by name, count. Photos that are not in both keep
+    their pixels.
     """
     if points is None or points.tracks is None:
         return points

@@ -215,9 +215,7 @@ class View(ArrayEquality, NotebookPicture):
 
 @dataclass(eq=False, repr=False)
 class Tracks(ArrayEquality):
-    """M observations of points in photos.
-
-    Two are equal (``==``) if all their fields are.
+    """M observations of points in photos. Two are equal (``==``) if all their fields are.
 
     Attributes:
         names: names of the photos, as ``View.name``.
@@ -249,9 +247,7 @@ class Tracks(ArrayEquality):
 
 @dataclass(eq=False, repr=False)
 class Points(ArrayEquality):
-    """A point cloud of P points in the world frame.
-
-    Two are equal (``==``) if all their fields are.
+    """P points in the world frame. Two clouds are equal (``==``) if all their fields are.
 
     Attributes:
         xyz: float64 [P, 3], world units.
@@ -281,11 +277,9 @@ class Points(ArrayEquality):
             self.confidence = np.asarray(self.confidence, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise IgsrError("confidence is not a list of numbers; give one per point") from error
-        if self.confidence.shape != (len(self.xyz),):
-            raise IgsrError(
-                f"confidence has shape {list(self.confidence.shape)}; give [{len(self.xyz)}], one "
-                "number per point"
-            )
+        shape = self.confidence.shape
+        if shape != (len(self.xyz),):
+            raise IgsrError(f"confidence has shape {list(shape)}; give [{len(self.xyz)}]")
         if not (np.isfinite(self.confidence) & (self.confidence > 0.0)).all():
             raise IgsrError(
                 "confidence holds a number that is not positive and finite; remove such points"
@@ -399,12 +393,7 @@ class Capture(ArrayEquality, NotebookPicture):
 
 
 def check_holdout(every: object, photos: int, path: Path) -> None:
-    """Check an interval for held-out photos.
-
-    Args:
-        every: the interval.
-        photos: number of photos.
-        path: of the photos, for error messages.
+    """Check that every ``every``-th of so many photos, loaded from ``path``, can be held out.
 
     Raises:
         IgsrError: ``every`` is not a whole number of at least 2, or there is only one photo.
@@ -416,14 +405,11 @@ def check_holdout(every: object, photos: int, path: Path) -> None:
 
 
 def nearest_rigid(matrix: np.ndarray, name: str) -> np.ndarray:
-    """Return the rigid matrix nearest to one that is rigid up to rounding.
+    """Return the rigid matrix, float64 [4, 4], nearest to one that is rigid up to rounding.
 
     Args:
         matrix: [4, 4], of any numeric dtype.
         name: of the matrix, for error messages.
-
-    Returns:
-        float64 [4, 4].
 
     Raises:
         IgsrError: the matrix is not [4, 4], not finite, or further than 1e-3 from rigid.

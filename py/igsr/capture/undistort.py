@@ -56,9 +56,9 @@ class Lens:
             directions: float64 [..., 3], x right, y down, z forward, of any length.
 
         Returns:
-            x, y: float64 [...], distorted normalized coordinates.
-            valid: bool [...], False beyond the angle at which the model folds back on itself, and
-                straight behind the lens, which has no unique image.
+            Distorted normalized coordinates x and y [...], and whether they are valid: not beyond
+            the angle at which the model folds back on itself, nor straight behind the lens, which
+            has no unique image.
         """
         x, y, z = np.moveaxis(directions, -1, 0)
         across = np.hypot(x, y)
@@ -81,9 +81,9 @@ class Lens:
             x, y: float64 arrays of one shape, normalized pinhole coordinates.
 
         Returns:
-            x, y: float64, distorted normalized coordinates.
-            valid: bool, False beyond the radius at which the model folds back on itself. There two
-                rays share a pixel, and the polynomial does not describe the real lens.
+            Distorted normalized coordinates x and y, and whether they are valid: not beyond the
+            radius at which the model folds back on itself. There two rays share a pixel, and the
+            polynomial does not describe the real lens.
         """
         if self.fisheye and not self._is_radial:
             return self.fisheye_places(np.stack([x, y, np.ones_like(x)], axis=-1))

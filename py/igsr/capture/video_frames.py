@@ -82,13 +82,15 @@ def sharpest_frames(path: Path, max_frames: int) -> list[tuple[int, UInt8]]:
 def evenly_sharp(places: Float64, sharpness: Float64, max_frames: int) -> list[int]:
     """Choose the sharpest frame in the middle half of each of equal spans of the path.
 
+    There is a span per step of the path, but at least ``MIN_FRAMES`` and at most ``max_frames``.
+
     Args:
         places: [F], length of the path up to each frame, in steps; never decreases.
         sharpness: [F].
         max_frames: maximum number of frames, at least 1.
 
     Returns:
-        Indices of frames, rising: one per step of the path, and of at least ``MIN_FRAMES`` spans.
+        Indices of frames, rising.
     """
     count, length = len(places), float(places[-1] - places[0])
     spans = min(max_frames, max(MIN_FRAMES, math.ceil(length)))
@@ -109,12 +111,9 @@ def evenly_sharp(places: Float64, sharpness: Float64, max_frames: int) -> list[i
 
 
 def video_size(path: Path) -> tuple[tuple[int, int], int]:
-    """Read the width and height of a video's frames in pixels, and their number, from its header.
+    """Read width and height in pixels of a video's frames, and their number (0 if unknown).
 
-    The number is 0 if the header has none.
-
-    Raises:
-        IgsrError: the file cannot be read as a video.
+    Only the header is read. An unreadable video is an IgsrError.
     """
     import av
 
@@ -131,11 +130,7 @@ def _unreadable(path: Path) -> IgsrError:
 
 
 def _frames(path: Path) -> Iterator[Any]:
-    """The frames in order, up to the first damaged one.
-
-    Raises:
-        IgsrError: the file cannot be read as a video.
-    """
+    """The frames in order, up to the first damaged one."""
     import av
 
     try:
@@ -200,10 +195,7 @@ class CameraPath:
         self._at_key = self._at = 0.0
 
     def add(self, gray: UInt8) -> float:
-        """Add the next frame.
-
-        Args:
-            gray: uint8 [H, W], of the same size as all others, at least 64 pixels each way.
+        """Add the next frame, uint8 [H, W] in gray, of at least 64 pixels each way.
 
         Returns:
             Length of the path up to it, in steps; it never decreases.

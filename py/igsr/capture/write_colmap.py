@@ -21,16 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.atomic_write import atomic_folder
-from igsr.capture.colmap_files import (
-    CAMERA,
-    CAMERA_SENSOR,
-    COUNT,
-    FRAME,
-    FRAME_DATA,
-    IMAGE,
-    OBSERVATION,
-    POINT,
-)
+from igsr.capture import colmap_files as layouts
 from igsr.capture.downscaling import resampled_plane
 from igsr.capture.types import Camera, Capture, Points, View
 from igsr.capture.write_files import png_names, save_png, write_depths, write_pictures
@@ -93,14 +84,9 @@ _Frame = tuple[int, Float64, list[int]]
 
 @dataclass(frozen=True)
 class _Image:
-    """An image of a model.
+    """An image: ``camera`` is the number of its camera; ``xy`` [N, 2] are its features, in pixels.
 
-    Attributes:
-        name: of its file.
-        camera: number of its camera, from 1.
-        pose: quaternion wxyz and translation, world to camera.
-        xy: float64 [N, 2], its features, pixels.
-        point_ids: int64 [N], numbers of their points, from 1.
+    ``pose`` is quaternion wxyz and translation, world to camera.
     """
 
     name: str
@@ -220,38 +206,42 @@ def _parameters(camera: Camera) -> list[float]:
 
 def _write_binary(folder: Path, model: _Model) -> None:
     with open(folder / "cameras.bin", "wb") as file:
-        file.write(COUNT.pack(len(model.cameras)))
+        file.write(layouts.COUNT.pack(len(model.cameras)))
         for number, camera in enumerate(model.cameras, start=1):
-            file.write(CAMERA.pack(number, _PINHOLE, camera.width, camera.height))
+            file.write(layouts.CAMERA.pack(number, _PINHOLE, camera.width, camera.height))
             file.write(struct.pack("<4d", *_parameters(camera)))
     with open(folder / "images.bin", "wb") as file:
-        file.write(COUNT.pack(len(model.images)))
+        file.write(layouts.COUNT.pack(len(model.images)))
         for number, image in enumerate(model.images, start=1):
-            file.write(IMAGE.pack(number, *image.pose, image.camera))
+            file.write(layouts.IMAGE.pack(number, *image.pose, image.camera))
             file.write(image.name.encode() + b"\0")
-            features = np.zeros(len(image.xy), dtype=OBSERVATION)
+            features = np.zeros(len(image.xy), dtype=layouts.OBSERVATION)
             features["xy"], features["point"] = image.xy, image.point_ids
-            file.write(COUNT.pack(len(features)) + features.tobytes())
+            file.write(layouts.COUNT.pack(len(features)) + features.tobytes())
     with open(folder / "points3D.bin", "wb") as file:
-        file.write(COUNT.pack(len(model.points)))
+        file.write(layouts.COUNT.pack(len(model.points)))
         for number, (xyz, rgb, error, track) in enumerate(model.points, start=1):
-            file.write(POINT.pack(number, *xyz, *rgb, error, len(track)))
+            file.write(layouts.POINT.pack(number, *xyz, *rgb, error, len(track)))
             file.write(track.astype("<u4").tobytes())
 
 
 def _write_rigs(folder: Path, model: _Model) -> None:
     with open(folder / "rigs.bin", "wb") as file:
-        file.write(COUNT.pack(len(model.rigs)))
+        file.write(layouts.COUNT.pack(len(model.rigs)))
         for number, (cameras, poses) in enumerate(model.rigs, start=1):
-            file.write(struct.pack("<IIiI", number, len(cameras), CAMERA_SENSOR, cameras[0]))
+            file.write(
+                struct.pack("<IIiI", number, len(cameras), layouts.CAMERA_SENSOR, cameras[0])
+            )
             for camera, pose in zip(cameras[1:], poses[1:], strict=True):
-                file.write(struct.pack("<iIB7d", CAMERA_SENSOR, camera, 1, *pose_numbers(pose)))
+                file.write(
+                    struct.pack("<iIB7d", layouts.CAMERA_SENSOR, camera, 1, *pose_numbers(pose))
+                )
     with open(folder / "frames.bin", "wb") as file:
-        file.write(COUNT.pack(len(model.frames)))
+        file.write(layouts.COUNT.pack(len(model.frames)))
         for number, (rig, pose, members) in enumerate(model.frames, start=1):
-            file.write(FRAME.pack(number, rig, *pose_numbers(pose), len(members)))
-            rows = [(CAMERA_SENSOR, model.images[k - 1].camera, k) for k in members]
-            file.write(np.array(rows, dtype=FRAME_DATA).tobytes())
+            file.write(layouts.FRAME.pack(number, rig, *pose_numbers(pose), len(members)))
+            rows = [(layouts.CAMERA_SENSOR, model.images[k - 1].camera, k) for k in members]
+            file.write(np.array(rows, dtype=layouts.FRAME_DATA).tobytes())
 
 
 # --- text -----------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-from igsr.capture.depth_files import FOLDER, write_depth
+from igsr.capture.image_files import DEPTHS, write_depth
 from igsr.capture.types import View
 
 
@@ -69,8 +69,7 @@ def write_depths(
     Args:
         folder: folder of the capture.
         names: the photos' file names, from ``png_names``.
-        depths: per photo camera-space z [h, w] in world units, of any size, 0 for unknown depths;
-            or None.
+        depths: per photo z [h, w] in world units, of any size, 0 for unknown depths; or None.
 
     Returns:
         The name of each file in the folder, by the name of its photo.
@@ -78,7 +77,7 @@ def write_depths(
     written = {}
     for name, depth in zip(names, depths, strict=True):
         if depth is not None:
-            written[name] = f"{FOLDER}/{name}.npy"
+            written[name] = f"{DEPTHS}/{name}.npy"
             write_depth(folder / written[name], depth)
     return written
 

@@ -12,6 +12,7 @@ from typing import Any
 from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
 from igsr.capture.load import holds_cameras
+from igsr.capture.photo_checks import split_unfit
 from igsr.capture.photo_folder import (
     FRAMES,
     MIN_PHOTOS,
@@ -20,7 +21,6 @@ from igsr.capture.photo_folder import (
     photo_headers,
     reduced_photo,
 )
-from igsr.capture.unfit_photos import split_unfit
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Estimate, Progress
 from igsr.pose.found_cameras import FoundCameras
