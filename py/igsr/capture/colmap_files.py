@@ -9,6 +9,7 @@ Source of the formats: https://colmap.github.io/format.html.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import struct
 from collections.abc import Iterator
@@ -248,19 +249,24 @@ def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
             yield number, line.strip()
 
 
-def _damaged(path: Path, number: int, expected: str) -> IgsrError:
-    return IgsrError(f"{path}, line {number} is not of the form {expected}; export the model again")
+@contextlib.contextmanager
+def _form(path: Path, number: int, expected: str) -> Iterator[None]:
+    """Raise an IgsrError that names the line if it does not have the expected form."""
+    try:
+        yield
+    except (ValueError, IndexError, OverflowError) as error:
+        raise IgsrError(
+            f"{path}, line {number} is not of the form {expected}; export the model again"
+        ) from error
 
 
 def _text_cameras(path: Path) -> dict[int, ColmapCamera]:
     cameras = {}
     for number, line in _lines(path):
-        try:
+        with _form(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"):
             identity, model, width, height, *params = line.split()
             camera = ColmapCamera(model, int(width), int(height), tuple(map(float, params)))
             camera_id = int(identity)
-        except ValueError as error:
-            raise _damaged(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from error
         count = _checked_parameter_count(path, camera_id, model)
         if len(params) != count:
             raise IgsrError(
@@ -277,12 +283,10 @@ def _text_images(path: Path) -> list[ColmapImage]:
     for number, line in lines:
         if not line:
             continue
-        try:
+        with _form(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
             fields = line.split(maxsplit=9)
             pose = tuple(map(float, fields[1:8]))
             name, camera_id, identity = fields[9], int(fields[8]), int(fields[0])
-        except (ValueError, IndexError) as error:
-            raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from error
         number, line = next(lines, (number + 1, ""))  # its observations, possibly none
         xy, point_ids = _text_observations(path, number, line)
         images.append(ColmapImage(identity, name, pose, camera_id, xy, point_ids))
@@ -291,30 +295,25 @@ def _text_images(path: Path) -> list[ColmapImage]:
 
 def _text_observations(path: Path, number: int, line: str) -> tuple[np.ndarray, np.ndarray]:
     fields = line.split()
-    try:
+    with _form(path, number, "X Y POINT3D_ID of each feature"):
         xy = np.array([fields[0::3], fields[1::3]], dtype=np.float64).T
         # No point is -1, or the same 64 bits without a sign.
         ids = [-1 if int(field) == (1 << 64) - 1 else int(field) for field in fields[2::3]]
-        point_ids = np.array(ids, dtype=np.int64)
         if len(fields) % 3:
             raise ValueError
-    except (ValueError, OverflowError) as error:
-        raise _damaged(path, number, "X Y POINT3D_ID of each feature") from error
-    return xy, point_ids
+        return xy, np.array(ids, dtype=np.int64)
 
 
 def _text_points(path: Path) -> list[tuple[Any, ...]]:
     rows = []
     for number, line in _lines(path):
-        try:
+        with _form(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
             identity, x, y, z, r, g, b, *rest = line.split()
             # Other programs may omit the error and the track.
             error, length = float(rest[0]) if rest else math.nan, max(0, len(rest) - 1) // 2
             xyz, rgb = (float(x), float(y), float(z)), (int(r), int(g), int(b))
             if not (all(0 <= value <= 255 for value in rgb) and 0 <= int(identity) < 1 << 64):
                 raise ValueError
-        except ValueError as cause:
-            raise _damaged(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from cause
         rows.append((int(identity), xyz, rgb, error, length))
     return rows
 

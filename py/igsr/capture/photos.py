@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -196,17 +197,12 @@ def shot_sizes(shots: list[Shot], headers: list[PhotoHeader]) -> PhotoSizes:
 
 def _load_views(shots: list[Shot], headers: list[PhotoHeader], max_size: int | None) -> list[View]:
     """Load all photos of a capture on all cores, in the order given."""
-    cameras = {
-        shot.name: resized_camera(shot.camera, *reduced_size(*header.size, max_size))
-        for shot, header in zip(shots, headers, strict=True)
-        if shot.rig is None
-    }
-    undistorters = _Undistorters([shot for shot in shots if shot.rig is None], cameras)
+    undistorters = _Undistorters(zip(shots, headers, strict=True))
 
-    def load(group: list[Shot], header: PhotoHeader) -> list[View]:
-        shot, rig = group[0], group[0].rig
+    def load(group: list[tuple[Shot, PhotoHeader]]) -> list[View]:
+        (shot, header), rig = group[0], group[0][0].rig
         if rig is None:
-            size = cameras[shot.name].width, cameras[shot.name].height
+            size = reduced_size(*header.size, max_size)
         else:
             size = decoded_size(rig, header.size, max_size)
         with open_image(shot.path) as opened:
@@ -216,19 +212,19 @@ def _load_views(shots: list[Shot], headers: list[PhotoHeader], max_size: int | N
             image, mask = decoded(opened, shot.path, size, mask)
             exposure_value = read_exif(opened).exposure_value
         if rig is None:
-            views = [_undistorted(shot, cameras[shot.name], image, mask, undistorters)]
+            camera = resized_camera(shot.camera, *size)
+            undistorter = undistorters.take(shot, header, camera)
+            views = [_undistorted(shot, camera, image, mask, undistorter)]
         else:
-            views = _rig_views(group, rig, image, mask, max_size)
+            views = _rig_views([shot for shot, _ in group], rig, image, mask, max_size)
         return [replace(view, exposure_value=exposure_value, rig=shot.photo) for view in views]
 
     # The views of a wide photo share one decoding of it.
-    groups: dict[str, tuple[list[Shot], PhotoHeader]] = {}
-    for shot, header in zip(shots, headers, strict=True):
-        key = shot.name if shot.rig is None else photo_of(shot)
-        groups.setdefault(key, ([], header))[0].append(shot)
+    pairs = zip(shots, headers, strict=True)
+    groups = groupby(pairs, lambda pair: pair[0].name if pair[0].rig is None else pair[0].photo)
     threads = shot_sizes(shots, headers).decoding_threads(max_size)
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        futures = [pool.submit(load, *group) for group in groups.values()]
+        futures = [pool.submit(load, list(group)) for _, group in groups]
         try:
             return [view for future in futures for view in future.result()]
         except BaseException:
@@ -239,31 +235,29 @@ def _load_views(shots: list[Shot], headers: list[PhotoHeader], max_size: int | N
 class _Undistorters:
     """One resampling map per distinct camera, freed after its last photo to save memory."""
 
-    def __init__(self, shots: list[Shot], cameras: dict[str, Camera]) -> None:
+    def __init__(self, photos: Iterable[tuple[Shot, PhotoHeader]]) -> None:
         self._maps: dict[object, Undistorter] = {}
-        self._uses = Counter(
-            self._key(shot, cameras[shot.name]) for shot in shots if not shot.lens.is_pinhole
-        )
+        self._uses = Counter(self._key(shot, header) for shot, header in photos)
         # One lock per camera, so that maps of different cameras are computed in parallel.
         self._locks = {key: threading.Lock() for key in self._uses}
 
     @staticmethod
-    def _key(shot: Shot, camera: Camera) -> object:
-        return shot.lens, camera.K.tobytes(), camera.width, camera.height
+    def _key(shot: Shot, header: PhotoHeader) -> object:
+        camera = shot.camera
+        return shot.lens, camera.K.tobytes(), camera.width, camera.height, header.size
 
-    def take(self, shot: Shot, camera: Camera) -> Undistorter:
-        key = self._key(shot, camera)
+    def take(self, shot: Shot, header: PhotoHeader, camera: Camera) -> Undistorter | None:
+        if shot.lens.is_pinhole:
+            return None
+        key = self._key(shot, header)
         with self._locks[key]:
             if key not in self._maps:
                 try:
                     self._maps[key] = Undistorter(shot.lens, camera.K, camera.width, camera.height)
                 except IgsrError as error:
                     raise IgsrError(f"{shot.source}: the camera of {shot.name}: {error}") from error
-            undistorter = self._maps[key]
             self._uses[key] -= 1
-            if self._uses[key] == 0:
-                del self._maps[key]
-        return undistorter
+            return self._maps[key] if self._uses[key] else self._maps.pop(key)
 
 
 def _undistorted(
@@ -271,17 +265,14 @@ def _undistorted(
     camera: Camera,
     image: np.ndarray,
     mask: np.ndarray | None,
-    undistorters: _Undistorters,
+    undistorter: Undistorter | None,
 ) -> View:
     depth = _read_depth(shot, camera)
-    if not shot.lens.is_pinhole:
-        undistorter = undistorters.take(shot, camera)
+    if undistorter is not None:
         image = undistorter.image(image)
         mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
-        if mask.all():
-            mask = None
-        if depth is not None:
-            depth = undistorter.nearest(depth)
+        mask = None if mask.all() else mask
+        depth = None if depth is None else undistorter.nearest(depth)
     return View(shot.name, camera, shot.split, image, mask, depth=depth)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -115,37 +116,36 @@ def video_size(path: Path) -> tuple[tuple[int, int], int]:
 
     Only the header is read. An unreadable video is an IgsrError.
     """
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        return (int(stream.width), int(stream.height)), max(0, int(stream.frames))
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     import av
 
     try:
         with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            return (int(stream.width), int(stream.height)), max(0, int(stream.frames))
+            yield container
     except (av.FFmpegError, IndexError, ValueError) as error:
-        raise _unreadable(path) from error
-
-
-def _unreadable(path: Path) -> IgsrError:
-    return IgsrError(f"{path} cannot be read as a video; save it as MP4 again")
+        raise IgsrError(f"{path} cannot be read as a video; save it as MP4 again") from error
 
 
 def _frames(path: Path) -> Iterator[Any]:
     """The frames in order, up to the first damaged one."""
     import av
 
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            frames = container.decode(stream)
-            while True:
-                try:
-                    frame = next(frames)
-                except (StopIteration, av.FFmpegError):
-                    return
-                yield frame
-    except (av.FFmpegError, IndexError, ValueError) as error:
-        raise _unreadable(path) from error
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        frames = container.decode(stream)
+        while True:
+            try:
+                frame = next(frames)
+            except (StopIteration, av.FFmpegError):
+                return
+            yield frame
 
 
 def _refuse_hdr(path: Path, frame: Any) -> None:
