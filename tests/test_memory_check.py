@@ -11,18 +11,14 @@ import pytest
 from capture_files import photo, save, write_transforms
 
 from igsr.capture import load_capture, memory_check
-from igsr.capture.memory_check import (
-    USABLE_PART,
-    PhotoSizes,
-    available_memory,
-)
+from igsr.capture.memory_check import USABLE_PART, PhotoSizes, available_memory
 from igsr.capture.photo_folder import load_photos
 from igsr.errors import IgsrError
 
 TWELVE_MP = PhotoSizes(sizes=[(4000, 3000)] * 100)
 
 
-def test_the_message_names_a_size_that_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_message_names_a_size_that_fits(monkeypatch):
     monkeypatch.setattr(memory_check, "available_memory", lambda: 2_000_000_000)
     with pytest.raises(IgsrError) as error:
         TWELVE_MP.check_memory(splats=30_000)
@@ -45,7 +41,7 @@ def test_the_message_names_a_size_that_fits(monkeypatch: pytest.MonkeyPatch) -> 
         TWELVE_MP.check_memory(splats=10_000_000)
 
 
-def test_more_pixels_channels_masks_and_splats_need_more() -> None:
+def test_more_pixels_channels_masks_and_splats_need_more():
     base = TWELVE_MP.needed_memory(1000, 30_000)
     assert TWELVE_MP.needed_memory(1000) < base < TWELVE_MP.needed_memory(1100, 30_000)
     assert base < replace(TWELVE_MP, channels=4).needed_memory(1000, 30_000)
@@ -57,7 +53,7 @@ def test_more_pixels_channels_masks_and_splats_need_more() -> None:
     assert TWELVE_MP.largest_size_that_fits(available=10**6) is None
 
 
-def test_depths_need_more() -> None:
+def test_depths_need_more():
     sizes = [(1000, 750)] * 100
     without, with_depths = PhotoSizes(sizes=sizes), PhotoSizes(sizes=sizes, depths=True)
     # Four bytes per pixel as loaded; in a fit also depth and confidence twice.
@@ -66,10 +62,8 @@ def test_depths_need_more() -> None:
         assert extra == bytes_per_pixel * 100 * 1000 * 750
 
 
-def test_photos_are_refused_before_any_is_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def decode(*arguments: object) -> None:
+def test_photos_are_refused_before_any_is_decoded(tmp_path, monkeypatch):
+    def decode(*arguments):
         raise AssertionError("a photo is decoded")
 
     write_transforms(tmp_path / "capture")
@@ -83,7 +77,7 @@ def test_photos_are_refused_before_any_is_decoded(
         load_photos(tmp_path / "photos")
 
 
-def test_what_is_available() -> None:
+def test_available_memory():
     here = available_memory()
     assert 0 < here < 1 << 50
     before = resource.getrlimit(resource.RLIMIT_AS)
@@ -97,9 +91,7 @@ def test_what_is_available() -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_limits_of_control_groups(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int
-) -> None:
+def test_limits_of_control_groups(tmp_path, monkeypatch, version):
     root = tmp_path / "cgroup"
     memory = root / "memory" if version == 1 else root
     limit, used = {
@@ -118,19 +110,19 @@ def test_limits_of_control_groups(
     assert available_memory() > 0.5 * without
     (group.parent / limit).write_text("3000000\n")
     (group.parent / used).write_text("1000000\n")
-    assert available_memory() == 2_000_000, "a group above limits too"
+    assert available_memory() == 2_000_000, "a parent group limits too"
     (group / limit).write_text("1500000\n")
     (group / used).write_text("900000\n")
     assert available_memory() == 600_000
     (group / "memory.stat").write_text("anon 5\ninactive_file 300000\nbroken\n")
-    assert available_memory() == 900_000, "cached files are given up"
+    assert available_memory() == 900_000, "cached files are freed"
     (group / used).write_text("9000000\n")
     assert available_memory() == 0
     own.write_text("nothing of the kind")
     assert available_memory() > 0.5 * without
 
 
-def test_large_photos_are_decoded_by_fewer_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_photos_are_decoded_by_fewer_threads(monkeypatch):
     monkeypatch.setattr(memory_check.os, "cpu_count", lambda: 64)
     for free in (2_000_000_000, 3_000_000_000):
         monkeypatch.setattr(memory_check, "available_memory", lambda free=free: free)

@@ -23,16 +23,8 @@ from igsr.errors import IgsrError
 pillow_heif.register_heif_opener()
 
 ORIENTATION, MAKE, MODEL, SUB_FOLDER = 0x0112, 0x010F, 0x0110, 0x8769
-TAGS = {
-    "focal35": 0xA405,
-    "focal": 0x920A,
-    "resolution": 0xA20E,
-    "unit": 0xA210,
-    "w": 0xA002,
-    "seconds": 0x829A,
-    "f_number": 0x829D,
-    "iso": 0x8827,
-}
+TAGS = {"focal35": 0xA405, "focal": 0x920A, "resolution": 0xA20E, "unit": 0xA210, "w": 0xA002}
+TAGS |= {"seconds": 0x829A, "f_number": 0x829D, "iso": 0x8827}
 
 
 def smooth(width=48, height=32):

@@ -16,10 +16,9 @@ from igsr.blocks.options import BlockOptions
 from igsr.blocks.plan import BlockPlan, memory_of
 from igsr.blocks.reach import reaching_out
 from igsr.blocks.tasks import SPLATS, BlockPart, FitTask
-from igsr.capture.downscaling import reduced_size
+from igsr.capture.downscaling import reduced_size, resized_tracks
 from igsr.capture.exposure import Exposure
 from igsr.capture.memory_check import SPLAT_BYTES
-from igsr.capture.tracks import resized
 from igsr.capture.types import Points
 from igsr.errors import IgsrError
 from igsr.splats import Splats
@@ -64,7 +63,7 @@ def coarse_task(
         # Transient things are looked for by the blocks: the search holds all photos of a fit.
         settings=settings,
         backend=options.backend,
-        points=resized(points, before, cast(Any, after)),
+        points=resized_tracks(points, before, cast(Any, after)),
     )
 
 

@@ -140,9 +140,6 @@ def _utf8(path: Path, data: bytes) -> str:
         raise IgsrError(f"{path} is corrupt or not in UTF-8; export the model again") from error
 
 
-# --- binary ---------------------------------------------------------------------------------------
-
-
 class _BinaryReader:
     """A little-endian file read from front to back; every read is checked against its length."""
 
@@ -237,9 +234,6 @@ def _binary_frames(path: Path) -> list[list[int]]:
         data = file.table(FRAME_DATA, count)
         frames.append(data["image"][data["sensor_type"] == CAMERA_SENSOR].tolist())
     return frames
-
-
-# --- text -----------------------------------------------------------------------------------------
 
 
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[int, str]]:

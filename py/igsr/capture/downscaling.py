@@ -1,4 +1,4 @@
-"""Reduce photos and views with an area filter.
+"""Reduce photos and views with an area filter, and scale their tracks.
 
 A pixel of the smaller photo is the mean of the area that it covers, including parts of pixels. The
 field of view stays the same: focal lengths and principal point scale by the ratio of the two sizes
@@ -7,14 +7,14 @@ per axis, exactly, since pixel centers are at +0.5.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from igsr.capture.types import Camera, View
+from igsr.capture.types import Camera, Points, View
 from igsr.errors import IgsrError
 
 Float64 = npt.NDArray[np.float64]
@@ -175,6 +175,27 @@ def halved(view: View) -> View:
     }
     camera = replace(view.camera, width=2 * width, height=2 * height)
     return reduced_view(replace(view, camera=camera, **cropped), width, height)
+
+
+def resized_tracks(
+    points: Points | None, before: Mapping[str, Camera], after: Mapping[str, Camera]
+) -> Points | None:
+    """Return points with tracks in pixels of resized photos.
+
+    Only the sizes of the cameras before and after, by name, count. Photos that are not in both keep
+    their pixels.
+    """
+    if points is None or points.tracks is None:
+        return points
+    tracks = points.tracks
+    scale = np.ones((len(tracks.names), 2))
+    for index, name in enumerate(tracks.names):
+        if name in before and name in after:
+            old, new = before[name], after[name]
+            scale[index] = new.width / old.width, new.height / old.height
+    if (scale == 1.0).all():
+        return points
+    return replace(points, tracks=replace(tracks, xy=tracks.xy * scale[tracks.view]))
 
 
 def _rounded(values: Float64) -> npt.NDArray[np.uint8]:

@@ -198,9 +198,6 @@ def _converted(image: Image.Image, path: Path, mode: str) -> Image.Image:
         ) from error
 
 
-# --- depth ----------------------------------------------------------------------------------------
-
-
 def find_depth(folder: Path, name: str) -> Path | None:
     """Return a photo's depth file: its name, with or without suffix, and a suffix of depth."""
     stems = (name, posixpath.splitext(name)[0])

@@ -167,10 +167,7 @@ def _address_space_limit() -> int | None:
 
 def _left_to_cgroups() -> list[int]:
     """Bytes left to each control group of this process that has a limit."""
-    try:
-        lines = _OWN_CGROUPS.read_text(encoding="utf-8").splitlines()
-    except (OSError, ValueError):
-        return []
+    lines = _text(_OWN_CGROUPS).splitlines()
     left = []
     for line in lines:
         _, controllers, path = (line.split(":", 2) + ["", ""])[:3]
@@ -192,19 +189,21 @@ def _left_to_cgroups() -> list[int]:
     return left
 
 
-def _number(path: Path) -> int | None:
+def _text(path: Path) -> str:
     try:
-        return int(path.read_text(encoding="ascii"))
-    except (OSError, ValueError):  # "max" is no limit
-        return None
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return ""
+
+
+def _number(path: Path) -> int | None:
+    text = _text(path).strip()
+    return int(text) if text.isdecimal() else None  # "max" is no limit
 
 
 def _reclaimable(group: Path) -> int:
     """Bytes of cached files that a control group frees when it needs memory."""
-    try:
-        lines = (group / "memory.stat").read_text(encoding="ascii").splitlines()
-    except (OSError, ValueError):
-        return 0
+    lines = _text(group / "memory.stat").splitlines()
     fields = dict(line.split(None, 1) for line in lines if " " in line)
     for name in ("total_inactive_file", "inactive_file"):
         if fields.get(name, "").isdecimal():

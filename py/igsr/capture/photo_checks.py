@@ -141,9 +141,6 @@ def _detail(photo: Photo, longest: int) -> Float64 | None:
     return detail / length if length > np.sqrt(detail.size) else None
 
 
-# --- before a fit ---------------------------------------------------------------------------------
-
-
 def check_photos(views: list[View]) -> None:
     """Warn about photos that do not determine the scene; refuse photos that no fit can use.
 

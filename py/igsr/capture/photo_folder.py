@@ -160,9 +160,6 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_MAX_NAMES]) + (f" and {others} more" if others > 0 else "")
 
 
-# --- files ----------------------------------------------------------------------------------------
-
-
 def has_photos(path: Path) -> bool:
     """Return whether a path is a video, or a folder that holds photos or videos."""
     if is_file(path):
@@ -246,9 +243,6 @@ def _listed_files(files: list[Path]) -> tuple[Path, list[Path], Path]:
     return root, files, root / "masks"
 
 
-# --- headers --------------------------------------------------------------------------------------
-
-
 def photo_headers(path: Paths, frames: int = FRAMES) -> PhotoSizes:
     """Return the sizes of the photos that ``load_photos`` would load.
 
@@ -297,9 +291,6 @@ def _wide_photo(file: Path, size: tuple[int, int], lens: WideFisheye | None) -> 
     if lens is not None and size[0] * lens.height == size[1] * lens.width:
         return lens.resized(*size)
     return panorama_of(file)
-
-
-# --- photos ---------------------------------------------------------------------------------------
 
 
 def _photos_of_file(

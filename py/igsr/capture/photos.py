@@ -19,6 +19,7 @@ from igsr.capture.downscaling import (
     reduced_size,
     resampled_plane,
     resized_camera,
+    resized_tracks,
 )
 from igsr.capture.exif import read_exif
 from igsr.capture.image_files import (
@@ -31,7 +32,6 @@ from igsr.capture.image_files import (
 )
 from igsr.capture.memory_check import PhotoSizes
 from igsr.capture.rig import Rig, decoded_size, sampled_views
-from igsr.capture.tracks import resized
 from igsr.capture.types import Camera, Capture, Points, View
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
@@ -134,7 +134,7 @@ class DescribedCapture:
         views = _load_views(self.shots, headers, max_size)
         before = {shot.name: shot.camera for shot in self.shots}
         after = {view.name: view.camera for view in views}
-        return Capture(self.path, views, resized(points, before, after))
+        return Capture(self.path, views, resized_tracks(points, before, after))
 
 
 def checked_headers(shots: list[Shot]) -> list[PhotoHeader]:

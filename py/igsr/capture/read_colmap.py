@@ -32,9 +32,8 @@ from igsr.capture.colmap_files import ColmapCamera, ColmapImage
 from igsr.capture.image_files import DEPTHS, SUFFIXES, find_depth, is_file
 from igsr.capture.photos import DescribedCapture, Shot, rig_shots
 from igsr.capture.rig import Rig, moved_to_side, rig_of
-from igsr.capture.tracks import straightened, track_confidence
 from igsr.capture.types import Camera, Points, Tracks, intrinsic_matrix
-from igsr.capture.undistort import Lens
+from igsr.capture.undistort import Lens, straightened
 from igsr.capture.wide_photos import WidePhoto, whole_sphere, wide_fisheye
 from igsr.errors import IgsrError
 
@@ -198,9 +197,6 @@ def _shared_centers(frames: list[list[int]], photos: list[_Photo]) -> dict[int, 
     return rigs
 
 
-# --- points ---------------------------------------------------------------------------------------
-
-
 def _points(path: Path, table: np.ndarray, images_path: Path, photos: list[_Photo]) -> Points:
     xyz = np.ascontiguousarray(table["xyz"])
     if not np.isfinite(xyz).all():
@@ -215,6 +211,11 @@ def _points(path: Path, table: np.ndarray, images_path: Path, photos: list[_Phot
     points = Points(xyz, np.ascontiguousarray(table["rgb"]), confidence if is_known else None)
     points.tracks = _tracks(images_path, photos, table["id"], xyz)
     return points
+
+
+def track_confidence(length: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return the confidence of points by their track lengths [P] and mean errors [P] in pixels."""
+    return np.asarray(length / (1.0 + error))
 
 
 def _tracks(path: Path, photos: list[_Photo], ids: np.ndarray, xyz: np.ndarray) -> Tracks | None:
@@ -251,9 +252,6 @@ def _tracks(path: Path, photos: list[_Photo], ids: np.ndarray, xyz: np.ndarray) 
     names = [shot.name for shot in shots]
     tracks = Tracks(names, *(np.concatenate(part) for part in (views, points, places)))
     return straightened(tracks, xyz, [shot.camera for shot in shots], [shot.lens for shot in shots])
-
-
-# --- photos ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -142,9 +142,8 @@ def sampled_views(
 
     Args:
         rig: the views.
-        image: uint8 [H, W, 3 or 4] of the wide photo, at its full size or that of ``decoded_size``.
-        mask: bool [H, W] of it, or None. A fisheye photo without a mask is masked to the circle
-            that its lens lights.
+        image: uint8 [H, W, 3 or 4] of the photo, at its full size or that of ``decoded_size``.
+        mask: bool [H, W] of it; without one, a fisheye photo is masked to its lit circle.
         max_size: as ``decoded_size``.
 
     Returns:

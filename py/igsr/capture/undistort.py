@@ -1,4 +1,4 @@
-"""Undistort photos: a distorted photo becomes a pinhole photo and a mask of its valid pixels.
+"""Undistort photos, into a pinhole photo and a mask of its valid pixels, and their tracks.
 
 The pinhole camera keeps the focal lengths, principal point and size of the distorted camera. So the
 middle of the picture keeps its resolution, and no crop has to be chosen. Parts of the photo outside
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from igsr.capture.types import Camera, Tracks
 from igsr.errors import IgsrError
 
 # Pixels mapped at a time, which limits the float64 temporaries to a few MB.
@@ -154,8 +155,7 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
 class Sampler:
     """Resamples photos bilinearly to another camera, a band of rows at a time.
 
-    Attributes:
-        valid: bool [H, W], True for pixels of the new picture that the photo shows.
+    ``valid``, bool [H, W], is True for pixels of the new picture that the photo shows.
     """
 
     def __init__(self, height: int, width: int, weights_sum_to_one: bool = False) -> None:
@@ -172,14 +172,9 @@ class Sampler:
         return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
 
     def image(self, image: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-        """Resample a photo.
+        """Resample a photo, uint8 [H, W, 3 or 4] with straight alpha; invalid pixels become 0.
 
-        Args:
-            image: uint8 [H, W, 3 or 4] of the photo, alpha straight.
-            mask: bool [H, W] of the photo, or None; masked pixels lend no color if others can.
-
-        Returns:
-            uint8 [h, w, 3 or 4]; pixels that are not valid are 0.
+        Masked pixels lend no color if others can.
         """
         channels = image.shape[2]
         # Fetching a pixel as one 32-bit word is three times as fast as byte by byte.
@@ -228,9 +223,6 @@ class Undistorter(Sampler):
         lens: the distortion.
         K: float64 [3, 3], pixels; kept as the pinhole camera's intrinsics.
         width, height: the photo's size, pixels; kept.
-
-    Attributes:
-        valid: bool [H, W], True for pinhole pixels whose center is within the photo.
 
     Raises:
         IgsrError: no pixel is valid.
@@ -284,3 +276,34 @@ class Undistorter(Sampler):
         out = plane.ravel()[self._index + right + width * down]
         out[~self.valid] = 0
         return out
+
+
+def straightened(
+    tracks: Tracks, xyz: np.ndarray, cameras: list[Camera], lenses: list[Lens | None]
+) -> Tracks:
+    """Move observations from photos as taken to undistorted photos.
+
+    Lens models are explicit only from the ray to the pixel. So each observation is moved by the
+    distortion at its point's projection, which keeps its reprojection error to first order.
+    Observations of points behind the camera or outside the lens's view are dropped.
+
+    Args:
+        tracks: in pixels of the photos as taken.
+        xyz: float64 [P, 3], the points, world frame.
+        cameras: pinhole, one for each of ``tracks.names``.
+        lenses: their lenses; None has no distortion.
+    """
+    xy = tracks.xy.copy()
+    keep = np.ones(len(xy), dtype=bool)
+    for index, (camera, lens) in enumerate(zip(cameras, lenses, strict=True)):
+        if lens is None or lens.is_pinhole:
+            continue
+        rows = np.flatnonzero(tracks.view == index)
+        local = xyz[tracks.point[rows]] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        in_front = local[:, 2] > 0.0
+        x, y = local[:, :2].T / np.where(in_front, local[:, 2], 1.0)
+        bent_x, bent_y, valid = lens.distort(x, y)
+        focal = camera.K[[0, 1], [0, 1]]
+        xy[rows] -= np.stack([bent_x - x, bent_y - y], axis=1) * focal
+        keep[rows] = in_front & valid & np.isfinite(xy[rows]).all(axis=1)
+    return Tracks(tracks.names, tracks.view[keep], tracks.point[keep], xy[keep])

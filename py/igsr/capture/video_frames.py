@@ -51,14 +51,10 @@ def sharpest_frames(path: Path, max_frames: int) -> list[tuple[int, UInt8]]:
     most a step, and the sharpest frame in the middle half of each is taken: a slow pan gives as
     many frames as a fast one, a stop gives one. Sharpness is the variance of the Laplacian
     (Pech-Pacheco et al., ICPR 2000), which motion blur and defocus lower. A still video is divided
-    by time.
-
-    Args:
-        path: the video. Of a damaged one, the readable part counts.
-        max_frames: maximum number of frames, at least 1.
+    by time. Of a damaged video, the readable part counts.
 
     Returns:
-        (index in the video, uint8 [H, W, 3] RGB, upright), in order.
+        (index in the video, uint8 [H, W, 3] RGB, upright), in order; at most ``max_frames``.
 
     Raises:
         IgsrError: the file cannot be read as a video, or is HDR.

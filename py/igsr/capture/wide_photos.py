@@ -248,9 +248,6 @@ def whole_sphere(width: int, height: int) -> Equirectangular:
     return Equirectangular.whole(width, height)
 
 
-# --- recognition ----------------------------------------------------------------------------------
-
-
 def panorama_of(path: Path) -> Equirectangular | None:
     """Recognize a panorama that is stored upright; None for any other photo.
 

@@ -2,7 +2,7 @@
 
 Cameras are PINHOLE. If views are of wide photos, the model has rigs and frames (COLMAP 3.12). Of an
 image's features, only those with points are written. A point with a track gets the error that its
-confidence was computed from (see ``track_confidence``; -1, as in COLMAP, if it is unknown), a point
+confidence was computed from (``track_confidence``; -1, as in COLMAP, if it is unknown), a point
 without a track 1 / confidence (0 if it is unknown). ``load_capture`` reads both back. A mask has
 the photo's whole name and ``.png``, as COLMAP's feature extraction expects.
 
@@ -78,7 +78,9 @@ def write_colmap(
             (_write_rigs_as_text if text else _write_rigs)(path, model)
 
 
+#: The numbers of a rig's cameras, and their poses relative to the first one.
 _Rig = tuple[list[int], list[Float64]]
+#: The number of a frame's rig, its pose and the numbers of its images.
 _Frame = tuple[int, Float64, list[int]]
 
 
@@ -98,19 +100,11 @@ class _Image:
 
 @dataclass(frozen=True)
 class _Model:
-    """The contents of a model's files. Numbers count from 1, in the order of the lists.
-
-    Attributes:
-        cameras: distinct cameras.
-        images: one per view.
-        points: per point position, color, error in pixels and track: int64 [L, 2], numbers of the
-            images and indices of their features.
-        rigs: per rig, the numbers of its cameras and their poses relative to the first one.
-        frames: per frame, the number of its rig, its pose and the numbers of its images.
-    """
+    """The contents of a model's files; numbers count from 1, in the order of the lists."""
 
     cameras: list[Camera]
     images: list[_Image]
+    # Position, color, error in pixels, and track [L, 2]: images and indices of their features.
     points: list[tuple[list[float], list[int], float, np.ndarray]]
     rigs: list[_Rig]
     frames: list[_Frame]
@@ -201,9 +195,6 @@ def _parameters(camera: Camera) -> list[float]:
     return [float(camera.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
 
 
-# --- binary ---------------------------------------------------------------------------------------
-
-
 def _write_binary(folder: Path, model: _Model) -> None:
     with open(folder / "cameras.bin", "wb") as file:
         file.write(layouts.COUNT.pack(len(model.cameras)))
@@ -242,9 +233,6 @@ def _write_rigs(folder: Path, model: _Model) -> None:
             file.write(layouts.FRAME.pack(number, rig, *pose_numbers(pose), len(members)))
             rows = [(layouts.CAMERA_SENSOR, model.images[k - 1].camera, k) for k in members]
             file.write(np.array(rows, dtype=layouts.FRAME_DATA).tobytes())
-
-
-# --- text -----------------------------------------------------------------------------------------
 
 
 def _write_text(folder: Path, model: _Model) -> None:
@@ -288,9 +276,6 @@ def _joined(numbers: Sequence[float]) -> str:
 
 def _write_lines(path: Path, lines: list[str]) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-
-
-# --- poses ----------------------------------------------------------------------------------------
 
 
 def pose_numbers(viewmat: Float64) -> list[float]:
