@@ -11,7 +11,7 @@ import rooms
 
 from igsr.capture import Camera
 from igsr.capture.types import PoseEvidence
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.errors import IgsrError
 from igsr.fitting.pose_priors import pose_priors
 from igsr.geometry.pose_errors import pose_accuracy, pose_errors

@@ -10,7 +10,7 @@ import pytest
 import scenes
 from PIL import Image
 
-from igsr.capture.overview import Overview, look_at
+from igsr.capture.load import Overview, look_at
 from igsr.cli import announcement
 from igsr.cli.announcement import announce
 from igsr.fitting.presets import settings_for

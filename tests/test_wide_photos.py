@@ -16,7 +16,7 @@ from PIL.PngImagePlugin import PngInfo
 
 import igsr
 from igsr.capture import Capture, load_capture
-from igsr.capture.overview import look_at
+from igsr.capture.load import look_at
 from igsr.capture.photo_folder import load_photos
 from igsr.capture.rig import moved_to_side, rig_of
 from igsr.capture.undistort import Lens

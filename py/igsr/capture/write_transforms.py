@@ -1,8 +1,10 @@
-"""Write captures for nerfstudio: ``transforms.json`` with cameras in OpenGL axes."""
+"""Write captures and cameras in the format of nerfstudio's ``transforms.json``."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,8 +12,7 @@ import numpy as np
 from igsr._internal.atomic_write import atomic_folder
 from igsr._internal.json_file import write_json
 from igsr.capture.point_cloud import write_point_cloud
-from igsr.capture.types import Camera, Capture
-from igsr.capture.write_cameras import camera_fields
+from igsr.capture.types import Camera, Capture, View
 from igsr.capture.write_files import png_names, write_depths, write_pictures
 
 
@@ -37,7 +38,7 @@ def write_transforms(
     for view, name in zip(capture.views, names, strict=True):
         frame = {
             "file_path": f"images/{name}",
-            **camera_fields(view.camera, _to_world(view.camera)),
+            **_camera_fields(view.camera, _to_world(view.camera)),
         }
         if view.mask is not None:
             frame["mask_path"] = f"masks/{name}"
@@ -62,6 +63,48 @@ def write_transforms(
             document["ply_file_path"] = "points.ply"
             write_point_cloud(folder / "points.ply", capture.points)
         write_json(folder / "transforms.json", document)
+
+
+def write_cameras(path: Path, views: Sequence[View]) -> None:
+    """Write ``cameras.json``: the cameras of photos, without the photos.
+
+    One frame per photo: ``file_path`` (its name in the capture), ``w``, ``h``, ``fl_x``, ``fl_y``,
+    ``cx``, ``cy`` in pixels, ``transform_matrix`` camera-to-world in OpenGL axes; for views of one
+    wide photo their common ``rig``; for a photo with an exposure ``exposure``, with ``gain`` and
+    ``offset`` of R, G and B (see ``Exposure``); for an estimated camera ``pose_evidence``, with the
+    fields of ``PoseEvidence``.
+
+    Raises:
+        IgsrError: the file cannot be written.
+    """
+    frames = []
+    for view in views:
+        to_world = np.linalg.inv(view.camera.viewmat)
+        frame = {"file_path": view.name, **_camera_fields(view.camera, to_world)}
+        if view.rig is not None:
+            frame["rig"] = view.rig
+        if view.pose_evidence is not None:
+            frame["pose_evidence"] = vars(view.pose_evidence)
+        if view.exposure is not None:
+            frame["exposure"] = view.exposure.plain()
+        frames.append(frame)
+    write_json(path, {"camera_model": "PINHOLE", "frames": frames})
+
+
+def _camera_fields(camera: Camera, to_world: np.ndarray) -> dict[str, Any]:
+    """The camera fields of a frame, given the inverse [4, 4] of the viewmat."""
+    opengl = to_world.copy()
+    # From x right, y down, z forward to x right, y up, z back.
+    opengl[:3, 1:3] *= -1.0
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": float(camera.K[0, 0]),
+        "fl_y": float(camera.K[1, 1]),
+        "cx": float(camera.K[0, 2]),
+        "cy": float(camera.K[1, 2]),
+        "transform_matrix": opengl.tolist(),
+    }
 
 
 def _to_world(camera: Camera) -> np.ndarray:

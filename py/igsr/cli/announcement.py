@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from igsr.capture.downscaling import reduced_size
-from igsr.capture.overview import Overview
+from igsr.capture.load import Overview
 from igsr.cli.error_messages import print_message
 from igsr.evaluation.quick_scores import MOST_TRAIN
 from igsr.fitting.photo_support import PhotoSupport, detail_of_files

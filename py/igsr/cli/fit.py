@@ -59,7 +59,7 @@ from igsr.pose import AUTO, not_placed
 # What computes takes long to import: the help of the command does without.
 if TYPE_CHECKING:
     from igsr.capture import Capture
-    from igsr.capture.overview import Overview
+    from igsr.capture.load import Overview
     from igsr.fitting import Progress
     from igsr.fitting.fit_report import FitScores
     from igsr.fitting.followed_run import FollowedRun

@@ -19,8 +19,7 @@ from igsr._internal.atomic_write import check_folder
 from igsr._internal.part_usage import Parts
 from igsr.capture import Capture
 from igsr.capture.downscaling import check_max_size
-from igsr.capture.load import holds_cameras
-from igsr.capture.overview import Overview, look_at
+from igsr.capture.load import Overview, holds_cameras, look_at
 from igsr.capture.photo_folder import FRAMES
 from igsr.capture.write_colmap import write_colmap
 from igsr.cli.error_messages import error_messages, print_message, warning_messages

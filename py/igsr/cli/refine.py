@@ -43,7 +43,7 @@ from igsr.refinement.settings import AUTO, RefineSettings
 # What imports torch is imported by the command, so that --help answers at once.
 if TYPE_CHECKING:
     from igsr.capture import Capture
-    from igsr.capture.overview import Overview
+    from igsr.capture.load import Overview
     from igsr.denoiser import Denoiser
     from igsr.refinement.results import Refined
 
@@ -164,7 +164,7 @@ def _check_photo_count(photos: Path, holdout: int | None, frames: int, count: in
     Raises:
         IgsrError: there are fewer train photos, even if the cameras of all are found.
     """
-    from igsr.capture.overview import look_at
+    from igsr.capture.load import look_at
 
     _check_count(count, look_at(photos, frames).train_photos(holdout), photos)
 

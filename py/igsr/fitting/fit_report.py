@@ -11,7 +11,7 @@ from igsr import _core
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Parts, total
 from igsr.capture import Capture
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.evaluation.contact_sheet import contact_sheet, save_sheet
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.scores import METRICS, ScoredView, Scores

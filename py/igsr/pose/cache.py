@@ -16,8 +16,7 @@ from igsr._internal.atomic_write import check_folder
 from igsr._internal.part_usage import Parts, Usage
 from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
-from igsr.capture.load import describe_capture, holds_cameras
-from igsr.capture.overview import look_at
+from igsr.capture.load import describe_capture, holds_cameras, look_at
 from igsr.capture.photo_folder import FRAMES, LENS, VIDEO_SUFFIXES, photo_sizes
 from igsr.capture.write_colmap import write_colmap
 from igsr.errors import IgsrError

@@ -18,7 +18,7 @@ from igsr._internal.choices import Backend
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Usage, total
 from igsr.capture import View
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.evaluation.contact_sheet import contact_sheet, rounds_sheet, save_sheet, sheet_names
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.quick_scores import mean_of, quick_views, train_photos, train_scores
