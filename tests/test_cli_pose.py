@@ -284,9 +284,9 @@ def test_little_memory_is_told_before_any_work(
     from igsr.capture import memory_check
 
     given = scenes.write_capture(tmp_path / "given", MADE)
-    monkeypatch.setattr(memory_check, "LIBRARIES", 0)
-    monkeypatch.setattr(memory_check, "OF_A_SPLAT", 0)
-    monkeypatch.setattr(memory_check, "STEP", 10)
+    monkeypatch.setattr(memory_check, "LIBRARY_BYTES", 0)
+    monkeypatch.setattr(memory_check, "SPLAT_BYTES", 0)
+    monkeypatch.setattr(memory_check, "SIZE_STEP_PX", 10)
     monkeypatch.setattr(memory_check, "available_memory", lambda: 400_000)
     for path in (photos, given):
         result = igsr_here(command, path, "--out", tmp_path / "out")

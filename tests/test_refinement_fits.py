@@ -36,7 +36,7 @@ def test_weights_of_one_are_as_none_and_of_zero_as_a_mask(ball_photos):
         replace(ball_photos.views[0], weights=left[1:])
 
 
-@pytest.mark.filterwarnings("ignore:.*one and the same camera", "ignore:.*black or wholly")
+@pytest.mark.filterwarnings("ignore:.*have the same camera", "ignore:.*black or fully")
 def test_a_picture_of_small_weights_counts_less_than_a_photo(ball_photos):
     """Two pictures of one camera that disagree: the splats side with the heavier."""
     view = ball_photos.train_views[0]
@@ -77,7 +77,7 @@ def test_a_warm_start_goes_on_from_splats(ball_photos):
         scenes.fit(ball_photos, steps=5, backend="cpu", start=replace(first, antialiased=True))
 
 
-@pytest.mark.filterwarnings("ignore:.*one and the same camera")
+@pytest.mark.filterwarnings("ignore:.*have the same camera")
 def test_novel_views_change_neither_settings_nor_initialization(ball_photos):
     photos = ball_photos.train_views[:3]
     weights = np.ones((40, 40), np.float32)

@@ -9,7 +9,7 @@ from scene_pages import BACKGROUND, MEAN, check_pictures, drawn, model, three_ca
 from typer.testing import CliRunner
 
 import igsr
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.cli import app
 from igsr.cli.scene_page_option import write_page
 from igsr.rendering.renders import render

@@ -12,7 +12,7 @@ from scene_pages import MEAN, drawn, model, named, three_cameras
 from web_views import served
 
 import igsr
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.fitting.followed_run import FollowedRun
 from igsr.rendering import scene_page
 from igsr.rendering.renders import render

@@ -21,7 +21,7 @@ from scene_pages import model
 from web_views import asked, served, state_of, with_token
 
 import igsr
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.fitting.followed_run import FollowedRun
 from igsr.rendering import live_view, run_folder
 from igsr.rendering.live_server import is_loopback, open_server
