@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 from PIL import Image
+
+from igsr.errors import IgsrError
 
 WIDTH, HEIGHT = 48, 32
 
@@ -35,19 +35,19 @@ MODEL_PARAMS = {
 }
 
 
-def photo(seed: int = 0, width: int = WIDTH, height: int = HEIGHT, channels: int = 3) -> np.ndarray:
+def photo(seed=0, width=WIDTH, height=HEIGHT, channels=3):
     """uint8 [H, W, C] of noise."""
     rng = np.random.default_rng(seed)
     return rng.integers(0, 256, (height, width, channels), dtype=np.uint8)
 
 
-def save(path: Path, pixels: np.ndarray) -> Path:
+def save(path, pixels):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path)
     return path
 
 
-def random_viewmats(count: int, seed: int = 0) -> np.ndarray:
+def random_viewmats(count, seed=0):
     """float64 [count, 4, 4], rigid."""
     rng = np.random.default_rng(seed)
     viewmats = np.tile(np.eye(4), (count, 1, 1))
@@ -60,44 +60,44 @@ def random_viewmats(count: int, seed: int = 0) -> np.ndarray:
     return viewmats
 
 
-def opengl_pose(viewmat: np.ndarray) -> list[list[float]]:
+def opengl_pose(viewmat):
     """transform_matrix of a viewmat: camera to world, y up, z back."""
     return (np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
-def write_json(path: Path, document: Any) -> Path:
+def write_json(path, document):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(document))
     return path
 
 
-def transforms_document(viewmats: np.ndarray, **fields: Any) -> dict[str, Any]:
-    """A transforms.json with frames images/0.png, images/1.png, ..."""
-    camera = {"fl_x": 40.0, "fl_y": 42.0, "cx": 23.0, "cy": 17.0, "w": WIDTH, "h": HEIGHT}
-    frames = [
+def write_transforms(folder, count=3, frame=None, **fields):
+    """Write a capture with a transforms.json and frames images/0.png, images/1.png, ...
+
+    Args:
+        frame: fields of the second frame (the first, if it is the only one).
+        fields: fields of the document. A field ``...`` is left out.
+    """
+    viewmats = random_viewmats(count)
+    for index in range(count):
+        save(folder / f"images/{index}.png", photo(index))
+    document = {"fl_x": 40.0, "fl_y": 42.0, "cx": 23.0, "cy": 17.0, "w": WIDTH, "h": HEIGHT}
+    document["frames"] = [
         {"file_path": f"images/{index}.png", "transform_matrix": opengl_pose(viewmat)}
         for index, viewmat in enumerate(viewmats)
     ]
-    return {**camera, **fields, "frames": frames}
-
-
-def write_transforms(folder: Path, count: int = 3, **fields: Any) -> dict[str, Any]:
-    """Write a capture with a transforms.json; returns the document."""
-    for index in range(count):
-        save(folder / f"images/{index}.png", photo(index))
-    document = transforms_document(random_viewmats(count), **fields)
+    for target, changes in (
+        (document["frames"][min(1, count - 1)], frame or {}),
+        (document, fields),
+    ):
+        target |= changes
+        for key in [key for key, value in changes.items() if value is ...]:
+            del target[key]
     write_json(folder / "transforms.json", document)
     return document
 
 
-def write_colmap(
-    folder: Path,
-    model: str = "PINHOLE",
-    *,
-    text: bool = False,
-    viewmats: np.ndarray | None = None,
-    place: str = "sparse/0",
-) -> pycolmap.Reconstruction:
+def write_colmap(folder, model="PINHOLE", *, text=False, viewmats=None, place="sparse/0"):
     """Write a capture with a COLMAP model through pycolmap: images 0.png ..., three points."""
     viewmats = random_viewmats(3) if viewmats is None else viewmats
     reconstruction = pycolmap.Reconstruction()
@@ -105,8 +105,8 @@ def write_colmap(
     if model in MODEL_PARAMS:
         camera.params = MODEL_PARAMS[model]
     reconstruction.add_camera_with_trivial_rig(camera)
+    keypoints = np.array([[1.5, 2.5], [3.0, 4.0], [5.0, 6.0]])
     for index, viewmat in enumerate(viewmats):
-        keypoints = np.array([[1.5, 2.5], [3.0, 4.0], [5.0, 6.0]])
         image = pycolmap.Image(
             name=f"{index}.png", keypoints=keypoints, camera_id=7, image_id=index + 1
         )
@@ -117,8 +117,34 @@ def write_colmap(
         track = pycolmap.Track()
         for image_id in range(2, len(viewmats) + 1):
             track.add_element(image_id, index)
-        colour = np.array([index, 100, 255 - index], dtype=np.uint8)
-        reconstruction.add_point3D(np.array([index, 0.5, -2.0]), track, colour)
+        color = np.array([index, 100, 255 - index], dtype=np.uint8)
+        reconstruction.add_point3D(np.array([index, 0.5, -2.0]), track, color)
     (folder / place).mkdir(parents=True, exist_ok=True)
     (reconstruction.write_text if text else reconstruction.write_binary)(folder / place)
     return reconstruction
+
+
+def assert_damage_is_refused(path, load, rng, count, choices):
+    """Replace random bytes of a file: ``load`` reads it, or raises one printable sentence.
+
+    Args:
+        count: number of damaged files.
+        choices: bytes to write; None is any.
+
+    Returns:
+        The number of refused files.
+    """
+    data = path.read_bytes()
+    refused = 0
+    for _ in range(count):
+        damaged = bytearray(data)
+        for _ in range(rng.randint(1, 4)):
+            byte = rng.randrange(256) if choices is None else rng.choice(choices)
+            damaged[rng.randrange(len(data))] = byte
+        path.write_bytes(damaged)
+        try:
+            load()
+        except IgsrError as error:
+            refused += 1
+            assert str(error).isprintable()
+    return refused

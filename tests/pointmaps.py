@@ -93,7 +93,7 @@ def all_pairs(count):
 
 def surface(camera, pixels):
     """World points [P, 3] that pixels [P, 2] see."""
-    centre = camera.centre
+    centre = camera.center
     rays = np.ones((len(pixels), 3))
     rays[:, :2] = (pixels - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]
     rays = rays @ camera.viewmat[:3, :3]

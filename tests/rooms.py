@@ -58,10 +58,10 @@ def picture(camera: Camera, seed: int = 0, k: float = 0.0) -> np.ndarray:
     colors = np.zeros((*x.shape, 3))
     for wall, (normal, offset, along, up) in enumerate(WALLS):
         with np.errstate(divide="ignore"):
-            distance = (offset - camera.centre @ normal) / (rays @ np.array(normal))
+            distance = (offset - camera.center @ normal) / (rays @ np.array(normal))
         hit = (distance > 0.0) & (distance < nearest)
         nearest[hit] = distance[hit]
-        places = camera.centre + distance[hit][:, None] * rays[hit]
+        places = camera.center + distance[hit][:, None] * rays[hit]
         texels = texture(10 * seed + wall)
         row, column = (
             np.floor(places @ np.array(axis) * TEXELS).astype(np.int64) % len(texels)
@@ -84,7 +84,7 @@ def depths(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     nearest = np.full(len(rays), np.inf)
     for normal, offset, *_ in WALLS:
         with np.errstate(divide="ignore"):
-            distance = (offset - camera.centre @ normal) / (rays @ np.array(normal))
+            distance = (offset - camera.center @ normal) / (rays @ np.array(normal))
         nearest = np.where((distance > 0.0) & (distance < nearest), distance, nearest)
     return nearest
 

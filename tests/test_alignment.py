@@ -221,7 +221,7 @@ def test_fixed_poses_define_the_world(fixed, noise):
             np.testing.assert_array_equal(camera.viewmat, truth.viewmat)
         np.testing.assert_allclose(camera.viewmat[:3, :3], truth.viewmat[:3, :3], atol=0.1 * bound)
         if len(fixed) > 1:
-            np.testing.assert_allclose(camera.centre, truth.centre, atol=bound)
+            np.testing.assert_allclose(camera.center, truth.center, atol=bound)
     if len(fixed) > 1:
         depth = scene.worlds[0] @ scene.cameras[0].viewmat[2, :3] + scene.cameras[0].viewmat[2, 3]
         found = alignment.photos[0].depth.ravel()
@@ -235,7 +235,7 @@ def test_fixed_poses_far_from_the_origin():
     photos = scene.photos(viewmat=lambda i: moved[i].viewmat if i < 2 else None)
     alignment = align(scene.predictions(), photos, steps=20)
     for found, truth in zip(cameras_of(alignment), moved, strict=True):
-        np.testing.assert_allclose(found.centre, truth.centre, atol=1e-3)
+        np.testing.assert_allclose(found.center, truth.center, atol=1e-3)
 
 
 def test_fixed_poses_at_one_place_do_not_fix_the_scale():

@@ -10,7 +10,7 @@ import pytest
 import scenes
 from PIL import Image
 
-from igsr.capture.overview import Overview, look_at
+from igsr.capture.load import Overview, look_at
 from igsr.cli import announcement
 from igsr.cli.announcement import announce
 from igsr.fitting.presets import settings_for
@@ -101,9 +101,14 @@ def said(monkeypatch, seen, **options):
     return lines
 
 
+def overview(sizes, **fields):
+    fields = {"path": Path("photos"), "has_cameras": True, "train": len(sizes), **fields}
+    return Overview(sizes=sizes, **fields)
+
+
 def test_three_lines_say_what_is_found_done_and_how_long_it_takes(monkeypatch):
     sizes = [(1558, 1039)] * 24 + [(1039, 1558)]
-    seen = Overview(Path("photos"), False, sizes, 25, 3, True, True)
+    seen = overview(sizes, has_cameras=False, masked=True)
     found, done, long = said(monkeypatch, seen, holdout=8)
     assert (
         found == "Found 25 photos of 1558x1039 to 1039x1558, 4 of them held out, without cameras."
@@ -123,7 +128,7 @@ def test_three_lines_say_what_is_found_done_and_how_long_it_takes(monkeypatch):
 
 
 def test_few_of_many_photos_are_counted(monkeypatch):
-    seen = Overview(Path("photos"), True, [(300, 200)] * 100, 100, 3, False, True)
+    seen = overview([(300, 200)] * 100)
     given = {"steps": None}
     many = said(monkeypatch, seen, cameras_kept=True, given=given)[1]
     few = said(monkeypatch, seen, cameras_kept=True, given=given, photos=8)[1]
@@ -134,7 +139,7 @@ def test_few_of_many_photos_are_counted(monkeypatch):
 def test_detailed_photos_have_more_splats(monkeypatch, tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (200, 304, 3), np.uint8)
     Image.fromarray(noise).save(tmp_path / "0.png")
-    seen = Overview(Path("photos"), True, [(304, 200)] * 8, 8, 3, False, True)
+    seen = overview([(304, 200)] * 8)
     plain = said(monkeypatch, seen, cameras_kept=True)[1]
     detailed = said(monkeypatch, replace(seen, plain=[tmp_path / "0.png"]), cameras_kept=True)[1]
     most = [int(line.split("up to ")[1].split()[0]) for line in (plain, detailed)]
@@ -155,7 +160,7 @@ def test_the_files_of_photos_are_named(tmp_path):
 
 
 def test_photos_that_need_no_depth_maps_take_less(monkeypatch):
-    seen = Overview(Path("photos"), True, [(100, 100)] * 30, 30, 3, False, True)
+    seen = overview([(100, 100)] * 30)
 
     def seconds(changed, **given):
         given = {"steps": 10, **given}

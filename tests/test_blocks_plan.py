@@ -27,7 +27,8 @@ from igsr.blocks.task_making import coarse_task
 from igsr.blocks.tasks import BlockPart
 from igsr.blocks.worker import depths_of_points, depths_of_scene
 from igsr.capture import Camera, View
-from igsr.capture.photos import PhotoHeader, Shot
+from igsr.capture.image_files import PhotoHeader
+from igsr.capture.photos import Shot
 from igsr.capture.types import intrinsic_matrix
 from igsr.capture.undistort import Lens
 from igsr.fitting.photo_support import support_of
@@ -306,7 +307,7 @@ def test_what_is_hidden_is_not_shown():
 def test_tracks_tell_what_photos_show(town):
     capture, _ = town
     ground = ground_of([view.camera for view in capture.views])
-    places = ground.places(np.stack([view.camera.centre for view in capture.views]))
+    places = ground.places(np.stack([view.camera.center for view in capture.views]))
     cells = split_into_cells(places, 2)
     names = [view.name for view in capture.views]
     shares = tracked_shares(capture.points, names, cells, ground)

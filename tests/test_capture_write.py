@@ -15,9 +15,8 @@ from PIL import Image
 
 from igsr._internal.atomic_write import atomic_folder
 from igsr.capture import Camera, Capture, Points, View, load_capture
-from igsr.capture.colmap_rigs import quaternion
 from igsr.capture.types import Tracks, intrinsic_matrix
-from igsr.capture.write_colmap import write_colmap
+from igsr.capture.write_colmap import quaternion, write_colmap
 from igsr.capture.write_transforms import write_transforms
 from igsr.errors import IgsrError
 
@@ -26,9 +25,11 @@ WRITERS = {
     "colmap-text": lambda *arguments: write_colmap(*arguments, text=True),
     "transforms": write_transforms,
 }
+#: The files of the views of ``made_up``, in their order.
+NAMES = ["a/1.png", "a/1.png.png", "out side/2.png", "line_break.png"]
 
 
-def made_up(confidence: bool = True) -> Capture:
+def made_up(confidence=True):
     """Four views of two sizes, with alpha, masks and awkward names."""
     random = np.random.default_rng(0)
     names = ["images/a/1.jpg", "images/a/1.png", "../out side/2.heic", "images/line\nbreak.webp"]
@@ -47,39 +48,38 @@ def made_up(confidence: bool = True) -> Capture:
     return Capture(Path("made-up"), views, points)
 
 
+def assert_same_confidence(points, expected):
+    if expected.confidence is None:
+        assert points.confidence is None
+    else:
+        np.testing.assert_allclose(points.confidence, expected.confidence, 1e-12)
+
+
 @pytest.mark.parametrize("form", WRITERS)
 @pytest.mark.parametrize("confidence", [False, True])
-def test_round_trip(tmp_path: Path, form: str, confidence: bool) -> None:
+def test_round_trip(tmp_path, form, confidence):
     capture = made_up(confidence)
     WRITERS[form](capture, tmp_path / "new" / "out")
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["out"]
     again = load_capture(tmp_path / "new" / "out")
-    names = [
-        "images/a/1.png",
-        "images/a/1.png.png",
-        "images/out side/2.png",
-        "images/line_break.png",
-    ]
     read = {view.name: view for view in again.views}
-    assert set(read) == set(names)
-    for name, view in zip(names, capture.views, strict=True):
-        np.testing.assert_allclose(read[name].camera.viewmat, view.camera.viewmat, 1e-9, 1e-12)
-        np.testing.assert_array_equal(read[name].camera.K, view.camera.K)
-        np.testing.assert_array_equal(read[name].image, view.image)
-        if view.mask is None:
-            assert read[name].mask is None
-        else:
-            np.testing.assert_array_equal(read[name].mask, view.mask)
+    assert set(read) == {f"images/{name}" for name in NAMES}
+    for name, view in zip(NAMES, capture.views, strict=True):
+        found = read[f"images/{name}"]
+        np.testing.assert_allclose(found.camera.viewmat, view.camera.viewmat, 1e-9, 1e-12)
+        np.testing.assert_array_equal(found.camera.K, view.camera.K)
+        np.testing.assert_array_equal(found.image, view.image)
+        np.testing.assert_array_equal(found.mask, view.mask)
     np.testing.assert_array_equal(again.points.xyz, capture.points.xyz)
     np.testing.assert_array_equal(again.points.rgb, capture.points.rgb)
-    if confidence:
-        np.testing.assert_allclose(again.points.confidence, capture.points.confidence, 1e-12)
-    else:
-        assert again.points.confidence is None
+    assert_same_confidence(again.points, capture.points)
+    capture.points = None
+    WRITERS[form](capture, tmp_path / "no-points")
+    assert load_capture(tmp_path / "no-points").points is None
 
 
 @pytest.mark.parametrize("form", ["colmap", "colmap-text"])
-def test_pycolmap_reads_what_we_write(tmp_path: Path, form: str) -> None:
+def test_pycolmap_reads_the_model(tmp_path, form):
     capture = made_up()
     WRITERS[form](capture, tmp_path / "out")
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
@@ -95,43 +95,38 @@ def test_pycolmap_reads_what_we_write(tmp_path: Path, form: str) -> None:
     np.testing.assert_array_equal(xyz, capture.points.xyz)
 
 
-def with_tracks(confidence: bool = True) -> Capture:
+def with_tracks(confidence=True):
     """Points 0 to 4 are seen, point 2 by one view alone; the third view sees none."""
     capture = made_up(confidence)
     names = [capture.views[index].name for index in (3, 0, 1)]
     view = np.array([0, 0, 1, 1, 1, 2, 2, 0, 2])
     point = np.array([4, 0, 1, 0, 2, 3, 1, 3, 4])
-    random = np.random.default_rng(3)
-    capture.points.tracks = Tracks(names, view, point, random.uniform(0.0, 30.0, (9, 2)))
+    xy = np.random.default_rng(3).uniform(0.0, 30.0, (9, 2))
+    capture.points.tracks = Tracks(names, view, point, xy)
     if confidence:
-        # As confidences of tracks are: their lengths over one and an error.
+        # Confidences of tracks: their lengths over one plus an error.
         capture.points.confidence[:5] = [2, 2, 1, 2, 2] / (1.0 + np.arange(5) / 3.0)
     return capture
 
 
-def observations(points: Points, names: dict[str, str]) -> set[tuple[object, ...]]:
+def observations(points, names=None):
     tracks = points.tracks
     seen = zip(tracks.view, points.xyz[tracks.point].tolist(), tracks.xy.tolist(), strict=True)
-    return {(names[tracks.names[view]], *xyz, *xy) for view, xyz, xy in seen}
+    named = ((tracks.names[view], xyz, xy) for view, xyz, xy in seen)
+    return {(names[name] if names else name, *xyz, *xy) for name, xyz, xy in named}
 
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("confidence", [False, True])
-def test_tracks_come_back(tmp_path: Path, text: bool, confidence: bool) -> None:
+def test_tracks_survive(tmp_path, text, confidence):
     capture = with_tracks(confidence)
     write_colmap(capture, tmp_path / "out", text=text)
-    written = ["a/1.png", "a/1.png.png", "out side/2.png", "line_break.png"]
-    read_as = {
-        view.name: f"images/{name}" for view, name in zip(capture.views, written, strict=True)
-    }
     again = load_capture(tmp_path / "out").points
+    read_as = {v.name: f"images/{name}" for v, name in zip(capture.views, NAMES, strict=True)}
     expected = observations(capture.points, read_as)
     assert len(expected) == 9
-    assert observations(again, {name: name for name in again.tracks.names}) == expected
-    if confidence:
-        np.testing.assert_allclose(again.confidence, capture.points.confidence, 1e-12)
-    else:
-        assert again.confidence is None
+    assert observations(again) == expected
+    assert_same_confidence(again, capture.points)
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     for number, view in enumerate(capture.views, start=1):
         for feature in model.images[number].points2D:
@@ -145,34 +140,28 @@ def test_tracks_come_back(tmp_path: Path, text: bool, confidence: bool) -> None:
             assert feature.point3D_id == number
 
 
-def test_tracks_of_views_that_are_not_written_are_left_out(tmp_path: Path) -> None:
+def test_tracks_of_other_views_are_left_out(tmp_path):
     capture = with_tracks()
     write_colmap(Capture(capture.path, capture.views[:2], capture.points), tmp_path / "out")
     tracks = load_capture(tmp_path / "out").points.tracks
     assert sorted(tracks.point.tolist()) == [0, 1, 1, 2, 3, 4]
 
 
-def test_what_pycolmap_wrote_has_no_confidence_of_ours(tmp_path: Path) -> None:
-    write_with_pycolmap(tmp_path)
-    assert load_capture(tmp_path).points.confidence is None
-
-
-def test_masks_beside_a_model_are_read(tmp_path: Path) -> None:
+def test_models_of_pycolmap_have_masks_and_no_confidence(tmp_path):
     write_with_pycolmap(tmp_path)
     mask = np.zeros((32, 48), dtype=np.uint8)
     mask[:, :9] = 255
     save(tmp_path / "masks/1.png.png", mask)
-    views = load_capture(tmp_path).views
-    assert views[0].mask is None
-    np.testing.assert_array_equal(views[1].mask, mask > 0)
+    capture = load_capture(tmp_path)
+    assert capture.points.confidence is None
+    assert capture.views[0].mask is None
+    np.testing.assert_array_equal(capture.views[1].mask, mask > 0)
 
 
-def test_further_masks_are_masks_of_the_photos_size(tmp_path: Path) -> None:
-    capture = made_up()
+def test_further_masks_have_the_size_of_the_photos(tmp_path):
     trusted = np.array([[True, False, True], [False, False, True]])
-    write_colmap(
-        capture, tmp_path / "out", further_masks={"trusted": [trusted, None, None, trusted]}
-    )
+    masks = {"trusted": [trusted, None, None, trusted]}
+    write_colmap(made_up(), tmp_path / "out", further_masks=masks)
     with Image.open(tmp_path / "out/trusted/a/1.png.png") as image:
         written = np.array(image)
     np.testing.assert_array_equal(written > 0, np.kron(trusted, np.ones((16, 16), dtype=bool)))
@@ -181,24 +170,15 @@ def test_further_masks_are_masks_of_the_photos_size(tmp_path: Path) -> None:
     assert read["images/a/1.png"] is None
 
 
-def test_transforms_keep_the_split(tmp_path: Path) -> None:
-    capture = made_up().with_holdout(2)
-    write_transforms(capture, tmp_path / "out")
-    splits = {view.name: view.split for view in load_capture(tmp_path / "out").views}
-    assert sorted(splits.values()) == ["test", "test", "train", "train"]
+def test_transforms_keep_the_split(tmp_path):
+    write_transforms(made_up().with_holdout(2), tmp_path / "out")
+    splits = [view.split for view in load_capture(tmp_path / "out").views]
+    assert sorted(splits) == ["test", "test", "train", "train"]
     document = json.loads((tmp_path / "out/transforms.json").read_text())
     assert document["ply_file_path"] == "points.ply"
 
 
-def test_no_points(tmp_path: Path) -> None:
-    capture = made_up()
-    capture.points = None
-    for form, write in WRITERS.items():
-        write(capture, tmp_path / form)
-        assert load_capture(tmp_path / form).points is None
-
-
-def test_quaternions_of_all_turns() -> None:
+def test_quaternions_of_all_turns():
     half_turns = [np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, 1])]
     for rotation in [*half_turns, *random_viewmats(50)[:, :3, :3]]:
         w, x, y, z = quaternion(np.asarray(rotation, dtype=np.float64))
@@ -207,15 +187,15 @@ def test_quaternions_of_all_turns() -> None:
         np.testing.assert_allclose(back, rotation, atol=1e-14)
 
 
-def test_a_folder_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_is_complete_or_missing(tmp_path, monkeypatch):
     out = tmp_path / "out"
-    out.mkdir()  # an empty one is taken
+    out.mkdir()  # an empty one is allowed
     write_colmap(made_up(), out)
     with pytest.raises(IgsrError, match="out holds something already"):
         write_colmap(made_up(), out)
     before = (out / "sparse/0/points3D.bin").read_bytes()
 
-    def full(*arguments: object, **options: object) -> None:
+    def full(*arguments, **options):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:

@@ -99,7 +99,7 @@ def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, igsr_h
     assert report["estimator"] == "auto"
     assert (report["photos"], report["not_placed"]) == (6, ["02.png"])
     assert [camera["name"] for camera in report["cameras"]] == [f"{i:02d}.png" for i in PLACED]
-    np.testing.assert_allclose(report["cameras"][0]["center"], MADE.views[0].camera.centre)
+    np.testing.assert_allclose(report["cameras"][0]["center"], MADE.views[0].camera.center)
     assert sorted(path.name for path in out.iterdir()) == ["images", "poses.png", "sparse"]
     capture = igsr.load_capture(out)
     assert [view.name for view in capture.views] == [f"images/{i:02d}.png" for i in PLACED]
@@ -278,9 +278,9 @@ def test_arguments_are_checked_before_cameras_are_sought(
 def test_too_little_memory_is_an_error_before_any_work(
     photos, given, calls, tmp_path, igsr_here, monkeypatch, command
 ):
-    monkeypatch.setattr(memory_check, "LIBRARIES", 0)
-    monkeypatch.setattr(memory_check, "OF_A_SPLAT", 0)
-    monkeypatch.setattr(memory_check, "STEP", 10)
+    monkeypatch.setattr(memory_check, "LIBRARY_BYTES", 0)
+    monkeypatch.setattr(memory_check, "SPLAT_BYTES", 0)
+    monkeypatch.setattr(memory_check, "SIZE_STEP_PX", 10)
     monkeypatch.setattr(memory_check, "available_memory", lambda: 400_000)
     for path in (photos, given):
         result = igsr_here(command, path, "--out", tmp_path / "out")

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 import igsr
 from igsr.capture import Capture, View
-from igsr.capture.write_cameras import write_cameras
 from igsr.capture.write_colmap import write_colmap
+from igsr.capture.write_transforms import write_cameras
 from igsr.cli import app
 from igsr.cli.view import write_for_viewer
 

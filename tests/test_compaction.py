@@ -143,7 +143,7 @@ def test_no_view_is_both_trained_on_and_validated_on(photos):
 def test_cameras_around_see_the_scene_from_all_sides():
     splats = scenes.splats(count=60, origin=(100.0, -20.0, 5.0))
     cameras = [view.camera for view in self_validation(splats, None, None, "cpu").train_views]
-    directions = np.array([camera.centre for camera in cameras]) - [100.0, -20.0, 5.0]
+    directions = np.array([camera.center for camera in cameras]) - [100.0, -20.0, 5.0]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     assert np.linalg.norm(directions.mean(axis=0)) < 0.25
     for camera in cameras:

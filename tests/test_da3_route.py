@@ -35,7 +35,7 @@ def spheres(camera, pixels):
     """Depths [P] of a ball inside a hollow one, as a camera sees them at pixels [P, 2]."""
     K, rotation = camera.K, camera.viewmat[:3, :3]
     local = np.pad((pixels - K[[0, 1], 2]) / K[[0, 1], [0, 1]], ((0, 0), (0, 1)), constant_values=1)
-    rays, centre = local @ rotation, camera.centre
+    rays, centre = local @ rotation, camera.center
     a, b = (rays * rays).sum(1), rays @ centre
 
     def hit(radius, sign):
@@ -198,7 +198,7 @@ def test_cameras_at_one_place_give_a_warning():
     here = []
     for camera in cameras:
         viewmat = camera.viewmat.copy()
-        viewmat[:3, 3] = -viewmat[:3, :3] @ cameras[0].centre
+        viewmat[:3, 3] = -viewmat[:3, :3] @ cameras[0].center
         here.append(replace(camera, viewmat=viewmat))
     found = unadjusted(ExactPredictor(here, photos))(photos)
     assert found.warnings[0].startswith("All photos seem to be taken from one place")

@@ -97,7 +97,7 @@ def plane_photo(at, z=0.0):
     """A camera's picture of the plane z, painted by a smooth function of x and y."""
     columns, rows = np.meshgrid(np.arange(at.width) + 0.5, np.arange(at.height) + 0.5)
     depth = z + 4.0
-    x = (columns - at.K[0, 2]) / at.K[0, 0] * depth + at.centre[0]
+    x = (columns - at.K[0, 2]) / at.K[0, 0] * depth + at.center[0]
     y = (rows - at.K[1, 2]) / at.K[1, 1] * depth
     color = np.stack([np.sin(2 * x), np.cos(3 * y), np.sin(x + y)], -1) * 0.4 + 0.5
     return color.astype(np.float32), np.full((at.height, at.width), depth, np.float32)

@@ -185,7 +185,7 @@ def test_known_cameras_are_kept_and_define_intrinsics(scene):
     found = Dust3r(scene.predictor, cameras=known)(scene.photos)
     for i, (camera, truth) in enumerate(zip(found.cameras, scene.cameras, strict=True)):
         np.testing.assert_array_equal(camera.K, truth.K)
-        np.testing.assert_allclose(camera.centre, truth.centre, atol=1e-2)
+        np.testing.assert_allclose(camera.center, truth.center, atol=1e-2)
         if i in (0, 3):
             np.testing.assert_array_equal(camera.viewmat, truth.viewmat)
 

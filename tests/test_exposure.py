@@ -17,8 +17,7 @@ import igsr
 from igsr import _core
 from igsr.capture import Capture, Exposure, View
 from igsr.capture.exif import read_exif
-from igsr.capture.write_cameras import write_cameras
-from igsr.capture.write_transforms import write_transforms
+from igsr.capture.write_transforms import write_cameras, write_transforms
 from igsr.evaluation.scores import render_of
 from igsr.fitting.exposures import (
     LEAST_SPREAD,

@@ -37,7 +37,7 @@ def specks(means, size=0.05, opacity=2.0, color=0.5):
 def before(view, distance=1.2):
     """A place before a view's camera, between it and the ball."""
     camera = view.camera
-    return camera.centre + distance * camera.viewmat[2, :3]
+    return camera.center + distance * camera.viewmat[2, :3]
 
 
 # ---- evidence of photos ------------------------------------------------------------------------

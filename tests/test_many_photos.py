@@ -29,14 +29,14 @@ def test_the_nearest_photos_are_held_and_no_more(ball_photos, helped, monkeypatc
         near = sources.of(photo.camera)
         assert len(near) == 3
         assert any(one.camera is photo.camera for one in near)
-        distances = [np.linalg.norm(p.camera.centre - photo.camera.centre) for p in photos]
-        farthest = max(np.linalg.norm(one.camera.centre - photo.camera.centre) for one in near)
+        distances = [np.linalg.norm(p.camera.center - photo.camera.center) for p in photos]
+        farthest = max(np.linalg.norm(one.camera.center - photo.camera.center) for one in near)
         assert farthest <= np.sort(distances)[2] + 1e-9
         assert len(sources._held) <= 4
-    assert len(made) > len(photos), "what was let go of is made again"
+    assert len(made) > len(photos), "a freed photo is made again"
     again = len(made)
     sources.of(photos[0].camera)
-    assert len(made) == again, "what is held is not"
+    assert len(made) == again, "a held one is not"
 
 
 def test_all_photos_are_near_where_there_are_few(ball_photos, helped):

@@ -14,7 +14,7 @@ BALL = scenes.splats()
 
 def angle(camera, other):
     """Degrees between two cameras about the ball."""
-    here, there = (c.centre / np.linalg.norm(c.centre) for c in (camera, other))
+    here, there = (c.center / np.linalg.norm(c.center) for c in (camera, other))
     return np.degrees(np.arccos(np.clip(here @ there, -1.0, 1.0)))
 
 
@@ -28,9 +28,9 @@ def test_views_lie_near_known_ones_and_apart_and_look_at_the_ball():
         # About what each camera looks at, which is near the ball's middle but not there.
         assert nearest > 0.8 * LEAST_STEP * STEP
         assert min(angle(view.camera, other) for other in known) < 1.3 * max(STEP, 17.2)
-        towards = -view.camera.centre / np.linalg.norm(view.camera.centre)
+        towards = -view.camera.center / np.linalg.norm(view.camera.center)
         assert towards @ view.camera.viewmat[2, :3] > 0.99
-        assert np.linalg.norm(view.camera.centre) == pytest.approx(4.0, rel=0.1)
+        assert np.linalg.norm(view.camera.center) == pytest.approx(4.0, rel=0.1)
         assert view.camera.viewmat[1, :3] @ (0.0, 1.0, 0.0) > 0.9, "upright as the photos"
         seen.append(view.camera)
 
@@ -76,10 +76,10 @@ def test_what_is_too_near_goes_by_how_far_a_view_itself_is():
     """Halfway between a camera at 2 and one at 10 a view is 6 away, whichever it is made from."""
     known = [scenes.ring_camera(0.0, distance=2.0), scenes.ring_camera(0.9, distance=10.0)]
     (free,) = (view for view in novel_views(BALL, known, 20, "cpu") if view.between)
-    centre = free.camera.centre
-    assert np.linalg.norm(centre) == pytest.approx(6.0, rel=0.1)
+    center = free.camera.center
+    assert np.linalg.norm(center) == pytest.approx(6.0, rel=0.1)
     for part, stays in ((0.8 * CLOSE, False), (1.3 * CLOSE, True)):
-        found = novel_views(with_wall(centre * (1.0 - part)), known, 20, "cpu")
+        found = novel_views(with_wall(center * (1.0 - part)), known, 20, "cpu")
         assert any(view.between for view in found) == stays
 
 
@@ -87,11 +87,11 @@ def test_no_view_stands_inside_or_behind_a_wall():
     known = [scenes.ring_camera(0.0)]
     free = novel_views(BALL, known, 8, "cpu")
     # A wall that begins right of the photo's picture, where views to that side would stand.
-    there = max((view.camera.centre for view in free), key=lambda centre: centre[0])
+    there = max((view.camera.center for view in free), key=lambda center: center[0])
     left = novel_views(with_wall(there * (1.0 - 0.5 * CLOSE)), known, 8, "cpu")
-    assert any(np.allclose(view.camera.centre, there) for view in free)
+    assert any(np.allclose(view.camera.center, there) for view in free)
     assert left
-    assert not any(np.linalg.norm(view.camera.centre - there) < 0.2 for view in left)
+    assert not any(np.linalg.norm(view.camera.center - there) < 0.2 for view in left)
 
 
 def test_where_nothing_is_seen_there_is_nowhere_to_look():

@@ -1,17 +1,174 @@
-"""What photos cannot tell is one clear sentence, and no more is said than is so."""
+"""Photos that are left out or reported: screenshots, bursts, blur, and unsuitable cameras."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import scenes
+import textured_room as room
+from PIL import Image, ImageDraw, ImageFilter
 
 import igsr
-from igsr.capture import Camera, Capture
-from igsr.capture.photo_checks import check_photos
+from igsr.capture import Camera, Capture, View
+from igsr.capture.photo_checks import check_photos, is_screenshot, split_unfit
+from igsr.capture.photo_folder import Photo, load_photos
+from igsr.capture.sharpness import blur, blurred_photos
+from igsr.capture.types import intrinsic_matrix
+from igsr.errors import IgsrError
+
+SIZE = (240, 180)
+K = intrinsic_matrix(200.0, 200.0, 120.0, 90.0)
+
+
+@pytest.fixture(scope="module")
+def photos():
+    return [
+        Photo(f"{index}.jpg", room.photo(viewmat, SIZE, room.pinhole(K), 1), device="phone")
+        for index, viewmat in enumerate(room.stands(8))
+    ]
+
+
+def moved(photo, name, pixels, noise=2.0):
+    """The next photo of a burst: moved by some pixels, with its own noise."""
+    random = np.random.default_rng(len(name))
+    image = np.roll(photo.image, pixels, axis=1) + random.normal(0.0, noise, photo.image.shape)
+    return replace(photo, name=name, image=np.clip(image, 0, 255).astype(np.uint8))
+
+
+def blurred(photo, name, radius=4.0):
+    image = Image.fromarray(photo.image).filter(ImageFilter.GaussianBlur(radius))
+    return replace(photo, name=name, image=np.asarray(image))
+
+
+def screenshot(name, seed=0):
+    """Bars and lines of text on a page, different for each seed."""
+    image = Image.new("RGB", SIZE, (250, 250, 252))
+    draw = ImageDraw.Draw(image)
+    random = np.random.default_rng(seed)
+    draw.rectangle((0, 0, SIZE[0], 14), fill=(30, 80, 160))
+    for line in range(11):
+        x = 10
+        while x < SIZE[0] - 30:
+            width = int(random.integers(4, 20))
+            draw.rectangle((x, 22 + 14 * line, x + width, 29 + 14 * line), fill=(40, 40, 40))
+            x += width + 4
+    return Photo(name, np.asarray(image))
+
+
+# --- before cameras are found -------------------------------------------------------------------
+
+
+def test_photos_of_one_scene_are_kept(photos):
+    # A step to the side is another photo.
+    for kept in (photos, [*photos, moved(photos[0], "step.jpg", 5)]):
+        assert split_unfit(kept) == (kept, [])
+
+
+def test_the_sharpest_photo_of_a_burst_is_kept(photos):
+    burst = [blurred(photos[2], "a.jpg", 1.0), moved(photos[2], "b.jpg", 0), *photos]
+    kept, sentences = split_unfit(burst)
+    best = {photo.name for photo in kept} & {"a.jpg", "b.jpg", "2.jpg"}
+    assert len(best) == 1
+    assert best != {"a.jpg"}
+    assert len(kept) == 8
+    assert len(sentences) == 1
+    assert "the same view as" in sentences[0]
+    # Photos of two phones from one place are kept: their lenses differ.
+    assert len(split_unfit([*photos, replace(burst[1], device="another")])[0]) == 9
+
+
+def test_screenshots_are_left_out(photos):
+    game = replace(photos[3], device=None)
+    # By its look, by its name, and by its EXIF.
+    for shot in (
+        screenshot("IMG_7.png"),
+        replace(game, name="Screenshot_2024-01-02.png"),
+        replace(photos[3], name="3x.jpg", screenshot=True),
+    ):
+        kept, sentences = split_unfit([*photos[:3], shot, *photos[4:]])
+        assert kept == [*photos[:3], *photos[4:]]
+        assert sentences == [f"{shot.name}: left out, a screenshot and no photo."]
+    # A whole folder of them may show views of a game.
+    views = [replace(photo, name=f"Screenshot {photo.name}", device=None) for photo in photos]
+    assert split_unfit(views) == (views, [])
+
+
+def test_other_pictures_are_no_screenshots(photos):
+    on_white = np.full((180, 240, 3), 255, dtype=np.uint8)
+    on_white[50:130, 80:160] = photos[0].image[50:130, 80:160]
+    random = np.random.default_rng(0)
+    noisy = np.clip(on_white - random.integers(0, 4, on_white.shape), 0, 255).astype(np.uint8)
+    barred = photos[1].image.copy()
+    barred[:20] = barred[-20:] = 0
+    for pixels in (on_white, noisy, barred, photos[2].image, np.zeros_like(barred)):
+        assert not is_screenshot(Photo("a.png", pixels))
+    assert is_screenshot(screenshot("a.png"))
+    assert not is_screenshot(replace(screenshot("a.png"), device="camera"))
+
+
+def test_a_folder_of_screenshots_is_an_error(tmp_path, photos):
+    for index in range(4):
+        Image.fromarray(screenshot("", index).image).save(tmp_path / f"{index}.png")
+    with pytest.raises(IgsrError, match=r"0 is left .*0\.png, 1\.png, 2\.png and 1 more: .*screen"):
+        igsr.estimate_poses(tmp_path, "colmap")
+    Image.fromarray(photos[0].image).save(tmp_path / "photo.png")
+    with pytest.raises(IgsrError, match=r"2 photos at least, and 1 is left"):
+        igsr.estimate_poses(tmp_path, "colmap")
+
+
+def test_exif_of_a_screenshot(tmp_path, photos):
+    exif = Image.Exif()
+    for index, comment in enumerate((b"Screenshot", b"A screenshot of nothing")):
+        exif.get_ifd(0x8769)[0x9286] = b"ASCII\0\0\0" + comment
+        Image.fromarray(photos[index].image).save(tmp_path / f"{index}.jpg", exif=exif)
+    assert [photo.screenshot for photo in load_photos(tmp_path)] == [True, False]
+
+
+# --- blur ---------------------------------------------------------------------------------------
+
+
+def test_blur_is_measured_for_any_content(photos):
+    grainy = [moved(photo, photo.name, 0, 12.0) for photo in photos]
+    for photo in grainy:
+        assert blur(blurred(photo, "b", 2.0).image) > blur(photo.image) + 0.1
+    # A moving hand blurs along one axis.
+    image = grainy[0].image.astype(float)
+    smeared = np.mean([np.roll(image, k, axis=1) for k in range(12)], axis=0).astype(np.uint8)
+    assert blur(smeared) > blur(grainy[0].image) + 0.2
+    assert blur(np.full((40, 40, 3), 7, np.uint8)) == 1.0
+    assert blur(photos[0].image[:5, :5]) == 0.0  # too small
+
+
+def views_of(photos):
+    camera = Camera(np.eye(4), K, *SIZE)
+    return [View(photo.name, camera, "train", photo.image) for photo in photos]
+
+
+def blurred_views(views):
+    return blurred_photos((view.photo, view.image, view.mask) for view in views)
+
+
+def test_blurred_photos_are_reported_and_not_held_out(photos):
+    # Noise makes the painted walls as sharp as photos are.
+    sharp = [moved(photo, photo.name, 0, 12.0) for photo in photos]
+    mixed = [blurred(p, p.name) if index in (0, 3) else p for index, p in enumerate(sharp)]
+    views = views_of(mixed)
+    assert blurred_views(views) == {"0.jpg", "3.jpg"}
+    for photos_here, held_out in ((mixed, ["1.jpg", "4.jpg"]), (sharp, ["0.jpg", "4.jpg"])):
+        split = Capture(Path("photos"), views_of(photos_here)).with_holdout(4)
+        assert [view.name for view in split.test_views] == held_out
+    with pytest.warns(UserWarning, match=r"0\.jpg, 3\.jpg: blurred; leave"):
+        check_photos(views)
+    # If all photos are equally blurred, none is reported.
+    assert not blurred_views(views_of([blurred(photo, photo.name) for photo in sharp]))
+    assert not blurred_views(scenes.capture().views)
+
+
+# --- before a fit -------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -21,81 +178,76 @@ def views():
 
 def turned_away(view, index):
     """The same photo from a camera that looks away from all others."""
-    viewmat = np.diag([1.0, 1.0, 1.0, 1.0])
     angle = 2.0 * np.pi * index / 3.0
     c, s = np.cos(angle), np.sin(angle)
+    viewmat = np.eye(4)
     viewmat[:3, :3] = [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]
-    viewmat[:3, 3] = [0.0, 0.0, -1.0]  # its centre lies one unit along its own axis
+    viewmat[:3, 3] = [0.0, 0.0, -1.0]  # its center lies one unit along its own axis
     return replace(view, camera=Camera(viewmat, view.camera.K, 24, 24), name=f"{index}.png")
 
 
-def test_good_photos_are_not_talked_about(views):
+def zoomed(view):
+    K = view.camera.K * [[1.5], [1.5], [1.0]]
+    return replace(view, camera=replace(view.camera, K=K), name="zoomed.png")
+
+
+def with_image(view, image):
+    return replace(view, image=image)
+
+
+def test_good_photos_are_not_reported(views):
+    apart = [turned_away(views[k], k) for k in range(3)]
+    outline = np.zeros((24, 24, 4), np.uint8)  # of a black object
+    outline[8:, :, 3] = 255
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_photos(views)
-        check_photos(views[:2])
+        for good in (views, views[:2], [*views, zoomed(views[2])], [*apart, *views]):
+            check_photos(good)
+        check_photos([with_image(view, outline) for view in views])
 
 
-def test_one_photo_works_and_says_what_it_cannot(views):
+def test_a_fit_of_one_photo_works(views):
     with pytest.warns(UserWarning, match="one photo only"):
         splats = scenes.fit(Capture("one", views[1:2]), steps=20, backend="cpu", max_splats=200)
     assert np.isfinite(splats.means).all()
 
 
-def test_all_poses_equal(views):
-    same = [replace(view, camera=views[0].camera) for view in views]
-    with pytest.warns(UserWarning, match="All cameras stand at one place"):
-        check_photos(same)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda views: [replace(view, camera=views[0].camera) for view in views],
+            "All cameras are at one place",
+        ),
+        (
+            lambda views: [*views, replace(views[2], name="again.png")],
+            r"02\.png, again\.png have the same camera",
+        ),
+        (
+            lambda views: [turned_away(views[k], k) for k in range(3)],
+            "No two photos see anything in common",
+        ),
+        (
+            lambda views: [with_image(views[0], np.zeros((24, 24, 3), np.uint8)), *views[1:]],
+            "black or fully transparent; leave",
+        ),
+    ],
+)
+def test_unsuitable_photos_are_reported(views, change, words):
+    with pytest.warns(UserWarning, match=words):
+        check_photos(change(views))
 
 
-def test_a_camera_given_twice(views):
-    twice = [*views, replace(views[2], name="again.png")]
-    with pytest.warns(UserWarning, match=r"02\.png, again\.png have one and the same camera"):
-        check_photos(twice)
-    other = [*views, replace(views[2], camera=replace_focal(views[2].camera), name="zoomed.png")]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_photos(other)
-
-
-def replace_focal(camera):
-    K = camera.K.copy()
-    K[0, 0] *= 1.5
-    K[1, 1] *= 1.5
-    return Camera(camera.viewmat, K, camera.width, camera.height)
-
-
-def test_photos_that_see_nothing_in_common(views):
-    apart = [turned_away(views[k], k) for k in range(3)]
-    with pytest.warns(UserWarning, match="No two photos see anything in common"):
-        check_photos(apart)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_photos([*apart, *views])
-
-
-def test_black_and_transparent_photos(views):
-    black = [replace(view, image=np.zeros_like(view.image)) for view in views]
-    with pytest.raises(igsr.IgsrError, match="Every photo is black"):
-        check_photos(black)
-    with pytest.warns(UserWarning, match="black or wholly transparent; leave out"):
-        check_photos([black[0], *views[1:]])
-    clear = np.full((24, 24, 4), 255, np.uint8)
-    clear[..., 3] = 0
-    with pytest.raises(igsr.IgsrError, match="wholly transparent"):
-        check_photos([replace(view, image=clear) for view in views])
-    dark = np.zeros((24, 24, 4), np.uint8)
-    dark[..., 3] = 255
-    with pytest.raises(igsr.IgsrError, match="Every photo is black"):
-        check_photos([replace(view, image=dark) for view in views])
-    outline = dark.copy()  # of a black thing: it tells where the thing is
-    outline[:8, :, 3] = 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_photos([replace(view, image=outline) for view in views])
+@pytest.mark.parametrize("alpha", [None, 0, 255])
+def test_empty_photos_are_refused(views, alpha):
+    image = np.zeros((24, 24, 3 if alpha is None else 4), np.uint8)
+    if alpha is not None:
+        image[..., :3], image[..., 3] = 255 - alpha, alpha
+    with pytest.raises(IgsrError, match="Every photo is black or fully transparent"):
+        check_photos([with_image(view, image) for view in views])
 
 
 def test_a_mask_that_hides_everything(views):
     hidden = replace(views[1], mask=np.zeros((24, 24), bool))
-    with pytest.raises(igsr.IgsrError, match=r"01\.png: its mask leaves no pixel"):
+    with pytest.raises(IgsrError, match=r"01\.png: its mask leaves no pixel"):
         check_photos([hidden, *views])

@@ -110,8 +110,8 @@ def test_known_points_tell_the_range_of_depths():
     assert nearest < DEPTH - 1.0 < DEPTH + 1.0 < farthest
     assert farthest / nearest < 0.5 * FARTHEST / plane_sweep.NEAREST
     without = plane_sweep.NEAREST * DEPTH, FARTHEST * DEPTH
-    assert _depth_range(photo, np.array([photo.camera.centre[0], 0, DEPTH]), None) == without
-    assert _depth_range(photo, np.array([photo.camera.centre[0], 0, DEPTH]), KNOWN[:5]) == without
+    assert _depth_range(photo, np.array([photo.camera.center[0], 0, DEPTH]), None) == without
+    assert _depth_range(photo, np.array([photo.camera.center[0], 0, DEPTH]), KNOWN[:5]) == without
 
 
 def test_points_need_a_second_depth_map_that_agrees():

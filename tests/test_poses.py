@@ -295,9 +295,9 @@ def test_noise_has_the_size_that_it_says(made):
     between = noisy.camera.viewmat[:3, :3] @ true[:3, :3].T
     angle = np.degrees(np.arccos((np.trace(between) - 1.0) / 2.0))
     assert angle == pytest.approx(2.0, abs=1e-6)
-    assert np.allclose(noisy.camera.centre, view.camera.centre)
+    assert np.allclose(noisy.camera.center, view.camera.center)
     moves = [
-        noisy_view(view, Noise("matrix", 0.01), random).camera.centre - view.camera.centre
+        noisy_view(view, Noise("matrix", 0.01), random).camera.center - view.camera.center
         for _ in range(300)
     ]
     assert np.std(moves) == pytest.approx(0.01, rel=0.1)
@@ -308,13 +308,13 @@ def test_noise_on_positions_goes_by_how_far_cameras_stand_from_what_they_see():
     views = scenes.capture(views=6, size=16).views
     unit = noise_unit(views)
     for view in views:
-        distance = np.linalg.norm(view.camera.centre)
+        distance = np.linalg.norm(view.camera.center)
         assert distance / 4.03 == pytest.approx(unit, rel=0.05), "they look at the origin"
 
     def moved(unit):
         random = np.random.default_rng(3)
         noisy = noisy_view(views[0], Noise("matrix", 0.01), random, unit)
-        return noisy.camera.viewmat[:3, :3], noisy.camera.centre - views[0].camera.centre
+        return noisy.camera.viewmat[:3, :3], noisy.camera.center - views[0].camera.center
 
     (turned, offset), (as_turned, doubled) = moved(1.0), moved(2.0)
     assert np.array_equal(turned, as_turned)

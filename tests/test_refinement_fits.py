@@ -47,7 +47,7 @@ def test_weights_of_one_are_as_none_and_weights_of_zero_as_a_mask(ball_photos):
         pseudo(photos[0], left[1:])
 
 
-@pytest.mark.filterwarnings("ignore:.*one and the same camera", "ignore:.*black or wholly")
+@pytest.mark.filterwarnings("ignore:.*have the same camera", "ignore:.*black or fully")
 def test_of_two_pictures_that_disagree_the_one_of_larger_weight_wins(ball_photos):
     view = ball_photos.train_views[0]
     white = np.full((40, 40, 3), 255, np.uint8)
@@ -81,7 +81,7 @@ def test_a_fit_continues_from_splats(ball_photos):
             scenes.fit(ball_photos, 5, start=start, backend="cpu", **settings)
 
 
-@pytest.mark.filterwarnings("ignore:.*one and the same camera")
+@pytest.mark.filterwarnings("ignore:.*have the same camera")
 def test_novel_views_change_neither_settings_nor_initialization(ball_photos):
     photos = ball_photos.train_views[:3]
     views = [

@@ -160,7 +160,7 @@ def test_mouse_and_keys_move_the_camera(browser, tmp_path):
     assert state()["camera"] == 0
     browser.run("document.getElementById('next').click()")
     assert state()["camera"] == 1
-    second = three_cameras()[1].centre - browser.run("window.igsr.viewer.scene.origin")
+    second = three_cameras()[1].center - browser.run("window.igsr.viewer.scene.origin")
     assert state()["position"] == pytest.approx(second.tolist(), abs=1e-9)
     browser.key("v", "KeyV")
     assert state()["flies"]

@@ -8,7 +8,7 @@ import scenes
 from scene_pages import BACKGROUND, MEAN, check_pictures, drawn, model, three_cameras
 
 import igsr
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.rendering.renders import render
 from igsr.rendering.run_folder import background_beside, cameras_beside
 from igsr.rendering.scene_page import write_scene_page

@@ -61,7 +61,7 @@ def photo(angle, seed=0):
         axis=-1,
     )
     rays = local @ camera.viewmat[:3, :3]
-    wall = camera.centre - rays * ((camera.centre @ NORMAL) / (rays @ NORMAL))[..., None]
+    wall = camera.center - rays * ((camera.center @ NORMAL) / (rays @ NORMAL))[..., None]
     at = ((wall[..., :2] + 2.5) * 100).astype(int) % 512
     image = texture(seed)[at[..., 1], at[..., 0]].astype(np.uint8)
     return View(f"{angle}.png", camera, "train", image)

@@ -1,19 +1,19 @@
-"""Which frames of a video become photos: by the camera's path and by sharpness."""
+"""Frames of a video that become photos: by the camera's path and by sharpness."""
 
 from __future__ import annotations
 
 import av
 import numpy as np
 import pytest
+from test_photo_folder import write_video
 
 from igsr.capture import video_frames
 from igsr.capture.photo_folder import load_photos
-from igsr.capture.video_frames import FEWEST, evenly_sharp, sharpest_frames
-from igsr.capture.video_motion import SIDE, STEP, CameraPath
+from igsr.capture.video_frames import MIN_FRAMES, CameraPath, evenly_sharp, sharpest_frames
 from igsr.errors import IgsrError
 
-HEIGHT = 136
-RANDOM = np.random.default_rng(0)
+HEIGHT, WIDTH = 136, video_frames.MOTION_SIDE_PX
+STEP = video_frames.STEP_PART * WIDTH
 
 
 def smooth(height, width, seed=0):
@@ -28,8 +28,8 @@ WALL = smooth(HEIGHT, 1200)
 
 
 def pan(places):
-    """Grey frames of a camera that pans along a wall to ``places``, in pixels."""
-    return [WALL[:, round(x) : round(x) + SIDE] for x in places]
+    """Gray frames of a camera that pans along a wall to ``places``, in pixels."""
+    return [WALL[:, round(x) : round(x) + WIDTH] for x in places]
 
 
 def path_of(frames):
@@ -40,27 +40,23 @@ def path_of(frames):
 # ---- the path ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("frames", [40, 160, 1200])
-def test_a_pan_is_as_long_however_fast_it_goes(frames):
-    places = np.linspace(0, 360, frames)
-    found = path_of(pan(places))
-    assert found[0] == 0.0
-    assert (np.diff(found) >= 0.0).all()
-    assert found[-1] == pytest.approx(360 / (STEP * SIDE), rel=0.05)
+@pytest.mark.parametrize("frames", [40, 160, 600])
+def test_the_length_of_a_pan_does_not_depend_on_its_speed(frames):
+    path = path_of(pan(np.linspace(0, 360, frames)))
+    assert path[0] == 0.0
+    assert (np.diff(path) >= 0.0).all()
+    assert path[-1] == pytest.approx(360 / STEP, rel=0.05)
 
 
-def test_a_stop_adds_nothing_also_under_noise():
-    noisy = [
-        np.clip(frame + RANDOM.normal(scale=5.0, size=frame.shape), 0, 255).astype(np.uint8)
-        for frame in pan(np.full(60, 100))
-    ]
-    assert path_of(noisy)[-1] < 0.05
+def test_a_stop_adds_nothing_in_spite_of_noise():
+    random = np.random.default_rng(0)
+    noisy = (frame + random.normal(scale=5.0, size=frame.shape) for frame in pan([100] * 60))
+    assert path_of([np.clip(frame, 0, 255).astype(np.uint8) for frame in noisy])[-1] < 0.05
 
 
 def test_a_cut_is_a_step_and_blank_frames_are_none():
-    frames = [*pan([0, 0]), smooth(HEIGHT, SIDE, seed=1), smooth(HEIGHT, SIDE, seed=1)]
-    assert path_of(frames).tolist() == [0.0, 0.0, 1.0, 1.0]
-    blank = np.full((HEIGHT, SIDE), 200, np.uint8)
+    other, blank = smooth(HEIGHT, WIDTH, seed=1), np.full((HEIGHT, WIDTH), 200, np.uint8)
+    assert path_of([*pan([0, 0]), other, other]).tolist() == [0.0, 0.0, 1.0, 1.0]
     assert path_of([blank] * 3).tolist() == [0.0, 0.0, 0.0]
     assert path_of([blank, *pan([0, 0]), blank]).tolist() == [0.0, 1.0, 1.0, 2.0]
 
@@ -71,17 +67,17 @@ def test_a_cut_is_a_step_and_blank_frames_are_none():
 def test_frames_are_spread_over_the_path_not_over_time():
     parts = np.linspace(0, 10, 20), np.full(200, 10.0), np.linspace(10, 30, 90)
     stop_and_go = np.concatenate(parts)
-    chosen = evenly_sharp(stop_and_go, np.ones(310), most=100)
+    chosen = evenly_sharp(stop_and_go, np.ones(310), max_frames=100)
     assert len(chosen) == 30
     assert np.abs(np.diff(stop_and_go[chosen]) - 1.0).max() < 0.6
-    assert len(evenly_sharp(stop_and_go, np.ones(310), most=7)) == 7
+    assert len(evenly_sharp(stop_and_go, np.ones(310), max_frames=7)) == 7
 
 
-def test_the_sharpest_frame_of_the_middle_of_a_span_is_taken():
+def test_the_sharpest_frame_in_the_middle_of_a_span_is_taken():
     places = np.linspace(0.0, 20.0, 400, endpoint=False)
     sharpness = np.ones(400)
     sharpness[[29, 45, 79]] = 2.0  # the middle of span 1 and of span 2; the edge of span 3
-    chosen = evenly_sharp(places, sharpness, most=100)
+    chosen = evenly_sharp(places, sharpness, max_frames=100)
     assert len(chosen) == 20
     assert {29, 45} <= set(chosen)
     assert 79 not in chosen
@@ -89,14 +85,14 @@ def test_the_sharpest_frame_of_the_middle_of_a_span_is_taken():
 
 @pytest.mark.parametrize("count", [1, 5, 12, 300])
 def test_a_still_video_is_divided_by_time(count):
-    chosen = evenly_sharp(np.zeros(count), np.ones(count), most=100)
-    assert len(chosen) == min(count, FEWEST)
+    chosen = evenly_sharp(np.zeros(count), np.ones(count), max_frames=100)
+    assert len(chosen) == min(count, MIN_FRAMES)
     if count == 300:
         assert np.ptp(np.diff(chosen)) <= 1
 
 
 def test_a_jump_leaves_spans_without_a_frame_empty():
-    chosen = evenly_sharp(np.array([0.0, 1.0, 2.0, 30.0, 31.0]), np.ones(5), most=100)
+    chosen = evenly_sharp(np.array([0.0, 1.0, 2.0, 30.0, 31.0]), np.ones(5), max_frames=100)
     assert chosen == sorted(set(chosen))
     assert {0, 1, 2} & set(chosen)
     assert {3, 4} & set(chosen)
@@ -106,21 +102,14 @@ def test_a_jump_leaves_spans_without_a_frame_empty():
 
 
 def write(path, frames):
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=25)
-        stream.height, stream.width = frames[0].shape
-        stream.pix_fmt, stream.bit_rate = "yuv420p", 8_000_000
-        for frame in frames:
-            rgb = np.repeat(frame[..., None], 3, axis=2)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
-        container.mux(stream.encode())
+    write_video(path, [np.repeat(frame[..., None], 3, axis=2) for frame in frames])
 
 
 def test_photos_of_a_stop_and_go_video(tmp_path):
     places = np.concatenate([np.linspace(0, 150, 30), np.full(80, 150), np.linspace(150, 300, 60)])
     write(tmp_path / "walk.mp4", pan(places))
     chosen = [index for index, _ in sharpest_frames(tmp_path / "walk.mp4", 100)]
-    assert len(chosen) == pytest.approx(300 / (STEP * SIDE), abs=2)
+    assert len(chosen) == pytest.approx(300 / STEP, abs=2)
     assert sum(32 < index < 108 for index in chosen) <= 1
     names = [photo.name for photo in load_photos(tmp_path)]
     assert names == [f"walk.mp4/{index:06d}.png" for index in chosen]

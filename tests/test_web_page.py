@@ -13,7 +13,7 @@ from web_views import served
 
 import igsr
 from igsr._internal.event import Event
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.fitting.followed_run import FollowedRun
 from igsr.rendering import scene_page
 from igsr.rendering.renders import render

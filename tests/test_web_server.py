@@ -22,7 +22,7 @@ from web_views import asked, served, state_of, with_token
 
 import igsr
 from igsr._internal.event import Event
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.followed_run import FollowedRun
 from igsr.rendering import live_view, run_folder

@@ -1,17 +1,15 @@
-"""A room with boxes, all painted with noise, and what any camera in it sees: traced, not rendered.
+"""A room with boxes, all painted with noise, ray traced from any camera in it.
 
 World axes are x right, y down, z forward; the room is ``ROOM`` and its floor is at the largest y.
+Functions named after a lens return its rays: from pixel coordinates u, v [N] to rays [N, 3] of the
+camera, and whether the pixel has one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-Rays = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-#: Lowest and highest corners, in metres.
+#: Lowest and highest corners, in meters.
 ROOM = np.array([[-3.0, -1.5, -2.5], [3.0, 1.2, 2.5]])
 BOXES = np.array(
     [
@@ -23,18 +21,18 @@ BOXES = np.array(
         [[0.2, -1.5, -2.3], [0.7, -0.7, -1.8]],
     ]
 )
-#: Cells of the noise per metre, and how strong each is.
+#: Cells of the noise per meter, and the strength of each.
 _OCTAVES = ((0.8, 0.55), (2.5, 0.3), (8.0, 0.15))
 
 
-def _noise(a: np.ndarray, b: np.ndarray, cells: float, seed: np.ndarray) -> np.ndarray:
+def _noise(a, b, cells, seed):
     """Smooth noise in 0..1 at places [N] of surfaces with numbers [N]."""
     a, b = a * cells, b * cells
     left, up = np.floor(a), np.floor(b)
-    across, below = (np.clip((t - t0) * 1.0, 0, 1) for t, t0 in ((a, left), (b, up)))
+    across, below = (np.clip(t - t0, 0, 1) for t, t0 in ((a, left), (b, up)))
     across, below = (t * t * (3.0 - 2.0 * t) for t in (across, below))
 
-    def at(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    def at(i, j):
         hashed = (
             i.astype(np.int64) * 73856093 ^ j.astype(np.int64) * 19349663 ^ seed * 83492791
         ).astype(np.uint64)
@@ -46,8 +44,8 @@ def _noise(a: np.ndarray, b: np.ndarray, cells: float, seed: np.ndarray) -> np.n
     return top * (1 - below) + bottom * below
 
 
-def colors(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """RGB in 0..1 [N, 3] of what rays [N, 3] from a place in the room meet first."""
+def colors(origin, rays):
+    """RGB in 0..1 [N, 3] of the first surfaces that rays [N, 3] from a place in the room hit."""
     boxes = np.concatenate([ROOM[None], BOXES])
     nearest = np.full(len(rays), np.inf)
     surface = np.zeros(len(rays), dtype=np.int64)
@@ -78,13 +76,13 @@ def colors(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     return np.clip(0.5 + 1.4 * (out - 0.5), 0.0, 1.0)
 
 
-def photo(viewmat: np.ndarray, size: tuple[int, int], rays: Rays, samples: int = 3) -> np.ndarray:
+def photo(viewmat, size, rays, samples=3):
     """A photo, uint8 [H, W, 3]: the mean of ``samples`` x ``samples`` rays through each pixel.
 
     Args:
         viewmat: [4, 4], world to camera.
         size: width and height, pixels.
-        rays: from pixel coordinates u, v [N] to rays [N, 3] of the camera, and whether it has one.
+        rays: of the lens; see the module.
         samples: per side of a pixel.
     """
     width, height = size
@@ -97,26 +95,23 @@ def photo(viewmat: np.ndarray, size: tuple[int, int], rays: Rays, samples: int =
                 np.arange(height) + (down + 0.5) / samples,
             )
             local, seen = rays(u.ravel(), v.ravel())
-            found = colors(origin, local @ viewmat[:3, :3])
-            total += np.where(seen[:, None], found, 0.0)
+            total += np.where(seen[:, None], colors(origin, local @ viewmat[:3, :3]), 0.0)
     mean = total.reshape(height, width, 3) / samples**2
     return np.rint(255.0 * mean).astype(np.uint8)
 
 
-def pinhole(K: np.ndarray) -> Rays:
-    """Rays of a pinhole camera."""
-
-    def rays(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pinhole(K):
+    def rays(u, v):
         x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
         return np.stack([x, y, np.ones_like(x)], axis=1), np.ones(len(u), dtype=bool)
 
     return rays
 
 
-def panorama(width: int) -> Rays:
-    """Rays of an equirectangular camera of width x width / 2 pixels."""
+def panorama(width):
+    """An equirectangular camera of width x width / 2 pixels."""
 
-    def rays(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rays(u, v):
         longitude = (u / width - 0.5) * 2.0 * np.pi
         latitude = (2.0 * v / width - 0.5) * np.pi
         across = np.cos(latitude)
@@ -126,10 +121,10 @@ def panorama(width: int) -> Rays:
     return rays
 
 
-def fisheye(size: int, degrees: float) -> Rays:
-    """Rays of an equidistant fisheye of ``degrees`` across, black beyond that circle."""
+def fisheye(size, degrees):
+    """An equidistant fisheye of ``degrees`` across, black outside that circle."""
 
-    def rays(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rays(u, v):
         x, y = u - 0.5 * size, v - 0.5 * size
         radius = np.hypot(x, y)
         angle = radius / fisheye_focal(size, degrees)
@@ -139,28 +134,25 @@ def fisheye(size: int, degrees: float) -> Rays:
     return rays
 
 
-def fisheye_focal(size: int, degrees: float) -> float:
+def fisheye_focal(size, degrees):
     """Pixels per radian of that lens."""
     return 0.5 * size / np.radians(0.5 * degrees)
 
 
-def stands(count: int, seed: int = 0) -> list[np.ndarray]:
-    """World-to-camera matrices [4, 4] of places around the middle of the room, turned at random."""
+def stands(count, seed=0):
+    """World-to-camera matrices [4, 4] around the middle of the room, turned at random."""
     random = np.random.default_rng(seed)
-    found = []
+    viewmats = []
     for k in range(count):
         angle = 2.0 * np.pi * (k + 0.3 * random.random()) / count
         place = np.array([1.1 * np.cos(angle), 0.35 * random.normal(), 0.8 * np.sin(angle)])
         place[1] = np.clip(place[1], -0.6, 0.5)
         turn, tilt = random.uniform(-np.pi, np.pi), 0.15 * random.normal()
-        yaw = np.array(
-            [[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]]
-        )
-        pitch = np.array(
-            [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
-        )
+        c, s = np.cos((turn, tilt)), np.sin((turn, tilt))
+        yaw = np.array([[c[0], 0, -s[0]], [0, 1, 0], [s[0], 0, c[0]]])
+        pitch = np.array([[1, 0, 0], [0, c[1], -s[1]], [0, s[1], c[1]]])
         viewmat = np.eye(4)
         viewmat[:3, :3] = pitch @ yaw
         viewmat[:3, 3] = -viewmat[:3, :3] @ place
-        found.append(viewmat)
-    return found
+        viewmats.append(viewmat)
+    return viewmats

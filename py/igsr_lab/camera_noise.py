@@ -46,7 +46,7 @@ def noise_unit(views: Sequence[View]) -> float:
     for view in views:
         axis = view.camera.viewmat[2, :3]
         across.append(np.eye(3) - np.outer(axis, axis))
-    centers = np.stack([view.camera.centre for view in views])
+    centers = np.stack([view.camera.center for view in views])
     pulled = np.einsum("nij,nj->i", np.stack(across), centers - centers[0])
     target = centers[0] + np.linalg.lstsq(np.sum(across, axis=0), pulled, rcond=1e-6)[0]
     distance = float(np.mean(np.linalg.norm(centers - target, axis=1)))

@@ -84,7 +84,7 @@ def test_captures_load_with_the_cameras_written(made: Path) -> None:
             assert max(view.camera.width, view.camera.height) == 24
             assert view.camera.K[0, 0] == frame["fl_x"]
             centre = np.array(frame["transform_matrix"])[:3, 3]
-            assert np.allclose(view.camera.centre, centre, atol=1e-12)
+            assert np.allclose(view.camera.center, centre, atol=1e-12)
             channels = 4 if recipe["family"] == "object" else 3
             assert view.image.shape == (view.camera.height, view.camera.width, channels)
             # Neither black nor burnt out, and not one flat colour.

@@ -96,8 +96,8 @@ def ground_of(cameras: Sequence[Camera]) -> Ground:
     Args:
         cameras: at least one.
     """
-    centres = np.stack([camera.centre for camera in cameras])
-    spread, axes = np.linalg.eigh(np.cov((centres - centres.mean(axis=0)).T, bias=True))
+    centers = np.stack([camera.center for camera in cameras])
+    spread, axes = np.linalg.eigh(np.cov((centers - centers.mean(axis=0)).T, bias=True))
     axes = axes.T[::-1]  # the largest first
     largest, lesser, least = np.sqrt(np.maximum(spread[::-1], 0.0))
     if least < FLAT * lesser:

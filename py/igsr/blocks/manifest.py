@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from igsr.capture.image_files import PhotoHeader
 from igsr.capture.load import describe_capture
-from igsr.capture.photos import PhotoHeader, Shot, checked_headers, photo_of
+from igsr.capture.photos import Shot, checked_headers, photo_of
 from igsr.capture.types import Points
 from igsr.errors import IgsrError
 

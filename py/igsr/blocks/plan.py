@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from igsr.blocks.manifest import Manifest
 from igsr.blocks.photo_parts import ALL, Box, boxes_of
 from igsr.blocks.shares import shown_shares, tracked_shares
 from igsr.capture.downscaling import reduced_size
-from igsr.capture.memory_check import LIBRARIES, USABLE, available_memory, needed_memory
-from igsr.capture.photos import loaded_sizes
+from igsr.capture.memory_check import LIBRARY_BYTES, USABLE_PART, available_memory
+from igsr.capture.photos import shot_sizes
 from igsr.capture.types import Points
 from igsr.splats import Splats
 
@@ -76,7 +76,7 @@ def cells_of(manifest: Manifest, count: int) -> tuple[Ground, list[Cell]]:
     """
     cameras = [manifest.shots[index].camera for index in manifest.of_split("train")]
     ground = ground_of(cameras)
-    places = ground.places(np.stack([camera.centre for camera in cameras]))
+    places = ground.places(np.stack([camera.center for camera in cameras]))
     return ground, split_into_cells(places, count)
 
 
@@ -105,7 +105,7 @@ def plan_blocks(
     shares = shown_shares(coarse, cameras, [*cells, *widened], ground, backend)
     names = [shot.name for shot in manifest.shots]
     tracked = tracked_shares(points, names, widened, ground)
-    places = ground.places(np.stack([camera.centre for camera in cameras]))
+    places = ground.places(np.stack([camera.center for camera in cameras]))
     near = np.stack([cell.holds(places) for cell in widened], axis=1)
     photos = photos_of_blocks(shares[:, count:], tracked, near)
     photos[[shot.split != "train" for shot in manifest.shots]] = False
@@ -128,10 +128,10 @@ def blocks_for_memory(
         available: bytes; None: what this machine has free.
     """
     train = manifest.of_split("train")
-    usable = USABLE * (available_memory() if available is None else available)
+    usable = USABLE_PART * (available_memory() if available is None else available)
     whole = memory_of(manifest, train, max_size, splats)
-    per_photo = max(0, whole - LIBRARIES) / max(1, len(train))
-    photos = max(1.0, (usable - LIBRARIES) / max(per_photo, 1.0) / (1.0 + SHARED))
+    per_photo = max(0, whole - LIBRARY_BYTES) / max(1, len(train))
+    photos = max(1.0, (usable - LIBRARY_BYTES) / max(per_photo, 1.0) / (1.0 + SHARED))
     needed = math.ceil(len(train) / min(photos, PHOTOS_PER_BLOCK))
     return min(max(1, needed), max(1, len(train)))
 
@@ -154,17 +154,11 @@ def memory_of(
     """
     shots = [manifest.shots[index] for index in photos]
     headers = [manifest.headers[index] for index in photos]
-    sizes = loaded_sizes(shots, headers)
+    sizes = shot_sizes(shots, headers)
     if boxes is not None:
-        sizes = [
-            box.size(*reduced_size(*size, max_size)) for box, size in zip(boxes, sizes, strict=True)
+        parts = [
+            box.size(*reduced_size(*size, max_size))
+            for box, size in zip(boxes, sizes.sizes, strict=True)
         ]
-    return needed_memory(
-        sizes,
-        max_size,
-        200_000 if splats is None else splats,
-        channels=max((header.channels for header in headers), default=3),
-        masked=any(shot.is_resampled or shot.mask_path for shot in shots),
-        depths=any(shot.depth_path for shot in shots),
-        decoded=[header.size for header in headers],
-    )
+        sizes = replace(sizes, sizes=parts)
+    return sizes.needed_memory(max_size, 200_000 if splats is None else splats)

@@ -1,4 +1,4 @@
-"""Splats that reach far beyond the cell of their centre: no one block can fit them for all."""
+"""Splats that reach far beyond the cell of their center: no one block can fit them for all."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from igsr._internal.choices import Backend
 from igsr.blocks.manifest import Manifest
 from igsr.blocks.photo_parts import Box, cut_out
 from igsr.capture import View
-from igsr.capture.described import DescribedCapture
 from igsr.capture.exposure import Exposure
+from igsr.capture.photos import DescribedCapture
 from igsr.evaluation.scores import score_views
 from igsr.fitting.fitter import without_exposures
 from igsr.splats import Splats

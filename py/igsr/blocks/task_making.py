@@ -16,10 +16,9 @@ from igsr.blocks.options import BlockOptions
 from igsr.blocks.plan import BlockPlan, memory_of
 from igsr.blocks.reach import reaching_out
 from igsr.blocks.tasks import SPLATS, BlockPart, FitTask
-from igsr.capture.downscaling import reduced_size
+from igsr.capture.downscaling import reduced_size, resized_tracks
 from igsr.capture.exposure import Exposure
-from igsr.capture.memory_check import OF_A_SPLAT
-from igsr.capture.tracks import resized
+from igsr.capture.memory_check import SPLAT_BYTES
 from igsr.capture.types import Points
 from igsr.errors import IgsrError
 from igsr.splats import Splats
@@ -64,7 +63,7 @@ def coarse_task(
         # Transient things are looked for by the blocks: the search holds all photos of a fit.
         settings=settings,
         backend=options.backend,
-        points=resized(points, before, cast(Any, after)),
+        points=resized_tracks(points, before, cast(Any, after)),
     )
 
 
@@ -100,7 +99,7 @@ def _coarse_splats(
     some = list(photos)[: max(1, round((1.0 + WIDENED) * len(photos) / blocks))]
     left = memory_of(manifest, some, max_size, of_block)
     left -= memory_of(manifest, list(photos), size, 0)
-    return min(of_scene, max(of_block, COARSE_SPLATS, left // OF_A_SPLAT))
+    return min(of_scene, max(of_block, COARSE_SPLATS, left // SPLAT_BYTES))
 
 
 def block_tasks(

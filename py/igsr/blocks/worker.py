@@ -33,8 +33,8 @@ from igsr.blocks.tasks import (
     save_splats,
 )
 from igsr.capture import Capture, View, photos_among
-from igsr.capture.described import DescribedCapture
 from igsr.capture.downscaling import reduced_size, resized_camera
+from igsr.capture.photos import DescribedCapture
 from igsr.capture.types import Points
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import BLACK, default_background, score_views

@@ -1,65 +1,54 @@
-"""Make photos and views smaller, with an area filter.
+"""Reduce photos and views with an area filter, and scale their tracks.
 
-A pixel of the smaller photo is the mean of the area that it covers, parts of pixels included. The
-photo covers the same field of view: focal lengths and principal point scale by the two sizes' ratio
-per axis, exactly, since pixel centres are at +0.5.
+A pixel of the smaller photo is the mean of the area that it covers, including parts of pixels. The
+field of view stays the same: focal lengths and principal point scale by the ratio of the two sizes
+per axis, exactly, since pixel centers are at +0.5.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from igsr.capture.types import Camera, PseudoView, View
+from igsr.capture.types import Camera, Points, PseudoView, View
 from igsr.errors import IgsrError
 
 Float64 = npt.NDArray[np.float64]
 
-#: Rows of the smaller photo computed at a time are so many that this many numbers are held.
+#: Numbers that are held at a time; limits the rows that are reduced at once.
 _BAND_NUMBERS = 1 << 20
 
 
 def check_max_size(max_size: int | None) -> None:
-    """Find a size that no photo can have.
-
-    Raises:
-        IgsrError: it is neither None nor a whole number of at least 1.
-    """
+    """Raise an IgsrError unless an option is None or a whole number of at least 1."""
     if max_size is None:
         return
-    whole = isinstance(max_size, (int, np.integer)) and not isinstance(max_size, bool)
-    if not whole or max_size < 1:
+    is_whole = isinstance(max_size, (int, np.integer)) and not isinstance(max_size, bool)
+    if not is_whole or max_size < 1:
         raise IgsrError(
             f"max_size is {max_size!r}; give the longest side in pixels, at least 1, such as 1600"
         )
 
 
 def reduced_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
-    """Width and height of a photo whose longest side may have ``max_size`` pixels.
+    """Return width and height of a photo whose longest side is reduced to ``max_size`` pixels.
 
-    Args:
-        width, height: of the photo, pixels.
-        max_size: the most pixels of its longest side; None, or more than it has, keeps it.
+    Photos are not enlarged; None keeps the size.
     """
     longest = max(width, height)
     if max_size is None or longest <= max_size:
         return width, height
-    # Halves go up; whole numbers, so that no rounding of a quotient can decide.
+    # Rounds halves up, in integers, so that no rounding of a quotient matters.
     shorter = max(1, (2 * min(width, height) * int(max_size) + longest) // (2 * longest))
     return (int(max_size), shorter) if width >= height else (shorter, int(max_size))
 
 
 def resized_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of the same photo at another size.
-
-    Args:
-        camera: pinhole, in pixels of the photo as it is.
-        width, height: the photo's new size, pixels.
-    """
+    """Return the pinhole camera of the same photo at another size in pixels."""
     if (width, height) == (camera.width, camera.height):
         return camera
     K = camera.K.copy()
@@ -69,16 +58,12 @@ def resized_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 class PixelRows(Protocol):
-    """Pixels [H, W, C] of which rows can be asked for: an array, or a photo that is not one yet."""
+    """Pixels [H, W, C] that are read by rows: an array, or a photo that is converted on demand."""
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """H, W, C."""
-        ...
+    def shape(self) -> tuple[int, ...]: ...
 
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """The rows, [rows, W, C]; a slice may end beyond the last."""
-        ...
+    def __getitem__(self, rows: slice, /) -> np.ndarray: ...
 
 
 def area_means(
@@ -90,24 +75,24 @@ def area_means(
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_] | None]:
     """Reduce a photo by an area filter.
 
-    Colors are weighted by alpha and by the mask, where there are such: transparent and masked
-    pixels lend no color. Alpha is weighted by the mask.
+    Colors are weighted by alpha and mask, if there are any: transparent and masked pixels lend no
+    color. Alpha is weighted by the mask.
 
     Args:
         pixels: uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha.
         width, height: the smaller size in pixels, at most the larger.
-        mask: bool [H, W], True where a pixel counts, or None if all do.
-        box: width and height, in pixels, of the part of ``pixels`` that is the photo, from the
-            upper left corner; None is all.
+        mask: bool [H, W], True for pixels that count, or None if all do.
+        box: width and height, in pixels, of the upper left part of ``pixels`` that is the photo;
+            None is all.
 
     Returns:
         The photo, uint8 [height, width, 3 or 4], and its mask, None without ``mask``: a pixel of it
-        is False where none of the pixels under it counts.
+        is False if no pixel under it counts.
     """
     alpha = pixels.shape[2] == 4
 
     def planes(rows: slice) -> np.ndarray:
-        """What is summed: the weighted color, and what it is divided by."""
+        """The weighted colors, and their weights."""
         band = pixels[rows]
         if mask is None and not alpha:
             return band
@@ -117,10 +102,11 @@ def area_means(
         opacity = band[..., 3:] * used
         return np.concatenate([band[..., :3] * opacity, opacity, used], axis=2)
 
-    sums = _area_sums(planes, pixels.shape[:2], (height, width), box)
+    covered = (pixels.shape[1], pixels.shape[0]) if box is None else box
+    sums = _area_sums(planes, pixels.shape[:2], (height, width), covered)
     if mask is None and not alpha:
-        return _rounded(sums / _area(pixels.shape[:2], (height, width), box)), None
-    # The sums of weights are 0 only where the color has no meaning.
+        return _rounded(sums / _area(covered, width, height)), None
+    # A weight is 0 only if the color has no meaning.
     colors = sums[..., :3] / np.maximum(sums[..., 3:4], 1e-9)
     if alpha:
         colors = np.concatenate([colors, sums[..., 3:4] / np.maximum(sums[..., 4:], 1e-9)], axis=2)
@@ -129,19 +115,16 @@ def area_means(
 
 def plane_area_means(plane: np.ndarray, width: int, height: int) -> Float64:
     """Reduce one number per pixel, [H, W], by an area filter; see ``area_means``."""
-    sums = _area_sums(lambda rows: plane[rows, :, None], plane.shape, (height, width), None)
-    return sums[..., 0] / _area(plane.shape, (height, width), None)
+    covered = plane.shape[1], plane.shape[0]
+    sums = _area_sums(lambda rows: plane[rows, :, None], plane.shape, (height, width), covered)
+    return sums[..., 0] / _area(covered, width, height)
 
 
 def reduced_view(view: View, width: int, height: int) -> View:
-    """A view with a smaller photo; its camera, mask, weights and depth go with it.
+    """Return a view reduced to a size in pixels, with its camera, mask, weights and depth.
 
-    A pixel is masked if all under it were. Weights are averaged. The depth is that of the pixel in
-    the middle: a mean over an edge is on no surface.
-
-    Args:
-        view: the view.
-        width, height: the smaller size in pixels, at most the larger.
+    A pixel is masked if all under it were. Weights are averaged. Depth is that of the pixel in the
+    middle: a mean over an edge is on no surface.
     """
     if (width, height) == (view.camera.width, view.camera.height):
         return view
@@ -149,26 +132,25 @@ def reduced_view(view: View, width: int, height: int) -> View:
     weights: dict[str, Any] = {}
     if isinstance(view, PseudoView):
         weights["weights"] = plane_area_means(view.weights, width, height).astype(np.float32)
-    camera = resized_camera(view.camera, width, height)
+    depth, confidence = (
+        None if plane is None else resampled_plane(plane, width, height)
+        for plane in (view.depth, view.depth_confidence)
+    )
     return replace(
         view,
-        camera=camera,
+        camera=resized_camera(view.camera, width, height),
         image=image,
         mask=mask,
-        depth=_resampled(view.depth, width, height),
-        depth_confidence=_resampled(view.depth_confidence, width, height),
+        depth=depth,
+        depth_confidence=confidence,
         **weights,
     )
 
 
-def _resampled(plane: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
-    return None if plane is None else resampled_plane(plane, width, height)
-
-
 def resampled_plane(plane: np.ndarray, width: int, height: int) -> np.ndarray:
-    """One number per pixel [H, W] at another size [height, width], larger or smaller.
+    """Return one number per pixel [H, W] at another size [height, width], larger or smaller.
 
-    Each is that of the pixel that its middle lies in: nothing is mixed.
+    Each is taken from the pixel that contains its center, without interpolation.
     """
     if plane.shape == (height, width):
         return plane
@@ -185,38 +167,48 @@ def halved(view: View) -> View:
     See ``reduced_view``; focal lengths and principal point are halved.
     """
     width, height = view.camera.width // 2, view.camera.height // 2
-    even = (slice(2 * height), slice(2 * width))
-    weights: dict[str, Any] = {}
-    if isinstance(view, PseudoView):
-        weights["weights"] = view.weights[even]
-    whole = replace(
-        view,
-        camera=replace(view.camera, width=2 * width, height=2 * height),
-        image=view.image[even],
-        mask=None if view.mask is None else view.mask[even],
-        depth=None if view.depth is None else view.depth[even],
-        depth_confidence=None if view.depth_confidence is None else view.depth_confidence[even],
-        **weights,
-    )
-    return reduced_view(whole, width, height)
+    planes = ("image", "mask", "weights", "depth", "depth_confidence")
+    cropped = {
+        name: plane[: 2 * height, : 2 * width]
+        for name in planes
+        if (plane := getattr(view, name, None)) is not None
+    }
+    camera = replace(view.camera, width=2 * width, height=2 * height)
+    return reduced_view(replace(view, camera=camera, **cropped), width, height)
+
+
+def resized_tracks(
+    points: Points | None, before: Mapping[str, Camera], after: Mapping[str, Camera]
+) -> Points | None:
+    """Return points with tracks in pixels of resized photos.
+
+    Only the sizes of the cameras before and after, by name, count. Photos that are not in both keep
+    their pixels.
+    """
+    if points is None or points.tracks is None:
+        return points
+    tracks = points.tracks
+    scale = np.ones((len(tracks.names), 2))
+    for index, name in enumerate(tracks.names):
+        if name in before and name in after:
+            old, new = before[name], after[name]
+            scale[index] = new.width / old.width, new.height / old.height
+    if (scale == 1.0).all():
+        return points
+    return replace(points, tracks=replace(tracks, xy=tracks.xy * scale[tracks.view]))
 
 
 def _rounded(values: Float64) -> npt.NDArray[np.uint8]:
     return np.floor(values + 0.5).astype(np.uint8)
 
 
-def _area(shape: tuple[int, ...], size: tuple[int, int], box: tuple[float, float] | None) -> float:
-    """How many pixels one of the smaller photo covers."""
-    width, height = (shape[1], shape[0]) if box is None else box
-    return width / size[1] * (height / size[0])
+def _area(covered: tuple[float, float], width: int, height: int) -> float:
+    """The number of pixels that a pixel of the smaller photo covers."""
+    return covered[0] / width * (covered[1] / height)
 
 
 def _bounds(covered: float, count: int) -> tuple[npt.NDArray[np.int64], Float64]:
-    """Where each of ``count`` equal parts of ``covered`` pixels begins, and the last ends.
-
-    Returns:
-        The pixel, int64 [count + 1], and how much of it lies before, in [0, 1).
-    """
+    """Bounds of ``count`` equal parts of ``covered`` pixels: whole pixels, and their rest."""
     ends = np.arange(count + 1) * covered / count
     whole = ends.astype(np.int64)
     return whole, ends - whole
@@ -226,20 +218,15 @@ def _area_sums(
     planes: Callable[[slice], np.ndarray],
     shape: tuple[int, ...],
     size: tuple[int, int],
-    box: tuple[float, float] | None,
+    covered: tuple[float, float],
 ) -> Float64:
-    """Sums over the areas that the smaller pixels cover, float64 [h, w, C].
+    """Sum planes over the areas that the smaller pixels cover, float64 [h, w, C].
 
-    Whole numbers are summed exactly where pixels are covered whole.
-
-    Args:
-        planes: gives rows of what is summed, [rows, W, C].
-        shape: H and W.
-        size: h and w.
-        box: as ``area_means``.
+    Whole numbers are summed exactly if areas consist of whole pixels. ``planes`` returns rows of
+    the planes, [rows, W, C]; ``shape`` is H, W and ``size`` h, w; ``covered`` is the width and
+    height of the part that the smaller pixels cover.
     """
     (full_height, full_width), (height, width) = shape[:2], size
-    covered = (full_width, full_height) if box is None else box
     rows, row_parts = _bounds(covered[1], height)
     columns, column_parts = _bounds(covered[0], width)
     at_once = max(1, _BAND_NUMBERS * height // (full_height * full_width * 4))
@@ -259,7 +246,7 @@ def _area_sums(
                 out -= row_parts[row] * band[start]
         sums = np.add.reduceat(summed[:, : columns[-1]], columns[:-1], axis=1)
         if column_parts.any():
-            # What lies in the first part of the pixel where an area ends, and the next begins.
+            # The first part of the pixel in which one area ends and the next begins.
             edge = summed[:, np.minimum(columns, full_width - 1)] * column_parts[:, None]
             sums += np.diff(edge, axis=1)
         parts.append(sums)

@@ -1,4 +1,4 @@
-"""The example capture, which every installation of igsr has: photos of a tea table."""
+"""The example capture that every installation of igsr contains: photos of a tea table."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def write_example(folder: str | os.PathLike[str]) -> Path:
     """Write the example capture into a folder, in the layout of NeRF Synthetic.
 
     It has eight photos to fit, 256 x 256 pixels with alpha, and eight held-out ones. They are
-    photos of ``examples/tea_table`` in igsr's source: those that ``igsr refine --photos 8`` takes.
+    photos of ``examples/tea_table`` in igsr's source, those of ``igsr refine --photos 8``.
 
     Args:
-        folder: is made where it is missing; files that it has already stay as they are.
+        folder: is created if it is missing; complete files in it are not written again.
 
     Returns:
         The folder, for ``igsr.load_capture``.
@@ -28,21 +28,17 @@ def write_example(folder: str | os.PathLike[str]) -> Path:
     folder = Path(folder)
     files = _core.example_files()
     for name, contents in files.items():
-        if name == "transforms_train.json":  # it names photos that are not brought along
-            contents = _without_missing(contents, set(files))
+        if name == "transforms_train.json":
+            # It also names photos of the source that are not installed.
+            document = json.loads(contents)
+            document["frames"] = [
+                frame
+                for frame in document["frames"]
+                if f"{frame['file_path'].removeprefix('./')}.png" in files
+            ]
+            contents = json.dumps(document, indent=1).encode()
         path = folder / name
         if not path.is_file() or path.read_bytes() != contents:
             with atomic_write(path) as temporary:
                 temporary.write_bytes(contents)
     return folder
-
-
-def _without_missing(transforms: bytes, names: set[str]) -> bytes:
-    """A ``transforms.json`` with those frames whose photos are among ``names``."""
-    described = json.loads(transforms)
-    described["frames"] = [
-        frame
-        for frame in described["frames"]
-        if f"{frame['file_path'].removeprefix('./')}.png" in names
-    ]
-    return json.dumps(described, indent=1).encode()

@@ -1,4 +1,4 @@
-"""EXIF of a photo: orientation, focal length and camera.
+"""Read the EXIF of a photo: orientation, focal length, camera and exposure.
 
 EXIF is untrusted and often wrong or damaged: a field that cannot be read counts as missing.
 
@@ -23,26 +23,25 @@ _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 _MM_FROM_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 #: Orientations that exchange width and height.
 TURNED = (5, 6, 7, 8)
-_FILM_DIAGONAL = math.hypot(36.0, 24.0)
-# In units of the longer side. Fisheyes and telescopes are within; other numbers are wrong fields.
+_FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+# Plausible values: focal lengths in units of the longer side, from fisheyes to telescopes ...
 _FOCAL_RANGE = (0.2, 50.0)
-# Seconds, f-number and ISO of cameras there are; other numbers are wrong fields.
-_TIMES, _F_NUMBERS, _ISOS = (1e-6, 3600.0), (0.5, 128.0), (1.0, 5e6)
+# ... and seconds, f-numbers and ISO speeds.
+_EXPOSURE_RANGES = {_EXPOSURE_TIME: (1e-6, 3600.0), _F_NUMBER: (0.5, 128.0), _ISO: (1.0, 5e6)}
 
 
 @dataclass(frozen=True)
 class Exif:
-    """The fields of a photo's EXIF that are used.
+    """The EXIF fields of a photo that igsr uses.
 
     Attributes:
         orientation: 1 to 8, as in EXIF; 1 is upright.
         focal: focal length in pixels of the photo as stored, or None.
         device: make, model and lens of the camera, or None.
-        exposure_value: how much light the photo took, in stops: log2(seconds * ISO / 100 /
-            f-number squared), by exposure time, f-number and ISO (Exif 2.32, section 4.6.5). It
-            compares photos of one place: a larger one is brighter there. None where a field is
-            missing or cannot be true.
-        screenshot: whether the comment says that it is one, as phones write it.
+        exposure_value: exposure in stops: log2(seconds * ISO / 100 / f-number squared), from
+            exposure time, f-number and ISO (Exif 2.32, section 4.6.5). Of two photos of one place,
+            the one with the larger value is brighter. None if a field is missing or implausible.
+        screenshot: whether the comment marks a screenshot, as phones write it.
     """
 
     orientation: int
@@ -65,47 +64,41 @@ def read_exif(image: Image.Image) -> Exif:
     names = [_text(fields.get(tag)) for tag in (_MAKE, _MODEL, _LENS_MODEL)]
     device = " ".join(name for name in names if name) or None
     comment = fields.get(_USER_COMMENT)
-    # Eight bytes that name the encoding come first.
+    # The first eight bytes name the encoding.
     text = comment[8:].decode("ascii", "replace") if isinstance(comment, bytes) else _text(comment)
     screenshot = text.strip(" \0").lower() == "screenshot"
-    focal, light = _focal(fields, *image.size), _exposure_value(fields)
-    return Exif(orientation, focal, device, light, screenshot)
+    focal = _focal(fields, *image.size)
+    return Exif(orientation, focal, device, _exposure_value(fields), screenshot)
 
 
 def _exposure_value(fields: dict[int, Any]) -> float | None:
-    iso = fields.get(_ISO)
-    if isinstance(iso, (tuple, list)) and iso:
-        iso = iso[0]
-    numbers = [_number(value) for value in (fields.get(_EXPOSURE_TIME), fields.get(_F_NUMBER), iso)]
-    ranges = (_TIMES, _F_NUMBERS, _ISOS)
-    sane = [
-        number
-        for number, (low, high) in zip(numbers, ranges, strict=True)
-        if number is not None and low <= number <= high
-    ]
-    if len(sane) < len(ranges):
-        return None
-    seconds, f_number, speed = sane
-    return math.log2(seconds * speed / 100.0 / f_number**2)
+    numbers = []
+    for tag, (low, high) in _EXPOSURE_RANGES.items():
+        value = fields.get(tag)
+        if tag == _ISO and isinstance(value, (tuple, list)) and value:
+            value = value[0]
+        number = _number(value)
+        if number is None or not low <= number <= high:
+            return None
+        numbers.append(number)
+    seconds, f_number, iso = numbers
+    return math.log2(seconds * iso / 100.0 / f_number**2)
 
 
 def _focal(fields: dict[int, Any], width: int, height: int) -> float | None:
+    longer = max(width, height)
     equivalent = _number(fields.get(_FOCAL_LENGTH_35MM))
-    if equivalent is not None:
-        return _plausible(equivalent * math.hypot(width, height) / _FILM_DIAGONAL, width, height)
     length, resolution = (_number(fields.get(tag)) for tag in (_FOCAL_LENGTH, _PLANE_RESOLUTION))
-    if length is None or resolution is None:
+    if equivalent is not None:
+        focal = equivalent * math.hypot(width, height) / _FILM_DIAGONAL_MM
+    elif length is not None and resolution is not None:
+        unit = _MM_FROM_UNIT.get(fields.get(_PLANE_UNIT, 2), 25.4)
+        # The resolution is that of the original photo, before it was downscaled.
+        original = _number(fields.get(_PIXEL_WIDTH)) or float(width)
+        focal = length * resolution / unit * (longer / original if original >= longer else 1.0)
+    else:
         return None
-    unit = _MM_FROM_UNIT.get(fields.get(_PLANE_UNIT, 2), 25.4)
-    # The resolution refers to the photo as it was taken, before it was downscaled.
-    taken = _number(fields.get(_PIXEL_WIDTH)) or float(width)
-    reduced = max(width, height) / taken if taken >= max(width, height) else 1.0
-    return _plausible(length * resolution / unit * reduced, width, height)
-
-
-def _plausible(focal: float, width: int, height: int) -> float | None:
-    low, high = (factor * max(width, height) for factor in _FOCAL_RANGE)
-    return focal if low < focal < high else None
+    return focal if _FOCAL_RANGE[0] * longer < focal < _FOCAL_RANGE[1] * longer else None
 
 
 def _number(value: Any) -> float | None:
@@ -135,10 +128,5 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def turned_back(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Undo ``upright``."""
-    if orientation in (3, 4, 7, 8):
-        pixels = pixels[::-1]
-    if orientation in (2, 3, 6, 7):
-        pixels = pixels[:, ::-1]
-    if orientation in TURNED:
-        pixels = np.swapaxes(pixels, 0, 1)
-    return np.ascontiguousarray(pixels)
+    # Quarter turns are each other's inverse; all other orientations are their own.
+    return upright(pixels, {6: 8, 8: 6}.get(orientation, orientation))

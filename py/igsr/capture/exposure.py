@@ -13,26 +13,25 @@ from igsr.errors import IgsrError
 
 @dataclass(frozen=True)
 class Exposure:
-    """What a photo's colors are of the scene's: ``gain * color + offset``, channel by channel.
+    """Exposure of a photo relative to the scene: ``gain * color + offset``, channel by channel.
 
-    Colors are encoded as in photos (sRGB), 1 at the brightest. One stop more of light is a gain of
-    about 2^(1/2.2) = 1.37.
+    Colors are encoded as in photos (sRGB), 1 at the brightest. One stop more is a gain of about
+    2^(1/2.2) = 1.37.
 
     Attributes:
         gain: factors of R, G and B, finite and above 0.
-        offset: added to R, G and B after it, finite.
+        offset: added to R, G and B after the gain, finite.
 
     Raises:
-        IgsrError: a value is none of these.
+        IgsrError: a value is out of range or not a number.
     """
 
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ("gain", "offset"):
-            object.__setattr__(self, name, _three(name, getattr(self, name)))
+            object.__setattr__(self, name, _three_floats(name, getattr(self, name)))
         if min(self.gain) <= 0.0:
             raise IgsrError(f"gain must be three numbers above 0, not {list(self.gain)}.")
 
@@ -42,12 +41,12 @@ class Exposure:
         alpha: npt.NDArray[np.float32] | None = None,
         background: tuple[float, ...] = (0.0, 0.0, 0.0),
     ) -> npt.NDArray[np.float32]:
-        """Rendered colors as the photo has them.
+        """Apply the exposure to rendered colors.
 
         Args:
             colors: float32 [H, W, 3] over ``background``.
-            alpha: float32 [H, W] of the render, for a photo with alpha, whose background is none of
-                what the camera saw and stays as it is; None for a photo without.
+            alpha: float32 [H, W] of the render, for a photo with alpha, whose background keeps its
+                color; None for a photo without.
             background: RGB in [0, 1].
 
         Returns:
@@ -62,10 +61,10 @@ class Exposure:
         return np.asarray((colors - kept) * gain + offset * alpha[..., None] + kept, np.float32)
 
     def taken_out_of(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """A photo with the scene's colors, clipped to what 8 bits hold.
+        """Convert a photo to the scene's colors, clipped to 8 bits.
 
         Args:
-            image: uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha, which stays as it is.
+            image: uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha, which does not change.
 
         Returns:
             uint8 of the same shape.
@@ -78,11 +77,11 @@ class Exposure:
         return out
 
     def plain(self) -> dict[str, list[float]]:
-        """Gain and offset as JSON has them."""
+        """Return gain and offset for JSON."""
         return {"gain": list(self.gain), "offset": list(self.offset)}
 
 
-def _three(name: str, values: Any) -> tuple[float, ...]:
+def _three_floats(name: str, values: Any) -> tuple[float, ...]:
     try:
         three = tuple(float(value) for value in values)
     except (TypeError, ValueError):

@@ -1,19 +1,23 @@
-"""``load_capture``: finds out which format a capture has and reads it."""
+"""Load captures of any supported format, or only look at their headers."""
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
-from igsr.capture.described import DescribedCapture
 from igsr.capture.downscaling import check_max_size
-from igsr.capture.image_folders import reduction_of
-from igsr.capture.photos import SUFFIXES, is_file
-from igsr.capture.read_colmap import described_colmap, find_model
-from igsr.capture.read_transforms import described_split_transforms, described_transforms
-from igsr.capture.types import Capture
+from igsr.capture.image_files import SUFFIXES, is_file
+from igsr.capture.memory_check import PhotoSizes
+from igsr.capture.photo_folder import FRAMES, has_photos, photo_headers
+from igsr.capture.photos import DescribedCapture, checked_headers, shot_sizes
+from igsr.capture.read_colmap import describe_colmap, find_model, reduction_of
+from igsr.capture.read_transforms import describe_split_transforms, describe_transforms
+from igsr.capture.types import Capture, check_holdout
 from igsr.errors import IgsrError
 
 logger = logging.getLogger(__name__)
@@ -22,24 +26,24 @@ logger = logging.getLogger(__name__)
 def load_capture(path: str | os.PathLike[str], max_size: int | None = None) -> Capture:
     """Load photos with known cameras.
 
-    A capture is one of, tried in this order:
+    A capture is one of the following, tried in this order:
 
     * a ``transforms.json`` (nerfstudio or instant-ngp), or a folder with one;
     * a folder with ``transforms_train.json`` and ``transforms_test.json`` (NeRF Synthetic);
     * a folder with ``images/`` and a COLMAP model in ``sparse/0``, ``sparse`` or itself;
-    * an ``images`` folder that has one of these beside it;
-    * an ``images_2``, ``images_4`` or ``images_8`` folder (photos reduced by as much) that has a
-      COLMAP model beside it.
+    * an ``images`` folder next to one of these;
+    * an ``images_2``, ``images_4`` or ``images_8`` folder (photos reduced by that factor) next to a
+      COLMAP model.
 
-    Photos of a COLMAP model are taken from the smallest of ``images`` and ``images_K`` that are not
-    smaller than ``max_size``, or, where ``images`` is missing, from the largest that there are.
+    Photos of a COLMAP model come from the smallest of ``images`` and ``images_K`` that are not
+    smaller than ``max_size`` or, without ``images``, from the largest.
 
-    Lens distortion is undone: cameras come out as pinholes with the focal lengths, principal point
-    and size of the distorted camera, and ``View.mask`` is False where the lens saw nothing.
+    Lens distortion is removed: cameras become pinholes with the focal lengths, principal point and
+    size of the distorted camera, and ``View.mask`` is False for pixels outside the lens's view.
 
-    The split is by file for NeRF Synthetic (a ``transforms_val.json`` is not read), by
-    ``train_filenames`` and ``test_filenames`` where nerfstudio's file has them, and otherwise all
-    views are for training; ``Capture.with_holdout`` splits anew.
+    The split is by file for NeRF Synthetic (a ``transforms_val.json`` is not read), and by
+    ``train_filenames`` and ``test_filenames`` if nerfstudio's file has them. Otherwise all views
+    are for training; ``Capture.with_holdout`` sets another split.
 
     Args:
         path: the folder, or its ``transforms.json``.
@@ -51,53 +55,35 @@ def load_capture(path: str | os.PathLike[str], max_size: int | None = None) -> C
         The capture, with its photos decoded.
 
     Raises:
-        IgsrError: nothing can be loaded; the message names the file and what is wrong with it. Or
-            the photos need more memory than there is; then it names the size that would fit.
+        IgsrError: the capture cannot be loaded; the message names the file and the problem. Or the
+            photos need more memory than is available; the message names the size that would fit.
     """
     started = time.monotonic()
     check_max_size(max_size)
     capture = describe_capture(Path(path), max_size).loaded(max_size)
-    points = "no" if capture.points is None else len(capture.points.xyz)
-    logger.info(
-        "%s: %d views (%d train, %d test), %s points, loaded in %.2f s",
-        path,
-        len(capture.views),
-        len(capture.train_views),
-        len(capture.test_views),
-        points,
-        time.monotonic() - started,
-    )
+    logger.info("%r, loaded in %.2f s", capture, time.monotonic() - started)
     return capture
 
 
 def describe_capture(path: Path, max_size: int | None = None) -> DescribedCapture:
-    """Read a capture but for its photos' pixels; see ``load_capture``."""
+    """Read a capture except for its photos' pixels; see ``load_capture``."""
     if is_file(path):
         if path.suffix.lower() != ".json":
             raise IgsrError(f"{path} is no capture; give a folder or a transforms.json")
-        return described_transforms(path)
+        return describe_transforms(path)
     try:
         files = sorted(entry.name for entry in path.iterdir())
     except (OSError, ValueError) as error:
         raise IgsrError(f"{path} does not exist or cannot be read; give a capture") from error
-    found = _described_folder(path, max_size)
-    # "path/.." would follow links and leave "." where it is; the real parent is meant.
-    if found is None and path.resolve().name == "images":
-        found = _described_folder(path.resolve().parent, max_size)
-    if found is None and reduction_of(path.resolve().name) is not None:
-        found = _described_model(path.resolve().parent, max_size, path.resolve().name)
-    if found is not None:
-        return found
+    describe = _reader(path)
+    if describe is not None:
+        return describe(max_size)
     photos = [name for name in files if name.lower().endswith(SUFFIXES)]
-    if photos:
+    if photos or (path / "images").is_dir():
+        content, place = (f"{len(photos)} images", "them") if photos else ("an images folder", "it")
         raise IgsrError(
-            f"{path} holds {len(photos)} images but no cameras; put a COLMAP model (sparse/0) or a "
-            "transforms.json beside them, or find cameras with igsr pose"
-        )
-    if (path / "images").is_dir():
-        raise IgsrError(
-            f"{path} holds an images folder but no cameras; put a COLMAP model (sparse/0) or a "
-            "transforms.json beside it, or find cameras with igsr pose"
+            f"{path} holds {content} but no cameras; put a COLMAP model (sparse/0) or a "
+            f"transforms.json next to {place}, or find cameras with igsr pose"
         )
     raise IgsrError(
         f"{path} holds no images and no cameras; give a folder with a transforms.json, or with "
@@ -106,42 +92,76 @@ def describe_capture(path: Path, max_size: int | None = None) -> DescribedCaptur
 
 
 def holds_cameras(path: str | os.PathLike[str]) -> bool:
-    """Whether a path holds photos with cameras, as ``load_capture`` looks for them.
-
-    Args:
-        path: a folder or file; it need not exist.
-    """
+    """Return whether a path, which need not exist, holds photos with cameras."""
     path = Path(path)
     if is_file(path):
         return path.suffix.lower() == ".json"
     try:
-        place = path.resolve()
+        return _reader(path) is not None
     except (OSError, ValueError):
         return False
-    if reduction_of(place.name) is not None and find_model(place.parent) is not None:
-        return True
-    folders = [path, place.parent] if place.name == "images" else [path]
-    return any(
-        is_file(folder / "transforms.json")
-        or is_file(folder / "transforms_train.json")
-        or find_model(folder) is not None
-        for folder in folders
-    )
 
 
-def _described_folder(path: Path, max_size: int | None) -> DescribedCapture | None:
-    if is_file(path / "transforms.json"):
-        return described_transforms(path / "transforms.json")
-    if is_file(path / "transforms_train.json"):
-        return described_split_transforms(path)
-    return _described_model(path, max_size)
-
-
-def _described_model(
-    path: Path, max_size: int | None, folder: str | None = None
-) -> DescribedCapture | None:
-    model = find_model(path)
+def _reader(path: Path) -> Callable[[int | None], DescribedCapture] | None:
+    """The function that reads the capture in a folder, given ``max_size``."""
+    place = path.resolve()
+    # Not "path/..", which follows links and cannot leave ".".
+    for folder in (path, place.parent) if place.name == "images" else (path,):
+        if is_file(folder / "transforms.json"):
+            return lambda _: describe_transforms(folder / "transforms.json")
+        if is_file(folder / "transforms_train.json"):
+            return lambda _: describe_split_transforms(folder)
+        model = find_model(folder)
+        if model is not None:
+            return functools.partial(describe_colmap, folder, model)
+    model = None if reduction_of(place.name) is None else find_model(place.parent)
     if model is None:
         return None
-    logger.debug("%s: COLMAP model in %s", path, model)
-    return described_colmap(path, model, max_size, folder)
+    return functools.partial(describe_colmap, place.parent, model, folder=place.name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overview(PhotoSizes):
+    """Photos before they are decoded.
+
+    Attributes:
+        path: of the capture, folder or video.
+        has_cameras: whether it is a capture, whose cameras are known.
+        train: number of the photos that are for training; all of them without cameras.
+    """
+
+    path: Path
+    has_cameras: bool
+    train: int
+
+    def train_photos(self, holdout: int | None) -> int:
+        """Return the maximum number of photos to fit if every ``holdout``-th is held out."""
+        if holdout is None:
+            return self.train
+        views = self.views or [1] * len(self.sizes)
+        check_holdout(holdout, len(views), self.path)
+        return sum(views) - sum(views[::holdout])
+
+
+def look_at(
+    path: str | os.PathLike[str], frames: int = FRAMES, max_size: int | None = None
+) -> Overview:
+    """Look at a capture, a folder of photos or a video.
+
+    Args:
+        path: as for ``igsr.load_capture`` and ``igsr.estimate_poses``.
+        frames: maximum number of frames taken from each video.
+        max_size: longest side in pixels of photos as they will be loaded, or None; a capture may
+            have its photos at several sizes.
+
+    Raises:
+        IgsrError: nothing can be loaded from there.
+    """
+    path = Path(path)
+    if holds_cameras(path) or not has_photos(path):
+        shots = describe_capture(path, max_size).shots
+        sizes = shot_sizes(shots, checked_headers(shots))
+        train = sum(shot.split == "train" for shot in shots)
+        return Overview(path=path, has_cameras=True, train=train, **vars(sizes))
+    sizes = photo_headers(path, frames)
+    return Overview(path=path, has_cameras=False, train=len(sizes.sizes), **vars(sizes))

@@ -1,204 +1,159 @@
-"""Whether photos fit into memory, from their sizes alone, before any is decoded.
+"""Whether photos fit into memory, estimated from their sizes before any is decoded.
 
-The numbers of bytes are those of the arrays that a load and a fit on the CPU hold, and were
-compared with the memory that processes took.
+The constants are the bytes of the arrays that a load and a fit on the CPU hold; they were checked
+against the memory of real runs.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from igsr.capture.downscaling import reduced_size
 from igsr.errors import IgsrError
 
-#: Bytes of a photo's pixel while it is decoded: Pillow's four, copies of it, and what the allocator
-#: keeps between photos (17 together, measured on JPEGs of 12 megapixels).
-DECODED = 18
-#: Bytes of a pixel of the largest photo while it is undistorted: the map, and the padded photo.
-UNDISTORTED = 24
-#: Bytes of a pixel of the largest photo while it is fitted: render, photo, loss and gradients.
-FITTED = 110
-#: Bytes of a pixel of the largest photo while it is scored: planes of float64 for SSIM, and the
-#: colors and edges that FLIP compares.
-SCORED = 740
-#: Bytes of a splat at degree 3: parameters, two moments, gradients and statistics, its entries in
-#: tiles (1850 together), and the copies that checkpoints and results are.
-OF_A_SPLAT = 3500
-#: Bytes that a fit takes whatever its size: libraries, and threads' scratch.
-LIBRARIES = 650_000_000
-#: Photos may take this part of what is available: the rest is for what nobody counted.
-USABLE = 0.9
-#: Threads beyond these wait for the disk.
-MOST_THREADS = 16
-#: Sizes that are advised are multiples of this where they are larger, and none is below it.
-STEP = 50
+#: Per pixel of a photo that is decoded: Pillow's four bytes, copies, and memory that the allocator
+#: keeps between photos (17 in total, measured on JPEGs of 12 megapixels).
+DECODED_BYTES = 18
+#: Per pixel of the largest photo during undistortion: the map, and the padded photo.
+UNDISTORTED_BYTES = 24
+#: Per pixel of the largest photo during a fit: render, photo, loss and gradients.
+FITTED_BYTES = 110
+#: Per pixel of the largest photo while it is scored: planes of SSIM, colors and edges of FLIP.
+SCORED_BYTES = 740
+#: Per splat at degree 3: parameters, two moments, gradients, statistics and entries in tiles (1850
+#: in total), and copies for checkpoints and results.
+SPLAT_BYTES = 3500
+#: Of a fit of any size: libraries, and scratch memory of threads.
+LIBRARY_BYTES = 650_000_000
+#: Part of the available memory that photos may take.
+USABLE_PART = 0.9
+#: More threads only wait for the disk.
+MAX_THREADS = 16
+#: Suggested values of --max-size are multiples of this.
+SIZE_STEP_PX = 50
 
 _CGROUP_ROOT = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 
 
-def available_memory() -> int:
-    """Bytes that this process may still take without harm to others.
+@dataclass(frozen=True, kw_only=True)
+class PhotoSizes:
+    """Photos before they are decoded, and the memory that they need.
 
-    The least of what the system says is available, what is left to its control groups (versions 1
-    and 2; a container's limit), and what is left of its address space (``ulimit -v``).
+    Attributes:
+        sizes: width and height in pixels of each photo as stored. Panoramas count as several
+            photos, one per view, and videos as the largest number of frames that may be taken.
+        channels: 3, or 4 if any photo has alpha.
+        masked: whether photos have masks or lens distortion.
+        depths: whether photos have depths.
+        decoded: width and height in pixels of the files; empty if these are ``sizes``.
+        views: number of ``sizes`` of each photo, sorted by name; empty if each is one view.
+        plain: files that are one photo without a mask each.
     """
-    import psutil
 
-    left = [int(psutil.virtual_memory().available)]
-    left += _left_to_cgroups()
-    address_space = _address_space_limit()
-    if address_space is not None:
-        left.append(address_space - int(psutil.Process().memory_info().vms))
-    return max(0, min(left))
+    sizes: list[tuple[int, int]]
+    channels: int = 3
+    masked: bool = False
+    depths: bool = False
+    decoded: list[tuple[int, int]] = field(default_factory=list)
+    views: list[int] = field(default_factory=list)
+    plain: list[Path] = field(default_factory=list)
 
+    def needed_memory(self, max_size: int | None = None, splats: int | None = None) -> int:
+        """Return the largest number of bytes that the photos take at one time.
 
-def needed_memory(
-    sizes: Sequence[tuple[int, int]],
-    max_size: int | None = None,
-    splats: int | None = None,
-    *,
-    channels: int = 3,
-    masked: bool = False,
-    depths: bool = False,
-    decoded: Sequence[tuple[int, int]] = (),
-) -> int:
-    """Bytes that photos take at most, at one time.
+        Args:
+            max_size: longest side in pixels of photos as loaded; None keeps them as they are.
+            splats: maximum number of splats of a fit to these photos; None if they are only loaded.
+        """
+        reduced = [reduced_size(width, height, max_size) for width, height in self.sizes]
+        pixels = sum(width * height for width, height in reduced)
+        largest = _largest_area(reduced)
+        held = pixels * (self.channels + self.masked + 4 * self.depths)
+        undistorted = UNDISTORTED_BYTES * largest if self.masked else 0
+        loading = held + DECODED_BYTES * self._largest_file + undistorted
+        if splats is None:
+            return loading
+        # A mask becomes float32 weights; depths are stacked with their confidence, and copied.
+        copied = pixels * (self.channels + 4 * self.masked + 16 * self.depths)
+        fitting = held + copied + FITTED_BYTES * largest + SPLAT_BYTES * splats
+        scoring = held + SCORED_BYTES * largest
+        return LIBRARY_BYTES + max(loading, fitting, scoring)
 
-    Args:
-        sizes: width and height in pixels of each photo as stored.
-        max_size: longest side in pixels of photos as loaded; None keeps them as they are.
-        splats: most splats of a fit to these photos, or None where they are only loaded.
-        channels: of the photos: 3, or 4 with alpha.
-        masked: whether pixels are masked, or lens distortion is undone.
-        depths: whether photos come with depths.
-        decoded: sizes of the files, where photos are parts of them.
-    """
-    reduced = [reduced_size(width, height, max_size) for width, height in sizes]
-    pixels = sum(width * height for width, height in reduced)
-    largest = max((width * height for width, height in reduced), default=0)
-    held = pixels * (channels + masked + 4 * depths)
-    undistorted = UNDISTORTED * largest if masked else 0
-    files = decoded or sizes
-    loading = held + DECODED * _most_pixels(files) + undistorted
-    if splats is None:
-        return loading
-    # A mask becomes float32 weights; depths are stacked with their confidence, and copied.
-    copied = pixels * (channels + 4 * masked + 16 * depths)
-    fitting = held + copied + FITTED * largest + OF_A_SPLAT * splats
-    scoring = held + SCORED * largest
-    return LIBRARIES + max(loading, fitting, scoring)
+    def largest_size_that_fits(
+        self, splats: int | None = None, available: int | None = None
+    ) -> int | None:
+        """Return the longest side in pixels at which photos fit into memory; None if none does."""
+        usable = USABLE_PART * (available_memory() if available is None else available)
+        longest = max((max(size) for size in self.sizes), default=1)
+        if self.needed_memory(longest, splats) <= usable:
+            return longest
+        fits, too_large = 0, longest // SIZE_STEP_PX + 1  # in steps
+        while too_large - fits > 1:
+            middle = (fits + too_large) // 2
+            is_enough = self.needed_memory(middle * SIZE_STEP_PX, splats) <= usable
+            fits, too_large = (middle, too_large) if is_enough else (fits, middle)
+        return fits * SIZE_STEP_PX or None
 
-
-def largest_size_that_fits(
-    sizes: Sequence[tuple[int, int]],
-    splats: int | None = None,
-    *,
-    channels: int = 3,
-    masked: bool = False,
-    depths: bool = False,
-    decoded: Sequence[tuple[int, int]] = (),
-    available: int | None = None,
-) -> int | None:
-    """The longest side in pixels at which photos fit into memory; None where no size does.
-
-    Args:
-        sizes, splats, channels, masked, depths, decoded: as ``needed_memory``.
-        available: bytes; None is ``available_memory()``.
-    """
-    usable = USABLE * (available_memory() if available is None else available)
-
-    def fits(size: int) -> bool:
-        needed = needed_memory(
-            sizes, size, splats, channels=channels, masked=masked, depths=depths, decoded=decoded
+    def check_memory(self, max_size: int | None = None, splats: int | None = None) -> None:
+        """Raise an IgsrError, with the size that fits, if the photos do not fit into memory."""
+        available = available_memory()
+        needed = self.needed_memory(max_size, splats)
+        if needed <= USABLE_PART * available:
+            return
+        width, height = max(self.sizes, key=lambda size: size[0] * size[1])
+        count = f"{len(self.sizes)} photos" if len(self.sizes) > 1 else "photo"
+        up_to = "" if len(set(self.sizes)) == 1 else "up to "
+        is_reduced = max_size is not None and max_size < max(width, height)
+        at = f" at --max-size {max_size}" if is_reduced else ""
+        problem = (
+            f"The {count} of {up_to}{width}x{height}{at} would need {_gigabytes(needed)} "
+            f"and {_gigabytes(available)} are free"
         )
-        return needed <= usable
+        size = self.largest_size_that_fits(splats, available)
+        if size is None:
+            raise IgsrError(
+                f"{problem}: give fewer photos, or free memory; no --max-size would do."
+            )
+        at_size = _gigabytes(self.needed_memory(size, splats))
+        raise IgsrError(f"{problem}: give --max-size {size} ({at_size}).")
 
-    longest = max((max(size) for size in sizes), default=1)
-    if fits(longest):
-        return longest
-    low, high = 0, longest // STEP + 1  # in steps: low fits, or is nothing; high does not
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle * STEP) else (low, middle)
-    return low * STEP or None
+    def decoding_threads(self, max_size: int | None = None) -> int:
+        """Return the number of photos that memory allows to decode at once, at least one."""
+        alone = replace(self, masked=True, depths=False).needed_memory(max_size)
+        left = USABLE_PART * available_memory() - alone
+        more = int(max(0.0, left) / (DECODED_BYTES * max(1, self._largest_file)))
+        return min(1 + more, os.cpu_count() or 1, MAX_THREADS)
 
-
-def check_memory(
-    sizes: Sequence[tuple[int, int]],
-    max_size: int | None = None,
-    splats: int | None = None,
-    *,
-    channels: int = 3,
-    masked: bool = False,
-    depths: bool = False,
-    decoded: Sequence[tuple[int, int]] = (),
-) -> None:
-    """Refuse photos that do not fit into memory, and name the size at which they do.
-
-    Args:
-        sizes, max_size, splats, channels, masked, depths, decoded: as ``needed_memory``.
-
-    Raises:
-        IgsrError: they do not fit.
-    """
-    available = available_memory()
-
-    def needed_at(size: int | None) -> int:
-        return needed_memory(
-            sizes, size, splats, channels=channels, masked=masked, depths=depths, decoded=decoded
-        )
-
-    if needed_at(max_size) <= USABLE * available:
-        return
-    width, height = max(sizes, key=lambda size: size[0] * size[1])
-    count = f"{len(sizes)} photos" if len(sizes) > 1 else "photo"
-    up_to = "" if len(set(sizes)) == 1 else "up to "
-    at = "" if max_size is None or max_size >= max(width, height) else f" at --max-size {max_size}"
-    says = (
-        f"The {count} of {up_to}{width}x{height}{at} would need {_gigabytes(needed_at(max_size))} "
-        f"and {_gigabytes(available)} are free"
-    )
-    size = largest_size_that_fits(
-        sizes,
-        splats,
-        channels=channels,
-        masked=masked,
-        depths=depths,
-        decoded=decoded,
-        available=available,
-    )
-    if size is None:
-        raise IgsrError(f"{says}: give fewer photos, or free memory; no --max-size would do.")
-    raise IgsrError(f"{says}: give --max-size {size} ({_gigabytes(needed_at(size))}).")
+    @property
+    def _largest_file(self) -> int:
+        return _largest_area(self.decoded or self.sizes)
 
 
-def decoding_threads(
-    sizes: Sequence[tuple[int, int]],
-    max_size: int | None = None,
-    *,
-    channels: int = 3,
-    decoded: Sequence[tuple[int, int]] = (),
-) -> int:
-    """How many photos are decoded side by side: as many as memory allows, at least one.
-
-    Args:
-        sizes, max_size, channels, decoded: as ``needed_memory``.
-    """
-    alone = needed_memory(sizes, max_size, channels=channels, masked=True, decoded=decoded)
-    left = USABLE * available_memory() - alone
-    more = int(max(0.0, left) / (DECODED * max(1, _most_pixels(decoded or sizes))))
-    return min(1 + more, os.cpu_count() or 1, MOST_THREADS)
-
-
-def _most_pixels(sizes: Sequence[tuple[int, int]]) -> int:
+def _largest_area(sizes: Sequence[tuple[int, int]]) -> int:
     return max((width * height for width, height in sizes), default=0)
 
 
 def _gigabytes(count: float) -> str:
     return f"{count / 1e9:.1f} GB"
+
+
+def available_memory() -> int:
+    """Return the bytes that this process may still take.
+
+    This is the least of the system's available memory, the rest of each control group's limit
+    (versions 1 and 2, as of containers), and the rest of the address space (``ulimit -v``).
+    """
+    import psutil
+
+    left = [int(psutil.virtual_memory().available), *_left_to_cgroups()]
+    address_space = _address_space_limit()
+    if address_space is not None:
+        left.append(address_space - int(psutil.Process().memory_info().vms))
+    return max(0, min(left))
 
 
 def _address_space_limit() -> int | None:
@@ -211,11 +166,8 @@ def _address_space_limit() -> int | None:
 
 
 def _left_to_cgroups() -> list[int]:
-    """Bytes left to each control group that this process is in and that has a limit."""
-    try:
-        lines = _OWN_CGROUPS.read_text(encoding="utf-8").splitlines()
-    except (OSError, ValueError):
-        return []
+    """Bytes left to each control group of this process that has a limit."""
+    lines = _text(_OWN_CGROUPS).splitlines()
     left = []
     for line in lines:
         _, controllers, path = (line.split(":", 2) + ["", ""])[:3]
@@ -226,8 +178,7 @@ def _left_to_cgroups() -> list[int]:
             limit, used = "memory.limit_in_bytes", "memory.usage_in_bytes"
         else:
             continue
-        # Each group above limits too. In a container, the path may be that outside of it, of which
-        # only the root is seen.
+        # Parent groups limit too. In a container only the root may exist.
         group = root / path.lstrip("/")
         for folder in [group, *group.parents]:
             if folder != root and root not in folder.parents:
@@ -238,21 +189,23 @@ def _left_to_cgroups() -> list[int]:
     return left
 
 
-def _number(path: Path) -> int | None:
+def _text(path: Path) -> str:
     try:
-        return int(path.read_text(encoding="ascii"))
-    except (OSError, ValueError):  # "max" is no limit
-        return None
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return ""
+
+
+def _number(path: Path) -> int | None:
+    text = _text(path).strip()
+    return int(text) if text.isdecimal() else None  # "max" is no limit
 
 
 def _reclaimable(group: Path) -> int:
-    """Bytes of cached files that a control group gives up when it needs them."""
-    try:
-        lines = (group / "memory.stat").read_text(encoding="ascii").splitlines()
-    except (OSError, ValueError):
-        return 0
+    """Bytes of cached files that a control group frees when it needs memory."""
+    lines = _text(group / "memory.stat").splitlines()
     fields = dict(line.split(None, 1) for line in lines if " " in line)
     for name in ("total_inactive_file", "inactive_file"):
-        if fields.get(name, "").isdigit():
+        if fields.get(name, "").isdecimal():
             return int(fields[name])
     return 0

@@ -1,47 +1,44 @@
-"""Decode photos and masks, check them against their cameras, and undistort them."""
+"""Photos with known cameras: checked against their cameras, decoded and undistorted into views."""
 
 from __future__ import annotations
 
 import threading
 from collections import Counter
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from igsr._internal.choices import Split
-from igsr.capture.depth_files import depth_array, depth_of, holds_array, in_world_units
 from igsr.capture.downscaling import (
-    area_means,
+    check_max_size,
     plane_area_means,
     reduced_size,
     resampled_plane,
     resized_camera,
+    resized_tracks,
 )
 from igsr.capture.exif import read_exif
-from igsr.capture.memory_check import decoding_threads
-from igsr.capture.rig import LEAST_SHOWN, Rig, sampled_views, shown_part, sides_at
-from igsr.capture.types import Camera, View
+from igsr.capture.image_files import (
+    PhotoHeader,
+    decoded,
+    mask_of,
+    open_image,
+    photo_header,
+    read_depth,
+)
+from igsr.capture.memory_check import PhotoSizes
+from igsr.capture.rig import Rig, decoded_size, sampled_views
+from igsr.capture.types import Camera, Capture, Points, View
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
 
-_HEIF_SUFFIXES = (".heic", ".heif")
-SUFFIXES = (
-    *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".gif"),
-    *_HEIF_SUFFIXES,
-)
-
-# Pillow reads more formats, but for some of them (EPS) it runs another program.
-_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "GIF")
-
-#: Part by which a depth's ratio of sides may differ from its photo's: networks round sides to whole
-#: patches.
-DEPTH_ASPECT = 0.05
-
-# No photo is packed tighter; a file that claims more is a decompression bomb or damaged.
-_MOST_PIXELS_PER_BYTE = 10_000
+#: Relative tolerance between the aspect ratios of a depth and its photo: networks round sides to
+#: whole patches.
+DEPTH_ASPECT_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True)
@@ -56,12 +53,12 @@ class Shot:
         split: "train" or "test".
         mask_path: the mask's file, or None.
         source: the file that describes the camera, for error messages.
-        factor: by which the photo is smaller than its camera says, within a pixel.
-        rig: of a view of a wide photo, all views that this becomes; None for other photos.
-        side: which of these the shot is.
-        photo: the wide photo's name; also of views that were written as such.
+        factor: the photo is smaller than its camera by this factor, within a pixel.
+        rig: for a view of a wide photo, all views of that photo; None for other photos.
+        side: index of the view in ``rig``.
+        photo: the wide photo's name; also set for views that were written as files.
         depth_path: the file of the photo's depth, or None.
-        depth_unit: world units of one of its numbers; None: as ``in_world_units`` has it.
+        depth_unit: world units of one number in it; None: as in ``read_depth``.
     """
 
     name: str
@@ -79,27 +76,16 @@ class Shot:
     depth_unit: float | None = None
 
     @property
-    def photo_size(self) -> tuple[int, int]:
-        """Width and height in pixels that the photo has by its camera, before it is reduced."""
-        if self.rig is not None:
-            return self.rig.photo.width, self.rig.photo.height
-        return self.camera.width, self.camera.height
-
-    @property
     def is_resampled(self) -> bool:
-        """Whether the view's pixels are not those of the photo."""
+        """Whether the view's pixels are interpolated from those of the photo."""
         return self.rig is not None or not self.lens.is_pinhole
 
 
 def rig_shots(shot: Shot, rig: Rig) -> list[Shot]:
-    """The views of a wide photo.
-
-    Args:
-        shot: the photo; of its camera, only the pose counts.
-        rig: its views.
+    """Split a wide photo, of whose camera only the pose is used, into its views.
 
     Raises:
-        IgsrError: the photo comes with depth: distances from its centre are not read.
+        IgsrError: the photo has a depth file, which wide photos do not support.
     """
     if shot.depth_path is not None:
         raise IgsrError(
@@ -121,206 +107,42 @@ def rig_shots(shot: Shot, rig: Rig) -> list[Shot]:
 
 
 def photo_of(shot: Shot) -> str:
-    """The name of the photo that a shot is of, as ``View.photo``."""
+    """Return the name of the photo that a shot is part of, as ``View.photo``."""
     return shot.photo or shot.name
 
 
-def is_file(path: Path) -> bool:
-    """Whether the path is a file; False for paths that no file can have (an embedded NUL)."""
-    try:
-        return path.is_file()
-    except (ValueError, OSError):
-        return False
+@dataclass(frozen=True)
+class DescribedCapture:
+    """A capture whose photos are not decoded yet.
+
+    Attributes:
+        path: the folder of the capture.
+        shots: its photos, in their order.
+        points: reads the points, with tracks in the pixels of the shots' cameras.
+    """
+
+    path: Path
+    shots: list[Shot]
+    points: Callable[[], Points | None]
+
+    def loaded(self, max_size: int | None = None) -> Capture:
+        """Decode the photos, as ``load_capture``."""
+        check_max_size(max_size)
+        headers = checked_headers(self.shots)
+        shot_sizes(self.shots, headers).check_memory(max_size)
+        points = self.points()
+        views = _load_views(self.shots, headers, max_size)
+        before = {shot.name: shot.camera for shot in self.shots}
+        after = {view.name: view.camera for view in views}
+        return Capture(self.path, views, resized_tracks(points, before, after))
 
 
-def open_image(path: Path) -> Image.Image:
-    """Open an image without decoding its pixels.
+def checked_headers(shots: list[Shot]) -> list[PhotoHeader]:
+    """Read the headers of all photos of a capture, and check their sizes against their cameras.
 
     Raises:
-        IgsrError: the file is missing, has no format that is read, or claims more pixels than its
-            bytes can hold.
+        IgsrError: two photos have one name, or a photo cannot be read or has another size.
     """
-    formats: tuple[str, ...] = _FORMATS
-    if path.suffix.lower() in _HEIF_SUFFIXES:
-        # It loads an HEVC decoder, which few captures need.
-        import pillow_heif
-
-        pillow_heif.register_heif_opener()
-        formats = ("HEIF",)
-    try:
-        file_size = path.stat().st_size
-        image = Image.open(path, formats=formats)
-    except FileNotFoundError as error:
-        raise IgsrError(f"{path} does not exist; put the image there") from error
-    except Image.DecompressionBombError as error:
-        raise IgsrError(f"{path} claims too many pixels for a photo; shrink it") from error
-    except Exception as error:  # Pillow's plugins raise anything at all on broken files.
-        raise IgsrError(
-            f"{path} cannot be read as an image; save it as PNG, JPEG, WebP or TIFF again"
-        ) from error
-    if image.width * image.height > file_size * _MOST_PIXELS_PER_BYTE:
-        image.close()
-        raise IgsrError(
-            f"{path} claims {image.width}x{image.height} pixels but has only {file_size} bytes; "
-            "save it again"
-        )
-    return image
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels as stored (EXIF orientation not applied), from the header alone.
-
-    Raises:
-        IgsrError: the file is missing or not an image.
-    """
-    with open_image(path) as image:
-        return image.size
-
-
-def load_pixels(image: Image.Image, path: Path) -> None:
-    """Decode the pixels of an image from ``open_image``.
-
-    Raises:
-        IgsrError: the file is truncated or damaged.
-    """
-    try:
-        image.load()
-    except Exception as error:  # as in open_image
-        raise IgsrError(f"{path} is truncated or damaged; copy it again") from error
-
-
-def _eight_bit(image: Image.Image, path: Path) -> Image.Image:
-    """A 16-bit grey image in 8 bits; any other image as it is."""
-    if image.mode.startswith("I"):
-        grey = np.asarray(image)
-        if grey.min() < 0 or grey.max() > 65535:
-            raise IgsrError(f"{path} has 32-bit pixels; save it with 8 or 16 bits")
-        return Image.fromarray(np.rint(grey / 257.0).astype(np.uint8))
-    if image.mode == "F":
-        raise IgsrError(f"{path} has floating-point pixels; save it with 8 or 16 bits")
-    return image
-
-
-def decoded(
-    image: Image.Image,
-    path: Path,
-    size: tuple[int, int] | None = None,
-    mask: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decode an image from ``open_image``, as stored: its EXIF orientation is not applied.
-
-    Palettes, greys, 16 bits, CMYK and the like are converted. A JPEG that is to become much smaller
-    is decoded at a half, a quarter or an eighth of its size, as long as that is at least twice the
-    wanted one, and an area filter does the rest.
-
-    Args:
-        image: whose pixels are not decoded yet.
-        path: of its file, for error messages.
-        size: width and height to reduce it to, or None.
-        mask: bool [H, W] of its pixels: masked ones lend no color to the smaller photo.
-
-    Returns:
-        uint8 [h, w, 3] RGB, or [h, w, 4] with straight alpha if the file has transparency, and the
-        mask at that size.
-
-    Raises:
-        IgsrError: the file is truncated or damaged, or has pixels of an unsupported kind.
-    """
-    box = None
-    if size is not None and size != image.size and mask is None:
-        full = image.size
-        drafted = image.draft(None, (2 * size[0], 2 * size[1]))
-        if drafted is not None and image.size != full:
-            box = drafted[1][2], drafted[1][3]  # its last row and column may lie partly beyond
-    load_pixels(image, path)
-    if size is None or size == image.size:
-        return pixels_of(image, path), mask
-    return area_means(_ImageRows(image, path), *size, mask, box)
-
-
-class _ImageRows:
-    """Pixels of a decoded image, made an array a few rows at a time: it is never held twice."""
-
-    def __init__(self, image: Image.Image, path: Path) -> None:
-        self._image, self._path = image, path
-        self.shape = (image.height, image.width, 4 if _has_alpha(image) else 3)
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        box = (0, rows.start, self._image.width, min(rows.stop, self._image.height))
-        return pixels_of(self._image.crop(box), self._path)
-
-
-def _has_alpha(image: Image.Image) -> bool:
-    return "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
-
-
-def pixels_of(image: Image.Image, path: Path) -> np.ndarray:
-    """A decoded image as uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha if it has alpha.
-
-    Raises:
-        IgsrError: the kind of its pixels is not supported.
-    """
-    image = _eight_bit(image, path)
-    mode = "RGBA" if _has_alpha(image) else "RGB"
-    if image.mode == "La":
-        image = image.convert("LA")
-    try:
-        return np.array(image if image.mode == mode else image.convert(mode))
-    except Exception as error:
-        raise IgsrError(
-            f"{path} has pixels of the unsupported kind {image.mode}; save it as RGB or RGBA"
-        ) from error
-
-
-def mask_of(image: Image.Image, path: Path) -> np.ndarray:
-    """A decoded image as a mask, bool [H, W], True where it is brighter than half of its brightest.
-
-    So masks of 0 and 1 mean the same as masks of 0 and 255.
-
-    Raises:
-        IgsrError: the kind of its pixels is not supported.
-    """
-    image = _eight_bit(image, path)
-    try:
-        # convert("L") of transparent images keeps the grey and drops the alpha.
-        grey = np.array(image.convert("L")).astype(np.int32)
-    except Exception as error:
-        raise IgsrError(f"{path} has pixels of the unsupported kind {image.mode}") from error
-    return 2 * grey > max(int(grey.max()), 1)
-
-
-class _Undistorters:
-    """One resampling map per distinct camera, freed after its last photo: a map is larger."""
-
-    def __init__(self, shots: list[Shot], cameras: list[Camera]) -> None:
-        self._maps: dict[object, Undistorter] = {}
-        pairs = zip(shots, cameras, strict=True)
-        self._uses = Counter(
-            self._key(shot, camera) for shot, camera in pairs if not shot.lens.is_pinhole
-        )
-        # A lock for each camera, so that different cameras are mapped side by side.
-        self._locks = {key: threading.Lock() for key in self._uses}
-
-    @staticmethod
-    def _key(shot: Shot, camera: Camera) -> object:
-        return shot.lens, camera.K.tobytes(), camera.width, camera.height
-
-    def take(self, shot: Shot, camera: Camera) -> Undistorter:
-        key = self._key(shot, camera)
-        with self._locks[key]:
-            if key not in self._maps:
-                try:
-                    self._maps[key] = Undistorter(shot.lens, camera.K, camera.width, camera.height)
-                except IgsrError as error:
-                    raise IgsrError(f"{shot.source}: the camera of {shot.name}: {error}") from error
-            undistorter = self._maps[key]
-            self._uses[key] -= 1
-            if self._uses[key] == 0:
-                del self._maps[key]
-        return undistorter
-
-
-def _refuse_duplicates(shots: list[Shot]) -> None:
     source_from_name: dict[str, Path] = {}
     for shot in shots:
         if shot.name in source_from_name:
@@ -330,38 +152,6 @@ def _refuse_duplicates(shots: list[Shot]) -> None:
                 f"({' and '.join(sources)}); remove one"
             )
         source_from_name[shot.name] = shot.source
-
-
-@dataclass(frozen=True)
-class PhotoHeader:
-    """What the file of a photo says before it is decoded.
-
-    Attributes:
-        size: width and height, pixels, as stored.
-        channels: 3, or 4 with alpha.
-    """
-
-    size: tuple[int, int]
-    channels: int
-
-
-def photo_header(path: Path) -> PhotoHeader:
-    """Read the header of a photo.
-
-    Raises:
-        IgsrError: as ``open_image``.
-    """
-    with open_image(path) as image:
-        return PhotoHeader(image.size, 4 if _has_alpha(image) else 3)
-
-
-def checked_headers(shots: list[Shot]) -> list[PhotoHeader]:
-    """Read the headers of all photos of a capture, and check their sizes against their cameras.
-
-    Raises:
-        IgsrError: two photos have one name, one cannot be read, or has another size.
-    """
-    _refuse_duplicates(shots)
     headers = []
     for shot in shots:
         header = photo_header(shot.path)
@@ -370,93 +160,71 @@ def checked_headers(shots: list[Shot]) -> list[PhotoHeader]:
     return headers
 
 
-def loaded_sizes(shots: list[Shot], headers: list[PhotoHeader]) -> list[tuple[int, int]]:
-    """Width and height in pixels of each view before it is reduced."""
-    return [
-        header.size if shot.rig is None else (shot.camera.width, shot.camera.height)
-        for shot, header in zip(shots, headers, strict=True)
-    ]
-
-
-def _check_size(path: Path, size: tuple[int, int], shot: Shot, what: str) -> None:
-    """Check a photo's or mask's size against its camera."""
-    wanted = shot.photo_size
-    if size == wanted and (shot.factor == 1 or what == "mask"):
+def _check_size(path: Path, size: tuple[int, int], shot: Shot, kind: str) -> None:
+    """Check the size of a photo ("image") or "mask" against its camera."""
+    full = shot.camera if shot.rig is None else shot.rig.photo
+    wanted = full.width, full.height
+    if size == wanted and (shot.factor == 1 or kind == "mask"):
         return
     # Programs round the size of a reduced photo up, down or to the nearest.
-    near = all(abs(one - full / shot.factor) <= 1.0 for one, full in zip(size, wanted, strict=True))
-    if shot.factor > 1 and near:
+    off = max(abs(a - b / shot.factor) for a, b in zip(size, wanted, strict=True))
+    if shot.factor > 1 and off <= 1.0:
         return
-    is_turned = what == "image" and shot.factor == 1 and size == wanted[::-1]
+    is_turned = kind == "image" and shot.factor == 1 and size == wanted[::-1]
     turned = " (an EXIF orientation is never applied)" if is_turned else ""
     reduced = "" if shot.factor == 1 else f", and {path.parent.name} says 1/{shot.factor} of it"
     raise IgsrError(
         f"{path} is {size[0]}x{size[1]} pixels but its camera in {shot.source.name} "
-        f"is {wanted[0]}x{wanted[1]}{reduced}{turned}; resize the {what} or correct the camera"
+        f"is {wanted[0]}x{wanted[1]}{reduced}{turned}; resize the {kind} or correct the camera"
     )
 
 
-def load_views(
-    shots: list[Shot], headers: list[PhotoHeader], max_size: int | None = None
-) -> list[View]:
-    """Load all photos of a capture on all cores, in the order given.
+def shot_sizes(shots: list[Shot], headers: list[PhotoHeader]) -> PhotoSizes:
+    """Return the sizes of photos, from the headers of their files (``checked_headers``)."""
+    return PhotoSizes(
+        sizes=[
+            header.size if shot.rig is None else (shot.camera.width, shot.camera.height)
+            for shot, header in zip(shots, headers, strict=True)
+        ],
+        channels=max((header.channels for header in headers), default=3),
+        masked=any(shot.is_resampled or shot.mask_path is not None for shot in shots),
+        depths=any(shot.depth_path is not None for shot in shots),
+        decoded=[header.size for header in headers],
+        views=[number for _, number in sorted(Counter(map(photo_of, shots)).items())],
+        plain=[shot.path for shot in shots if shot.rig is None and shot.mask_path is None],
+    )
 
-    Args:
-        shots: the photos.
-        headers: of their files, from ``checked_headers``.
-        max_size: longest side in pixels of photos as loaded; larger ones are reduced. None keeps
-            all as they are.
 
-    Raises:
-        IgsrError: a photo cannot be used; of several, the message is about the first.
-    """
-    plain = [(s, h) for s, h in zip(shots, headers, strict=True) if s.rig is None]
-    cameras = {
-        shot.name: resized_camera(shot.camera, *reduced_size(*header.size, max_size))
-        for shot, header in plain
-    }
-    undistorters = _Undistorters([shot for shot, _ in plain], list(cameras.values()))
+def _load_views(shots: list[Shot], headers: list[PhotoHeader], max_size: int | None) -> list[View]:
+    """Load all photos of a capture on all cores, in the order given."""
+    undistorters = _Undistorters(zip(shots, headers, strict=True))
 
-    def load(group: list[Shot], header: PhotoHeader) -> list[View]:
-        shot, rig = group[0], group[0].rig
+    def load(group: list[tuple[Shot, PhotoHeader]]) -> list[View]:
+        (shot, header), rig = group[0], group[0][0].rig
         if rig is None:
-            size = cameras[shot.name].width, cameras[shot.name].height
+            size = reduced_size(*header.size, max_size)
         else:
-            size = _sampled_size(rig, header.size, max_size)
+            size = decoded_size(rig, header.size, max_size)
         with open_image(shot.path) as opened:
             if opened.size != header.size:
                 raise IgsrError(f"{shot.path} was changed while it was read; try again")
-            mask = _mask(shot, header.size)
+            mask = _read_mask(shot, header.size)
             image, mask = decoded(opened, shot.path, size, mask)
-            light = read_exif(opened).exposure_value
-        if rig is not None:
-            return _rig_views(group, rig, image, mask, max_size, light)
-        camera = cameras[shot.name]
-        if not shot.lens.is_pinhole:
-            undistorter = undistorters.take(shot, camera)
-            image = undistorter.image(image)
-            mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
-            if mask.all():
-                mask = None
-        view = View(shot.name, camera, shot.split, image, mask, exposure_value=light)
-        depth = _depth(shot, camera)
-        if depth is not None and not shot.lens.is_pinhole:
-            depth = undistorters.take(shot, camera).nearest(depth)
-        return [replace(view, rig=shot.photo, depth=depth)]
+            exposure_value = read_exif(opened).exposure_value
+        if rig is None:
+            camera = resized_camera(shot.camera, *size)
+            undistorter = undistorters.take(shot, header, camera)
+            views = [_undistorted(shot, camera, image, mask, undistorter)]
+        else:
+            views = _rig_views([shot for shot, _ in group], rig, image, mask, max_size)
+        return [replace(view, exposure_value=exposure_value, rig=shot.photo) for view in views]
 
-    # The views of a wide photo come from one decoding of it.
-    groups: dict[str, tuple[list[Shot], PhotoHeader]] = {}
-    for shot, header in zip(shots, headers, strict=True):
-        key = shot.name if shot.rig is None else photo_of(shot)
-        groups.setdefault(key, ([], header))[0].append(shot)
-    threads = decoding_threads(
-        loaded_sizes(shots, headers),
-        max_size,
-        channels=max((header.channels for header in headers), default=3),
-        decoded=[header.size for header in headers],
-    )
+    # The views of a wide photo share one decoding of it.
+    pairs = zip(shots, headers, strict=True)
+    groups = groupby(pairs, lambda pair: pair[0].name if pair[0].rig is None else pair[0].photo)
+    threads = shot_sizes(shots, headers).decoding_threads(max_size)
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        futures = [pool.submit(load, *group) for group in groups.values()]
+        futures = [pool.submit(load, list(group)) for _, group in groups]
         try:
             return [view for future in futures for view in future.result()]
         except BaseException:
@@ -464,73 +232,88 @@ def load_views(
             raise
 
 
-def _sampled_size(rig: Rig, size: tuple[int, int], max_size: int | None) -> tuple[int, int]:
-    """The size at which a wide photo is decoded, whose file has ``size`` pixels."""
-    wanted = sides_at(rig, max_size)[1]
-    return min(size[0], wanted[0]), min(size[1], wanted[1])
+class _Undistorters:
+    """One resampling map per distinct camera, freed after its last photo to save memory."""
+
+    def __init__(self, photos: Iterable[tuple[Shot, PhotoHeader]]) -> None:
+        self._maps: dict[object, Undistorter] = {}
+        self._uses = Counter(self._key(shot, header) for shot, header in photos)
+        # One lock per camera, so that maps of different cameras are computed in parallel.
+        self._locks = {key: threading.Lock() for key in self._uses}
+
+    @staticmethod
+    def _key(shot: Shot, header: PhotoHeader) -> object:
+        camera = shot.camera
+        return shot.lens, camera.K.tobytes(), camera.width, camera.height, header.size
+
+    def take(self, shot: Shot, header: PhotoHeader, camera: Camera) -> Undistorter | None:
+        if shot.lens.is_pinhole:
+            return None
+        key = self._key(shot, header)
+        with self._locks[key]:
+            if key not in self._maps:
+                try:
+                    self._maps[key] = Undistorter(shot.lens, camera.K, camera.width, camera.height)
+                except IgsrError as error:
+                    raise IgsrError(f"{shot.source}: the camera of {shot.name}: {error}") from error
+            self._uses[key] -= 1
+            return self._maps[key] if self._uses[key] else self._maps.pop(key)
+
+
+def _undistorted(
+    shot: Shot,
+    camera: Camera,
+    image: np.ndarray,
+    mask: np.ndarray | None,
+    undistorter: Undistorter | None,
+) -> View:
+    depth = _read_depth(shot, camera)
+    if undistorter is not None:
+        image = undistorter.image(image)
+        mask = undistorter.valid.copy() if mask is None else undistorter.mask(mask)
+        mask = None if mask.all() else mask
+        depth = None if depth is None else undistorter.nearest(depth)
+    return View(shot.name, camera, shot.split, image, mask, depth=depth)
 
 
 def _rig_views(
-    shots: list[Shot],
-    rig: Rig,
-    image: np.ndarray,
-    mask: np.ndarray | None,
-    max_size: int | None,
-    light: float | None,
+    shots: list[Shot], rig: Rig, image: np.ndarray, mask: np.ndarray | None, max_size: int | None
 ) -> list[View]:
-    """The views of a wide photo."""
-    sampled = sampled_views(rig, image, shown_part(rig, image, mask), max_size)
+    """The views of a wide photo, without those that its mask hides."""
+    sampled = sampled_views(rig, image, mask, max_size)
     views = []
     for shot in shots:
-        camera, pixels, shown = sampled[shot.side]
-        if shown is not None and shown.mean() < LEAST_SHOWN:
-            continue  # all masked, or beyond the circle that the lens shows
-        camera = replace(camera, viewmat=shot.camera.viewmat)
-        views.append(
-            View(
-                shot.name,
-                camera,
-                shot.split,
-                pixels,
-                shown,
-                exposure_value=light,
-                rig=shot.photo,
-            )
-        )
+        if shot.side in sampled:
+            camera, pixels, shown = sampled[shot.side]
+            camera = replace(camera, viewmat=shot.camera.viewmat)
+            views.append(View(shot.name, camera, shot.split, pixels, shown))
     return views
 
 
-def _depth(shot: Shot, camera: Camera) -> np.ndarray | None:
-    """The depth of a photo [H, W] in the camera's pixels, each that of the file's pixel there."""
+def _read_depth(shot: Shot, camera: Camera) -> np.ndarray | None:
+    """The depth of a photo in the camera's pixels [H, W], from the nearest pixels of the file."""
     if shot.depth_path is None:
         return None
-    if holds_array(shot.depth_path):
-        stored = depth_array(shot.depth_path)
-    else:
-        with open_image(shot.depth_path) as opened:
-            load_pixels(opened, shot.depth_path)
-            stored = depth_of(opened, shot.depth_path)
-    depth = in_world_units(stored, shot.depth_unit)
+    depth = read_depth(shot.depth_path, shot.depth_unit)
     height, width = depth.shape
-    # Depth cameras have fewer pixels than photos, but see as much.
-    whole = shot.camera
-    apart = abs(width * whole.height - height * whole.width)
-    rounding = max(whole.width, whole.height)
-    if apart > max(DEPTH_ASPECT * height * whole.width, rounding):
+    # Depth cameras have fewer pixels than photos, but the same field of view.
+    full = shot.camera
+    difference = abs(width * full.height - height * full.width)
+    rounding = max(full.width, full.height)
+    if difference > max(DEPTH_ASPECT_TOLERANCE * height * full.width, rounding):
         raise IgsrError(
-            f"{shot.depth_path} is {width}x{height} pixels but its photo {whole.width}x"
-            f"{whole.height}, of another shape; give depth of the whole photo"
+            f"{shot.depth_path} is {width}x{height} pixels but its photo {full.width}x"
+            f"{full.height}, of another shape; give depth of the whole photo"
         )
     return resampled_plane(depth, camera.width, camera.height)
 
 
-def _mask(shot: Shot, size: tuple[int, int]) -> np.ndarray | None:
-    """The mask of a photo in the photo's pixels; one of the camera's size is brought to them."""
+def _read_mask(shot: Shot, size: tuple[int, int]) -> np.ndarray | None:
+    """The mask of a photo in the photo's pixels, reduced if it has the camera's size."""
     if shot.mask_path is None:
         return None
     with open_image(shot.mask_path) as opened:
         _check_size(shot.mask_path, opened.size, shot, "mask")
-        load_pixels(opened, shot.mask_path)
         mask = mask_of(opened, shot.mask_path)
     if (mask.shape[1], mask.shape[0]) == size:
         return mask
@@ -539,5 +322,5 @@ def _mask(shot: Shot, size: tuple[int, int]) -> np.ndarray | None:
             f"{shot.mask_path} is {mask.shape[1]}x{mask.shape[0]} pixels but its photo is "
             f"{size[0]}x{size[1]}; resize the mask"
         )
-    # The smaller photo mixes what the mask tells apart: a pixel counts if all under it do.
+    # A reduced pixel may be used only if all pixels under it may.
     return plane_area_means(mask, *size) > 1.0 - 1e-6

@@ -1,4 +1,4 @@
-"""Point clouds in .ply files, as nerfstudio's ``ply_file_path`` names them, read and written."""
+"""Read and write point clouds as .ply files, which nerfstudio's ``ply_file_path`` names."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ _TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_COLORS = ("red", "green", "blue")
 
 
 def read_point_cloud(path: Path) -> Points | None:
     """Read positions, colors and confidences; other properties and elements are ignored.
 
-    Points without colors become grey. Confidences are ignored unless all are positive.
+    Points without colors become gray. Confidences are ignored unless all are positive.
 
     Args:
         path: the ``.ply`` file, ASCII or binary.
@@ -39,14 +40,14 @@ def read_point_cloud(path: Path) -> Points | None:
         raise IgsrError(
             f"{path} is missing or cannot be read; put the point cloud there"
         ) from error
-    header, end, rest = data.partition(b"end_header\n")
+    header, end, body = data.partition(b"end_header\n")
     if not end:
-        header, end, rest = data.partition(b"end_header\r\n")
+        header, end, body = data.partition(b"end_header\r\n")
     damaged = IgsrError(f"{path} is no .ply of points or is damaged; export it again")
     lines = header.decode("ascii", "replace").split("\n")
     if not end or lines[0].strip() != "ply":
         raise damaged
-    order, count, properties = "", -1, []
+    order, count, properties = "", -1, {}
     for line in lines[1:]:
         words = line.split()
         if words[:1] == ["format"] and len(words) == 3 and words[1] in _ORDERS:
@@ -59,41 +60,38 @@ def read_point_cloud(path: Path) -> Points | None:
                 raise damaged
             count = int(words[2]) if len(words[2]) < 19 else 10**18
         elif words[:1] == ["property"]:
-            if len(words) != 3 or words[1] not in _TYPES:
+            if len(words) != 3 or words[1] not in _TYPES or words[2] in properties:
                 raise damaged
-            properties.append((words[2], _ORDERS.get(order, "=") + _TYPES[words[1]]))
-    names = [name for name, _ in properties]
-    if not order or count < 0 or len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
+            properties[words[2]] = _ORDERS.get(order, "=") + _TYPES[words[1]]
+    if not order or count < 0 or not {"x", "y", "z"} <= properties.keys():
         raise damaged
-    dtype = np.dtype(properties)
-    # The shortest text of a value is a digit and a space.
-    if len(rest) + 1 < count * (2 * len(names) if order == "ascii" else dtype.itemsize):
-        raise IgsrError(f"{path} is truncated: it announces {count} points; copy it again")
-    if order == "ascii":
-        rows = rest.decode("ascii", "replace").split("\n")[:count]
-        try:
-            table = np.array([row.split()[: len(names)] for row in rows], dtype=np.float64)
-            table = table.reshape(count, len(names))
-        except ValueError as error:
-            raise damaged from error
-        columns = {name: table[:, index] for index, name in enumerate(names)}
-    else:
-        if len(rest) < count * dtype.itemsize:
-            raise IgsrError(f"{path} is truncated: it announces {count} points; copy it again")
-        structured = np.frombuffer(rest, dtype=dtype, count=count)
-        columns = {name: structured[name] for name in names}
     if count == 0:
         return None
+    dtype = np.dtype(list(properties.items()))
+    # The shortest text of a value is a digit and a space; the last one may lack the space.
+    least = count * 2 * len(properties) - 1 if order == "ascii" else count * dtype.itemsize
+    if len(body) < least:
+        raise IgsrError(f"{path} is truncated: it announces {count} points; copy it again")
+    if order == "ascii":
+        rows = body.decode("ascii", "replace").split("\n")[:count]
+        try:
+            values = np.array([row.split()[: len(properties)] for row in rows], dtype=np.float64)
+            values = values.reshape(count, len(properties))
+        except ValueError as error:
+            raise damaged from error
+        columns = dict(zip(properties, values.T, strict=True))
+    else:
+        table = np.frombuffer(body, dtype=dtype, count=count)
+        columns = {name: table[name] for name in properties}
     xyz = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
     if not np.isfinite(xyz).all():
         raise IgsrError(f"{path} has a point that is not finite; remove it")
     rgb = np.full((count, 3), 128, dtype=np.uint8)
-    if {"red", "green", "blue"} <= set(names):
-        colours = np.stack([columns[name] for name in ("red", "green", "blue")], axis=1)
-        kinds = dict(properties)
-        if order != "ascii" and kinds["red"][1] == "f":
-            colours = colours * 255.0
-        rgb = np.clip(np.nan_to_num(colours), 0, 255).astype(np.uint8)
+    if set(_COLORS) <= set(columns):
+        colors = np.stack([columns[name] for name in _COLORS], axis=1)
+        if order != "ascii" and columns["red"].dtype.kind == "f":
+            colors = colors * 255.0
+        rgb = np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
     confidence = columns.get("confidence")
     if confidence is not None and not (np.isfinite(confidence) & (confidence > 0.0)).all():
         confidence = None
@@ -102,22 +100,20 @@ def read_point_cloud(path: Path) -> Points | None:
 
 def write_point_cloud(path: Path, points: Points) -> None:
     """Write a binary .ply: positions in float64, colors and, if known, confidences."""
-    layout = [*((name, "<f8") for name in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))]
+    columns = [(name, "double", points.xyz[:, axis]) for axis, name in enumerate("xyz")]
+    columns += [(name, "uchar", points.rgb[:, axis]) for axis, name in enumerate(_COLORS)]
     if points.confidence is not None:
-        layout.append(("confidence", "<f8"))
-    table = np.zeros(len(points.xyz), dtype=np.dtype(layout))
-    for column, name in enumerate("xyz"):
-        table[name] = points.xyz[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        table[name] = points.rgb[:, column]
-    if points.confidence is not None:
-        table["confidence"] = points.confidence
-    kinds = {"<f8": "double", "u1": "uchar"}
+        columns.append(("confidence", "double", points.confidence))
+    table = np.zeros(
+        len(points.xyz), dtype=[(name, f"<{_TYPES[kind]}") for name, kind, _ in columns]
+    )
+    for name, _, values in columns:
+        table[name] = values
     header = [
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {len(table)}",
-        *(f"property {kinds[kind]} {name}" for name, kind in layout),
+        *(f"property {kind} {name}" for name, kind, _ in columns),
         "end_header",
     ]
     path.write_bytes("\n".join(header).encode() + b"\n" + table.tobytes())

@@ -1,9 +1,9 @@
 """Read captures with a ``transforms.json``: NeRF Synthetic, nerfstudio and instant-ngp.
 
-The three share one layout: a list of frames with a camera-to-world matrix each. They differ in the
-fields they use. Every camera field may be in the frame or, for all frames, beside the list.
+All three have a list of frames with a camera-to-world matrix each, but use different fields. Every
+camera field may be in the frame or, for all frames, next to the list.
 
-Only this reader turns OpenGL cameras (x right, y up, z back) into OpenCV cameras.
+Only this reader converts OpenGL cameras (x right, y up, z back) into OpenCV cameras.
 
 Sources: https://docs.nerf.studio/quickstart/data_conventions.html, the NeRF Synthetic data, and
 instant-ngp's ``docs/nerf_dataset_tips.md``.
@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import posixpath
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,40 +22,26 @@ from typing import Any
 import numpy as np
 
 from igsr._internal.choices import SPLITS, Split
-from igsr.capture.described import DescribedCapture
-from igsr.capture.photos import Shot, image_size, is_file, rig_shots
+from igsr.capture.image_files import is_file, photo_header
+from igsr.capture.photos import DescribedCapture, Shot, rig_shots
 from igsr.capture.point_cloud import read_point_cloud
 from igsr.capture.rig import rig_of
-from igsr.capture.types import Camera, Capture, Points, intrinsic_matrix, nearest_rigid
+from igsr.capture.types import Camera, Points, intrinsic_matrix, nearest_rigid
 from igsr.capture.undistort import Lens
 from igsr.capture.wide_photos import WideFisheye, WidePhoto, whole_sphere, wide_fisheye
 from igsr.errors import IgsrError
 
-# nerfstudio does not distinguish these: the coefficients determine the lens.
+# nerfstudio does not distinguish the perspective models: the coefficients determine the lens.
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-_FISHEYE = ("OPENCV_FISHEYE",)
+_FISHEYE = "OPENCV_FISHEYE"
 _EQUIRECTANGULAR = "EQUIRECTANGULAR"
 
 # NeRF Synthetic omits the suffix.
 _OMITTED_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
-def load_transforms(path: Path, max_size: int | None = None) -> Capture:
-    """Load a ``transforms.json``; see ``described_transforms``."""
-    return described_transforms(path).loaded(max_size)
-
-
-def load_split_transforms(folder: Path, max_size: int | None = None) -> Capture:
-    """Load a NeRF Synthetic capture; see ``described_split_transforms``."""
-    return described_split_transforms(folder).loaded(max_size)
-
-
-def described_transforms(path: Path) -> DescribedCapture:
-    """Read a ``transforms.json``; paths in it are relative to its folder.
-
-    Raises:
-        IgsrError: a field is missing, malformed or out of range, or a file it names is unusable.
-    """
+def describe_transforms(path: Path) -> DescribedCapture:
+    """Read a ``transforms.json`` except for its photos; paths in it are relative to its folder."""
     document = _read_json(path)
     frames = _frames(document, path)
     split_from_name = _named_splits(document, path, frames)
@@ -73,12 +60,8 @@ def described_transforms(path: Path) -> DescribedCapture:
     return DescribedCapture(path.parent, shots, points)
 
 
-def described_split_transforms(folder: Path) -> DescribedCapture:
-    """Read ``transforms_train.json`` and, where it exists, ``transforms_test.json`` of a folder.
-
-    Raises:
-        IgsrError: as ``described_transforms``.
-    """
+def describe_split_transforms(folder: Path) -> DescribedCapture:
+    """Read ``transforms_train.json`` and, if it exists, ``transforms_test.json`` of a folder."""
     shots = []
     for split in SPLITS:
         path = folder / f"transforms_{split}.json"
@@ -90,12 +73,7 @@ def described_split_transforms(folder: Path) -> DescribedCapture:
 
 
 def read_cameras(path: Path) -> list[tuple[str, Camera]]:
-    """The photos' names and cameras of a ``cameras.json`` as igsr writes it, without the photos.
-
-    Raises:
-        IgsrError: the file cannot be read, a field of a frame is missing or out of range, or a
-            lens distorts.
-    """
+    """Read the photos' names and cameras of a ``cameras.json`` that igsr wrote."""
     document = _read_json(path)
     if document.get("camera_model") != "PINHOLE":
         raise IgsrError(f"{path}: camera_model must be PINHOLE, as igsr writes it")
@@ -103,31 +81,27 @@ def read_cameras(path: Path) -> list[tuple[str, Camera]]:
     for index, frame in enumerate(_frames(document, path)):
         name = _text(frame, "file_path", f"{path}, frame {index}")
         where = f"{path}, frame {index} ({name})"
-        for key in ("w", "h"):
-            _required(frame, key, where)
-        width, height = _size(frame, path, where)
+        width, height = _size(frame, where)
         K, _ = _intrinsics(frame, width, height, where)
-        viewmat = _viewmat(_required(frame, "transform_matrix", where), where)
-        cameras.append((name, Camera(viewmat, K, width, height)))
+        cameras.append((name, Camera(_viewmat(frame, where), K, width, height)))
     return cameras
 
 
 def read_lens(path: Path) -> WideFisheye:
-    """The lens of fisheye photos without cameras, from the fields that a frame would have.
+    """Read the lens of fisheye photos without cameras.
 
     Args:
-        path: a JSON file with ``w``, ``h``, ``camera_model`` OPENCV_FISHEYE, ``fl_x`` and so on.
+        path: a JSON file with the camera fields of a frame: ``w``, ``h``, ``camera_model``
+            OPENCV_FISHEYE, ``fl_x`` and so on.
 
     Raises:
-        IgsrError: a field is missing or out of range, or one pinhole shows what the lens does.
+        IgsrError: a field is missing or out of range, or a pinhole can show the lens's view.
     """
     fields, where = _read_json(path), str(path)
-    for key in ("w", "h", "fl_x"):
-        _required(fields, key, where)
-    width, height = _size(fields, path, where)
+    width, height = _size(fields, where)
+    _required(fields, "fl_x", where)
     K, lens = _intrinsics(fields, width, height, where)
-    radius = _number(fields, "fisheye_crop_radius", where, math.inf)
-    wide = wide_fisheye(K, lens, width, height, radius)
+    wide = wide_fisheye(K, lens, width, height, _crop_radius(fields, where))
     if wide is None:
         raise IgsrError(
             f"{path} describes no fisheye of more than 120 degrees; delete it, since cameras of "
@@ -166,18 +140,10 @@ def _required(fields: dict[str, Any], key: str, where: str) -> Any:
 
 def _text(fields: dict[str, Any], key: str, where: str) -> str:
     value = _required(fields, key, where)
-    if not isinstance(value, str) or not value or "\0" in value or not _is_unicode(value):
+    # JSON can hold half a surrogate pair, which file names and terminals cannot.
+    if not isinstance(value, str) or not value or re.search("[\0\ud800-\udfff]", value):
         raise IgsrError(f"{where}: {key} must be a file's path, not {_shown(value)}; correct it")
     return value
-
-
-def _is_unicode(text: str) -> bool:
-    # JSON can hold half a surrogate pair, which no file name and no terminal can.
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _shown(value: Any) -> str:
@@ -189,7 +155,7 @@ def _number(fields: dict[str, Any], key: str, where: str, default: float | None 
     if key not in fields and default is not None:
         return default
     value = _required(fields, key, where)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if not _is_number(value):
         raise IgsrError(f"{where}: {key} must be a number, not {_shown(value)}; correct it")
     try:
         number = float(value)
@@ -200,6 +166,10 @@ def _number(fields: dict[str, Any], key: str, where: str, default: float | None 
     return number
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def _frame_name(frame: dict[str, Any], path: Path, index: int) -> str:
     """``file_path``, normalized: "./a.png" and "a.png" are the same frame."""
     return posixpath.normpath(_text(frame, "file_path", f"{path}, frame {index}"))
@@ -208,7 +178,7 @@ def _frame_name(frame: dict[str, Any], path: Path, index: int) -> str:
 def _shots(
     document: dict[str, Any], frame: dict[str, Any], path: Path, index: int, split: Split
 ) -> list[Shot]:
-    """The photo of a frame; of a wide one, the views that it becomes."""
+    """The photo of a frame, or its views if it is a wide one."""
     name = _frame_name(frame, path, index)
     where = f"{path}, frame {index} ({name})"
     for suffix in ("", *_OMITTED_SUFFIXES):
@@ -218,26 +188,30 @@ def _shots(
     else:
         raise IgsrError(f"{where}: the image {path.parent / name} is missing; put it there")
     photo = path.parent / name
-    mask_path = None
-    if "mask_path" in frame:
-        mask_path = path.parent / _text(frame, "mask_path", where)
-        if not is_file(mask_path):
-            raise IgsrError(f"{where}: the mask {mask_path} is missing; put it there")
+    mask_path = _named_file(frame, "mask_path", "mask", path, where)
     fields = {**document, **frame}
-    depth_path, depth_unit = _depth_file(fields, path, where)
-    width, height = _size(fields, photo, where)
-    viewmat = _viewmat(_required(frame, "transform_matrix", where), where)
+    depth_path = _named_file(fields, "depth_file_path", "depth", path, where)
+    depth_unit = None
+    if depth_path is not None and "depth_unit_scale_factor" in fields:
+        depth_unit = _number(fields, "depth_unit_scale_factor", where)
+        if depth_unit <= 0.0:
+            raise IgsrError(
+                f"{where}: depth_unit_scale_factor is {depth_unit:g}; give the world units of one "
+                "number of the depth's file"
+            )
+    has_size = "w" in fields or "h" in fields
+    width, height = _size(fields, where) if has_size else photo_header(photo).size
+    viewmat = _viewmat(frame, where)
     is_sphere = fields.get("camera_model") == _EQUIRECTANGULAR
     K, lens = (np.eye(3), Lens()) if is_sphere else _intrinsics(fields, width, height, where)
     rig = _text(frame, "rig", where) if "rig" in frame else None
     try:
         camera = Camera(viewmat, K, width, height)
+        wide: WidePhoto | None
         if is_sphere:
-            wide: WidePhoto | None = whole_sphere(width, height)
+            wide = whole_sphere(width, height)
         else:
-            # nerfstudio's, in pixels; without it, what has no light is left out.
-            radius = _number(fields, "fisheye_crop_radius", where, math.inf)
-            wide = wide_fisheye(K, lens, width, height, radius)
+            wide = wide_fisheye(K, lens, width, height, _crop_radius(fields, where))
         shot = Shot(name, photo, camera, lens, split, mask_path, path, photo=rig)
         shot = replace(shot, depth_path=depth_path, depth_unit=depth_unit)
         return [shot] if wide is None else rig_shots(shot, rig_of(wide))
@@ -245,51 +219,40 @@ def _shots(
         raise IgsrError(f"{where}: {error}") from error
 
 
-def _depth_file(fields: dict[str, Any], path: Path, where: str) -> tuple[Path | None, float | None]:
-    """The file of a frame's depth and the world units of one of its numbers, as nerfstudio's."""
-    if "depth_file_path" not in fields:
-        return None, None
-    depth_path = path.parent / _text(fields, "depth_file_path", where)
-    if not is_file(depth_path):
-        raise IgsrError(f"{where}: the depth {depth_path} is missing; put it there")
-    if "depth_unit_scale_factor" not in fields:
-        return depth_path, None
-    unit = _number(fields, "depth_unit_scale_factor", where)
-    if unit <= 0.0:
-        raise IgsrError(
-            f"{where}: depth_unit_scale_factor is {unit:g}; give the world units of one number of "
-            "the depth's file"
-        )
-    return depth_path, unit
+def _crop_radius(fields: dict[str, Any], where: str) -> float:
+    """nerfstudio's radius of the image circle, pixels."""
+    return _number(fields, "fisheye_crop_radius", where, math.inf)
 
 
-def _size(fields: dict[str, Any], photo: Path, where: str) -> tuple[int, int]:
-    if "w" not in fields and "h" not in fields:
-        return image_size(photo)
-    size = []
-    for key in ("w", "h"):
-        value = _number(fields, key, where)
+def _named_file(fields: dict[str, Any], key: str, kind: str, path: Path, where: str) -> Path | None:
+    if key not in fields:
+        return None
+    file = path.parent / _text(fields, key, where)
+    if not is_file(file):
+        raise IgsrError(f"{where}: the {kind} {file} is missing; put it there")
+    return file
+
+
+def _size(fields: dict[str, Any], where: str) -> tuple[int, int]:
+    width, height = (_number(fields, key, where) for key in ("w", "h"))
+    for key, value in (("w", width), ("h", height)):
         if value < 1 or value != int(value):
             raise IgsrError(f"{where}: {key} is {value:g}; give a whole number of pixels")
-        size.append(int(value))
-    return size[0], size[1]
+    return int(width), int(height)
 
 
 def _intrinsics(
     fields: dict[str, Any], width: int, height: int, where: str
 ) -> tuple[np.ndarray, Lens]:
     if "fl_x" in fields:
-        fx = _number(fields, "fl_x", where)
+        fx = fy = _number(fields, "fl_x", where)
     elif "camera_angle_x" in fields:
-        fx = _focal_length(fields, "camera_angle_x", width, where)
+        fx = fy = _focal_length(fields, "camera_angle_x", width, where)
+        if "camera_angle_y" in fields and "fl_y" not in fields:
+            fy = _focal_length(fields, "camera_angle_y", height, where)
     else:
         raise IgsrError(f"{where}: fl_x or camera_angle_x is missing; add one of them")
-    if "fl_y" in fields:
-        fy = _number(fields, "fl_y", where)
-    elif "camera_angle_y" in fields and "fl_x" not in fields:
-        fy = _focal_length(fields, "camera_angle_y", height, where)
-    else:
-        fy = fx
+    fy = _number(fields, "fl_y", where, fy)
     cx = _number(fields, "cx", where, width / 2)
     cy = _number(fields, "cy", where, height / 2)
     for key, value in (("fl_x", fx), ("fl_y", fy)):
@@ -310,16 +273,16 @@ def _focal_length(fields: dict[str, Any], key: str, size: int, where: str) -> fl
 
 def _lens(fields: dict[str, Any], where: str) -> Lens:
     model = fields.get("camera_model", "OPENCV")
-    if model not in _PERSPECTIVE + _FISHEYE:
+    if model not in (*_PERSPECTIVE, _FISHEYE):
         raise IgsrError(
             f"{where}: the camera_model {_shown(model)} is not supported; undistort the images to "
             "PINHOLE or use OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR"
         )
-    fisheye = model in _FISHEYE or fields.get("is_fisheye") is True
+    fisheye = model == _FISHEYE or fields.get("is_fisheye") is True
     k1, k2, k3, k4, p1, p2 = (
         _number(fields, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
     )
-    # Ignoring a coefficient would bend the scene, so each must have a meaning.
+    # Ignoring a coefficient would distort the scene.
     unused = {key: _number(fields, key, where, 0.0) for key in ("k5", "k6")}
     unused.update({"p1": p1, "p2": p2} if fisheye else {"k4": k4})
     for key, value in unused.items():
@@ -334,18 +297,16 @@ def _lens(fields: dict[str, Any], where: str) -> Lens:
     return Lens(False, (k1, k2, k3), (), (p1, p2))
 
 
-def _viewmat(matrix: Any, where: str) -> np.ndarray:
+def _viewmat(frame: dict[str, Any], where: str) -> np.ndarray:
     """World to camera in OpenCV axes, from camera to world in OpenGL axes (3 or 4 rows of 4)."""
-    rows_are_lists = isinstance(matrix, list) and all(isinstance(row, list) for row in matrix)
-    if (
-        not rows_are_lists
-        or [len(row) for row in matrix] not in ([4] * 3, [4] * 4)
-        or any(
-            isinstance(entry, bool) or not isinstance(entry, (int, float))
-            for row in matrix
-            for entry in row
-        )
-    ):
+    matrix = _required(frame, "transform_matrix", where)
+    is_matrix = (
+        isinstance(matrix, list)
+        and len(matrix) in (3, 4)
+        and all(isinstance(row, list) and len(row) == 4 for row in matrix)
+        and all(_is_number(entry) for row in matrix for entry in row)
+    )
+    if not is_matrix:
         raise IgsrError(f"{where}: transform_matrix must be 4 rows of 4 numbers; correct it")
     rows = matrix if len(matrix) == 4 else [*matrix, [0.0, 0.0, 0.0, 1.0]]
     try:
@@ -363,14 +324,14 @@ def _viewmat(matrix: Any, where: str) -> np.ndarray:
 def _named_splits(
     document: dict[str, Any], path: Path, frames: list[dict[str, Any]]
 ) -> dict[str, Split] | None:
-    """nerfstudio's lists as {frame name: split}, or None if the file has no such lists.
+    """nerfstudio's lists as {frame name: split}, or None if the file has none.
 
-    Frames that only ``val_filenames`` names are ignored, as a ``transforms_val.json`` is. Frames
-    that no list names are for training if there is no ``train_filenames``, else ignored.
+    Frames in ``val_filenames`` only are ignored, as a ``transforms_val.json`` is. Frames in no list
+    are for training if there is no ``train_filenames``, else ignored.
     """
-    split_from_name: dict[str, Split] = {}
-    if "train_filenames" not in document and "test_filenames" not in document:
+    if not {"train_filenames", "test_filenames"} & document.keys():
         return None
+    split_from_name: dict[str, Split] = {}
     known = {_frame_name(frame, path, index) for index, frame in enumerate(frames)}
     for split in SPLITS:
         listed = document.get(f"{split}_filenames", [])
@@ -388,12 +349,9 @@ def _named_splits(
                     "test_filenames; remove one"
                 )
     if "train_filenames" not in document:
-        validation = document.get("val_filenames", [])
-        left_out = {
-            posixpath.normpath(name)
-            for name in (validation if isinstance(validation, list) else [])
-            if isinstance(name, str)
-        }
+        listed = document.get("val_filenames", [])
+        names = listed if isinstance(listed, list) else []
+        left_out = {posixpath.normpath(name) for name in names if isinstance(name, str)}
         for name in known - left_out:
             split_from_name.setdefault(name, "train")
     return split_from_name

@@ -1,25 +1,26 @@
-"""Rigs: the pinhole views that a wide photo becomes, which share one centre.
+"""Rigs: the pinhole views of a wide photo, which share one center.
 
-The views are the sides of a cube around the camera, of 90 degrees each and as many pixels per
-degree in their middle as the photo has in its own. What the photo does not show is cut off; views
-that would be nearly empty are left out. So no direction is shown twice.
+The views are the sides of a cube around the camera, of 90 degrees each and with as many pixels per
+degree in their middle as the photo has in its own. They are cropped to what the photo shows, and
+nearly empty ones are dropped. So no direction is shown twice.
 
-A pixel of a view is the mean of what it covers in the photo, by ``SAMPLES`` x ``SAMPLES`` places
-within it; a photo that has more than twice the resolution is reduced by an area filter before.
+A pixel of a view is the mean of ``SAMPLES`` x ``SAMPLES`` places in the photo; a photo of more than
+twice the resolution is first reduced by an area filter.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr.capture.downscaling import reduced_size, resized_camera
 from igsr.capture.types import Camera, intrinsic_matrix
+from igsr.capture.undistort import Sampler
 from igsr.capture.wide_photos import WideFisheye, WidePhoto, lit_circle
 from igsr.errors import IgsrError
 
@@ -27,17 +28,15 @@ Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
-#: Places within a pixel, per axis, at which the photo is sampled.
+#: Samples of the photo per axis and pixel of a view.
 SAMPLES = 2
-#: The most pixels of a photo for one of a view, per axis, that are sampled.
-OVERSAMPLED = 2.0
-#: A view of which the photo shows less than this part of a cube's side is left out.
-LEAST_SHOWN = 0.02
-#: Pixels of a view mapped at a time: bounds memory.
-_BAND_PIXELS = 1 << 16
-#: Places per side of a cube at which it is looked whether the photo shows it.
-_LOOKED_AT = 128
-#: Where the sides of the cube look, as (right, down, forward) in the photo's frame.
+#: Maximum pixels of the decoded photo per axis and pixel of a view.
+MAX_OVERSAMPLING = 2.0
+#: Views that show less than this part of a cube's side are dropped.
+MIN_SHOWN_PART = 0.02
+#: Grid points per side of a cube that are tested for being inside the photo.
+_TEST_POINTS = 128
+#: Axes of the cube's sides, as (right, down, forward) in the photo's frame.
 _SIDES = {
     "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "right": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
@@ -53,35 +52,25 @@ class Side:
     """One pinhole view of a wide photo.
 
     Attributes:
-        name: where it looks: "front", "right", "back", "left", "up" or "down".
-        camera: in the frame of the photo's camera, which is its world.
+        name: its direction, a key of ``_SIDES``.
+        camera: its camera, whose world is the frame of the photo's camera.
     """
 
     name: str
     camera: Camera
 
     def named(self, photo: str) -> str:
-        """The view's name, by the photo's."""
+        """Return the view's name, given the photo's."""
         return f"{photo}/{self.name}.png"
 
     def in_world(self, viewmat: Float64) -> Camera:
-        """Its camera in the world.
-
-        Args:
-            viewmat: [4, 4], world to the photo's camera.
-        """
-        camera = self.camera
-        return Camera(camera.viewmat @ viewmat, camera.K, camera.width, camera.height)
+        """Return its camera in the world, given the photo camera's viewmat [4, 4]."""
+        return replace(self.camera, viewmat=self.camera.viewmat @ viewmat)
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """The views of a wide photo.
-
-    Attributes:
-        photo: the wide photo, at its full size.
-        sides: its views, at theirs.
-    """
+    """A wide photo at its full size, and its views."""
 
     photo: WidePhoto
     sides: tuple[Side, ...] = field(repr=False)
@@ -89,22 +78,17 @@ class Rig:
 
 @functools.lru_cache(maxsize=64)
 def rig_of(photo: WidePhoto) -> Rig:
-    """The views that a wide photo becomes.
-
-    Raises:
-        IgsrError: it shows nothing.
-    """
+    """Return the views of a wide photo; it is an IgsrError if it shows nothing."""
     focal = max(1.0, photo.pixels_per_radian)
     size = max(2, round(2.0 * focal))
     sides = []
     for name, axes in _SIDES.items():
-        rotation = np.array(axes, dtype=np.float64)
         viewmat = np.eye(4)
-        viewmat[:3, :3] = rotation
-        shown = _shown_part(photo, rotation, size)
-        if shown is None:
+        viewmat[:3, :3] = np.array(axes, dtype=np.float64)
+        crop = _crop(photo, viewmat[:3, :3], size)
+        if crop is None:
             continue
-        left, top, right, bottom = shown
+        left, top, right, bottom = crop
         # 90 degrees over ``size`` pixels.
         K = intrinsic_matrix(0.5 * size, 0.5 * size, 0.5 * size - left, 0.5 * size - top)
         sides.append(Side(name, Camera(viewmat, K, right - left, bottom - top)))
@@ -113,97 +97,84 @@ def rig_of(photo: WidePhoto) -> Rig:
     return Rig(photo, tuple(sides))
 
 
-def _shown_part(photo: WidePhoto, rotation: Float64, size: int) -> tuple[int, int, int, int] | None:
-    """Left, top, right and bottom, in pixels, of what a side of the cube has of the photo."""
-    count = min(size, _LOOKED_AT)
+def _crop(photo: WidePhoto, rotation: Float64, size: int) -> tuple[int, int, int, int] | None:
+    """Left, top, right and bottom of the part of a cube's side that the photo shows, pixels."""
+    count = min(size, _TEST_POINTS)
     at = (np.arange(count) + 0.5) * 2.0 / count - 1.0
     x, y = np.meshgrid(at, at)
     valid = photo.places(np.stack([x, y, np.ones_like(x)], axis=-1) @ rotation)[2]
-    if valid.mean() < LEAST_SHOWN:
+    if valid.mean() < MIN_SHOWN_PART:
         return None
     spans = []
     for axis in (0, 1):
-        seen = np.flatnonzero(valid.any(axis=axis))
-        low, high = max(0, int(seen[0]) - 1), min(count, int(seen[-1]) + 2)
+        shown = np.flatnonzero(valid.any(axis=axis))
+        low, high = max(0, int(shown[0]) - 1), min(count, int(shown[-1]) + 2)
         spans.append((low * size // count, -(-high * size // count)))
     (left, right), (top, bottom) = spans
     return left, top, right, bottom
 
 
-def sides_at(rig: Rig, max_size: int | None) -> tuple[list[Camera], tuple[int, int]]:
-    """The views at the size that they are loaded at, and the photo's size that suffices for them.
-
-    Args:
-        rig: the views.
-        max_size: longest side in pixels of a view; None keeps them as they are.
-
-    Returns:
-        Cameras in the frame of the photo's, and width and height of the photo, pixels.
-    """
-    cameras = [
-        resized_camera(one.camera, *reduced_size(one.camera.width, one.camera.height, max_size))
-        for one in rig.sides
+def _resized_cameras(rig: Rig, max_size: int | None) -> list[Camera]:
+    """The cameras of all sides with at most ``max_size`` pixels on their longest side."""
+    cameras = [side.camera for side in rig.sides]
+    return [
+        resized_camera(camera, *reduced_size(camera.width, camera.height, max_size))
+        for camera in cameras
     ]
+
+
+def decoded_size(rig: Rig, size: tuple[int, int], max_size: int | None) -> tuple[int, int]:
+    """Return the width and height at which to decode a wide photo, whose file has ``size`` pixels.
+
+    ``max_size`` is the longest side in pixels of a view; None keeps them as they are.
+    """
     photo = rig.photo
-    focal = max(camera.K[0, 0] for camera in cameras)
-    factor = min(1.0, OVERSAMPLED * focal / photo.pixels_per_radian)
-    return cameras, (math.ceil(factor * photo.width), math.ceil(factor * photo.height))
-
-
-def shown_part(rig: Rig, image: UInt8, mask: Bool | None) -> Bool | None:
-    """The mask of a wide photo; of a fisheye without one, the circle that has light."""
-    if mask is not None or not isinstance(rig.photo, WideFisheye):
-        return mask
-    return lit_circle(image, rig.photo.resized(image.shape[1], image.shape[0]))
+    focal = max(camera.K[0, 0] for camera in _resized_cameras(rig, max_size))
+    factor = min(1.0, MAX_OVERSAMPLING * focal / photo.pixels_per_radian)
+    width, height = math.ceil(factor * photo.width), math.ceil(factor * photo.height)
+    return min(size[0], width), min(size[1], height)
 
 
 def sampled_views(
     rig: Rig, image: UInt8, mask: Bool | None, max_size: int | None
-) -> list[tuple[Camera, UInt8, Bool | None]]:
-    """Camera, photo and mask of each view.
+) -> dict[int, tuple[Camera, UInt8, Bool | None]]:
+    """Sample the views of a wide photo.
 
     Args:
         rig: the views.
-        image: uint8 [H, W, 3 or 4] of the wide photo, at its full size or that of ``sides_at``.
-        mask: bool [H, W] of it, or None.
-        max_size: as ``sides_at``.
+        image: uint8 [H, W, 3 or 4] of the photo, at its full size or that of ``decoded_size``.
+        mask: bool [H, W] of it; without one, a fisheye photo is masked to its lit circle.
+        max_size: as ``decoded_size``.
+
+    Returns:
+        Camera, photo and mask of each view that is not hidden, by its index in ``rig.sides``.
     """
     photo = rig.photo.resized(image.shape[1], image.shape[0])
-    views: list[tuple[Camera, UInt8, Bool | None]] = []
-    for camera in sides_at(rig, max_size)[0]:
-        sampler = SideSampler(photo, camera)
-        pixels = sampler.image(image, mask)
+    if mask is None and isinstance(photo, WideFisheye):
+        mask = lit_circle(image, photo)
+    views: dict[int, tuple[Camera, UInt8, Bool | None]] = {}
+    for index, camera in enumerate(_resized_cameras(rig, max_size)):
+        sampler = _SideSampler(photo, camera)
         shown = sampler.valid if mask is None else sampler.mask(mask)
-        views.append((camera, pixels, None if shown.all() else shown))
+        if shown.mean() < MIN_SHOWN_PART:
+            continue
+        pixels = sampler.image(image, mask)
+        views[index] = camera, pixels, None if shown.all() else shown
     return views
 
 
-class SideSampler:
-    """Samples one view from photos.
-
-    Args:
-        photo: the wide photo, at the size that is sampled.
-        camera: the view, in the frame of the photo's camera.
-
-    Attributes:
-        valid: bool [H, W], True where the photo shows the whole pixel.
-    """
+class _SideSampler(Sampler):
+    """Samples one view, ``camera`` in the photo's frame, from a wide photo of the size given."""
 
     def __init__(self, photo: WidePhoto, camera: Camera) -> None:
-        """Find what the photo shows of the view."""
+        super().__init__(camera.height, camera.width)
         self._photo, self._camera = photo, camera
-        self.valid = np.ones((camera.height, camera.width), dtype=bool)
         for band in self._bands():
             for _, _, valid in self._places(band):
                 self.valid[band] &= valid
 
-    def _bands(self) -> Iterator[slice]:
-        rows = max(1, _BAND_PIXELS // self._camera.width)
-        height = self._camera.height
-        return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
-
     def _places(self, band: slice) -> Iterator[tuple[Float64, Float64, Bool]]:
-        """Places in the photo that the pixels of a band are sampled at."""
+        """Places in the photo at which the pixels of a band are sampled."""
         camera = self._camera
         for down in range(SAMPLES):
             for right in range(SAMPLES):
@@ -216,7 +187,6 @@ class SideSampler:
                 yield self._photo.places(rays @ camera.viewmat[:3, :3])
 
     def _taps(self, band: slice) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.float32]]]:
-        """The photo's pixels that a band mixes, and their weights."""
         width, height = self._photo.width, self._photo.height
         for u, v, valid in self._places(band):
             u, v = np.where(valid, u, 0.5) - 0.5, np.where(valid, v, 0.5) - 0.5
@@ -225,73 +195,25 @@ class SideSampler:
             v = np.clip(v, 0.0, height - 1.0)
             left, up = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
             across, below = (u - left).astype(np.float32), (v - up).astype(np.float32)
-            further, lower = left + 1, np.minimum(up + 1, height - 1)
+            right, lower = left + 1, np.minimum(up + 1, height - 1)
             if self._photo.wraps:
-                left, further = left % width, further % width
+                left, right = left % width, right % width
             else:
-                further = np.minimum(further, width - 1)
+                right = np.minimum(right, width - 1)
             part = np.float32(1.0 / SAMPLES**2)
             yield up * width + left, part * (1.0 - across) * (1.0 - below)
-            yield up * width + further, part * across * (1.0 - below)
+            yield up * width + right, part * across * (1.0 - below)
             yield lower * width + left, part * (1.0 - across) * below
-            yield lower * width + further, part * across * below
-
-    def image(self, image: UInt8, mask: Bool | None = None) -> UInt8:
-        """The view of a photo.
-
-        Args:
-            image: uint8 [H, W, 3 or 4] of the photo, alpha straight.
-            mask: bool [H, W]; masked pixels lend no color where others can.
-
-        Returns:
-            uint8 [h, w, 3 or 4]; pixels that are not valid are 0.
-        """
-        channels = image.shape[2]
-        # As in ``Undistorter``: a pixel is fetched as one word.
-        padded = np.zeros((*image.shape[:2], 4), dtype=np.uint8)
-        padded[..., :channels] = image
-        words = padded.view(np.uint32).ravel()
-        counted = None if mask is None else mask.ravel()
-        out = np.zeros((*self.valid.shape, channels), dtype=np.uint8)
-        for band in self._bands():
-            mixed = np.zeros((*self.valid[band].shape, channels), dtype=np.float32)
-            weights = np.zeros(self.valid[band].shape, dtype=np.float32)
-            for index, weight in self._taps(band):
-                pixels = words[index].view(np.uint8).reshape(*index.shape, 4)
-                if counted is not None:
-                    weight = weight * np.maximum(counted[index], np.float32(1e-6))
-                weights += weight
-                if channels == 4:
-                    weight = weight * pixels[..., 3]
-                    mixed[..., 3] += weight
-                mixed[..., :3] += weight[..., None] * pixels[..., :3]
-            if channels == 4:
-                mixed[..., :3] /= np.maximum(mixed[..., 3:], 1e-9)
-                mixed[..., 3] /= np.maximum(weights, 1e-9)
-            else:
-                mixed /= np.maximum(weights, 1e-9)[..., None]
-            mixed[~self.valid[band]] = 0.0
-            out[band] = np.clip(np.rint(mixed), 0.0, 255.0)
-        return out
-
-    def mask(self, mask: Bool) -> Bool:
-        """The view of a mask, bool [H, W]: True where valid and sampled from unmasked pixels."""
-        flat = mask.ravel()
-        out = self.valid.copy()
-        for band in self._bands():
-            for index, weight in self._taps(band):
-                # Less than a thousandth of a pixel is rounding.
-                out[band] &= flat[index] | (weight < 1e-3)
-        return out
+            yield lower * width + right, part * across * below
 
 
 def moved_to_side(
     xy: Float64, directions: Float64, photo: WidePhoto, camera: Camera
 ) -> tuple[Float64, Bool]:
-    """Where observations of known points in a wide photo are in one of its views.
+    """Move observations of known points from a wide photo to one of its views.
 
-    As with lenses, a place moves with the projection of its point; what it is off that is turned
-    and scaled as the view is against the photo there, so that errors stay what they are to first
+    An observation moves with the projection of its point. Its reprojection error is mapped by the
+    derivative of the view's projection with respect to the photo's, so it stays the same to first
     order.
 
     Args:
@@ -305,7 +227,7 @@ def moved_to_side(
     """
     norms = np.linalg.norm(directions, axis=1, keepdims=True)
     unit = directions / np.where(norms > 0.0, norms, 1.0)
-    # Two tangents, from the axis that is least along the direction.
+    # Two tangents, built from the axis that is farthest from the direction.
     least = np.eye(3)[np.abs(unit).argmin(axis=1)]
     first = np.cross(unit, least)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
@@ -326,17 +248,12 @@ def moved_to_side(
             difference[:, 0] -= photo.width * np.round(difference[:, 0] / photo.width)
         return difference
 
-    step = 1e-5
-    of_photo = np.stack(
-        [
-            across_edge(in_photo(unit + step * t) - in_photo(unit - step * t))
-            for t in (first, second)
-        ],
-        axis=2,
-    )
-    of_view = np.stack(
-        [in_view(unit + step * t) - in_view(unit - step * t) for t in (first, second)], axis=2
-    )
+    def derivatives(project: Callable[[Float64], Float64]) -> Float64:
+        """Differences [M, 2, 2] of a projection along both tangents."""
+        steps = (1e-5 * first, 1e-5 * second)
+        return np.stack([project(unit + step) - project(unit - step) for step in steps], axis=2)
+
+    of_photo, of_view = across_edge(derivatives(in_photo)), derivatives(in_view)
     ahead = (unit @ camera.viewmat[2, :3]) > 1e-6
     determinant = of_photo[:, 0, 0] * of_photo[:, 1, 1] - of_photo[:, 0, 1] * of_photo[:, 1, 0]
     usable = ahead & np.isfinite(of_view).all(axis=(1, 2)) & (np.abs(determinant) > 1e-30)

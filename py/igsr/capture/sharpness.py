@@ -1,7 +1,7 @@
-"""How blurred photos are, whatever they show, and which stand out among the others.
+"""Measure the blur of photos, and find photos that are blurrier than the rest.
 
-A photo is compared with itself under a further blur: what is blurred already changes little (Crete
-et al., "The Blur Effect: Perception and Estimation with a New No-reference Perceptual Blur Metric",
+A photo is compared with itself after another blur, which changes a blurred photo little (Crete et
+al., "The Blur Effect: Perception and Estimation with a New No-reference Perceptual Blur Metric",
 2007).
 """
 
@@ -16,38 +16,36 @@ Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
-#: Pixels of the longer side, about, at which photos are compared: less blur harms few fits, and
-#: noise is averaged.
-LONGEST = 480
-#: A photo stands out where it is blurred by more than this, and by so much more than the others in
-#: the median. Photos of eleven captures have 0.2 to 0.46; a blur by 0.4 percent of the width, 0.65.
-BLURRED, MORE_THAN_OTHERS = 0.6, 0.2
-#: Pixels of the further blur.
-_BLUR = 9
+#: Longer side of the reduced photos that are compared: less blur harms few fits, and reduction
+#: averages noise.
+_REDUCED_SIDE_PX = 480
+#: Minimum blur of a photo that is reported, and its minimum excess over the median. Photos of
+#: eleven captures have 0.2 to 0.46; after a blur by 0.4 percent of the width, 0.65.
+_MIN_BLUR = 0.6
+_MIN_BLUR_OVER_MEDIAN = 0.2
+#: Width of the second blur.
+_BLUR_PX = 9
 
 
 def blur(image: UInt8, mask: Bool | None = None) -> float:
-    """How blurred a photo is: 0 for noise, 1 for what shows no detail.
+    """Measure the blur of a photo: 0 for noise, 1 without any detail.
 
     Args:
         image: uint8 [H, W, 3 or 4].
         mask: bool [H, W] of the pixels that count, or None.
     """
-    factor = max(1, round(max(image.shape[:2]) / LONGEST))
-    grey = _reduced(image[..., :3].mean(axis=2), factor)
-    counted = np.ones(grey.shape, dtype=bool) if mask is None else _reduced(mask, factor) > 0.999
+    factor = max(1, round(max(image.shape[:2]) / _REDUCED_SIDE_PX))
+    gray = _reduced(image[..., :3].mean(axis=2), factor)
+    counted = np.ones(gray.shape, dtype=bool) if mask is None else _reduced(mask, factor) > 0.999
     if image.shape[2] == 4:
         counted &= _reduced(image[..., 3], factor) > 254.0
     ratios = []
-    for axis in (0, 1):
-        plane = grey if axis == 0 else grey.T
-        used = counted if axis == 0 else counted.T
-        if len(plane) <= _BLUR:
+    for plane, used in ((gray, counted), (gray.T, counted.T)):
+        if len(plane) <= _BLUR_PX:
             return 0.0
-        blurred = _means(plane)
         both = used[1:] & used[:-1]
         before = np.abs(np.diff(plane, axis=0))[both]
-        after = np.abs(np.diff(blurred, axis=0))[both]
+        after = np.abs(np.diff(row_means(plane, _BLUR_PX), axis=0))[both]
         total = float(before.sum())
         if total <= 1e-9 * max(1, before.size):
             return 1.0
@@ -56,31 +54,31 @@ def blur(image: UInt8, mask: Bool | None = None) -> float:
 
 
 def blurred_photos(photos: Iterable[tuple[str, UInt8, Bool | None]]) -> set[str]:
-    """Names of photos that are blurred where the others are not.
+    """Return the names of photos that are much blurrier than the rest.
 
-    Of a panorama, the sharpest view counts.
+    The sharpest view of a panorama counts. Photos without any detail are not reported as blurred.
 
     Args:
-        photos: name, image and mask of each; views of one panorama have one name.
+        photos: name, image and mask of each; views of one panorama share one name.
     """
-    found: dict[str, float] = {}
+    blurs: dict[str, float] = {}
     for name, image, mask in photos:
-        found[name] = min(found.get(name, 1.0), blur(image, mask))
-    usual = float(np.median(list(found.values()))) if found else 0.0
-    limit = max(BLURRED, usual + MORE_THAN_OTHERS)
-    # What shows nothing at all has no detail to be blurred; it is told apart elsewhere.
-    return {name for name, value in found.items() if limit < value < 1.0}
+        blurs[name] = min(blurs.get(name, 1.0), blur(image, mask))
+    median = float(np.median(list(blurs.values()))) if blurs else 0.0
+    limit = max(_MIN_BLUR, median + _MIN_BLUR_OVER_MEDIAN)
+    return {name for name, value in blurs.items() if limit < value < 1.0}
 
 
 def _reduced(plane: np.ndarray, factor: int) -> Float64:
-    """Means of squares; what is left over at the right and below does not count."""
+    """Means of squares; incomplete squares at the right and bottom are dropped."""
     height, width = (max(1, length // factor) for length in plane.shape)
-    whole = plane[: height * factor, : width * factor].astype(np.float64)
-    parts = whole.reshape(height, whole.shape[0] // height, width, whole.shape[1] // width)
-    return np.asarray(parts.mean(axis=(1, 3)))
+    cropped = plane[: height * factor, : width * factor].astype(np.float64)
+    squares = cropped.reshape(height, cropped.shape[0] // height, width, cropped.shape[1] // width)
+    return np.asarray(squares.mean(axis=(1, 3)))
 
 
-def _means(plane: Float64) -> Float64:
-    half = _BLUR // 2
+def row_means(plane: Float64, rows: int) -> Float64:
+    """Return the mean of an odd number of rows around each pixel, float64 [H, W]."""
+    half = rows // 2
     padded = np.pad(plane, ((half + 1, half), (0, 0)), mode="edge").cumsum(axis=0)
-    return np.asarray((padded[_BLUR:] - padded[:-_BLUR]) / _BLUR)
+    return np.asarray((padded[rows:] - padded[:-rows]) / rows)

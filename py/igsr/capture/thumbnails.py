@@ -9,16 +9,15 @@ from igsr._internal.notebook import Picture
 if TYPE_CHECKING:
     from igsr.capture import Capture, View
 
-#: Photos in the strip of a capture.
-MOST_PHOTOS = 5
+_MAX_PHOTOS = 5
 
 
 def view_pictures(view: View) -> list[Picture]:
-    """The photo of a view."""
+    """Return the photo of a view."""
     return [view.image]
 
 
 def capture_pictures(capture: Capture) -> list[Picture]:
-    """A few photos of a capture, evenly spaced."""
-    count = min(MOST_PHOTOS, len(capture.views))
+    """Return a few photos of a capture, evenly spaced."""
+    count = min(_MAX_PHOTOS, len(capture.views))
     return [capture.views[k * len(capture.views) // count].image for k in range(count)]

@@ -1,4 +1,4 @@
-"""Cameras, views, points and captures: the types that readers return and fits take."""
+"""The types that readers of captures return and fits take: cameras, views, points, captures."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from igsr.capture.exposure import Exposure
 from igsr.capture.sharpness import blurred_photos
 from igsr.errors import IgsrError
 
-# Files written with four or five decimals are this far from a rotation. What is further away has a
-# scale or a shear, or is another field.
+# Maximum of |R R^T - I|: numbers of four or five decimals stay below it, scale and shear do not.
 RIGID_TOLERANCE = 1e-3
-# A rotation computed in float64 is this near to an exact one.
+# Maximum of |R R^T - I| of a rotation that was computed in float64.
 ROUNDING = 1e-13
 
 
@@ -28,12 +27,12 @@ class Camera(ArrayEquality):
     """A pinhole camera in OpenCV axes: x right, y down, z forward.
 
     The point (x, y, z) of the camera frame has the pixel coordinates
-    (fx x / z + cx, fy y / z + cy); pixel (column i, row j) has its centre at (i + 0.5, j + 0.5).
+    (fx x / z + cx, fy y / z + cy); pixel (column i, row j) has its center at (i + 0.5, j + 0.5).
     Cameras with the same fields are equal (``==``) and have the same hash.
 
     Attributes:
-        viewmat: float64 [4, 4], world to camera, in world units. It must be rigid within 1e-3;
-            its rotation is replaced by the nearest exact one.
+        viewmat: float64 [4, 4], world to camera, in world units. It must be rigid within 1e-3; the
+            nearest exact rotation replaces its 3x3 block.
         K: float64 [3, 3], pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive.
         width: columns of the image, at least 1.
         height: rows of the image, at least 1.
@@ -48,13 +47,12 @@ class Camera(ArrayEquality):
     height: int
 
     def __post_init__(self) -> None:
-        """Check and normalise the fields."""
         object.__setattr__(self, "viewmat", nearest_rigid(self.viewmat, "viewmat"))
         object.__setattr__(self, "K", _checked_intrinsics(self.K))
         for name in ("width", "height"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-                raise IgsrError(f"{name} is {value!r} where a whole number of at least 1 belongs")
+                raise IgsrError(f"{name} is {value!r}; give a whole number of pixels, at least 1")
             object.__setattr__(self, name, int(value))
 
     def __hash__(self) -> int:
@@ -64,38 +62,36 @@ class Camera(ArrayEquality):
         fx, fy = self.K[0, 0], self.K[1, 1]
         return (
             f"Camera({self.width}x{self.height}, focal lengths {numbers((fx, fy))}, "
-            f"centre {numbers(self.centre)})"
+            f"center {numbers(self.center)})"
         )
 
     @property
-    def centre(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         """float64 [3]: the camera's position in the world frame, in world units."""
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """What a camera that was found rests on, and how well it is known.
+    """The source of an estimated camera, and its uncertainty.
 
     Attributes:
-        rests_on: "features" (places that photos share), "network" (what a network predicts) or
-            "both".
+        rests_on: "features" (matches between photos), "network" (a network's prediction) or "both".
         rotation: standard deviation about each axis, degrees.
-        centre: standard deviation along each axis, world units.
+        center: standard deviation along each axis, world units.
 
     Raises:
-        IgsrError: it rests on something else, or a deviation is negative or not finite.
+        IgsrError: ``rests_on`` has another value, or a deviation is negative or not finite.
     """
 
     rests_on: str
     rotation: float
-    centre: float
+    center: float
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         if self.rests_on not in ("features", "network", "both"):
             raise IgsrError(f"rests_on is {self.rests_on!r}; give 'features', 'network' or 'both'")
-        for name in ("rotation", "centre"):
+        for name in ("rotation", "center"):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise IgsrError(
                     f"the {name} of pose_evidence is {getattr(self, name)!r}; give a finite number "
@@ -113,26 +109,26 @@ class View(ArrayEquality, NotebookPicture):
         name: the photo's posix path relative to the capture; unique within it.
         camera: the pinhole camera of ``image``.
         split: "train" or "test".
-        image: uint8 [H, W, 3] RGB, or [H, W, 4] RGB with straight (not premultiplied) alpha, with
-            lens distortion already undone.
-        mask: bool [H, W], True where a pixel may be used, or None if all may. It joins the given
-            mask and the pixels that undistortion could fill.
-        exposure: gain and offset of the photo's colors, where a fit has found them; None where they
-            are not known, or are those of the scene. Scores of the view are of renders with them.
-        exposure_value: how much light the photo took by its EXIF, in stops (log2 of seconds times
-            ISO / 100 over the f-number squared), or None.
-        depth: float32 [H, W], camera-space z of what each pixel shows, world units, from a sensor
-            or a network; 0 where it is not known. None where it is known nowhere.
-        depth_confidence: float32 [H, W], how far each depth may be trusted, in [0, 1]; None: all as
-            far as any.
+        image: uint8 [H, W, 3] RGB, or [H, W, 4] RGB with straight (not premultiplied) alpha,
+            without lens distortion.
+        mask: bool [H, W], True for pixels that may be used, or None if all may. It combines the
+            photo's own mask with the pixels that undistortion could fill.
+        exposure: gain and offset of the photo's colors, found by a fit, or None for the scene's own
+            colors. Scores compare the photo with renders at this exposure.
+        exposure_value: exposure from the photo's EXIF, in stops (log2 of seconds times ISO / 100
+            over the f-number squared), or None.
+        depth: float32 [H, W], camera-space z of each pixel, world units, from a sensor or a
+            network; 0 for unknown pixels. None if all are unknown.
+        depth_confidence: float32 [H, W], confidence of each depth in [0, 1]; None: all are equally
+            reliable.
         rig: the name that views of one wide photo (a panorama, a fisheye photo of more than 120
-            degrees) share: they have one centre, move together and are held out together. None for
+            degrees) share: they have one center, move together and are held out together. None for
             other photos.
-        pose_evidence: what the camera rests on, where igsr found it; or None.
+        pose_evidence: source and uncertainty of an estimated camera, or None.
 
     Raises:
-        IgsrError: the image, mask or depth has a dtype or shape that does not fit the camera's
-            size, or a depth is negative or not finite.
+        IgsrError: the image, mask or depth has another dtype or shape than the camera's size
+            requires, or a depth is negative or not finite.
     """
 
     _pictures_by: ClassVar[str] = "igsr.capture.thumbnails:view_pictures"
@@ -150,7 +146,6 @@ class View(ArrayEquality, NotebookPicture):
     pose_evidence: PoseEvidence | None = None
 
     def __post_init__(self) -> None:
-        """Check the pixels against the camera."""
         size = (self.camera.height, self.camera.width)
         self._check("image", self.image, np.uint8, [(*size, 3), (*size, 4)])
         if self.mask is not None:
@@ -168,7 +163,7 @@ class View(ArrayEquality, NotebookPicture):
 
     @property
     def photo(self) -> str:
-        """The name of the photo that this is of: that of its rig, or its own."""
+        """The name of the photo that the view is part of: its rig, or else its own name."""
         return self.name if self.rig is None else self.rig
 
     def __repr__(self) -> str:
@@ -179,7 +174,7 @@ class View(ArrayEquality, NotebookPicture):
 
     @property
     def known_depth(self) -> np.ndarray | None:
-        """``depth``, and 0 also where its confidence is 0; None where there is none."""
+        """``depth`` with 0 for pixels of confidence 0; None without depth."""
         if self.depth is None or self.depth_confidence is None:
             return self.depth
         return np.where(self.depth_confidence > 0.0, self.depth, np.float32(0.0))
@@ -201,13 +196,13 @@ class View(ArrayEquality, NotebookPicture):
 
 @dataclass(eq=False, repr=False)
 class PseudoView(View):
-    """A made-up picture that a fit uses like a photo, such as a denoised novel view.
+    """An image that a fit uses like a photo, such as a denoised novel view.
 
-    Fits take at least five steps on photos for one on a pseudo-view, and none on pseudo-views in
-    the last fifth of the steps.
+    Fits take at least five steps on photos for each step on a pseudo-view, and none on pseudo-views
+    in the last fifth of the steps.
 
     Attributes:
-        weights: float32 [H, W], weight of each pixel beside a photo's pixel, which has 1.
+        weights: float32 [H, W], weight of each pixel, finite and not negative; photos have 1.
         background: RGB in [0, 1] behind the content of the image; None if it is unknown.
 
     Raises:
@@ -233,21 +228,19 @@ class PseudoView(View):
 
 
 def photos_among(views: Sequence[View]) -> list[View]:
-    """The views that are photos, not pseudo-views; all if none is a photo."""
+    """Return the views that are photos, not pseudo-views; all if none is a photo."""
     return [view for view in views if not isinstance(view, PseudoView)] or list(views)
 
 
 @dataclass(eq=False, repr=False)
 class Tracks(ArrayEquality):
-    """Where photos see points: M observations.
-
-    Two are equal (``==``) if all their fields are.
+    """M observations of points in photos. Two are equal (``==``) if all their fields are.
 
     Attributes:
         names: names of the photos, as ``View.name``.
         view: int64 [M], index into ``names``.
         point: int64 [M], index of the point.
-        xy: float64 [M, 2], pixel coordinates in the undistorted photo (pixel centres at +0.5).
+        xy: float64 [M, 2], pixel coordinates in the undistorted photo (pixel centers at +0.5).
 
     Raises:
         IgsrError: shapes differ, an index is out of range, or a coordinate is not finite.
@@ -259,7 +252,6 @@ class Tracks(ArrayEquality):
     xy: np.ndarray
 
     def __post_init__(self) -> None:
-        """Check that the observations belong together."""
         count = len(self.view)
         if self.view.shape != (count,) or self.point.shape != (count,):
             raise IgsrError("tracks: view and point must be lists of one length")
@@ -274,17 +266,15 @@ class Tracks(ArrayEquality):
 
 @dataclass(eq=False, repr=False)
 class Points(ArrayEquality):
-    """A point cloud of P points in the world frame.
-
-    Two are equal (``==``) if all their fields are.
+    """P points in the world frame. Two clouds are equal (``==``) if all their fields are.
 
     Attributes:
         xyz: float64 [P, 3], world units.
         rgb: uint8 [P, 3].
         confidence: float64 [P], confidence in each position, positive, in any unit: only the
-            order counts. None if it is not known.
-        tracks: where photos see the points, or None if it is not known. Fits that move cameras
-            take pose priors from them.
+            order counts. None if it is unknown.
+        tracks: observations of the points in photos, or None if they are unknown. Fits that move
+            cameras derive pose priors from them.
 
     Raises:
         IgsrError: confidence has another shape or holds a number that is not positive and finite,
@@ -297,21 +287,18 @@ class Points(ArrayEquality):
     tracks: Tracks | None = None
 
     def __post_init__(self) -> None:
-        """Check confidence and tracks against the points."""
         seen = () if self.tracks is None else self.tracks.point
         if len(seen) and not (np.min(seen) >= 0 and np.max(seen) < len(self.xyz)):
-            raise IgsrError("tracks: point has an index that is none of the points'")
+            raise IgsrError("tracks: point has an index without a point")
         if self.confidence is None:
             return
         try:
             self.confidence = np.asarray(self.confidence, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise IgsrError("confidence is not a list of numbers; give one per point") from error
-        if self.confidence.shape != (len(self.xyz),):
-            raise IgsrError(
-                f"confidence has shape {list(self.confidence.shape)}; give [{len(self.xyz)}], one "
-                "number per point"
-            )
+        shape = self.confidence.shape
+        if shape != (len(self.xyz),):
+            raise IgsrError(f"confidence has shape {list(shape)}; give [{len(self.xyz)}]")
         if not (np.isfinite(self.confidence) & (self.confidence > 0.0)).all():
             raise IgsrError(
                 "confidence holds a number that is not positive and finite; remove such points"
@@ -322,10 +309,10 @@ class Points(ArrayEquality):
         return f"Points({len(self.xyz)} points{''.join(f', {name}' for name in known)})"
 
     def seen_by(self, names: Iterable[str]) -> Points:
-        """The points that at least two of these photos see, without tracks.
+        """Return the points that at least two of the given photos observe, without tracks.
 
-        A fit of these photos must not know what only other photos show. Without tracks, all
-        points are returned.
+        This hides points from a fit that only held-out photos show. Without tracks, all points are
+        returned.
 
         Args:
             names: names of the photos, as ``View.name``.
@@ -373,87 +360,85 @@ class Capture(ArrayEquality, NotebookPicture):
 
     @property
     def test_views(self) -> list[View]:
-        """The views held out for testing: scored, never fitted."""
+        """The held-out views, which are scored and never fitted."""
         return [view for view in self.views if view.split == "test"]
 
     def with_holdout(self, every: int) -> Capture:
-        """Hold out every Nth view for testing.
+        """Hold out every Nth photo for testing.
 
-        The views of one rig count as one. A photo that is blurred where the others are not would
-        score a fit that is right as wrong: the next one is held out instead.
+        The views of one rig count as one photo. If a photo is blurred and its neighbors are sharp,
+        the next sharp one is held out instead: a blurred photo gives a good fit a bad score.
 
         Args:
-            every: of the views in the order of their names, those whose index is a multiple of
-                ``every`` become "test", all others "train". LLFF and 3DGS use 8.
+            every: photos, sorted by name, whose index is a multiple of ``every`` become "test", all
+                others "train". LLFF and 3DGS use 8.
 
         Returns:
             A capture with the new split. It shares the images with this one.
 
         Raises:
-            IgsrError: ``every`` is not a whole number of at least 2, or there is only one view.
+            IgsrError: ``every`` is not a whole number of at least 2, or there is only one photo.
         """
-        if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 2:
-            raise IgsrError(f"holdout is {every!r}; give a whole number of at least 2, such as 8")
         photos = sorted({view.photo for view in self.views})
-        if len(photos) < 2:
-            raise IgsrError(
-                f"{self.path} has one view only, so none can be held out; leave holdout out"
-            )
+        check_holdout(every, len(photos), self.path)
         blurred = blurred_photos((view.photo, view.image, view.mask) for view in self.views)
         spans = (photos[first : first + every] for first in range(0, len(photos), every))
-        sharp = ([name for name in span if name not in blurred] for span in spans)
-        held_out = {span[0] for span in sharp if span}
+        sharp_spans = ([name for name in span if name not in blurred] for span in spans)
+        held_out = {span[0] for span in sharp_spans if span}
         views = [
             replace(view, split="test" if view.photo in held_out else "train")
             for view in self.views
         ]
         return Capture(self.path, views, self.points)
 
-    def _centres(self) -> np.ndarray:
-        views = self.train_views or self.views
-        return np.stack([view.camera.centre for view in views])
+    def _camera_centers(self) -> np.ndarray:
+        return np.stack([view.camera.center for view in self.train_views or self.views])
 
     @property
-    def scene_centre(self) -> np.ndarray:
-        """float64 [3]: the mean of the training cameras' centres, in world units."""
-        return np.asarray(self._centres().mean(axis=0))
+    def scene_center(self) -> np.ndarray:
+        """float64 [3]: the mean of the training cameras' centers, in world units."""
+        return np.asarray(self._camera_centers().mean(axis=0))
 
     @property
     def scene_extent(self) -> float:
-        """1.1 times the largest distance of a training camera from ``scene_centre``, world units.
+        """1.1 times the largest distance of a training camera from ``scene_center``, world units.
 
         3DGS scales its learning rates and thresholds by this length (Kerbl et al. 2023). It is 1
-        if all cameras are at the same place: 0 would freeze every fit.
+        if all cameras are at the same place, since 0 would freeze every fit.
         """
-        centres = self._centres()
-        extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+        offsets = self._camera_centers() - self.scene_center
+        extent = 1.1 * float(np.linalg.norm(offsets, axis=1).max())
         return extent if extent > 0.0 else 1.0
 
 
+def check_holdout(every: object, photos: int, path: Path) -> None:
+    """Check that every ``every``-th of so many photos, loaded from ``path``, can be held out.
+
+    Raises:
+        IgsrError: ``every`` is not a whole number of at least 2, or there is only one photo.
+    """
+    if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 2:
+        raise IgsrError(f"holdout is {every!r}; give a whole number of at least 2, such as 8")
+    if photos < 2:
+        raise IgsrError(f"{path} has one photo only, so none can be held out; leave holdout out")
+
+
 def nearest_rigid(matrix: np.ndarray, name: str) -> np.ndarray:
-    """The rigid matrix nearest to one that is rigid up to rounding.
+    """Return the rigid matrix, float64 [4, 4], nearest to one that is rigid up to rounding.
 
     Args:
-        matrix: [4, 4], in any numeric dtype.
-        name: begins the error message.
-
-    Returns:
-        float64 [4, 4].
+        matrix: [4, 4], of any numeric dtype.
+        name: of the matrix, for error messages.
 
     Raises:
         IgsrError: the matrix is not [4, 4], not finite, or further than 1e-3 from rigid.
     """
-    try:
-        matrix = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise IgsrError(f"{name} is not a matrix of numbers; give 4 rows of 4") from error
-    if matrix.shape != (4, 4):
-        raise IgsrError(f"{name} has shape {list(matrix.shape)}; give [4, 4]")
+    matrix = _matrix_of_floats(matrix, name, 4)
     if not np.isfinite(matrix).all():
         raise IgsrError(f"{name} holds a NaN or infinite entry; give a finite pose")
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
         raise IgsrError(f"{name} ends in the row {matrix[3].tolist()}; it must be [0, 0, 0, 1]")
-    # Huge entries would overflow the products below and say no more than "not rigid" either.
+    # Clipped, so that the products below do not overflow.
     block = np.clip(matrix[:3, :3], -1e100, 1e100)
     scale = float(np.cbrt(abs(np.linalg.det(block))))
     deviation = float(np.abs(block @ block.T - np.eye(3)).max())
@@ -470,7 +455,7 @@ def nearest_rigid(matrix: np.ndarray, name: str) -> np.ndarray:
         raise IgsrError(f"{name} is a reflection (determinant -1); flip one axis of its rotation")
     rigid = np.eye(4)
     rigid[:3, :3] = block
-    if deviation > ROUNDING:  # or a camera made from another's matrix would differ in its last bits
+    if deviation > ROUNDING:  # keeps the bits of a matrix that is exact already
         u, _, vt = np.linalg.svd(block)
         rigid[:3, :3] = u @ vt
     rigid[:3, 3] = matrix[:3, 3]
@@ -478,12 +463,7 @@ def nearest_rigid(matrix: np.ndarray, name: str) -> np.ndarray:
 
 
 def _checked_intrinsics(K: np.ndarray) -> np.ndarray:
-    try:
-        K = np.array(K, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise IgsrError("K is not a matrix of numbers; give 3 rows of 3") from error
-    if K.shape != (3, 3):
-        raise IgsrError(f"K has shape {list(K.shape)}; give [3, 3]")
+    K = _matrix_of_floats(K, "K", 3)
     for name, value in (("fx", K[0, 0]), ("fy", K[1, 1])):
         if not (np.isfinite(value) and value > 0.0):
             raise IgsrError(
@@ -498,6 +478,17 @@ def _checked_intrinsics(K: np.ndarray) -> np.ndarray:
     return K
 
 
+def _matrix_of_floats(matrix: np.ndarray, name: str, size: int) -> np.ndarray:
+    """A copy as float64 [size, size]."""
+    try:
+        copy = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise IgsrError(f"{name} is not a matrix of numbers; give {size} rows of {size}") from error
+    if copy.shape != (size, size):
+        raise IgsrError(f"{name} has shape {list(copy.shape)}; give [{size}, {size}]")
+    return copy
+
+
 def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """The pinhole matrix, float64 [3, 3], of focal lengths and principal point in pixels."""
+    """Return the pinhole matrix, float64 [3, 3], of focal lengths and principal point in pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

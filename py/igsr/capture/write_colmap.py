@@ -1,11 +1,10 @@
 """Write captures for COLMAP: ``sparse/0``, ``images/``, ``masks/`` and ``depths/``.
 
-Cameras are PINHOLE. Where views are of wide photos, the model has rigs and frames (COLMAP 3.12).
-Of an image's features, only those of points are written. A point with a track gets the error that
-its confidence was made from (see ``track_confidence``; -1, as in COLMAP, if it is not known). A
-point without a track gets 1 / confidence as its error (0 if it is not known). ``load_capture``
-reads both back. A mask has the photo's whole name and ``.png``, as COLMAP's feature extraction
-expects.
+Cameras are PINHOLE. If views are of wide photos, the model has rigs and frames (COLMAP 3.12). Of an
+image's features, only those with points are written. A point with a track gets the error that its
+confidence was computed from (``track_confidence``; -1, as in COLMAP, if it is unknown), a point
+without a track 1 / confidence (0 if it is unknown). ``load_capture`` reads both back. A mask has
+the photo's whole name and ``.png``, as COLMAP's feature extraction expects.
 
 Source of the formats: https://colmap.github.io/format.html.
 """
@@ -15,19 +14,23 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.atomic_write import atomic_folder
-from igsr.capture.colmap_rigs import Rigs, pose_numbers
-from igsr.capture.types import Camera, Capture, Points
+from igsr.capture import colmap_files as layouts
+from igsr.capture.downscaling import resampled_plane
+from igsr.capture.types import Camera, Capture, Points, View
 from igsr.capture.write_files import png_names, save_png, write_depths, write_pictures
 
 Float64 = npt.NDArray[np.float64]
 
-_PINHOLE = 1
+_PINHOLE = 1  # COLMAP's number of the camera model
+#: Decimals to which rotations within a rig are compared.
+_RIG_DECIMALS = 9
 
 
 def write_colmap(
@@ -63,158 +66,238 @@ def write_colmap(
         for kind, masks in (further_masks or {}).items():
             for view, name, mask in zip(capture.views, names, masks, strict=True):
                 if mask is not None:
-                    save_png(folder / kind / f"{name}.png", _at_size(mask, view.camera))
+                    full = resampled_plane(mask, view.camera.width, view.camera.height)
+                    save_png(folder / kind / f"{name}.png", 255 * full.astype(np.uint8))
         for note, content in (notes or {}).items():
             (folder / note).write_bytes(content.encode() if isinstance(content, str) else content)
-        model = folder / "sparse" / "0"
-        model.mkdir(parents=True)
-        cameras = [view.camera for view in capture.views]
-        seen = _Seen(capture)
-        distinct, number_of = _distinct(cameras)
+        path = folder / "sparse" / "0"
+        path.mkdir(parents=True)
+        model = _model(capture, names)
+        (_write_text if text else _write_binary)(path, model)
         if any(view.rig is not None for view in capture.views):
-            rigs = Rigs(capture.views)
-            distinct, number_of = rigs.cameras, rigs.number_of
-            rigs.write(model, text)
-        write = _write_text if text else _write_binary
-        write(model, cameras, names, distinct, number_of, capture.points, seen)
+            (_write_rigs_as_text if text else _write_rigs)(path, model)
 
 
-class _Seen:
-    """Where the views of a capture see its points.
+#: The numbers of a rig's cameras, and their poses relative to the first one.
+_Rig = tuple[list[int], list[Float64]]
+#: The number of a frame's rig, its pose and the numbers of its images.
+_Frame = tuple[int, Float64, list[int]]
 
-    Attributes:
-        places: per view float64 [N, 2], pixels.
-        ids: per view int64 [N], numbers of the points in the file, from 1.
-        tracks: per point int64 [L, 2]: the number of the image, from 1, and which of its features.
+
+@dataclass(frozen=True)
+class _Image:
+    """An image: ``camera`` is the number of its camera; ``xy`` [N, 2] are its features, in pixels.
+
+    ``pose`` is quaternion wxyz and translation, world to camera.
     """
 
-    def __init__(self, capture: Capture) -> None:
-        self.places = [np.zeros((0, 2))] * len(capture.views)
-        self.ids = [np.zeros(0, dtype=np.int64)] * len(capture.views)
-        self.tracks = [np.zeros((0, 2), dtype=np.int64)] * (
-            0 if capture.points is None else len(capture.points.xyz)
+    name: str
+    camera: int
+    pose: list[float]
+    xy: np.ndarray
+    point_ids: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The contents of a model's files; numbers count from 1, in the order of the lists."""
+
+    cameras: list[Camera]
+    images: list[_Image]
+    # Position, color, error in pixels, and track [L, 2]: images and indices of their features.
+    points: list[tuple[list[float], list[int], float, np.ndarray]]
+    rigs: list[_Rig]
+    frames: list[_Frame]
+
+
+def _model(capture: Capture, names: list[str]) -> _Model:
+    cameras, rigs, frames = _rigs(capture.views)
+    features, tracks = _features(capture)
+    camera_of: dict[int, int] = {}
+    for rig, _, members in frames:
+        camera_of |= dict(zip(members, rigs[rig - 1][0], strict=True))
+    images = [
+        _Image(name, camera_of[number], pose_numbers(view.camera.viewmat), *feature)
+        for number, (name, view, feature) in enumerate(
+            zip(names, capture.views, features, strict=True), start=1
         )
-        tracks = None if capture.points is None else capture.points.tracks
-        if tracks is None:
-            return
-        number_of = {name: number for number, name in enumerate(tracks.names)}
-        points, elements = [], []
-        for index, view in enumerate(capture.views):
-            mine = np.flatnonzero(tracks.view == number_of.get(view.name, -1))
-            self.places[index], self.ids[index] = tracks.xy[mine], tracks.point[mine] + 1
-            points.append(tracks.point[mine])
-            image = np.full(len(mine), index + 1)
-            elements.append(np.stack([image, np.arange(len(mine))], axis=1))
-        point = np.concatenate(points)
-        order = np.argsort(point, kind="stable")
-        ends = np.cumsum(np.bincount(point, minlength=len(self.tracks)))
-        # Splitting nothing gives one part.
-        self.tracks = np.split(np.concatenate(elements)[order], ends[:-1])[: len(self.tracks)]
+    ]
+    points = []
+    if capture.points is not None:
+        xyz, rgb = capture.points.xyz.tolist(), capture.points.rgb.tolist()
+        errors = _errors(capture.points, tracks).tolist()
+        points = list(zip(xyz, rgb, errors, tracks, strict=True))
+    return _Model(cameras, images, points, rigs, frames)
 
 
-def _at_size(mask: np.ndarray, camera: Camera) -> np.ndarray:
-    """A mask [h, w] as 0 and 255 in the pixels of a camera, each from the nearest."""
-    row, column = (
-        ((np.arange(size) + 0.5) * given / size).astype(np.int64)
-        for size, given in zip((camera.height, camera.width), mask.shape, strict=True)
-    )
-    return 255 * mask[np.ix_(row, column)].astype(np.uint8)
+def _rigs(views: Sequence[View]) -> tuple[list[Camera], list[_Rig], list[_Frame]]:
+    """Distinct cameras, rigs and frames: the images of one photo are a frame.
+
+    Each view of a rig has its own camera, since COLMAP's sensors are cameras.
+    """
+    photos: dict[str, list[int]] = {}
+    for number, view in enumerate(views, start=1):
+        photos.setdefault(view.photo, []).append(number)
+    cameras: list[Camera] = []
+    rigs: list[_Rig] = []
+    frames: list[_Frame] = []
+    rig_numbers: dict[object, int] = {}
+    for members in photos.values():
+        of_photo = [views[number - 1].camera for number in members]
+        from_world = of_photo[0].viewmat
+        poses = [camera.viewmat @ np.linalg.inv(from_world) for camera in of_photo]
+        turns = [(pose[:3, :3].round(_RIG_DECIMALS) + 0.0).tobytes() for pose in poses]
+        key = tuple(
+            (camera.K.tobytes(), camera.width, camera.height, turn)
+            for camera, turn in zip(of_photo, turns, strict=True)
+        )
+        if key not in rig_numbers:
+            start = len(cameras) + 1
+            cameras += of_photo
+            rigs.append((list(range(start, start + len(members))), poses))
+            rig_numbers[key] = len(rigs)
+        frames.append((rig_numbers[key], from_world, members))
+    return cameras, rigs, frames
 
 
-def _distinct(cameras: list[Camera]) -> tuple[list[Camera], list[int]]:
-    """Cameras of different intrinsics, and each one's number among them, from 1."""
-    numbers: dict[object, int] = {}
-    distinct, number_of = [], []
-    for camera in cameras:
-        key = camera.K.tobytes(), camera.width, camera.height
-        if key not in numbers:
-            numbers[key] = len(numbers) + 1
-            distinct.append(camera)
-        number_of.append(numbers[key])
-    return distinct, number_of
+def _features(
+    capture: Capture,
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], list[np.ndarray]]:
+    """Features of each view (``xy`` and ``point_ids`` of an image), and the track of each point."""
+    features = [(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))] * len(capture.views)
+    count = 0 if capture.points is None else len(capture.points.xyz)
+    tracks = None if capture.points is None else capture.points.tracks
+    if tracks is None:
+        return features, [np.zeros((0, 2), dtype=np.int64)] * count
+    number_of = {name: number for number, name in enumerate(tracks.names)}
+    points, elements = [], []
+    for index, view in enumerate(capture.views):
+        rows = np.flatnonzero(tracks.view == number_of.get(view.name, -1))
+        features[index] = tracks.xy[rows], tracks.point[rows] + 1
+        points.append(tracks.point[rows])
+        elements.append(np.stack([np.full(len(rows), index + 1), np.arange(len(rows))], axis=1))
+    point = np.concatenate(points)
+    order = np.argsort(point, kind="stable")
+    ends = np.cumsum(np.bincount(point, minlength=count))
+    # Splitting an empty array gives one part.
+    return features, np.split(np.concatenate(elements)[order], ends[:-1])[:count]
 
 
-def _parameters(camera: Camera) -> list[float]:
-    K = camera.K
-    return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
-
-
-def _errors(points: Points, seen: _Seen) -> Float64:
-    length = np.array(list(map(len, seen.tracks)))
+def _errors(points: Points, tracks: list[np.ndarray]) -> Float64:
+    length = np.array(list(map(len, tracks)))
     if points.confidence is None:
         return np.where(length > 0, -1.0, 0.0)
     of_track = np.maximum(length / points.confidence - 1.0, 0.0)
     return np.where(length > 0, of_track, 1.0 / points.confidence)
 
 
-def _write_binary(
-    model: Path,
-    cameras: list[Camera],
-    names: list[str],
-    distinct: list[Camera],
-    number_of: list[int],
-    points: Points | None,
-    seen: _Seen,
-) -> None:
-    with open(model / "cameras.bin", "wb") as file:
-        file.write(struct.pack("<Q", len(distinct)))
-        for number, camera in enumerate(distinct, start=1):
-            file.write(struct.pack("<IiQQ", number, _PINHOLE, camera.width, camera.height))
+def _parameters(camera: Camera) -> list[float]:
+    return [float(camera.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
+
+
+def _write_binary(folder: Path, model: _Model) -> None:
+    with open(folder / "cameras.bin", "wb") as file:
+        file.write(layouts.COUNT.pack(len(model.cameras)))
+        for number, camera in enumerate(model.cameras, start=1):
+            file.write(layouts.CAMERA.pack(number, _PINHOLE, camera.width, camera.height))
             file.write(struct.pack("<4d", *_parameters(camera)))
-    with open(model / "images.bin", "wb") as file:
-        file.write(struct.pack("<Q", len(cameras)))
-        for image, (camera, name, number) in enumerate(
-            zip(cameras, names, number_of, strict=True), start=1
-        ):
-            file.write(struct.pack("<I7dI", image, *pose_numbers(camera.viewmat), number))
-            file.write(name.encode() + b"\0")
-            features = np.zeros(len(seen.ids[image - 1]), dtype=[("xy", "<f8", 2), ("id", "<i8")])
-            features["xy"], features["id"] = seen.places[image - 1], seen.ids[image - 1]
-            file.write(struct.pack("<Q", len(features)) + features.tobytes())
-    with open(model / "points3D.bin", "wb") as file:
-        file.write(struct.pack("<Q", 0 if points is None else len(points.xyz)))
-        if points is None:
-            return
-        rows = zip(points.xyz, points.rgb, _errors(points, seen), seen.tracks, strict=True)
-        for number, (xyz, rgb, error, track) in enumerate(rows, start=1):
-            file.write(struct.pack("<Q3d3BdQ", number, *xyz, *rgb, error, len(track)))
+    with open(folder / "images.bin", "wb") as file:
+        file.write(layouts.COUNT.pack(len(model.images)))
+        for number, image in enumerate(model.images, start=1):
+            file.write(layouts.IMAGE.pack(number, *image.pose, image.camera))
+            file.write(image.name.encode() + b"\0")
+            features = np.zeros(len(image.xy), dtype=layouts.OBSERVATION)
+            features["xy"], features["point"] = image.xy, image.point_ids
+            file.write(layouts.COUNT.pack(len(features)) + features.tobytes())
+    with open(folder / "points3D.bin", "wb") as file:
+        file.write(layouts.COUNT.pack(len(model.points)))
+        for number, (xyz, rgb, error, track) in enumerate(model.points, start=1):
+            file.write(layouts.POINT.pack(number, *xyz, *rgb, error, len(track)))
             file.write(track.astype("<u4").tobytes())
 
 
-def _write_text(
-    model: Path,
-    cameras: list[Camera],
-    names: list[str],
-    distinct: list[Camera],
-    number_of: list[int],
-    points: Points | None,
-    seen: _Seen,
-) -> None:
+def _write_rigs(folder: Path, model: _Model) -> None:
+    with open(folder / "rigs.bin", "wb") as file:
+        file.write(layouts.COUNT.pack(len(model.rigs)))
+        for number, (cameras, poses) in enumerate(model.rigs, start=1):
+            file.write(
+                struct.pack("<IIiI", number, len(cameras), layouts.CAMERA_SENSOR, cameras[0])
+            )
+            for camera, pose in zip(cameras[1:], poses[1:], strict=True):
+                file.write(
+                    struct.pack("<iIB7d", layouts.CAMERA_SENSOR, camera, 1, *pose_numbers(pose))
+                )
+    with open(folder / "frames.bin", "wb") as file:
+        file.write(layouts.COUNT.pack(len(model.frames)))
+        for number, (rig, pose, members) in enumerate(model.frames, start=1):
+            file.write(layouts.FRAME.pack(number, rig, *pose_numbers(pose), len(members)))
+            rows = [(layouts.CAMERA_SENSOR, model.images[k - 1].camera, k) for k in members]
+            file.write(np.array(rows, dtype=layouts.FRAME_DATA).tobytes())
+
+
+def _write_text(folder: Path, model: _Model) -> None:
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    for number, camera in enumerate(distinct, start=1):
-        numbers = " ".join(map(repr, _parameters(camera)))
-        lines.append(f"{number} PINHOLE {camera.width} {camera.height} {numbers}")
-    _write_lines(model / "cameras.txt", lines)
+    for number, camera in enumerate(model.cameras, start=1):
+        params = _joined(_parameters(camera))
+        lines.append(f"{number} PINHOLE {camera.width} {camera.height} {params}")
+    _write_lines(folder / "cameras.txt", lines)
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[]"]
-    for image, (camera, name, number) in enumerate(
-        zip(cameras, names, number_of, strict=True), start=1
-    ):
-        features = zip(seen.places[image - 1].tolist(), seen.ids[image - 1].tolist(), strict=True)
-        observed = " ".join(f"{x!r} {y!r} {point}" for (x, y), point in features)
-        lines += [
-            f"{image} {' '.join(map(repr, pose_numbers(camera.viewmat)))} {number} {name}",
-            observed,
-        ]
-    _write_lines(model / "images.txt", lines)
+    for number, image in enumerate(model.images, start=1):
+        features = zip(image.xy.tolist(), image.point_ids.tolist(), strict=True)
+        observations = " ".join(f"{x!r} {y!r} {point}" for (x, y), point in features)
+        lines += [f"{number} {_joined(image.pose)} {image.camera} {image.name}", observations]
+    _write_lines(folder / "images.txt", lines)
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
-    if points is not None:
-        errors = _errors(points, seen).tolist()
-        rows = zip(points.xyz.tolist(), points.rgb.tolist(), errors, seen.tracks, strict=True)
-        for point, (xyz, rgb, error, track) in enumerate(rows, start=1):
-            row = [*map(repr, xyz), *map(str, rgb), repr(error), *map(str, track.ravel())]
-            lines.append(f"{point} {' '.join(row)}")
-    _write_lines(model / "points3D.txt", lines)
+    for number, (xyz, rgb, error, track) in enumerate(model.points, start=1):
+        lines.append(_joined([number, *xyz, *rgb, error, *track.ravel().tolist()]))
+    _write_lines(folder / "points3D.txt", lines)
+
+
+def _write_rigs_as_text(folder: Path, model: _Model) -> None:
+    lines = ["# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]"]
+    for number, (cameras, poses) in enumerate(model.rigs, start=1):
+        line = f"{number} {len(cameras)} CAMERA {cameras[0]}"
+        for camera, pose in zip(cameras[1:], poses[1:], strict=True):
+            line += f" CAMERA {camera} 1 {_joined(pose_numbers(pose))}"
+        lines.append(line)
+    _write_lines(folder / "rigs.txt", lines)
+    lines = ["# FRAME_ID, RIG_ID, RIG_FROM_WORLD[], NUM_DATA_IDS, DATA_IDS[]"]
+    for number, (rig, pose, members) in enumerate(model.frames, start=1):
+        line = f"{number} {rig} {_joined(pose_numbers(pose))} {len(members)}"
+        for k in members:
+            line += f" CAMERA {model.images[k - 1].camera} {k}"
+        lines.append(line)
+    _write_lines(folder / "frames.txt", lines)
+
+
+def _joined(numbers: Sequence[float]) -> str:
+    return " ".join(map(repr, numbers))
 
 
 def _write_lines(path: Path, lines: list[str]) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def pose_numbers(viewmat: Float64) -> list[float]:
+    """Return quaternion wxyz and translation of a pose [4, 4]."""
+    return [*quaternion(viewmat[:3, :3]), *map(float, viewmat[:3, 3])]
+
+
+def quaternion(rotation: Float64) -> list[float]:
+    """Return the unit quaternion wxyz of a rotation matrix [3, 3], w not negative.
+
+    Source: Shepperd, "Quaternion from Rotation Matrix", 1978: the largest component comes from the
+    diagonal and the others from it, so that none is divided by a small number.
+    """
+    m, (x, y, z) = rotation, np.diag(rotation)
+    products = np.array(
+        [
+            [1.0 + x + y + z, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], 1.0 + x - y - z, m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], 1.0 - x + y - z, m[2, 1] + m[1, 2]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 1.0 - x - y + z],
+        ]
+    )
+    row = products[int(np.diag(products).argmax())]
+    row = row / np.linalg.norm(row)
+    return [float(value) for value in (row if row[0] >= 0.0 else -row)]

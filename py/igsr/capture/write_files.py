@@ -1,4 +1,4 @@
-"""Write the photos and masks of a capture; every format of cameras shares this."""
+"""Write the photos, masks and depths of a capture, which all formats of cameras share."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-from igsr.capture.depth_files import FOLDER, write_depth
+from igsr.capture.image_files import DEPTHS, write_depth
 from igsr.capture.types import View
 
 
 def relative_name(name: str) -> PurePosixPath:
-    """A view's name as a relative path that stays inside the folder it is joined to.
+    """Return a view's name as a relative path that stays inside the folder it is joined to.
 
-    Characters that cannot be printed become "_": a line break would end a name in text formats.
+    Unprintable characters become "_": a line break would end a name in text formats.
     """
     name = "".join(letter if letter.isprintable() else "_" for letter in name)
     parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..", ".")]
@@ -25,7 +25,7 @@ def relative_name(name: str) -> PurePosixPath:
 
 
 def png_names(views: list[View]) -> list[str]:
-    """A unique ``.png`` name for each view, without a leading ``images/``."""
+    """Return a unique ``.png`` name for each view, without a leading ``images/``."""
     names: list[str] = []
     for view in views:
         path = relative_name(view.name)
@@ -49,7 +49,7 @@ def write_pictures(
         folder: folder of the capture.
         views: the views to write.
         names: their file names, from ``png_names``.
-        mask_name: gives the mask's name in ``masks/``, from the photo's in ``images/``.
+        mask_name: returns the mask's name in ``masks/`` for the photo's in ``images/``.
     """
 
     def write(view: View, name: str) -> None:
@@ -69,8 +69,7 @@ def write_depths(
     Args:
         folder: folder of the capture.
         names: the photos' file names, from ``png_names``.
-        depths: per photo camera-space z [h, w] in world units, of any size; what is not above 0 is
-            not known. Or None.
+        depths: per photo z [h, w] in world units, of any size, 0 for unknown depths; or None.
 
     Returns:
         The name of each file in the folder, by the name of its photo.
@@ -78,13 +77,13 @@ def write_depths(
     written = {}
     for name, depth in zip(names, depths, strict=True):
         if depth is not None:
-            written[name] = f"{FOLDER}/{name}.npy"
+            written[name] = f"{DEPTHS}/{name}.npy"
             write_depth(folder / written[name], depth)
     return written
 
 
 def save_png(path: Path, pixels: np.ndarray) -> None:
-    """Write uint8 [H, W], [H, W, 3] or [H, W, 4]; the folder is made if it is missing."""
+    """Write uint8 [H, W], [H, W, 3] or [H, W, 4]; a missing folder is created."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The highest level takes ten times as long and makes photos hardly smaller.
+    # The highest level takes ten times as long and hardly makes photos smaller.
     Image.fromarray(pixels).save(path, compress_level=3)

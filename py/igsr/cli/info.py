@@ -88,7 +88,7 @@ def _capture_info(path: Path, max_size: int | None) -> dict[str, Any]:
         "views_with_alpha": sum(view.image.shape[2] == 4 for view in capture.views),
         "views_with_mask": sum(view.mask is not None for view in capture.views),
         "points": points,
-        "scene_centre": [_finite(x) for x in capture.scene_centre],
+        "scene_center": [_finite(x) for x in capture.scene_center],
         "scene_extent": _finite(capture.scene_extent),
     }
 

@@ -109,7 +109,7 @@ def _posed(
         "cameras": [
             {
                 "name": view.name,
-                "center": view.camera.centre.tolist(),
+                "center": view.camera.center.tolist(),
                 "focal": [float(view.camera.K[0, 0]), float(view.camera.K[1, 1])],
                 "pose_evidence": view.pose_evidence and vars(view.pose_evidence),
             }

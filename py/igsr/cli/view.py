@@ -20,8 +20,8 @@ from PIL import Image
 
 from igsr.capture import Capture, View, load_capture
 from igsr.capture.load import holds_cameras
-from igsr.capture.write_cameras import write_cameras
 from igsr.capture.write_files import png_names
+from igsr.capture.write_transforms import write_cameras
 from igsr.cli.error_messages import INTERRUPTED, error_messages, print_message
 from igsr.cli.web_view import has_display, serve_web_view
 from igsr.errors import IgsrError

@@ -78,8 +78,8 @@ class SingleStepDenoiser:
         """The photo with the nearest position and most similar direction."""
         if render.camera is None or not photos:
             return None
-        forward, center = render.camera.viewmat[2, :3], render.camera.centre
-        distances = [float(np.linalg.norm(photo.camera.centre - center)) for photo in photos]
+        forward, center = render.camera.viewmat[2, :3], render.camera.center
+        distances = [float(np.linalg.norm(photo.camera.center - center)) for photo in photos]
         scale = max(distances) or 1.0
         turns = [1.0 - float(photo.camera.viewmat[2, :3] @ forward) for photo in photos]
         nearest = int(np.argmin([d / scale + t for d, t in zip(distances, turns, strict=True)]))

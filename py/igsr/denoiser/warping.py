@@ -147,7 +147,7 @@ def _nearest(sources: Sequence[Source], camera: Camera, points: Tensor) -> list[
 
 
 def _direction(camera: Camera, point: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    direction: npt.NDArray[np.float64] = point - camera.centre
+    direction: npt.NDArray[np.float64] = point - camera.center
     return direction / max(float(np.linalg.norm(direction)), 1e-30)
 
 

@@ -126,7 +126,7 @@ def drawn_cameras(
     Returns:
         The kind of each camera, and its center and picture corners, [5, 3].
     """
-    centers = np.stack([camera.centre for camera in size_of])
+    centers = np.stack([camera.center for camera in size_of])
     origin = centers.mean(axis=0)
     size = max(float(np.linalg.norm(centers - origin, axis=1).max()), 1e-9)
     return [
@@ -150,5 +150,5 @@ def _frustum(camera: Camera, depth: float) -> npt.NDArray[np.float64]:
     K, w, h = camera.K, camera.width, camera.height
     corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
     rays = np.concatenate([(corners - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((4, 1))], axis=1)
-    world: npt.NDArray[np.float64] = depth * rays @ camera.viewmat[:3, :3] + camera.centre
-    return np.concatenate([camera.centre[None], world])
+    world: npt.NDArray[np.float64] = depth * rays @ camera.viewmat[:3, :3] + camera.center
+    return np.concatenate([camera.center[None], world])

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from igsr.capture.downscaling import reduced_size
-from igsr.capture.overview import Overview
+from igsr.capture.load import Overview
 from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.fitting.photo_statistics import PhotoStatistics, detail_of_files
 from igsr.fitting.presets import Quality, settings_for

@@ -14,7 +14,7 @@ from igsr._internal.choices import FitBackend
 from igsr._internal.event import Listener
 from igsr._internal.settings import checked_given
 from igsr.capture import Capture
-from igsr.capture.overview import Overview
+from igsr.capture.load import Overview
 from igsr.capture.photo_folder import FRAMES
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background

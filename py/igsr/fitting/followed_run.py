@@ -20,8 +20,8 @@ from igsr._internal.atomic_write import atomic_write
 from igsr._internal.event import NOTE, Event
 from igsr._internal.json_file import write_json
 from igsr.capture import Capture, View
-from igsr.capture.write_cameras import write_cameras
 from igsr.capture.write_files import png_names
+from igsr.capture.write_transforms import write_cameras
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import over_background
 from igsr.rendering.run_folder import CAMERAS, PROGRESS, RUN, VIEW

@@ -74,7 +74,7 @@ def photo_statistics(views: Sequence[View], depths: np.ndarray | None = None) ->
     """
     import numpy as np
 
-    centers = np.stack([view.camera.centre for view in views])
+    centers = np.stack([view.camera.center for view in views])
     sizes = np.array([(view.camera.width, view.camera.height) for view in views])
     K = np.stack([view.camera.K for view in views])
     rotations = np.stack([view.camera.viewmat[:3, :3] for view in views])
@@ -113,7 +113,7 @@ def _targets(views: Sequence[View], depths: np.ndarray | None) -> np.ndarray:
 
     from igsr.geometry.focus_point import focus_point
 
-    centers = np.stack([view.camera.centre for view in views])
+    centers = np.stack([view.camera.center for view in views])
     if depths is None:
         forward = np.stack([view.camera.viewmat[2, :3] for view in views])
         focus = focus_point([view.camera for view in views])

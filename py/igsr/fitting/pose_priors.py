@@ -79,9 +79,9 @@ def pose_priors(
         evidence = view.pose_evidence
         if evidence is None or information[k].any():
             continue
-        if min(evidence.rotation, evidence.centre) > 0.0:
+        if min(evidence.rotation, evidence.center) > 0.0:
             # Without DEVIATION_FACTOR: predictions are wrong by whole deviations.
-            deviations = np.repeat([np.radians(evidence.rotation), evidence.centre], 3)
+            deviations = np.repeat([np.radians(evidence.rotation), evidence.center], 3)
             information[k] = np.diag(1.0 / deviations**2)
     return PosePriors(views, information, priors.focal_information)
 

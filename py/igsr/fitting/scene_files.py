@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from igsr._internal.user_warning import warn_user
 from igsr.capture import Capture
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.errors import IgsrError
 from igsr.rendering.scene_page import PageCamera, PageModel, compared, write_scene_page
 from igsr.run import SCENE_WRITTEN, Run

@@ -46,7 +46,7 @@ def orbit(splats: Splats, cameras: Sequence[Camera], frames: int) -> list[Camera
         columns, rows = DEFAULT_SIZE
         K = _default_lens(columns, rows)
     else:
-        centers = np.stack([camera.centre for camera in cameras])
+        centers = np.stack([camera.center for camera in cameras])
         target = focus_point(list(cameras))
         up = _unit(-np.mean([camera.viewmat[1, :3] for camera in cameras], axis=0))
         offsets = centers - target

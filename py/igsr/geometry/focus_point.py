@@ -21,16 +21,16 @@ def focus_point(cameras: list[Camera]) -> Float64:
     Returns:
         float64 [3], world frame.
     """
-    centres = np.stack([camera.centre for camera in cameras])
+    centers = np.stack([camera.center for camera in cameras])
     axes = np.stack([camera.viewmat[2, :3] for camera in cameras])
-    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or 1.0
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()) or 1.0
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    in_front = (centres + spread * axes).mean(axis=0)
+    in_front = (centers + spread * axes).mean(axis=0)
     pull = 1e-3
     matrix = across.mean(axis=0) + pull * np.eye(3)
-    right = np.einsum("nij,nj->i", across, centres) / len(cameras) + pull * in_front
+    right = np.einsum("nij,nj->i", across, centers) / len(cameras) + pull * in_front
     point: Float64 = np.linalg.solve(matrix, right)
     # Axes that part ways meet behind the cameras; the scene is still in front of them.
-    if np.mean((point - centres) @ axes.mean(axis=0)) <= 0:
+    if np.mean((point - centers) @ axes.mean(axis=0)) <= 0:
         point = in_front
     return point

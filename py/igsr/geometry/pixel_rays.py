@@ -12,7 +12,7 @@ def pixel_rays(camera: Camera) -> npt.NDArray[np.float32]:
     """Directions [H * W, 3] of a camera's pixels, row by row, with z of 1, in its axes.
 
     Args:
-        camera: pinhole, OpenCV axes, pixel centres at +0.5.
+        camera: pinhole, OpenCV axes, pixel centers at +0.5.
     """
     rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
     K = camera.K

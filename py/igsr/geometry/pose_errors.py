@@ -83,8 +83,8 @@ def pose_accuracy(
     if len(pairs) >= 2:
         estimates, truths = (list(side) for side in zip(*pairs, strict=True))
         to_true = similarity_between(estimates, truths)
-        centers = np.stack([camera.centre for camera in truths])
-        aligned = np.stack([to_true.camera(camera).centre for camera in estimates])
+        centers = np.stack([camera.center for camera in truths])
+        aligned = np.stack([to_true.camera(camera).center for camera in estimates])
         error = float(np.sqrt(((aligned - centers) ** 2).sum(axis=1).mean()))
         size = float(np.sqrt(((centers - centers.mean(axis=0)) ** 2).sum(axis=1).mean()))
         result["rotation"] = float(np.median(rotation[registered]))
@@ -109,7 +109,7 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> di
         true_cameras: the corresponding true ones.
 
     Returns:
-        "rotation": mean angle in degrees; "centre": mean distance in units of the true world.
+        "rotation": mean angle in degrees; "center": mean distance in units of the true world.
 
     Raises:
         IgsrError: as ``similarity_between``.
@@ -119,8 +119,8 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> di
     for camera, true_camera in zip(cameras, true_cameras, strict=True):
         aligned = to_cameras.camera(true_camera)
         angles.append(rotation_angle(camera.viewmat[:3, :3] @ aligned.viewmat[:3, :3].T))
-        distances.append(np.linalg.norm(camera.centre - aligned.centre) / to_cameras.scale)
-    return {"rotation": float(np.mean(angles)), "centre": float(np.mean(distances))}
+        distances.append(np.linalg.norm(camera.center - aligned.center) / to_cameras.scale)
+    return {"rotation": float(np.mean(angles)), "center": float(np.mean(distances))}
 
 
 def rotation_angle(rotation: Float64) -> float:

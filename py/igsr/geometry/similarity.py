@@ -68,7 +68,7 @@ class Similarity:
         """
         viewmat = np.eye(4)
         viewmat[:3, :3] = camera.viewmat[:3, :3] @ self.rotation.T
-        center = self.scale * self.rotation @ camera.centre + self.translation
+        center = self.scale * self.rotation @ camera.center + self.translation
         viewmat[:3, 3] = -viewmat[:3, :3] @ center
         return replace(camera, viewmat=viewmat)
 
@@ -156,8 +156,8 @@ def similarity_between(cameras: Sequence[Camera], others: Sequence[Camera]) -> S
         raise IgsrError(
             f"cameras and others must be pairs; there are {len(cameras)} and {len(others)}."
         )
-    centers = np.stack([camera.centre for camera in cameras])
-    targets = np.stack([camera.centre for camera in others])
+    centers = np.stack([camera.center for camera in cameras])
+    targets = np.stack([camera.center for camera in others])
     offsets, target_offsets = centers - centers.mean(axis=0), targets - targets.mean(axis=0)
     spread, target_spread = (float(np.linalg.norm(x)) for x in (offsets, target_offsets))
     # Rows of a world-to-camera rotation are the camera's axes in the world.

@@ -296,7 +296,7 @@ def default_spread(world: Sequence[AlignedPhoto | None]) -> Spread:
 def _evidence(covariance: Float64, default: Spread) -> PoseEvidence:
     """Evidence of a camera with enough points."""
     turn, move = deviations(covariance)
-    alone = turn < FEATURES_ALONE * default.rotation and move < FEATURES_ALONE * default.centre
+    alone = turn < FEATURES_ALONE * default.rotation and move < FEATURES_ALONE * default.center
     return PoseEvidence("features" if alone else "both", float(np.degrees(turn)), move)
 
 
@@ -316,9 +316,9 @@ def _evidence_of_prediction(
         low, high = MIN_DEVIATION_FACTOR, MAX_DEVIATION_FACTOR
         spread = Spread(
             float(np.clip(turn, low * default.rotation, high * default.rotation)),
-            float(np.clip(move, low * default.centre, high * default.centre)),
+            float(np.clip(move, low * default.center, high * default.center)),
         )
-    return PoseEvidence("network", float(np.degrees(spread.rotation)), spread.centre)
+    return PoseEvidence("network", float(np.degrees(spread.rotation)), spread.center)
 
 
 def _with_tracks_of(points: Points | None, names: set[str]) -> Points | None:

@@ -78,7 +78,7 @@ def with_predicted_cameras(
         assert wrong is not None
         trace = np.trace(right.viewmat[:3, :3] @ wrong.viewmat[:3, :3].T)
         turns.append(np.degrees(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))))
-        shifts.append(np.linalg.norm(right.centre - wrong.centre))
+        shifts.append(np.linalg.norm(right.center - wrong.center))
     # Per axis, from the root mean square over photos.
     rotation, shift = (float(np.sqrt(np.mean(np.square(e)) / 3.0)) for e in (turns, shifts))
     cameras = list(found.cameras)

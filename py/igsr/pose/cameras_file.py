@@ -21,7 +21,7 @@ from igsr.pose.estimate import Estimate
 from igsr.pose.found_cameras import FoundCameras
 
 #: Of the file; files of another format are not read.
-FORMAT = 2
+FORMAT = 3
 _ABOUT = "about"
 
 
@@ -153,7 +153,7 @@ def _weights(value: Any) -> dict[str, str] | None:
 def _evidence(fields: Any) -> PoseEvidence | None:
     if fields is None:
         return None
-    return PoseEvidence(fields["rests_on"], float(fields["rotation"]), float(fields["centre"]))
+    return PoseEvidence(fields["rests_on"], float(fields["rotation"]), float(fields["center"]))
 
 
 def _camera(arrays: Mapping[str, np.ndarray], index: int, size: Any) -> Camera | None:

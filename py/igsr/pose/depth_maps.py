@@ -121,7 +121,7 @@ def trusted_depths(photos: Sequence[AlignedPhoto | None]) -> list[Bool | None]:
     """
     known = {i: photo for i, photo in enumerate(photos) if photo is not None}
     needed = 2 if len(known) >= MIN_PHOTOS_FOR_TWO else 1
-    centers = {i: photo.camera.centre for i, photo in known.items()}
+    centers = {i: photo.camera.center for i, photo in known.items()}
     trusted: list[Bool | None] = [None] * len(photos)
     for i, photo in known.items():
         confident = confident_pixels(photo) & ~_edges(photo.depth)

@@ -23,7 +23,7 @@ class Estimate:
     """Cameras of photos in one world frame, and what else an estimator found.
 
     Attributes:
-        cameras: per photo, pinhole, in pixels of the photo (centres at +0.5), or None where the
+        cameras: per photo, pinhole, in pixels of the photo (centers at +0.5), or None where the
             photo is not registered.
         points: in the world frame, with confidence, or None.
         depths: per photo float32 [h, w], z-depth along the camera's axis in world units, NaN where

@@ -15,16 +15,15 @@ from igsr._internal.user_warning import warn_user
 from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size, reduced_size
 from igsr.capture.load import holds_cameras
-from igsr.capture.memory_check import check_memory
+from igsr.capture.photo_checks import split_unfit
 from igsr.capture.photo_folder import (
-    FEWEST,
     FRAMES,
+    MIN_PHOTOS,
     Photo,
     load_photos,
     photo_headers,
     reduced_photo,
 )
-from igsr.capture.unfit_photos import split_unfit
 from igsr.errors import IgsrError
 from igsr.pose.auto import auto_estimate
 from igsr.pose.estimate import Estimate
@@ -159,19 +158,12 @@ def estimated_cameras(
     """
     settings.check()
     if isinstance(photos, (str, os.PathLike)):
-        headers = photo_headers(photos, settings.frames)
-        check_memory(
-            headers.sizes,
-            max_size,
-            channels=headers.channels,
-            masked=True,
-            decoded=headers.decoded,
-        )
+        photo_headers(photos, settings.frames).check_memory(max_size)
     loaded, left_out = split_unfit(photos_of(photos, settings.frames, MAX_SIDE_PX))
-    if len(loaded) < FEWEST and left_out:
+    if len(loaded) < MIN_PHOTOS and left_out:
         raise IgsrError(
-            f"Cameras are found from at least {FEWEST} photos, and {len(loaded)} is left of those "
-            f"given: {' '.join(left_out)} Add photos."
+            f"Cameras are found from at least {MIN_PHOTOS} photos, and {len(loaded)} is left of "
+            f"those given: {' '.join(left_out)} Add photos."
         )
     found = estimate(loaded, settings, report)
     found.warnings = [*left_out, *found.warnings]
@@ -192,9 +184,9 @@ def estimate(photos: Sequence[Photo], settings: CameraSettings, report: Listener
     seed = settings.seed
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise IgsrError(f"seed is {seed!r}; give a whole number of at least 0")
-    if len(photos) < FEWEST:
+    if len(photos) < MIN_PHOTOS:
         only = f"; there is only {photos[0].name}" if photos else ""
-        raise IgsrError(f"Cameras are found from at least {FEWEST} photos{only}; add photos")
+        raise IgsrError(f"Cameras are found from at least {MIN_PHOTOS} photos{only}; add photos")
     settings.check()
     name = settings.estimator
     panorama = next((photo.place.rig for photo in photos if photo.place is not None), None)
@@ -213,7 +205,7 @@ def estimate(photos: Sequence[Photo], settings: CameraSettings, report: Listener
         found = auto_estimate(photos, settings.options, seed, progress)
     else:
         found = ESTIMATORS[name].make(**settings.options)(photos, seed=seed, progress=progress)
-    if sum(camera is not None for camera in found.cameras) < FEWEST:
+    if sum(camera is not None for camera in found.cameras) < MIN_PHOTOS:
         raise IgsrError(
             f"No cameras found: the {len(photos)} photos ({photos[0].name} and others) have too "
             "few matches; take photos of one static scene that overlap more"

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from igsr.capture import Camera, Capture, View
-from igsr.capture.downscaling import resampled_plane, resized_camera
+from igsr.capture.downscaling import resampled_plane, resized_camera, resized_tracks
 from igsr.capture.photo_folder import Photo
-from igsr.capture.tracks import resized
 from igsr.capture.undistort import Lens, Undistorter
 from igsr.errors import IgsrError
 from igsr.pose.estimate import Estimate
@@ -52,7 +51,7 @@ class FoundCameras:
         whole = replace(
             estimate,
             cameras=[after.get(photo.name) for photo in photos],
-            points=resized(estimate.points, before, after),
+            points=resized_tracks(estimate.points, before, after),
             depths=_trusted_depths(photos, estimate),
             grids=[],
             lenses=list(estimate.lenses) or [None] * len(photos),
@@ -119,7 +118,7 @@ class FoundCameras:
         if lost:
             raise IgsrError(f"The photo {lost[0]} is missing or cannot be read; put it back")
         before = dict(zip(self.names, self.estimate.cameras, strict=True))
-        points = resized(
+        points = resized_tracks(
             self.estimate.points,
             {name: camera for name, camera in before.items() if camera is not None},
             {name: view.camera for name, view in views.items()},

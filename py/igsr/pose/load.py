@@ -12,7 +12,7 @@ from igsr._internal.part_usage import Meter
 from igsr._internal.user_warning import warn_user
 from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size
-from igsr.capture.overview import Overview, look_at
+from igsr.capture.load import Overview, look_at
 from igsr.capture.photo_folder import photo_sizes
 from igsr.errors import IgsrError
 from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file

@@ -29,10 +29,10 @@ def plot_poses(path: str | os.PathLike[str], capture: Capture) -> None:
     """
     from matplotlib.figure import Figure
 
-    centres = np.stack([view.camera.centre for view in capture.views])
+    centers = np.stack([view.camera.center for view in capture.views])
     turn = _upright([view.camera.viewmat[:3, :3] for view in capture.views])
-    middle = centres.mean(axis=0)
-    spread = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
+    middle = centers.mean(axis=0)
+    spread = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
     size = LENGTH * spread if spread > 0.0 else 1.0
     points, colors = _points(capture)
     points = (points - middle) @ turn.T
@@ -70,9 +70,9 @@ def plot_poses(path: str | os.PathLike[str], capture: Capture) -> None:
                 outline[:, across], sign * outline[:, up], color=f"C{number % 10}", linewidth=1.0
             )
             axis.annotate(str(number), (corners[0, across], sign * corners[0, up]), fontsize=8)
-        centre = 0.5 * (low + high)
-        axis.set_xlim(centre[across] - half, centre[across] + half)
-        axis.set_ylim(sign * centre[up] - half, sign * centre[up] + half)
+        center = 0.5 * (low + high)
+        axis.set_xlim(center[across] - half, center[across] + half)
+        axis.set_ylim(sign * center[up] - half, sign * center[up] + half)
         axis.set_aspect("equal")
         axis.set_title(title, fontsize=10)
         axis.grid(alpha=0.3)
@@ -100,7 +100,7 @@ def _upright(rotations: list[Float64]) -> Float64:
 
 
 def _frustum(viewmat: Float64, K: Float64, width: int, height: int, size: float) -> Float64:
-    """Centre and corners [5, 3] of a camera in the world."""
+    """Center and corners [5, 3] of a camera in the world."""
     pixels = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float64)
     rays = np.ones((4, 3))
     rays[:, :2] = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]

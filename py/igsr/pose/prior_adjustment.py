@@ -50,7 +50,7 @@ class Spread:
     """Standard deviations of a network's cameras."""
 
     rotation: float  # radians
-    centre: float  # world units
+    center: float  # world units
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ def spread_of(predicted: Sequence[Camera], true: Sequence[Camera]) -> tuple[floa
         np.radians(rotation_angle(a.viewmat[:3, :3] @ b.viewmat[:3, :3].T))
         for a, b in zip(predicted, true, strict=True)
     ]
-    moves = [np.linalg.norm(a.centre - b.centre) for a, b in zip(predicted, true, strict=True)]
+    moves = [np.linalg.norm(a.center - b.center) for a, b in zip(predicted, true, strict=True)]
     return float(np.median(turns)) / np.sqrt(3.0), float(np.median(moves)) / np.sqrt(3.0)
 
 
@@ -235,7 +235,7 @@ class _Problem:
             error = self._camera_error(camera, predicted)
             rows[:3, 6 * k : 6 * k + 3] = np.eye(3) / self.spread.rotation
             # The center moves against the translation, along the camera's axes.
-            rows[3:, 6 * k + 3 : 6 * k + 6] = -camera.viewmat[:3, :3].T / self.spread.centre
+            rows[3:, 6 * k + 3 : 6 * k + 6] = -camera.viewmat[:3, :3].T / self.spread.center
             rows[:, -1] = error
             normal += rows.T @ rows / (1.0 + (error**2).sum() / 6.0)
         begin = 6 * count
@@ -252,8 +252,8 @@ class _Problem:
     def _camera_error(self, camera: Camera, predicted: Camera) -> Float64:
         """Difference of a camera to the predicted one [6], in standard deviations."""
         turn = _rotation_vector(camera.viewmat[:3, :3] @ predicted.viewmat[:3, :3].T)
-        move = camera.centre - predicted.centre
-        return np.concatenate([turn / self.spread.rotation, move / self.spread.centre])
+        move = camera.center - predicted.center
+        return np.concatenate([turn / self.spread.rotation, move / self.spread.center])
 
     def _errors(self, bundle: Bundle) -> tuple[Float64, Float64, Float64]:
         """Errors in pixels [M, 2], errors of depth in standard deviations [M], and the points in

@@ -39,12 +39,12 @@ class NearSources:
         """
         self._splats, self._photos = splats, photos
         self._background, self._backend = background, backend
-        self._centres = np.stack([photo.camera.centre for photo in photos])
+        self._centers = np.stack([photo.camera.center for photo in photos])
         self._held: OrderedDict[int, Source] = OrderedDict()
 
     def of(self, camera: Camera) -> list[Source]:
         """The sources of at most ``NEAR`` photos, in the order of the photos."""
-        distances = np.linalg.norm(self._centres - camera.centre, axis=1)
+        distances = np.linalg.norm(self._centers - camera.center, axis=1)
         near = sorted(int(k) for k in np.argsort(distances, kind="stable")[:NEAR])
         return [self._source(k) for k in near]
 

@@ -75,19 +75,19 @@ def novel_views(
         for camera, distance in zip(known, distances, strict=True)
         if distance is not None
     ]
-    centres = np.array([camera.centre for camera, _ in looking]).reshape(-1, 3)
+    centers = np.array([camera.center for camera, _ in looking]).reshape(-1, 3)
     targets = np.array([_target(*one) for one in looking]).reshape(-1, 3)
     found: list[tuple[NovelView, float]] = []
     for k, (camera, distance) in enumerate(looking):
         others = [one for i, (one, _) in enumerate(looking) if i != k]
         for candidate, reach, between in _neighbourhood(camera, distance, others):
-            angle = float(_angles(targets, centres, candidate.centre).min())
+            angle = float(_angles(targets, centers, candidate.center).min())
             if angle >= LEAST_STEP * STEP:
                 found.append((NovelView(candidate, angle, between), reach))
     chosen: list[NovelView] = []
     for between in (True, False):
         group = [pair for pair in found if pair[0].between == between]
-        _add_farthest(chosen, group, count, centres, splats, backend)
+        _add_farthest(chosen, group, count, centers, splats, backend)
     return chosen
 
 
@@ -95,7 +95,7 @@ def _add_farthest(
     chosen: list[NovelView],
     group: Sequence[tuple[NovelView, float]],
     count: int,
-    centres: Float64,
+    centers: Float64,
     splats: Splats,
     backend: Backend,
 ) -> None:
@@ -105,14 +105,14 @@ def _add_farthest(
         chosen: views so far, at most ``count`` in the end.
         group: views, each with its distance to what it looks at.
         count: most views that are chosen.
-        centres: [N, 3] centres of the known cameras, world.
+        centers: [N, 3] centers of the known cameras, world.
         splats: the scene, which no view may stand inside of.
         backend: what renders.
     """
-    new = np.array([view.camera.centre for view in chosen]).reshape(-1, 3)
-    around = np.concatenate([centres, new])
+    new = np.array([view.camera.center for view in chosen]).reshape(-1, 3)
+    around = np.concatenate([centers, new])
     apart = np.array(
-        [_angles(_target(v.camera, d), v.camera.centre, around).min() for v, d in group]
+        [_angles(_target(v.camera, d), v.camera.center, around).min() for v, d in group]
     )
     while len(chosen) < count and len(apart) and apart.max() >= LEAST_STEP * STEP:
         best = int(np.argmax(apart))
@@ -123,7 +123,7 @@ def _add_farthest(
         chosen.append(view)
         for i, (other, its_reach) in enumerate(group):
             target = _target(other.camera, its_reach)
-            away = _angles(target, other.camera.centre, view.camera.centre)
+            away = _angles(target, other.camera.center, view.camera.center)
             apart[i] = min(apart[i], float(away))
 
 
@@ -144,7 +144,7 @@ def _neighbourhood(
 
 def _target(camera: Camera, distance: float) -> Float64:
     """The point [3], world, on a camera's axis at a distance."""
-    return np.asarray(camera.centre + distance * camera.viewmat[2, :3])
+    return np.asarray(camera.center + distance * camera.viewmat[2, :3])
 
 
 def _leaning(camera: Camera, distance: float, right: float, down: float) -> Camera:
@@ -161,7 +161,7 @@ def _leaning(camera: Camera, distance: float, right: float, down: float) -> Came
 def _towards(camera: Camera, other: Camera, distance: float, part: float) -> tuple[Camera, float]:
     """A camera on the arc between two, about what the first looks at, and its distance to that."""
     target = _target(camera, distance)
-    there = other.centre - target
+    there = other.center - target
     far = float(np.linalg.norm(there))
     start, end = -camera.viewmat[2, :3], there / far
     angle = np.arccos(np.clip(start @ end, -1.0, 1.0))
@@ -172,27 +172,27 @@ def _towards(camera: Camera, other: Camera, distance: float, part: float) -> tup
     return _looking(camera, target + reach * direction, target, down), reach
 
 
-def _looking(camera: Camera, centre: Float64, target: Float64, down: Float64) -> Camera:
+def _looking(camera: Camera, center: Float64, target: Float64, down: Float64) -> Camera:
     """A camera like another, at a place, looking at a target, its y axis nearest to a given one."""
-    forward = (target - centre) / np.linalg.norm(target - centre)
+    forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(down, forward)
     if np.linalg.norm(right) < 1e-6:
         right = camera.viewmat[0, :3] - (camera.viewmat[0, :3] @ forward) * forward
     right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
     return replace(camera, viewmat=viewmat)
 
 
 def _angle(camera: Camera, other: Camera, distance: float) -> float:
     """Degrees between where two cameras stand, seen from what the first looks at."""
-    return float(_angles(_target(camera, distance), camera.centre, other.centre))
+    return float(_angles(_target(camera, distance), camera.center, other.center))
 
 
-def _angles(target: Float64, centre: Float64, others: Float64) -> Float64:
-    """Degrees between ``centre`` and ``others``, seen from ``target``; [..., 3] broadcast."""
-    here, there = centre - target, others - target
+def _angles(target: Float64, center: Float64, others: Float64) -> Float64:
+    """Degrees between ``center`` and ``others``, seen from ``target``; [..., 3] broadcast."""
+    here, there = center - target, others - target
     lengths = np.linalg.norm(here, axis=-1) * np.linalg.norm(there, axis=-1)
     cosine = np.sum(here * there, axis=-1) / np.where(lengths > 0.0, lengths, 1.0)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -20,7 +20,7 @@ from igsr._internal.atomic_write import remove_unfinished
 from igsr._internal.choices import FitBackend
 from igsr._internal.event import Listener
 from igsr.capture import Capture
-from igsr.capture.overview import Overview
+from igsr.capture.load import Overview
 from igsr.capture.photo_checks import check_photos
 from igsr.capture.photo_folder import FRAMES
 from igsr.denoiser import Denoiser, NetworkDenoiser, load_network

@@ -81,7 +81,7 @@ def with_backdrop(splats: Splats, photos: Sequence[View], backend: Backend = "au
     """
     if len(splats) < MIN_SPLATS:
         return splats
-    cameras = np.array([photo.camera.centre for photo in photos])
+    cameras = np.array([photo.camera.center for photo in photos])
     center = cameras.mean(axis=0)
     distances = np.linalg.norm(splats.means[splats.finite] + splats.origin - center, axis=1)
     if not len(distances) or not 0.0 < distances.max() < np.inf:

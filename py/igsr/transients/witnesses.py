@@ -262,10 +262,10 @@ def _nearest(index: int, photos: Sequence[SmallPhoto]) -> list[SmallPhoto]:
     if not is_surface.any():
         return []
     forward = photo.camera.viewmat[2, :3]
-    middle = photo.camera.centre + forward * float(np.median(photo.depth[is_surface]))
+    middle = photo.camera.center + forward * float(np.median(photo.depth[is_surface]))
 
     def direction(camera: Camera) -> Float64:
-        away = middle - camera.centre
+        away = middle - camera.center
         return np.asarray(away / max(float(np.linalg.norm(away)), 1e-30))
 
     here = direction(photo.camera)

@@ -43,7 +43,7 @@ from igsr_lab.bench.stage_rows import MIN_REPEATS, SECONDS, timing_row
 VIEWS = 4
 #: Steps from one state before it is set up anew: more would fit the model to the one photo.
 STEPS_PER_STATE = 8
-#: Steps done before, by number only: all SH degrees are in use, the centres' rate has decayed.
+#: Steps done before, by number only: all SH degrees are in use, the centers' rate has decayed.
 STEPS_BEFORE, STEPS_OF_FIT = 5000, 10_000
 #: What the fit weighs new gradients with in Adam's first moments.
 FIRST_MOMENT = 0.1
@@ -318,7 +318,7 @@ class OwnLoop:
     ) -> None:
         """Parameters as leaves, at fixed rates.
 
-        They are the fit's, but for the centres', which here is a tenth of the fit's first and knows
+        They are the fit's, but for the centers', which here is a tenth of the fit's first and knows
         neither extent nor decay, and for all SH coefficients, which here share that of the first.
         """
         scene = shot.scene

@@ -30,14 +30,14 @@ class Noise:
     Attributes:
         depth: standard deviation of the logarithm of depths, of a photo's scale and of cells in it.
         rotation: degrees that every camera is turned by, about an axis of its own.
-        centre: distance that every camera is moved by, in units of the median depth.
+        center: distance that every camera is moved by, in units of the median depth.
         focal: standard deviation of the logarithm of focal lengths.
         wrong_confidence: part of the cells that are sure of a depth that is off by a half.
     """
 
     depth: float = 0.02
     rotation: float = 1.0
-    centre: float = 0.02
+    center: float = 0.02
     focal: float = 0.02
     wrong_confidence: float = 0.05
 
@@ -116,8 +116,8 @@ class NoisyNetwork:
         turn = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
         viewmat = np.eye(4)
         viewmat[:3, :3] = turn @ camera.viewmat[:3, :3]
-        centre = camera.centre + noise.centre * middle * way / np.linalg.norm(way)
-        viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+        center = camera.center + noise.center * middle * way / np.linalg.norm(way)
+        viewmat[:3, 3] = -viewmat[:3, :3] @ center
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= np.exp(noise.focal * random.normal())
         K[:2, 2] = camera.width / 2, camera.height / 2  # networks know no other

@@ -24,7 +24,7 @@ from PIL import Image
 
 import igsr
 from igsr.capture import Camera, View, load_capture
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.evaluation.metrics import psnr, ssim
 from igsr.rendering.levels import INDEX, level_within, write_levels
 

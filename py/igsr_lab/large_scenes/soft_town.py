@@ -78,7 +78,7 @@ def photo(boxes: np.ndarray, camera: Camera, sharp: int = 2) -> np.ndarray:
     K = camera.K
     x, y = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.viewmat[:3, :3]
-    origins = np.broadcast_to(camera.centre, rays.shape)
+    origins = np.broadcast_to(camera.center, rays.shape)
     distance, hit = towns.seen(boxes, origins, rays)
     length = np.linalg.norm(rays, axis=1)
     places = origins + np.where(hit >= -1, distance, 0.0)[:, None] * rays

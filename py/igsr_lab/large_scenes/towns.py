@@ -40,22 +40,22 @@ def cameras(columns: int, rows: int, each: int, width: int, height: int) -> list
         for number in range(each):
             angle = 2.0 * np.pi * (number + random.uniform(0.0, 0.5)) / each
             away = 3.2 + random.uniform(-0.3, 0.3)
-            centre = middle + [away * np.sin(angle), 0.0, away * np.cos(angle)]
-            centre[1] = -1.9 + random.uniform(-0.4, 0.4)
-            found.append(looking(centre, middle, 0.9 * width, width, height))
+            center = middle + [away * np.sin(angle), 0.0, away * np.cos(angle)]
+            center[1] = -1.9 + random.uniform(-0.4, 0.4)
+            found.append(looking(center, middle, 0.9 * width, width, height))
     return found
 
 
 def looking(
-    centre: np.ndarray, target: np.ndarray, focal: float, width: int, height: int
+    center: np.ndarray, target: np.ndarray, focal: float, width: int, height: int
 ) -> Camera:
     """A level camera that looks from one place to another; its focal length is in pixels."""
-    z = (target - centre) / np.linalg.norm(target - centre)
+    z = (target - center) / np.linalg.norm(target - center)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
     return Camera(viewmat, intrinsic_matrix(focal, focal, width / 2, height / 2), width, height)
 
 
@@ -113,7 +113,7 @@ def photo(boxes: np.ndarray, camera: Camera, sharp: int = 2) -> np.ndarray:
     K = camera.K
     x, y = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.viewmat[:3, :3]
-    origins = np.broadcast_to(camera.centre, rays.shape)
+    origins = np.broadcast_to(camera.center, rays.shape)
     distance, hit = seen(boxes, origins, rays)
     places = origins + np.where(hit >= -1, distance, 0.0)[:, None] * rays
     fine = colors(boxes, places, hit).reshape(height, sharp, width, sharp, 3)
@@ -177,8 +177,8 @@ def points_of(boxes: np.ndarray, views: list[View], each: int, paint=colors) -> 
         pixel = pixel[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]
         inside = ahead & (pixel > 0.0).all(axis=1) & (pixel < [camera.width, camera.height]).all(1)
         those = np.flatnonzero(inside)
-        rays = xyz[those] - camera.centre
-        origins = np.broadcast_to(camera.centre, rays.shape)
+        rays = xyz[those] - camera.center
+        origins = np.broadcast_to(camera.center, rays.shape)
         distance, _ = seen(boxes, origins, rays)
         those = those[distance > 0.999]
         view.append(np.full(len(those), index))

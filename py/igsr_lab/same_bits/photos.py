@@ -220,8 +220,8 @@ def write_plain_photos(folder: Path) -> Path:
         picture = np.zeros((height, width, 3), np.uint8)
         # The right half of the wall stands back by half a unit, a third of it comes forward.
         for z, low, high in ((0.5, 0.0, 9.0), (0.0, -9.0, 0.0), (-0.4, -0.5, 0.6)):
-            reach = (z - camera.centre[2]) / rays[..., 2]
-            place = camera.centre[:2] + reach[..., None] * rays[..., :2]
+            reach = (z - camera.center[2]) / rays[..., 2]
+            place = camera.center[:2] + reach[..., None] * rays[..., :2]
             column, row = ((place + 1.75) / 3.5 * size).astype(int).transpose(2, 0, 1)
             inside = (place[..., 0] >= low) & (place[..., 0] < high)
             if z < 0.0:

@@ -211,7 +211,7 @@ def compared(rows: list[dict[str, Any]], noise: str, scene: str) -> dict[str, An
         }
         line[name]["psnr_spread"] = _spread(chosen)
     joint = sets["joint"]
-    for error in ("rotation", "centre"):
+    for error in ("rotation", "center"):
         before = float(np.mean([row["before"][error] for row in joint]))
         after = float(np.mean([row["after"][error] for row in joint]))
         line[error] = {"before": before, "after": after}
@@ -241,14 +241,14 @@ def markdown(report: dict[str, Any]) -> str:
             f"{line['short_of_clean']:.2f}",
             *(
                 f"{before:.{digits}f} → {after:.{digits}f} ({before / after:.1f} ×)"
-                for error, digits in (("rotation", 3), ("centre", 4))
+                for error, digits in (("rotation", 3), ("center", 4))
                 for before, after in [(line[error]["before"], line[error]["after"])]
             ),
         ]
         for line in report["summary"]
     ]
     heads = ["noise", "scene", *fits, "recovered", "short of clean"]
-    heads += ["rotation, degrees", "centre, world units"]
+    heads += ["rotation, degrees", "center, world units"]
     note = "PSNR in dB, raw / aligned / refined."
     return text_of([*headed(report), note, "", *markdown_table(heads, rows, left=2)])
 

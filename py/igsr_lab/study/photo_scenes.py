@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from igsr.capture.photos import SUFFIXES
+from igsr.capture.image_files import SUFFIXES
 from igsr.errors import IgsrError
 
 

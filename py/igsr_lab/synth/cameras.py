@@ -35,15 +35,15 @@ class Viewpoint:
         return 0.5 * self.width / math.tan(0.5 * self.field_of_view)
 
     def project(self, point: np.ndarray) -> np.ndarray:
-        """The pixel coordinates [2] (x right, y down; pixel centres at + 0.5) of a world point."""
+        """The pixel coordinates [2] (x right, y down; pixel centers at + 0.5) of a world point."""
         right, up, back = (point - self.camera_to_world[:3, 3]) @ self.camera_to_world[:3, :3]
         middle = 0.5 * np.array([self.width, self.height])
         return np.asarray(np.array([right, -up]) / -back * self.focal + middle)
 
 
-def look_at(centre: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.ndarray:
+def look_at(center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.ndarray:
     """[4, 4] camera-to-world in OpenGL axes; world z up, then rolled by ``roll`` radians."""
-    back = np.asarray(centre, dtype=np.float64) - target
+    back = np.asarray(center, dtype=np.float64) - target
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -52,7 +52,7 @@ def look_at(centre: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.nda
     matrix[:3, 0] = math.cos(roll) * right + math.sin(roll) * up
     matrix[:3, 1] = math.cos(roll) * up - math.sin(roll) * right
     matrix[:3, 2] = back
-    matrix[:3, 3] = centre
+    matrix[:3, 3] = center
     return matrix
 
 
@@ -62,8 +62,8 @@ class Rig:
 
     Attributes:
         kind: "hemisphere", "sphere", "turntable", "arc" or "forward".
-        centre: [3], what the cameras look at.
-        distance: mean distance of the cameras from ``centre``, world units.
+        center: [3], what the cameras look at.
+        distance: mean distance of the cameras from ``center``, world units.
         azimuth, elevation_sine: the lowest and highest of each; radians, and the sine of them.
         follow: how much of a camera's offset from the middle of the rig its target has too: 0, all
             look at one point; 1, all look the same way.
@@ -75,7 +75,7 @@ class Rig:
     """
 
     kind: str
-    centre: np.ndarray
+    center: np.ndarray
     distance: float
     azimuth: tuple[float, float]
     elevation_sine: tuple[float, float]
@@ -100,11 +100,11 @@ class Rig:
         distance = self.distance * math.exp(rng.normal(0.0, self.unsteadiness))
         offset = self._offset(position, distance)
         middle = self._offset(np.array([0.5, 0.5]), self.distance)
-        target = self.centre + self.follow * (offset - middle)
+        target = self.center + self.follow * (offset - middle)
         target = target + rng.normal(0.0, self.unsteadiness * self.distance * 0.3, 3)
         view = self.field_of_view
         half = math.tan(0.5 * view) * math.exp(rng.normal(0.0, self.zoom))
-        matrix = look_at(self.centre + offset, target, rng.normal(0.0, self.roll))
+        matrix = look_at(self.center + offset, target, rng.normal(0.0, self.roll))
         return Viewpoint(matrix, 2.0 * math.atan(half), self.width, self.height)
 
 
@@ -150,7 +150,7 @@ def draw_rig(rng: np.random.Generator, description: Description, size: int) -> R
             follow = float(rng.uniform(0.0, 0.8)) if kind == "forward" else 0.0
     return Rig(
         kind=kind,
-        centre=description.centre,
+        center=description.center,
         distance=float(distance),
         azimuth=(float(azimuth[0]), float(azimuth[1])),
         elevation_sine=(float(rise[0]), float(rise[1])),

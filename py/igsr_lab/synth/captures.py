@@ -329,7 +329,7 @@ def _photograph(folder: Path, seed: int, index: int, settings: CaptureSettings) 
         "cameras": rig.kind,
         "lamps": len(description.lights),
         "exposure": gain,
-        "centre": description.centre.tolist(),
+        "center": description.center.tolist(),
         "radius": description.radius,
     }
 

@@ -45,7 +45,7 @@ class Light:
     """A rectangle that shines to one side.
 
     Attributes:
-        at: its centre.
+        at: its center.
         towards: the point that it faces.
         size: half extents.
         radiance: linear RGB, [3].
@@ -69,11 +69,11 @@ class Description:
         surroundings: all other parts.
         lights: beside the sky.
         sky: linear RGB radiance, equirectangular [H, W, 3], row 0 at the zenith, or None for none.
-        centre: the point that cameras look at, about.
-        radius: how far the objects reach from ``centre``.
+        center: the point that cameras look at, about.
+        radius: how far the objects reach from ``center``.
         open_towards: the azimuth in radians from which objects are seen best, or None where they
             can be seen from all around.
-        room: how far from ``centre`` cameras may stand; infinite outdoors.
+        room: how far from ``center`` cameras may stand; infinite outdoors.
     """
 
     family: str
@@ -83,7 +83,7 @@ class Description:
     sky: np.ndarray | None
     surroundings: list[Part] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
-    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    center: np.ndarray = field(default_factory=lambda: np.zeros(3))
     radius: float = 1.0
     open_towards: float | None = None
     room: float = np.inf

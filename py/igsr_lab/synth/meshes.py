@@ -207,8 +207,8 @@ def prism(
     reach = 2.0 * np.abs(outline).max()
     caps = []
     for level in (0, -1):
-        centre = np.broadcast_to([0.0, 0.0, wall[level, 0, 2]], wall[level].shape)
-        vertices, faces, _ = grid_mesh(np.stack([centre, wall[level]]))
+        center = np.broadcast_to([0.0, 0.0, wall[level, 0, 2]], wall[level].shape)
+        vertices, faces, _ = grid_mesh(np.stack([center, wall[level]]))
         caps.append((vertices, faces, vertices[:, :2] / reach + 0.5))
     return [grid_mesh(wall), *caps]
 

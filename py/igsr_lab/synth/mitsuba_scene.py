@@ -257,7 +257,7 @@ def take_photo(loaded: LoadedScene, viewpoint: Viewpoint, samples: int, seed: in
 
 
 def first_hits(loaded: LoadedScene, viewpoint: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
-    """What the ray through each pixel's centre meets first.
+    """What the ray through each pixel's center meets first.
 
     Returns:
         The z-depth along the camera's axis, float32 [H, W], world units, NaN where nothing is hit;
@@ -265,7 +265,7 @@ def first_hits(loaded: LoadedScene, viewpoint: Viewpoint) -> tuple[np.ndarray, n
     """
     import mitsuba as mi
 
-    # One sample in the middle of its only stratum: the pixel's centre.
+    # One sample in the middle of its only stratum: the pixel's center.
     camera = sensor(viewpoint, {"type": "stratified", "sample_count": 1, "jitter": False})
     integrator = mi.load_dict({"type": "depth", "block_size": BLOCK_SIZE})
 
@@ -297,7 +297,7 @@ def camera_error(viewpoints: Sequence[Viewpoint], lamps: np.ndarray, radius: flo
 
     Args:
         viewpoints: each sees every lamp.
-        lamps: [N, 3], centres of small shining balls.
+        lamps: [N, 3], centers of small shining balls.
         radius: of the balls, world units.
     """
     import mitsuba as mi

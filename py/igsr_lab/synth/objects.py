@@ -614,12 +614,12 @@ def drums(rng: np.random.Generator, materials: Materials) -> list[Part]:
         deep, foot = rng.uniform(0.15, 0.45), rng.uniform(0.15, 0.6)
         shell = [(radius, 0.0), (radius, 0.01), (radius, deep - 0.01), (radius, deep)]
         tilt = rotation((1, 0.3, 0), float(rng.uniform(-0.35, 0.35)))
-        centre = (at[0], at[1], foot)
-        parts.append(Part(transformed(lathe(shell, 48), tilt, centre), materials.textured()))
+        center = (at[0], at[1], foot)
+        parts.append(Part(transformed(lathe(shell, 48), tilt, center), materials.textured()))
         skin = Part(place(disc(radius), (0, 0, deep)), materials.textured("speckle", "printed"))
-        parts += moved([skin], tilt, centre)
+        parts += moved([skin], tilt, center)
         legs = [
-            _rod(centre, (at[0] + 0.3 * math.cos(a), at[1] + 0.3 * math.sin(a), 0.0), 0.014)
+            _rod(center, (at[0] + 0.3 * math.cos(a), at[1] + 0.3 * math.sin(a), 0.0), 0.014)
             for a in (0.3, 2.4, 4.5)
         ]
         parts.append(Part(joined(legs), materials.metal()))

@@ -17,7 +17,7 @@ ROWS = 256
 
 
 def _directions(rows: int) -> np.ndarray:
-    """[rows, 2 rows, 3]: the unit vector through the centre of every pixel."""
+    """[rows, 2 rows, 3]: the unit vector through the center of every pixel."""
     polar = (np.arange(rows) + 0.5) / rows * np.pi
     around = (np.arange(2 * rows) + 0.5) / rows * np.pi
     ring = np.sin(polar)[:, None]

@@ -76,11 +76,11 @@ def _lamps(rng: np.random.Generator, most: int, reach: float, power: float) -> l
 
 
 def _framed(description: Description) -> Description:
-    """The description with ``centre`` and ``radius`` of its objects."""
+    """The description with ``center`` and ``radius`` of its objects."""
     lowest, highest = bounds(description.objects)
-    description.centre = 0.5 * (lowest + highest)
+    description.center = 0.5 * (lowest + highest)
     description.radius = max(
-        float(np.linalg.norm(part.mesh[0] - description.centre, axis=1).max())
+        float(np.linalg.norm(part.mesh[0] - description.center, axis=1).max())
         for part in description.objects
     )
     return description

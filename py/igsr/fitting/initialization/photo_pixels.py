@@ -84,7 +84,7 @@ def world_points(view: View, rows: Int64, columns: Int64) -> Float64:
 
 def camera_centers(views: list[View]) -> Float64:
     """Positions [V, 3] of the views' cameras, world frame."""
-    return np.array([view.camera.centre for view in views]).reshape(-1, 3)
+    return np.array([view.camera.center for view in views]).reshape(-1, 3)
 
 
 def by_distance(centers: Float64, k: int) -> list[int]:

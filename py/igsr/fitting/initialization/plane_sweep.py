@@ -176,7 +176,7 @@ def _luma(view: View, usable: Bool) -> Float32:
 
 def _angles_deg(views: list[View], target: Float64) -> Float64:
     """Angles [V, V] between the directions from which photos see the target."""
-    rays = np.stack([view.camera.centre - target for view in views])
+    rays = np.stack([view.camera.center - target for view in views])
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
     rays = rays / np.maximum(lengths, np.finfo(np.float64).tiny)
     angles: Float64 = np.degrees(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
@@ -200,7 +200,7 @@ def _depth_range(view: View, target: Float64, known: Float64 | None) -> tuple[fl
         if inside.sum() >= MIN_KNOWN_POINTS:
             low, high = np.percentile(depth[inside], [1.0, 99.0])
             return MIN_POINT_DEPTH * float(low), MAX_POINT_DEPTH * float(high)
-    distance = max(float(np.linalg.norm(target - view.camera.centre)), 1e-9)
+    distance = max(float(np.linalg.norm(target - view.camera.center)), 1e-9)
     return MIN_DEPTH * distance, MAX_DEPTH * distance
 
 

@@ -54,7 +54,7 @@ def ray_points(
             usable = np.flatnonzero(view.mask)
         pixel = random.choice(usable, size=rays)
         directions = pixel_rays(camera, pixel % camera.width, pixel // camera.width)
-        distance = float(np.linalg.norm(target - camera.centre))
+        distance = float(np.linalg.norm(target - camera.center))
         # Without jitter, all points would be on a few shells.
         jitter = np.exp(random.uniform(-0.5, 0.5, size=rays) * np.log(depths[1] / depths[0]))
         z = distance * depths[None, :] * jitter[:, None]

@@ -27,7 +27,7 @@ def viewed_box(cameras: list[Camera]) -> tuple[Float64, Float64]:
     It is as large as what their photos show at that distance.
     """
     target = focus_point(cameras)
-    distances = [float(np.linalg.norm(camera.centre - target)) for camera in cameras]
+    distances = [float(np.linalg.norm(camera.center - target)) for camera in cameras]
     tangents = [0.5 * max(c.width / c.K[0, 0], c.height / c.K[1, 1]) for c in cameras]
     half_side = float(np.median(distances) * np.median(tangents))
     return target - half_side, target + half_side

@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo
-from igsr.capture.tracks import straightened, track_confidence
+from igsr.capture.read_colmap import track_confidence
 from igsr.capture.types import Tracks, intrinsic_matrix
-from igsr.capture.undistort import Lens
+from igsr.capture.undistort import Lens, straightened
 from igsr.pose.colmap.attempts import Mapped
 from igsr.pose.estimate import Estimate
 

@@ -133,7 +133,7 @@ class Da3:
         """Predict a pass; with known cameras, in their world."""
         shown = [photos[i] for i in part]
         known = [self.cameras[photo.name] for photo in shown] if self.cameras else None
-        centers = np.array([camera.centre for camera in known or ()])
+        centers = np.array([camera.center for camera in known or ()])
         # Tolerate only rounding: coordinates may be millions of meters, as in map projections.
         if len(centers) and np.ptp(centers, axis=0).max() <= 1e-9 * np.abs(centers).max():
             raise IgsrError(
@@ -206,7 +206,7 @@ class Da3:
             )
         placed = [one for one in aligned if one is not None]
         if len(placed) > 1:
-            centers = np.stack([one.camera.centre for one in placed])
+            centers = np.stack([one.camera.center for one in placed])
             spread = float(np.linalg.norm(centers - centers[0], axis=1).max())
             depth = float(np.median([np.nanmedian(one.depth) for one in placed]))
             if spread <= MAX_ONE_PLACE * depth:

@@ -1,0 +1,269 @@
+"""Open and decode the files of photos, masks and depths, which are untrusted."""
+
+from __future__ import annotations
+
+import posixpath
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from igsr import _core
+from igsr.capture.downscaling import area_means
+from igsr.errors import IgsrError
+
+Numbers = npt.NDArray[Any]
+
+_HEIF_SUFFIXES = (".heic", ".heif")
+SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".gif"),
+    *_HEIF_SUFFIXES,
+)
+
+# Pillow reads more formats, but runs another program for some of them (EPS).
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "GIF")
+
+# A file that claims more is a decompression bomb or damaged.
+_MAX_PIXELS_PER_BYTE = 10_000
+
+#: Folder of depths, for cameras that do not name their depth files.
+DEPTHS = "depths"
+_DEPTH_SUFFIXES = (".npy", ".exr", ".png", ".tif", ".tiff")
+# World units of a whole number, unless a capture gives them: depth cameras write millimeters.
+_WHOLE_NUMBER_UNIT = 1e-3
+# Depths outside these limits count as unknown; products with them would overflow float32.
+_MIN_DEPTH = 1e-20
+_MAX_DEPTH = 1e20
+
+
+def is_file(path: Path) -> bool:
+    """Return whether the path is a file; False for impossible paths (an embedded NUL)."""
+    try:
+        return path.is_file()
+    except (ValueError, OSError):
+        return False
+
+
+def open_image(path: Path) -> Image.Image:
+    """Open an image without decoding its pixels.
+
+    Raises:
+        IgsrError: the file is missing, has an unsupported format, or claims more pixels than its
+            bytes can hold.
+    """
+    formats: tuple[str, ...] = _FORMATS
+    if path.suffix.lower() in _HEIF_SUFFIXES:
+        # Imported here because it loads an HEVC decoder, which few captures need.
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
+        formats = ("HEIF",)
+    try:
+        file_size = path.stat().st_size
+        image = Image.open(path, formats=formats)
+    except FileNotFoundError as error:
+        raise IgsrError(f"{path} does not exist; put the image there") from error
+    except Image.DecompressionBombError as error:
+        raise IgsrError(f"{path} claims too many pixels for a photo; shrink it") from error
+    except Exception as error:  # Pillow's plugins raise anything at all on broken files.
+        raise IgsrError(
+            f"{path} cannot be read as an image; save it as PNG, JPEG, WebP or TIFF again"
+        ) from error
+    if image.width * image.height > file_size * _MAX_PIXELS_PER_BYTE:
+        image.close()
+        raise IgsrError(
+            f"{path} claims {image.width}x{image.height} pixels but has only {file_size} bytes; "
+            "save it again"
+        )
+    return image
+
+
+@dataclass(frozen=True)
+class PhotoHeader:
+    """Width and height of a photo in pixels as stored, and channels: 3, or 4 with alpha."""
+
+    size: tuple[int, int]
+    channels: int
+
+
+def photo_header(path: Path) -> PhotoHeader:
+    """Read the header of a photo; raises as ``open_image``."""
+    with open_image(path) as image:
+        return PhotoHeader(image.size, 4 if _has_alpha(image) else 3)
+
+
+def load_pixels(image: Image.Image, path: Path) -> None:
+    """Decode the pixels of an image from ``open_image``; damage is an IgsrError."""
+    try:
+        image.load()
+    except Exception as error:  # as in open_image
+        raise IgsrError(f"{path} is truncated or damaged; copy it again") from error
+
+
+def decoded(
+    image: Image.Image,
+    path: Path,
+    size: tuple[int, int] | None = None,
+    mask: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Decode an image from ``open_image`` as stored: its EXIF orientation is not applied.
+
+    Palettes, grays, 16 bits, CMYK and the like are converted. To reduce a JPEG by more than 2, it
+    is decoded at a half, a quarter or an eighth of its size, at least twice the wanted size, and
+    then reduced by an area filter.
+
+    Args:
+        image: its pixels are not decoded yet.
+        path: of its file, for error messages.
+        size: width and height to reduce it to, or None.
+        mask: bool [H, W] of its pixels: masked ones lend no color to the smaller photo.
+
+    Returns:
+        uint8 [h, w, 3] RGB, or [h, w, 4] with straight alpha if the file has transparency, and the
+        mask at that size.
+
+    Raises:
+        IgsrError: the file is truncated or damaged, or has pixels of an unsupported kind.
+    """
+    box = None
+    if size is not None and size != image.size and mask is None:
+        full = image.size
+        drafted = image.draft(None, (2 * size[0], 2 * size[1]))
+        if drafted is not None and image.size != full:
+            box = drafted[1][2], drafted[1][3]  # the last row and column may be partly outside
+    load_pixels(image, path)
+    if size is None or size == image.size:
+        return _pixels(image, path), mask
+    return area_means(_ImageRows(image, path), *size, mask, box)
+
+
+class _ImageRows:
+    """Pixels of a decoded image, converted a few rows at a time to save memory."""
+
+    def __init__(self, image: Image.Image, path: Path) -> None:
+        self._image, self._path = image, path
+        self.shape = (image.height, image.width, 4 if _has_alpha(image) else 3)
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        box = (0, rows.start, self._image.width, min(rows.stop, self._image.height))
+        return _pixels(self._image.crop(box), self._path)
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
+
+
+def _pixels(image: Image.Image, path: Path) -> np.ndarray:
+    """A decoded image as uint8 [H, W, 3] RGB, or [H, W, 4] with straight alpha if it has alpha."""
+    image = _eight_bit(image, path)
+    mode = "RGBA" if _has_alpha(image) else "RGB"
+    if image.mode == "La":
+        image = image.convert("LA")
+    return np.array(image if image.mode == mode else _converted(image, path, mode))
+
+
+def mask_of(image: Image.Image, path: Path) -> np.ndarray:
+    """Decode an image from ``open_image`` as a mask, bool [H, W].
+
+    It is True for pixels brighter than half of the brightest, so that masks of 0 and 1 mean the
+    same as masks of 0 and 255.
+    """
+    load_pixels(image, path)
+    # convert("L") of transparent images keeps the gray and drops the alpha.
+    gray = np.array(_converted(_eight_bit(image, path), path, "L")).astype(np.int32)
+    return 2 * gray > max(int(gray.max()), 1)
+
+
+def _eight_bit(image: Image.Image, path: Path) -> Image.Image:
+    """A 16-bit gray image in 8 bits; any other image as it is."""
+    if image.mode.startswith("I"):
+        gray = np.asarray(image)
+        if gray.min() < 0 or gray.max() > 65535:
+            raise IgsrError(f"{path} has 32-bit pixels; save it with 8 or 16 bits")
+        return Image.fromarray(np.rint(gray / 257.0).astype(np.uint8))
+    if image.mode == "F":
+        raise IgsrError(f"{path} has floating-point pixels; save it with 8 or 16 bits")
+    return image
+
+
+def _converted(image: Image.Image, path: Path, mode: str) -> Image.Image:
+    try:
+        return image.convert(mode)
+    except Exception as error:
+        raise IgsrError(
+            f"{path} has pixels of the unsupported kind {image.mode}; save it as RGB or RGBA"
+        ) from error
+
+
+def find_depth(folder: Path, name: str) -> Path | None:
+    """Return a photo's depth file: its name, with or without suffix, and a suffix of depth."""
+    stems = (name, posixpath.splitext(name)[0])
+    files = (folder / f"{stem}{suffix}" for stem in stems for suffix in _DEPTH_SUFFIXES)
+    return next((file for file in files if file.is_file()), None)
+
+
+def write_depth(path: Path, depth: Numbers) -> None:
+    """Write depth [h, w] in world units as float32 ``.npy``; a missing folder is created."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, depth.astype(np.float32), allow_pickle=False)
+
+
+def read_depth(path: Path, unit: float | None) -> npt.NDArray[np.float32]:
+    """Read a depth file.
+
+    Args:
+        path: an ``.npy``, an OpenEXR (channel Z, or else its only one), a 16-bit picture or a
+            32-bit float TIFF. 0, negative and non-finite numbers mean that the depth is unknown.
+        unit: world units of one number in the file; None is 0.001 for whole numbers and 1 for
+            floats.
+
+    Returns:
+        Camera-space z [h, w] in world units, 0 for unknown depths.
+
+    Raises:
+        IgsrError: the file cannot be read, or holds something else.
+    """
+    suffix = path.suffix.lower()
+    stored = _npy(path) if suffix == ".npy" else _exr(path) if suffix == ".exr" else _picture(path)
+    if unit is None:
+        unit = _WHOLE_NUMBER_UNIT if np.issubdtype(stored.dtype, np.integer) else 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = stored.astype(np.float64) * unit
+    is_known = np.isfinite(depth) & (depth > _MIN_DEPTH) & (depth < _MAX_DEPTH)
+    return np.where(is_known, depth, 0.0).astype(np.float32)
+
+
+def _picture(path: Path) -> Numbers:
+    with open_image(path) as image:
+        load_pixels(image, path)
+        if image.mode not in ("I", "I;16", "I;16B", "F"):
+            raise IgsrError(
+                f"{path} is an 8-bit picture, which cannot hold depth; give a 16-bit PNG, .npy or "
+                "EXR"
+            )
+        return np.asarray(image).astype(np.float32 if image.mode == "F" else np.int64)
+
+
+def _exr(path: Path) -> Numbers:
+    try:
+        return _core.read_exr_depth(str(path))
+    except (OSError, ValueError) as error:
+        raise IgsrError(f"{path} cannot be read as depth: {error}") from error
+
+
+def _npy(path: Path) -> Numbers:
+    try:
+        # Mapped, so that a header that claims more than the file holds reserves no memory.
+        stored = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise IgsrError(f"{path} cannot be read as depth: {error}") from error
+    if not isinstance(stored, np.ndarray) or stored.dtype.kind not in "uif":
+        raise IgsrError(f"{path} holds no numbers; give depth as a .npy array of [H, W]")
+    if stored.ndim == 3 and 1 in (stored.shape[0], stored.shape[2]):
+        stored = stored[0] if stored.shape[0] == 1 else stored[..., 0]
+    if stored.ndim != 2 or 0 in stored.shape:
+        raise IgsrError(f"{path} has shape {list(stored.shape)}; give depth as [H, W]")
+    return np.array(stored)
