@@ -185,6 +185,7 @@ def test_fit_finds_cameras_once_and_keeps_them(photos, calls, tmp_path, igsr_her
     assert len(calls) == 1
 
 
+@pytest.mark.filterwarnings("ignore:Not placed")
 def test_found_cameras_serve_photos_of_any_size(photos, calls, tmp_path):
     sizes = []
     for size in (None, 30, 20, 99):
@@ -221,6 +222,7 @@ def test_cameras_of_other_photos_or_settings_are_found_again(photos, calls, tmp_
     assert read_cameras_file(damaged).photos["01.png"] == (photos / "01.png").stat().st_size
 
 
+@pytest.mark.filterwarnings("ignore:2 of 6")
 @pytest.mark.parametrize("command", ["fit", "refine"])
 def test_a_run_with_few_placed_photos_stops_with_advice(photos, only, tmp_path, igsr_here, command):
     calls = []

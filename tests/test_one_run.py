@@ -15,7 +15,7 @@ from PIL import Image, ImageFile
 
 import igsr
 from igsr._internal import part_usage
-from igsr.capture.photos import SUFFIXES
+from igsr.capture.image_files import SUFFIXES
 from igsr.denoiser import save_network
 from igsr.denoiser.network import Architecture, DenoiserNetwork
 from igsr.fitting import train

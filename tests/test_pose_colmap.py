@@ -172,7 +172,8 @@ def test_few_pairs_of_many_photos_are_matched(monkeypatch: pytest.MonkeyPatch) -
     assert len(pairs.pairs_to_match(pairs.MAX_EXHAUSTIVE_PHOTOS, Path("database"))) == 60 * 59 // 2
     tiles = pairs.in_tiles(chosen)
     assert sorted(pair for tile in tiles for pair in tile) == chosen
-    assert max(len({photo for pair in tile for photo in pair}) for tile in tiles) <= 2 * pairs.TILE_PHOTOS
+    photos_of_tiles = [len({photo for pair in tile for photo in pair}) for tile in tiles]
+    assert max(photos_of_tiles) <= 2 * pairs.TILE_PHOTOS
 
 
 def test_a_warning_says_how_long_many_photos_take(monkeypatch: pytest.MonkeyPatch) -> None:
