@@ -150,6 +150,7 @@ check-python: build $(VENV)/.dev-ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tests/plain_words.py --check
 	$(PYTEST)
 
 # ---- system packages ---------------------------------------------------------------------------

@@ -16,10 +16,10 @@ from igsr.cli import app
 from igsr.evaluation.scores import BLACK
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.settings import FitSettings
-from igsr.geometry.camera_noise import Noise, noise_unit, noisy_view
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
 from igsr_lab.__main__ import app as lab_app
+from igsr_lab.camera_noise import Noise, noise_unit, noisy_view
 from igsr_lab.study import noisy_poses, pose_noise
 from igsr_lab.study.noisy_poses import CLEAN, PoseFit, compared, run_fit
 from igsr_lab.study.noisy_poses import markdown as pose_table
@@ -342,7 +342,7 @@ def test_affine_noise_is_the_same_picture_with_a_shear(made):
 
 
 def test_the_photo_is_sheared_by_what_the_camera_is_not():
-    from igsr.geometry.camera_noise import _rows_shifted
+    from igsr_lab.camera_noise import _rows_shifted
 
     image = np.zeros((3, 6, 4), np.uint8)
     image[:, 2] = (200, 100, 50, 255)

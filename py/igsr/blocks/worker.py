@@ -37,7 +37,7 @@ from igsr.evaluation.scores import default_background, score_views
 from igsr.fitting.checkpoint import load_checkpoint
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.fitter import without_exposures
-from igsr.fitting.photo_support import support_of
+from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import settings_for
 from igsr.fitting.result import FitResult
 from igsr.splats import Splats, joined, subset
@@ -139,10 +139,10 @@ def _fit(
     The depths give presets the number of photos that see the same place. Without blocks it is
     counted at the point that all photos look at; large scenes have no such point.
     """
-    support = support_of(photos_among(capture.train_views), depths)
+    statistics = photo_statistics(photos_among(capture.train_views), depths)
     given = {name: value for name, value in task.settings.items() if name != "start"}
     quality = given.pop("quality", "normal")
-    preset = settings_for(support, quality, **given)
+    preset = settings_for(statistics, quality, **given)
     chosen: dict[str, Any] = {"dropout": preset.dropout, "density": preset.density}
     max_splats = round(task.splats_part * preset.max_splats)
     if start is None:

@@ -1,4 +1,4 @@
-"""A matcher's features and matches in COLMAP's database, verified there."""
+"""Put the features and matches of a matcher into COLMAP's database, and verify them."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from igsr.pose.colmap.matcher import Matcher, PhotoFeatures
 from igsr.pose.colmap.pairs import EXHAUSTIVE
 from igsr.pose.estimate import Progress
 
-#: Matches of a pair that verification needs at least (COLMAP's number of inliers).
-FEWEST = 15
+#: Minimum number of matches of a pair for verification (COLMAP's number of inliers).
+MIN_MATCHES = 15
 
 
 def matched_by(
     matcher: Matcher, photos: Sequence[Photo], database: Path, seed: int, show: Progress
 ) -> Path:
-    """Put a matcher's features and matches of all pairs into a database, and verify them.
+    """Match all pairs of photos by a matcher, and verify the matches.
 
     Args:
-        matcher: finds them.
-        photos: those of the database.
-        database: of the photos, without features; it is changed.
-        seed: of the search for the geometry of pairs.
-        show: called with "features" and "matching", how much is done, and how much there is.
+        matcher: of features.
+        photos: of the database.
+        database: without features; it is changed.
+        seed: of the verification.
+        show: called with "features" and "matching", done and total.
 
     Returns:
         The database.
 
     Raises:
-        IgsrError: there are too many photos to compare all, or the matcher's arrays cannot be used.
+        IgsrError: there are too many photos for all pairs, or the matcher's arrays are invalid.
     """
     import pycolmap
 
@@ -46,28 +46,28 @@ def matched_by(
             f"matcher {matcher.name} compares every pair of photos: give at most {EXHAUSTIVE} of "
             f"the {count} photos, or use matcher sift"
         )
-    found = []
+    features = []
     for index, photo in enumerate(photos):
         show("features", index, count)
-        found.append(_features(matcher, photo))
+        features.append(_features(matcher, photo))
     show("features", count, count)
     pairs = [(a, b) for a in range(count) for b in range(a + 1, count)]
-    listing = database.with_name("pairs.txt")
-    listed = []
+    matched = []
     with pycolmap.Database.open(database) as opened:
-        for index, one in enumerate(found):
+        for index, one in enumerate(features):
             opened.write_keypoints(image_id(index), one.xy)
         for done, (a, b) in enumerate(pairs):
             show("matching", done, len(pairs))
-            matches = _matches(matcher, found[a], found[b])
-            if len(matches) >= FEWEST:
+            matches = _matches(matcher, features[a], features[b])
+            if len(matches) >= MIN_MATCHES:
                 opened.write_matches(image_id(a), image_id(b), matches)
-                listed.append(f"{photo_file(a)} {photo_file(b)}\n")
+                matched.append(f"{photo_file(a)} {photo_file(b)}\n")
     show("matching", len(pairs), len(pairs))
-    listing.write_text("".join(listed))
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    if listed:
+    if matched:
+        listing = database.with_name("pairs.txt")
+        listing.write_text("".join(matched))
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = seed
         pycolmap.verify_matches(database, listing, verification)
     return database
 
@@ -94,7 +94,7 @@ def _features(matcher: Matcher, photo: Photo) -> PhotoFeatures:
 def _matches(
     matcher: Matcher, first: PhotoFeatures, second: PhotoFeatures
 ) -> npt.NDArray[np.uint32]:
-    """The matches of two photos, checked: COLMAP would read beyond its arrays."""
+    """Match two photos and check the indices: COLMAP would read beyond its arrays."""
     if not len(first.xy) or not len(second.xy):
         return np.zeros((0, 2), dtype=np.uint32)
     matches = np.asarray(matcher.matches(first, second))

@@ -15,8 +15,14 @@ from typing import Any
 import numpy as np
 
 from igsr.pose.colmap.database import image_id, photo_file
-from igsr.pose.colmap.epipolar import Constraint, EpipolarLine, Plane
-from igsr.pose.colmap.guided_matching import Features, comparable, guided_matches
+from igsr.pose.colmap.guided_matching import (
+    Constraint,
+    EpipolarLine,
+    Features,
+    Plane,
+    comparable,
+    guided_matches,
+)
 from igsr.pose.colmap.pairs import in_tiles, pairs_to_match
 from igsr.pose.estimate import Progress
 
