@@ -14,11 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
+from ray_stand_in import stand_in_ray
 
 import igsr
 from igsr._internal.worker_processes import WorkerLostError
 from igsr.blocks import BlockOptions, fit_in_blocks, plan, run, runner, seams, tasks, worker
 from igsr.blocks.tasks import load_splats, save_splats
+from igsr.fitting import fit_capture
 from igsr.splats import joined, subset
 from igsr_lab.large_scenes import towns
 
@@ -103,10 +106,38 @@ def test_a_block_that_is_lost_is_done_alone_with_the_same_bits(whole, folder, tm
     copy = tmp_path / "copy"
     shutil.copytree(out, copy)
     (copy / "blocks/block-001/splats.npz").unlink()
+    # Checkpoints of other fits are not used.
+    checkpoint = copy / "blocks/block-001/checkpoint.npz"
+    fit_capture(igsr.load_capture(folder), steps=2, backend="cpu", checkpoint=checkpoint)
     again, other = fit_in_blocks(folder, copy, options())
     assert again == splats
     assert other["blocks"][0]["process"] == report["blocks"][0]["process"]
     assert other["blocks"][1]["process"] != report["blocks"][1]["process"]
+
+
+def test_blocks_over_ray_have_the_same_bits(whole, folder, tmp_path, monkeypatch):
+    ray = stand_in_ray(monkeypatch)
+    splats, _ = fit_in_blocks(folder, tmp_path, options(ray="auto"))
+    assert splats == whole[0]
+    assert not ray.running
+    assert ray.addresses == ["auto", "auto"]
+    # A machine with other instructions may give other bits.
+    for path in (tmp_path / "blocks").glob("block-*.json"):
+        row = json.loads(path.read_text())
+        path.write_text(json.dumps({**row, "host": "far", "instruction_set": "other"}))
+    with pytest.warns(UserWarning, match=r"^far: the instruction set is not .* other bits"):
+        fit_in_blocks(folder, tmp_path, options())
+
+
+def test_an_exception_of_the_listener_ends_the_run(folder, tmp_path):
+    def stop(event):
+        if event.stage == "coarse fit" and event.done == 1:
+            raise RuntimeError("stop here")
+
+    with pytest.raises(RuntimeError, match="stop here"):
+        fit_in_blocks(folder, tmp_path, options(), stop)
+    assert (tmp_path / "blocks/coarse.json").is_file()
+    assert not (tmp_path / "blocks/block-000").exists()
 
 
 def command(folder, out):
@@ -291,8 +322,8 @@ def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
     usual = {"start": start, "frozen": frozen}
     for changed, message in (
         ({"start": None}, "frozen needs start"),
-        ({"frozen": replace(frozen, sh=frozen.sh[:, :1].copy())}, "frozen has splats of SH degree"),
-        ({"frozen": replace(frozen, origin=np.ones(3))}, "frozen and start have other origins"),
+        ({"frozen": replace(frozen, sh=frozen.sh[:, :1].copy())}, "frozen has SH degree 0 and start has"),
+        ({"frozen": replace(frozen, origin=np.ones(3))}, "frozen and start have different origins"),
         ({"frozen": replace(frozen, antialiased=True)}, "frozen has antialiased splats"),
     ):
         with pytest.raises(igsr.IgsrError, match=message):

@@ -31,7 +31,7 @@ from igsr.capture import Camera, View
 from igsr.capture.photos import PhotoHeader, Shot
 from igsr.capture.types import intrinsic_matrix
 from igsr.capture.undistort import Lens
-from igsr.fitting.photo_support import support_of
+from igsr.fitting.photo_statistics import photo_statistics
 from igsr_lab.large_scenes import towns
 
 
@@ -187,10 +187,10 @@ def test_photos_of_many_places_tell_how_many_see_each():
     cameras = [camera([x, -4.0, z], (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)) for x, z in grid]
     image = np.zeros((24, 32, 3), np.uint8)
     views = [View(f"{k}.png", one, "train", image) for k, one in enumerate(cameras)]
-    assert support_of(views, np.full(100, 4.0)).seen_by == pytest.approx(2.8)
+    assert photo_statistics(views, np.full(100, 4.0)).overlap == pytest.approx(2.8)
     # Parts of photos look at what is in their own middle, and show less.
     parts = [cropped(view, Box(0.5, 0.0, 1.0, 1.0)) for view in views]
-    assert support_of(parts, np.full(100, 4.0)).seen_by == pytest.approx(1.0)
+    assert photo_statistics(parts, np.full(100, 4.0)).overlap == pytest.approx(1.0)
 
 
 def test_depths_are_those_of_the_points_that_photos_see():
