@@ -27,14 +27,10 @@ CONNECT_TIMEOUT_S = 10.0
 
 
 class RayCluster:
-    """A Ray cluster that is joined for the duration of a ``with`` block.
-
-    Attributes:
-        address: of its head, such as "10.0.0.1:6379"; "auto" for the cluster that this machine
-            belongs to; "local" for one on this machine. None tries "auto", then "local".
-    """
+    """A Ray cluster that is joined for the duration of a ``with`` block."""
 
     def __init__(self, address: str | None = None) -> None:
+        """Name the head: "10.0.0.1:6379", "auto" or "local"; None tries "auto", then "local"."""
         self.address = address
 
     def __enter__(self) -> RayCluster:
@@ -64,12 +60,7 @@ class RayCluster:
             self._ray.shutdown()
 
     def check(self, folder: Path) -> list[str]:
-        """Check that all machines can do the work, and return their names.
-
-        A lost machine may still be listed; another one answers in its place.
-
-        Args:
-            folder: shared folder, which all machines must see under the same path.
+        """Check that all machines have this igsr and see a shared folder; return their names.
 
         Raises:
             IgsrError: a machine lacks igsr, has another version of it, or does not see the folder.
@@ -79,6 +70,7 @@ class RayCluster:
         remote = self._ray.remote(num_cpus=0, max_retries=1)(_describe_node)
         pending = {}
         for listed in self._machines():
+            # Soft: Ray lists a lost machine for a while, and another one answers in its place.
             strategy = NodeAffinitySchedulingStrategy(listed["NodeID"], soft=True)
             name = listed.get("NodeManagerHostname") or listed["NodeID"][:8]
             task = remote.options(scheduling_strategy=strategy)

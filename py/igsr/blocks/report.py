@@ -40,12 +40,7 @@ OMITTED_FIELDS = ("across", "exposures", "key", "name")
 def score_photos(
     context: Context, plan: BlockPlan, splats: Splats
 ) -> tuple[dict[str, Any], list[ScoredView]]:
-    """Score held-out photos, or some train photos if none is held out.
-
-    Returns:
-        Scores of all these photos and of those that show a seam, for the report; and a few photos
-        for the page.
-    """
+    """Score held-out photos, or some train photos if none is held out; for report and page."""
     options, manifest = context.options, context.manifest
     split: Split = "test" if manifest.of_split("test") else "train"
     photos = manifest.of_split(split)

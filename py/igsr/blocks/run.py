@@ -126,10 +126,7 @@ def _check(options: BlockOptions) -> None:
 
 
 def _joined(plan: BlockPlan, coarse: Splats, tasks: Sequence[FitTask]) -> Splats:
-    """The splats of all blocks in the order of the cells, with the coarse fit's spanning splats.
-
-    A cell without a task keeps the splats of the coarse fit.
-    """
+    """The splats of all blocks, with spanning splats and unfitted cells from the coarse fit."""
     folders = {task.name: task.folder for task in tasks}
     positions, spanning = plan.grid.splat_positions(coarse), plan.grid.spanning(coarse)
     parts = []

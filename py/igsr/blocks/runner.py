@@ -32,14 +32,8 @@ def run_tasks(
 ) -> list[dict[str, Any]]:
     """Run the tasks that are not finished, and return the report row of each.
 
-    Args:
-        stage: name of the progress events.
-        tasks: the tasks.
-        ray: address of a Ray cluster, or None.
-        progress: as for ``fit_in_blocks``.
-
     Raises:
-        IgsrError: a task fails; the message names it. Rows of finished tasks are kept.
+        IgsrError: a task fails; the message names it. Finished tasks are kept.
         UserWarning: a task is started again, or machines of the cluster differ.
     """
     rows: dict[str, dict[str, Any]] = {}
@@ -90,13 +84,7 @@ def _run_in_process(task: FitTask) -> dict[str, Any]:
 
 
 def _for_retry(task: FitTask, error: Exception) -> FitTask:
-    """The task for the next attempt, after its process was lost or memory ran out.
-
-    It has fewer splats, except after the first loss: any process may be killed.
-
-    Raises:
-        IgsrError: there were too many attempts; the message names the task.
-    """
+    """The task for the next attempt; it has fewer splats, except after the first lost process."""
     if not isinstance(error, MemoryError) and not task.was_lost:
         warn_user(f"{task.name} was lost and is started again: {error}")
         return replace(task, was_lost=True)

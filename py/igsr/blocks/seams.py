@@ -27,8 +27,7 @@ def seam_scores(
 ) -> dict[str, Any] | None:
     """Mean PSNR in dB of the blocks' crops across seams, by the joined scene and by blocks alone.
 
-    The worker of a block scored it alone, with its splats beyond the cell and the frozen ones. None
-    if no photo shows a seam.
+    None if no photo shows a seam.
     """
     alone = {
         (task.name, name): psnr

@@ -134,11 +134,8 @@ def _fit(
     start: Splats | None = None,
     **keywords: Any,
 ) -> tuple[FitResult, dict[str, Any]]:
-    """Fit a capture, from the task's checkpoint if there is a usable one; return the report too.
-
-    The depths give presets the number of photos that see the same place. Without blocks it is
-    counted at the point that all photos look at; large scenes have no such point.
-    """
+    """Fit a capture, from the task's checkpoint if it can be used; return the report, too."""
+    # Large scenes have no point that all photos look at; the depths replace it.
     statistics = photo_statistics(photos_among(capture.train_views), depths)
     given = {name: value for name, value in task.settings.items() if name != "start"}
     quality = given.pop("quality", "normal")

@@ -157,10 +157,7 @@ def consensus_of(index: int, photos: Sequence[Thumbnail]) -> Consensus | None:
 
 
 def shown_at_any_depth(photo: Thumbnail, pixels: Int64, consensus: Consensus) -> Bool:
-    """Whether two neighbors show the color of each of M pixels at any common depth, bool [M].
-
-    They do so at the true depth if the scene so far has a wrong surface.
-    """
+    """Whether two neighbors show the color of each of M pixels at any common depth, bool [M]."""
     surface = photo.depth[photo.depth > 0.0]
     shown = np.zeros(len(pixels), np.bool_)
     if not len(pixels) or not len(surface):
@@ -184,14 +181,12 @@ def colors_at(picture: UInt8, at: Int64) -> Float32:
 def _color_ranges(
     neighbors: Sequence[Thumbnail], at: Int64, gains: Float32
 ) -> tuple[Float32, Float32]:
-    """Extreme colors [K, N, 3] around pixels [K, N] of neighbors, with the photo's gain.
-
-    Overexposed pixels of a neighbor may have any brighter color.
-    """
+    """Extreme colors [K, N, 3] around pixels [K, N] of neighbors, with the photo's gain."""
     pairs = list(zip(neighbors, at, strict=True))
     low = np.stack([colors_at(neighbor.low, at_n) for neighbor, at_n in pairs])
     high = np.stack([colors_at(neighbor.high, at_n) for neighbor, at_n in pairs])
     one = np.float32(1.0)
+    # Overexposed pixels may have any brighter color.
     brightest = np.where(high >= OVEREXPOSED, one, np.minimum(high * gains[:, None], one))
     return np.minimum(low * gains[:, None], one), brightest
 
@@ -258,10 +253,7 @@ def _sights(
     neighbors: Sequence[Thumbnail],
     occluded: bool = True,
 ) -> tuple[Int64, Bool]:
-    """Flat indices [K, N] of the neighbors' pixels that show points on rays, and their visibility.
-
-    A neighbor's surface occludes points, unless ``occluded`` is False.
-    """
+    """Flat indices [K, N] of the neighbors' pixels that points on rays lie in, and visibility."""
     at, visible = np.zeros((2, len(neighbors), len(depth)), np.int64)
     for k, neighbor in enumerate(neighbors):
         x, y, z = _projected(camera, neighbor.camera, rays, depth)
@@ -279,16 +271,13 @@ def _in_frame(camera: Camera, x: Float32, y: Float32, z: Float32) -> Bool:
 
 
 def _warped_depth(photo: Thumbnail, neighbor: Thumbnail) -> Float32:
-    """The depth [H, W] of a neighbor's surface in a photo, infinite if it has none.
-
-    Each pixel of the neighbor covers the four nearest pixels of the photo.
-    """
+    """The depth [H, W] of a neighbor's surface in a photo, infinite if it has none."""
     height, width = photo.usable.shape
     depth = neighbor.depth.reshape(-1)
     x, y, z = _projected(neighbor.camera, photo.camera, pixel_rays(neighbor.camera), depth)
     inside = (depth > 0.0) & _in_frame(photo.camera, x, y, z)
     x, y, z = x[inside] - 0.5, y[inside] - 0.5, z[inside]
-    # One more pixel on each side, for those that are half outside.
+    # Each pixel covers the four nearest ones, which may lie one pixel outside of the photo.
     warped = np.full((height + 2) * (width + 2), np.inf, np.float32)
     corner = (np.floor(y).astype(np.int64) + 1) * (width + 2) + np.floor(x).astype(np.int64) + 1
     for offset in (0, 1, width + 2, width + 3):

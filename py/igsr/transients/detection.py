@@ -111,15 +111,13 @@ def _deviation(compared: Sequence[tuple[Thumbnail, Consensus | None]]) -> float:
 
 
 def _distances(photo: Thumbnail, consensus: Consensus) -> Float32:
-    """Distance of colors from all consensus colors within ``RADIUS_PX``, float32 [H, W].
-
-    The mean of the neighborhood replaces missing colors; 0 if it has none either.
-    """
+    """Distance of colors from all consensus colors within ``RADIUS_PX``, float32 [H, W]."""
     height, width = photo.usable.shape
     sums = np.zeros((height * width, 4))
     sums[consensus.pixels[consensus.agreed], :3] = consensus.color[consensus.agreed]
     sums[consensus.pixels[consensus.agreed], 3] = 1.0
     whole = sums.reshape(height, width, 4)
+    # Means replace missing colors.
     whole = np.where(whole[..., 3:] > 0.0, whole, box_sums(whole, MEAN_RADIUS_PX))
     known = whole[..., 3:] > 0.0
     color = whole[..., :3] / np.maximum(whole[..., 3:], 1.0)
@@ -149,6 +147,7 @@ def transient_regions(
     different = window_max(window_min(different, 1), 1)
     seeds = different.copy()
     pixels = np.flatnonzero(different)
+    # A color that is shown at another depth is due to a wrong surface in the scene so far.
     seeds.reshape(-1)[pixels] = ~shown_at_any_depth(photo, pixels, consensus)
     seeds &= 2 * box_sums(seeds, VOTE_RADIUS_PX) >= box_sums(different, VOTE_RADIUS_PX)
     if not seeds.any():
