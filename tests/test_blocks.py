@@ -322,7 +322,7 @@ def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
     usual = {"start": start, "frozen": frozen}
     for changed, message in (
         ({"start": None}, "frozen needs start"),
-        ({"frozen": replace(frozen, sh=frozen.sh[:, :1].copy())}, "frozen has SH degree 0 and start has"),
+        ({"frozen": replace(frozen, sh=frozen.sh[:, :1].copy())}, "frozen has SH degree 0 and"),
         ({"frozen": replace(frozen, origin=np.ones(3))}, "frozen and start have different origins"),
         ({"frozen": replace(frozen, antialiased=True)}, "frozen has antialiased splats"),
     ):
