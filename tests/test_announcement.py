@@ -23,7 +23,7 @@ from igsr.fitting.time_estimate import (
     times_usual,
     work_done,
 )
-from igsr.pose.colmap.time_estimate import camera_seconds
+from igsr.pose.colmap.estimator import camera_seconds
 
 #: A step that takes a microsecond a pixel.
 BY_PIXELS = StepTime(0.0, 1e-6, 0.0)

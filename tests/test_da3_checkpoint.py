@@ -10,11 +10,10 @@ from da3_networks import TINY, hashed_network, hashed_weight
 from safetensors.torch import save_file
 
 from igsr.errors import IgsrError
+from igsr.pose.checkpoint_search import find_checkpoint
 from igsr.pose.da3.backbone import BASE, SMALL
 from igsr.pose.da3.checkpoint import (
     SIZES,
-    VARIABLE,
-    find_checkpoint,
     load_checkpoint,
     load_network,
     size_of,
@@ -27,7 +26,7 @@ NORM = "model.head.scratch.output_conv2_aux.{}.2.{}"
 def tiny_as_small(monkeypatch):
     # The published sizes would be hundreds of megabytes on disk.
     monkeypatch.setitem(SIZES, "da3-small", TINY)
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv("IGSR_DA3", raising=False)
 
 
 def published_weights():
@@ -239,7 +238,7 @@ def test_configs_that_describe_no_network(content):
 def test_where_checkpoints_are_searched(folder, tmp_path, monkeypatch):
     cache = tmp_path / "hub"
     monkeypatch.setenv("HF_HUB_CACHE", str(cache))
-    assert find_checkpoint() is None
+    assert find_checkpoint("da3") is None
     files = {}
     for size in ("SMALL", "BASE"):
         model = cache / f"models--depth-anything--DA3-{size}"
@@ -250,16 +249,16 @@ def test_where_checkpoints_are_searched(folder, tmp_path, monkeypatch):
         (model / "refs" / "main").write_text("bbbb\n")
     for file in (("SMALL", "aaaa"), ("SMALL", "bbbb"), ("BASE", "aaaa")):
         files[file].touch()
-        assert find_checkpoint() == files[file]
-    monkeypatch.setenv(VARIABLE, str(folder))
-    assert find_checkpoint() == folder / "model.safetensors"
-    assert find_checkpoint(files["SMALL", "aaaa"]) == files["SMALL", "aaaa"]
+        assert find_checkpoint("da3") == files[file]
+    monkeypatch.setenv("IGSR_DA3", str(folder))
+    assert find_checkpoint("da3") == folder / "model.safetensors"
+    assert find_checkpoint("da3", files["SMALL", "aaaa"]) == files["SMALL", "aaaa"]
     for missing in (tmp_path / "none", tmp_path / "a\0b", cache):
         with pytest.raises(IgsrError, match="checkpoint names"):
-            find_checkpoint(missing)
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
+            find_checkpoint("da3", missing)
+    monkeypatch.setenv("IGSR_DA3", str(tmp_path / "none"))
     with pytest.raises(IgsrError, match="IGSR_DA3 names"):
-        find_checkpoint()
+        find_checkpoint("da3")
 
 
 def test_a_missing_device(folder):

@@ -16,7 +16,8 @@ from safetensors.torch import save_file
 
 import igsr.pose.dust3r.checkpoint
 from igsr.errors import IgsrError
-from igsr.pose.dust3r.checkpoint import find_checkpoint, load_checkpoint, load_network
+from igsr.pose.checkpoint_search import find_checkpoint
+from igsr.pose.dust3r.checkpoint import load_checkpoint, load_network
 
 
 def call_of(config, **changes):
@@ -273,28 +274,28 @@ def touched(path):
 
 
 def test_where_checkpoints_are_searched(caches, monkeypatch):
-    assert find_checkpoint() is None
+    assert find_checkpoint("dust3r") is None
     touched(caches / "torch/hub/checkpoints/other.pth")
-    assert find_checkpoint() is None
+    assert find_checkpoint("dust3r") is None
     small = "DUSt3R_ViTLarge_BaseDecoder_224_linear"
     large = "DUSt3R_ViTLarge_BaseDecoder_512_dpt"
     expected = touched(caches / f"torch/hub/checkpoints/{small}.pth")
-    assert find_checkpoint() == expected
+    assert find_checkpoint("dust3r") == expected
     snapshots = caches / f"hf/hub/models--naver--{large}"
     expected = touched(snapshots / "snapshots/bbb/model.safetensors")
-    assert find_checkpoint() == expected
+    assert find_checkpoint("dust3r") == expected
     touched(snapshots / "snapshots/aaa/model.safetensors")
     touched(snapshots / "refs/main").write_text("bbb\n")
-    assert find_checkpoint() == expected
+    assert find_checkpoint("dust3r") == expected
     expected = touched(caches / f"torch/hub/checkpoints/{large}.pth")
-    assert find_checkpoint() == expected
+    assert find_checkpoint("dust3r") == expected
     mine, named = touched(caches / "mine.pth"), touched(caches / "named.pth")
     monkeypatch.setenv("IGSR_DUST3R", str(mine))
-    assert find_checkpoint() == mine
-    assert find_checkpoint(named) == named
+    assert find_checkpoint("dust3r") == mine
+    assert find_checkpoint("dust3r", named) == named
     monkeypatch.setenv("IGSR_DUST3R", str(caches / "gone.pth"))
     with pytest.raises(IgsrError, match=r"IGSR_DUST3R names .*gone\.pth"):
-        find_checkpoint()
+        find_checkpoint("dust3r")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scenes import capture as made_up_capture
 
-import igsr
 from igsr import _core
 
 pytestmark = pytest.mark.usefixtures("faults_end")

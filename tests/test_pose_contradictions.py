@@ -13,7 +13,7 @@ import rooms
 
 from igsr.capture.photo_folder import Photo
 from igsr.geometry.pose_errors import pose_accuracy
-from igsr.pose.colmap.attempts import mapped
+from igsr.pose.colmap.attempts import THRESHOLDS, mapped
 from igsr.pose.colmap.contradictions import (
     contradictions,
     leave_out,
@@ -23,7 +23,6 @@ from igsr.pose.colmap.contradictions import (
 )
 from igsr.pose.colmap.database import list_photos
 from igsr.pose.colmap.estimator import guarded
-from igsr.pose.colmap.evidence import STEPS
 from igsr.pose.colmap.features import find_features
 from igsr.pose.colmap.mapping import map_photos
 from igsr.pose.colmap.matching import matched, with_focal_lengths
@@ -156,14 +155,14 @@ def test_two_rooms_that_look_alike_are_kept_apart(
         matches = matches_of(photos, tmp_path)
         across = {pair for pair in links(matches) if pair[0] <= 5 < pair[1]}
         assert across
-        wrong = map_photos(9, with_focal_lengths(matches, 0), STEPS[0], 0, show)
+        wrong = map_photos(9, with_focal_lengths(matches, 0), THRESHOLDS[0], 0, show)
         assert wrong.num_reg_images() > 5
         assert contradictions(wrong, links(matches), {})
         copy = Path(shutil.copyfile(matches, tmp_path / "copy.db"))
         leave_out(copy, across)
         assert links(copy).keys() == links(matches).keys() - across
         found = mapped(len(photos), matches, 0, show)
-    assert found.alike == len(across)
+    assert found.removed_pairs == len(across)
     assert not found.doubtful
     estimate = estimate_of(photos, found)
     assert [camera is not None for camera in estimate.cameras] == [True] * 5 + [False] * 4
@@ -184,7 +183,7 @@ def test_photos_of_another_season_stay_in_one_model(
     photos += rooms.photos(cameras[1::2])
     with guarded(0):
         found = mapped(6, matches_of(photos, tmp_path), 0, show)
-    assert found.alike == 0
+    assert found.removed_pairs == 0
     estimate = estimate_of(photos, found)
     accuracy = pose_accuracy(estimate.cameras, [*cameras[::2], *cameras[1::2]])
     assert accuracy["registered"] == 6

@@ -14,7 +14,7 @@ from huggingface_hub import file_download as download
 
 from igsr.errors import IgsrError
 from igsr.pose import weights as module
-from igsr.pose.da3.checkpoint import find_checkpoint
+from igsr.pose.checkpoint_search import find_checkpoint
 from igsr.pose.weights import KNOWN, fetch_weights, known_weights, weights_path
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -144,7 +144,7 @@ def test_weights_are_fetched_found_and_not_fetched_twice(server, cache):
     assert (path.parent / "config.json").read_bytes() == CONTENT["config.json"]
     assert path.parent.name == COMMIT
     assert weights_path("da3-small") == path
-    assert find_checkpoint() == path
+    assert find_checkpoint("da3") == path
     assert (cache / "models--depth-anything--DA3-SMALL/refs/main").read_text() == COMMIT
     server.drops = 99  # would end every download
     assert fetch_weights("da3-small") == path

@@ -22,16 +22,15 @@ from igsr.capture.undistort import Lens
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
 from igsr.pose.colmap.adjustment import (
-    FEWEST_POINTS,
+    MIN_POINTS,
     Adjusted,
     adjusted,
     deviations,
     evidence_of_model,
 )
-from igsr.pose.colmap.attempts import Mapped, mapped
-from igsr.pose.colmap.distortion import without_distortion
-from igsr.pose.colmap.estimator import guarded, matched_photos, usable_by_number
-from igsr.pose.colmap.evidence import DOUBTFUL, STEPS
+from igsr.pose.colmap.attempts import FIRST_DOUBTFUL, THRESHOLDS, Mapped, mapped
+from igsr.pose.colmap.estimator import guarded, matched_photos, usable_by_image_id
+from igsr.pose.colmap.mapping import without_distortion
 from igsr.pose.colmap.matcher import Matcher
 from igsr.pose.colmap.matching import matched_along_lines, with_matches
 from igsr.pose.colmap.predicted_matches import matched_by_prediction, without_contradictions
@@ -107,8 +106,8 @@ def with_all_evidence(
             seed,
             show,
             sift=matcher is None,
-            usable=usable_by_number(photos),
-            steps=STEPS[:DOUBTFUL],
+            usable=usable_by_image_id(photos),
+            attempts=THRESHOLDS[:FIRST_DOUBTFUL],
         )
         model = found.model
         if model is not None:
@@ -229,7 +228,7 @@ def _by_both(
         known = {
             i: _evidence(covariance, default)
             for i, covariance in result.covariances.items()
-            if result.observed[i] >= FEWEST_POINTS
+            if result.observed[i] >= MIN_POINTS
         }
     pairs = list(zip(predicted, by_features, strict=True))
     certain = [
@@ -251,10 +250,10 @@ def _by_both(
         lens if photo.name in with_features else None
         for photo, lens in zip(photos, by_colmap.lenses or [None] * len(photos), strict=True)
     ]
-    if found.alike:
+    if found.removed_pairs:
         warnings.append(
             "Some photos show places that look alike: their matches contradict others and "
-            f"were left out (pairs of photos: {found.alike})."
+            f"were left out (pairs of photos: {found.removed_pairs})."
         )
     alone = [
         photo.name
@@ -277,7 +276,7 @@ def _contradicts(predicted: Sequence[Camera | None], result: Adjusted) -> bool:
     pairs = [
         (camera, wanted)
         for i, camera in result.cameras.items()
-        if (wanted := predicted[i]) is not None and result.observed[i] >= FEWEST_POINTS
+        if (wanted := predicted[i]) is not None and result.observed[i] >= MIN_POINTS
     ]
     if len(pairs) < 2:
         return False
@@ -352,7 +351,7 @@ def _with_cameras(
             depths = xyz @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
             known = one.depths_at(tracks.xy[own])
             both = np.isfinite(known) & (depths > 0.0)
-            if np.count_nonzero(both) >= FEWEST_POINTS:
+            if np.count_nonzero(both) >= MIN_POINTS:
                 # The median is robust against wrong points and edges.
                 ratio = np.exp(np.median(np.log(depths[both] / known[both])))
                 one = replace(one, depth=(one.depth * ratio).astype(np.float32))

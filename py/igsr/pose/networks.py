@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -110,14 +109,6 @@ class Checkpoint(Generic[Config]):
     unknown: list[str]  # sorted keys of the file that the network does not have
 
 
-def exists(path: Path, folder: bool = False) -> bool:
-    """Whether a path is a file, or a folder; False for names that neither can have."""
-    try:
-        return path.is_dir() if folder else path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
 def config_of(path: Path) -> dict[str, Any] | None:
     """Read the ``config.json`` next to a checkpoint; None if there is none.
 
@@ -136,24 +127,6 @@ def config_of(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError, RecursionError) as error:
         raise IgsrError(f"{config} cannot be read ({error}); download it again") from error
     return content
-
-
-def named_checkpoint(named: str | Path | None, variable: str, advice: str) -> Path | None:
-    """The file that the user names, by argument or by environment variable; None if not named.
-
-    Of a folder, it is ``model.safetensors``.
-
-    Raises:
-        IgsrError: there is no such file; the message ends with ``advice``.
-    """
-    for source, value in (("checkpoint", named), (variable, os.environ.get(variable))):
-        if value:
-            path = Path(value).expanduser()
-            path = path / "model.safetensors" if exists(path, folder=True) else path
-            if not exists(path):
-                raise IgsrError(f"{source} names {str(path)!r}, which does not exist; {advice}")
-            return path
-    return None
 
 
 def checked_weight(path: Path, key: str, value: Any, shape: Sequence[int]) -> Tensor:

@@ -17,13 +17,13 @@ import numpy.typing as npt
 
 from igsr.capture import Camera
 from igsr.pose.colmap.database import image_id
-from igsr.pose.colmap.given_matches import MIN_MATCHES
 from igsr.pose.colmap.guided_matching import (
     EpipolarLine,
     Features,
     comparable,
     guided_matches,
 )
+from igsr.pose.colmap.matcher import MIN_MATCHES
 from igsr.pose.depth_maps import AlignedPhoto
 from igsr.pose.estimate import Progress
 from igsr.pose.grid import ray_slopes

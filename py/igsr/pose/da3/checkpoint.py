@@ -1,4 +1,4 @@
-"""Find, read and check checkpoints of Depth Anything 3, which are untrusted files.
+"""Read and check checkpoints of Depth Anything 3, which are untrusted files.
 
 A checkpoint is a safetensors file, which holds only arrays and text, with a ``config.json`` next to
 it that gives the size. Without that file, the shapes give the size. Nothing in them is run.
@@ -16,6 +16,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from igsr.errors import IgsrError
+from igsr.pose.checkpoint_search import WEIGHTS, exists
 from igsr.pose.da3.backbone import BASE, FIRST_GLOBAL, OUTPUT_BLOCKS, SMALL, NetworkConfig
 from igsr.pose.da3.head import RAY_LEVEL, SHARED_NORM
 from igsr.pose.da3.network import Da3Network
@@ -23,21 +24,12 @@ from igsr.pose.networks import (
     Checkpoint,
     checked_weight,
     config_of,
-    exists,
-    named_checkpoint,
     with_weights,
     without_weights,
 )
-from igsr.pose.weights import cached_snapshots
 
-#: Environment variable that names a checkpoint.
-VARIABLE = "IGSR_DA3"
-#: The published models on huggingface.co, the better first.
-PUBLISHED = ("depth-anything/DA3-BASE", "depth-anything/DA3-SMALL")
 #: License of the published models.
 LICENSE = "Apache-2.0"
-#: The file in a checkpoint's folder.
-WEIGHTS = "model.safetensors"
 #: The implemented sizes, by the names of the published models.
 SIZES = {"da3-small": SMALL, "da3-base": BASE}
 
@@ -51,26 +43,6 @@ _UNUSED = re.compile(r"head\.scratch\.output_conv[12]_aux\.[012]\..*")
 _LARGER = re.compile(
     r"(da3|da3_metric|gs_head|gs_adapter)\..*|backbone\.pretrained\.blocks\.1[2-9]\..*"
 )
-
-
-def find_checkpoint(named: str | Path | None = None) -> Path | None:
-    """Find a checkpoint: the named one, else IGSR_DA3, else a cached one.
-
-    A named checkpoint is a safetensors file or a folder with ``model.safetensors``. The cache is
-    huggingface_hub's. Nothing is downloaded.
-
-    Raises:
-        IgsrError: the named checkpoint, or IGSR_DA3, does not exist.
-    """
-    advice = "name a checkpoint of Depth Anything 3, or get one by 'igsr weights fetch'"
-    path = named_checkpoint(named, VARIABLE, advice)
-    if path is not None:
-        return path
-    for model in PUBLISHED:
-        for folder in cached_snapshots(model):
-            if exists(folder / WEIGHTS):
-                return folder / WEIGHTS
-    return None
 
 
 def load_network(path: str | Path, device: str | None = None) -> Da3Network:

@@ -14,8 +14,9 @@ from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.geometry.similarity import similarity_between
 from igsr.pose.all_evidence import Evidence, with_all_evidence
+from igsr.pose.checkpoint_search import find_checkpoint
 from igsr.pose.colmap.matcher import Matcher, checked_matcher
-from igsr.pose.da3.checkpoint import LICENSE, SIZES, find_checkpoint, load_network
+from igsr.pose.da3.checkpoint import LICENSE, SIZES, load_network
 from igsr.pose.da3.passes import joined_passes, passes_of
 from igsr.pose.da3.prediction import SOURCES, Da3Predictor, Predictor
 from igsr.pose.depth_maps import (
@@ -227,7 +228,7 @@ class Da3:
         return warnings
 
     def _network(self) -> tuple[Predictor, dict[str, str]]:
-        path = find_checkpoint(self.checkpoint)
+        path = find_checkpoint("da3", self.checkpoint)
         if path is None:
             raise IgsrError(
                 "no checkpoint of Depth Anything 3 is found; get one by 'igsr weights fetch "

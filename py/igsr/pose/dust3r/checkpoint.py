@@ -1,4 +1,4 @@
-"""Find, read and check checkpoints of DUSt3R, which are untrusted files.
+"""Read and check checkpoints of DUSt3R, which are untrusted files.
 
 Two formats hold the same weights: ``torch.save`` with the sizes as the text of a constructor call,
 and safetensors with the sizes in a ``config.json`` next to it. Nothing in them is run.
@@ -19,26 +19,16 @@ import torch
 from safetensors.torch import load_file
 
 from igsr.errors import IgsrError
+from igsr.pose.checkpoint_search import exists
 from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig
 from igsr.pose.networks import (
     Checkpoint,
     checked_weight,
     config_of,
-    exists,
-    named_checkpoint,
     with_weights,
     without_weights,
 )
-from igsr.pose.weights import cached_snapshots
 
-#: Environment variable that names a checkpoint.
-VARIABLE = "IGSR_DUST3R"
-#: The published models, the best first.
-PUBLISHED = (
-    "DUSt3R_ViTLarge_BaseDecoder_512_dpt",
-    "DUSt3R_ViTLarge_BaseDecoder_512_linear",
-    "DUSt3R_ViTLarge_BaseDecoder_224_linear",
-)
 LICENSE = (
     "The weights of DUSt3R are under CC BY-NC-SA 4.0, which forbids commercial use of them and of "
     "their results, and come with the terms of the data sets that they were trained on "
@@ -71,27 +61,6 @@ _MAX_CALL_LENGTH = 10_000
 _UNUSED = re.compile(r"mask_token|downstream_head[12]\.dpt\.scratch\.layer_rn\.[0-3]\.weight")
 
 _license_shown = False
-
-
-def find_checkpoint(named: str | Path | None = None) -> Path | None:
-    """Find a checkpoint: the named file, else IGSR_DUST3R, else a cached one.
-
-    The caches belong to ``torch.hub`` (``checkpoints/NAME.pth``) and to huggingface_hub
-    (``models--naver--NAME``). Nothing is downloaded.
-
-    Raises:
-        IgsrError: the named file, or IGSR_DUST3R, does not exist.
-    """
-    path = named_checkpoint(named, VARIABLE, "name a checkpoint of DUSt3R, or none")
-    if path is not None:
-        return path
-    hub = Path(torch.hub.get_dir()) / "checkpoints"
-    for name in PUBLISHED:
-        cached = [one / "model.safetensors" for one in cached_snapshots(f"naver/{name}")]
-        for path in (hub / f"{name}.pth", *cached):
-            if exists(path):
-                return path
-    return None
 
 
 def load_network(path: Path, device: str | None = None) -> Dust3rNetwork:

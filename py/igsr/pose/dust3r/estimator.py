@@ -15,8 +15,9 @@ from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.alignment import PhotoToAlign, Predictor, align
+from igsr.pose.checkpoint_search import find_checkpoint
 from igsr.pose.depth_maps import AlignedPhoto, fused_points, trusted_pixels
-from igsr.pose.dust3r.checkpoint import find_checkpoint, load_network
+from igsr.pose.dust3r.checkpoint import load_network
 from igsr.pose.dust3r.prediction import DenseGrid, DenseMap, DustPredictor
 from igsr.pose.estimate import Estimate
 from igsr.pose.given_cameras import check_given_cameras
@@ -113,7 +114,7 @@ class Dust3r:
         )
 
     def _network(self) -> Predictor:
-        path = find_checkpoint(self.checkpoint)
+        path = find_checkpoint("dust3r", self.checkpoint)
         if path is None:
             raise IgsrError("no checkpoint of DUSt3R is found in the usual places; name one")
         return DustPredictor(load_network(path))
