@@ -323,7 +323,7 @@ def world(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder to run a page in, where fits are short."""
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    for name in ("fit", "fit_with_cameras", "refine", "compact"):
+    for name in ("fit", "refine", "compact"):
         monkeypatch.setattr(igsr, name, _short(getattr(igsr, name)))
     monkeypatch.setattr(Colmap, "__call__", _looked_for_once(Colmap.__call__))
     return tmp_path
