@@ -115,12 +115,12 @@ def test_bounds_and_orbit_ignore_nonfinite_splats():
     assert np.array_equal(high, splats.means[kept].max(axis=0))
     arrays = {n: a for n, a in vars(splats).items() if n not in ("origin", "antialiased")}
     clean = igsr.Splats(**{name: array[kept] for name, array in arrays.items()})
-    for ours, theirs in zip(orbit(splats, None, 3), orbit(clean, None, 3), strict=True):
+    for ours, theirs in zip(orbit(splats, [], 3), orbit(clean, [], 3), strict=True):
         assert np.array_equal(ours.viewmat, theirs.viewmat)
     splats.means[:] = np.nan
     assert splats.bounds() is None
     with pytest.raises(igsr.IgsrError, match="no finite splats"):
-        orbit(splats, None, 3)
+        orbit(splats, [], 3)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
