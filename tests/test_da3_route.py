@@ -297,9 +297,8 @@ def small_photos(monkeypatch):
     return [*photos[:2], high]
 
 
-@pytest.mark.parametrize("source", ["decoder", "rays"])
-def test_the_network_on_portrait_and_landscape_photos(small_photos, source):
-    estimator = unadjusted(Da3Predictor(hashed_network(), source))
+def test_the_network_on_portrait_and_landscape_photos(small_photos):
+    estimator = unadjusted(Da3Predictor(hashed_network()))
     one, again = estimator(small_photos, seed=1), estimator(small_photos, seed=1)
     for photo, camera, depth, other in zip(
         small_photos, one.cameras, one.depths, again.cameras, strict=True
@@ -358,8 +357,3 @@ def test_passes_are_as_large_as_memory_allows(monkeypatch):
     ):
         predictor.most_photos(photos)
     assert memory_of_pass(BASE, 16, pixels) < 6e9
-
-
-def test_an_unknown_source_of_cameras():
-    with pytest.raises(IgsrError, match="cameras_from is 'both'; give decoder or rays"):
-        Da3Predictor(hashed_network(), "both")
