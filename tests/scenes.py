@@ -62,15 +62,15 @@ def splats(count=40, degree=1, seed=0, origin=(0.0, 0.0, 0.0)):
     )
 
 
-def ring_camera(angle, size=48, distance=4.0, centre=(0.0, 0.0, 0.0)):
-    """A camera on a ring in the x-z plane, y down, looking at ``centre``."""
+def ring_camera(angle, size=48, distance=4.0, center=(0.0, 0.0, 0.0)):
+    """A camera on a ring in the x-z plane, y down, looking at ``center``."""
     back = np.array([np.sin(angle), 0.0, -np.cos(angle)])
     z = -back
     y = np.array([0.0, 1.0, 0.0])
     x = np.cross(y, z)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([x, y, z])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (np.asarray(centre) + distance * back)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (np.asarray(center) + distance * back)
     K = np.array([[1.5 * size, 0.0, size / 2], [0.0, 1.5 * size, size / 2], [0.0, 0.0, 1.0]])
     return Camera(viewmat, K, size, size)
 
@@ -84,7 +84,7 @@ def perturbed_camera(camera, degrees, moved, seed):
     rotation *= np.sign(np.diag(rotation))
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation @ camera.viewmat[:3, :3]
-    center = camera.centre + moved * random.normal(size=3) / np.sqrt(3.0)
+    center = camera.center + moved * random.normal(size=3) / np.sqrt(3.0)
     viewmat[:3, 3] = -viewmat[:3, :3] @ center
     return replace(camera, viewmat=viewmat)
 

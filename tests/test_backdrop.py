@@ -85,7 +85,7 @@ def test_opaque_scenes_have_the_photos_colors_behind_them():
     view = igsr.View("wall.png", camera, "train", image)
     forward = camera.viewmat[2, :3]
     wall = igsr.Splats(
-        means=(camera.centre + 2.0 * forward)[None].astype(np.float32),
+        means=(camera.center + 2.0 * forward)[None].astype(np.float32),
         quats=np.float32([[1.0, 0.0, 0.0, 0.0]]),
         scales=np.full((1, 3), 2.0, np.float32),
         opacities=np.float32([9.0]),
@@ -165,7 +165,7 @@ def test_compaction_keeps_the_backdrop(photos, scene):
 
 
 def test_no_backdrop_for_few_splats_or_no_extent(monkeypatch, photos):
-    still = photos.views[0].camera.centre
+    still = photos.views[0].camera.center
     at_camera = replace(BALL, means=np.tile(still, (len(BALL), 1)).astype(np.float32))
     same_place = [replace(v, camera=photos.views[0].camera) for v in photos.views]
     assert with_backdrop(at_camera, same_place, "cpu") is at_camera

@@ -80,12 +80,12 @@ def test_photos_at_one_place_are_not_torn_apart():
         split_into_cells(places[:4], 5)
 
 
-def camera(centre, up=(0.0, -1.0, 0.0), forward=(0.0, 0.0, 1.0)):
+def camera(center, up=(0.0, -1.0, 0.0), forward=(0.0, 0.0, 1.0)):
     z = np.array(forward)
     x = np.cross(-np.array(up), z)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
     return Camera(viewmat, intrinsic_matrix(50.0, 50.0, 16.0, 12.0), 32, 24)
 
 
@@ -93,12 +93,12 @@ def camera(centre, up=(0.0, -1.0, 0.0), forward=(0.0, 0.0, 1.0)):
 def test_the_ground_is_level(kind):
     random = np.random.default_rng(3)
     spread = {"plane": (5, 0.1, 4), "line": (9, 0.01, 0.01), "ball": (3, 3, 3), "place": (0, 0, 0)}
-    centres = random.normal(size=(60, 3)) * spread[kind]
+    centers = random.normal(size=(60, 3)) * spread[kind]
     # A drone's photos of the ground have no up of their own; those of a street do.
     drone = kind == "plane"
     cameras = [
-        camera(centre, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) if drone else camera(centre)
-        for centre in centres
+        camera(center, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) if drone else camera(center)
+        for center in centers
     ]
     axes = ground_axes(cameras)
     assert axes @ axes.T == pytest.approx(np.eye(2), abs=1e-9)
@@ -355,22 +355,22 @@ def made_up_capture(folder, count, points):
     with open(folder / "sparse/0/cameras.bin", "wb") as file:
         file.write(struct.pack("<QIiQQ", 1, 1, 1, 4000, 3000))
         file.write(struct.pack("<4d", 3000.0, 3000.0, 2000.0, 1500.0))
-    centres = np.stack(
+    centers = np.stack(
         [np.linspace(0.0, count / 10.0, count), np.full(count, -1.6), random.uniform(-4, 4, count)],
         axis=1,
     )
     xyz = random.uniform([0.0, -6.0, 4.0], [count / 10.0, 0.0, 8.0], (points, 3))
     # Each photo sees the points that lie ahead.
     seen = [
-        np.flatnonzero(np.abs(xyz[:, 0] - centre[0]) < 0.4 * (xyz[:, 2] - centre[2]))[:150]
-        for centre in centres
+        np.flatnonzero(np.abs(xyz[:, 0] - center[0]) < 0.4 * (xyz[:, 2] - center[2]))[:150]
+        for center in centers
     ]
     with open(folder / "sparse/0/images.bin", "wb") as file:
         file.write(struct.pack("<Q", count))
-        for number, (centre, ids) in enumerate(zip(centres, seen, strict=True)):
-            file.write(struct.pack("<I7dI", number + 1, 1.0, 0.0, 0.0, 0.0, *-centre, 1))
+        for number, (center, ids) in enumerate(zip(centers, seen, strict=True)):
+            file.write(struct.pack("<I7dI", number + 1, 1.0, 0.0, 0.0, 0.0, *-center, 1))
             file.write(f"{number:05d}.jpg".encode() + b"\0")
-            local = xyz[ids] - centre
+            local = xyz[ids] - center
             rows = np.zeros(len(ids), [("xy", "<f8", 2), ("id", "<i8")])
             rows["xy"] = 3000.0 * local[:, :2] / local[:, 2:] + [2000.0, 1500.0]
             rows["id"] = ids + 1

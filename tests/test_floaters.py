@@ -170,7 +170,7 @@ def test_unsampled_photos_keep_their_splats(monkeypatch):
     assert seen.shown[0] > 1
     assert unsupported_splats(model, views, BLACK, backend="cpu")["floating"][-1]
     monkeypatch.setattr(removal, "MAX_NEED_PHOTOS", 1)
-    elsewhere = scenes.ring_camera(0.0, centre=(50.0, 0.0, 0.0))
+    elsewhere = scenes.ring_camera(0.0, center=(50.0, 0.0, 0.0))
     photos = [replace(views[0], camera=elsewhere), *views]
     assert not unsupported_splats(model, photos, BLACK, backend="cpu")["floating"][-1]
 

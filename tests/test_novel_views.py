@@ -76,10 +76,10 @@ def test_what_is_too_near_goes_by_how_far_a_view_itself_is():
     """Halfway between a camera at 2 and one at 10 a view is 6 away, whichever it is made from."""
     known = [scenes.ring_camera(0.0, distance=2.0), scenes.ring_camera(0.9, distance=10.0)]
     (free,) = (view for view in novel_views(BALL, known, 20, "cpu") if view.between)
-    centre = free.camera.center
-    assert np.linalg.norm(centre) == pytest.approx(6.0, rel=0.1)
+    center = free.camera.center
+    assert np.linalg.norm(center) == pytest.approx(6.0, rel=0.1)
     for part, stays in ((0.8 * CLOSE, False), (1.3 * CLOSE, True)):
-        found = novel_views(with_wall(centre * (1.0 - part)), known, 20, "cpu")
+        found = novel_views(with_wall(center * (1.0 - part)), known, 20, "cpu")
         assert any(view.between for view in found) == stays
 
 
@@ -87,7 +87,7 @@ def test_no_view_stands_inside_or_behind_a_wall():
     known = [scenes.ring_camera(0.0)]
     free = novel_views(BALL, known, 8, "cpu")
     # A wall that begins right of the photo's picture, where views to that side would stand.
-    there = max((view.camera.center for view in free), key=lambda centre: centre[0])
+    there = max((view.camera.center for view in free), key=lambda center: center[0])
     left = novel_views(with_wall(there * (1.0 - 0.5 * CLOSE)), known, 8, "cpu")
     assert any(np.allclose(view.camera.center, there) for view in free)
     assert left
@@ -95,6 +95,6 @@ def test_no_view_stands_inside_or_behind_a_wall():
 
 
 def test_where_nothing_is_seen_there_is_nowhere_to_look():
-    away = scenes.ring_camera(0.0, centre=(50.0, 0.0, 0.0))
+    away = scenes.ring_camera(0.0, center=(50.0, 0.0, 0.0))
     assert novel_views(BALL, [away], 5, "cpu") == []
     assert novel_views(BALL, [], 5, "cpu") == []

@@ -30,12 +30,12 @@ def views(count=3, flat=lambda x: np.zeros(x.shape, dtype=bool), baseline=0.4):
     texture = np.random.default_rng(0).integers(0, 256, (40, 200, 3))
     made = []
     for i in range(count):
-        centre = baseline * (i - (count - 1) / 2)
+        center = baseline * (i - (count - 1) / 2)
         viewmat = np.eye(4)
-        viewmat[0, 3] = -centre
+        viewmat[0, 3] = -center
         K = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
         at = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL * DEPTH
-        y, x = np.meshgrid(at, at + centre, indexing="ij")
+        y, x = np.meshgrid(at, at + center, indexing="ij")
         cells = texture[((y + 2.0) * 10).astype(int) % 40, ((x + 10.0) * 10).astype(int) % 200]
         image = np.where(flat(x)[..., None], 128, cells).astype(np.uint8)
         made.append(View(f"{i}.png", Camera(viewmat, K, SIZE, SIZE), "train", image))
@@ -85,11 +85,11 @@ def test_masked_pixels_have_no_points_and_do_not_matter():
 
 def test_photos_are_swept_that_have_a_near_neighbour():
     ring = [replace(views(1)[0], camera=scenes.ring_camera(a, SIZE)) for a in (0.0, 0.6, 1.2, 2.4)]
-    centre = np.zeros(3)
-    assert can_sweep(ring[:3], centre)
-    assert not can_sweep(ring, centre)
-    assert not can_sweep(ring[:1], centre)
-    assert not can_sweep(ring[:3], centre, 30.0)
+    center = np.zeros(3)
+    assert can_sweep(ring[:3], center)
+    assert not can_sweep(ring, center)
+    assert not can_sweep(ring[:1], center)
+    assert not can_sweep(ring[:3], center, 30.0)
 
 
 def back_to_back():

@@ -71,7 +71,7 @@ def test_a_similarity_is_found_and_leaves_no_error(made):
     assert np.allclose(found.translation, there.translation, atol=1e-12)
     errors = pose_errors(moved, cameras(made))
     assert errors["rotation"] < 1e-6
-    assert errors["centre"] < 1e-9
+    assert errors["center"] < 1e-9
 
 
 def test_pose_errors_are_in_degrees_and_the_true_world(made):
@@ -83,7 +83,7 @@ def test_pose_errors_are_in_degrees_and_the_true_world(made):
     ]
     errors = pose_errors([there.camera(camera) for camera in both], cameras(made))
     assert errors["rotation"] == pytest.approx(1.5, abs=0.01)
-    assert errors["centre"] < 0.01
+    assert errors["center"] < 0.01
 
 
 def test_one_camera_and_cameras_at_one_place_have_no_scale(made):
@@ -368,8 +368,8 @@ def stand_in(data, one):
         "poses": one.poses,
         "seed": one.seed,
         "backend": one.backend,
-        "before": {"rotation": 0.6, "centre": 0.02},
-        "after": {"rotation": 0.1, "centre": 0.005},
+        "before": {"rotation": 0.6, "center": 0.02},
+        "after": {"rotation": 0.1, "center": 0.005},
         "splats": 10,
         "seconds": 1.0,
         "protocol": {"views": 2},
