@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from igsr.capture import Camera, Capture, View
@@ -142,6 +143,13 @@ def fit_with_cameras(capture, steps=None, **options):
     """The splats of a fit, and the capture with fitted cameras, exposures and masks."""
     result = fit_capture(capture, steps=steps, **options)
     return result.splats, result.capture
+
+
+def resumed_fit(capture, checkpoint, stop, **options):
+    """The result of a fit that a listener ends at step ``stop`` and that is then resumed."""
+    with pytest.raises(Stop):
+        fit_capture(capture, checkpoint=checkpoint, report=stop_at(stop), **options)
+    return fit_capture(capture, checkpoint=checkpoint, resume=True, **options)
 
 
 class Stop(Exception):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
+from igsr._internal.user_warning import warn_user
 from igsr.capture.sharpness import blurred_photos
 from igsr.capture.types import PseudoView, View
 from igsr.errors import IgsrError
@@ -70,8 +70,7 @@ def check_photos(views: list[View]) -> None:
 
 
 def _warn(sentence: str) -> None:
-    # To the caller of ``fit``.
-    warnings.warn(sentence, stacklevel=5)
+    warn_user(sentence)
 
 
 def _listed(names: list[str]) -> str:

@@ -24,6 +24,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from igsr._internal.user_warning import warn_user
 from igsr.capture.downscaling import area_means, check_max_size, reduced_size
 from igsr.capture.exif import TURNED, Exif, read_exif, turned_back, upright
 from igsr.capture.find_panoramas import panorama_of
@@ -156,7 +157,7 @@ def load_photos(
     if broken:
         if len(photos) < FEWEST:
             raise broken[0]
-        warnings.warn(_left_out(files, loaded, broken), stacklevel=2)
+        warn_user(_left_out(files, loaded, broken))
     return photos
 
 

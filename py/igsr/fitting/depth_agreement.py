@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.user_warning import warn_user
 from igsr.capture import View
 from igsr.fitting.initialization.given_depths import COMPARED
 from igsr.fitting.initialization.photo_pixels import known_pixels, pixels_of, reduced, world_points
@@ -53,10 +53,7 @@ def with_agreeing_depths(views: Sequence[View]) -> list[View]:
     wrong = {with_depths[int(i)] for i in np.nonzero(against)[0]}
     if wrong:
         names = ", ".join(views[k].name for k in sorted(wrong))
-        warnings.warn(
-            f"The depth of {names} contradicts that of the other photos and is left out.",
-            stacklevel=3,
-        )
+        warn_user(f"The depth of {names} contradicts that of the other photos and is left out.")
     return [
         replace(view, depth=None, depth_confidence=None) if k in wrong else view
         for k, view in enumerate(views)

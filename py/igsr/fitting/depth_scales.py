@@ -6,12 +6,12 @@ Points of the capture that a photo is known to show tell what its depths are to 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from igsr._internal.user_warning import warn_user
 from igsr.capture import Points, View
 
 #: With fewer points on known depths, a photo's depths stay as they are.
@@ -61,10 +61,9 @@ def with_scaled_depths(views: Sequence[View], points: Points | None) -> list[Vie
         depth = (view.depth * np.exp(middle)).astype(np.float32)
         scaled.append(replace(view, depth=depth))
     if left_out:
-        warnings.warn(
+        warn_user(
             f"The depth of {', '.join(left_out)} does not fit to the points of the capture and is "
-            "left out.",
-            stacklevel=3,
+            "left out."
         )
     return scaled
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.user_warning import warn_user
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.attempts import mapped
@@ -56,10 +56,9 @@ class Colmap:
         if len(photos) > MANY:
             sizes = [(photo.image.shape[1], photo.image.shape[0]) for photo in photos]
             minutes = camera_seconds(sizes) / 60.0
-            warnings.warn(
+            warn_user(
                 f"COLMAP needs about {minutes:.0f} minutes for {len(photos)} photos; every third "
-                "is mostly enough",
-                stacklevel=2,
+                "is mostly enough"
             )
         with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, guarded(seed):
             workspace = Path(folder)
