@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from igsr.capture import Camera, Capture, View
+from igsr.capture import Camera, Capture, PseudoView, View
 from igsr.fitting import fit_capture
 from igsr.rendering.renders import render
 from igsr.splats import Splats
@@ -80,6 +80,12 @@ def capture(views=8, size=48, alpha=False, scene=None, arc=2.0 * np.pi):
         split = "test" if i % 4 == 0 else "train"
         result.append(View(f"photos/{i:02d}.png", camera, split, image))
     return Capture(Path("made-up"), result)
+
+
+def pseudo_view(view, **changes):
+    """The view as a pseudo-view, by default with a weight of 1 for each pixel."""
+    weights = np.ones(view.image.shape[:2], np.float32)
+    return PseudoView(**{**vars(view), "weights": weights, **changes})
 
 
 def write_capture(folder, made):

@@ -113,24 +113,28 @@ def test_a_stopped_fit_resumes_with_the_same_bits(capture, tmp_path, backend, st
         assert np.array_equal(ours[name], theirs[name]), name
 
 
-@pytest.mark.parametrize("moment", ["in the listener", "between two events"])
+@pytest.mark.parametrize("place", ["listener", "loop"])
 @pytest.mark.usefixtures("single_steps")
-def test_a_fit_that_ctrl_c_ends_resumes_with_the_same_bits(capture, whole, tmp_path, moment):
-    path = tmp_path / "checkpoint.npz"
+def test_a_fit_that_ctrl_c_ends_resumes_with_the_same_bits(
+    capture, whole, tmp_path, monkeypatch, place
+):
+    path, fit_event = tmp_path / "checkpoint.npz", train.fit_event
 
-    def interrupt(now):
-        if now.done == 50 and moment == "in the listener":
+    def interrupt(event):
+        if event.done == 50 and place == "listener":
             raise KeyboardInterrupt
-        if now.done == 50:
-            signal.setitimer(signal.ITIMER_REAL, 0.002)
 
-    usual = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            fit(capture, checkpoint=path, report=interrupt)
-    finally:
-        signal.signal(signal.SIGALRM, usual)
-    assert load_checkpoint(path)[0]["step"] >= 50
+    def interrupted(step, *arguments, **named):
+        if step == 50:
+            raise KeyboardInterrupt
+        return fit_event(step, *arguments, **named)
+
+    if place == "loop":
+        monkeypatch.setattr(train, "fit_event", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, checkpoint=path, report=interrupt)
+    assert load_checkpoint(path)[0]["step"] == [50]
+    monkeypatch.undo()
     assert fit(capture, checkpoint=path, resume=True) == whole
 
 
@@ -195,13 +199,9 @@ def test_masks_of_any_true_byte_are_equal(capture):
 
 def test_pseudo_views_are_compared_over_their_own_background(capture):
     green = (0.2, 0.9, 0.1)
-    weights = np.ones((40, 40), np.float32)
 
     def pseudo(color):
-        views = [
-            igsr.PseudoView(v.name, v.camera, v.split, v.image, weights=weights, background=color)
-            for v in capture.views
-        ]
+        views = [scenes.pseudo_view(view, background=color) for view in capture.views]
         return igsr.Capture(capture.path, views)
 
     expected = fit(pseudo(None), steps=20, background=green)
