@@ -351,8 +351,8 @@ def test_resume_refuses_other_photos_and_versions(capture, finished, tmp_path):
     views = [replace(view) for view in capture.views]
     views[1].image = views[1].image.copy()
     views[1].image[0, 0] ^= 1
+    changed = igsr.Capture(capture.path, views)
     with pytest.raises(igsr.IgsrError, match="made from other photos"):
-        changed = igsr.Capture(capture.path, views)
         fit_capture(changed, checkpoint=finished, resume=True, **SHORT)
     state, settings = load_checkpoint(finished)
     path = tmp_path / "other.npz"
