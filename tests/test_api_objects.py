@@ -1,4 +1,4 @@
-"""What objects of the API show in a prompt and a notebook, and how they compare."""
+"""Representation, notebook pictures and equality of the API's objects."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_reprs_are_one_short_line(capture):
         assert "\n" not in repr(one)
 
 
-def test_equality_is_one_bool_and_sees_every_field(capture):
+def test_equality_compares_every_field(capture):
     splats = scenes.splats()
     for field in ("means", "quats", "scales", "opacities", "sh"):
         changed = getattr(splats, field).copy()
@@ -82,14 +82,14 @@ def test_equality_is_one_bool_and_sees_every_field(capture):
     assert points() != moved
 
 
-def test_nan_equals_itself_as_a_saved_copy_does(tmp_path):
+def test_nan_equals_itself(tmp_path):
     splats = scenes.splats()
     splats.means[3] = np.nan
     splats.save(tmp_path / "scene.ply")
     assert igsr.Splats.load(tmp_path / "scene.ply") == splats
 
 
-def test_equal_cameras_are_one_key(capture):
+def test_equal_cameras_have_equal_hashes(capture):
     camera = capture.views[0].camera
     copy = igsr.Camera(camera.viewmat.copy(), camera.K.copy(), camera.width, camera.height)
     assert copy == camera
@@ -153,39 +153,36 @@ def test_scores_are_a_dictionary_with_typed_attributes(capture):
     assert [row["name"] for row in scores.views] == [view.name for view in capture.test_views]
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (3.0, -2.0, 1.5)])
-def test_rasterization_of_to_torch_draws_what_render_draws(antialiased, origin):
-    splats = dataclasses.replace(scenes.splats(degree=2, origin=origin), antialiased=antialiased)
-    camera = scenes.ring_camera(0.7, centre=origin)
-    expected = igsr.render(splats, camera, backend="cpu")
-    color, alpha, _ = igsr.rasterization(
-        **splats.to_torch(),
-        viewmats=torch.tensor(camera.viewmat)[None],
-        Ks=torch.tensor(camera.K)[None],
-        width=camera.width,
-        height=camera.height,
-        backend="cpu",
-    )
-    assert expected.alpha.max() > 0.5
-    np.testing.assert_allclose(color[0], expected.color, atol=2e-5)
-    np.testing.assert_allclose(alpha[0, ..., 0], expected.alpha, atol=2e-5)
-
-
-def test_to_torch_keeps_far_scenes_precise_about_their_origin():
-    far = (5e6, 4e5, 30.0)
-    splats = scenes.splats(origin=far)
-    camera = scenes.ring_camera(0.7, centre=far)
-    viewmat = camera.viewmat.copy()
-    viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin
-    color, _, _ = igsr.rasterization(
-        **splats.to_torch(origin=splats.origin),
+def rasterized(tensors, camera, viewmat):
+    return igsr.rasterization(
+        **tensors,
         viewmats=torch.tensor(viewmat)[None],
         Ks=torch.tensor(camera.K)[None],
         width=camera.width,
         height=camera.height,
         backend="cpu",
     )
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (3.0, -2.0, 1.5)])
+def test_rasterization_of_to_torch_equals_render(antialiased, origin):
+    splats = dataclasses.replace(scenes.splats(degree=2, origin=origin), antialiased=antialiased)
+    camera = scenes.ring_camera(0.7, centre=origin)
+    expected = igsr.render(splats, camera, backend="cpu")
+    color, alpha, _ = rasterized(splats.to_torch(), camera, camera.viewmat)
+    assert expected.alpha.max() > 0.5
+    np.testing.assert_allclose(color[0], expected.color, atol=2e-5)
+    np.testing.assert_allclose(alpha[0, ..., 0], expected.alpha, atol=2e-5)
+
+
+def test_to_torch_keeps_far_scenes_precise():
+    far = (5e6, 4e5, 30.0)
+    splats = scenes.splats(origin=far)
+    camera = scenes.ring_camera(0.7, centre=far)
+    viewmat = camera.viewmat.copy()
+    viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin
+    color, _, _ = rasterized(splats.to_torch(origin=splats.origin), camera, viewmat)
     np.testing.assert_allclose(
         color[0], igsr.render(splats, camera, backend="cpu").color, atol=2e-5
     )
@@ -195,21 +192,14 @@ def test_to_torch_keeps_far_scenes_precise_about_their_origin():
         splats.to_torch(origin="here")
 
 
-def test_to_torch_gives_leaves_that_collect_gradients_and_share_no_memory():
+def test_to_torch_returns_independent_leaves():
     splats = scenes.splats()
     before = splats.means.copy()
     tensors = splats.to_torch(requires_grad=True)
     leaves = {name: value for name, value in tensors.items() if isinstance(value, torch.Tensor)}
     assert set(leaves) == {"means", "quats", "scales", "opacities", "colors"}
     camera = scenes.ring_camera(0.7)
-    color, _, _ = igsr.rasterization(
-        **tensors,
-        viewmats=torch.tensor(camera.viewmat)[None],
-        Ks=torch.tensor(camera.K)[None],
-        width=camera.width,
-        height=camera.height,
-        backend="cpu",
-    )
+    color, _, _ = rasterized(tensors, camera, camera.viewmat)
     assert (leaves["scales"] > 0).all()
     assert ((leaves["opacities"] > 0) & (leaves["opacities"] < 1)).all()
     color.sum().backward()
