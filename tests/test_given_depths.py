@@ -1,4 +1,4 @@
-"""Depths that photos came with: a fit starts from them and stays near them, if they are right."""
+"""Fits with given depths start from them and stay near them, if they are right."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import rooms
 import scenes
 
 import igsr
+from igsr._internal.part_usage import Usage
 from igsr.capture import Capture, Points, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import Tracks
@@ -19,48 +20,50 @@ from igsr.fitting.depth_scales import with_scaled_depths
 from igsr.fitting.initialization import initial_splats
 from igsr.fitting.initialization.given_depths import given_points, have_depths
 from igsr.fitting.initialization.initial_splats import chosen_start
-from igsr.pose import FoundCameras, read_found
+from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
 from igsr.pose.estimate import Estimate
+from igsr.pose.found_cameras import FoundCameras
 from igsr.pose.grid import Grid
 from igsr.rendering.renders import render
 
 
-def depth_of(camera):
-    """The depth of every pixel of the textured room, float32 [H, W]."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    K = camera.K
-    local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
-    rays = local @ camera.viewmat[:3, :3]
-    depth = np.full(x.shape, np.inf)
-    for normal, offset, _, _ in rooms.WALLS:
-        along = rays @ np.array(normal)
-        with np.errstate(divide="ignore"):
-            far = (offset - camera.centre @ np.array(normal)) / along
-        depth = np.where((far > 0.0) & (far < depth), far, depth)
-    return depth.astype(np.float32)
-
-
 def room(angles, held_out, width=96, height=72):
-    """Photos of the textured room with exact depths, and photos to score without."""
+    """Photos of the textured room with exact depths, and held-out photos without depths."""
     views = []
     for k, angle in enumerate(angles):
         camera = rooms.camera(angle, 80.0, width, height)
         test = k in held_out
-        depth = None if test else depth_of(camera)
+        depth = None if test else rooms.depth(camera)
         split = "test" if test else "train"
         views.append(View(f"{k}.png", camera, split, rooms.picture(camera), depth=depth))
     return Capture(Path("room"), views)
 
 
 def with_views(capture, change):
+    """The capture with ``change(index, view)`` applied to its train views."""
     views = [
         change(k, view) if view.split == "train" else view for k, view in enumerate(capture.views)
     ]
     return replace(capture, views=views)
 
 
+def with_factors(capture, factors):
+    """The capture with the depths of some views multiplied; None removes them."""
+
+    def change(k, view):
+        factor = factors.get(k, 1.0)
+        depth = None if factor is None else view.depth * np.float32(factor)
+        return replace(view, depth=depth)
+
+    return with_views(capture, change)
+
+
+def without_depths(capture):
+    return with_factors(capture, dict.fromkeys(range(len(capture.views))))
+
+
 def off_walls(xyz):
-    """How far points are from the nearest wall."""
+    """Distances of points to the nearest wall."""
     normals = np.array([wall[0] for wall in rooms.WALLS])
     offsets = np.array([wall[1] for wall in rooms.WALLS])
     lengths = np.linalg.norm(normals, axis=1)
@@ -72,7 +75,7 @@ def made():
     return room(np.linspace(-0.5, 0.5, 6), (1, 4))
 
 
-def test_the_depths_of_the_room_are_right(made):
+def test_points_of_exact_depths_are_on_the_walls(made):
     for view in made.train_views:
         world, colors, confidence = given_points([view], 500, np.random.default_rng(0))
         assert off_walls(world).max() < 1e-5
@@ -85,20 +88,17 @@ def test_a_fit_starts_from_depths(made):
     assert chosen_start(made) == "depths"
     splats, start = initial_splats(made, 0, 2000, 0)
     assert start == "depths"
-    assert len(splats) == 1000  # growth has room for as many
+    assert len(splats) == 1000  # as many can be added later
     assert off_walls(splats.means + splats.origin).max() < 1e-3
 
 
 def test_half_of_the_photos_must_have_depths(made):
-    def without(count):
-        return with_views(made, lambda k, v: v if k >= count else replace(v, depth=None))
-
-    # Of the photos 0, 2, 3 and 5 two are left, and one.
-    assert have_depths(without(3).train_views)
-    assert not have_depths(without(4).train_views)
+    # The train photos are 0, 2, 3 and 5.
+    assert have_depths(with_factors(made, {0: None, 2: None}).train_views)
+    assert not have_depths(with_factors(made, {0: None, 2: None, 3: None}).train_views)
 
 
-def test_masked_transparent_and_unsure_pixels_have_no_points(made):
+def test_masked_transparent_and_uncertain_pixels_have_no_points(made):
     def spoiled(k, view):
         depth = view.depth.copy()
         depth[:, :40] = 0.01
@@ -120,124 +120,102 @@ def test_masked_transparent_and_unsure_pixels_have_no_points(made):
 
 
 def test_points_of_a_wrong_depth_map_are_left_out(made):
-    def wrong(k, view):
-        return replace(view, depth=np.float32(0.5) * view.depth) if k == 2 else view
-
-    world, *_ = given_points(with_views(made, wrong).train_views, 4000, np.random.default_rng(0))
-    # All points of three photos; of the fourth, only what no other photo looks past.
+    wrong = with_factors(made, {2: 0.5})
+    world, *_ = given_points(wrong.train_views, 4000, np.random.default_rng(0))
+    # All points of three photos; of the fourth, only those that no other photo contradicts.
     assert np.mean(off_walls(world) > 0.1) < 0.06
     whole, *_ = given_points(made.train_views, 4000, np.random.default_rng(0))
     assert len(whole) == 4000
 
 
-def fitted(capture, **options):
-    arguments = {"steps": 300, "backend": "cpu", "max_splats": 1500, "sh_degree": 0, **options}
-    return scenes.fit(capture, **arguments)
+OPTIONS = {"steps": 300, "backend": "cpu", "max_splats": 1500, "sh_degree": 0}
 
 
-def score(splats, capture):
-    return igsr.evaluate(splats, capture, backend="cpu")["psnr"]
+def fit(capture, **options):
+    return scenes.fit(capture, **{**OPTIONS, **options})
 
 
-def test_held_out_photos_gain_by_depths_also_where_one_is_wrong():
-    # So far apart that features and patches tell little.
+def psnr(splats, capture):
+    return igsr.evaluate(splats, capture, backend="cpu").psnr
+
+
+def test_depths_improve_held_out_photos_even_if_one_is_wrong():
+    # Too far apart for features and patches.
     capture = room(np.linspace(-1.2, 1.2, 5), (1, 3))
-    bare = with_views(capture, lambda k, v: replace(v, depth=None))
-    wrong = with_views(
-        capture, lambda k, v: replace(v, depth=np.float32(1.5) * v.depth) if k == 0 else v
-    )
-    without, given, one_wrong = (score(fitted(c), capture) for c in (bare, capture, wrong))
-    assert given > without + 1.0, (without, given)
-    assert one_wrong > without + 0.5, (without, one_wrong)
+    captures = without_depths(capture), capture, with_factors(capture, {0: 1.5})
+    without, given, one_wrong = (psnr(fit(photos), capture) for photos in captures)
+    assert given > without + 1.0
+    assert one_wrong > without + 0.5
 
 
-def test_the_loss_alone_brings_renders_nearer_to_depths(made):
+def test_the_depth_loss_brings_renders_closer_to_depths(made):
     def error(splats):
         errors = []
         for view in made.train_views:
             drawn = render(splats, view.camera, (0.0, 0.0, 0.0), backend="cpu")
-            there = drawn.alpha > 0.9
-            errors.append(np.abs(drawn.expected_depth / view.depth - 1.0)[there].mean())
+            opaque = drawn.alpha > 0.9
+            errors.append(np.abs(drawn.expected_depth / view.depth - 1.0)[opaque].mean())
         return np.mean(errors)
 
     start, _ = initial_splats(made, 0, 1500, 0, "rays")
-    loose, near = (error(fitted(made, start=start, depth_weight=w)) for w in (0.0, 1.0))
-    assert near < 0.7 * loose, (near, loose)
+    loose, near = (error(fit(made, start=start, depth_weight=weight)) for weight in (0.0, 1.0))
+    assert near < 0.7 * loose
 
 
 def test_a_weight_of_0_uses_no_depths(made):
-    bare = with_views(made, lambda k, v: replace(v, depth=None))
     options = {"steps": 40, "depth_weight": 0.0}
-    first, second = fitted(made, **options), fitted(bare, **options)
-    assert np.array_equal(first.means, second.means)
-    assert np.array_equal(first.sh, second.sh)
+    assert fit(made, **options) == fit(without_depths(made), **options)
 
 
 def test_cpu_and_gpu_fit_alike(made):
-    cpu, gpu = (score(fitted(made, steps=60, backend=name), made) for name in ("cpu", "gpu"))
+    cpu, gpu = (psnr(fit(made, steps=60, backend=name), made) for name in ("cpu", "gpu"))
     assert cpu == pytest.approx(gpu, abs=0.1)
 
 
-def test_a_resumed_fit_ends_with_the_same_bits(made, tmp_path):
-    whole = fitted(made, steps=60)
-    file = tmp_path / "checkpoint.npz"
-    fitted(made, steps=60, checkpoint=file, progress=lambda now: now.step < 20)
-    again = fitted(made, steps=60, checkpoint=file, resume=True)
-    assert np.array_equal(whole.means, again.means)
-    assert np.array_equal(whole.sh, again.sh)
-    fitted(made, steps=60, checkpoint=file, progress=lambda now: now.step < 20)
-    other = with_views(made, lambda k, v: replace(v, depth=v.depth + np.float32(0.01 * (k == 2))))
+def test_a_fit_to_depths_resumes_with_the_same_bits(made, tmp_path):
+    path, options = tmp_path / "checkpoint.npz", OPTIONS | {"steps": 60}
+    assert scenes.resumed_fit(made, path, 20, **options).splats == fit(made, **options)
+    other = with_factors(made, {2: 1.01})
     with pytest.raises(igsr.IgsrError, match="other photos"):
-        fitted(other, steps=60, checkpoint=file, resume=True)
-
-
-def test_presets_that_are_baselines_use_no_depths(made):
-    for preset in ("3dgs", "instantsplat"):
-        assert igsr.fitting.presets.settings_for(preset, 4).depth_weight == 0.0
+        fit(other, checkpoint=path, resume=True, **options)
 
 
 @pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf"), 1e9, "much"])
-def test_a_senseless_weight_is_named(made, weight):
+def test_an_invalid_weight_is_named(made, weight):
     with pytest.raises(igsr.IgsrError, match="depth_weight"):
-        fitted(made, depth_weight=weight)
+        fit(made, depth_weight=weight)
 
 
 # ---- depths in the unit of the cameras -----------------------------------------------------------
 
 
 def points_of(capture, per_photo=60):
-    """Points on the walls with tracks, as a structure-from-motion program has them."""
+    """Points on the walls, each seen by one photo with depths."""
     random = np.random.default_rng(4)
-    xyz, view, xy = [], [], []
-    for k, one in enumerate(capture.views):
-        if one.depth is None:
-            continue
-        place = random.uniform(
-            [2.0, 2.0], [one.camera.width - 2, one.camera.height - 2], (per_photo, 2)
-        )
-        column, row = np.floor(place).astype(int).T
-        local = np.concatenate([place, np.ones((per_photo, 1))], 1) @ np.linalg.inv(one.camera.K).T
-        local *= depth_of(one.camera)[row, column, None]
-        xyz.append((local - one.camera.viewmat[:3, 3]) @ one.camera.viewmat[:3, :3])
-        view += [k] * per_photo
-        xy.append(place)
-    count = len(view)
-    tracks = Tracks(
-        [one.name for one in capture.views], np.array(view), np.arange(count), np.concatenate(xy)
-    )
-    return Points(np.concatenate(xyz), np.full((count, 3), 128, np.uint8), None, tracks)
+    numbers = [k for k, view in enumerate(capture.views) if view.depth is not None]
+    xyz, xy = [], []
+    for camera in (capture.views[k].camera for k in numbers):
+        pixels = random.uniform(2.0, [camera.width - 2, camera.height - 2], (per_photo, 2))
+        column, row = np.floor(pixels).astype(int).T
+        rays = np.pad(pixels, ((0, 0), (0, 1)), constant_values=1.0) @ np.linalg.inv(camera.K).T
+        local = rays * rooms.depth(camera)[row, column, None]
+        xyz.append((local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+        xy.append(pixels)
+    names = [view.name for view in capture.views]
+    seen_by = np.repeat(numbers, per_photo)
+    tracks = Tracks(names, seen_by, np.arange(len(seen_by)), np.concatenate(xy))
+    return Points(np.concatenate(xyz), np.full((len(seen_by), 3), 128, np.uint8), None, tracks)
 
 
-def test_each_photos_depths_get_the_unit_of_the_points(made):
+def test_depths_of_each_photo_are_scaled_to_the_points(made):
     points = points_of(made)
-    factors = [0.001, 1.0, 250.0, 0.2, 0.5, 3.0]
-    scaled = with_views(made, lambda k, v: replace(v, depth=v.depth * np.float32(factors[k])))
+    scaled = with_factors(made, {0: 0.001, 2: 250.0, 3: 0.2, 5: 3.0})
     for view, truth in zip(with_scaled_depths(scaled.views, points), made.views, strict=True):
         if truth.depth is None:
             assert view.depth is None
         else:
             assert view.depth == pytest.approx(truth.depth, rel=0.02)
-    # Without tracks, or with few, they stay.
+    # They are unchanged without tracks, or with few.
     for few in (None, replace(points, tracks=None), points_of(made, 10)):
         same = with_scaled_depths(scaled.views, few)
         assert all(a is b for a, b in zip(same, scaled.views, strict=True))
@@ -255,8 +233,8 @@ def test_depths_of_something_else_are_left_out(made):
 
 def test_a_fit_scales_depths(made):
     points = points_of(made)
-    scaled = with_views(made, lambda k, v: replace(v, depth=v.depth * np.float32(0.1)))
-    splats = fitted(replace(scaled, points=points), steps=30)
+    scaled = with_factors(made, dict.fromkeys(range(6), 0.1))
+    splats = fit(replace(scaled, points=points), steps=30)
     assert np.median(off_walls(splats.means + splats.origin)) < 0.1
 
 
@@ -266,35 +244,26 @@ def depths_left_out(capture):
     return [k for k, view in enumerate(views) if view.split == "train" and view.depth is None]
 
 
-def times(capture, factors):
-    """The capture with some photos' depths multiplied."""
-    return with_views(
-        capture,
-        lambda k, v: replace(v, depth=v.depth * np.float32(factors[k])) if k in factors else v,
-    )
-
-
 @pytest.mark.parametrize("factor", [0.6, 1.3, 2.0])
-def test_a_photo_whose_depths_the_others_contradict_loses_them(made, factor):
+def test_depths_that_other_photos_contradict_are_not_used(made, factor):
     with pytest.warns(UserWarning, match=r"The depth of 2\.png contradicts that of the other"):
-        assert depths_left_out(times(made, {2: factor})) == [2]
+        assert depths_left_out(with_factors(made, {2: factor})) == [2]
 
 
-def test_depths_stay_where_most_do_not_contradict_them(made):
+def test_depths_without_a_majority_against_them_are_kept(made):
     assert depths_left_out(made) == []
-    # Two photos that disagree: nobody knows which is right.
-    two = with_views(made, lambda k, v: v if k in (0, 2) else replace(v, depth=None))
-    assert depths_left_out(times(two, {2: 2.0})) == depths_left_out(two)
-    # A unit that all share is not seen.
-    assert depths_left_out(times(made, dict.fromkeys(range(6), 1.5))) == []
+    # Two photos that disagree: either may be right.
+    assert depths_left_out(with_factors(made, {2: 2.0, 3: None, 5: None})) == [3, 5]
+    # A common factor is no contradiction.
+    assert depths_left_out(with_factors(made, dict.fromkeys(range(6), 1.5))) == []
     # Photos without depths, and none at all.
-    none = with_views(made, lambda k, v: replace(v, depth=None))
+    none = without_depths(made)
     assert all(a is b for a, b in zip(with_agreeing_depths(none.views), none.views, strict=True))
     assert with_agreeing_depths([]) == []
 
 
-def test_what_stands_behind_an_object_contradicts_nothing():
-    """Two photos of a wall's two sides: each sees the other's points behind its own surface."""
+def test_hidden_surfaces_are_no_contradiction():
+    # Photos of both sides of a wall: each sees the other's points behind its own surface.
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
     behind[2, 3] = 6.0  # the other camera stands 6 units away and looks back
     views = []
@@ -303,59 +272,50 @@ def test_what_stands_behind_an_object_contradicts_nothing():
         moved[0, 3] += 0.1 * k
         camera = igsr.Camera(moved, np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), 40, 30)
         image = np.zeros((30, 40, 3), np.uint8)
-        # Walls at z = 2 and z = 4 of the first camera: what is between is not seen.
+        # Walls at z = 2 and z = 4 of the first camera.
         views.append(View(f"{k}.png", camera, "train", image, depth=np.full((30, 40), 2.0, "f4")))
     assert all(a is b for a, b in zip(with_agreeing_depths(views), views, strict=True))
 
 
 def test_a_fit_leaves_out_a_photos_wrong_depths(made):
     with pytest.warns(UserWarning, match="contradicts"):
-        splats = fitted(times(made, {2: 1.6}), steps=30)
+        splats = fit(with_factors(made, {2: 1.6}), steps=30)
     assert np.median(off_walls(splats.means + splats.origin)) < 0.1
 
 
 # ---- depths of networks --------------------------------------------------------------------------
 
 
-def test_depths_that_an_estimator_trusts_come_with_the_photos(made, tmp_path):
+def written_and_read(found, folder):
+    """Found cameras from a cameras file."""
+    write_cameras_file(folder / "cameras.npz", KeptCameras(found, {}, Usage(0.0, 0.0, None)))
+    return read_cameras_file(folder / "cameras.npz").found
+
+
+def test_trusted_depths_of_an_estimator_are_kept_with_the_photos(made, tmp_path):
     photos = [Photo(view.name, view.image, None, None, "phone") for view in made.views]
     grid = Grid(34, 44, 2.0, 2.0, 6.0, 2.0)
     column, row = grid.photo_pixels().astype(int).T
-    depths = [depth_of(view.camera)[row, column].reshape(34, 44) for view in made.views]
+    depths = [rooms.depth(view.camera)[row, column].reshape(34, 44) for view in made.views]
     depths[1] = np.full((34, 44), np.nan, np.float32)
     sure = [np.ones((34, 44), bool) for _ in depths]
     sure[2][:20] = False
     nothing = [None] * len(photos)
-    estimate = Estimate(
-        [view.camera for view in made.views],
-        None,
-        [*depths[:5], None],
-        [*sure[:5], None],
-        [],
-        grids=[*[grid] * 5, None],
-    )
+    cameras, grids = [view.camera for view in made.views], [*[grid] * 5, None]
+    estimate = Estimate(cameras, None, [*depths[:5], None], [*sure[:5], None], [], grids=grids)
     found = FoundCameras.of(photos, estimate, {"estimator": "stand-in"})
-    (tmp_path / "found.npz").write_bytes(found.to_bytes())
-    for one in (found, read_found(tmp_path / "found.npz")):
-        capture = one.capture(Path("room"), photos)
-        assert [view.depth is None for view in capture.views] == [
-            False,
-            True,
-            False,
-            False,
-            False,
-            True,
-        ]
+    for cameras_of_room in (found, written_and_read(found, tmp_path)):
+        capture = cameras_of_room.capture(Path("room"), photos)
+        assert [k for k in range(6) if capture.views[k].depth is None] == [1, 5]
         for k in (0, 2, 3, 4):
-            depth, truth = capture.views[k].depth, depth_of(made.views[k].camera)
+            depth, truth = capture.views[k].depth, rooms.depth(made.views[k].camera)
             known = depth > 0.0
-            # Within a pixel of the grid; the border that the grid leaves out is not known.
+            # Within a pixel of the grid; the border outside the grid is unknown.
             assert not known[:, :6].any()
             assert not known[:2].any()
             assert np.median(np.abs(depth[known] / truth[known] - 1.0)) < 0.01
-            assert known.mean() == pytest.approx(
-                (14 if k == 2 else 34) * 44 * 4 / known.size, rel=0.05
-            )
+            rows = 14 if k == 2 else 34
+            assert known.mean() == pytest.approx(rows * 44 * 4 / known.size, rel=0.05)
     old = FoundCameras.of(photos, replace(estimate, depths=nothing, trusted=nothing, grids=[]), {})
     assert all(view.depth is None for view in old.capture(Path("room"), photos).views)
 
@@ -367,11 +327,5 @@ def test_damaged_kept_depths_are_refused(made, tmp_path):
         estimate = Estimate(cameras, None, list(nothing), nothing, [])
         found = FoundCameras.of(photos, estimate, {})
         found.estimate.depths[0] = bad
-        (tmp_path / "found.npz").write_bytes(found.to_bytes())
-        with pytest.raises(igsr.IgsrError, match=r"delete .* to find the cameras anew"):
-            read_found(tmp_path / "found.npz")
-
-
-def test_scenes_without_depths_start_as_before():
-    capture = scenes.capture(views=8, size=24)
-    assert chosen_start(capture) != "depths" or not have_depths(capture.train_views)
+        with pytest.raises(igsr.IgsrError, match="delete it to find the cameras again"):
+            written_and_read(found, tmp_path)
