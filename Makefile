@@ -1,20 +1,19 @@
-# make demo   sets everything up and makes a scene of eight photos of the example capture
-# make test   sets everything up and runs the checks: about ten minutes on two cores once built
+# make setup  installs what the tests need with apt: a software Vulkan driver, a browser, shader tools
+# make test   runs the checks: about eight minutes on two cores once built
 # make test-long   runs the tests that take longer
-# make wheel  builds the wheel for this platform into dist: it has all, the viewer and the example too
-# make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
-# make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
-# make bench-check  compares this build's speed with a commit's: [BASE=HEAD~1]; fails at 10 % slower
-# make gpu-check   tests and measures this computer's GPU; writes out/gpu-check/report.html to send
-#             along with a problem: [GARDEN=test_garden.npz] [CAPTURE=DIR] [SECONDS=2]
+# make demo   makes a scene of the example photos in out/demo
+# make build  builds igsr into .venv
+# make wheel  builds the wheel for this platform into dist
 # make docs   builds the documentation site into out/docs
+# make bench  measures speed and error: [BACKENDS="cpu gpu"] [GARDEN=test_garden.npz] [CAPTURE=DIR]
+# make bench-check  compares this build's speed with a commit's: [BASE=HEAD~1]
+# make gpu-check   tests and measures this computer's GPU; attach out/gpu-check/report.html to an issue
+# make fuzz   changes splat files at random for longer than make test does: [CASES=100000]
 #
-# Needs a Python (3.10 or newer), a Rust toolchain (1.95 or newer), a C linker and a package manager. Everything
-# Python goes into .venv; what a rerun need not repeat is remembered in .venv/.*-ready.
+# Needs Python 3.10 or newer, Rust 1.95 or newer and a C linker. Everything Python goes into .venv.
 
 PYTHON ?= python3
 CARGO ?= cargo
-EXAMPLE := examples/tea_table
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -29,14 +28,14 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml \)) \
 	Cargo.toml Cargo.lock
 
-.PHONY: demo test test-long fuzz bench bench-check gpu-check accuracy docs profile build wheel check-rust check-python vulkan display shader-validators browser \
-	example-capture clean
+.PHONY: demo setup test test-long fuzz bench bench-check gpu-check accuracy docs profile build wheel \
+	check-rust check-python check-system example-capture clean
 .DELETE_ON_ERROR:
 
 # ---- what a user runs --------------------------------------------------------------------------
 
 demo: build
-	$(BIN)/igsr refine $(EXAMPLE) --photos 8 --out out/demo
+	$(BIN)/igsr refine --example --out out/demo
 	@printf '%s\n' '' 'The demo wrote' \
 		'  out/demo/scene.html   the scene to turn, in a browser' \
 		'  out/demo/scene.ply    the splats: any splat viewer opens it' \
@@ -58,12 +57,12 @@ bench-check: build
 # What a person with a GPU can send: tests of the kernels, times beside errors (and beside gsplat where
 # CUDA and gsplat are), driver and limits. On the software driver where there is no GPU.
 SECONDS ?= 2
-gpu-check: build vulkan
+gpu-check: build
 	$(BIN)/python -m igsr_lab gpu-check --seconds $(SECONDS) \
 		$(if $(GARDEN),--garden '$(GARDEN)') $(if $(CAPTURE),--capture '$(CAPTURE)')
 
 # Writes the page of accuracy and its plot; on the software driver where there is no GPU.
-accuracy: build vulkan
+accuracy: build
 	$(BIN)/python -m igsr_lab bench --backend cpu --backend gpu --accuracy docs/how-it-works/accuracy.md
 
 # Stops at any warning: a link without a target, a page that no menu leads to.
@@ -106,9 +105,9 @@ example-capture: build
 
 # ---- the checks --------------------------------------------------------------------------------
 
-test: check-rust check-python
+test: check-system check-rust check-python
 
-test-long: build vulkan browser $(VENV)/.dev-ready $(VENV)/ray
+test-long: check-system build $(VENV)/.dev-ready $(VENV)/ray
 	$(PYTEST) -m long --ignore=tests/test_blocks_ray.py
 	PYTHONPATH="$(CURDIR)/$(VENV)/ray" $(BIN)/python -m pytest -m long tests/test_blocks_ray.py
 
@@ -132,7 +131,7 @@ CARGO_TEST := $(CARGO) test --workspace --exclude pyo3_bindings
 RUST_TESTS := $(sort $(notdir $(basename $(wildcard crates/*/tests/*.rs)) \
 	$(patsubst %/main.rs,%,$(wildcard crates/*/tests/*/main.rs))))
 
-check-rust: build vulkan display shader-validators
+check-rust: build
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy $(PROFILE) --locked --workspace --all-targets -- -D warnings
 	$(CARGO_TEST) --lib --bins $(patsubst %,--test %,$(filter-out gpu_%,$(RUST_TESTS)))
@@ -146,45 +145,47 @@ fuzz:
 	IGSR_FUZZ_CASES=$(CASES) $(CARGO) test --locked --package splat_render \
 		--test formats mutations -- --nocapture
 
-check-python: build vulkan browser $(VENV)/.dev-ready
+check-python: build $(VENV)/.dev-ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tests/plain_words.py --check
 	$(PYTEST)
 
-# The GPU kernels are tested on whatever device answers; where none does, on Mesa's software one.
-VULKAN_ANSWERS := $(BIN)/python -c 'from igsr import _core; print("GPU tests run on", _core.backend_info("gpu")["device"])'
+# ---- system packages ---------------------------------------------------------------------------
 
-vulkan: build
-	@$(VULKAN_ANSWERS) 2>/dev/null || { \
-		$(call apt_install,mesa-vulkan-drivers libvulkan1,no GPU or software Vulkan driver answers) && $(VULKAN_ANSWERS); \
-	}
+# Vulkan on the CPU where there is no GPU; a display for the viewer's window, with a fake mouse;
+# readers of the shaders that naga's authors did not write; a browser for pages.
+SYSTEM_PACKAGES := python3-venv mesa-vulkan-drivers libvulkan1 xvfb xdotool libx11-6 libx11-xcb1 \
+	libxcursor1 libxi6 libxrandr2 libxkbcommon-x11-0 spirv-tools glslang-tools chromium
 
-# Shaders are written in every driver's language, and read by programs that naga's authors did not
-# write. (No compiler for HLSL or MSL of Microsoft's or Apple's own runs here.)
-shader-validators:
-	@[ "$$(uname -s)" != Linux ] || { command -v spirv-val && command -v glslangValidator; } >/dev/null || { \
-		$(call apt_install,spirv-tools glslang-tools,the tests of the shaders need validators); \
-	}
+setup:
+	@command -v apt-get >/dev/null || { \
+		echo "make setup needs apt-get; install what your system calls: $(SYSTEM_PACKAGES)" >&2; exit 1; }
+	@as_root=; [ "$$(id -u)" = 0 ] || as_root="sudo -n"; \
+	$$as_root apt-get update -qq && \
+	$$as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+		$(SYSTEM_PACKAGES)
 
-# The report of a refinement is opened in a browser.
-browser:
-	@for name in chromium chromium-browser google-chrome chrome; do \
-		command -v $$name >/dev/null && exit 0; \
-	done; \
-	$(call apt_install,chromium,no browser opens the tests' pages)
-
-# The viewer's window is tested on a display of its own, with a made-up hand. The libraries are those
-# that winit opens windows with on X11.
-WINDOW_PACKAGES := xvfb xdotool libx11-6 libx11-xcb1 libxcursor1 libxi6 libxrandr2 libxkbcommon-x11-0
-
-display:
-	@[ "$$(uname -s)" != Linux ] || { command -v Xvfb && command -v xdotool && \
-		ldconfig -p | grep libxkbcommon-x11.so.0 && ldconfig -p | grep libXcursor.so.1 && \
-		ldconfig -p | grep libXi.so.6; } >/dev/null 2>&1 || { \
-		$(call apt_install,$(WINDOW_PACKAGES),the tests of the viewer need a display of their own); \
-	}
+# Says all that is missing before anything runs, and installs nothing.
+check-system:
+	@missing=; \
+	need() { eval "$$2" >/dev/null 2>&1 || missing="$$missing $$1"; }; \
+	lib() { ldconfig -p | grep -q "$$1"; }; \
+	if [ "$$(uname -s)" = Linux ]; then \
+		need "libvulkan1" "lib libvulkan.so.1"; \
+		need "mesa-vulkan-drivers" "ls /usr/share/vulkan/icd.d/*.json || ls /etc/vulkan/icd.d/*.json"; \
+		need "xvfb" "command -v Xvfb"; need "xdotool" "command -v xdotool"; \
+		need "libxkbcommon-x11-0" "lib libxkbcommon-x11.so.0"; \
+		need "libxcursor1" "lib libXcursor.so.1"; need "libxi6" "lib libXi.so.6"; \
+		need "spirv-tools" "command -v spirv-val"; \
+		need "glslang-tools" "command -v glslangValidator"; \
+	fi; \
+	need "chromium" "command -v chromium || command -v chromium-browser || command -v google-chrome || command -v chrome"; \
+	[ -z "$$missing" ] || { \
+		echo "make test needs packages that are not installed:$$missing. Run make setup, or install them." >&2; \
+		exit 1; }
 
 # ---- setting up --------------------------------------------------------------------------------
 
@@ -196,7 +197,7 @@ $(VENV)/.venv-ready: requirements-dev.txt
 	@command -v $(CARGO) >/dev/null || { \
 		echo "igsr needs a Rust toolchain, and 'cargo' is not on the PATH: install Rust with rustup." >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
-		$(call apt_install,python3-venv,Python's venv module is missing); }
+		echo "Python's venv module is missing: run make setup, or install python3-venv." >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet "$$(grep '^maturin==' requirements-dev.txt)"
 	@touch $@
@@ -209,15 +210,3 @@ $(VENV)/.build-ready: $(VENV)/.venv-ready pyproject.toml $(RUST_SOURCES)
 $(VENV)/.dev-ready: $(VENV)/.venv-ready requirements-dev.txt
 	$(BIN)/python -m pip install --quiet --requirement requirements-dev.txt
 	@touch $@
-
-# $(call apt_install,packages,why): installs with apt, as root or through sudo, or says what to do.
-define apt_install
-as_root=; [ "$$(id -u)" = 0 ] || as_root="sudo -n"; \
-if command -v apt-get >/dev/null && $$as_root true 2>/dev/null; then \
-	echo "Installing $(1), since $(2)."; \
-	$$as_root apt-get update -qq && \
-	$$as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(1); \
-else \
-	echo "make: $(2), and apt cannot be used from here to mend it: install $(1), or what your system calls them, and run make again." >&2; exit 1; \
-fi
-endef

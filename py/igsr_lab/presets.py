@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from igsr.capture import Capture
 from igsr.errors import IgsrError
-from igsr.fitting.photo_support import PhotoSupport
+from igsr.fitting.photo_statistics import PhotoStatistics
 from igsr.fitting.presets import Quality, chosen_keywords, settings_for
 
 Preset: TypeAlias = Literal["default", "3dgs", "instantsplat"]
@@ -72,7 +72,7 @@ def preset_keywords(name: str, capture: Capture | None = None) -> dict[str, Any]
 
 
 def preset_settings(
-    name: str, photos: PhotoSupport | int, quality: Quality = "normal", **given: Any
+    name: str, photos: PhotoStatistics | int, quality: Quality = "normal", **given: Any
 ) -> dict[str, Any]:
     """All settings of a preset that depend on the photos, as keywords of ``igsr.fit``.
 

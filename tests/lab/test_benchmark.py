@@ -427,7 +427,7 @@ def test_two_builds_take_turns(tmp_path):
 def test_a_build_is_used_in_place_of_the_packages_own(tmp_path):
     copy = str(shutil.copy(_core.__file__, tmp_path / "_core.abi3.so"))
     code = (
-        "import sys; from igsr._internal.other_build import use_build; use_build(sys.argv[1]);"
+        "import sys; from igsr_lab.bench.other_build import use_build; use_build(sys.argv[1]);"
         "from igsr_lab.bench import fit_rows, stage_rows, timed_work;"
         "print({module._core.__file__ for module in (fit_rows, stage_rows, timed_work)});"
         "use_build(sys.argv[1])"

@@ -9,11 +9,10 @@ import numpy as np
 
 
 class ArrayEquality:
-    """Gives a dataclass an ``==`` that compares arrays entry by entry and returns one bool.
+    """Adds an ``==`` to a dataclass with ``eq=False``, whose generated ``==`` raises for arrays.
 
-    The dataclass is declared with ``eq=False``, whose generated ``==`` raises for arrays. Two
-    objects are equal if they have the same class and equal fields. Arrays are equal if dtype, shape
-    and entries are; NaN equals NaN, so that a copy equals its original.
+    Two objects are equal if they have the same class and equal fields. Arrays are equal if dtype,
+    shape and entries are; NaN equals NaN.
     """
 
     def __eq__(self, other: object) -> bool:
@@ -28,20 +27,20 @@ class ArrayEquality:
         )
 
 
-def _equal(one: Any, other: Any) -> bool:
-    if one is other:
+def _equal(a: Any, b: Any) -> bool:
+    if a is b:
         return True
-    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return (
-            isinstance(one, np.ndarray)
-            and isinstance(other, np.ndarray)
-            and one.dtype == other.dtype
-            and np.array_equal(one, other, equal_nan=one.dtype.kind in "fc")
+            isinstance(a, np.ndarray)
+            and isinstance(b, np.ndarray)
+            and a.dtype == b.dtype
+            and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
         )
-    if isinstance(one, (list, tuple)):
+    if isinstance(a, (list, tuple)):
         return (
-            type(one) is type(other)
-            and len(one) == len(other)
-            and all(_equal(a, b) for a, b in zip(one, other, strict=True))
+            type(a) is type(b)
+            and len(a) == len(b)
+            and all(_equal(x, y) for x, y in zip(a, b, strict=True))
         )
-    return bool(one == other)
+    return bool(a == b)

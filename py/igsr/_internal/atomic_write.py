@@ -1,7 +1,6 @@
-"""Write a file, or a folder of files, whole or not at all.
+"""Write files and folders atomically.
 
-A file that someone may be reading, or may need after a crash, is never opened for writing: the
-new content goes to a temporary name in the same folder and takes the old name in one rename.
+New content goes to a temporary name in the same folder, which is renamed when it is complete.
 """
 
 from __future__ import annotations
@@ -18,20 +17,15 @@ from igsr.errors import IgsrError
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path to write to; on success it replaces ``path``, on failure it goes.
+    """Yield a temporary path that replaces ``path`` on success and is deleted on failure.
 
-    The temporary file keeps the suffix of ``path`` (image and video writers choose their format
-    by it) and lies beside it, because a rename is only atomic within one file system.
+    It has the suffix of ``path``, by which image and video writers choose their format.
 
     Args:
-        path: where the finished file shall lie. Its folder is made if it is missing.
-
-    Yields:
-        The path to write to.
+        path: file to write. Its folder is created if it is missing.
 
     Raises:
-        IgsrError: the folder cannot be made or the file not be written (disk full, no
-            permission); what lay at ``path`` before is still there.
+        IgsrError: the file cannot be written; an older file stays.
     """
     target = Path(path)
     temporary: Path | None = None
@@ -43,10 +37,10 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        # mkstemp makes files private; a result is as readable as any other new file.
+        # mkstemp makes files private.
         os.chmod(temporary, 0o666 & ~_umask())
         with open(temporary, "rb") as written:
-            # Without this a power cut can leave the new name with no content.
+            # Without this, the file can be empty after a power failure.
             os.fsync(written.fileno())
         os.replace(temporary, target)
         temporary = None
@@ -61,17 +55,14 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
-    """Give a temporary folder to fill; on success it takes the name ``path``, on failure it goes.
+    """Yield a temporary folder that replaces ``path`` on success and is deleted on failure.
 
     Args:
-        path: where the finished folder shall lie; it must not be there or be empty.
-        replace: a folder that is there, whatever it holds, is replaced at the end.
-
-    Yields:
-        The folder to fill; it lies beside ``path``.
+        path: new or empty folder.
+        replace: whether to replace a folder that is not empty.
 
     Raises:
-        IgsrError: ``path`` is there and holds something, or the folder cannot be made or filled.
+        IgsrError: ``path`` is not empty, or the folder cannot be written.
     """
     target = Path(path)
     check_folder(target, replace=replace)
@@ -96,33 +87,33 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Ite
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what writing into a folder left when it was killed; what cannot be removed stays."""
+    """Remove temporary files that killed processes left in a folder, as far as possible."""
     for path in folder.glob(".*.unfinished*"):
         with contextlib.suppress(OSError):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def check_folder(path: str | os.PathLike[str], *, replace: bool = False) -> None:
-    """Find out before long work whether ``atomic_folder`` will take a path.
+    """Check before long work that ``atomic_folder(path)`` will work.
 
     Raises:
-        IgsrError: the path is a file, or a folder that holds something and is not to be replaced.
+        IgsrError: the path is a file, or a folder that is not empty.
     """
     target = Path(path)
     try:
         if target.exists() and not target.is_dir():
             raise IgsrError(f"Cannot write {target}: it is a file.")
         if not replace and target.is_dir() and any(target.iterdir()):
-            raise IgsrError(f"{target} holds something already; name a new folder.")
+            raise IgsrError(f"{target} is not empty; name a new folder.")
     except OSError as error:
         raise IgsrError(f"Cannot write {target}: {error.strerror or error}.") from error
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Find out before long work whether ``atomic_write(path)`` will be able to make its file.
+    """Check before long work that ``atomic_write(path)`` will work.
 
     Raises:
-        IgsrError: the folder cannot be made or takes no new file, or ``path`` is a folder.
+        IgsrError: the folder cannot be written to, or ``path`` is a folder.
     """
     target = Path(path)
     if target.is_dir():
@@ -136,7 +127,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _umask() -> int:
-    """The process's umask (it can only be read by setting it)."""
+    """The process's umask, which can only be read by setting it."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

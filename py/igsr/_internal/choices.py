@@ -1,15 +1,14 @@
-"""Names that public arguments choose from, as types for editors and type checkers."""
+"""Types of arguments that choose from names."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-#: What renders. "auto" is a real GPU if one answers, else the CPU; "reference" computes in float64.
+#: "auto" is a real GPU if there is one, else the CPU; "reference" computes in float64.
 Backend = Literal["auto", "cpu", "gpu", "reference"]
-#: What fits: the reference has no optimizer.
+#: Backends with an optimizer.
 FitBackend = Literal["auto", "cpu", "gpu"]
-#: A backend that "auto" is resolved to.
 ResolvedBackend = Literal["cpu", "gpu", "reference"]
-#: Views to fit, or views that are held out for testing.
+#: Views to fit, or held out for testing.
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, ...] = ("train", "test")

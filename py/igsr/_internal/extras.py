@@ -1,4 +1,4 @@
-"""Which extra of igsr brings a package that is not installed."""
+"""Extras of igsr that install optional packages."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from collections.abc import Iterator
 
 from igsr.errors import MissingExtraError
 
-#: The extra of ``pip install 'igsr[EXTRA]'`` that brings a package, by the package's import name.
+#: Extra (``pip install 'igsr[EXTRA]'``) of each optional package, by import name.
 EXTRA_OF = {"torch": "refine", "torchmetrics": "refine", "torchvision": "lpips"}
 
 
 def is_installed(package: str) -> bool:
-    """Whether a top-level package can be imported; it is not."""
+    """Whether a top-level package is installed; it is not imported."""
     try:
         return importlib.util.find_spec(package) is not None
-    except ModuleNotFoundError:  # whatever finds modules here says so itself
+    except ModuleNotFoundError:
         return False
 
 
 @contextlib.contextmanager
 def naming_extra(user: str) -> Iterator[None]:
-    """Name the extra where an import within fails since that extra is not installed.
+    """Turn ModuleNotFoundError of an optional package into an error that names its extra.
 
     Args:
-        user: what needs the package, such as "Splats.to_torch".
+        user: the feature that needs the package, such as "Splats.to_torch".
 
     Raises:
         MissingExtraError: a package of an extra is not installed.

@@ -1,4 +1,4 @@
-"""Write JSON files, whole or not at all."""
+"""Write JSON files atomically."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from igsr._internal.atomic_write import atomic_write
 
 
 def write_json(path: Path, report: dict[str, Any]) -> None:
-    """Write ``report`` as JSON, whole or not at all.
+    """Write ``report`` as JSON.
 
     Raises:
         IgsrError: the file cannot be written.

@@ -1,8 +1,4 @@
-"""Public names of a package that are imported when they are first used (PEP 562).
-
-A package whose ``__init__`` imports all of its modules loads torch for whoever wants one small name
-of it.
-"""
+"""Public names of a package that are imported on first use (PEP 562), so that it imports fast."""
 
 from __future__ import annotations
 
@@ -19,20 +15,18 @@ def lazy_exports(
     package: str,
     homes: Mapping[str, Sequence[str]],
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """The ``__getattr__`` and ``__dir__`` of a package.
+    """Return the ``__getattr__`` and ``__dir__`` of a package.
+
+    The former raises MissingExtraError for names of ``igsr`` that need an extra.
 
     Args:
         package: its ``__name__``.
         homes: public names by the module that defines them.
-
-    The ``__getattr__`` of ``igsr`` itself raises a ``MissingExtraError`` for a name whose module
-    needs an extra that is not installed.
     """
     home_of = {name: module for module, names in homes.items() for name in names}
 
     def find(name: str) -> Any:
         if name in home_of:
-            # Rooms within let the error through: who asked the package itself is named.
             with naming_extra(f"igsr.{name}") if package == "igsr" else contextlib.nullcontext():
                 value = getattr(importlib.import_module(home_of[name]), name)
             setattr(sys.modules[package], name, value)

@@ -41,7 +41,7 @@ from igsr.evaluation.scores import BLACK, default_background, score_views
 from igsr.fitting.checkpoint import load_checkpoint
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.fitter import without_exposures
-from igsr.fitting.photo_support import PhotoSupport, support_of
+from igsr.fitting.photo_statistics import PhotoStatistics, photo_statistics
 from igsr.fitting.presets import settings_for
 from igsr.fitting.result import FitResult
 from igsr.fitting.settings import FitSettings
@@ -187,7 +187,7 @@ def _fit(
             **keywords,
         )
 
-    support = support_of(photos_among(capture.train_views), depths)
+    support = photo_statistics(photos_among(capture.train_views), depths)
     usual = _usual_settings(task, support)
     start = more.get("start")
     chosen: dict[str, Any] = {"dropout": usual.dropout, "density": usual.density}
@@ -219,7 +219,7 @@ def _fit(
     return result.splats, result.capture, about
 
 
-def _usual_settings(task: FitTask, support: PhotoSupport) -> FitSettings:
+def _usual_settings(task: FitTask, support: PhotoStatistics) -> FitSettings:
     """The settings of the task, and of its preset for photos that tell this."""
     given = {k: v for k, v in task.settings.items() if k not in ("quality", "start")}
     return settings_for(support, task.settings.get("quality", "normal"), **given)

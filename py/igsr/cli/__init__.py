@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar
 import typer
 
 from igsr.cli.lazy_group import LazyCommand, LazyGroup
-from igsr.cli.process_options import MOST_THREADS, log_to_stderr, show_tracebacks, use_threads
+from igsr.cli.process_options import MAX_THREADS, log_to_stderr, show_tracebacks, use_threads
 
 #: Options that ``igsr view`` does not know are the viewer's.
 _PASSED_ON = {"ignore_unknown_options": True}
@@ -111,7 +111,7 @@ def _options(
             "--threads",
             metavar="N",
             min=1,
-            max=MOST_THREADS,
+            max=MAX_THREADS,
             help="Use N threads. Default: all cores.",
         ),
     ] = None,

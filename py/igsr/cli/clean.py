@@ -1,4 +1,4 @@
-"""``igsr clean``: a scene without its floaters."""
+"""``igsr clean``: remove floaters from a scene."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def clean_command(
         option(
             "--capture",
             metavar="CAPTURE",
-            help="The photos that SCENE was fitted to, with their cameras: remove what no photo "
-            "shows, what masks hide, and what floats before the surface and at most one photo "
-            "needs. Without it, remove what is too faint to be drawn, and splats that stand alone.",
+            help="Photos that SCENE was fitted to. Removes splats that no photo shows or that "
+            "masks hide, and floaters in front of the surface. Without it, only very faint and "
+            "isolated splats are removed.",
         ),
     ] = None,
     holdout: HoldoutOption = None,
@@ -49,8 +49,7 @@ def clean_command(
         option(
             "--out",
             metavar="FILE",
-            help="The clean scene, in any format that igsr writes. Default: SCENE's name with "
-            ".clean.ply.",
+            help="Cleaned scene, in any splat format. Default: SCENE's name with .clean.ply.",
         ),
     ] = None,
     seed: SeedOption = 0,
@@ -58,7 +57,7 @@ def clean_command(
     backend: BackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Remove floaters from SCENE: splats that photos do not support, or that stand alone."""
+    """Remove floaters from SCENE: splats that photos do not support, or isolated ones."""
     from igsr.evaluation.scores import default_background
     from igsr.floaters import remove_floaters
 
@@ -70,15 +69,17 @@ def clean_command(
         if capture_path is not None:
             capture = load(capture_path, holdout, max_size)
         elif holdout is not None or max_size is not None:
-            option = "--holdout" if holdout is not None else "--max-size"
-            raise IgsrError(f"{option} needs photos; give --capture, or leave {option} out.")
+            unused = "--holdout" if holdout is not None else "--max-size"
+            raise IgsrError(f"{unused} needs photos; give --capture, or leave {unused} out.")
         check_writable(target)
         color = background_color(background)
         cleaned = remove_floaters(splats, capture, background=color, seed=seed, backend=name)
         if capture is not None and capture.test_views:
             color = color or default_background(capture)
-            both = {"before": splats, "after": cleaned.splats}
-            held_out = {when: _scores(of, capture, color, name) for when, of in both.items()}
+            held_out = {
+                "before": _scores(splats, capture, color, name),
+                "after": _scores(cleaned.splats, capture, color, name),
+            }
         notes = cleaned.splats.save(target)
     report: dict[str, Any] = {
         "scene": str(scene),
@@ -99,10 +100,10 @@ def clean_command(
     console.print(f"{len(cleaned.splats)} splats of {len(splats)}")
     console.print(removed_line(cleaned.removed))
     if held_out is not None:
-        was, now = held_out["before"], held_out["after"]
+        before, after = held_out["before"], held_out["after"]
         console.print(
-            f"{now['views']} held-out photos: PSNR {was['psnr']:.2f} to {now['psnr']:.2f} dB, "
-            f"SSIM {was['ssim']:.4f} to {now['ssim']:.4f}"
+            f"{after['views']} held-out photos: PSNR {before['psnr']:.2f} to {after['psnr']:.2f} "
+            f"dB, SSIM {before['ssim']:.4f} to {after['ssim']:.4f}"
         )
     for note in notes:
         print_message(note)

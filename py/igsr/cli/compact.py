@@ -40,8 +40,8 @@ def compact_command(
         option(
             "--capture",
             metavar="CAPTURE",
-            help="Photos of the scene: fine-tune on them and measure the loss on held-out photos. "
-            "Without it, renders of SCENE from around it take their place.",
+            help="Photos of the scene, to fine-tune on and to measure the loss on held-out ones. "
+            "Without it, renders of SCENE are used.",
         ),
     ] = None,
     holdout: HoldoutOption = None,
@@ -49,8 +49,8 @@ def compact_command(
         float | None,
         option(
             "--psnr",
-            help="Without --capture: the PSNR of SCENE on its photos, against which a change "
-            "counts. Default: that of the report.json beside SCENE, else 30.",
+            help="Without --capture: PSNR of SCENE on its photos, from which the loss counts. "
+            "Default: that in report.json in SCENE's folder, or 30.",
         ),
     ] = None,
     out: Annotated[
@@ -58,7 +58,7 @@ def compact_command(
         option(
             "--out",
             metavar="PLY",
-            help="The smaller scene; its curve of size and PSNR goes beside it as .json and .png. "
+            help="Smaller scene; its curve of size and PSNR is written as .json and .png. "
             "Default: SCENE's name with .compact.ply.",
         ),
     ] = None,
@@ -67,7 +67,7 @@ def compact_command(
         option(
             "--sh-degree",
             help="Spherical-harmonics degree of the smaller scene. A higher degree needs fewer "
-            "splats with more bytes each. Default: SCENE's, or lower where that loses little.",
+            "splats with more bytes each. Default: SCENE's, or a lower one that loses little.",
         ),
     ] = None,
     steps: Annotated[
@@ -78,7 +78,7 @@ def compact_command(
     backend: FitBackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Make SCENE smaller: the fewest splats that lose at most --max-loss of PSNR."""
+    """Reduce SCENE to the fewest splats that lose at most --max-loss of PSNR."""
     with error_messages(lambda: "Interrupted; nothing is written."):
         name = resolved(backend)
         limit = _decibels("--max-loss", max_loss)
@@ -121,11 +121,11 @@ def compact_command(
     console = output_console()
     console.print(
         f"{result['splats']} splats of SH degree {result['sh_degree']}, {result['bytes']} bytes; "
-        f"before {whole['splats']}, {whole['sh_degree']}, {whole['bytes']}"
+        f"before: {whole['splats']}, {whole['sh_degree']}, {whole['bytes']}"
     )
-    console.print(f"loses {result['loss']:.3f} dB of at most {limit:g}")
+    console.print(f"loss: {result['loss']:.3f} dB of at most {limit:g}")
     console.print(
-        f"measured on {report['protocol']['validation_views']} held-out views against "
+        f"measured on {report['protocol']['validation_views']} held-out views, compared with "
         f"{report['protocol']['against']}",
         style="dim",
     )
@@ -143,7 +143,7 @@ def _decibels(option: str, text: str) -> float:
 
 
 def _reported_psnr(path: Path) -> float | None:
-    """The PSNR in the report of a fit, or None if there is no such report."""
+    """PSNR in the report of a fit; None if there is no report."""
     try:
         psnr = json.loads(path.read_text(encoding="utf-8"))["psnr"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

@@ -1,4 +1,4 @@
-"""``igsr denoise``: render the views of a scene and denoise them."""
+"""``igsr denoise``: render views of a scene and denoise them."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def denoise_command(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Splats (.ply).")],
     capture_path: Annotated[
         Path,
-        option("--capture", metavar="CAPTURE", help="The photos that the splats were fitted to."),
+        option("--capture", metavar="CAPTURE", help="Photos that the splats were fitted to."),
     ],
-    out: Annotated[Path, option("--out", metavar="DIR", help="Folder for the pictures.")],
+    out: Annotated[Path, option("--out", metavar="DIR", help="Folder for the images.")],
     holdout: Annotated[
         int | None, option("--holdout", help="Hold out every Nth photo for testing.")
     ] = None,
     split: Annotated[
         SplitName | None,
-        option("--split", help="Views to render. Default: test, if there are any."),
+        option("--split", help="Views to render. Default: test if there are any, else train."),
     ] = None,
     denoiser_name: DenoiserOption = None,
     backend: BackendOption = "auto",
@@ -64,17 +64,17 @@ def denoise_command(
         denoiser = chosen_denoiser(
             denoiser_name, lambda weights: NetworkDenoiser(load_network(weights))
         )
-        splats = Splats.load(scene).without_backdrop()  # holes are to be seen as such
+        splats = Splats.load(scene).without_backdrop()  # the denoiser fills holes
         capture = load(capture_path, holdout)
-        background, behind = default_background(capture), known_background(capture.views)
-        on = resolved(backend)
+        background, known = default_background(capture), known_background(capture.views)
+        name = resolved(backend)
         views = views_of_split(capture, split or default_split(capture))
         photos = capture.train_views
-        support = photo_support(splats, photos, on)
-        sources = photo_sources(splats, photos, background, on)
+        support = photo_support(splats, photos, name)
+        sources = photo_sources(splats, photos, background, name)
         files = []
         for view in views:
-            buffers = render_buffers(splats, view.camera, support, behind, on)
+            buffers = render_buffers(splats, view.camera, support, known, name)
             others = [
                 source
                 for source, photo in zip(sources, photos, strict=True)
@@ -85,8 +85,8 @@ def denoise_command(
             path.parent.mkdir(parents=True, exist_ok=True)
             for array, file in ((picture, path), (confidence, path.with_suffix(".confidence.png"))):
                 with atomic_write(file) as temporary:
-                    eight = np.rint(255.0 * array).astype(np.uint8)
-                    Image.fromarray(eight).save(temporary, format="PNG")
+                    pixels = np.rint(255.0 * array).astype(np.uint8)
+                    Image.fromarray(pixels).save(temporary, format="PNG")
                 files.append(str(file))
     if as_json:
         print_json({"files": files})

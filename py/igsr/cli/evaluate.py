@@ -1,4 +1,4 @@
-"""``igsr eval``: score a scene against photos."""
+"""``igsr eval``: score a scene on photos."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ def eval_command(
     holdout: HoldoutOption = None,
     max_size: MaxSizeOption = None,
     split: Annotated[
-        SplitName | None, option("--split", help="Views to score. Default: test, if any.")
+        SplitName | None,
+        option("--split", help="Views to score. Default: test if there are any, else train."),
     ] = None,
     background: BackgroundOption = None,
     backend: BackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Score SCENE against the photos of CAPTURE."""
+    """Score SCENE on the photos of CAPTURE."""
     with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)

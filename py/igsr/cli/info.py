@@ -1,4 +1,4 @@
-"""``igsr info``: what a file holds, and which backends this machine has."""
+"""``igsr info``: describe a scene or a capture, and list the backends."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ from igsr.splats import SPLAT_ENDINGS, Splats
 
 
 def info_command(
-    path: Annotated[
-        Path, typer.Argument(metavar="SCENE|CAPTURE", help="A splat file, or a capture.")
-    ],
+    path: Annotated[Path, typer.Argument(metavar="SCENE|CAPTURE", help="Splat file or capture.")],
     max_size: MaxSizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -37,14 +35,14 @@ def info_command(
     console = output_console()
     for key, value in report.items():
         if key == "backends":
-            for name, what in value.items():
-                console.print(f"backend {name}: {what}")
+            for name, device in value.items():
+                console.print(f"backend {name}: {device}")
         else:
             console.print(f"{key.replace('_', ' ')}: {_plain(value)}")
 
 
 def _opacity(logit: float) -> float:
-    # tanh does not overflow for any logit, as exp does.
+    # tanh does not overflow, unlike exp.
     return 0.5 + 0.5 * math.tanh(0.5 * logit)
 
 
@@ -69,11 +67,8 @@ def _scene_info(path: Path) -> dict[str, Any]:
     }
 
 
-def _known(number: float) -> float | None:
-    """The number, or None if it is not finite: JSON has no such number.
-
-    The mean of camera centres overflows where a camera is absurdly far out.
-    """
+def _finite(number: float) -> float | None:
+    """The number, or None if it is not finite (the mean of extreme camera positions overflows)."""
     return float(number) if math.isfinite(number) else None
 
 
@@ -93,22 +88,22 @@ def _capture_info(path: Path, max_size: int | None) -> dict[str, Any]:
         "views_with_alpha": sum(view.image.shape[2] == 4 for view in capture.views),
         "views_with_mask": sum(view.mask is not None for view in capture.views),
         "points": points,
-        "scene_centre": [_known(x) for x in capture.scene_centre],
-        "scene_extent": _known(capture.scene_extent),
+        "scene_centre": [_finite(x) for x in capture.scene_centre],
+        "scene_extent": _finite(capture.scene_extent),
     }
 
 
 def _backends() -> dict[str, str]:
-    """What each backend runs on, or why it is not available."""
-    found = {}
+    """Device of each backend, or why it is not available."""
+    backends = {}
     for name in ("cpu", "gpu", "reference"):
         try:
             info = _core.backend_info(_core.resolve_backend(name))
-            found[name] = f"{info['device']}, {info['instruction_set']}"
+            backends[name] = f"{info['device']}, {info['instruction_set']}"
         except RuntimeError as error:
-            found[name] = f"not available: {error}"
-    found["auto"] = _core.resolve_backend("auto")
-    return found
+            backends[name] = f"not available: {error}"
+    backends["auto"] = _core.resolve_backend("auto")
+    return backends
 
 
 def _plain(value: object) -> str:

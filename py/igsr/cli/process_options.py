@@ -1,6 +1,6 @@
-"""Options of the process, before any command: ``--debug``, ``--verbose`` and ``--threads``.
+"""Global options: ``--debug``, ``--verbose`` and ``--threads``.
 
-They are set before the command's module is imported, because thread pools read their size once.
+They are applied before the command's module is imported, because thread pools read their size once.
 """
 
 from __future__ import annotations
@@ -10,33 +10,32 @@ import sys
 
 from igsr.cli.error_messages import DEBUG_VARIABLE
 
-#: Environment variables that set how many threads the renderer, torch and numpy start.
+#: Environment variables for the number of threads of the renderer, torch and numpy.
 THREAD_VARIABLES = (
     "RAYON_NUM_THREADS",
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
 )
-#: More threads than any machine has cores are a slip of the finger.
-MOST_THREADS = 1024
+MAX_THREADS = 1024
 
 
 def show_tracebacks() -> None:
-    """Show the traceback behind each error message, here and in worker processes."""
+    """Show tracebacks with error messages, also in worker processes."""
     os.environ[DEBUG_VARIABLE] = "1"
 
 
 def use_threads(count: int) -> None:
-    """Let everything that starts threads start ``count`` of them, here and in worker processes."""
+    """Set the number of threads, also in worker processes."""
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(count)))
-    if "torch" in sys.modules:  # it has read its variable already
+    if "torch" in sys.modules:  # it reads the variable once
         import torch
 
         torch.set_num_threads(count)
 
 
 def log_to_stderr(verbosity: int) -> None:
-    """Print igsr's log on stderr: 1 for what happens, 2 for details too."""
+    """Print igsr's log to stderr: level INFO for 1, DEBUG for 2."""
     import logging
 
     logger = logging.getLogger("igsr")

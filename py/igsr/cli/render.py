@@ -1,4 +1,4 @@
-"""``igsr render``: pictures and videos of splats."""
+"""``igsr render``: render images or a video of a scene."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from igsr.splats import Splats
 def render_command(
     scene: SceneArgument,
     out: Annotated[
-        Path, option("--out", help="Folder for the pictures; with --orbit, an .mp4 file.")
+        Path, option("--out", help="Folder for the images; with --orbit, an .mp4 file.")
     ],
     cameras: Annotated[
         Path | None,
@@ -51,7 +51,7 @@ def render_command(
         bool,
         option(
             "--exr",
-            help="Write EXR, not PNG: 32-bit floats R, G, B, A and Z (expected depth).",
+            help="Write EXR instead of PNG: 32-bit floats R, G, B, A and Z (expected depth).",
         ),
     ] = False,
     background: BackgroundOption = None,
@@ -59,7 +59,7 @@ def render_command(
     backend: BackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Render SCENE to PNG or EXR pictures, or to a video around it."""
+    """Render SCENE to PNG or EXR images, or to a video."""
     with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)
@@ -69,19 +69,19 @@ def render_command(
         )
         if orbit_frames is not None:
             if exr:
-                raise IgsrError("--exr writes pictures and --orbit writes a video; leave one out.")
+                raise IgsrError("--exr writes images and --orbit writes a video; leave one out.")
             if out.suffix.lower() not in (".mp4", ".mkv", ".mov"):
                 raise IgsrError(f"--out {out} must be a video file such as orbit.mp4 with --orbit.")
             files = [_write_orbit(splats, orbit(splats, capture, orbit_frames), out, color, name)]
         elif capture is not None:
             files = _write_pictures(splats, capture, out, color, name, exr)
         else:
-            raise IgsrError("Name the cameras: --cameras CAPTURE, --orbit FRAMES, or both.")
+            raise IgsrError("Give the cameras: --cameras CAPTURE, --orbit FRAMES, or both.")
     if as_json:
         print_json({"files": [str(file) for file in files], **_core.backend_info(name)})
     else:
         output_console().print(
-            str(files[0]) if len(files) == 1 else f"{len(files)} pictures in {out}"
+            str(files[0]) if len(files) == 1 else f"{len(files)} images in {out}"
         )
 
 

@@ -1,7 +1,7 @@
-"""``igsr view``: a scene in a window, or in the browser.
+"""``igsr view``: show a scene in a window or in the browser.
 
-The viewer ``splat-view`` is a process of its own and reads cameras in one format, the
-``cameras.json`` that igsr writes. This command reads any other capture for it.
+The viewer ``splat-view`` runs in its own process and reads cameras from ``cameras.json`` only; this
+command converts other captures.
 """
 
 from __future__ import annotations
@@ -26,22 +26,19 @@ from igsr.cli.error_messages import INTERRUPTED, error_messages, print_message
 from igsr.cli.web_view import has_display, serve_web_view
 from igsr.errors import IgsrError
 
-#: The viewer.
 PROGRAM = (sys.executable, "-m", "igsr.rendering.window")
-#: Nothing in the folder that the command was typed in takes the place of a module.
+#: Do not import modules from the current folder.
 ENVIRONMENT = {"PYTHONSAFEPATH": "1"}
 #: Options of the viewer that open no window.
 WITHOUT_WINDOW = ("--screenshot", "--frames", "--time", "--help", "-h", "--version")
-#: The viewer's file of cameras.
 CAMERAS = "cameras.json"
-#: Where the browser view listens: nowhere that other computers reach.
 OWN_HOST = "127.0.0.1"
-#: The folder in that of a run which has photos and cameras for the page.
+#: Subfolder of a run with photos and cameras for the page.
 VIEW = "view"
-#: Options that this command does not know are the viewer's.
+#: Unknown options are the viewer's.
 PASSED_ON = {"ignore_unknown_options": True}
-#: Longest side of the photos that the viewer lays over renders, pixels.
-PHOTO_SIDE = 1600
+#: Longest side of the photos for the viewer.
+MAX_PHOTO_SIDE_PX = 1600
 
 
 def view_command(
@@ -49,8 +46,8 @@ def view_command(
         list[str],
         typer.Argument(
             metavar="SCENE...",
-            help="Splat file, or the folder of a fit or a refinement; two are compared. "
-            "Options of splat-view may follow.",
+            help="Splat file or folder of a fit or refinement; two are compared. Options of "
+            "splat-view may follow.",
         ),
     ],
     cameras: Annotated[
@@ -58,15 +55,15 @@ def view_command(
         typer.Option(
             "--cameras",
             metavar="CAPTURE",
-            help="Capture whose cameras and photos to show. Default: what lies beside SCENE.",
+            help="Capture whose cameras and photos to show. Default: that in SCENE's folder.",
         ),
     ] = None,
     web: Annotated[
         bool,
         typer.Option(
             "--web",
-            help="Show it in the browser, and follow a fit or a refinement that is running. "
-            "Where there is no display this is the default.",
+            help="Show the scene in the browser, and follow a running fit or refinement. Default "
+            "without a display.",
         ),
     ] = False,
     host: Annotated[
@@ -74,8 +71,8 @@ def view_command(
         typer.Option(
             "--host",
             metavar="ADDRESS",
-            help="For --web: address to listen at; 0.0.0.0 opens it to other computers. "
-            f"Default: {OWN_HOST}, this computer alone.",
+            help="For --web: address to listen on; 0.0.0.0 allows other computers. "
+            f"Default: {OWN_HOST}.",
         ),
     ] = None,
     port: Annotated[
@@ -84,15 +81,16 @@ def view_command(
             "--port",
             min=1,
             max=65535,
-            help="For --web: port to listen at. Default: 8765, or the next free one.",
+            help="For --web: port to listen on. Default: 8765, or the next free one.",
         ),
     ] = None,
 ) -> None:
-    """Show splats in a window or in the browser, one scene alone or two beside each other."""
+    """Show one scene, or two side by side, in a window or in the browser."""
     with error_messages():
-        if web or (not has_display() and not _asks_for_no_window(scenes)):
+        opens_window = not any(word.partition("=")[0] in WITHOUT_WINDOW for word in scenes)
+        if web or (opens_window and not has_display()):
             if not web:
-                _say_why_the_browser(scenes)
+                _announce_browser(scenes)
             serve_web_view(
                 scenes,
                 lambda folder: _cameras_for_web(cameras, Path(scenes[0]), folder),
@@ -117,60 +115,47 @@ def view_command(
     raise typer.Exit(code if code >= 0 else 128 - code)
 
 
-def _asks_for_no_window(scenes: list[str]) -> bool:
-    return any(word.partition("=")[0] in WITHOUT_WINDOW for word in scenes)
-
-
-def _say_why_the_browser(scenes: list[str]) -> None:
-    """Say in a line that the browser stands in for a window.
+def _announce_browser(scenes: list[str]) -> None:
+    """Print that the browser is used instead of a window.
 
     Raises:
-        IgsrError: options are given that only the window has.
+        IgsrError: options of the window are given.
     """
     options = [word for word in scenes if word.startswith("-")]
     if options:
         raise IgsrError(
-            f"{options[0]} is for the window, and there is no display; set DISPLAY, or leave it "
-            "out for the browser view"
+            f"{options[0]} needs a window, and there is no display; set DISPLAY, or leave it out "
+            "to use the browser"
         )
-    print_message("There is no display to open a window on; the browser shows the scene.")
+    print_message("There is no display; the scene is shown in the browser.")
 
 
 def _cameras(named: str | None, scene: Path, folder: Path) -> Path | None:
-    """The ``cameras.json`` to show: of the capture that is named, else of the one beside the scene.
+    """``cameras.json`` of the named capture, or of a capture in the scene's folder.
 
-    None where the viewer finds its own, or where there is none.
+    None if there is none, or if the viewer finds it.
     """
     if named is not None:
         return _readable(Path(named), folder)
-    capture = _beside(scene)
-    if capture is None:
+    capture = scene if scene.is_dir() else scene.parent
+    if (capture / CAMERAS).is_file() or not holds_cameras(capture):
         return None
     try:
         return _readable(capture, folder)
-    except IgsrError as error:
-        # Nobody asked for them: the scene can be looked at without.
+    except IgsrError as error:  # the scene can be shown without cameras
         print(f"{error}; no cameras are shown.", file=sys.stderr)
         return None
 
 
 def _cameras_for_web(named: str | None, scene: Path, folder: Path) -> Path | None:
-    """As ``_cameras``; None, too, where a run has left cameras and photos for the page."""
+    """As ``_cameras``; also None if a run has written cameras and photos for the page."""
     if named is None and (scene / VIEW / CAMERAS).is_file():
         return None
     return _cameras(named, scene, folder)
 
 
-def _beside(scene: Path) -> Path | None:
-    """The capture that a scene lies in, or that igsr keeps beside it."""
-    folder = scene if scene.is_dir() else scene.parent
-    if (folder / CAMERAS).is_file():
-        return None
-    return next((path for path in (folder, folder / "capture") if holds_cameras(path)), None)
-
-
 def _readable(capture: Path, folder: Path) -> Path:
-    """A capture's own ``cameras.json``, or one that is made of the capture in ``folder``."""
+    """The capture's ``cameras.json``, or one written into ``folder``."""
     for path in (capture, capture / CAMERAS):
         if path.name == CAMERAS and path.is_file():
             return path
@@ -180,11 +165,11 @@ def _readable(capture: Path, folder: Path) -> Path:
 
 
 def write_for_viewer(capture: Capture, folder: Path) -> None:
-    """Write a capture's cameras, and its photos undistorted and at most 1600 pixels wide or high.
+    """Write ``cameras.json`` and ``photos/``, undistorted and at most ``MAX_PHOTO_SIDE_PX``.
 
     Args:
         capture: cameras and photos.
-        folder: where ``cameras.json`` goes, and the photos beside it under ``photos/``.
+        folder: to write to.
 
     Raises:
         IgsrError: the file of cameras cannot be written.
@@ -202,7 +187,7 @@ def write_for_viewer(capture: Capture, folder: Path) -> None:
 
 def _write_photo(view: View, path: Path) -> None:
     photo = Image.fromarray(view.image)
-    photo.thumbnail((PHOTO_SIDE, PHOTO_SIDE))
+    photo.thumbnail((MAX_PHOTO_SIDE_PX, MAX_PHOTO_SIDE_PX))
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Read once and thrown away: speed counts, size does not.
+    # A temporary file: fast to write rather than small.
     photo.save(path, compress_level=1)

@@ -1,4 +1,4 @@
-"""``igsr view --web``: the server in the foreground, until Ctrl-C."""
+"""``igsr view --web``: run the server in the foreground until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def serve_web_view(
 
     Args:
         scenes: splat files, and folders of fits and refinements.
-        readable_cameras: the ``cameras.json`` to show, made in a folder where it has to be; None
-            for those beside the scenes.
-        host: address to listen at.
-        port: None takes the usual one, or the next that is free.
+        readable_cameras: given a temporary folder, returns the ``cameras.json`` to show, or None
+            to use those in the scenes' folders.
+        host: address to listen on.
+        port: None for the default, or the next free one.
 
     Raises:
-        IgsrError: a scene is not there, or the server cannot listen.
+        IgsrError: a scene does not exist, or the server cannot listen.
     """
     from igsr.rendering.live_models import check_viewable, live_models
     from igsr.rendering.live_server import is_loopback, open_server
@@ -48,7 +48,6 @@ def serve_web_view(
         cameras = readable_cameras(Path(folder))
         with open_server(LiveView(paths, cameras), host, port) as server:
             _announce(server.url, server.server_port, is_open=not is_loopback(host))
-            # Ctrl-C is how it is meant to end.
             with contextlib.suppress(KeyboardInterrupt):
                 server.serve_forever()
 
@@ -57,22 +56,22 @@ def _announce(url: str, port: int, *, is_open: bool) -> None:
     print(url, flush=True)
     if is_open:
         print_message(
-            f"Port {port} is open to other computers: whoever has the address above sees the "
-            "scenes and photos, and nothing is encrypted."
+            f"Port {port} is open to other computers: anyone with the address above can see the "
+            "scenes and photos. The connection is not encrypted."
         )
     is_remote = "SSH_CONNECTION" in os.environ
     if is_remote and not is_open:
         print_message(
             f"On your own computer run: ssh -L {port}:127.0.0.1:{port} HOST, "
-            "then open the address above there."
+            "then open the address above."
         )
-    print_message("Ctrl-C ends it.")
+    print_message("Press Ctrl-C to stop.")
     if has_display() and not is_remote:
         webbrowser.open(url)
 
 
 def has_display() -> bool:
-    """Whether windows can be opened here, as far as the environment says."""
+    """Whether the environment has a display."""
     return sys.platform in ("win32", "darwin") or bool(
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     )

@@ -1,4 +1,4 @@
-"""``igsr weights``: list, download and find the weights of pose networks."""
+"""``igsr weights``: list, download and locate the weights of pose networks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from igsr.pose.huggingface_cache import cache_folder
 from igsr.pose.weights import KNOWN, fetch_weights, known_weights, weights_path
 
 app = typer.Typer(
-    help="List, download and find the weights of pose networks.", no_args_is_help=True
+    help="List, download and locate the weights of pose networks.", no_args_is_help=True
 )
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help=f"One of {', '.join(KNOWN)}.")]
@@ -21,7 +21,7 @@ NameArgument = Annotated[str, typer.Argument(metavar="NAME", help=f"One of {', '
 
 @app.command("list")
 def list_command(as_json: JsonOption = False) -> None:
-    """List the weights that igsr can use, their licences, and which are downloaded."""
+    """List known weights, their licenses, and which are downloaded."""
     with error_messages():
         rows = [
             {
@@ -51,8 +51,8 @@ def list_command(as_json: JsonOption = False) -> None:
 
 @app.command("fetch")
 def fetch_command(name: NameArgument) -> None:
-    """Download weights NAME to the cache, check them, and print where they are."""
-    with error_messages(lambda: "Interrupted; nothing unfinished is kept."):
+    """Download weights NAME to the cache, check them and print their path."""
+    with error_messages(lambda: "Interrupted; the unfinished download is deleted."):
         weights = known_weights(name)
         if weights.fetched:
             print_message(f"{name} is published under {weights.licence}: {weights.page}")
@@ -62,7 +62,7 @@ def fetch_command(name: NameArgument) -> None:
 
 @app.command("path")
 def path_command(name: NameArgument) -> None:
-    """Print where the downloaded weights NAME are."""
+    """Print the path of the downloaded weights NAME."""
     with error_messages():
         path = weights_path(name)
     typer.echo(path)

@@ -1,4 +1,4 @@
-"""What a run says before slow work: the photos, the steps and an estimate of the time."""
+"""What a run announces before slow work: the photos, the steps and the estimated time."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 from igsr.capture.downscaling import reduced_size
 from igsr.capture.overview import Overview
 from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
-from igsr.fitting.photo_support import PhotoSupport, detail_of_files
+from igsr.fitting.photo_statistics import PhotoStatistics, detail_of_files
 from igsr.fitting.presets import Quality, settings_for
-from igsr.fitting.time_estimate import fit_seconds, other_seconds, timed_steps, times_usual
+from igsr.fitting.time_estimate import fit_seconds, other_seconds, slowdown, timed_steps
 from igsr.pose.colmap.time_estimate import camera_seconds
 
-#: Angle between neighboring photos that is assumed before cameras are known, degrees.
-USUAL_ANGLE_DEG = 10.0
+#: Angle between neighboring photos before cameras are known.
+ASSUMED_SPACING_DEG = 10.0
 #: Time of a refinement's round, as a fraction of a fit's time.
 ROUND_FRACTION = 1.5
 
@@ -47,18 +47,18 @@ def announcement(
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     pixels = sum(w * h for w, h in sizes) / len(sizes)
     detail = detail_of_files(seen.plain, max_size)
-    support = PhotoSupport(photos, pixels, float(photos), USUAL_ANGLE_DEG, detail)
-    settings = settings_for(support, quality, **given)
+    statistics = PhotoStatistics(photos, pixels, float(photos), ASSUMED_SPACING_DEG, detail)
+    settings = settings_for(statistics, quality, **given)
     has_alpha = seen.channels == 4
     step = timed_steps(backend, settings.sh_degree, has_alpha)
     fit = (1.0 + ROUND_FRACTION * rounds) * fit_seconds(settings, width, height, step)
     held_out = len(seen.sizes) - photos
-    # Photos with alpha start from their hull, photos with depths from these.
+    # Photos with alpha start from their hull, photos with depth maps from these.
     swept = settings.start in ("auto", "depths") and not has_alpha and not seen.depths
     scored = held_out + min(photos, MAX_TRAIN_PHOTOS)
-    # Scores and depth maps run on the CPU; a GPU's steps do not say how fast it is.
-    times = times_usual(step, has_alpha) if backend == "cpu" else 1.0
-    fit += other_seconds(photos if swept else 0, scored, pixels, times)
+    # Scores and depth maps run on the CPU, whose speed is unknown if steps run on a GPU.
+    factor = slowdown(step, has_alpha) if backend == "cpu" else 1.0
+    fit += other_seconds(photos if swept else 0, scored, pixels, factor)
     cameras = 0.0 if cameras_known else camera_seconds(seen.sizes)
     return [
         f"Found {len(seen.sizes)} photos of {_size_range(seen.sizes)}"
@@ -80,7 +80,7 @@ def _size_range(sizes: list[tuple[int, int]]) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """A time, as precise as the estimate is."""
+    """A time, rounded to the precision of the estimate."""
     if seconds < 90.0:
         return f"{max(5, 5 * round(seconds / 5.0))} s"
     if seconds < 285.0:

@@ -1,4 +1,4 @@
-"""Hashes of what a fit was made from, by which a checkpoint is told from others."""
+"""Hashes of a fit's inputs, recorded in checkpoints."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from igsr.capture.types import PseudoView, Tracks
 
 
 def fingerprint(views: list[View], tracks: Tracks | None = None) -> str:
-    """SHA-256 of all that a fit has of its photos, of cameras, rigs and tracks, in hexadecimal."""
+    """SHA-256 of photos, cameras, rigs and tracks, in hexadecimal."""
     arrays: list[npt.NDArray[Any] | None] = []
     for view in views:
         camera = view.camera
@@ -33,7 +33,7 @@ def _weights(view: View) -> npt.NDArray[np.float32] | None:
 
 
 def hash_of(arrays: Iterable[npt.NDArray[Any] | None]) -> str:
-    """SHA-256 of arrays with their types and shapes, in hexadecimal; None counts for nothing."""
+    """SHA-256 of arrays with their types and shapes, in hexadecimal; None is skipped."""
     digest = hashlib.sha256()
     for array in arrays:
         if array is not None:

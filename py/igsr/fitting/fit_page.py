@@ -1,7 +1,4 @@
-"""``report.html`` of a fit: one page, with everything inside.
-
-The page itself is ``templates/fit.html.jinja``; this module says what is put into it.
-"""
+"""``report.html`` of a fit, from ``templates/fit.html.jinja``."""
 
 from __future__ import annotations
 
@@ -29,15 +26,11 @@ from igsr.evaluation.scores import ScoredView
 from igsr.rendering.scene_page import PageModel
 from igsr.splats import Splats
 
-#: Most photos with transient things that are shown, and the color of what is masked in them.
-MOST_MASKED, TINT = 12, (255, 0, 255)
-#: Parts as the page calls them.
-PARTS = {
-    "cameras": "find cameras",
-    "load": "load photos",
-    "fit": "fit",
-    "score": "score",
-}
+#: Maximum number of photos with transient objects that are shown, and the color of their masks.
+MAX_MASKED_PHOTOS = 12
+MASK_COLOR = (255, 0, 255)
+#: Titles of measured parts.
+PARTS = {"cameras": "find cameras", "load": "load photos", "fit": "fit", "score": "score"}
 
 
 def write_fit_page(
@@ -47,14 +40,14 @@ def write_fit_page(
     capture: Capture,
     shown: Sequence[ScoredView],
 ) -> None:
-    """Write the page, whole or not at all; it needs nothing but a browser.
+    """Write the page, a single file.
 
     Args:
-        path: where to.
-        report: of ``report.json``.
+        path: HTML file to write.
+        report: content of ``report.json``.
         splats: the scene.
-        capture: the photos, with cameras.
-        shown: views that are shown beside their renders.
+        capture: photos and cameras.
+        shown: views to show next to their renders.
 
     Raises:
         IgsrError: the file cannot be written.
@@ -94,16 +87,16 @@ def _title(capture: str) -> str:
 
 
 def _masked_photos(masked: dict[str, float], capture: Capture) -> list[dict[str, str]]:
-    """Photos in which most is masked as transient, with what is masked tinted."""
+    """The photos with the most masked pixels, which are tinted."""
     views = {view.name: view for view in capture.train_views}
-    most = sorted(masked, key=lambda name: -masked[name])[:MOST_MASKED]
+    names = sorted(masked, key=lambda name: -masked[name])[:MAX_MASKED_PHOTOS]
     rows = []
-    for name in (name for name in most if name in views):
+    for name in (name for name in names if name in views):
         view = views[name]
         picture = view.image[..., :3].copy()
         if view.mask is not None:
             hidden = ~view.mask
-            picture[hidden] = (picture[hidden] // 2) + np.array(TINT, np.uint8) // 2
+            picture[hidden] = (picture[hidden] // 2) + np.array(MASK_COLOR, np.uint8) // 2
         caption = f"{name}, {100.0 * masked[name]:.1f} %"
         rows.append({"picture": jpeg(picture, BESIDE), "caption": caption})
     return rows

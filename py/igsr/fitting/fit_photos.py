@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from igsr import _core
@@ -35,7 +36,7 @@ from igsr.fitting.settings import (
     TransientMode,
 )
 from igsr.pose import AUTO, CameraSettings, load_photos
-from igsr.run import open_run
+from igsr.run import Run, open_run
 from igsr.splats import Splats
 
 #: File of the checkpoint in the folder of a fit.
@@ -204,13 +205,6 @@ def fit(
         result = replace(result, not_placed=tuple(loaded.not_placed))
         if run.out is None:
             return result
-        write_scene(run, result.splats, result.capture, color)
-        refined = result.settings.moves_cameras or loaded.cameras_found
-        with run.parts.measured("score"):
-            scored = score_fit(
-                result, color, run, refined=refined and bool(result.capture.test_views)
-            )
-        scored.scores.protocol["holdout"] = holdout
         asked = {
             "capture": str(capture.path),
             "holdout": holdout,
@@ -225,6 +219,25 @@ def fit(
             "background": None if background is None else list(background),
             "igsr": _core.__version__,
         }
-        report = fit_report(result, scored, run, asked)
-        write_fit_report(run.out, report, result, scored)
-        return replace(result, scores=scored.scores, report=report)
+        return _written(run, run.out, result, color, asked, cameras_found=loaded.cameras_found)
+
+
+def _written(
+    run: Run,
+    out: Path,
+    result: FitResult,
+    color: tuple[float, float, float],
+    asked: dict[str, Any],
+    *,
+    cameras_found: bool,
+) -> FitResult:
+    """Write the scene, score it and write the report."""
+    write_scene(run, result.splats, result.capture, color)
+    # Held-out photos of cameras that moved are scored at their best pose (see evaluate).
+    refined = bool(result.capture.test_views) and (result.settings.moves_cameras or cameras_found)
+    with run.parts.measured("score"):
+        scored = score_fit(result, color, run, refined=refined)
+    scored.scores.protocol["holdout"] = asked["holdout"]
+    report = fit_report(result, scored, run, asked)
+    write_fit_report(out, report, result, scored)
+    return replace(result, scores=scored.scores, report=report)

@@ -1,4 +1,4 @@
-"""The renderer's fitter, made from views and splats, and read back as cameras."""
+"""Conversion between views, splats and cameras and the arrays of the renderer's fitter."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ from igsr.fitting.settings import FitSettings
 from igsr.rendering.renders import intrinsics_of, viewmat_about
 from igsr.splats import PARAMETERS, Splats, subset
 
-#: Steps on photos, at least, for one on a pseudo-view, where there are both: these teach what they
-#: can soon, and what photos show is right.
+#: Minimum number of steps on photos for each step on a pseudo-view, which may be wrong.
 PHOTO_STEPS = 5
-#: The last fraction of the steps, which are on photos alone: pseudo-views are a little blurred, and
-#: fine detail is fitted last.
-PHOTOS_LAST = 0.2
+#: Last fraction of the steps, on photos only: pseudo-views are a little blurred, and fine detail is
+#: fitted last.
+PHOTOS_ONLY_FRACTION = 0.2
 
 
 def fitter_of(
@@ -39,26 +38,26 @@ def fitter_of(
     priors: PosePriors | None = None,
     exposures: StartingExposures | None = None,
 ) -> _core.Fitter:
-    """The renderer's fitter of splats to views; see ``_core.Fitter``.
+    """Return the renderer's fitter; see ``_core.Fitter``.
 
     Args:
         views: V photos or pseudo-views with their cameras, in the world frame.
-        origin: float64 [3], world position that the splats are relative to.
-        state: float32 arrays of N splats ("means" [N, 3] ...), and where a fit goes on, those of
-            the optimizer, as ``Fitter.state`` returns them.
-        settings: fields of ``FitSettings``, and what else the fitter knows: "frozen" (splats stay
-            as they are), "frozen_splats" (so many, the last ones, do) and "camera_warm_up"
-            (fraction of the steps before cameras move).
+        origin: float64 [3], world position of the splats' origin.
+        state: float32 arrays of N splats ("means" [N, 3] ...) and, to continue, those of the
+            optimizer, as ``Fitter.state`` returns them.
+        settings: fields of ``FitSettings``, and "frozen" (no splat changes), "frozen_splats"
+            (number of last splats that do not change) and "camera_warm_up" (fraction of the steps
+            before cameras move).
         backend: "cpu" or "gpu".
-        priors: of the V cameras, where these are optimized and something is known of them.
-        exposures: where those of the V views start; None where none is optimized.
+        priors: of the V cameras, or None.
+        exposures: initial exposures of the V views; None if they are not optimized.
 
     Raises:
         ValueError: a view, the state or a setting cannot be used; the message names it.
     """
     return _core.Fitter(
         [np.ascontiguousarray(view.image) for view in views],
-        [_counting(view) for view in views],
+        [_mask(view) for view in views],
         [getattr(view, "background", None) for view in views],
         _schedule(views, int(settings["steps"]), int(settings.get("first_step", 0))),
         *_arrays(views, origin),
@@ -73,7 +72,7 @@ def fitter_of(
 
 
 def _rigs(views: Sequence[View]) -> list[int] | None:
-    """A number for each view, the same for those of one rig; None where there is no rig."""
+    """A number for each view, equal for views of one rig; None if there is no rig."""
     if all(view.rig is None for view in views):
         return None
     names = {name: number for number, name in enumerate(dict.fromkeys(v.photo for v in views))}
@@ -81,10 +80,10 @@ def _rigs(views: Sequence[View]) -> list[int] | None:
 
 
 def check_fits(backend: str) -> dict[str, str]:
-    """What a backend is ("backend", "device", "instruction_set"), which must be one that fits.
+    """Return "backend", "device" and "instruction_set" of a backend that fits.
 
     Raises:
-        IgsrError: there is none of that name, or it does not fit.
+        IgsrError: the name is unknown, or the backend only renders.
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     if backend == "reference":
@@ -97,9 +96,7 @@ def check_fits(backend: str) -> dict[str, str]:
 def initial_state(
     capture: Capture, settings: FitSettings, given: Splats | None = None
 ) -> tuple[dict[str, npt.NDArray[Any]], tuple[str, int]]:
-    """The splats that a fit starts from, by name of parameter, with their origin.
-
-    And what they were made from, with their number.
+    """Return the arrays of the initial splats, with their origin, and how and how many were made.
 
     Raises:
         IgsrError: as ``initial_splats``.
@@ -122,14 +119,14 @@ def initial_state(
 
 
 def splat_arrays(splats: Splats) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of splats by name, with their origin."""
+    """Arrays of splats by name, with their origin."""
     return {name: getattr(splats, name) for name in (*PARAMETERS, "origin")}
 
 
 def with_splats_after(
     state: dict[str, npt.NDArray[Any]], splats: Splats
 ) -> dict[str, npt.NDArray[Any]]:
-    """The parameters of a state's splats, followed by those of others of the same origin."""
+    """Parameters of a state's splats, followed by other splats of the same origin."""
     return {name: np.concatenate([state[name], getattr(splats, name)]) for name in PARAMETERS}
 
 
@@ -141,29 +138,28 @@ def first_splats(splats: Splats, count: int) -> Splats:
 
 
 def _schedule(views: Sequence[View], steps: int, first: int) -> list[tuple[int, int | None]]:
-    """For each view, its steps in a round and the first step that no longer takes it.
+    """Number of steps per round of each view, and the step after its last; None if there is none.
 
-    The latter is None for views that stay to the end. Steps are counted from 0; a fit that enters
-    the schedule late begins with ``first``.
+    Steps count from 0; a fit that enters the schedule late begins with ``first``.
     """
     photos = sum(not isinstance(view, PseudoView) for view in views)
     others = len(views) - photos
     if not photos:
         return [(1, None)] * others
     each = max(1, -(-PHOTO_STEPS * others // photos))
-    until = first + round((1.0 - PHOTOS_LAST) * (steps - first))
+    until = first + round((1.0 - PHOTOS_ONLY_FRACTION) * (steps - first))
     return [(1, until) if isinstance(view, PseudoView) else (each, None) for view in views]
 
 
-def _counting(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None:
-    """What the fitter takes as a view's mask [H, W]: confidence weights where the view has them."""
+def _mask(view: View) -> npt.NDArray[np.bool_] | npt.NDArray[np.float32] | None:
+    """Mask [H, W] of a photo, or confidence weights of a pseudo-view."""
     if not isinstance(view, PseudoView):
         return None if view.mask is None else np.ascontiguousarray(view.mask)
     return np.ascontiguousarray(view.weights if view.mask is None else view.weights * view.mask)
 
 
 def _depth(view: View) -> npt.NDArray[np.float32] | None:
-    """What the fitter takes as a view's depth [H, W, 2]: z and confidence, 0 where not known."""
+    """Depth and confidence [H, W, 2]; the confidence is 0 where the depth is unknown."""
     if view.depth is None:
         return None
     known = (view.depth > 0.0).astype(np.float32)
@@ -196,17 +192,17 @@ def _prior_arrays(
 
 
 def _exposure_arrays(start: StartingExposures) -> dict[str, npt.NDArray[Any]]:
-    known = [one or Exposure() for one in start.exposures]
+    exposures = [exposure or Exposure() for exposure in start.exposures]
     return {
-        "gains": np.array([one.gain for one in known], np.float64),
-        "offsets": np.array([one.offset for one in known], np.float64),
-        "fitted": np.array([one is not None for one in start.exposures], np.bool_),
+        "gains": np.array([exposure.gain for exposure in exposures], np.float64),
+        "offsets": np.array([exposure.offset for exposure in exposures], np.float64),
+        "fitted": np.array([exposure is not None for exposure in start.exposures], np.bool_),
         "pulls": start.pulls,
     }
 
 
 def fitted_exposures(views: Sequence[View], fitter: _core.Fitter) -> list[Exposure | None]:
-    """The views' exposures as a fitter has them; None where they are not optimized.
+    """Return the views' exposures; None if they are not optimized.
 
     Args:
         views: V views.
@@ -222,7 +218,7 @@ def fitted_exposures(views: Sequence[View], fitter: _core.Fitter) -> list[Exposu
 
 
 def without_exposures(views: Sequence[View], exposures: Sequence[Exposure | None]) -> list[View]:
-    """The views with the scene's colors: exposures taken out of their pixels, and forgotten."""
+    """The views with exposures removed from their pixels."""
     return [
         view if one is None else replace(view, image=one.taken_out_of(view.image), exposure=None)
         for view, one in zip(views, exposures, strict=True)
@@ -232,12 +228,12 @@ def without_exposures(views: Sequence[View], exposures: Sequence[Exposure | None
 def fitted_cameras(
     views: Sequence[View], fitter: _core.Fitter, origin: npt.NDArray[np.float64]
 ) -> list[Camera]:
-    """The views' cameras with poses and focal lengths as a fitter has them, in the world frame.
+    """Return the views' cameras with the fitter's poses and focal lengths, in the world frame.
 
     Args:
         views: V views.
         fitter: of these views.
-        origin: float64 [3] of the splats, which the fitter's poses are relative to.
+        origin: float64 [3], world position of the splats' origin.
     """
     arrays = fitter.cameras()
     return [
@@ -253,7 +249,7 @@ def fitted_cameras(
 
 
 def with_train_exposures(capture: Capture, exposures: Sequence[Exposure | None]) -> Capture:
-    """The capture with these exposures for its train views, given in their order."""
+    """The capture with other exposures of its train views, in their order."""
     if all(one is view.exposure for one, view in zip(exposures, capture.train_views, strict=True)):
         return capture
     each = iter(exposures)
@@ -265,7 +261,7 @@ def with_train_exposures(capture: Capture, exposures: Sequence[Exposure | None])
 
 
 def with_train_cameras(capture: Capture, cameras: list[Camera]) -> Capture:
-    """The capture with other cameras for its train views, given in their order."""
+    """The capture with other cameras of its train views, in their order."""
     each = iter(cameras)
     views = [
         replace(view, camera=next(each)) if view.split == "train" else view
@@ -285,7 +281,7 @@ def camera_rows(views: Sequence[View]) -> npt.NDArray[np.float64]:
 
 
 def with_camera_rows(views: list[View], rows: npt.NDArray[np.float64] | None) -> list[View]:
-    """The views with the cameras of ``camera_rows``; as they are where there are none.
+    """Return the views with the cameras of ``camera_rows``, or unchanged if there are none.
 
     Raises:
         ValueError: there is not a finite row for each view.

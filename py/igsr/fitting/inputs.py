@@ -11,11 +11,10 @@ from igsr._internal.choices import Backend
 from igsr.capture import Capture, View, photos_among
 from igsr.capture.photo_checks import check_photos
 from igsr.errors import IgsrError
-from igsr.fitting.depth_agreement import with_agreeing_depths
-from igsr.fitting.depth_scales import with_scaled_depths
+from igsr.fitting.depth_checks import with_consistent_depths, with_scaled_depths
 from igsr.fitting.exposures import StartingExposures, starting_exposures
 from igsr.fitting.fitter import check_fits, without_exposures
-from igsr.fitting.photo_support import PhotoSupport, support_of
+from igsr.fitting.photo_statistics import PhotoStatistics, photo_statistics
 from igsr.fitting.pose_priors import PosePriors, pose_priors
 from igsr.fitting.presets import Quality, settings_for
 from igsr.fitting.settings import FitSettings
@@ -102,18 +101,18 @@ def prepare(
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
-    support = support_of(photos_among(views))
+    statistics = photo_statistics(photos_among(views))
     if initial is None:
-        settings = settings_for(support, quality, **given)
+        settings = settings_for(statistics, quality, **given)
     else:
         initial = initial.without_backdrop()
-        settings = _settings_from_splats(support, quality, initial, given, whole_schedule)
+        settings = _settings_from_splats(statistics, quality, initial, given, whole_schedule)
     if frozen is not None:
         _check_frozen(frozen, initial)
     check_photos(views)
     if settings.depth_weight > 0.0 and any(view.depth is not None for view in views):
         scaled = with_scaled_depths(capture.views, capture.points)
-        capture = replace(capture, views=with_agreeing_depths(scaled))
+        capture = replace(capture, views=with_consistent_depths(scaled))
         views = capture.train_views
     _check_focal(views, settings)
     device = check_fits(backend)
@@ -149,7 +148,7 @@ def _check_focal(views: list[View], settings: FitSettings) -> None:
 
 
 def _settings_from_splats(
-    support: PhotoSupport,
+    statistics: PhotoStatistics,
     quality: Quality,
     splats: Splats,
     given: dict[str, Any],
@@ -159,7 +158,7 @@ def _settings_from_splats(
     given = {**given, "start": None}
     if given.get("sh_degree") is None:
         given["sh_degree"] = splats.sh_degree
-    settings = settings_for(support, quality, **given)
+    settings = settings_for(statistics, quality, **given)
     if splats.sh_degree != settings.sh_degree:
         raise IgsrError(
             f"start has splats of SH degree {splats.sh_degree}; sh_degree must be the same, not "
@@ -174,7 +173,7 @@ def _settings_from_splats(
         raise IgsrError("start has antialiased splats, which igsr does not fit.")
     if whole_schedule:
         return settings
-    usual = settings_for(support, quality, **(given | {"steps": None}))
+    usual = settings_for(statistics, quality, **(given | {"steps": None}))
     whole = max(settings.steps, usual.steps)
-    schedule = settings_for(support, quality, **(given | {"steps": whole}))
+    schedule = settings_for(statistics, quality, **(given | {"steps": whole}))
     return replace(schedule, first_step=whole - settings.steps)

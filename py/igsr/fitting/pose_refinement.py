@@ -1,11 +1,8 @@
-"""Test-time pose refinement: cameras are fitted to their photos while the splats stay as they are.
+"""Test-time pose refinement: cameras of held-out photos are fitted to them, with fixed splats.
 
-Splats and cameras that were optimized together may be rotated, moved and scaled as a whole without
-any photo showing it. Scores of held-out photos therefore say which cameras they are of:
-
-* raw: as they were given;
-* aligned: moved by the similarity that maps the true train cameras onto the optimized ones;
-* refined: each fitted to its own photo.
+Jointly optimized splats and cameras are determined only up to a similarity, so held-out photos are
+scored with their cameras as given ("raw"), moved by the similarity from the true to the optimized
+train cameras ("aligned"), or fitted to the photo ("refined").
 """
 
 from __future__ import annotations
@@ -21,11 +18,11 @@ from igsr._internal.event import Event, Listener
 from igsr.capture import View
 from igsr.errors import IgsrError
 from igsr.fitting.fitter import fitted_cameras, fitter_of
-from igsr.splats import Splats
+from igsr.splats import PARAMETERS, Splats
 
 Float64 = npt.NDArray[np.float64]
 
-#: Steps that refining spends on each camera.
+#: Steps per camera.
 REFINE_STEPS = 30
 
 
@@ -38,22 +35,21 @@ def refine_cameras(
     backend: str = "auto",
     progress: Listener | None = None,
 ) -> list[View]:
-    """The views with poses fitted to their photos; splats and focal lengths stay as they are.
+    """Return the views with poses fitted to their photos; splats and focal lengths stay fixed.
 
-    Each view is used alone, with its photo, mask and given camera, and nothing is learned about the
-    scene: this is how few-view papers score scenes whose cameras were optimized too.
+    Few-view papers score scenes with optimized cameras in this way.
 
     Args:
         splats: the scene.
-        views: whose cameras to refine, from where they are.
+        views: with initial cameras.
         background: RGB in [0, 1] behind splats and photos with alpha.
-        steps: steps per view; each moves the picture by at most about a third of a pixel, at the
-            end by a hundredth.
-        backend: "auto" (a real GPU if one answers, else "cpu"), "cpu" or "gpu".
+        steps: steps per view; each moves the image by about a third of a pixel at first and by a
+            hundredth at the end.
+        backend: "auto", "cpu" or "gpu".
         progress: called with each ``igsr.Event``.
 
     Returns:
-        The views in their order, with other cameras.
+        The views in their order.
 
     Raises:
         IgsrError: ``steps`` is not positive, the splats are antialiased, or a view cannot be used.
@@ -62,12 +58,13 @@ def refine_cameras(
     if steps < 1:
         raise IgsrError(f"steps must be at least 1, not {steps}.")
     if splats.antialiased:
-        raise IgsrError("Cameras cannot be refined to antialiased splats: fits draw without that.")
+        raise IgsrError(
+            "Cameras cannot be refined with antialiased splats, which igsr does not fit."
+        )
     if not views:
         return []
     total = steps * len(views)
-    apart = ("origin", "antialiased")
-    state = {name: value for name, value in vars(splats).items() if name not in apart}
+    state = {name: getattr(splats, name) for name in PARAMETERS}
     settings = {
         "steps": total,
         "sh_degree": splats.sh_degree,

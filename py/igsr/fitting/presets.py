@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 
 from igsr._internal.settings import checked_given
 from igsr.errors import IgsrError
-from igsr.fitting.photo_support import PhotoSupport
+from igsr.fitting.photo_statistics import PhotoStatistics
 from igsr.fitting.settings import FitSettings
 
 Quality: TypeAlias = Literal["draft", "normal", "high"]
@@ -27,8 +27,8 @@ MIN_DROPOUT = 0.05
 #: MCMC density control is used if photos are further apart than this (mean, degrees) and at least
 #: this fraction of them show the same place. Its pull toward faint splats acts in every step, so
 #: in large scenes, where few photos show a place, most splats would fade.
-WIDE_APART_DEG = 7.0
-MIN_SHOWN_FRACTION = 0.5
+MCMC_SPACING_DEG = 7.0
+MCMC_VISIBLE_FRACTION = 0.5
 #: Minimum number of photos of the same place for SH degree 2; with fewer it overfits.
 SH2_PHOTOS = 12.0
 #: Steps = min(MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO n, STEPS_PER_PHOTO n) for n photos.
@@ -104,7 +104,7 @@ def _quality(quality: Quality) -> tuple[float, float, float]:
 
 
 def settings_for(
-    photos: PhotoSupport | int, quality: Quality = "normal", **given: Any
+    photos: PhotoStatistics | int, quality: Quality = "normal", **given: Any
 ) -> FitSettings:
     """Choose the settings of a fit; those given (not None) stay as they are.
 
@@ -116,37 +116,41 @@ def settings_for(
     Raises:
         IgsrError: a setting or the quality is unknown or invalid.
     """
-    support = photos if isinstance(photos, PhotoSupport) else PhotoSupport.of_number(photos)
+    if isinstance(photos, int):
+        photos = PhotoStatistics.of_number(photos)
     given = checked_given(FitSettings, given)
     joint = replace(_DEFAULT, **given).moves_cameras
-    return replace(_default(support, quality, given.get("steps"), joint), **given)
+    return replace(_default(photos, quality, given.get("steps"), joint), **given)
 
 
 def _default(
-    support: PhotoSupport, quality: Quality, steps: int | None, joint: bool
+    statistics: PhotoStatistics, quality: Quality, steps: int | None, joint: bool
 ) -> FitSettings:
     """The default settings for these photos; ``steps`` and ``joint`` are as asked for."""
-    dropout = min(MAX_DROPOUT, DROPOUT_PHOTOS / support.seen_by)
+    dropout = min(MAX_DROPOUT, DROPOUT_PHOTOS / statistics.overlap)
     _, more_steps, more_splats = _quality(quality)
     if steps is None:
-        photos = support.photos
+        photos = statistics.photos
         usual = min(MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO * photos, STEPS_PER_PHOTO * photos)
         steps = round(more_steps * usual * (JOINT_STEPS_FACTOR if joint else 1))
     rate = 1.0 if joint else min(MAX_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps)))
-    wide = support.apart > WIDE_APART_DEG
-    more = (support.photos / REFERENCE_PHOTOS) ** SPLATS_POWER
+    is_mcmc = (
+        statistics.spacing_deg > MCMC_SPACING_DEG
+        and statistics.visible_fraction >= MCMC_VISIBLE_FRACTION
+    )
+    more = (statistics.photos / REFERENCE_PHOTOS) ** SPLATS_POWER
     splats = max(
-        SPLATS_PER_PIXEL * support.pixels * more,
-        min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * support.pixels * max(1.0, more)),
-        min(support.detail * more, DETAIL_PER_PIXEL * support.pixels),
+        SPLATS_PER_PIXEL * statistics.pixels * more,
+        min(SMALL_SPLATS, SMALL_SPLATS_PER_PIXEL * statistics.pixels * max(1.0, more)),
+        min(statistics.detail * more, DETAIL_PER_PIXEL * statistics.pixels),
     )
     return replace(
         _DEFAULT,
         steps=steps,
         learning_rate=round(rate, 2),
         max_splats=max(1000, min(MAX_SPLATS, round(more_splats * splats))),
-        sh_degree=2 if support.seen_by >= SH2_PHOTOS else 1,
-        density="mcmc" if wide and support.shown >= MIN_SHOWN_FRACTION else "original",
+        sh_degree=2 if statistics.overlap >= SH2_PHOTOS else 1,
+        density="mcmc" if is_mcmc else "original",
         dropout=round(dropout, 2) if dropout >= MIN_DROPOUT else 0.0,
     )
 

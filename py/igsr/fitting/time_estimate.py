@@ -1,4 +1,4 @@
-"""How long a fit takes on this machine: a few steps are timed, the rest is counted."""
+"""Estimated time of a fit on this machine, from a few timed steps."""
 
 from __future__ import annotations
 
@@ -8,57 +8,57 @@ from dataclasses import dataclass
 import numpy as np
 
 from igsr import _core
-from igsr.fitting.initialization.plane_sweep import MOST_SWEPT
+from igsr.fitting.initialization.plane_sweep import MAX_DEPTH_MAPS
 from igsr.fitting.settings import FitSettings
 
-#: Sides in pixels of the two photos that steps are timed on, and numbers of splats before them.
-#: Three timings tell what a step, a pixel and a splat cost.
-SIDES = (128, 384)
+#: Sides of the two photos that steps are timed on, pixels, and the two numbers of splats.
+SIDES_PX = (128, 384)
 SPLATS = (2_000, 20_000)
-#: Steps timed of each, after one that is not.
-TIMED = 3
-#: Splats cover their photo so often: as those of fitted scenes do. Photos with alpha show nothing
-#: in much of their area.
-COVER, COVER_OF_ALPHA = 40.0, 18.0
-#: Part of the most splats that fits start with, from which step on they have as many as they come
-#: to, and how many of the most that mostly is.
-START_PART, GROWN, REACHED = 0.5, 0.5, 0.95
-#: Splats per pixel that fits without a limit of their own come to, at most.
-UNLIMITED_PER_PIXEL = 0.5
-#: Seconds of a photo's depth map, and of a scored photo's pixel, on a machine whose steps take as
-#: long as ``USUAL``; others are as many times as fast as their steps.
-SWEPT, SCORED = 0.4, 2e-6
-#: Parts that steps are counted in.
+#: Steps timed of each, after one that is not; the fastest counts.
+TIMED_STEPS = 3
+#: Mean number of splats that cover a pixel in fitted scenes; photos with alpha are mostly empty.
+COVER = 40.0
+COVER_ALPHA = 18.0
+#: Number of splats: this fraction of the maximum at first, growing until this fraction of the steps
+#: to this fraction of the maximum.
+START_FRACTION = 0.5
+GROWN_AT = 0.5
+GROWN_FRACTION = 0.95
+#: Maximum splats per pixel that density control adds without a limit.
+MAX_SPLATS_PER_PIXEL = 0.5
+#: Number of parts that steps are summed over.
 PARTS = 50
+#: Seconds for the depth map of a photo, and for each pixel of a scored photo, at ``TYPICAL`` speed.
+DEPTH_MAP_SECONDS = 0.4
+SCORE_SECONDS_PER_PIXEL = 2e-6
 
 
 @dataclass(frozen=True)
 class StepTime:
-    """What an optimizer step takes, in seconds.
+    """Time of an optimizer step, seconds.
 
     Attributes:
-        fixed: any step.
-        per_pixel: each pixel of its photo.
-        per_splat: each splat.
+        fixed: of any step.
+        per_pixel: of each pixel of the photo.
+        per_splat: of each splat.
     """
 
     fixed: float
     per_pixel: float
     per_splat: float
 
-    def of(self, pixels: float, splats: float) -> float:
-        """A step on a photo of so many pixels, with so many splats."""
+    def seconds(self, pixels: float, splats: float) -> float:
+        """Return the time of a step."""
         return self.fixed + self.per_pixel * pixels + self.per_splat * splats
 
 
-#: What steps take on two cores.
-USUAL = StepTime(1e-3, 7e-8, 4e-7)
-#: What part of that they take on photos with alpha.
-USUAL_OF_ALPHA = 0.6
+#: Two cores, and the factor for photos with alpha.
+TYPICAL = StepTime(1e-3, 7e-8, 4e-7)
+TYPICAL_ALPHA_FACTOR = 0.6
 
 
 def timed_steps(backend: str, sh_degree: int = 1, alpha: bool = False) -> StepTime:
-    """Time a few steps on made-up photos and splats; takes about a second.
+    """Time a few steps on random photos and splats, for about a second.
 
     Args:
         backend: "cpu" or "gpu".
@@ -68,12 +68,12 @@ def timed_steps(backend: str, sh_degree: int = 1, alpha: bool = False) -> StepTi
     Raises:
         RuntimeError: no adapter answers for backend "gpu".
     """
-    small, large = SIDES[0] ** 2, SIDES[1] ** 2
+    small, large = SIDES_PX[0] ** 2, SIDES_PX[1] ** 2
     few, many = SPLATS
-    cover = COVER_OF_ALPHA if alpha else COVER
-    base = _timed(backend, SIDES[0], few, sh_degree, cover)
-    more_pixels = _timed(backend, SIDES[1], few, sh_degree, cover)
-    more_splats = _timed(backend, SIDES[1], many, sh_degree, cover)
+    cover = COVER_ALPHA if alpha else COVER
+    base = _timed_step(backend, SIDES_PX[0], few, sh_degree, cover)
+    more_pixels = _timed_step(backend, SIDES_PX[1], few, sh_degree, cover)
+    more_splats = _timed_step(backend, SIDES_PX[1], many, sh_degree, cover)
     per_pixel = max(0.0, more_pixels - base) / (large - small)
     per_splat = max(0.0, more_splats - more_pixels) / (many - few)
     return StepTime(max(0.0, base - per_pixel * small - per_splat * few), per_pixel, per_splat)
@@ -82,98 +82,99 @@ def timed_steps(backend: str, sh_degree: int = 1, alpha: bool = False) -> StepTi
 def fit_seconds(
     settings: FitSettings, width: float, height: float, step: StepTime, until: int | None = None
 ) -> float:
-    """Seconds that the steps of a fit take.
+    """Estimate the time of a fit's steps.
 
     Args:
         settings: of the fit.
         width, height: of its photos, pixels.
-        step: what steps take on this machine.
-        until: count the steps before this one; None counts all.
+        step: time of a step on this machine.
+        until: only the steps before this one; None for all.
     """
     seconds, longest = 0.0, round(max(width, height))
-    most = min(settings.max_splats, UNLIMITED_PER_PIXEL * width * height)
-    if settings.density == "fixed":
-        most = settings.max_splats
+    is_fixed = settings.density == "fixed"
+    limit = min(settings.max_splats, MAX_SPLATS_PER_PIXEL * width * height)
+    if is_fixed:
+        limit = settings.max_splats
     first = settings.first_step
     for part in range(PARTS):
         progress = (part + 0.5) / PARTS
         at = first + int(progress * (settings.steps - first))
-        by = _core.reduction(settings.steps, settings.coarse_to_fine, at, longest)
-        grown = 1.0 if settings.density == "fixed" else min(1.0, progress / GROWN)
-        splats = most * (START_PART + (REACHED - START_PART) * grown)
-        begins = first + part * (settings.steps - first) / PARTS
+        reduction = _core.reduction(settings.steps, settings.coarse_to_fine, at, longest)
+        grown = 1.0 if is_fixed else min(1.0, progress / GROWN_AT)
+        splats = limit * (START_FRACTION + (GROWN_FRACTION - START_FRACTION) * grown)
         steps = (settings.steps - first) / PARTS
         if until is not None:
+            begins = first + part * (settings.steps - first) / PARTS
             steps = min(steps, max(0.0, until - begins))
-        seconds += steps * step.of(width * height / by**2, splats)
+        seconds += steps * step.seconds(width * height / reduction**2, splats)
     return seconds
 
 
 def work_done(settings: FitSettings, width: float, height: float, step: int) -> float:
-    """Part of a fit's time, in [0, 1], that its first steps take: late ones have more splats.
+    """Estimate the fraction of a fit's time, in [0, 1], that its first steps take.
 
     Args:
         settings: of the fit.
         width, height: of its photos, pixels.
         step: number of steps done.
     """
-    whole = fit_seconds(settings, width, height, USUAL)
-    first = settings.first_step
+    whole = fit_seconds(settings, width, height, TYPICAL)
     if step >= settings.steps or whole <= 0.0:
         return 1.0
-    return fit_seconds(settings, width, height, USUAL, until=max(first, step)) / whole
+    until = max(settings.first_step, step)
+    return fit_seconds(settings, width, height, TYPICAL, until=until) / whole
 
 
-def times_usual(step: StepTime, alpha: bool) -> float:
-    """How many times as long as usual a step takes on this machine.
+def slowdown(step: StepTime, alpha: bool) -> float:
+    """Return the time of a step on this machine, as a multiple of the typical one.
 
     Args:
         step: of ``timed_steps``.
         alpha: whether it was timed for photos with alpha.
     """
-    work = (float(SIDES[1] ** 2), float(SPLATS[1]))
-    return step.of(*work) / USUAL.of(*work) / (USUAL_OF_ALPHA if alpha else 1.0)
+    work = (float(SIDES_PX[1] ** 2), float(SPLATS[1]))
+    return step.seconds(*work) / TYPICAL.seconds(*work) / (TYPICAL_ALPHA_FACTOR if alpha else 1.0)
 
 
-def other_seconds(photos: int, scored: int, pixels: float, times: float = 1.0) -> float:
-    """Seconds that a run takes beside the steps: depth maps before them, and scores after.
+def other_seconds(photos: int, scored: int, pixels: float, slowdown: float = 1.0) -> float:
+    """Estimate the time of depth maps before a fit and of scores after it.
 
     Args:
-        photos: number of photos that depth maps are found for.
-        scored: number of photos scored.
+        photos: number of photos to find depth maps for.
+        scored: number of photos to score.
         pixels: of a photo.
-        times: how many times as long as usual this machine takes.
+        slowdown: of this machine.
     """
-    return times * (SWEPT * min(photos, MOST_SWEPT) + SCORED * scored * pixels)
+    depth_maps = DEPTH_MAP_SECONDS * min(photos, MAX_DEPTH_MAPS)
+    return slowdown * (depth_maps + SCORE_SECONDS_PER_PIXEL * scored * pixels)
 
 
-def _timed(backend: str, side: int, splats: int, sh_degree: int, cover: float) -> float:
-    """Seconds of a step: the least of some."""
+def _timed_step(backend: str, side: int, splats: int, sh_degree: int, cover: float) -> float:
+    """Time of the fastest of some steps, seconds."""
     random = np.random.default_rng(0)
-    # Before a camera at the origin that sees from -1 to 1 at depth 1.
+    # In view of a camera at the origin that sees from -1 to 1 at depth 1.
     depth = random.uniform(2.0, 4.0, size=splats)
     means = np.stack([random.uniform(-1.0, 1.0, splats) * depth for _ in range(2)] + [depth], 1)
-    # Three standard deviations to all sides, about, are rasterized.
+    # Splats are rasterized to about three standard deviations.
     radius = np.sqrt(cover * 4.0 / (np.pi * splats)) / 3.0 * depth
+    scales = radius[:, None] * random.uniform(0.3, 1.7, (splats, 3))
     state = {
         "means": means.astype(np.float32),
         "quats": random.normal(size=(splats, 4)).astype(np.float32),
-        "scales": np.log(radius[:, None] * random.uniform(0.3, 1.7, (splats, 3))).astype(
-            np.float32
-        ),
+        "scales": np.log(scales).astype(np.float32),
         "opacities": random.normal(size=splats).astype(np.float32),
         "sh": random.normal(0.0, 0.3, (splats, (sh_degree + 1) ** 2, 3)).astype(np.float32),
     }
-    config = {"steps": 10 * TIMED, "sh_degree": sh_degree, "density": "fixed"}
+    config = {"steps": 10 * TIMED_STEPS, "sh_degree": sh_degree, "density": "fixed"}
     image = random.integers(0, 256, (side, side, 3), dtype=np.uint8)
     intrinsics = np.array([[side / 2.0] * 4])
     fitter = _core.Fitter(
         [image], [None], [None], [(1, None)], np.eye(4)[None], intrinsics, state, config, backend
     )
     fitter.step(1)
-    least = np.inf
-    for _ in range(TIMED):
+    seconds = []
+    for _ in range(TIMED_STEPS):
         began = time.perf_counter()
         fitter.step(1)
-        least = min(least, time.perf_counter() - began)
-    return float(least)
+        seconds.append(time.perf_counter() - began)
+    return min(seconds)

@@ -29,7 +29,7 @@ from igsr.evaluation.scores import check_masks, default_background
 from igsr.fitting.announcement import announcement
 from igsr.fitting.fitter import check_fits
 from igsr.fitting.followed_run import FollowedRun
-from igsr.fitting.photo_support import support_of
+from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import Quality, default_max_size
 from igsr.fitting.settings import ExposureMode, TransientMode
 from igsr.pose import AUTO as AUTO_ESTIMATOR
@@ -236,9 +236,9 @@ def _stop_before(context: Context, whole: Reconstruction) -> Stop | None:
     settings = context.settings
     if context.progress.round > settings.most_rounds:
         return Stop(StopReason.ROUNDS_DONE, settings.most_rounds)
-    seen_by = support_of(whole.photos).seen_by
-    if settings.rounds == AUTO and seen_by >= ENOUGH_PHOTOS:
-        return Stop(StopReason.ENOUGH_PHOTOS, round(seen_by))
+    overlap = photo_statistics(whole.photos).overlap
+    if settings.rounds == AUTO and overlap >= ENOUGH_PHOTOS:
+        return Stop(StopReason.ENOUGH_PHOTOS, round(overlap))
     if settings.cross_validate and len({view.photo for view in whole.photos}) < MIN_PHOTOS:
         return Stop(StopReason.TOO_FEW_PHOTOS, MIN_PHOTOS)
     return None

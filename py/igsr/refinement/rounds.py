@@ -24,7 +24,7 @@ from igsr.evaluation.scores import (
 )
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.fitter import with_train_exposures, without_exposures
-from igsr.fitting.photo_support import support_of
+from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import settings_for
 from igsr.fitting.result import FitResult
 from igsr.refinement.cut_highlights import with_cut_highlights
@@ -131,7 +131,7 @@ def make_context(
     Folds have fewer photos and steps, but the settings that are chosen for all photos.
     """
     chosen = settings_for(
-        support_of(capture.train_views), settings.quality, steps=settings.steps
+        photo_statistics(capture.train_views), settings.quality, steps=settings.steps
     ).plain()
     return Context(
         capture,

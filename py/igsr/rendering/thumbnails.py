@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from igsr._internal.choices import Backend
-from igsr._internal.notebook import LONGEST_SIDE, Picture
+from igsr._internal.notebook import MAX_SIDE_PX, Picture
 from igsr.rendering.renders import Render, render
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def splats_pictures(splats: Splats) -> list[Picture]:
     """The scene from a few sides, each at a distance that frames it."""
     from igsr.geometry.camera_paths import cameras_around
 
-    cameras = cameras_around(splats, SIDES, LONGEST_SIDE)
+    cameras = cameras_around(splats, SIDES, MAX_SIDE_PX)
     return [render(splats, camera, backend=BACKEND).to_uint8() for camera in cameras]
 
 

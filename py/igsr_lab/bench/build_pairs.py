@@ -32,7 +32,7 @@ PAIR_PROTOCOL = (
 #: The build must be there before anything of igsr's benchmark is imported.
 _CHILD = """
 import sys
-from igsr._internal.other_build import use_build
+from igsr_lab.bench.other_build import use_build
 use_build(sys.argv[1])
 from igsr_lab.bench.build_process import main
 main(sys.argv[2])

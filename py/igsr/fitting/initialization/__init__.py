@@ -1,7 +1,1 @@
-"""Initialization of splats: SfM points, visual hull, plane sweep, SIFT features or random."""
-
-from __future__ import annotations
-
-from igsr.fitting.initialization.initial_splats import STARTS, initial_splats
-
-__all__ = ["STARTS", "initial_splats"]
+"""Initial splats of a fit, from points of the capture, depth maps, photos or at random."""

@@ -1,20 +1,18 @@
-"""Initialization: the splats that a fit starts from.
+"""Initialization: one splat for each point of a set.
 
-There is one splat for each of some points. These are
+The points of each initialization are
 
-* "points": the capture's own (COLMAP);
-* "depths": these, and points of the depths that photos came with (``given_depths``), or else of
-  depth maps by plane sweep that other photos confirm (``plane_sweep``);
-* "hull": inside the visual hull of photos with alpha (``visual_hull``);
+* "points": those of the capture (COLMAP);
+* "depths": those of the capture, and points of the photos' depth maps (``given_depths``) or, if
+  photos have none, of depth maps by plane sweep (``plane_sweep``);
+* "hull": in the visual hull of photos with alpha (``visual_hull``);
 * "rays": on rays of photo pixels, at the depth where other photos agree best (``ray_depths``);
-* "sift": triangulated features, and points between them (``sift_points``);
-* "random": anywhere in the box that the cameras look at;
-* "sfm": points where the capture has some, else random, as 3DGS starts.
+* "sift": triangulated features and points between them (``sift_points``);
+* "random": in the box that the cameras look at.
 
-"auto" is depths where half of the photos came with depths; points where the capture has as many as
-splats are wanted; hull where photos have alpha and there are no points; depths where most photos
-have another from a similar direction; else points where there are some, else sift, and rays where
-there are too few features.
+"auto" chooses the first that applies: depths if half of the photos have depth maps; points if there
+are enough; hull if photos have alpha and there are no points; depths if half of the photos have
+another one from a similar direction; points if there are any; sift; rays if features are too few.
 """
 
 from __future__ import annotations
@@ -27,80 +25,74 @@ import numpy.typing as npt
 from igsr import _core
 from igsr.capture import Capture, Points, View
 from igsr.errors import IgsrError
-from igsr.fitting.initialization.camera_coverage import looked_at_box
 from igsr.fitting.initialization.given_depths import given_points, have_depths
-from igsr.fitting.initialization.plane_sweep import can_sweep, looked_at, swept_points
+from igsr.fitting.initialization.photo_pixels import at_most
+from igsr.fitting.initialization.plane_sweep import can_sweep, sweep_target, swept_points
 from igsr.fitting.initialization.ray_depths import ray_points
 from igsr.fitting.initialization.sift_points import sift_points, with_points_between
-from igsr.fitting.initialization.visual_hull import hull_points
+from igsr.fitting.initialization.visual_hull import hull_points, viewed_box
 from igsr.fitting.settings import Initialization
 from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 Generator = np.random.Generator
 
-#: Splats where a capture has no points and density control adds more where they are needed. A fit
-#: that adds none starts with as many as it may have.
-MADE_UP_SPLATS = 20_000
-#: Part of the most splats that depth maps start a fit with.
-DEPTHS_PART = 0.5
-#: Part of the photos that need another from a similar direction for depth maps.
-SWEPT_PHOTOS = 0.5
-#: Fewer points of a capture than this say too little of a scene's surface.
+#: Number of splats if the capture has no points and density control adds more.
+DEFAULT_SPLATS = 20_000
+#: Number of points from depth maps, as a fraction of the maximum number of splats.
+DEPTHS_FRACTION = 0.5
+#: Minimum fraction of photos with another one from a similar direction for a plane sweep.
+MIN_SWEPT_FRACTION = 0.5
+#: Minimum number of points to start from.
 MIN_POINTS = 100
-#: Opacity of the least and most confident points, where points have a confidence; others have the
-#: former, as in 3DGS. The least confident are larger by this factor.
-UNSURE_OPACITY, SURE_OPACITY = 0.1, 0.5
-UNSURE_SIZE = 1.5
-
-#: The names of initializations.
-STARTS: tuple[str, ...] = get_args(Initialization)
-#: Fewer triangulated features than this say nothing of a scene's shape.
+#: Minimum number of triangulated features to start from.
 MIN_FEATURES = 30
-#: Splats per triangulated feature: itself and points between it and one of its nearest neighbours.
-#: Many more of them fit the photos but not novel views.
+#: Splats per triangulated feature; with many more, novel views get worse.
 SPLATS_PER_FEATURE = 10
-#: Splats of a random initialization (3DGS has 100 000, for many photos).
+#: Number of splats of a random initialization (3DGS has 100 000, for many photos).
 RANDOM_SPLATS = 10_000
+#: Opacities of the least and the most confident points (3DGS starts all with the former), and the
+#: factor on the size of the least confident.
+MIN_OPACITY = 0.1
+MAX_OPACITY = 0.5
+UNSURE_SIZE_FACTOR = 1.5
 
 
-def chosen_start(capture: Capture, start: str = "auto", wanted: int = MADE_UP_SPLATS) -> str:
-    """The initialization that "auto" or "sfm" stands for with this capture, or ``start`` itself.
+def chosen_start(capture: Capture, start: str = "auto", wanted: int = DEFAULT_SPLATS) -> str:
+    """Return the initialization that "auto" stands for, or ``start`` itself.
 
-    Where "auto" stands for "sift", too few features may still turn it into "rays"; where it stands
-    for "depths", too few points that photos confirm into what it were without.
+    ``initial_splats`` may still replace "sift" and "depths" if they give too few points.
 
     Args:
         capture: its train views are used.
-        start: a name of ``STARTS``.
-        wanted: number of splats that would do to start from.
+        start: an ``Initialization``.
+        wanted: enough points of the capture to need no others.
 
     Raises:
-        IgsrError: there is no such initialization, or the capture has not what it needs.
+        IgsrError: the name is unknown, or the capture does not have what it needs.
     """
-    if start not in STARTS:
-        raise IgsrError(f"start must be one of {', '.join(STARTS)}, not {start!r}.")
+    names = get_args(Initialization)
+    if start not in names:
+        raise IgsrError(f"start must be one of {', '.join(names)}, not {start!r}.")
     points = 0 if capture.points is None else len(capture.points.xyz)
-    has_alpha = all(view.image.shape[2] == 4 for view in capture.train_views)
+    views = capture.train_views
+    has_alpha = all(view.image.shape[2] == 4 for view in views)
     if start == "points" and points < MIN_POINTS:
         raise IgsrError(
-            f"{capture.path} has no {MIN_POINTS} points to start from; use another start."
+            f"{capture.path} has fewer than {MIN_POINTS} points to start from; use another start."
         )
     if start == "hull" and not has_alpha:
         raise IgsrError(f"{capture.path} has photos without alpha; start hull needs it in all.")
-    if start == "sfm":
-        return "points" if points >= MIN_POINTS else "random"
     if start != "auto":
         return start
-    if have_depths(capture.train_views):
+    if have_depths(views):
         return "depths"
     if points >= wanted:
         return "points"
     if has_alpha:
         return "points" if points >= MIN_POINTS else "hull"
-    views = capture.train_views
-    target = looked_at(views, None if capture.points is None else capture.points.xyz)
-    if can_sweep(views, target, part=SWEPT_PHOTOS):
+    target = sweep_target(views, None if capture.points is None else capture.points.xyz)
+    if can_sweep(views, target, fraction=MIN_SWEPT_FRACTION):
         return "depths"
     return "points" if points >= MIN_POINTS else "sift"
 
@@ -115,26 +107,25 @@ def initial_splats(
     dense: bool = False,
     exact_poses: bool = True,
 ) -> tuple[Splats, str]:
-    """Splats to start a fit from, and what they were made from ("points", "hull" ...).
+    """Return the splats that a fit starts from, and the name of their initialization.
 
     Deterministic for a given seed.
 
     Args:
-        capture: its train views are used, and the points that two of them see.
-        seed: of the random choices.
-        max_splats: at most so many.
-        sh_degree: 0-4; coefficients above degree 0 start at zero.
-        start: a name of ``STARTS``; see the module.
-        dense: whether there are to be ``max_splats`` splats, where the capture has no points.
-        exact_poses: whether "auto" may stand for "sift", which wrong poses mislead.
+        capture: its train views and the points that at least two of them see are used.
+        seed: random seed.
+        max_splats: maximum number of splats.
+        sh_degree: 0 to 4; coefficients above degree 0 start at zero.
+        start: an ``Initialization``.
+        dense: make ``max_splats`` splats if the capture has no points.
+        exact_poses: allow "auto" to choose "sift", which needs exact poses.
 
     Returns:
-        The splats, relative to an origin in the middle of their points (the median), and the name
-        of the initialization.
+        Splats relative to the median of their points, and the initialization ("points" ...).
 
     Raises:
-        IgsrError: there is no such initialization, the capture has not what it needs, or no points
-            can be placed: the poses, points or focal lengths are too extreme.
+        IgsrError: the name is unknown, the capture does not have what it needs, or poses, points
+            or focal lengths are too extreme to place points.
     """
     if capture.points is not None:
         points = capture.points.seen_by(view.name for view in capture.train_views)
@@ -142,22 +133,22 @@ def initial_splats(
     if start == "auto" and not exact_poses and chosen_start(capture, start) == "sift":
         start = "rays"
     try:
-        # What overflows is found by the check of the points; numpy's warnings would say less.
+        # Overflow is found by the check of the splats, with a better message.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            return _placed_splats(capture, seed, max_splats, sh_degree, start, dense)
+            return _initial_splats(capture, seed, max_splats, sh_degree, start, dense)
     except IgsrError:
         raise
     except (ValueError, OverflowError) as error:  # numpy's LinAlgError is a ValueError
         raise IgsrError(
-            f"{capture.path}: no splats can be placed before its cameras ({error}); check its "
-            "poses, focal lengths and points."
+            f"{capture.path}: no splats can be placed in front of its cameras ({error}); check "
+            "its poses, focal lengths and points."
         ) from error
 
 
-def _placed_splats(
+def _initial_splats(
     capture: Capture, seed: int, max_splats: int, sh_degree: int, start: str, dense: bool
 ) -> tuple[Splats, str]:
-    wanted = max_splats if dense else max(MIN_POINTS, round(DEPTHS_PART * max_splats))
+    wanted = max_splats if dense else max(MIN_POINTS, round(DEPTHS_FRACTION * max_splats))
     asked, start = start, chosen_start(capture, start, wanted)
     random = np.random.default_rng([seed, 0x1617])
     points, views = capture.points, capture.train_views
@@ -171,7 +162,6 @@ def _placed_splats(
                 "to start from; use start auto or random."
             )
         start = "points" if points is not None and len(points.xyz) >= MIN_POINTS else "sift"
-    confidence = None
     features = sift_points(views) if start == "sift" else None
     if features is not None and len(features[0]) < MIN_FEATURES:
         if asked != "auto":
@@ -180,43 +170,38 @@ def _placed_splats(
                 "features of its photos, too few to start from; use start rays or random."
             )
         start = "rays"
+    confidence = None
     if start == "points" and points is not None:
         confidence = points.confidence
-        xyz, colors = points.xyz, points.rgb.astype(np.float64) / 255.0
-        chosen = _at_most(max_splats, len(xyz), random)
-        xyz, colors = xyz[chosen], colors[chosen]
-        confidence = None if confidence is None else confidence[chosen]
+        arrays = (points.xyz, points.rgb.astype(np.float64) / 255.0)
+        if confidence is not None:
+            xyz, colors, confidence = at_most(max_splats, (*arrays, confidence), random)
+        else:
+            xyz, colors = at_most(max_splats, arrays, random)
     elif start == "sift" and features is not None:
-        made = min(MADE_UP_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
-        xyz, colors = with_points_between(*features, max_splats if dense else made, random)
-        chosen = _at_most(max_splats, len(xyz), random)
-        xyz, colors = xyz[chosen], colors[chosen]
+        count = min(DEFAULT_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
+        made = with_points_between(*features, max_splats if dense else count, random)
+        xyz, colors = at_most(max_splats, made, random)
     elif start == "random":
-        low, high = looked_at_box([view.camera for view in views])
+        low, high = viewed_box([view.camera for view in views])
         count = min(RANDOM_SPLATS, max_splats)
         xyz, colors = random.uniform(low, high, size=(count, 3)), random.uniform(size=(count, 3))
     else:
-        count = max_splats if dense else min(MADE_UP_SPLATS, max_splats)
-        if start == "hull":
-            xyz, colors = hull_points(views, count, random)
-        else:
-            xyz, colors = ray_points(views, count, random)
+        count = max_splats if dense else min(DEFAULT_SPLATS, max_splats)
+        points_of = hull_points if start == "hull" else ray_points
+        xyz, colors = points_of(views, count, random)
     return _splats_at(xyz, colors, confidence, sh_degree), start
 
 
 def _with_depths(
     views: list[View], points: Points | None, wanted: int, random: Generator
 ) -> tuple[Float64, Float64, Float64 | None]:
-    """Points of depths and, where there are some, the capture's, ``wanted`` in all.
-
-    With their colors and, where photos came with depths that have a confidence, theirs.
-    """
+    """``wanted`` points of the capture and of depth maps, their colors and confidence."""
     known, rgb = np.zeros((0, 3)), np.zeros((0, 3))
     if points is not None:
-        # Depths that came with the photos show all of the scene; half of the room is theirs.
-        most = wanted // 2 if have_depths(views) else wanted
-        chosen = _at_most(most, len(points.xyz), random)
-        known, rgb = points.xyz[chosen], points.rgb[chosen] / 255.0
+        # Given depth maps cover the whole scene: leave half of the splats for them.
+        limit = wanted // 2 if have_depths(views) else wanted
+        known, rgb = at_most(limit, (points.xyz, points.rgb / 255.0), random)
     confidence = None
     if have_depths(views):
         dense, colors, confidence = given_points(views, wanted - len(known), random)
@@ -224,41 +209,33 @@ def _with_depths(
             # Points of a capture are triangulated from several photos.
             confidence = np.concatenate([np.ones(len(known)), confidence])
     else:
-        places = known if len(known) else None
-        dense, colors = swept_points(views, places, wanted - len(known), random)
+        count = wanted - len(known)
+        dense, colors = swept_points(views, known if len(known) else None, count, random)
     return np.concatenate([known, dense]), np.concatenate([rgb, colors]), confidence
 
 
 def _splats_at(xyz: Float64, colors: Float64, confidence: Float64 | None, sh_degree: int) -> Splats:
-    """A splat at each point [P, 3], of its color [P, 3], by the points' confidence [P]."""
-    # Relative to the middle, so that float32 is precise where the scene is.
+    """A splat at each point [P, 3] with its color [P, 3]."""
+    # Relative to the median, so that float32 is precise where the scene is.
     origin = np.median(xyz, axis=0)
     arrays = _core.splats_from_points(
         (xyz - origin).astype(np.float32), colors.astype(np.float32), sh_degree
     )
     if confidence is not None:
-        _follow_confidence(arrays, confidence)
+        _apply_confidence(arrays, confidence)
     return Splats(**arrays, origin=origin, antialiased=False)
 
 
-def _at_most(most: int, count: int, random: Generator) -> npt.NDArray[np.int64]:
-    """Indices of ``most`` of ``count`` points, or of all where they are not more."""
-    if count <= most:
-        return np.arange(count)
-    return np.sort(random.choice(count, size=most, replace=False))
+def _apply_confidence(arrays: dict[str, npt.NDArray[np.float32]], confidence: Float64) -> None:
+    """Make splats of low confidence fainter and larger, in place.
 
-
-def _follow_confidence(arrays: dict[str, npt.NDArray[np.float32]], confidence: Float64) -> None:
-    """Make points of low confidence faint and larger, by the order of confidence [P]; in place.
-
-    The order alone, since networks' confidences have no common unit. Where all are equal, they say
-    nothing.
+    By rank only, because the confidences of networks have no common unit.
     """
     levels, level = np.unique(confidence, return_inverse=True)
     if len(levels) < 2:
         return
     rank = level / (len(levels) - 1.0)
-    opacity = UNSURE_OPACITY + rank * (SURE_OPACITY - UNSURE_OPACITY)
+    opacity = MIN_OPACITY + rank * (MAX_OPACITY - MIN_OPACITY)
     arrays["opacities"] = np.log(opacity / (1.0 - opacity)).astype(np.float32)
-    larger = (1.0 - rank) * np.log(UNSURE_SIZE)
-    arrays["scales"] = (arrays["scales"] + larger[:, None]).astype(np.float32)
+    log_factor = (1.0 - rank) * np.log(UNSURE_SIZE_FACTOR)
+    arrays["scales"] = (arrays["scales"] + log_factor[:, None]).astype(np.float32)
