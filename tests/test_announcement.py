@@ -13,12 +13,12 @@ from PIL import Image
 from igsr.capture.overview import Overview, look_at
 from igsr.fitting import announcement, settings_for
 from igsr.fitting.time_estimate import (
-    USUAL,
+    TYPICAL,
     StepTime,
     fit_seconds,
     other_seconds,
     timed_steps,
-    times_usual,
+    slowdown,
     work_done,
 )
 from igsr.pose.colmap.time_estimate import camera_seconds
@@ -65,10 +65,10 @@ def test_time_of_depth_maps_and_scores():
     assert other_seconds(8, 0, 1e6) < other_seconds(24, 0, 1e6) == other_seconds(100, 0, 1e6)
     assert other_seconds(0, 10, 2e6) == pytest.approx(2.0 * other_seconds(0, 10, 1e6))
     # A machine with steps of half the time needs half the time for the rest.
-    fast = StepTime(USUAL.fixed / 2.0, USUAL.per_pixel / 2.0, USUAL.per_splat / 2.0)
-    assert times_usual(USUAL, alpha=False) == 1.0
-    assert times_usual(fast, alpha=False) == pytest.approx(0.5)
-    assert times_usual(fast, alpha=True) > 0.5
+    fast = StepTime(TYPICAL.fixed / 2.0, TYPICAL.per_pixel / 2.0, TYPICAL.per_splat / 2.0)
+    assert slowdown(TYPICAL, alpha=False) == 1.0
+    assert slowdown(fast, alpha=False) == pytest.approx(0.5)
+    assert slowdown(fast, alpha=True) > 0.5
     assert other_seconds(8, 10, 1e6, 0.5) == pytest.approx(0.5 * other_seconds(8, 10, 1e6))
 
 

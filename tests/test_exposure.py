@@ -20,10 +20,10 @@ from igsr.capture.write_cameras import write_cameras
 from igsr.evaluation.scores import render_of
 from igsr.fitting import fit_capture
 from igsr.fitting.exposures import (
-    LEAST_SPREAD,
-    LOG_GAIN_OF_STOP,
-    gains_by_exif,
-    gains_by_points,
+    MIN_SPREAD,
+    LOG_GAIN_PER_STOP,
+    gains_from_exif,
+    gains_from_points,
     starting_exposures,
 )
 from igsr.fitting.fitter import fitter_of, splat_arrays, without_exposures
@@ -75,7 +75,7 @@ def test_points_determine_gains_and_offsets(seed):
 
 def test_equal_exposures_are_not_optimized():
     views, points = wall(noise=12.0)
-    assert gains_by_points(views, points).spread < LEAST_SPREAD
+    assert gains_from_points(views, points).spread < MIN_SPREAD
     assert starting_exposures(views, points, "auto") is None
     assert starting_exposures(views, points, "off") is None
     assert starting_exposures(views, points, "on") is not None
@@ -89,7 +89,7 @@ def test_gains_within_their_errors_are_not_optimized():
         replace(view, image=(view.image * np.exp(sign * ramp)).clip(0, 255).astype(np.uint8))
         for view, sign in zip(views, (1.0, -1.0, 1.0, -1.0), strict=True)
     ]
-    assert np.sqrt(np.mean(gains_by_points(uneven, points).error ** 2)) > 0.02
+    assert np.sqrt(np.mean(gains_from_points(uneven, points).error ** 2)) > 0.02
     assert starting_exposures(uneven, points, "auto") is None
 
 
@@ -108,7 +108,7 @@ def test_gains_that_drift_slowly_are_not_optimized():
         return exposed(views, [Exposure((gain,) * 3) for gain in np.exp(log_gains)])
 
     drift, jumps = 0.3 * np.sin(angles), 0.2 * (-1.0) ** np.arange(16)
-    drifting, jumping = (gains_by_points(photos(gains), points) for gains in (drift, jumps))
+    drifting, jumping = (gains_from_points(photos(gains), points) for gains in (drift, jumps))
     assert np.abs(drifting.log_gain[:, 0]).max() > 0.2
     assert drifting.log_gain.std() > 0.9 * jumping.log_gain.std()
     assert jumping.spread > 2.0 * drifting.spread
@@ -119,7 +119,7 @@ def test_gains_that_drift_slowly_are_not_optimized():
 def test_few_points_determine_no_gains():
     views, points = wall(points=12)
     photos = exposed(views, random_exposures(len(views)))
-    assert gains_by_points(photos, points) is None
+    assert gains_from_points(photos, points) is None
     assert starting_exposures(photos, points, "auto") is None
     assert starting_exposures(photos, None, "auto") is None
 
@@ -132,11 +132,11 @@ def test_exif_determines_gains_without_points():
         return [replace(view, exposure_value=value) for view, value in pairs]
 
     start = starting_exposures(photos(3.0, 4.0, 5.0), None, "auto")
-    gain = np.exp(LOG_GAIN_OF_STOP)
+    gain = np.exp(LOG_GAIN_PER_STOP)
     np.testing.assert_allclose([one.gain[0] for one in start.exposures], [1 / gain, 1.0, gain])
     assert (start.pulls < 1.0).all(), "tone curves differ between cameras"
     assert starting_exposures(photos(4.0, 4.0, 4.0), None, "auto") is None
-    assert gains_by_exif(photos(3.0, 4.0, None)) is None
+    assert gains_from_exif(photos(3.0, 4.0, None)) is None
 
 
 def test_impossible_exif_is_ignored(tmp_path):

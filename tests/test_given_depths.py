@@ -15,11 +15,9 @@ from igsr._internal.part_usage import Usage
 from igsr.capture import Capture, Points, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import Tracks
-from igsr.fitting.depth_agreement import with_agreeing_depths
-from igsr.fitting.depth_scales import with_scaled_depths
-from igsr.fitting.initialization import initial_splats
+from igsr.fitting.depth_checks import with_consistent_depths, with_scaled_depths
 from igsr.fitting.initialization.given_depths import given_points, have_depths
-from igsr.fitting.initialization.initial_splats import chosen_start
+from igsr.fitting.initialization.initial_splats import chosen_start, initial_splats
 from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
 from igsr.pose.estimate import Estimate
 from igsr.pose.found_cameras import FoundCameras
@@ -226,7 +224,7 @@ def test_depths_of_something_else_are_left_out(made):
     spoiled = with_views(
         made, lambda k, v: replace(v, depth=noise.astype(np.float32)) if k == 2 else v
     )
-    with pytest.warns(UserWarning, match=r"The depth of 2\.png does not fit to the points"):
+    with pytest.warns(UserWarning, match=r"The depth of 2\.png does not fit the points"):
         views = with_scaled_depths(spoiled.views, points_of(made))
     assert [view.depth is None for view in views] == [False, True, True, False, True, False]
 
@@ -240,7 +238,7 @@ def test_a_fit_scales_depths(made):
 
 def depths_left_out(capture):
     """Numbers of the train photos without depth."""
-    views = with_agreeing_depths(capture.views)
+    views = with_consistent_depths(capture.views)
     return [k for k, view in enumerate(views) if view.split == "train" and view.depth is None]
 
 
@@ -258,8 +256,8 @@ def test_depths_without_a_majority_against_them_are_kept(made):
     assert depths_left_out(with_factors(made, dict.fromkeys(range(6), 1.5))) == []
     # Photos without depths, and none at all.
     none = without_depths(made)
-    assert all(a is b for a, b in zip(with_agreeing_depths(none.views), none.views, strict=True))
-    assert with_agreeing_depths([]) == []
+    assert all(a is b for a, b in zip(with_consistent_depths(none.views), none.views, strict=True))
+    assert with_consistent_depths([]) == []
 
 
 def test_hidden_surfaces_are_no_contradiction():
@@ -274,7 +272,7 @@ def test_hidden_surfaces_are_no_contradiction():
         image = np.zeros((30, 40, 3), np.uint8)
         # Walls at z = 2 and z = 4 of the first camera.
         views.append(View(f"{k}.png", camera, "train", image, depth=np.full((30, 40), 2.0, "f4")))
-    assert all(a is b for a, b in zip(with_agreeing_depths(views), views, strict=True))
+    assert all(a is b for a, b in zip(with_consistent_depths(views), views, strict=True))
 
 
 def test_a_fit_leaves_out_a_photos_wrong_depths(made):

@@ -11,7 +11,7 @@ from made_up_tracks import projected, tracked
 
 import igsr
 from igsr.capture import Capture, View
-from igsr.fitting.pose_priors import LEAST_ERROR, LEFT_OPEN, pose_priors
+from igsr.fitting.pose_priors import MIN_ERROR_PX, DEVIATION_FACTOR, pose_priors
 from igsr.geometry.pose_errors import pose_errors
 
 COUNT = 4
@@ -71,7 +71,7 @@ def expected_covariance(views, points, poses, focal):
     inverse = np.linalg.pinv(normal / scale, rcond=1e-8) / scale
     move = -inverse @ by_camera.T @ rest @ error
     left = np.sum((rest @ (error + by_camera @ move)) ** 2)
-    variance = LEFT_OPEN**2 * max(left / (len(error) - len(columns)), LEAST_ERROR**2)
+    variance = DEVIATION_FACTOR**2 * max(left / (len(error) - len(columns)), MIN_ERROR_PX**2)
     return inverse * variance + np.outer(move, move)
 
 

@@ -17,18 +17,18 @@ from igsr.capture.types import Tracks
 from igsr.fitting import fit_capture, presets, settings_for
 from igsr.fitting.checkpoint import load_checkpoint
 from igsr.fitting.initialization.initial_splats import (
-    SURE_OPACITY,
-    UNSURE_OPACITY,
-    UNSURE_SIZE,
+    MAX_OPACITY,
+    MIN_OPACITY,
+    UNSURE_SIZE_FACTOR,
     chosen_start,
     initial_splats,
 )
 from igsr.fitting.initialization.visual_hull import color_disagreement
-from igsr.fitting.photo_support import (
-    PhotoSupport,
+from igsr.fitting.photo_statistics import (
+    PhotoStatistics,
+    count_squares,
     detail_of_files,
-    squares_of_one_tone,
-    support_of,
+    photo_statistics,
 )
 
 
@@ -42,23 +42,23 @@ def fit(capture, **options):
     return scenes.fit(capture, **arguments)
 
 
-def support(photos, seen_by=8.0, apart=5.0, pixels=100_000.0):
-    return PhotoSupport(photos, pixels, seen_by, apart)
+def statistics(photos, overlap=8.0, spacing_deg=5.0, pixels=100_000.0):
+    return PhotoStatistics(photos, pixels, overlap, spacing_deg)
 
 
 def test_settings_depend_on_how_many_photos_see_a_place():
-    few, many = settings_for(support(8)), settings_for(support(100, 50.0))
+    few, many = settings_for(statistics(8)), settings_for(statistics(100, 50.0))
     assert (few.dropout, many.dropout) == (0.15, 0.0)
-    assert settings_for(support(3, 1.5)).dropout == presets.MAX_DROPOUT
+    assert settings_for(statistics(3, 1.5)).dropout == presets.MAX_DROPOUT
     assert (few.sh_degree, many.sh_degree) == (1, 2)
     assert few.exposure == many.exposure == "off"
     assert few.density == "original"
-    assert settings_for(support(8, apart=30.0)).density == "mcmc"
+    assert settings_for(statistics(8, spacing_deg=30.0)).density == "mcmc"
 
 
 def test_splats_depend_on_pixels_photos_detail_and_quality():
     def max_splats(quality="normal", **changes):
-        return settings_for(replace(support(8), **changes), quality).max_splats
+        return settings_for(replace(statistics(8), **changes), quality).max_splats
 
     assert (max_splats(), max_splats(photos=100)) == (30_000, 45_000)
     assert max_splats(pixels=1e9) == presets.MAX_SPLATS
@@ -80,7 +80,7 @@ def test_settings_change_smoothly_with_the_number_of_photos():
     steps = splats = 0
     dropout = presets.MAX_DROPOUT
     for photos in range(1, 200):
-        settings = settings_for(support(photos, max(1.0, 0.4 * photos)))
+        settings = settings_for(statistics(photos, max(1.0, 0.4 * photos)))
         assert steps <= settings.steps <= max(2 * presets.STEPS_PER_PHOTO, 1.5 * steps)
         assert splats <= settings.max_splats <= max(30_000, 1.32 * splats)
         assert dropout - 0.1 <= settings.dropout <= dropout
@@ -89,7 +89,7 @@ def test_settings_change_smoothly_with_the_number_of_photos():
 
 
 def test_better_qualities_have_larger_photos_and_more_steps_and_splats():
-    settings = [settings_for(support(8), quality) for quality in presets.QUALITIES]
+    settings = [settings_for(statistics(8), quality) for quality in presets.QUALITIES]
     sizes = [presets.default_max_size("cpu", quality) for quality in presets.QUALITIES]
     for values in (sizes, [s.steps for s in settings], [s.max_splats for s in settings]):
         assert values == sorted(set(values))
@@ -115,7 +115,7 @@ def test_fits_of_cameras_take_more_and_smaller_steps(joint):
 def test_a_fit_uses_the_settings_for_its_photos(capture, tmp_path):
     path = tmp_path / "a.npz"
     result = fit_capture(capture, steps=3, backend="cpu", checkpoint=path)
-    assert result.settings == settings_for(support_of(capture.train_views), steps=3)
+    assert result.settings == settings_for(photo_statistics(capture.train_views), steps=3)
     expected = result.settings.plain() | {"depth_weight": 0.0}  # the photos have no depths
     # These are applied after the last step.
     del expected["remove_floaters"], expected["backdrop"]
@@ -123,17 +123,21 @@ def test_a_fit_uses_the_settings_for_its_photos(capture, tmp_path):
     assert {name: saved[name] for name in expected} == expected
 
 
-def test_support_counts_photos_from_similar_directions():
+def test_overlap_counts_photos_from_similar_directions():
     ring = scenes.capture(views=12, size=40, alpha=True).views
-    all_round, half, one = support_of(ring), support_of(ring[::2]), support_of(ring[:1])
-    assert (all_round.photos, all_round.pixels, all_round.shown) == (12, 1600.0, 1.0)
+    all_round, half, one = (
+        photo_statistics(ring),
+        photo_statistics(ring[::2]),
+        photo_statistics(ring[:1]),
+    )
+    assert (all_round.photos, all_round.pixels, all_round.visible_fraction) == (12, 1600.0, 1.0)
     # Within 60 degrees of each, itself included, on a ring with steps of 30 degrees.
-    assert 3.0 <= all_round.seen_by <= 5.0
-    assert half.apart > all_round.apart
-    assert half.seen_by < all_round.seen_by
-    assert one == PhotoSupport(1, 1600.0, 1.0, 180.0, one.detail)
+    assert 3.0 <= all_round.overlap <= 5.0
+    assert half.spacing_deg > all_round.spacing_deg
+    assert half.overlap < all_round.overlap
+    assert one == PhotoStatistics(1, 1600.0, 1.0, 180.0, one.detail)
     masked = [replace(view, mask=np.arange(1600).reshape(40, 40) < 400) for view in ring]
-    assert support_of(masked).pixels == 400.0
+    assert photo_statistics(masked).pixels == 400.0
 
 
 def test_few_photos_of_a_large_scene_show_the_same_place():
@@ -143,36 +147,36 @@ def test_few_photos_of_a_large_scene_show_the_same_place():
             viewmat = view.camera.viewmat.copy()
             viewmat[:3, 3] -= viewmat[:3, :3] @ [50.0 * k, 0.0, 0.0]
             views.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
-    rooms = replace(support_of(views), apart=30.0)
-    assert rooms.shown < presets.MIN_SHOWN_FRACTION
+    rooms = replace(photo_statistics(views), spacing_deg=30.0)
+    assert rooms.visible_fraction < presets.MCMC_VISIBLE_FRACTION
     assert settings_for(rooms).density == "original"
-    assert settings_for(replace(rooms, shown=1.0)).density == "mcmc"
+    assert settings_for(replace(rooms, visible_fraction=1.0)).density == "mcmc"
 
 
 def test_squares_of_one_tone_are_counted():
     plain = np.full((40, 72, 3), 77, np.uint8)
     # Whole squares of 16 pixels; the rest at the edges does not count.
-    assert squares_of_one_tone(plain) == 2 * 4
+    assert count_squares(plain) == 2 * 4
     half = plain.copy()
     half[:, 24:] = 200  # an edge inside a column of squares: each becomes four of 8 pixels
-    assert squares_of_one_tone(half) == 2 * 3 + 2 * 4
-    assert squares_of_one_tone(half // 20) == 2 * 4
+    assert count_squares(half) == 2 * 3 + 2 * 4
+    assert count_squares(half // 20) == 2 * 4
     noise = np.random.default_rng(0).choice(np.uint8([0, 255]), (32, 64, 1)).repeat(3, axis=2)
-    assert 0.8 * 32 * 64 < squares_of_one_tone(noise) <= 32 * 64
+    assert 0.8 * 32 * 64 < count_squares(noise) <= 32 * 64
     # Squares count by their unmasked fraction.
     mask = np.zeros((32, 64), bool)
     mask[:, :8] = True
-    assert squares_of_one_tone(plain[:32, :64], mask) == 1.0
+    assert count_squares(plain[:32, :64], mask) == 1.0
     # Transparent pixels are white.
     hidden = np.concatenate([noise, np.zeros((32, 64, 1), np.uint8)], axis=2)
-    assert squares_of_one_tone(hidden) == 2 * 4
-    assert squares_of_one_tone(plain[:10]) == 0.0
+    assert count_squares(hidden) == 2 * 4
+    assert count_squares(plain[:10]) == 0.0
 
 
 def test_detail_is_the_mean_of_a_few_photos_or_files(tmp_path):
     views = scenes.capture(views=20, size=48, alpha=True).views
-    counts = [squares_of_one_tone(view.image) for view in views]
-    assert support_of(views).detail == pytest.approx(np.mean(counts[::2]))
+    counts = [count_squares(view.image) for view in views]
+    assert photo_statistics(views).detail == pytest.approx(np.mean(counts[::2]))
     files = []
     for view in views:
         files.append(tmp_path / f"{len(files)}.png")
@@ -200,7 +204,7 @@ def test_dropout_changes_the_fit_repeats_and_resumes(capture, tmp_path):
         ({"dropout": True}, "dropout must be"),
         ({"backdrop": "yes"}, "backdrop must be True or False"),
         ({"start": "sphere"}, "start must be one of auto"),
-        ({"start": "points"}, r"^made-up has no 100 points to start from; use another start\.$"),
+        ({"start": "points"}, r"^made-up has fewer than 100 points to start from; use another start\.$"),
         ({"preset": "3dgs"}, "unknown setting preset"),
     ],
 )
@@ -229,7 +233,9 @@ def test_start_depends_on_the_photos(capture):
     assert chosen_start(capture) == "hull"
     assert chosen_start(scenes.capture(views=4, size=24)) == "sift"
     assert chosen_start(scenes.capture(views=16, size=8)) == "depths"
-    with pytest.raises(igsr.IgsrError, match=r"^made-up has photos without alpha; start hull needs"):
+    with pytest.raises(
+        igsr.IgsrError, match=r"^made-up has photos without alpha; start hull needs"
+    ):
         initial_splats(scenes.capture(views=4, size=24), 0, 300, 1, "hull")
 
 
@@ -281,10 +287,10 @@ def test_uncertain_points_start_faint_and_large(capture):
     plain, splats = start(None), start(confidence)
     order = np.argsort(confidence)
     opacity = 1.0 / (1.0 + np.exp(-splats.opacities[order]))
-    np.testing.assert_allclose(opacity[[0, -1]], [UNSURE_OPACITY, SURE_OPACITY], rtol=1e-5)
+    np.testing.assert_allclose(opacity[[0, -1]], [MIN_OPACITY, MAX_OPACITY], rtol=1e-5)
     assert (np.diff(opacity) > 0).all()
     larger = np.exp(splats.scales - plain.scales)[order]
-    np.testing.assert_allclose(larger[[0, -1]], [[UNSURE_SIZE] * 3, [1.0] * 3], rtol=1e-5)
+    np.testing.assert_allclose(larger[[0, -1]], [[UNSURE_SIZE_FACTOR] * 3, [1.0] * 3], rtol=1e-5)
     assert (np.diff(larger[:, 0]) < 0).all()
     # The unit does not matter; equal confidences are as none.
     assert np.array_equal(start(confidence * 1e9).opacities, splats.opacities)
