@@ -1,4 +1,4 @@
-"""Networks of Depth Anything 3 with weights that are computed, so that tests need no files."""
+"""Networks of Depth Anything 3 with computed weights, so that tests need no files."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from math import prod
 import torch
 from dust3r_networks import hashed
 
-from igsr.pose.da3.config import NetworkConfig
+from igsr.pose.da3.backbone import NetworkConfig
 from igsr.pose.da3.network import Da3Network
 
-#: Twelve blocks as the published sizes have, with little in each.
+#: Twelve blocks as in the published sizes, with few channels.
 TINY = NetworkConfig(embed_dim=32, heads=2, features=16, out_channels=(8, 12, 16, 24))
 
 
@@ -48,6 +48,6 @@ def hashed_network(config=TINY):
 
 
 def hashed_pixels(name, views, height, width):
-    """float32 [S, 3, H, W] as normalised pixels may be."""
+    """float32 [S, 3, H, W], in the range of normalized pixels."""
     values = hashed(name, views * 3 * height * width)
     return torch.from_numpy(4.0 * values.reshape(views, 3, height, width))

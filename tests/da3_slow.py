@@ -1,8 +1,7 @@
-"""Depth Anything 3 once more, slow and plain, in float64 and numpy: what the network is held to.
+"""A slow implementation of Depth Anything 3 in float64 and numpy, to compare the network with.
 
-Written from the description of the network, not from ``igsr.pose.da3``: a matrix product where that
-has a fused kernel, a sum over shifted images where that has a convolution, complex numbers where
-that turns pairs.
+It follows the description of the network, not ``igsr.pose.da3``: matrix products instead of fused
+kernels, sums over shifted images instead of convolutions, complex numbers instead of rotated pairs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""DUSt3R networks with weights that are computed, so that tests need no files."""
+"""DUSt3R networks with computed weights, so that tests need no files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BLOCK = 1 << 13
 
 
 def hashed(key, count):
-    """Numbers in [-0.5, 0.5) that any program can make from a key: murmur3's finaliser of j."""
+    """Numbers in [-0.5, 0.5) from a key, reproducible in any language: murmur3's finalizer of j."""
     values = np.empty(count, dtype=np.float32)
     for start in range(0, count, BLOCK):
         stop = min(start + BLOCK, count)
@@ -47,7 +47,7 @@ def hashed(key, count):
 
 
 def hashed_weight(key, shape):
-    """The test weight of a key: norms near 1, layers that keep the size of what they are given."""
+    """The test weight of a key: norms near 1, layers that keep the size of their input."""
     u = hashed(key, prod(shape))
     if len(shape) == 1:
         u *= np.float32(0.2)

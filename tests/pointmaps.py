@@ -25,7 +25,7 @@ def camera_at(eye, target, focal, width, height):
 
 
 class PointmapScene:
-    """Cameras on an arc, each with a grid, and what a perfect network would say."""
+    """Cameras on an arc, each with a grid, and exact predictions for them."""
 
     def __init__(self, count=6, arc=1.2, sizes=((96, 128),), focals=(1.2,), seed=0):
         random = np.random.default_rng(seed)
@@ -37,7 +37,7 @@ class PointmapScene:
             height, width = sizes[i % len(sizes)]
             focal = focals[i % len(focals)] * max(height, width)
             self.cameras.append(camera_at(eye, target, focal, width, height))
-            # Grids of 4 pixels, cut off unevenly: offsets must not be lost.
+            # Grids of 4 pixels with unequal borders, so that offsets matter.
             grid = Grid(height // 4 - 1, width // 4 - 2, 4.0, 4.0, 5.0, 1.0)
             self.grids.append(grid)
         self.worlds = [
@@ -70,7 +70,7 @@ class PointmapScene:
         Args:
             pairs: all by default.
             seed: of the scales.
-            spoil: called with (points, confidence, first, photo), gives both anew.
+            spoil: called with (points, confidence, first, photo), returns changed ones.
         """
         random = np.random.default_rng(seed)
         count = len(self.cameras)

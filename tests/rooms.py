@@ -77,14 +77,20 @@ def photos(cameras: list[Camera], seed: int = 0, k: float = 0.0) -> list[Photo]:
     return [Photo(f"{i}.png", picture(camera, seed, k)) for i, camera in enumerate(cameras)]
 
 
-def depth(camera: Camera) -> np.ndarray:
-    """float32 [H, W]: z-depth of the room as a camera sees it, at the pixels' centres."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
-    rays = pixels @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]  # their z is 1
-    nearest = np.full(x.shape, np.inf)
+def depths(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """float64 [P]: z-depths of the room at pixels [P, 2] of a camera."""
+    slopes = (pixels - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]
+    rays = np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0) @ camera.viewmat[:3, :3]
+    nearest = np.full(len(rays), np.inf)
     for normal, offset, *_ in WALLS:
         with np.errstate(divide="ignore"):
             distance = (offset - camera.centre @ normal) / (rays @ np.array(normal))
         nearest = np.where((distance > 0.0) & (distance < nearest), distance, nearest)
-    return nearest.astype(np.float32)
+    return nearest
+
+
+def depth(camera: Camera) -> np.ndarray:
+    """float32 [H, W]: z-depths of the room at all pixel centers of a camera."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    return depths(camera, pixels).reshape(x.shape).astype(np.float32)

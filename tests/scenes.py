@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,20 @@ def ring_camera(angle, size=48, distance=4.0, centre=(0.0, 0.0, 0.0)):
     viewmat[:3, 3] = -viewmat[:3, :3] @ (np.asarray(centre) + distance * back)
     K = np.array([[1.5 * size, 0.0, size / 2], [0.0, 1.5 * size, size / 2], [0.0, 0.0, 1.0]])
     return Camera(viewmat, K, size, size)
+
+
+def perturbed_camera(camera, degrees, moved, seed):
+    """The camera rotated by an angle about a random axis, its center moved by about a distance."""
+    random = np.random.default_rng(seed)
+    axis = random.normal(size=3)
+    x, y, z = np.radians(degrees) * axis / np.linalg.norm(axis)
+    rotation = np.linalg.qr(np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))[0]
+    rotation *= np.sign(np.diag(rotation))
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation @ camera.viewmat[:3, :3]
+    center = camera.centre + moved * random.normal(size=3) / np.sqrt(3.0)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    return replace(camera, viewmat=viewmat)
 
 
 def capture(views=8, size=48, alpha=False, scene=None, arc=2.0 * np.pi):

@@ -1,4 +1,4 @@
-"""Global alignment: exact pointmaps, noise, what is fixed, and predictions that cannot be used."""
+"""Global alignment: exact pointmaps, noise, fixed cameras, and unusable predictions."""
 
 from __future__ import annotations
 
@@ -10,16 +10,14 @@ from pointmaps import CONFIDENCE, PointmapScene, all_pairs
 
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
-from igsr.geometry.similarity import Similarity, apply, similarity_between, similarity_of_points
-from igsr.pose.alignment import AlignedPhoto, PairPrediction, PhotoToAlign, align
-from igsr.pose.alignment import observations as observations_module
-from igsr.pose.alignment.absolute_pose import searched_focal
-from igsr.pose.alignment.confidence import trusted_pixels
-from igsr.pose.alignment.focal import weiszfeld_focal
-from igsr.pose.alignment.initial_alignment import start
+from igsr.geometry.similarity import Similarity, similarity_between, similarity_of_points
+from igsr.pose.alignment import AlignedPhoto, align
+from igsr.pose.alignment import predictions as predictions_module
+from igsr.pose.alignment.camera_solvers import searched_focal, weiszfeld_focal
+from igsr.pose.alignment.initial_alignment import components, spanning_tree, start
 from igsr.pose.alignment.objective import Objective
-from igsr.pose.alignment.observations import observe, strong_edges
-from igsr.pose.alignment.spanning_tree import components, spanning_tree
+from igsr.pose.alignment.predictions import observe, overlapping_edges
+from igsr.pose.depth_maps import trusted_pixels
 from igsr.pose.grid import Grid
 
 
@@ -53,11 +51,11 @@ def assert_exact(alignment, scene, photos=None, degrees=1e-3, centre=1e-4, focal
         assert (camera.width, camera.height) == (true_camera.width, true_camera.height)
 
 
-# --- what is exact
+# --- exact predictions
 
 
 def mixed_scene():
-    """Two cameras of different focal lengths and sizes, one of them held upright too."""
+    """Photos of two cameras of different focal lengths and sizes, some of them upright."""
     return PointmapScene(6, sizes=((96, 128), (128, 96), (80, 112)), focals=(1.2, 1.2, 0.9))
 
 
@@ -65,25 +63,14 @@ def by_size(i):
     return i % 3 == 2
 
 
-def test_the_start_from_exact_pointmaps_is_exact():
+@pytest.mark.parametrize("steps", [0, 20])
+def test_exact_pointmaps_give_exact_cameras_and_depths(steps):
     scene = mixed_scene()
-    alignment = align(scene.predictions(), scene.photos(group=by_size), steps=0)
-    assert alignment.start_loss < 1e-5
+    alignment = align(scene.predictions(), scene.photos(group=by_size), steps=steps)
+    assert alignment.loss <= alignment.start_loss < 1e-5
     assert_exact(alignment, scene)
     assert alignment.warnings == []
     assert sorted(alignment.pairs) == all_pairs(6)
-
-
-def test_optimising_what_is_exact_leaves_it_exact():
-    scene = mixed_scene()
-    alignment = align(scene.predictions(), scene.photos(group=by_size), steps=20)
-    assert alignment.loss <= alignment.start_loss
-    assert_exact(alignment, scene)
-
-
-def test_depths_are_those_of_the_scene_in_the_world_of_the_cameras():
-    scene = mixed_scene()
-    alignment = align(scene.predictions(), scene.photos(group=by_size), steps=0)
     world = similarity_between(cameras_of(alignment), scene.cameras)
     for photo, grid, truth in zip(alignment.photos, scene.grids, scene.worlds, strict=True):
         assert photo.depth.shape == photo.confidence.shape == (grid.height, grid.width)
@@ -91,7 +78,7 @@ def test_depths_are_those_of_the_scene_in_the_world_of_the_cameras():
         np.testing.assert_array_equal(photo.confidence, CONFIDENCE)
         xyz, index = photo.world_points()
         assert len(index) == photo.depth.size
-        np.testing.assert_allclose(apply(world, xyz.T).T, truth, atol=1e-3)
+        np.testing.assert_allclose(world.apply(xyz.T).T, truth, atol=1e-3)
 
 
 def test_the_world_is_the_camera_frame_of_a_photo():
@@ -100,19 +87,16 @@ def test_the_world_is_the_camera_frame_of_a_photo():
     assert nearest < 1e-12
 
 
-def test_two_photos():
+def test_two_photos_and_pairs_in_one_direction():
     scene = PointmapScene(2, arc=0.4)
     assert_exact(align(scene.predictions(), scene.photos(), steps=20), scene)
-
-
-def test_one_direction_of_each_pair_is_enough():
     scene = PointmapScene(4)
     pairs = [(0, 1), (2, 1), (3, 2), (0, 3)]
     assert_exact(align(scene.predictions(pairs), scene.photos(), steps=0), scene)
 
 
 def test_a_photo_that_is_never_first_has_its_focal_length_searched():
-    # Its own group: no other photo tells. 21 values are tried and the optimiser does the rest.
+    # It is alone in its group. 21 values are tried, and the optimizer refines the best.
     scene = PointmapScene(4)
     pairs = [(i, j) for i, j in all_pairs(4) if i != 2]
     photos = scene.photos(group=lambda i: i == 2)
@@ -123,11 +107,11 @@ def test_a_photo_that_is_never_first_has_its_focal_length_searched():
     assert abs(found.K[0, 0] / true_focal - 1) < 0.01
 
 
-def test_a_group_of_which_nothing_tells_still_shares_its_focal_length():
+def test_a_group_with_mirrored_points_shares_its_focal_length():
     scene = PointmapScene(4)
 
     def spoil(points, confidence, first, photo):
-        """Photos 2 and 3 are behind themselves."""
+        """The points of photos 2 and 3 are behind them."""
         return (-points if first >= 2 else points), confidence
 
     found = align(scene.predictions(spoil=spoil), scene.photos(group=lambda i: i >= 2), steps=3)
@@ -140,26 +124,25 @@ def test_fifty_photos_in_a_sliding_window():
     scene = PointmapScene(50, arc=6.0, sizes=((64, 96),))
     pairs = [(i, j) for i, j in all_pairs(50) if abs(i - j) <= 2]
     alignment = align(scene.predictions(pairs), scene.photos(), steps=1)
-    # Rounding adds up along 49 links.
+    # Rounding errors accumulate along 49 edges.
     assert_exact(alignment, scene, degrees=0.02, centre=1e-3)
 
 
-def test_thinned_grids_still_give_every_depth(monkeypatch):
-    monkeypatch.setattr(observations_module, "MOST_POINTS", 3_000)
+def test_thinned_grids_give_every_depth(monkeypatch):
+    monkeypatch.setattr(predictions_module, "MAX_POINTS", 3_000)
     scene = PointmapScene(4)
-    edges = strong_edges(scene.predictions())
-    photo = observe(edges, scene.photos()).photos[0]
-    assert len(photo.pixels) < 200
-    assert_exact(align(scene.predictions(), scene.photos(), steps=0), scene)
+    edges = overlapping_edges(scene.predictions())
+    assert len(observe(edges, scene.photos()).photos[0].pixels) < 200
     alignment = align(scene.predictions(), scene.photos(), steps=0)
+    assert_exact(alignment, scene)
     assert np.isfinite(alignment.photos[0].depth).all()
     assert alignment.photos[0].depth.shape == (23, 30)
 
 
-# --- what is not
+# --- noise
 
 
-def test_noise_is_averaged_away():
+def test_noise_is_averaged():
     scene = PointmapScene(6)
     predictions = scene.predictions(spoil=depth_noise(0.05))
     begun = align(predictions, scene.photos(), steps=0)
@@ -172,7 +155,7 @@ def test_noise_is_averaged_away():
     assert after["centre"] < 0.5 * before["centre"]
 
 
-def test_the_confident_half_of_the_pixels_wins():
+def test_a_confident_half_of_the_pixels_suffices():
     scene = PointmapScene(5)
     random = np.random.default_rng(1)
 
@@ -204,17 +187,6 @@ def test_the_order_of_photos_does_not_matter():
     np.testing.assert_allclose(other[0].K[0, 0], straight[0].K[0, 0], rtol=1e-3)
 
 
-def test_same_seed_same_bits():
-    scene = PointmapScene(4)
-    predictions = scene.predictions(spoil=depth_noise(0.05))
-    one, two = (align(predictions, scene.photos(), steps=20, seed=3) for _ in range(2))
-    assert one.loss == two.loss
-    for a, b in zip(one.photos, two.photos, strict=True):
-        np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
-        np.testing.assert_array_equal(a.camera.K, b.camera.K)
-        np.testing.assert_array_equal(a.depth, b.depth)
-
-
 def test_photos_of_one_group_share_their_focal_length():
     scene = PointmapScene(4)
     predictions = scene.predictions(spoil=depth_noise(0.05))
@@ -224,7 +196,7 @@ def test_photos_of_one_group_share_their_focal_length():
     assert len({camera.K[0, 0] for camera in own}) == 4
 
 
-def test_predictions_are_left_as_they_are():
+def test_predictions_are_not_changed():
     scene = PointmapScene(3)
     predictions = scene.predictions()
     before = [p.first_points.copy() for p in predictions]
@@ -233,16 +205,16 @@ def test_predictions_are_left_as_they_are():
         np.testing.assert_array_equal(prediction.first_points, points)
 
 
-# --- what is fixed
+# --- fixed cameras
 
 
 @pytest.mark.parametrize("fixed", [[1], [0, 3], [1, 2, 4], [0, 1, 2, 3, 4]])
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_fixed_poses_set_the_world(fixed, noise):
+def test_fixed_poses_define_the_world(fixed, noise):
     scene = PointmapScene(5)
     photos = scene.photos(viewmat=lambda i: scene.cameras[i].viewmat if i in fixed else None)
     alignment = align(scene.predictions(spoil=depth_noise(noise)), photos, steps=60)
-    # Noise of 2 % at 5 units: what is averaged over hundreds of pixels is far below.
+    # Noise of 2 % at 5 units is averaged over hundreds of pixels.
     bound = 0.2 if noise else 1e-4
     for i, (camera, truth) in enumerate(zip(cameras_of(alignment), scene.cameras, strict=True)):
         if i in fixed:
@@ -266,18 +238,18 @@ def test_fixed_poses_far_from_the_origin():
         np.testing.assert_allclose(found.centre, truth.centre, atol=1e-3)
 
 
-def test_fixed_poses_at_one_place_leave_the_scale_free():
+def test_fixed_poses_at_one_place_do_not_fix_the_scale():
     scene = PointmapScene(4)
     photos = scene.photos(viewmat=lambda i: scene.cameras[0].viewmat if i == 0 else None)
     twin = replace(photos[0], name="twin.jpg")
     pairs = [p for p in scene.predictions() if p.first != 3 and p.second != 3]
-    # Photo 3 is photo 0 once more.
+    # Photo 3 is a copy of photo 0.
     doubled = [replace(p, first=3) for p in pairs if p.first == 0]
     alignment = align(pairs + doubled, [*photos[:3], twin], steps=20)
     assert_exact(alignment, scene, photos=range(3))
 
 
-def test_fixed_intrinsics_stay():
+def test_fixed_intrinsics_are_kept():
     scene = mixed_scene()
     given = scene.cameras[1].K * [[1.01, 1.0, 1.0], [1.0, 0.99, 1.02], [1.0, 1.0, 1.0]]
     photos = scene.photos(group=by_size, intrinsics=lambda i: given if i == 1 else None)
@@ -287,10 +259,10 @@ def test_fixed_intrinsics_stay():
     assert focals[0] == focals[3] != focals[1]
 
 
-# --- predictions that cannot be used
+# --- unusable predictions
 
 
-def test_pixels_that_are_not_finite_are_left_out():
+def test_pixels_that_are_not_finite_are_ignored():
     scene = PointmapScene(4)
 
     def spoil(points, confidence, first, photo):
@@ -313,7 +285,7 @@ def test_pixels_that_are_not_finite_are_left_out():
 
 
 @pytest.mark.parametrize("kind", ["garbage", "nothing", "not finite", "one point", "one line"])
-def test_a_photo_that_cannot_be_used_is_named(kind):
+def test_a_photo_without_overlap_is_named(kind):
     scene = PointmapScene(5)
     random = np.random.default_rng(2)
 
@@ -337,25 +309,20 @@ def test_a_photo_that_cannot_be_used_is_named(kind):
     assert_exact(alignment, scene, photos=[0, 1, 2, 4])
 
 
-def test_of_two_things_the_one_with_more_photos_is_placed():
+def test_of_two_groups_the_one_with_fixed_poses_or_more_photos_is_placed():
     scene = PointmapScene(5)
     pairs = [(i, j) for i, j in all_pairs(5) if (i < 2) == (j < 2)]
     alignment = align(scene.predictions(pairs), scene.photos(), steps=5)
     assert [photo is None for photo in alignment.photos] == [True, True, False, False, False]
     assert ["0.jpg" in alignment.warnings[0], "1.jpg" in alignment.warnings[1]] == [True, True]
     assert_exact(alignment, scene, photos=[2, 3, 4])
-
-
-def test_of_two_things_the_one_with_known_poses_is_placed():
-    scene = PointmapScene(5)
-    pairs = [(i, j) for i, j in all_pairs(5) if (i < 2) == (j < 2)]
     photos = scene.photos(viewmat=lambda i: scene.cameras[i].viewmat if i == 1 else None)
     alignment = align(scene.predictions(pairs), photos, steps=5)
     assert [photo is None for photo in alignment.photos] == [False, False, True, True, True]
 
 
 @pytest.mark.parametrize("kind", ["nothing", "not finite", "none", "one point"])
-def test_nothing_to_place_is_a_sentence(kind):
+def test_no_overlap_at_all(kind):
     scene = PointmapScene(3)
 
     def spoil(points, confidence, first, photo):
@@ -366,70 +333,21 @@ def test_nothing_to_place_is_a_sentence(kind):
         return np.full_like(points, np.nan), confidence
 
     predictions = [] if kind == "none" else scene.predictions(spoil=spoil)
-    with pytest.raises(IgsrError, match="no two of the photos show the same thing"):
+    with pytest.raises(IgsrError, match="no overlap between any two photos"):
         align(predictions, scene.photos())
 
 
-def test_random_predictions_end_or_raise():
-    random = np.random.default_rng(5)
-    for trial in range(3):
-        photos = [
-            PhotoToAlign(f"{i}.png", 40, 60, Grid(8, 12, 5.0, 5.0, 0.0, 0.0)) for i in range(3)
-        ]
-        predictions = [
-            PairPrediction(
-                i,
-                j,
-                *(
-                    random.normal(size=shape).astype(np.float32) * 10.0 ** (6 * trial - 6)
-                    if shape[2:]
-                    else np.exp(random.normal(size=shape)).astype(np.float32) + 1
-                    for shape in ((8, 12, 3), (8, 12), (8, 12, 3), (8, 12))
-                ),
-            )
-            for i, j in all_pairs(3)
-        ]
-        try:
-            alignment = align(predictions, photos, steps=10)
-        except IgsrError:
-            continue
-        assert np.isfinite(alignment.loss)
-
-
-def test_arguments_are_checked():
-    scene = PointmapScene(2)
-    photos, predictions = scene.photos(), scene.predictions()
-    with pytest.raises(IgsrError, match="steps is -1"):
-        align(predictions, photos, steps=-1)
-    with pytest.raises(IgsrError, match="two different photos, counted from 0 to 1"):
-        align([replace(predictions[0], second=2)], photos)
-    with pytest.raises(IgsrError, match="two different photos"):
-        align([replace(predictions[0], second=0)], photos)
-    with pytest.raises(IgsrError, match=r"second_points float32 \[4, 4, 3\]"):
-        align([replace(predictions[0], second_points=np.zeros((4, 4, 3), np.float32))], photos)
-    with pytest.raises(IgsrError, match="first_confidence int64"):
-        align([replace(predictions[0], first_confidence=np.ones((23, 30), np.int64))], photos)
-    with pytest.raises(IgsrError, match=r"the pose of 0.jpg is not rigid"):
-        replace(photos[0], viewmat=np.diag([2.0, 1.0, 1.0, 1.0]))
-    with pytest.raises(IgsrError, match=r"0.jpg: the focal length fx is 0"):
-        replace(photos[0], intrinsics=np.diag([0.0, 1.0, 1.0]))
-    with pytest.raises(IgsrError, match="a grid's height is 0"):
-        Grid(0, 4, 1.0, 1.0, 0.0, 0.0)
-    with pytest.raises(IgsrError, match="a grid's scale_y is nan"):
-        Grid(4, 4, 1.0, float("nan"), 0.0, 0.0)
-
-
-# --- the parts
+# --- parts
 
 
 def test_the_gradient_is_that_of_the_loss():
     scene = PointmapScene(3, sizes=((64, 96),))
     photos = scene.photos(viewmat=lambda i: scene.cameras[i].viewmat if i == 0 else None)
-    observations = observe(strong_edges(scene.predictions(spoil=depth_noise(0.05))), photos)
+    observations = observe(overlapping_edges(scene.predictions(spoil=depth_noise(0.05))), photos)
     placement, depths = start(observations, photos, seed=0)
     objective = Objective(observations, placement, depths, photos)
     random = np.random.default_rng(0)
-    # The start has distances of nearly zero, where the norm has a kink.
+    # The norm is not differentiable at the initial distances of nearly zero.
     for parameter in objective.parameters:
         parameter.data += 0.05 * parameter.new_tensor(random.normal(size=parameter.shape))
     objective.loss()
@@ -454,13 +372,13 @@ def test_similarity_with_a_third_of_the_points_wrong():
     rotation *= np.sign(np.linalg.det(rotation))
     truth = Similarity(2.5, rotation, np.array([1.0, -2.0, 7.0]))
     points = random.normal(size=(3, 300))
-    others = apply(truth, points)
+    others = truth.apply(points)
     others[:, :100] += random.normal(size=(3, 100)) + 2.0
     found = similarity_of_points(points, others, np.ones(300))
     assert abs(found.scale / truth.scale - 1) < 1e-3
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-3)
     line = np.outer([1.0, 2.0, 3.0], random.normal(size=300))
-    assert similarity_of_points(line, apply(truth, line), np.ones(300)) is None
+    assert similarity_of_points(line, truth.apply(line), np.ones(300)) is None
     assert similarity_of_points(points, others, np.zeros(300)) is None
 
 
@@ -478,15 +396,12 @@ def test_weiszfeld_focal():
     assert weiszfeld_focal(-points, offsets, np.ones(500)) is None
 
 
-def test_focal_lengths_are_searched_where_none_is_known():
+def test_searched_focal():
     scene = PointmapScene(1)
-    camera = scene.cameras[0]
-    pixels = scene.grids[0].photo_pixels()
-    found = searched_focal(scene.worlds[0].T, pixels, np.full(len(pixels), 5.0), (96, 128), seed=0)
-    assert found is not None
-    assert abs(found[0] / camera.K[0, 0] - 1) < 0.1
-    few = searched_focal(scene.worlds[0].T[:, :3], pixels[:3], np.full(3, 5.0), (96, 128), 0)
-    assert few is None
+    points, pixels = scene.worlds[0].T, scene.grids[0].photo_pixels()
+    focal, _ = searched_focal(points, pixels, np.full(len(pixels), 5.0), (96, 128), seed=0)
+    assert abs(focal / scene.cameras[0].K[0, 0] - 1) < 0.1
+    assert searched_focal(points[:, :3], pixels[:3], np.full(3, 5.0), (96, 128), 0) is None
 
 
 def test_spanning_tree_takes_the_strongest_edges():
@@ -496,24 +411,21 @@ def test_spanning_tree_takes_the_strongest_edges():
     assert components(5, [(0, 1), (3, 4), (1, 2)]) == [[0, 1, 2], [3, 4]]
 
 
-# --- trust
+# --- trusted pixels
 
 
-def floater_scene():
-    """Two photos of one wall; in the first, one pixel stands before it."""
-    cameras = PointmapScene(2, arc=0.2).cameras
+def photos_of_a_wall():
     grid = Grid(24, 32, 4.0, 4.0, 0.0, 0.0)
-    photos = []
-    for camera in cameras:
-        truth = PointmapScene(2, arc=0.2)
-        truth.grids = [grid, grid]
-        depth = np.full((24, 32), 5.0, np.float32)
-        photos.append(AlignedPhoto(camera, grid, depth, np.full((24, 32), 9.0, np.float32)))
-    return photos
+    return [
+        AlignedPhoto(
+            camera, grid, np.full((24, 32), 5.0, np.float32), np.full((24, 32), 9.0, np.float32)
+        )
+        for camera in PointmapScene(2, arc=0.2).cameras
+    ]
 
 
-def test_a_less_sure_pixel_before_a_surface_is_not_trusted():
-    photos = floater_scene()
+def test_a_less_confident_pixel_in_front_of_a_surface_is_not_trusted():
+    photos = photos_of_a_wall()
     assert all(mask.all() for mask in trusted_pixels(photos, [(0, 1)]))
     photos[0].depth[12, 16] = 2.5
     photos[0].confidence[12, 16] = 8.0
@@ -526,7 +438,7 @@ def test_a_less_sure_pixel_before_a_surface_is_not_trusted():
     assert trusted_pixels(photos, [(0, 1)])[0].all()
 
 
-def test_trust_does_not_depend_on_the_order_of_photos():
+def test_trusted_pixels_do_not_depend_on_the_order_of_photos():
     scene = PointmapScene(4)
     random = np.random.default_rng(7)
     predictions = scene.predictions(spoil=depth_noise(0.1))
@@ -542,7 +454,7 @@ def test_trust_does_not_depend_on_the_order_of_photos():
 
 
 def test_low_confidence_and_unknown_depth_are_not_trusted():
-    photos = floater_scene()
+    photos = photos_of_a_wall()
     photos[0].confidence[0, 0] = 3.0
     photos[0].depth[0, 1] = np.nan
     first, missing = trusted_pixels([photos[0], None], [(0, 1)])
@@ -555,11 +467,11 @@ def test_low_confidence_and_unknown_depth_are_not_trusted():
 # --- grids
 
 
-def test_grid_pixels_lie_at_their_centres_in_the_photo():
+def test_pixels_of_a_grid():
     grid = Grid(2, 3, 4.0, 5.0, 1.0, -2.0)
     expected = [[x, y] for y in (0.5, 5.5) for x in (3.0, 7.0, 11.0)]
     np.testing.assert_array_equal(grid.photo_pixels(), expected)
-    # Of five columns and of four rows every second.
+    # Every second of five columns and four rows.
     thinned = Grid(4, 5, 1.0, 1.0, 0.0, 0.0).photo_pixels(2)
     np.testing.assert_array_equal(np.unique(thinned[:, 0]), [0.5, 2.5, 4.5])
     np.testing.assert_array_equal(np.unique(thinned[:, 1]), [0.5, 2.5])

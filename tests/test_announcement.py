@@ -21,7 +21,7 @@ from igsr.fitting.time_estimate import (
     slowdown,
     work_done,
 )
-from igsr.pose.colmap.time_estimate import camera_seconds
+from igsr.pose.colmap.estimator import camera_seconds
 
 #: A step that takes a microsecond per pixel.
 PER_PIXEL = StepTime(0.0, 1e-6, 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 
 import pytest
 import torch
@@ -11,23 +10,27 @@ from da3_networks import TINY, hashed_network, hashed_weight
 from safetensors.torch import save_file
 
 from igsr.errors import IgsrError
-from igsr.pose.da3 import checkpoint as module
-from igsr.pose.da3.checkpoint import VARIABLE, find_checkpoint, load_checkpoint, load_network
-from igsr.pose.da3.config import BASE, SIZES, SMALL, size_of
+from igsr.pose.checkpoint_search import find_checkpoint
+from igsr.pose.da3.backbone import BASE, SMALL
+from igsr.pose.da3.checkpoint import (
+    SIZES,
+    load_checkpoint,
+    load_network,
+    size_of,
+)
 
 NORM = "model.head.scratch.output_conv2_aux.{}.2.{}"
 
 
 @pytest.fixture(autouse=True)
-def tiny_in_place_of_small(monkeypatch):
+def tiny_as_small(monkeypatch):
     # The published sizes would be hundreds of megabytes on disk.
     monkeypatch.setitem(SIZES, "da3-small", TINY)
-    monkeypatch.setitem(module._WIDTHS, TINY.embed_dim, "da3-small")
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv("IGSR_DA3", raising=False)
 
 
-def published_keys():
-    """Weights as the hub's file has them: the shared norm once, under its first name."""
+def published_weights():
+    """Weights as in the published file: the shared norm once, under its first name."""
     weights = {f"model.{key}": t for key, t in hashed_network().state_dict().items()}
     for part in ("weight", "bias"):
         weights[NORM.format(0, part)] = weights.pop(NORM.format(3, part))
@@ -37,16 +40,9 @@ def published_keys():
     return weights
 
 
-@pytest.fixture
-def folder(tmp_path):
-    save_file(published_keys(), tmp_path / "model.safetensors")
-    (tmp_path / "config.json").write_text('{"model_name": "da3-small"}')
-    return tmp_path
-
-
-def changed(folder, **changes):
-    """The file with keys replaced (by None: removed); double underscores stand for dots."""
-    weights = published_keys()
+def saved(folder, **changes):
+    """Save weights with changes (None removes a key); double underscores stand for dots."""
+    weights = published_weights()
     for key, value in changes.items():
         key = "model." + key.replace("__", ".")
         weights.pop(key, None)
@@ -56,23 +52,33 @@ def changed(folder, **changes):
     return folder / "model.safetensors"
 
 
-def test_a_loaded_network_has_the_files_weights_and_the_shared_norm(folder, recwarn):
+@pytest.fixture
+def folder(tmp_path):
+    saved(tmp_path)
+    (tmp_path / "config.json").write_text('{"model_name": "da3-small"}')
+    return tmp_path
+
+
+def test_a_loaded_network_has_the_weights_of_the_file(folder, recwarn):
+    before = torch.serialization.get_safe_globals(), torch.get_rng_state()
     network = load_network(folder, "cpu")
     assert not recwarn.list
     for key, value in network.state_dict().items():
         assert torch.equal(value, hashed_weight(key, value.shape)), key
     norm = network.head.scratch["output_conv2_aux"]["3"][2]
     assert not torch.equal(norm.weight, torch.ones(32))
+    assert torch.serialization.get_safe_globals() == before[0]
+    assert torch.equal(torch.get_rng_state(), before[1])
 
 
-def test_a_file_that_has_the_norm_under_the_name_that_is_used(folder):
-    weights = published_keys()
+def test_the_shared_norm_under_either_name(folder):
+    weights = published_weights()
     used = {part: weights.pop(NORM.format(0, part)) for part in ("weight", "bias")}
     weights |= {NORM.format(3, part): value for part, value in used.items()}
     save_file(weights, folder / "model.safetensors")
     found = load_checkpoint(folder).weights
     assert torch.equal(found["head.scratch.output_conv2_aux.3.2.weight"], used["weight"])
-    # Both names are well if they agree.
+    # Both names are accepted if they agree.
     weights |= {NORM.format(0, part): value.clone() for part, value in used.items()}
     save_file(weights, folder / "model.safetensors")
     assert load_checkpoint(folder).unknown == []
@@ -82,128 +88,113 @@ def test_a_file_that_has_the_norm_under_the_name_that_is_used(folder):
         load_checkpoint(folder)
 
 
-def test_a_file_alone_tells_its_size_by_its_shapes(folder):
+def test_the_shapes_give_the_size_without_a_config(folder):
     (folder / "config.json").unlink()
-    assert load_checkpoint(folder / "model.safetensors").name == "da3-small"
+    assert load_checkpoint(folder / "model.safetensors").config == TINY
 
 
 def test_half_precision_becomes_float32(folder):
-    weights = {key: value.to(torch.bfloat16) for key, value in published_keys().items()}
+    weights = {key: value.to(torch.bfloat16) for key, value in published_weights().items()}
     save_file(weights, folder / "model.safetensors")
     found = load_checkpoint(folder).weights
     assert {value.dtype for value in found.values()} == {torch.float32}
 
 
-def test_loading_leaves_torchs_safe_globals_and_generator(folder):
-    before = torch.serialization.get_safe_globals(), torch.get_rng_state()
-    load_network(folder, "cpu")
-    assert torch.serialization.get_safe_globals() == before[0]
-    assert torch.equal(torch.get_rng_state(), before[1])
-
-
-def test_keys_without_a_use_are_listed(folder):
-    path = changed(folder, head__sky__weight=torch.zeros(2), more=torch.zeros(1))
-    with pytest.warns(UserWarning, match=r"no use for.*: model\.head\.sky\.weight, model\.more"):
+def test_ignored_keys_are_listed(folder):
+    path = saved(folder, head__sky__weight=torch.zeros(2), more=torch.zeros(1))
+    with pytest.warns(UserWarning, match=r"were ignored: model\.head\.sky\.weight, model\.more"):
         load_network(path, "cpu")
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("key", "value", "message"),
     [
+        ("backbone__pretrained__norm__bias", None, r"has no model\.backbone\.pretrained\.norm\.b"),
+        ("head__scratch__output_conv2_aux__0__2__weight", None, r"has no .*aux\.0\.2\.weight"),
         (
-            {"backbone__pretrained__norm__bias": None},
-            r"has no model\.backbone\.pretrained\.norm\.b",
-        ),
-        ({"head__scratch__output_conv2_aux__0__2__weight": None}, r"has no .*aux\.0\.2\.weight"),
-        (
-            {"backbone__pretrained__camera_token": torch.zeros(1, 1, 32)},
-            r"camera_token has shape \[1, 1, 32\] where \[1, 2, 32\] belongs",
+            "backbone__pretrained__camera_token",
+            torch.zeros(1, 1, 32),
+            r"camera_token has shape \[1, 1, 32\] instead of \[1, 2, 32\]",
         ),
         (
-            {"head__norm__weight": torch.zeros(64, dtype=torch.int32)},
-            r"head\.norm\.weight is no array of floats",
+            "head__norm__weight",
+            torch.zeros(64, dtype=torch.int32),
+            r"head\.norm\.weight is not an array of floats",
         ),
         (
-            {"head__norm__weight": torch.full((64,), torch.nan)},
-            r"head\.norm\.weight holds numbers that are not finite",
+            "head__norm__weight",
+            torch.full((64,), torch.nan),
+            r"head\.norm\.weight has values that are not finite",
         ),
         (
-            {"backbone__pretrained__blocks__12__norm1__weight": torch.zeros(32)},
+            "backbone__pretrained__blocks__12__norm1__weight",
+            torch.zeros(32),
             "larger model .* non-commercial",
         ),
     ],
 )
-def test_a_damaged_or_another_file_is_refused_by_name(folder, changes, message):
-    path = changed(folder, **changes)
+def test_damaged_and_other_files_are_refused_by_name(folder, key, value, message):
     with pytest.raises(IgsrError, match=message):
-        load_checkpoint(path)
+        load_checkpoint(saved(folder, **{key: value}))
 
 
-def test_what_is_no_checkpoint(folder, tmp_path):
+def test_files_that_are_not_checkpoints(folder, tmp_path):
     path = folder / "model.safetensors"
     whole = path.read_bytes()
     for content in (b"", b"<!doctype html><title>404</title>", whole[:5000], b"\xff" * 200):
         path.write_bytes(content)
-        with pytest.raises(IgsrError, match="damaged or no safetensors"):
+        with pytest.raises(IgsrError, match="damaged or not safetensors"):
             load_checkpoint(path)
-    with pytest.raises(IgsrError, match="is no file"):
+    with pytest.raises(IgsrError, match="does not exist"):
         load_checkpoint(tmp_path / "none.safetensors")
     other = tmp_path / "weights.pth"
     other.write_bytes(b"x")
-    with pytest.raises(IgsrError, match=r"no \.safetensors file"):
+    with pytest.raises(IgsrError, match=r"not a \.safetensors file"):
         load_checkpoint(other)
     (folder / "config.json").unlink()
     save_file({"a": torch.zeros(1)}, path)
-    with pytest.raises(IgsrError, match="no checkpoint of Depth Anything 3 SMALL or BASE"):
+    with pytest.raises(IgsrError, match="not a checkpoint of Depth Anything 3 SMALL or BASE"):
         load_checkpoint(path)
 
 
-def test_a_config_beside_it_that_cannot_be_read(folder):
-    for content in ("{", "[" * 100_000, " " * 200_000):
-        (folder / "config.json").write_text(content)
-        with pytest.raises(IgsrError, match=r"config\.json cannot be read"):
-            load_checkpoint(folder)
+@pytest.mark.parametrize("content", ["{", "[]", "null", "[" * 100_000, " " * 200_000])
+def test_a_config_that_cannot_be_read(folder, content):
+    (folder / "config.json").write_text(content)
+    with pytest.raises(IgsrError, match=r"config\.json cannot be read"):
+        load_checkpoint(folder)
 
 
-def hub_config(name, config, net):
-    """A config.json in the layout of the hub's."""
+def published_config(name, config, net):
+    """A config.json in the layout of the published ones."""
     dim = config.embed_dim
 
     def part(cls, **sizes):
         return {"__object__": {"path": "os", "name": cls, "args": "as_params"}, **sizes}
 
+    blocks = {"alt_start": 4, "qknorm_start": 4, "rope_start": 4, "cat_token": True}
+    head = {"output_dim": 2, "features": config.features, "out_channels": [*config.out_channels]}
     return {
         "model_name": name,
         "config": {
-            "net": part(
-                "DinoV2",
-                name=net,
-                out_layers=[5, 7, 9, 11],
-                alt_start=4,
-                qknorm_start=4,
-                rope_start=4,
-                cat_token=True,
-            ),
-            "head": part(
-                "DualDPT",
-                dim_in=2 * dim,
-                output_dim=2,
-                features=config.features,
-                out_channels=list(config.out_channels),
-            ),
+            "net": part("DinoV2", name=net, out_layers=[5, 7, 9, 11], **blocks),
+            "head": part("DualDPT", dim_in=2 * dim, **head),
             "cam_enc": part("CameraEnc", dim_out=dim),
             "cam_dec": part("CameraDec", dim_in=2 * dim),
         },
     }
 
 
-def test_sizes_by_the_hubs_configuration():
-    big, small = hub_config("da3-base", BASE, "vitb"), hub_config("da3-small", SMALL, "vits")
-    SIZES["da3-small"] = SMALL  # the fixture takes it back
+def test_sizes_of_the_published_configs():
+    big = published_config("da3-base", BASE, "vitb")
+    small = published_config("da3-small", SMALL, "vits")
+    SIZES["da3-small"] = SMALL  # the fixture restores it
     assert size_of(big, "c") == "da3-base"
     assert size_of(small, "c") == "da3-small"
     assert size_of({"config": big["config"]}, "c") == "da3-base"
     assert size_of({"model_name": "da3-base"}, "c") == "da3-base"
+    # The camera encoder is only needed for known cameras.
+    del big["config"]["cam_enc"]
+    assert size_of(big, "c") == "da3-base"
 
 
 @pytest.mark.parametrize(
@@ -221,34 +212,33 @@ def test_sizes_by_the_hubs_configuration():
     ],
 )
 def test_a_number_of_another_network_is_refused_by_name(part, entry, value):
-    content = hub_config("da3-base", BASE, "vitb")
+    content = published_config("da3-base", BASE, "vitb")
     content["config"][part][entry] = value
-    with pytest.raises(IgsrError, match=rf"c: its {part}\.{entry}.* is .* belongs"):
+    with pytest.raises(IgsrError, match=rf"c: {part}\.{entry}.* is .* instead of"):
         size_of(content, "c")
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        [],
         {},
         {"model_name": "da3-large"},
         {"model_name": ["da3-base"]},
         {"config": 3},
         {"config": {}},
         {"config": {"net": {"name": {}}}},
-        {"model_name": "da3-small", "config": hub_config("", BASE, "vitb")["config"]},
+        {"model_name": "da3-small", "config": published_config("", BASE, "vitb")["config"]},
     ],
 )
-def test_a_configuration_that_is_none(content):
+def test_configs_that_describe_no_network(content):
     with pytest.raises(IgsrError, match=r"^c"):
         size_of(json.loads(json.dumps(content)), "c")
 
 
-def test_where_checkpoints_are_looked_for(folder, tmp_path, monkeypatch):
+def test_where_checkpoints_are_searched(folder, tmp_path, monkeypatch):
     cache = tmp_path / "hub"
     monkeypatch.setenv("HF_HUB_CACHE", str(cache))
-    assert find_checkpoint() is None
+    assert find_checkpoint("da3") is None
     files = {}
     for size in ("SMALL", "BASE"):
         model = cache / f"models--depth-anything--DA3-{size}"
@@ -257,23 +247,20 @@ def test_where_checkpoints_are_looked_for(folder, tmp_path, monkeypatch):
             files[size, revision].parent.mkdir(parents=True)
         (model / "refs").mkdir()
         (model / "refs" / "main").write_text("bbbb\n")
-    files["SMALL", "aaaa"].touch()
-    assert find_checkpoint() == files["SMALL", "aaaa"]
-    files["SMALL", "bbbb"].touch()
-    assert find_checkpoint() == files["SMALL", "bbbb"]
-    files["BASE", "aaaa"].touch()
-    assert find_checkpoint() == files["BASE", "aaaa"]
-    monkeypatch.setenv(VARIABLE, str(folder))
-    assert find_checkpoint() == folder / "model.safetensors"
-    assert find_checkpoint(files["SMALL", "aaaa"]) == files["SMALL", "aaaa"]
+    for file in (("SMALL", "aaaa"), ("SMALL", "bbbb"), ("BASE", "aaaa")):
+        files[file].touch()
+        assert find_checkpoint("da3") == files[file]
+    monkeypatch.setenv("IGSR_DA3", str(folder))
+    assert find_checkpoint("da3") == folder / "model.safetensors"
+    assert find_checkpoint("da3", files["SMALL", "aaaa"]) == files["SMALL", "aaaa"]
     for missing in (tmp_path / "none", tmp_path / "a\0b", cache):
-        with pytest.raises(IgsrError, match=re.escape("checkpoint names")):
-            find_checkpoint(missing)
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
+        with pytest.raises(IgsrError, match="checkpoint names"):
+            find_checkpoint("da3", missing)
+    monkeypatch.setenv("IGSR_DA3", str(tmp_path / "none"))
     with pytest.raises(IgsrError, match="IGSR_DA3 names"):
-        find_checkpoint()
+        find_checkpoint("da3")
 
 
-def test_a_device_that_is_not_there(folder):
+def test_a_missing_device(folder):
     with pytest.raises(IgsrError, match="device 'cuda:93' cannot hold the network"):
         load_network(folder, "cuda:93")

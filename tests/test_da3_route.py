@@ -1,4 +1,4 @@
-"""The Depth Anything 3 route, photos to estimate, with exact depths in the network's place."""
+"""Depth Anything 3 from photos to an estimate, with exact predictions and with the network."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
 from igsr.pose import FoundCameras, estimate, read_found
 from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.da3 import passes
-from igsr.pose.da3.chunks import chunks_of, joined
-from igsr.pose.da3.confidence import trusted_depths
-from igsr.pose.da3.config import BASE, SIZES
+from igsr.pose.da3 import prediction
+from igsr.pose.da3.backbone import BASE
+from igsr.pose.da3.checkpoint import SIZES
 from igsr.pose.da3.estimator import Da3, with_shared_focals
-from igsr.pose.da3.passes import Da3Predictor, memory_of_pass, resamplings_of
-from igsr.pose.da3.preprocessing import resampling_of
+from igsr.pose.da3.passes import joined_passes, passes_of
+from igsr.pose.da3.prediction import Da3Predictor, memory_of_pass, resampling_of
+from igsr.pose.depth_maps import trusted_depths
 
 SIZE = 64
 
@@ -47,7 +47,7 @@ def spheres(camera, pixels):
 
 
 def scene(count, width=SIZE, height=SIZE, step=0.25):
-    """Cameras on a ring and photos of noise."""
+    """Cameras on a ring, and photos of noise."""
     random = np.random.default_rng(count)
     cameras, photos = [], []
     for i in range(count):
@@ -61,11 +61,11 @@ def scene(count, width=SIZE, height=SIZE, step=0.25):
 
 
 class ExactPredictor:
-    """Exact depths and cameras, every pass in a world and a unit of its own."""
+    """Predicts exact depths and cameras, every pass in another world and unit."""
 
-    def __init__(self, cameras, photos, most=99, worlds=True):
+    def __init__(self, cameras, photos, most=99):
         self.cameras = {photo.name: camera for photo, camera in zip(photos, cameras, strict=True)}
-        self.most, self.worlds = most, worlds
+        self.most = most
         self.shown = []
 
     def most_photos(self, photos):
@@ -89,7 +89,7 @@ class ExactPredictor:
 
 
 def unadjusted(*arguments, **more):
-    """The estimator without bundle adjustment: photos here are noise, without features to match."""
+    """The estimator without bundle adjustment, since photos of noise have no matches."""
     return Da3(*arguments, bundle_adjustment=False, **more)
 
 
@@ -119,11 +119,11 @@ def test_cameras_depths_and_points_of_one_pass(count, size):
         assert trusted.mean() > 0.1
 
 
-def test_thirty_three_photos_in_passes_become_one_world():
+def test_several_passes_are_joined_in_one_world():
     cameras, photos = scene(33, step=0.18)
     predictor = ExactPredictor(cameras, photos, most=12)
-    told = []
-    found = unadjusted(predictor)(photos, progress=lambda *what: told.append(what))
+    calls = []
+    found = unadjusted(predictor)(photos, progress=lambda *call: calls.append(call))
     assert len(predictor.shown) > 2
     assert max(len(shown) for shown in predictor.shown) <= 12
     check_cameras(found.cameras, cameras)
@@ -134,27 +134,24 @@ def test_thirty_three_photos_in_passes_become_one_world():
         for camera in cameras
     ]
     np.testing.assert_allclose(depths, truth, rtol=1e-4)
-    assert told[-1][0] == "passes"
-    assert told[-1][1] == told[-1][2] == sum(len(shown) for shown in predictor.shown)
+    total = sum(len(shown) for shown in predictor.shown)
+    assert calls[-1] == ("passes", total, total)
 
 
 @pytest.mark.parametrize(("count", "most"), [(33, 32), (33, 12), (200, 32), (5, 4), (7, 2), (9, 3)])
-def test_every_photo_is_in_a_pass_and_every_pass_is_joined_to_the_others(count, most):
-    plan = chunks_of(count, most)
+def test_every_photo_is_in_a_pass_and_all_passes_overlap(count, most):
+    plan = passes_of(count, most)
     assert set(itertools.chain(*plan)) == set(range(count))
-    assert all(len(chunk) <= most and chunk == sorted(set(chunk)) for chunk in plan)
+    assert all(len(part) <= most and part == sorted(set(part)) for part in plan)
     seen = set(plan[0])
-    for chunk in plan[1:]:
-        assert len(seen & set(chunk)) >= max(1, most // 4)
-        assert set(chunk) - seen
-        seen |= set(chunk)
+    for part in plan[1:]:
+        assert len(seen & set(part)) >= max(1, most // 4)
+        assert set(part) - seen
+        seen |= set(part)
+    assert passes_of(32, 32) == [list(range(32))]
 
 
-def test_photos_that_fit_are_one_pass():
-    assert chunks_of(32, 32) == [list(range(32))]
-
-
-def test_wrong_pixels_of_shared_photos_move_nothing():
+def test_wrong_pixels_of_shared_photos_have_no_influence():
     cameras, photos = scene(6)
     predictor = ExactPredictor(cameras, photos)
     one = dict(enumerate(predictor(photos[:4], None, 0)))
@@ -162,12 +159,12 @@ def test_wrong_pixels_of_shared_photos_move_nothing():
     depth = two[2].depth.copy()
     depth[:20] *= 3.0  # a third of one shared photo of two
     two[2] = replace(two[2], depth=depth)
-    world, lost = joined([one, two])
+    world, lost = joined_passes([one, two])
     assert lost == []
     check_cameras([world[i].camera for i in range(6)], cameras, degrees=0.1)
 
 
-def test_a_pass_that_shares_nothing_sure_is_not_registered():
+def test_a_pass_without_confident_shared_pixels_is_not_registered():
     cameras, photos = scene(6)
     predictor = ExactPredictor(cameras, photos, most=4)
     exact = predictor.aligned
@@ -186,36 +183,17 @@ def test_a_pass_that_shares_nothing_sure_is_not_registered():
     assert found.warnings[0].startswith(f"Not registered: {', '.join(missing)}. Their pass shares")
 
 
-def test_a_prediction_that_is_no_camera_is_not_registered():
+def test_an_invalid_camera_is_not_registered():
     cameras, photos = scene(4)
     predictor = ExactPredictor(cameras, photos)
     exact = predictor.aligned
     predictor.aligned = lambda photo, world: None if photo.name == "01.png" else exact(photo, world)
     found = unadjusted(predictor)(photos)
     assert [one is None for one in found.cameras] == [False, True, False, False]
-    assert "Not registered: 01.png. What Depth Anything 3 predicts" in found.warnings[0]
+    assert "Not registered: 01.png. Depth Anything 3 predicts no valid camera" in found.warnings[0]
 
 
-def test_photos_that_are_the_same_picture_have_the_same_camera():
-    cameras, photos = scene(3)
-    copies = [photos[0], replace(photos[0], name="copy.png"), *photos[1:]]
-    predictor = ExactPredictor(cameras, photos)
-    found = unadjusted(predictor)(copies)
-    assert predictor.shown == [["00.png", "01.png", "02.png"]]
-    np.testing.assert_array_equal(found.cameras[0].viewmat, found.cameras[1].viewmat)
-    check_cameras([found.cameras[i] for i in (0, 2, 3)], cameras)
-
-
-def test_photos_of_which_no_two_differ():
-    _, photos = scene(1)
-    copies = [replace(photos[0], name=f"{n}.png") for n in range(3)]
-    with pytest.raises(IgsrError, match=r"2 different photos at least; all are the same as 0\.png"):
-        unadjusted(ExactPredictor([], []))(copies)
-    with pytest.raises(IgsrError, match=r"from 2 different photos at least$"):
-        unadjusted(ExactPredictor([], []))(photos)
-
-
-def test_cameras_at_one_place_are_told_of():
+def test_cameras_at_one_place_give_a_warning():
     cameras, photos = scene(3)
     here = []
     for camera in cameras:
@@ -241,7 +219,7 @@ def test_one_camera_has_one_focal_length():
     assert with_shared_focals(photos[:1], [None]) == [None]
 
 
-def test_known_cameras_stay_and_set_world_and_unit():
+def test_known_cameras_are_kept_and_define_the_world():
     cameras, photos = scene(9)
     off = cameras[4].K.copy()
     off[0, 2] += 0.2 * SIZE
@@ -256,7 +234,7 @@ def test_known_cameras_stay_and_set_world_and_unit():
     assert found.warnings == []
     given["04.png"] = replace(cameras[4], K=off)
     found = unadjusted(predictor, cameras=given)(photos)
-    assert found.warnings[0].startswith("The principal point is far from the middle of 04.png")
+    assert found.warnings[0].startswith("The principal point of 04.png is far from the center")
 
 
 @pytest.mark.parametrize(
@@ -278,7 +256,7 @@ def test_known_cameras_that_cannot_be_used(change, message):
         unadjusted(ExactPredictor(cameras, photos), cameras=change(given))(photos)
 
 
-def test_what_only_one_photo_says_is_not_trusted():
+def test_a_depth_of_a_single_photo_is_not_trusted():
     cameras, photos = scene(6)
     predictor = ExactPredictor(cameras, photos)
     exact = predictor(photos, None, 0)
@@ -288,14 +266,14 @@ def test_what_only_one_photo_says_is_not_trusted():
     after = trusted_depths([*exact[:2], replace(exact[2], depth=wrong), *exact[3:]])
     assert before[2][20:30, 20:40].mean() > 0.2
     assert after[2][20:30, 20:40].mean() < 0.02
-    # A step of depth is an edge, whose pixels are of neither side.
+    # The pixels at a step in depth are not trusted.
     steps = np.abs(np.diff(exact[0].depth, axis=1)) > 0.05 * exact[0].depth[:, 1:]
     assert steps.any()
     assert not (before[0][:, 1:] & steps).any()
     assert not (before[0][:, :-1] & steps).any()
 
 
-def test_masked_and_transparent_pixels_weigh_nothing():
+def test_masked_and_transparent_pixels_have_no_confidence():
     _, photos = scene(2)
     image = np.dstack([photos[0].image, np.full((SIZE, SIZE), 255, np.uint8)])
     image[:, :32, 3] = 0
@@ -309,29 +287,18 @@ def test_masked_and_transparent_pixels_weigh_nothing():
     assert (second.confidence > 1.0).all()
 
 
-def test_photos_of_almost_one_size_are_shown_at_one():
-    def photo(width, height):
-        return Photo(f"{width}x{height}", np.zeros((height, width, 3), np.uint8))
-
-    shown = resamplings_of([photo(400, 300), photo(400, 300), photo(400, 290), photo(300, 400)])
-    assert [(one.width, one.height) for one in shown] == [(504, 378)] * 3 + [(378, 504)]
-    assert shown[2].grid().scale_y == pytest.approx(290 / 378)
-    with pytest.raises(IgsrError, match="400x3: a photo of 400x3 pixels is too narrow"):
-        resamplings_of([photo(400, 3)])
-
-
 @pytest.fixture
 def small_photos(monkeypatch):
-    """Photos of two formats, shown small so that the network is fast."""
-    usual = passes.resampling_of
-    monkeypatch.setattr(passes, "resampling_of", lambda w, h, _: usual(w, h, 70))
+    """Portrait and landscape photos, resampled to few pixels so that the network is fast."""
+    usual = prediction.resampling_of
+    monkeypatch.setattr(prediction, "resampling_of", lambda w, h: usual(w, h, 70))
     _, photos = scene(3, 64, 40)
     high = replace(photos[2], image=np.ascontiguousarray(photos[2].image.swapaxes(0, 1)))
     return [*photos[:2], high]
 
 
 @pytest.mark.parametrize("source", ["decoder", "rays"])
-def test_the_network_itself_on_photos_of_two_formats(small_photos, source):
+def test_the_network_on_portrait_and_landscape_photos(small_photos, source):
     estimator = unadjusted(Da3Predictor(hashed_network(), source))
     one, again = estimator(small_photos, seed=1), estimator(small_photos, seed=1)
     for photo, camera, depth, other in zip(
@@ -346,7 +313,7 @@ def test_the_network_itself_on_photos_of_two_formats(small_photos, source):
         np.testing.assert_array_equal(camera.viewmat, other.viewmat)
 
 
-def test_from_a_checkpoint_by_name(small_photos, tmp_path, monkeypatch):
+def test_a_named_checkpoint(small_photos, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "none"))
     monkeypatch.delenv("IGSR_DA3", raising=False)
     with pytest.raises(IgsrError, match="igsr weights fetch da3-base"):
@@ -356,37 +323,39 @@ def test_from_a_checkpoint_by_name(small_photos, tmp_path, monkeypatch):
     weights = {f"model.{key}": value for key, value in network.state_dict().items()}
     save_file(weights, tmp_path / "model.safetensors")
     (tmp_path / "config.json").write_text('{"model_name": "da3-small"}')
-    monkeypatch.setattr(passes, "SHORTEST", 0.0)
-    monkeypatch.setattr(passes, "LONGEST", np.inf)
+    monkeypatch.setattr(prediction, "MIN_FOCAL", 0.0)
+    monkeypatch.setattr(prediction, "MAX_FOCAL", np.inf)
     name, found = estimate(small_photos, "da3", checkpoint=tmp_path)
     assert name == "da3"
     assert all(camera is not None for camera in found.cameras)
     content = (tmp_path / "model.safetensors").read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     assert found.weights == {"name": "da3-small", "licence": "Apache-2.0", "sha256": digest}
-    # What is kept of the cameras has the licence too.
+    # The license is kept with the cameras.
     kept = FoundCameras.of(small_photos, found, {"estimator": "da3"})
     (tmp_path / "found.npz").write_bytes(kept.to_bytes())
     assert read_found(tmp_path / "found.npz").estimate.weights == found.weights
 
 
-def test_numbers_that_are_not_finite_are_the_checkpoints_fault(small_photos):
+def test_predictions_that_are_not_finite(small_photos):
     network = hashed_network()
     network.cam_dec.fc_t.bias.data.fill_(torch.nan)
-    with pytest.raises(IgsrError, match=r"not finite for 00\.png; its checkpoint is damaged"):
+    with pytest.raises(IgsrError, match=r"predictions for 00\.png are not finite"):
         unadjusted(Da3Predictor(network))(small_photos)
 
 
 def test_passes_are_as_large_as_memory_allows(monkeypatch):
     predictor, photos = Da3Predictor(hashed_network()), scene(4, 640, 480)[1]
-    assert predictor.most_photos(photos) == passes.MOST_ON_CPU
+    assert predictor.most_photos(photos) == prediction.MAX_PHOTOS_ON_CPU
     pixels = 504 * 378
     for wanted in (31, 7, 2):
-        free = memory_of_pass(predictor.network.config, wanted, pixels) / passes.USABLE
-        monkeypatch.setattr(passes, "available_memory", lambda free=free: free + 1)
+        free = memory_of_pass(predictor.network.config, wanted, pixels) / prediction.USABLE_MEMORY
+        monkeypatch.setattr(prediction, "available_memory", lambda free=free: free + 1)
         assert predictor.most_photos(photos) == wanted
-    monkeypatch.setattr(passes, "available_memory", lambda: free - 10)
-    with pytest.raises(IgsrError, match=r"needs \d.\d GB for two photos and \d.\d GB are free"):
+    monkeypatch.setattr(prediction, "available_memory", lambda: free - 10)
+    with pytest.raises(
+        IgsrError, match=r"needs \d.\d GB for two photos, but only \d.\d GB are free"
+    ):
         predictor.most_photos(photos)
     assert memory_of_pass(BASE, 16, pixels) < 6e9
 

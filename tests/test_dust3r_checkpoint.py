@@ -1,4 +1,4 @@
-"""Checkpoints of DUSt3R: found, loaded, and refused with a sentence."""
+"""Checkpoints of DUSt3R: found, loaded, and refused with a message."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from safetensors.torch import save_file
 
 import igsr.pose.dust3r.checkpoint
 from igsr.errors import IgsrError
-from igsr.pose.dust3r.checkpoint import find_checkpoint, load_checkpoint, load_network
+from igsr.pose.checkpoint_search import find_checkpoint
+from igsr.pose.dust3r.checkpoint import load_checkpoint, load_network
 
 
 def call_of(config, **changes):
@@ -54,16 +55,16 @@ def saved(path, weights=None, call=None, **more):
 
 
 def refusal(path):
-    """The sentence that a checkpoint is refused with."""
+    """The message that a checkpoint is refused with."""
     with pytest.raises(IgsrError) as caught:
         load_checkpoint(path)
-    sentence = str(caught.value)
-    assert str(path.parent) in sentence
-    assert "\n" not in sentence
-    return sentence
+    message = str(caught.value)
+    assert str(path.parent) in message
+    assert "\n" not in message
+    return message
 
 
-def test_a_checkpoint_comes_back_as_the_network_that_was_saved(tmp_path):
+def test_a_loaded_network_is_the_saved_one(tmp_path):
     weights = small_weights()
     path = saved(tmp_path / "a.pth", {**weights, "mask_token": torch.zeros(1, 1, 8)})
     checkpoint = load_checkpoint(path)
@@ -79,7 +80,7 @@ def test_a_checkpoint_comes_back_as_the_network_that_was_saved(tmp_path):
     assert torch.equal(network.encode(image).features, expected)
 
 
-def test_safetensors_with_the_sizes_beside_them(tmp_path):
+def test_safetensors_with_a_config(tmp_path):
     path = tmp_path / "model.safetensors"
     save_file({key: t.half() for key, t in small_weights().items()}, path)
     assert "config.json" in refusal(path)
@@ -104,20 +105,14 @@ def test_safetensors_with_the_sizes_beside_them(tmp_path):
         assert torch.equal(checkpoint.weights[key], weight.half().float())
     path.write_bytes(path.read_bytes()[:-10])
     assert "damaged" in refusal(path)
-    for text in (
-        "[]",
-        "{",
-        "[" * 5000,
-        '{"enc_depth": 1}',
-        json.dumps({**config, "dec_depth": 1e9}),
-    ):
+    for text in ("[]", '{"enc_depth": 1}', json.dumps({**config, "dec_depth": 1e9})):
         (tmp_path / "config.json").write_text(text)
         assert "config.json" in refusal(path)
 
 
-def test_weights_under_the_name_that_repeats_another_are_found(tmp_path):
+def test_weights_under_a_second_name(tmp_path):
     config = replace(SMALL, head="dpt")
-    # One stored number for all of each tensor's places keeps the file small.
+    # Expanded tensors keep the file small.
     weights = {
         key: torch.zeros(1).expand(t.shape) for key, t in empty_network(config).state_dict().items()
     }
@@ -154,15 +149,15 @@ def test_missing_keys_and_wrong_shapes_are_refused_by_name(tmp_path):
 def test_unknown_keys_are_listed(tmp_path):
     more = {f"downstream_head1.act_{n}_postprocess.weight": torch.zeros(3) for n in range(30)}
     path = saved(tmp_path / "a.pth", {**small_weights(), **more, 7: torch.zeros(1)})
-    assert "that are no text" in refusal(path)
+    assert "that are not text" in refusal(path)
     path = saved(path, {**small_weights(), **more})
     assert load_checkpoint(path).unknown == sorted(more)
     with pytest.warns(UserWarning, match=r"act_0_postprocess.weight, .* and 10 more\."):
         load_network(path, "cpu")
 
 
-def test_the_licence_is_told_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(igsr.pose.dust3r.checkpoint, "_licence_shown", False)
+def test_the_license_is_shown_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(igsr.pose.dust3r.checkpoint, "_license_shown", False)
     path = saved(tmp_path / "a.pth")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -172,7 +167,7 @@ def test_the_licence_is_told_once(tmp_path, monkeypatch):
 
 
 class Order:
-    """What a hostile pickle is made of."""
+    """Runs code when it is unpickled."""
 
     def __init__(self, path):
         self.path = path
@@ -213,14 +208,14 @@ def test_hostile_checkpoints_run_nothing(tmp_path):
         (call_of(SMALL, dec_num_heads="1.0"), "decoder_heads"),
     ],
 )
-def test_calls_that_make_no_network(tmp_path, call, named):
+def test_calls_that_describe_no_network(tmp_path, call, named):
     settings = argparse.Namespace(model=call)
     path = tmp_path / "a.pth"
     torch.save({"args": settings, "model": {}}, path)
     assert named in refusal(path)
 
 
-def test_containers_that_are_no_checkpoints(tmp_path):
+def test_files_that_are_not_checkpoints(tmp_path):
     path = tmp_path / "a.pth"
     refusal(path)
     refusal(tmp_path)
@@ -278,48 +273,35 @@ def touched(path):
     return path
 
 
-def test_checkpoints_are_looked_for_where_they_lie(caches, monkeypatch):
-    assert find_checkpoint() is None
+def test_where_checkpoints_are_searched(caches, monkeypatch):
+    assert find_checkpoint("dust3r") is None
     touched(caches / "torch/hub/checkpoints/other.pth")
-    assert find_checkpoint() is None
+    assert find_checkpoint("dust3r") is None
     small = "DUSt3R_ViTLarge_BaseDecoder_224_linear"
     large = "DUSt3R_ViTLarge_BaseDecoder_512_dpt"
     expected = touched(caches / f"torch/hub/checkpoints/{small}.pth")
-    assert find_checkpoint() == expected
+    assert find_checkpoint("dust3r") == expected
     snapshots = caches / f"hf/hub/models--naver--{large}"
     expected = touched(snapshots / "snapshots/bbb/model.safetensors")
-    assert find_checkpoint() == expected
+    assert find_checkpoint("dust3r") == expected
     touched(snapshots / "snapshots/aaa/model.safetensors")
     touched(snapshots / "refs/main").write_text("bbb\n")
-    assert find_checkpoint() == expected
+    assert find_checkpoint("dust3r") == expected
     expected = touched(caches / f"torch/hub/checkpoints/{large}.pth")
-    assert find_checkpoint() == expected
-    mine = touched(caches / "mine.pth")
+    assert find_checkpoint("dust3r") == expected
+    mine, named = touched(caches / "mine.pth"), touched(caches / "named.pth")
     monkeypatch.setenv("IGSR_DUST3R", str(mine))
-    assert find_checkpoint() == mine
-    named = touched(caches / "named.pth")
-    assert find_checkpoint(named) == named
-    with pytest.raises(IgsrError, match=r"checkpoint names .*gone\.pth"):
-        find_checkpoint(caches / "gone.pth")
-    with pytest.raises(IgsrError, match="checkpoint names"):
-        find_checkpoint("a\0b")
+    assert find_checkpoint("dust3r") == mine
+    assert find_checkpoint("dust3r", named) == named
     monkeypatch.setenv("IGSR_DUST3R", str(caches / "gone.pth"))
     with pytest.raises(IgsrError, match=r"IGSR_DUST3R names .*gone\.pth"):
-        find_checkpoint()
-
-
-def test_devices_that_are_not_there(tmp_path):
-    path = saved(tmp_path / "a.pth")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(IgsrError, match="device 'toaster'"):
-            load_network(path, "toaster")
+        find_checkpoint("dust3r")
 
 
 @pytest.mark.parametrize(
     "before", [[], [argparse.Namespace], [argparse.Namespace, zipfile.ZipInfo]]
 )
-def test_torchs_safe_globals_are_left_as_they_were(tmp_path, before):
+def test_torchs_safe_globals_are_restored(tmp_path, before):
     path = saved(tmp_path / "a.pth")
     damaged = tmp_path / "b.pth"
     damaged.write_bytes(path.read_bytes()[:-100])

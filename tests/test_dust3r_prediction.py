@@ -1,7 +1,8 @@
-"""Photos to pointmaps: what the network is shown, which pairs, and what is kept."""
+"""DUSt3R from photos to pointmaps: crops, pairs and predictions."""
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -11,18 +12,15 @@ from dust3r_networks import SMALL, hashed_network
 
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
-from igsr.pose.dust3r.network import NetworkConfig
-from igsr.pose.dust3r.pairs import MOST_COMPLETE, pair_graph, usual_graph
+from igsr.pose.dust3r import prediction
+from igsr.pose.dust3r.estimator import MAX_COMPLETE_PHOTOS, default_graph, pair_graph
 from igsr.pose.dust3r.prediction import (
     DustPredictor,
-    _EncodedPhotos,
-    _View,
+    crop_of,
     grid_samples,
-    memory_bound,
+    network_input,
     stride_for,
 )
-from igsr.pose.dust3r.preprocessing import crop_of, network_input
-from igsr.pose.photo_samples import usable
 
 
 def photo(width, height, name="a.jpg", seed=0, mask=None, channels=3):
@@ -33,7 +31,7 @@ def photo(width, height, name="a.jpg", seed=0, mask=None, channels=3):
     return Photo(name, blocks[rows][:, columns], mask, None, None)
 
 
-# ---- preprocessing -------------------------------------------------------------------------------
+# ---- crops ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -54,7 +52,7 @@ def photo(width, height, name="a.jpg", seed=0, mask=None, channels=3):
         ((50, 50), 224, (224, 224)),
     ],
 )
-def test_what_the_network_is_shown(size, image_size, expected):
+def test_crops(size, image_size, expected):
     taken = photo(*size)
     crop = crop_of(taken, image_size)
     assert (crop.width, crop.height) == expected
@@ -62,7 +60,7 @@ def test_what_the_network_is_shown(size, image_size, expected):
     assert pixels.shape == (3, crop.height, crop.width)
     assert pixels.dtype == np.float32
     assert np.abs(pixels).max() <= 1.0
-    # What is cut off is the same on both sides, up to the odd pixel.
+    # Both sides lose the same, up to an odd pixel.
     assert 0 <= crop.resized_width - crop.width - 2 * crop.left <= 1
     assert 0 <= crop.resized_height - crop.height - 2 * crop.top <= 1
 
@@ -71,7 +69,7 @@ def test_what_the_network_is_shown(size, image_size, expected):
 @pytest.mark.parametrize(
     "size", [(1600, 1200), (300, 451), (700, 700), (1000, 333), (1279, 961), (511, 512)]
 )
-def test_grids_lead_back_to_the_photo(size, image_size):
+def test_a_spot_is_found_at_its_place(size, image_size):
     width, height = size
     centre = np.array([0.54 * width, 0.47 * height])
     row, column = np.indices((height, width)) + 0.5
@@ -91,7 +89,7 @@ def test_grids_lead_back_to_the_photo(size, image_size):
         row, column = np.indices(sampled.shape) + 0.5
         found = np.array([(column * sampled).sum(), (row * sampled).sum()]) / sampled.sum()
         found = found * [grid.scale_x, grid.scale_y] + [grid.offset_x, grid.offset_y]
-        # Half a pixel of the network is what mistaken pixel centres would cost.
+        # Wrong pixel centers would cost half a pixel of the network.
         assert np.abs(found - centre).max() < 0.05 * width / crop.resized_width
 
 
@@ -112,7 +110,7 @@ def test_transparent_and_masked_pixels():
     mask[:30] = True
     masked = Photo("d.png", taken.image, mask, None, None)
     grid = crop.grid(range(crop.width), range(crop.height))
-    shown = usable(masked, grid)
+    shown = grid.usable(masked)
     assert shown[:10, 40:].all()
     assert not shown[:, :30].any()
     assert not shown[20:].any()
@@ -128,7 +126,7 @@ def test_transparent_and_masked_pixels():
         (photo(40, 30, mask=np.ones((40, 30), bool)), "mask"),
     ],
 )
-def test_photos_that_cannot_be_shown(taken, named):
+def test_unusable_photos(taken, named):
     with pytest.raises(IgsrError, match=rf"^a\.jpg.*{named}"):
         crop_of(taken, 512)
 
@@ -157,11 +155,11 @@ def test_pair_graphs(kind, photos, expected):
     assert len(pairs) == len(set(pairs)) == 2 * len(expected)
     assert {pair for pair in pairs if pair[0] < pair[1]} == expected
     assert {(j, i) for i, j in pairs} == set(pairs)
-    # Both orders follow each other, and a photo's pairs are near each other.
+    # Both orders of a pair are adjacent, and pairs are sorted.
     assert [tuple(sorted(pair)) for pair in pairs] == sorted(2 * sorted(expected))
 
 
-def test_windows_of_all_photos_are_complete():
+def test_large_windows_and_default_ones():
     for kind in ("swin-6", "swin-999999999", "logwin-999999999-noncyclic"):
         pairs = pair_graph(kind, 7)
         if kind.startswith("swin"):
@@ -170,9 +168,11 @@ def test_windows_of_all_photos_are_complete():
     assert pair_graph("logwin", 20) == pair_graph("logwin-3", 20)
 
 
-@pytest.mark.parametrize("photos", [2, 3, 15, MOST_COMPLETE, MOST_COMPLETE + 1, 50, 500])
-def test_the_usual_graph_joins_all_and_grows_slowly(photos):
-    pairs = pair_graph(usual_graph(photos), photos)
+@pytest.mark.parametrize(
+    "photos", [2, 3, 15, MAX_COMPLETE_PHOTOS, MAX_COMPLETE_PHOTOS + 1, 50, 500]
+)
+def test_the_default_graph_joins_all_and_grows_slowly(photos):
+    pairs = pair_graph(default_graph(photos), photos)
     assert len(pairs) <= 20 * photos
     reached = {0}
     for i, j in 2 * pairs:
@@ -197,7 +197,7 @@ def test_the_usual_graph_joins_all_and_grows_slowly(photos):
         ("swin-3", 0),
     ],
 )
-def test_graphs_that_are_none(kind, photos):
+def test_invalid_graphs(kind, photos):
     with pytest.raises(IgsrError) as caught:
         pair_graph(kind, photos)
     assert (kind if photos > 1 else "at least two photos") in str(caught.value)
@@ -218,8 +218,9 @@ def test_graphs_that_are_none(kind, photos):
         (16, 2, 7, 2),
     ],
 )
-def test_grids_are_symmetric(side, longest, stride, samples):
-    assert stride_for(side, longest) == stride
+def test_samples_are_symmetric(monkeypatch, side, longest, stride, samples):
+    monkeypatch.setattr(prediction, "MAX_GRID_SIDE", longest)
+    assert stride_for(side) == stride
     pixels = grid_samples(side, stride)
     assert len(pixels) == samples <= longest
     assert pixels[0] == side - 1 - pixels[-1] >= 0
@@ -241,7 +242,7 @@ def photos():
 
 
 def directly(network, first, second):
-    """The network's maps of two photos, one after the other."""
+    """The network's maps of two photos."""
     with torch.inference_mode():
         tokens = [
             network.encode(torch.from_numpy(network_input(one, crop_of(one, 64))[None]))
@@ -251,7 +252,7 @@ def directly(network, first, second):
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_predictions_are_the_networks_in_the_order_of_the_pairs(network, photos, order):
+def test_predictions_in_the_order_of_pairs(network, photos, order):
     pairs = pair_graph("complete", 4)[::order]
     steps = []
     grids, predictions = DustPredictor(network)(photos, pairs, lambda *step: steps.append(step))
@@ -271,9 +272,10 @@ def test_predictions_are_the_networks_in_the_order_of_the_pairs(network, photos,
             np.testing.assert_allclose(got, wanted[0], rtol=1e-4, atol=1e-5)
 
 
-def test_grids_are_samples_of_the_surest_map(network, photos):
+def test_the_dense_map_is_the_most_confident_one(monkeypatch, network, photos):
+    monkeypatch.setattr(prediction, "MAX_GRID_SIDE", 20)
     pairs = [(0, 1), (1, 0), (0, 2), (2, 3), (2, 0)]
-    grids, predictions = DustPredictor(network, longest=20)(photos, pairs)
+    grids, predictions = DustPredictor(network)(photos, pairs)
     scores = [
         np.prod([m.confidence.double().mean() for m in directly(network, photos[i], photos[j])])
         for i, j in pairs
@@ -281,10 +283,13 @@ def test_grids_are_samples_of_the_surest_map(network, photos):
     for i, grid in enumerate(grids[:3]):
         own = grid.dense
         of_photo = [n for n, pair in enumerate(pairs) if pair[0] == i]
-        assert own.prediction == max(of_photo, key=lambda n: scores[n])
-        sampled = predictions[own.prediction]
-        assert np.array_equal(own.points[own.rows, own.columns], sampled.first_points)
-        assert np.array_equal(own.confidence[own.rows, own.columns], sampled.first_confidence)
+        sampled = predictions[max(of_photo, key=lambda n: scores[n])]
+        assert np.array_equal(
+            own.depth[np.ix_(own.rows, own.columns)], sampled.first_points[..., 2]
+        )
+        assert np.array_equal(
+            own.confidence[np.ix_(own.rows, own.columns)], sampled.first_confidence
+        )
         assert sampled.first_points.shape == (grid.height, grid.width, 3)
         assert max(grid.height, grid.width) <= 20
         for samples, count, scale, offset, whole_scale, whole_offset in (
@@ -293,7 +298,7 @@ def test_grids_are_samples_of_the_surest_map(network, photos):
             (own.rows, grid.height, grid.scale_y, grid.offset_y,
              own.grid.scale_y, own.grid.offset_y),
         ):  # fmt: skip
-            pixel = np.arange(own.grid.width + own.grid.height)[samples][:count] + 0.5
+            pixel = np.array(samples) + 0.5
             expected = pixel * whole_scale + whole_offset
             np.testing.assert_allclose((np.arange(count) + 0.5) * scale + offset, expected)
     assert grids[3].dense is None
@@ -301,25 +306,24 @@ def test_grids_are_samples_of_the_surest_map(network, photos):
 
 def test_each_photo_is_encoded_once_and_forgotten_after_its_last_pair(photos):
     network = hashed_network(SMALL)
-    encode, encoded = network.encode, []
+    encode, tokens, kept = network.encode, [], []
 
-    def counted(images):
-        encoded.append(images)
-        return encode(images)
+    def watched(images):
+        result = encode(images)
+        tokens.append(weakref.ref(result))
+        return result
 
-    network.encode = counted
-    DustPredictor(network)(photos, pair_graph("complete", 4))
-    assert len(encoded) == 4
-    pairs = [(0, 1), (1, 0), (1, 2)]
-    kept = _EncodedPhotos(network, [_View(one, SMALL, 64) for one in photos], pairs)
-    for pair, left in zip(pairs, [{0, 1}, {1}, set()], strict=True):
-        kept.batch([pair[0]])
-        kept.batch([pair[1]])
-        kept.release([pair])
-        assert set(kept.tokens) == left
+    network.encode = watched
+    DustPredictor(network)(
+        photos,
+        [(0, 1), (1, 2), (2, 3)],
+        lambda *step: kept.append(sum(token() is not None for token in tokens)),
+    )
+    assert len(tokens) == 4
+    assert kept == [1, 1, 0]
 
 
-def test_what_may_not_be_used_has_no_confidence(network, photos):
+def test_masked_pixels_have_no_confidence(network, photos):
     mask = np.ones((60, 80), dtype=bool)
     mask[:, 40:] = False
     masked = [replace(photos[0], mask=mask), photos[1]]
@@ -332,44 +336,18 @@ def test_what_may_not_be_used_has_no_confidence(network, photos):
     assert np.array_equal(found.first_points, whole.first_points)
 
 
-def test_the_same_photos_give_the_same_bits(network, photos):
-    pairs = pair_graph("swin-1", 4)
-    runs = [DustPredictor(network, longest=30)(photos, pairs)[1] for _ in range(2)]
-    for one, other in zip(*runs, strict=True):
-        assert np.array_equal(one.first_points, other.first_points)
-        assert np.array_equal(one.second_confidence, other.second_confidence)
-
-
-def test_pairs_and_checkpoints_that_cannot_be_used(photos):
+def test_predictions_that_are_not_finite(photos):
     network = hashed_network(SMALL)
-    for pair in ((0, 0), (0, 4), (-1, 0), (0,)):
-        with pytest.raises(IgsrError, match="pairs holds"):
-            DustPredictor(network)(photos, [(0, 1), pair])
-    with pytest.raises(IgsrError, match="longest"):
-        DustPredictor(network, longest=1)
     assert DustPredictor(network)(photos, [])[1] == []
     with torch.no_grad():
         network.downstream_head2.proj.bias[5] = torch.nan
-    with pytest.raises(IgsrError, match=r"wide\.jpg and tall\.jpg"):
+    with pytest.raises(IgsrError, match=r"predictions for wide\.jpg and tall\.jpg are not finite"):
         DustPredictor(network)(photos, [(0, 1)])
 
 
-def test_memory_stays_within_its_bound(network):
-    taken = [photo(64, 60, f"{n}.jpg", n) for n in range(4)]
-    pairs = pair_graph("complete", 4)
-    grids, predictions = DustPredictor(network, longest=20)(taken, pairs)
+def test_predictions_keep_no_larger_arrays(monkeypatch, network, photos):
+    monkeypatch.setattr(prediction, "MAX_GRID_SIDE", 20)
+    grids, predictions = DustPredictor(network)(photos, pair_graph("complete", 4))
     arrays = [a for p in predictions for a in vars(p).values() if isinstance(a, np.ndarray)]
+    arrays += [array for grid in grids for array in (grid.dense.depth, grid.dense.confidence)]
     assert all(array.base is None for array in arrays)
-    arrays += [array for grid in grids for array in (grid.dense.points, grid.dense.confidence)]
-    kept = sum(array.nbytes for array in arrays)
-    bound = memory_bound(SMALL, 4, len(pairs), longest=20)
-    assert 0.7 * bound.kept < kept <= bound.kept
-    # A device of 16 GB holds 15 photos in all their pairs, and what more photos add is their own.
-    published = NetworkConfig()
-    fifteen, fifty, hundred = (
-        memory_bound(published, n, len(pair_graph(usual_graph(n), n))) for n in (15, 50, 100)
-    )
-    assert sum(fifteen) < 8e9
-    assert 4 * 571_000_000 < fifteen.device < fifty.device < 5e9
-    assert fifty.kept < 0.6e9
-    assert hundred.kept == 2 * fifty.kept

@@ -194,9 +194,8 @@ def points_of(capture, per_photo=60):
     xyz, xy = [], []
     for camera in (capture.views[k].camera for k in numbers):
         pixels = random.uniform(2.0, [camera.width - 2, camera.height - 2], (per_photo, 2))
-        column, row = np.floor(pixels).astype(int).T
         rays = np.pad(pixels, ((0, 0), (0, 1)), constant_values=1.0) @ np.linalg.inv(camera.K).T
-        local = rays * rooms.depth(camera)[row, column, None]
+        local = rays * rooms.depths(camera, pixels)[:, None]
         xyz.append((local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
         xy.append(pixels)
     names = [view.name for view in capture.views]

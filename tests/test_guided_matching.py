@@ -1,4 +1,4 @@
-"""Matches along epipolar lines, against every distance computed one by one."""
+"""Guided matching, compared with all distances computed one by one."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from igsr.pose.colmap import guided_matching
-from igsr.pose.colmap.epipolar import EpipolarLine, Plane
-from igsr.pose.colmap.guided_matching import comparable, guided_matches
+from igsr.pose.colmap.guided_matching import EpipolarLine, Plane, comparable, guided_matches
 
 H = np.array([[0.9, 0.1, 20.0], [-0.1, 1.0, 5.0], [1e-4, 0.0, 1.0]])
 
@@ -19,7 +18,7 @@ def homogeneous(xy: np.ndarray) -> np.ndarray:
 def two_photos(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Places and descriptors of two photos of 300 points, and their fundamental matrix.
 
-    Ten textures repeat everywhere, so that descriptors alone do not tell points apart.
+    Ten textures repeat everywhere, so that descriptors alone are ambiguous.
     """
     random = np.random.default_rng(seed)
     points = np.column_stack([random.uniform(-2, 2, (300, 2)), random.uniform(3, 6, 300)])
@@ -44,7 +43,7 @@ def two_photos(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
 
 
 def one_by_one(xy, a, other_xy, b, allowed) -> set[tuple[int, int]]:
-    """The definition: each other's nearest by less than 0.8 of the next, among those allowed."""
+    """The definition: each other's nearest by less than 0.8 of the next, if allowed."""
     distance = np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2)
     distance[~allowed] = np.inf
 
@@ -58,17 +57,17 @@ def one_by_one(xy, a, other_xy, b, allowed) -> set[tuple[int, int]]:
 
 
 @pytest.mark.parametrize("rows", [7, 512])
-def test_matches_are_those_of_the_definition(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guided_matching, "ROWS_AT_ONCE", rows)
+def test_matches_follow_the_definition(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guided_matching, "BATCH_FEATURES", rows)
     xy, a, other_xy, b, F = two_photos()
-    # Features that are clearly most like one of the other photo, which has a better partner.
+    # Features whose nearest one has a better partner.
     noise = np.random.default_rng(4).normal(0, 12, (100, 128))
     xy, a = np.vstack([xy, xy[:100]]), np.vstack([a, (a[:100] + noise).clip(0, 255).astype("u1")])
     lines, others = homogeneous(xy) @ F.T, homogeneous(other_xy) @ F
     off = lines @ homogeneous(other_xy).T
     size = (lines[:, :2] ** 2).sum(1)[:, None] + (others[:, :2] ** 2).sum(1)
     expected = one_by_one(xy, a, other_xy, b, off**2 / size <= 16.0)
-    # Equations may be of any scale, as COLMAP's matrices are.
+    # Fundamental matrices have any scale.
     for scale in (1.0, 1e-12, 1e12):
         constraint = EpipolarLine(scale * F, 4.0)
         found = guided_matches(comparable(xy, a), comparable(other_xy, b), constraint)
@@ -78,8 +77,8 @@ def test_matches_are_those_of_the_definition(rows: int, monkeypatch: pytest.Monk
     assert len(expected) > 100 > 10 * len(everywhere)
 
 
-def test_a_plane_guides_too() -> None:
-    """The distance is that in the second photo, whichever photo's best is looked for."""
+def test_a_plane_guides_matching() -> None:
+    """Distances are in the second photo, also for matches from the second to the first."""
     xy, a, _, _, _ = two_photos(1)
     mapped = homogeneous(xy) @ H.T
     mapped = mapped[:, :2] / mapped[:, 2:]
@@ -96,7 +95,7 @@ def test_a_plane_guides_too() -> None:
 def test_distances_are_exact_for_any_descriptors() -> None:
     random = np.random.default_rng(3)
     a, b = (random.integers(0, 256, (50, 128)).astype(np.uint8) for _ in range(2))
-    a[0], b[0] = 255, 0  # the longest distance that there is
+    a[0], b[0] = 255, 0  # the longest possible distance
     product = comparable(np.zeros((50, 2)), a).left @ comparable(np.zeros((50, 2)), b).right.T
     exact = ((a[:, None].astype(np.int64) - b[None].astype(np.int64)) ** 2).sum(axis=2)
     np.testing.assert_array_equal(-product.astype(np.int64), exact)

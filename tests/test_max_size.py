@@ -12,7 +12,6 @@ import scenes
 from capture_files import HEIGHT, WIDTH, photo, save, write_colmap, write_json, write_transforms
 from PIL import Image
 
-import igsr
 from igsr.capture import Camera, View, load_capture
 from igsr.capture.downscaling import area_means, plane_area_means, reduced_size, reduced_view
 from igsr.capture.photo_folder import load_photos

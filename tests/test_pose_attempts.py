@@ -13,10 +13,9 @@ import rooms
 
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.colmap import attempts
-from igsr.pose.colmap.attempts import Mapped, mapped
+from igsr.pose.colmap.attempts import THRESHOLDS, Mapped, mapped
 from igsr.pose.colmap.database import image_id, list_photos
 from igsr.pose.colmap.estimator import guarded
-from igsr.pose.colmap.evidence import STEPS
 from igsr.pose.colmap.features import find_features
 from igsr.pose.colmap.mapping import extend, map_photos
 from igsr.pose.colmap.matching import matched, matched_along_lines, with_focal_lengths, with_matches
@@ -55,12 +54,12 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[A
         calls: list[Any] = []
 
         def make(count: int, database: Path, evidence: Any, *_: object) -> Model | None:
-            step = STEPS.index(evidence)
+            step = THRESHOLDS.index(evidence)
             calls.append(("anew", step, database.name))
             return anew.get(step)
 
         def add(model: Model, count: int, database: Path, evidence: Any, *_: object) -> None:
-            step = STEPS.index(evidence)
+            step = THRESHOLDS.index(evidence)
             calls.append(("extend", step, database.name))
             model.placed |= further.get(step, set())
 
@@ -77,7 +76,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[A
         monkeypatch.setattr(attempts, "map_photos", make)
         monkeypatch.setattr(attempts, "extend", add)
         result = mapped(8, Path("matched.db"), 0, silent)
-        assert result.alike == 0
+        assert result.removed_pairs == 0
         return result.model, result.doubtful, calls
 
     return with_models
@@ -159,10 +158,10 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
             for other in range(4):
                 opened.delete_two_view_geometry(image_id(other), image_id(4))
         assert with_matches(fewer) == set(range(4))
-        model = map_photos(5, with_focal_lengths(fewer, 0), STEPS[0], 0, silent)
+        model = map_photos(5, with_focal_lengths(fewer, 0), THRESHOLDS[0], 0, silent)
         assert model.num_reg_images() == 4
         told: list[tuple[int, int]] = []
-        extend(model, 5, database, STEPS[0], 0, lambda stage, done, of: told.append((done, of)))
+        extend(model, 5, database, THRESHOLDS[0], 0, lambda stage, done, of: told.append((done, of)))
     assert told == [(4, 5), (5, 5)]
     found = estimate_of(photos, Mapped(model, doubtful=False, alike=0))
     accuracy = pose_accuracy(found.cameras, CAMERAS)

@@ -164,10 +164,10 @@ def test_of_many_photos_few_pairs_are_matched(monkeypatch: pytest.MonkeyPatch) -
     glances[77] = np.zeros((0, 128), dtype=np.float32)  # a photo without features
     monkeypatch.setattr(pairs, "largest_features", lambda count, database: glances)
     chosen = pairs.pairs_to_match(200, Path("database"))
-    assert len(chosen) < 200 * (pairs.FOLLOWING + pairs.MOST_SIMILAR) < 200 * 199 // 2
+    assert len(chosen) < 200 * (pairs.FOLLOWING_PHOTOS + pairs.SIMILAR_PHOTOS) < 200 * 199 // 2
     assert {(i, i + 180) for i in range(20)} <= set(chosen)
     assert {(i, i + 1) for i in range(199)} <= set(chosen)
-    assert len(pairs.pairs_to_match(pairs.EXHAUSTIVE, Path("database"))) == 60 * 59 // 2
+    assert len(pairs.pairs_to_match(pairs.MAX_EXHAUSTIVE_PHOTOS, Path("database"))) == 60 * 59 // 2
     tiles = pairs.in_tiles(chosen)
     assert sorted(pair for tile in tiles for pair in tile) == chosen
     assert max(len({photo for pair in tile for photo in pair}) for tile in tiles) <= 2 * pairs.TILE

@@ -1,4 +1,4 @@
-"""Models that place photos of one side among those of another, since places look alike."""
+"""Models with wrong matches between places that look alike."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import rooms
 
+from igsr.capture.photo_folder import Photo
 from igsr.geometry.pose_errors import pose_accuracy
-from igsr.pose.colmap.attempts import mapped
+from igsr.pose.colmap.attempts import THRESHOLDS, mapped
 from igsr.pose.colmap.contradictions import (
     contradictions,
     leave_out,
@@ -22,7 +23,6 @@ from igsr.pose.colmap.contradictions import (
 )
 from igsr.pose.colmap.database import list_photos
 from igsr.pose.colmap.estimator import guarded
-from igsr.pose.colmap.evidence import STEPS
 from igsr.pose.colmap.features import find_features
 from igsr.pose.colmap.mapping import map_photos
 from igsr.pose.colmap.matching import matched, with_focal_lengths
@@ -30,10 +30,10 @@ from igsr.pose.colmap.result import estimate_of
 
 
 class Image:
-    """A photo of a model, at ``centre`` and looking along +z, as far as the check asks it."""
+    """A photo of a model that looks along +z, with pycolmap's interface."""
 
-    def __init__(self, centre: tuple[float, float, float], sees: list[int]) -> None:
-        self.centre = np.array(centre)
+    def __init__(self, center: tuple[float, float, float], sees: list[int]) -> None:
+        self.center = np.array(center)
         self.camera = SimpleNamespace(
             mean_focal_length=lambda: 100.0,
             focal_length_x=100.0,
@@ -49,10 +49,10 @@ class Image:
         ]
 
     def projection_center(self) -> np.ndarray:
-        return self.centre
+        return self.center
 
     def cam_from_world(self) -> Any:
-        pose = np.hstack([np.eye(3), -self.centre[:, None]])
+        pose = np.hstack([np.eye(3), -self.center[:, None]])
         return SimpleNamespace(matrix=lambda: pose)
 
 
@@ -73,29 +73,29 @@ def model_of(*images: Image, frames: int = 0) -> Any:
 HALF, OTHER = list(range(200)), list(range(180, 380))
 
 
-def test_photos_that_stand_together_must_share_points() -> None:
+def test_neighboring_photos_must_share_points() -> None:
     together = Image((0.0, 0.0, 0.0), HALF), Image((0.3, 0.0, 0.0), OTHER)
     assert contradictions(model_of(*together), {}, {}) == {(1, 2)}
     sharing = Image((0.3, 0.0, 0.0), list(range(150, 380)))
     assert contradictions(model_of(together[0], sharing), {}, {}) == set()
-    # Photos of other light share few points, but all over.
+    # Photos of other light share few points, but not in one place.
     few = Image((0.3, 0.0, 0.0), [*range(0, 180, 9), *range(200, 380)])
     assert contradictions(model_of(together[0], few), {}, {}) == set()
-    # Photos that were never compared share none; those of a rig move together.
+    # Photos that were never compared share no points; rigs are not checked.
     strange = Image((0.3, 0.0, 0.0), list(range(200, 380)))
     assert contradictions(model_of(together[0], strange), {}, {}) == set()
     assert contradictions(model_of(*together, frames=1), {}, {}) == set()
-    # Matches count whether they have become points or not.
+    # Matches count also without points.
     matches = {(1, 2): np.stack([np.arange(50), np.arange(50)], axis=1).astype(np.uint32)}
     assert contradictions(model_of(*together), matches, {}) == set()
-    # What a mask hides need not be shared.
+    # Masked points need not be shared.
     hidden = np.zeros((200, 200), dtype=np.bool_)
     hidden[80:120, 80:120] = True
     assert contradictions(model_of(*together), {}, {1: hidden, 2: hidden}) == set()
 
 
 @pytest.mark.parametrize(
-    ("centre", "sees"),
+    ("center", "sees"),
     [
         ((2.5, 0.0, 0.0), OTHER),  # from another direction
         ((0.0, 0.0, 2.0), OTHER),  # from nearer
@@ -103,15 +103,15 @@ def test_photos_that_stand_together_must_share_points() -> None:
         ((0.3, 0.0, 0.0), []),
     ],
 )
-def test_photos_that_see_the_wall_otherwise_need_not(
-    centre: tuple[float, float, float], sees: list[int]
+def test_other_photos_need_not_share_points(
+    center: tuple[float, float, float], sees: list[int]
 ) -> None:
     few = HALF[:90]
     assert (
-        contradictions(model_of(Image((0.0, 0.0, 0.0), few), Image(centre, sees)), {}, {}) == set()
+        contradictions(model_of(Image((0.0, 0.0, 0.0), few), Image(center, sees)), {}, {}) == set()
     )
     if sees:
-        whole = Image((0.0, 0.0, 0.0), HALF), Image(centre, sees)
+        whole = Image((0.0, 0.0, 0.0), HALF), Image(center, sees)
         assert contradictions(model_of(*whole), {}, {}) == set()
 
 
@@ -121,45 +121,48 @@ def test_the_weakest_links_are_left_out() -> None:
     assert links_between_parts(strengths, set()) == set()
     assert links_between_parts(strengths, {(2, 5)}) == {(3, 4), (1, 5)}
     assert parts(strengths, {(2, 5)}) == {1: 1, 2: 1, 3: 1, 4: 4, 5: 4, 6: 4}
-    # Where strong links lead from one to the other, something stands between the cameras.
+    # Photos with strong links stay together.
     assert links_between_parts({**strengths, (3, 4): 200}, {(2, 5)}) == set()
 
 
-def alike(monkeypatch: pytest.MonkeyPatch, patch: int = 64) -> None:
-    """Give the walls of room 1 a piece of those of room 0."""
+def show(*progress: object) -> None:
+    pass
+
+
+def matches_of(photos: list[Photo], folder: Path) -> Path:
+    features = folder / "features.db"
+    list_photos(photos, features)
+    find_features(photos, folder, features, show)
+    return matched(len(photos), features, 0, show)
+
+
+def test_two_rooms_that_look_alike_are_kept_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A part of the walls of room 0 is also in room 1.
     original = rooms.texture
 
-    def texture(seed: int, size: int = 256) -> np.ndarray:
-        walls = original(seed, size)
+    def texture(seed: int) -> np.ndarray:
+        walls = original(seed)
         if seed >= 10:
-            walls[:patch, :patch] = original(seed - 10, size)[:patch, :patch]
+            walls[:64, :64] = original(seed - 10)[:64, :64]
         return walls
 
     monkeypatch.setattr(rooms, "texture", texture)
-
-
-def test_two_rooms_with_a_like_piece_are_not_made_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    alike(monkeypatch)
     cameras = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 5)]
     photos = [*rooms.photos(cameras), *rooms.photos(cameras[1:], seed=1)]
-    features = tmp_path / "features.db"
-    show = lambda *arguments: None  # noqa: E731
     with guarded(0):
-        list_photos(photos, features)
-        find_features(photos, tmp_path, features, show)
-        matches = matched(len(photos), features, 0, show)
+        matches = matches_of(photos, tmp_path)
         across = {pair for pair in links(matches) if pair[0] <= 5 < pair[1]}
         assert across
-        wrong = map_photos(9, with_focal_lengths(matches, 0), STEPS[0], 0, show)
+        wrong = map_photos(9, with_focal_lengths(matches, 0), THRESHOLDS[0], 0, show)
         assert wrong.num_reg_images() > 5
         assert contradictions(wrong, links(matches), {})
         copy = Path(shutil.copyfile(matches, tmp_path / "copy.db"))
         leave_out(copy, across)
         assert links(copy).keys() == links(matches).keys() - across
         found = mapped(len(photos), matches, 0, show)
-    assert found.alike == len(across)
+    assert found.removed_pairs == len(across)
     assert not found.doubtful
     estimate = estimate_of(photos, found)
     assert [camera is not None for camera in estimate.cameras] == [True] * 5 + [False] * 4
@@ -170,7 +173,7 @@ def test_two_rooms_with_a_like_piece_are_not_made_one(
 def test_photos_of_another_season_stay_in_one_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What they share with the others is little, but all over."""
+    # They share few points with the others, but not in one place.
     cameras = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 6)]
     photos = rooms.photos(cameras[::2])
     original = rooms.texture
@@ -178,13 +181,9 @@ def test_photos_of_another_season_stay_in_one_model(
         rooms, "texture", lambda seed: 0.6 * original(seed) + 0.4 * original(seed + 100)
     )
     photos += rooms.photos(cameras[1::2])
-    features = tmp_path / "features.db"
-    show = lambda *arguments: None  # noqa: E731
     with guarded(0):
-        list_photos(photos, features)
-        find_features(photos, tmp_path, features, show)
-        found = mapped(6, matched(6, features, 0, show), 0, show)
-    assert found.alike == 0
+        found = mapped(6, matches_of(photos, tmp_path), 0, show)
+    assert found.removed_pairs == 0
     estimate = estimate_of(photos, found)
     accuracy = pose_accuracy(estimate.cameras, [*cameras[::2], *cameras[1::2]])
     assert accuracy["registered"] == 6

@@ -9,7 +9,7 @@ import pytest
 import scenes
 from made_up_tracks import projected
 
-from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
+from igsr_lab.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
 
 
 @pytest.fixture(scope="module")

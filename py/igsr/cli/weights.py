@@ -9,8 +9,7 @@ import typer
 from igsr.cli.error_messages import error_messages, print_message
 from igsr.cli.options import JsonOption
 from igsr.cli.output import output_console, print_json
-from igsr.pose.huggingface_cache import cache_folder
-from igsr.pose.weights import KNOWN, fetch_weights, known_weights, weights_path
+from igsr.pose.weights import KNOWN, cache_folder, fetch_weights, known_weights, weights_path
 
 app = typer.Typer(
     help="List, download and locate the weights of pose networks.", no_args_is_help=True

@@ -1,4 +1,4 @@
-"""Geometry of cameras: similarity transforms, pose errors and noise, camera paths."""
+"""Geometry of cameras: similarity transforms, pose errors, camera paths."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""One answer from what a network predicts and what features say.
+"""Combine a network's prediction with features.
 
-Where COLMAP places all photos, its cameras stand: no network is as exact. Else the network's
-cameras are the start. Features are matched along the lines that it predicts, too, and bundle
-adjustment with the prediction as a prior decides, photo by photo, by how much each says.
+If COLMAP places all photos, its cameras are kept: no network is as accurate. Else the network's
+cameras are the start: features are also matched along the epipolar lines that it predicts, and
+bundle adjustment with the prediction as a prior weighs both for each photo.
 """
 
 from __future__ import annotations
@@ -21,83 +21,75 @@ from igsr.capture.types import PoseEvidence, Tracks
 from igsr.capture.undistort import Lens
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
-from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.colmap.adjustment import (
-    FEWEST_POINTS,
+    MIN_POINTS,
     Adjusted,
     adjusted,
     deviations,
     evidence_of_model,
 )
-from igsr.pose.colmap.attempts import Mapped, mapped
-from igsr.pose.colmap.distortion import without_distortion
-from igsr.pose.colmap.estimator import guarded, matched_photos, usable_by_number
-from igsr.pose.colmap.evidence import DOUBTFUL, STEPS
+from igsr.pose.colmap.attempts import FIRST_DOUBTFUL, THRESHOLDS, Mapped, mapped
+from igsr.pose.colmap.estimator import guarded, matched_photos, usable_by_image_id
+from igsr.pose.colmap.mapping import without_distortion
 from igsr.pose.colmap.matcher import Matcher
 from igsr.pose.colmap.matching import matched_along_lines, with_matches
 from igsr.pose.colmap.predicted_matches import matched_by_prediction, without_contradictions
 from igsr.pose.colmap.result import estimate_of
+from igsr.pose.depth_maps import AlignedPhoto
 from igsr.pose.estimate import Progress
 from igsr.pose.name_lists import listed
 from igsr.pose.prior_adjustment import Spread, spread_of
 
 Float64 = npt.NDArray[np.float64]
 
-#: COLMAP is right where the two contradict if it has placed more than this part of the photos.
-MOST_RIGHT = 0.5
-#: Degrees that cameras by features may be from the predicted ones, on average. Beyond, one of the
-#: two is wrong.
-FARTHEST = 15.0
-#: Factor by which a focal length may change.
-STRETCHED = 1.5
-#: COLMAP's photos, at least, for their cameras to be a start.
-FEWEST_PLACED = 3
-#: Standard deviations of predicted cameras where nothing tells them: degrees, and units of the
-#: median depth. What tells them is bounded by factors of these.
-ROTATION, CENTRE, LEAST, MOST = 1.5, 0.03, 0.1, 6.0
-#: A camera rests on features alone where they leave less than this part of the prediction's spread.
+#: COLMAP is kept over a contradicting prediction if it places more than this fraction of photos.
+MIN_PLACED_FRACTION = 0.5
+#: Maximum mean angle between COLMAP's or adjusted cameras and the predicted ones, degrees.
+MAX_ANGLE = 15.0
+#: Maximum factor between adjusted and predicted focal lengths.
+MAX_FOCAL_FACTOR = 1.5
+#: Minimum number of photos that COLMAP must place to be used.
+MIN_PLACED = 3
+#: Default standard deviations of predicted cameras: degrees, and units of the median depth.
+ROTATION_DEVIATION = 1.5
+CENTER_DEVIATION = 0.03
+#: Bounds of measured standard deviations, as factors of the default.
+MIN_DEVIATION_FACTOR = 0.1
+MAX_DEVIATION_FACTOR = 6.0
+#: A camera rests on features alone if they leave less than this fraction of the default.
 FEATURES_ALONE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What all evidence together says of photos, in one world.
-
-    Attributes:
-        cameras: per photo, or None where it has no place.
-        photos: per photo with its camera and depths, or None where no depths are known.
-        lenses: per photo, as ``Estimate``.
-        points: of features, with tracks, or None.
-        evidence: per photo what its camera rests on, or None where it has none.
-        warnings: for the user.
-    """
+    """Cameras and depths by all evidence, in one world; None for photos that are not placed."""
 
     cameras: list[Camera | None]
-    photos: list[AlignedPhoto | None]
-    lenses: list[Lens | None]
-    points: Points | None
+    photos: list[AlignedPhoto | None]  # with depths; also None if these are unknown
+    lenses: list[Lens | None]  # as ``Estimate``
+    points: Points | None  # of features, with tracks
     evidence: list[PoseEvidence | None]
-    warnings: list[str]
+    warnings: list[str]  # for the user
 
 
 def with_all_evidence(
     photos: Sequence[Photo],
     predicted: Sequence[AlignedPhoto | None],
-    sure: Sequence[npt.NDArray[np.bool_] | None],
+    confident: Sequence[npt.NDArray[np.bool_] | None],
     network: str,
     matcher: Matcher | None,
     seed: int,
     progress: Progress | None = None,
 ) -> Evidence:
-    """Cameras of photos by features and prediction together.
+    """Find cameras by features and a network's prediction together.
 
     Args:
         photos: at least two.
-        predicted: what a network says of each, in one world; None where it says nothing. Photos of
-            one camera have one focal length, the same in both directions.
-        sure: bool [h, w] per photo: depths that the network is sure of.
+        predicted: per photo, in one world, or None. Photos of one camera have one focal length,
+            the same in both directions.
+        confident: bool [h, w] per photo: depths of which the network is confident.
         network: its name, for messages.
-        matcher: what finds and matches features, None for SIFT.
+        matcher: of features; None for SIFT.
         seed: random seed.
         progress: as for estimators.
 
@@ -107,20 +99,19 @@ def with_all_evidence(
     show = progress or (lambda stage, done, total: None)
     with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, guarded(seed):
         matches = matched_photos(photos, Path(folder), matcher, seed, show)
-        sift = matcher is None
-        # What COLMAP would need lower thresholds for, the network tells better.
+        # Not COLMAP's lowest thresholds: the prediction is more reliable.
         found = mapped(
             len(photos),
             matches,
             seed,
             show,
-            sift=sift,
-            usable=usable_by_number(photos),
-            steps=STEPS[:DOUBTFUL],
+            sift=matcher is None,
+            usable=usable_by_image_id(photos),
+            attempts=THRESHOLDS[:FIRST_DOUBTFUL],
         )
         model = found.model
         if model is not None:
-            few = model.num_reg_images() < FEWEST_PLACED
+            few = model.num_reg_images() < MIN_PLACED
             found = replace(found, model=None if few else without_distortion(model))
         placed = estimate_of(photos, found).cameras
         if all(placed):
@@ -129,18 +120,20 @@ def with_all_evidence(
         if world is None:
             count = sum(camera is not None for camera in placed)
             contradiction = (
-                f"Features place {count} of {len(photos)} photos where {network} does not predict "
-                "them"
+                f"Features place {count} of {len(photos)} photos, but not where {network} "
+                "predicts them"
             )
-            if count > MOST_RIGHT * len(photos):
-                left_out = _by_features(photos, predicted, found)
-                left_out.warnings.append(f"{contradiction}; the prediction is left out")
-                return left_out
-            # Sides of an object that look alike are seldom more than a part of the photos.
+            if count > MIN_PLACED_FRACTION * len(photos):
+                by_features = _by_features(photos, predicted, found)
+                by_features.warnings.append(f"{contradiction}; the prediction is not used")
+                return by_features
+            # Wrong matches between similar sides of an object usually place few photos.
             found, placed = replace(found, model=None), [None] * len(photos)
             world = list(predicted)
-            warnings.append(f"{contradiction}; these features are left out")
-        result = _adjusted(photos, world, sure, found, placed, matches, sift, seed, show)
+            warnings.append(f"{contradiction}; these features are not used")
+        result = _adjusted(
+            photos, world, confident, found, placed, matches, matcher is None, seed, show
+        )
     both = _by_both(photos, world, found, result, network)
     return replace(both, warnings=[*warnings, *both.warnings])
 
@@ -148,18 +141,18 @@ def with_all_evidence(
 def _by_features(
     photos: Sequence[Photo], predicted: Sequence[AlignedPhoto | None], found: Mapped
 ) -> Evidence:
-    """COLMAP's cameras, and depths that fit to its points."""
+    """COLMAP's cameras, with the predicted depths scaled to its points."""
     placed = estimate_of(photos, found)
-    told = evidence_of_model(photos, placed.cameras, found.model)
+    known = evidence_of_model(photos, placed.cameras, found.model)
     depths = _with_cameras(photos, predicted, placed.cameras, placed.points)
-    evidence = [told.get(i) for i in range(len(photos))]
+    evidence = [known.get(i) for i in range(len(photos))]
     return Evidence(placed.cameras, depths, placed.lenses, placed.points, evidence, placed.warnings)
 
 
 def _in_one_world(
     predicted: Sequence[AlignedPhoto | None], placed: Sequence[Camera | None]
 ) -> list[AlignedPhoto | None] | None:
-    """The prediction in the world of the cameras that COLMAP placed; None where the two differ."""
+    """Map the prediction to the world of COLMAP's cameras; None if they contradict it."""
     pairs = [
         (one.camera, camera)
         for one, camera in zip(predicted, placed, strict=True)
@@ -170,7 +163,7 @@ def _in_one_world(
     if len(pairs) < 2:
         return None
     before, after = (list(side) for side in zip(*pairs, strict=True))
-    if pose_errors(before, after)["rotation"] > FARTHEST:
+    if pose_errors(before, after)["rotation"] > MAX_ANGLE:
         return None
     similarity = similarity_between(before, after)
     return [None if one is None else one.mapped(similarity) for one in predicted]
@@ -179,7 +172,7 @@ def _in_one_world(
 def _adjusted(
     photos: Sequence[Photo],
     world: Sequence[AlignedPhoto | None],
-    sure: Sequence[npt.NDArray[np.bool_] | None],
+    confident: Sequence[npt.NDArray[np.bool_] | None],
     found: Mapped,
     placed: Sequence[Camera | None],
     matches: Path,
@@ -187,18 +180,18 @@ def _adjusted(
     seed: int,
     show: Progress,
 ) -> Adjusted | None:
-    """What bundle adjustment says, or None where photos share too few features."""
-    confident = [
+    """Adjust the cameras to all matches; None if photos share too few features."""
+    reliable = [
         None
-        if one is None or known is None
-        else replace(one, depth=np.where(known, one.depth, np.float32(np.nan)))
-        for one, known in zip(world, sure, strict=True)
+        if one is None or mask is None
+        else replace(one, depth=np.where(mask, one.depth, np.float32(np.nan)))
+        for one, mask in zip(world, confident, strict=True)
     ]
     predicted = {i: one.camera for i, one in enumerate(world) if one is not None}
     if sift:
-        matches = matched_by_prediction(matches, confident, seed, show)
+        matches = matched_by_prediction(matches, reliable, seed, show)
         matches = matched_along_lines(matches, set(predicted), show) or matches
-    matches = without_contradictions(matches, confident)
+    matches = without_contradictions(matches, reliable)
     starts = predicted | {i: one for i, one in enumerate(placed) if one is not None}
     if len(with_matches(matches) & starts.keys()) < 2:
         return None
@@ -207,7 +200,7 @@ def _adjusted(
         for image in found.model.reg_image_ids():
             camera = found.model.images[image].camera
             lenses[camera.camera_id] = camera.params
-    return adjusted(photos, starts, confident, usual_spread(world), matches, lenses, seed, show)
+    return adjusted(photos, starts, reliable, default_spread(world), matches, lenses, seed, show)
 
 
 def _by_both(
@@ -217,107 +210,119 @@ def _by_both(
     result: Adjusted | None,
     network: str,
 ) -> Evidence:
-    """Photo by photo, what features and prediction say together."""
+    """Choose the camera of each photo, and state what it rests on."""
     predicted = [None if one is None else one.camera for one in world]
+    default = default_spread(world)
     warnings = []
-    if result is not None and _far_off(predicted, result):
+    if result is not None and _contradicts(predicted, result):
         warnings.append(
-            f"Bundle adjustment led too far from what {network} predicts, and is left out"
+            f"Bundle adjustment contradicts the prediction of {network}, and is not used"
         )
         result = None
-    usual = usual_spread(world)
-    told = estimate_of(photos, found if result is None else replace(found, model=result.model))
+    by_colmap = estimate_of(photos, found if result is None else replace(found, model=result.model))
     if result is None:
-        by_features = told.cameras
-        evidence = evidence_of_model(photos, told.cameras, found.model)
+        by_features = by_colmap.cameras
+        known = evidence_of_model(photos, by_features, found.model)
     else:
         by_features = [result.cameras.get(i) for i in range(len(photos))]
-        evidence = {
-            i: _evidence(covariance, usual)
+        known = {
+            i: _evidence(covariance, default)
             for i, covariance in result.covariances.items()
-            if result.observed[i] >= FEWEST_POINTS
+            if result.observed[i] >= MIN_POINTS
         }
+    pairs = list(zip(predicted, by_features, strict=True))
     certain = [
         (before, after)
-        for i, (before, after) in enumerate(zip(predicted, by_features, strict=True))
-        if before is not None and after is not None and i in evidence
-        if evidence[i].rests_on == "features"
+        for i, (before, after) in enumerate(pairs)
+        if before is not None and after is not None and i in known
+        if known[i].rests_on == "features"
     ]
-    alone = _evidence_of_prediction(certain, usual)
+    of_prediction = _evidence_of_prediction(certain, default)
     cameras: list[Camera | None] = []
-    for i, (before, after) in enumerate(zip(predicted, by_features, strict=True)):
-        cameras.append(after if i in evidence else before)
-        if i not in evidence and before is not None:
-            evidence[i] = alone
-    rests = [evidence.get(i) for i in range(len(photos))]
-    borne_out = {
-        photo.name
-        for photo, one in zip(photos, rests, strict=True)
-        if one is not None and one.rests_on != "network"
-    }
-    points = _seen_by(told.points, borne_out)
+    for i, (before, after) in enumerate(pairs):
+        cameras.append(after if i in known else before)
+        if i not in known and before is not None:
+            known[i] = of_prediction
+    evidence = [known.get(i) for i in range(len(photos))]
+    with_features = {photos[i].name for i, one in known.items() if one.rests_on != "network"}
+    points = _with_tracks_of(by_colmap.points, with_features)
     lenses = [
-        lens if photo.name in borne_out else None
-        for photo, lens in zip(photos, told.lenses or [None] * len(photos), strict=True)
+        lens if photo.name in with_features else None
+        for photo, lens in zip(photos, by_colmap.lenses or [None] * len(photos), strict=True)
     ]
-    if found.alike:
+    if found.removed_pairs:
         warnings.append(
-            "Some photos show places that look alike: matches between them contradict others and "
-            f"were left out (pairs of photos: {found.alike})."
+            "Some photos show places that look alike: their matches contradict others and "
+            f"were left out (pairs of photos: {found.removed_pairs})."
         )
-    warnings += _told(photos, rests, network)
+    alone = [
+        photo.name
+        for photo, one in zip(photos, evidence, strict=True)
+        if one is not None and one.rests_on == "network"
+    ]
+    if alone:
+        which = "all photos" if len(alone) == len(known) else listed(alone)
+        warnings.append(
+            f"Cameras of {which} are as {network} predicts them, with errors of about "
+            f"{of_prediction.rotation:.1f} degrees per axis: they share too few features with "
+            "other photos"
+        )
     depths = _with_cameras(photos, world, cameras, points)
-    return Evidence(cameras, depths, lenses, points, rests, warnings)
+    return Evidence(cameras, depths, lenses, points, evidence, warnings)
 
 
-def _far_off(predicted: Sequence[Camera | None], result: Adjusted) -> bool:
+def _contradicts(predicted: Sequence[Camera | None], result: Adjusted) -> bool:
     """Whether adjusted cameras are so far from the predicted ones that they must be wrong."""
-    after, before = [], []
-    for i, camera in result.cameras.items():
-        wanted = predicted[i]
-        if wanted is not None and result.observed[i] >= FEWEST_POINTS:
-            after.append(camera)
-            before.append(wanted)
-    if len(after) < 2:
+    pairs = [
+        (camera, wanted)
+        for i, camera in result.cameras.items()
+        if (wanted := predicted[i]) is not None and result.observed[i] >= MIN_POINTS
+    ]
+    if len(pairs) < 2:
         return False
-    changes = [a.K[0, 0] / b.K[0, 0] for a, b in zip(after, before, strict=True)]
-    turned = pose_errors(after, before)["rotation"]
-    return turned > FARTHEST or max(max(c, 1.0 / c) for c in changes) > STRETCHED
+    after, before = (list(side) for side in zip(*pairs, strict=True))
+    factors = [a.K[0, 0] / b.K[0, 0] for a, b in pairs]
+    angle = pose_errors(after, before)["rotation"]
+    return angle > MAX_ANGLE or max(max(f, 1.0 / f) for f in factors) > MAX_FOCAL_FACTOR
 
 
-def usual_spread(world: Sequence[AlignedPhoto | None]) -> Spread:
-    """Of predicted cameras, where nothing tells it; in units of the world of the prediction."""
+def default_spread(world: Sequence[AlignedPhoto | None]) -> Spread:
+    """The default spread of predicted cameras, in units of their world."""
     depths = [float(np.nanmedian(one.depth)) for one in world if one is not None]
-    return Spread(float(np.radians(ROTATION)), CENTRE * float(np.median(depths or [1.0])))
+    unit = float(np.median(depths or [1.0]))
+    return Spread(float(np.radians(ROTATION_DEVIATION)), CENTER_DEVIATION * unit)
 
 
-def _evidence(covariance: Float64, usual: Spread) -> PoseEvidence:
-    """What a camera with enough points rests on."""
+def _evidence(covariance: Float64, default: Spread) -> PoseEvidence:
+    """Evidence of a camera with enough points."""
     turn, move = deviations(covariance)
-    alone = turn < FEATURES_ALONE * usual.rotation and move < FEATURES_ALONE * usual.centre
+    alone = turn < FEATURES_ALONE * default.rotation and move < FEATURES_ALONE * default.centre
     return PoseEvidence("features" if alone else "both", float(np.degrees(turn)), move)
 
 
-def _evidence_of_prediction(pairs: Sequence[tuple[Camera, Camera]], usual: Spread) -> PoseEvidence:
-    """Of a camera that is as predicted: how far the prediction is from cameras that are known.
+def _evidence_of_prediction(
+    pairs: Sequence[tuple[Camera, Camera]], default: Spread
+) -> PoseEvidence:
+    """Evidence of a predicted camera, by the errors of other predictions.
 
     Args:
-        pairs: of predicted cameras and what features say of them.
-        usual: where there are too few.
+        pairs: predicted cameras, and the same by features.
+        default: spread if there are too few pairs.
     """
-    spread = usual
-    if len(pairs) >= FEWEST_PLACED:
+    spread = default
+    if len(pairs) >= MIN_PLACED:
         before, after = (list(side) for side in zip(*pairs, strict=True))
         turn, move = spread_of(before, after)
+        low, high = MIN_DEVIATION_FACTOR, MAX_DEVIATION_FACTOR
         spread = Spread(
-            float(np.clip(turn, LEAST * usual.rotation, MOST * usual.rotation)),
-            float(np.clip(move, LEAST * usual.centre, MOST * usual.centre)),
+            float(np.clip(turn, low * default.rotation, high * default.rotation)),
+            float(np.clip(move, low * default.centre, high * default.centre)),
         )
     return PoseEvidence("network", float(np.degrees(spread.rotation)), spread.centre)
 
 
-def _seen_by(points: Points | None, names: set[str]) -> Points | None:
-    """Points with the tracks of some photos alone."""
+def _with_tracks_of(points: Points | None, names: set[str]) -> Points | None:
+    """Points with only the tracks of some photos."""
     if points is None or points.tracks is None:
         return points
     tracks = points.tracks
@@ -333,47 +338,22 @@ def _with_cameras(
     cameras: Sequence[Camera | None],
     points: Points | None,
 ) -> list[AlignedPhoto | None]:
-    """The predicted depths with other cameras, at the scale of the points that the photos see."""
-    found: list[AlignedPhoto | None] = []
+    """The predicted depths with other cameras, scaled to the points that each photo sees."""
+    result: list[AlignedPhoto | None] = []
+    tracks = None if points is None else points.tracks
     for photo, one, camera in zip(photos, predicted, cameras, strict=True):
         if one is None or camera is None:
-            found.append(None)
+            result.append(None)
             continue
-        pixels, depths = _points_of(photo.name, camera, points)
-        known = one.depths_at(pixels)
-        both = np.isfinite(known) & (depths > 0.0)
-        if np.count_nonzero(both) >= FEWEST_POINTS:
-            # The median of logarithms: one wrong point, or one edge, moves nothing.
-            ratio = np.exp(np.median(np.log(depths[both] / known[both])))
-            one = replace(one, depth=(one.depth * ratio).astype(np.float32))
-        found.append(replace(one, camera=camera))
-    return found
-
-
-def _points_of(name: str, camera: Camera, points: Points | None) -> tuple[Float64, Float64]:
-    """Where a photo sees points [M, 2], and their depths [M]."""
-    if points is None or points.tracks is None or name not in points.tracks.names:
-        return np.zeros((0, 2)), np.zeros(0)
-    tracks = points.tracks
-    own = tracks.view == tracks.names.index(name)
-    xyz = points.xyz[tracks.point[own]]
-    return tracks.xy[own], xyz @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-
-
-def _told(
-    photos: Sequence[Photo], evidence: Sequence[PoseEvidence | None], network: str
-) -> list[str]:
-    """What the user is told of cameras that features do not bear out."""
-    placed = sum(one is not None for one in evidence)
-    alone = [
-        (photo.name, one)
-        for photo, one in zip(photos, evidence, strict=True)
-        if one is not None and one.rests_on == "network"
-    ]
-    if not alone:
-        return []
-    which = "all photos" if len(alone) == placed else listed([name for name, _ in alone])
-    return [
-        f"Cameras of {which} are as {network} predicts them, about {alone[0][1].rotation:.1f} "
-        "degrees off about each axis: they share too few features with the others"
-    ]
+        if points is not None and tracks is not None and photo.name in tracks.names:
+            own = tracks.view == tracks.names.index(photo.name)
+            xyz = points.xyz[tracks.point[own]]
+            depths = xyz @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+            known = one.depths_at(tracks.xy[own])
+            both = np.isfinite(known) & (depths > 0.0)
+            if np.count_nonzero(both) >= MIN_POINTS:
+                # The median is robust against wrong points and edges.
+                ratio = np.exp(np.median(np.log(depths[both] / known[both])))
+                one = replace(one, depth=(one.depth * ratio).astype(np.float32))
+        result.append(replace(one, camera=camera))
+    return result

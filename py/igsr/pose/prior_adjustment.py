@@ -1,9 +1,8 @@
-"""Bundle adjustment with what a network predicts as a prior: cameras and depths, each robustly.
+"""Bundle adjustment with a network's prediction as a prior on cameras and depths.
 
-Where features say little (places that only two photos share tell nothing of the distance to a third
-photo), the prediction decides; where they say much, it is outweighed. What is predicted wrongly is
-far off, and what is far off weighs little (Cauchy's loss), so one wrong camera or depth map moves
-no other.
+Features decide if they determine the cameras, otherwise the prediction does: for example, two
+photos alone determine no distance to a third one. Cauchy losses limit the influence of outliers, so
+one wrong camera or depth map moves no other.
 """
 
 from __future__ import annotations
@@ -28,64 +27,58 @@ from igsr.geometry.pose_errors import rotation_angle
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-#: Standard deviations of what a network predicts: the logarithm of a photo's scale of depths, of a
-#: depth, and of a focal length.
-SCALE, DEPTH, FOCAL = 0.1, 0.05, 0.05
-#: Errors of neighbouring depths hang together: those of a photo count as so many.
-INDEPENDENT = 20
-#: Steps at most, and the part of the cost that a step must take off to go on.
-STEPS, SETTLED = 30, 1e-5
-#: Damping (Levenberg-Marquardt): the first, by how much it changes, and the last.
-FIRST, CHANGE, LAST = 1e-4, 10.0, 1e6
-#: Pixels; no place in a photo is known better.
-LEAST_ERROR = 0.05
+#: Standard deviations of predictions: the logarithms of a photo's scale of depths, of a depth, and
+#: of a focal length.
+SCALE_DEVIATION = 0.1
+DEPTH_DEVIATION = 0.05
+FOCAL_DEVIATION = 0.05
+#: Effective number of independent depths of a photo, since neighboring depths have similar errors.
+INDEPENDENT_DEPTHS = 20
+#: Maximum number of steps, and the relative decrease of the cost that ends them.
+MAX_STEPS = 30
+TOLERANCE = 1e-5
+#: Levenberg-Marquardt damping: the first one, the factor of changes, and the maximum.
+FIRST_DAMPING = 1e-4
+DAMPING_FACTOR = 10.0
+MAX_DAMPING = 1e6
+#: Minimum standard deviation of an observation, pixels.
+MIN_DEVIATION_PX = 0.05
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard deviations of a network's cameras.
+    """Standard deviations of a network's cameras."""
 
-    Attributes:
-        rotation: radians.
-        centre: world units.
-    """
-
-    rotation: float
-    centre: float
+    rotation: float  # radians
+    centre: float  # world units
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Where photos see points.
+    """Observations of points in photos."""
 
-    Attributes:
-        view: int64 [M], index of the photo's camera.
-        point: int64 [M], index of the point; every point is seen.
-        xy: float64 [M, 2], pixels, without the lens's distortion.
-        depth: float64 [M], z-depth there as it is predicted, world units; NaN where it is not.
-    """
-
-    view: Int64
-    point: Int64
-    xy: Float64
-    depth: Float64
+    view: Int64  # [M], index of the photo's camera
+    point: Int64  # [M], index of the point; every point is observed
+    xy: Float64  # [M, 2], pixels, without lens distortion
+    depth: Float64  # [M], predicted z-depth, world units; NaN if there is none
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Cameras and points.
+    """V cameras and P points."""
 
-    Attributes:
-        cameras: V of them, with one focal length for both directions.
-        lenses: int64 [V]: cameras of one number share their focal length.
-        points: float64 [P, 3], world frame.
-        scales: float64 [V], logarithm of what each photo's predicted depths are too large by.
-    """
+    cameras: Sequence[Camera]  # with one focal length for both directions
+    lenses: Int64  # [V]: cameras of one number share their focal length
+    points: Float64  # [P, 3], world frame
+    scales: Float64  # [V], logarithms of the factors that correct each photo's predicted depths
 
-    cameras: Sequence[Camera]
-    lenses: Int64
-    points: Float64
-    scales: Float64
+    @property
+    def log_focals(self) -> Float64:
+        """Logarithms of the focal lengths [G]."""
+        focals = np.zeros(int(self.lenses.max()) + 1)
+        for lens, camera in zip(self.lenses, self.cameras, strict=True):
+            focals[lens] = np.log(camera.K[0, 0])
+        return focals
 
 
 def adjusted_bundle(
@@ -95,28 +88,28 @@ def adjusted_bundle(
     spread: Spread,
     pixels: float,
 ) -> Bundle:
-    """The bundle that fits observations and prediction best, by a robust loss of each.
+    """Fit a bundle to observations and prediction, each with a robust loss.
 
     Args:
-        bundle: to start from.
-        seen: where its cameras see its points.
-        predicted: V cameras in the bundle's world; None where nothing is predicted.
+        bundle: initial.
+        seen: of its points by its cameras.
+        predicted: V cameras in the bundle's world, or None.
         spread: of the predicted cameras.
-        pixels: an observation that is off by more than that weighs less.
+        pixels: scale of the loss of observations.
     """
-    problem = _Problem(seen, predicted, spread, pixels, _focals(bundle))
-    damping, cost = FIRST, problem.cost(bundle)
-    for _ in range(STEPS):
-        equations, prior = problem.linearised(bundle)
+    problem = _Problem(seen, predicted, spread, pixels, bundle.log_focals)
+    damping, cost = FIRST_DAMPING, problem.cost(bundle)
+    for _ in range(MAX_STEPS):
+        equations, prior = problem.linearized(bundle)
         before = cost
-        while damping < LAST:
+        while damping < MAX_DAMPING:
             moved = _stepped(bundle, equations, prior, damping)
             cost = before if moved is None else problem.cost(moved)
             if moved is not None and cost < before:
-                bundle, damping = moved, damping / CHANGE
+                bundle, damping = moved, damping / DAMPING_FACTOR
                 break
-            damping *= CHANGE
-        if not cost < (1.0 - SETTLED) * before:
+            damping *= DAMPING_FACTOR
+        if not cost < (1.0 - TOLERANCE) * before:
             break
     return bundle
 
@@ -126,11 +119,11 @@ def covariances(
 ) -> Float64:
     """Covariances [V, 6, 6] of rotation (radians) about and translation along the cameras' axes.
 
-    Turning, moving and scaling all cameras together is left out: no photo shows it.
+    Rotation, translation and scale of the world are left out, since no photo shows them.
     """
-    problem = _Problem(seen, predicted, spread, 1.0, _focals(bundle))
-    equations, prior = problem.linearised(bundle)
-    # Observations are as exact as they turn out to be, the prediction is as given.
+    problem = _Problem(seen, predicted, spread, 1.0, bundle.log_focals)
+    equations, prior = problem.linearized(bundle)
+    # Deviations of observations are estimated; the prediction's are known.
     for rows in (equations.value[:, :2], equations.of_point[:, :2]):
         rows /= problem.deviation(bundle)
     normal = (without_points(equations) + prior)[:-1, :-1]
@@ -146,40 +139,32 @@ def covariances(
     return np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
 
 
-def spread_of(predicted: Sequence[Camera], right: Sequence[Camera]) -> tuple[float, float]:
-    """Medians, per axis, of how far predicted cameras are from right ones: radians, world units."""
+def spread_of(predicted: Sequence[Camera], true: Sequence[Camera]) -> tuple[float, float]:
+    """Median errors per axis of predicted cameras: radians, and world units."""
     turns = [
         np.radians(rotation_angle(a.viewmat[:3, :3] @ b.viewmat[:3, :3].T))
-        for a, b in zip(predicted, right, strict=True)
+        for a, b in zip(predicted, true, strict=True)
     ]
-    moves = [np.linalg.norm(a.centre - b.centre) for a, b in zip(predicted, right, strict=True)]
+    moves = [np.linalg.norm(a.centre - b.centre) for a, b in zip(predicted, true, strict=True)]
     return float(np.median(turns)) / np.sqrt(3.0), float(np.median(moves)) / np.sqrt(3.0)
-
-
-def _focals(bundle: Bundle) -> Float64:
-    """Logarithms of the focal lengths [G]."""
-    focals = np.zeros(int(bundle.lenses.max()) + 1)
-    for lens, camera in zip(bundle.lenses, bundle.cameras, strict=True):
-        focals[lens] = np.log(camera.K[0, 0])
-    return focals
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is minimised. Parameters: 6 per camera, then focal lengths, then scales of depths."""
+    """The cost. Parameters: 6 per camera, then focal lengths, then scales of depths."""
 
     seen: Observations
     predicted: Sequence[Camera | None]
     spread: Spread
     pixels: float
-    focals: Float64  # as predicted
+    log_focals: Float64  # predicted
 
     @cached_property
     def depth_deviations(self) -> Float64:
         """Standard deviations [M] of the logarithms of depths, as if they were independent."""
         known = np.isfinite(self.seen.depth)
         of_photo = np.bincount(self.seen.view, known)[self.seen.view]
-        return np.asarray(DEPTH * np.sqrt(np.maximum(of_photo / INDEPENDENT, 1.0)))
+        return np.asarray(DEPTH_DEVIATION * np.sqrt(np.maximum(of_photo / INDEPENDENT_DEPTHS, 1.0)))
 
     def cost(self, bundle: Bundle) -> float:
         errors, depth_errors, _ = self._errors(bundle)
@@ -187,24 +172,24 @@ class _Problem:
             return np.inf
         cost = self.pixels**2 * np.log1p((errors**2).sum(axis=1) / self.pixels**2).sum()
         cost += np.log1p(depth_errors**2).sum()
-        for one, wanted in zip(bundle.cameras, self.predicted, strict=True):
-            if wanted is not None:
-                cost += 6.0 * np.log1p((self._off(one, wanted) ** 2).sum() / 6.0)
-        cost += (((_focals(bundle) - self.focals) / FOCAL) ** 2).sum()
-        return float(cost + ((bundle.scales / SCALE) ** 2).sum())
+        for camera, predicted in zip(bundle.cameras, self.predicted, strict=True):
+            if predicted is not None:
+                cost += 6.0 * np.log1p((self._camera_error(camera, predicted) ** 2).sum() / 6.0)
+        cost += (((bundle.log_focals - self.log_focals) / FOCAL_DEVIATION) ** 2).sum()
+        return float(cost + ((bundle.scales / SCALE_DEVIATION) ** 2).sum())
 
     def deviation(self, bundle: Bundle) -> float:
-        """Of observations, pixels; wrong ones do not count."""
+        """Robust standard deviation of observations, pixels."""
         errors = np.linalg.norm(self._errors(bundle)[0], axis=1)
         # The median of distances in the plane is 1.18 standard deviations.
-        return max(LEAST_ERROR, float(np.median(errors)) / 1.18)
+        return max(MIN_DEVIATION_PX, float(np.median(errors)) / 1.18)
 
-    def linearised(self, bundle: Bundle) -> tuple[Equations, Float64]:
-        """Equations of observations, and normal equations of what needs no point."""
+    def linearized(self, bundle: Bundle) -> tuple[Equations, Float64]:
+        """Equations of the observations, and normal equations of the prior."""
         seen, count = self.seen, len(bundle.cameras)
         errors, depth_errors, local = self._errors(bundle)
         rotation = np.stack([one.viewmat[:3, :3] for one in bundle.cameras])[seen.view]
-        focal = np.exp(_focals(bundle))[bundle.lenses][seen.view]
+        focal = np.exp(bundle.log_focals)[bundle.lenses][seen.view]
         lenses = int(bundle.lenses.max()) + 1
         ray = local[:, :2] / local[:, 2:]
         of_local = np.zeros((len(local), 3, 3))
@@ -243,33 +228,36 @@ class _Problem:
     def _prior(self, bundle: Bundle, width: int) -> Float64:
         normal = np.zeros((width, width))
         count = len(bundle.cameras)
-        for k, (one, wanted) in enumerate(zip(bundle.cameras, self.predicted, strict=True)):
-            if wanted is None:
+        for k, (camera, predicted) in enumerate(zip(bundle.cameras, self.predicted, strict=True)):
+            if predicted is None:
                 continue
             rows = np.zeros((6, width))
-            off = self._off(one, wanted)
+            error = self._camera_error(camera, predicted)
             rows[:3, 6 * k : 6 * k + 3] = np.eye(3) / self.spread.rotation
-            # The centre moves against the translation, along the camera's axes.
-            rows[3:, 6 * k + 3 : 6 * k + 6] = -one.viewmat[:3, :3].T / self.spread.centre
-            rows[:, -1] = off
-            normal += rows.T @ rows / (1.0 + (off**2).sum() / 6.0)
+            # The center moves against the translation, along the camera's axes.
+            rows[3:, 6 * k + 3 : 6 * k + 6] = -camera.viewmat[:3, :3].T / self.spread.centre
+            rows[:, -1] = error
+            normal += rows.T @ rows / (1.0 + (error**2).sum() / 6.0)
         begin = 6 * count
-        off = np.concatenate([(_focals(bundle) - self.focals) / FOCAL, bundle.scales / SCALE])
-        unit = np.concatenate([np.full(len(self.focals), FOCAL), np.full(count, SCALE)])
-        at = np.arange(begin, begin + len(off))
+        unit = np.concatenate(
+            [np.full(len(self.log_focals), FOCAL_DEVIATION), np.full(count, SCALE_DEVIATION)]
+        )
+        error = np.concatenate([bundle.log_focals - self.log_focals, bundle.scales]) / unit
+        at = np.arange(begin, begin + len(error))
         normal[at, at] += 1.0 / unit**2
-        normal[at, -1] += off / unit
-        normal[-1, at] += off / unit
+        normal[at, -1] += error / unit
+        normal[-1, at] += error / unit
         return normal
 
-    def _off(self, one: Camera, wanted: Camera) -> Float64:
-        """How far a camera is from the predicted one [6], in standard deviations."""
-        turn = _rotation_vector(one.viewmat[:3, :3] @ wanted.viewmat[:3, :3].T)
-        move = one.centre - wanted.centre
+    def _camera_error(self, camera: Camera, predicted: Camera) -> Float64:
+        """Difference of a camera to the predicted one [6], in standard deviations."""
+        turn = _rotation_vector(camera.viewmat[:3, :3] @ predicted.viewmat[:3, :3].T)
+        move = camera.centre - predicted.centre
         return np.concatenate([turn / self.spread.rotation, move / self.spread.centre])
 
     def _errors(self, bundle: Bundle) -> tuple[Float64, Float64, Float64]:
-        """Pixels [M, 2] and standard deviations of depth [M] off, and points in their cameras."""
+        """Errors in pixels [M, 2], errors of depth in standard deviations [M], and the points in
+        their camera frames [M, 3]."""
         seen = self.seen
         viewmats = np.stack([one.viewmat for one in bundle.cameras])[seen.view]
         K = np.stack([one.K for one in bundle.cameras])[seen.view]
@@ -285,7 +273,7 @@ class _Problem:
 
 
 def _stepped(bundle: Bundle, equations: Equations, prior: Float64, damping: float) -> Bundle | None:
-    """The bundle after a damped step of Gauss-Newton; None where there is none."""
+    """Take a damped Gauss-Newton step; None if the equations are singular."""
     normal = without_points(equations, RIDGE + damping) + prior
     size = equations.width - 1
     information: Float64 = normal[:size, :size].copy()
@@ -299,30 +287,30 @@ def _stepped(bundle: Bundle, equations: Equations, prior: Float64, damping: floa
     count, lenses = len(bundle.cameras), int(bundle.lenses.max()) + 1
     factors = np.exp(np.clip(step[6 * count : 6 * count + lenses], -0.5, 0.5))
     cameras = []
-    for k, one in enumerate(bundle.cameras):
+    for k, camera in enumerate(bundle.cameras):
         turn, move = step[6 * k : 6 * k + 3], step[6 * k + 3 : 6 * k + 6]
-        viewmat = one.viewmat.copy()
+        viewmat = camera.viewmat.copy()
         viewmat[:3] = _rotation_of(turn) @ viewmat[:3]
         viewmat[:3, 3] += move
-        K = one.K.copy()
+        K = camera.K.copy()
         K[[0, 1], [0, 1]] *= factors[bundle.lenses[k]]
-        cameras.append(replace(one, viewmat=viewmat, K=K))
+        cameras.append(replace(camera, viewmat=viewmat, K=K))
     return replace(
         bundle, cameras=cameras, points=points, scales=bundle.scales + step[6 * count + lenses :]
     )
 
 
-def _rotation_of(turn: Float64) -> Float64:
+def _rotation_of(vector: Float64) -> Float64:
     """The rotation about a vector by its length (Rodrigues)."""
-    angle = float(np.linalg.norm(turn))
-    x, y, z = turn / max(angle, 1e-300)
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / max(angle, 1e-300)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     rotation: Float64 = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
     return rotation
 
 
 def _rotation_vector(rotation: Float64) -> Float64:
-    """The vector that a rotation turns about, of the angle's length."""
+    """The inverse of ``_rotation_of``."""
     axis = np.array(
         [
             rotation[2, 1] - rotation[1, 2],

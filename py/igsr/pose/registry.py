@@ -1,4 +1,4 @@
-"""The pose estimators by name. A new one is a file of its own and an entry here."""
+"""Pose estimators by name."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from igsr._internal.extras import is_installed, naming_extra
 from igsr.capture import Camera
+from igsr.pose.checkpoint_search import find_checkpoint
 from igsr.pose.estimate import Estimator
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ class Entry:
     """An estimator.
 
     Attributes:
-        make: makes it; its parameters are the estimator's options.
-        ready: whether it can run here with these options: its packages and weights are found.
+        make: creates the estimator; its parameters are the estimator's options.
+        ready: whether packages and weights for these options are found.
     """
 
     make: Callable[..., Estimator]
@@ -37,14 +38,6 @@ def _dust3r(
         from igsr.pose.dust3r.estimator import Dust3r
 
     return Dust3r(checkpoint=checkpoint, graph=graph, cameras=cameras)
-
-
-def _dust3r_is_ready(options: Mapping[str, Any]) -> bool:
-    if not is_installed("torch"):
-        return False
-    from igsr.pose.dust3r.checkpoint import find_checkpoint
-
-    return find_checkpoint(options.get("checkpoint")) is not None
 
 
 def _colmap(matcher: Matcher | None = None) -> Estimator:
@@ -72,18 +65,18 @@ def _da3(
     )
 
 
-def _da3_is_ready(options: Mapping[str, Any]) -> bool:
-    if not is_installed("torch"):
-        return False
-    from igsr.pose.da3.checkpoint import find_checkpoint
+def _is_ready(estimator: str) -> Callable[[Mapping[str, Any]], bool]:
+    def is_ready(options: Mapping[str, Any]) -> bool:
+        has_torch = is_installed("torch")
+        return has_torch and find_checkpoint(estimator, options.get("checkpoint")) is not None
 
-    return find_checkpoint(options.get("checkpoint")) is not None
+    return is_ready
 
 
 ESTIMATORS = {
     "colmap": Entry(_colmap, lambda options: True),
-    "dust3r": Entry(_dust3r, _dust3r_is_ready),
-    "da3": Entry(_da3, _da3_is_ready),
+    "dust3r": Entry(_dust3r, _is_ready("dust3r")),
+    "da3": Entry(_da3, _is_ready("da3")),
 }
 #: Pose networks, in the order that "auto" looks for their weights.
 NETWORKS = ("da3", "dust3r")

@@ -1,8 +1,7 @@
-"""Weights of pose networks: which there are, under which licence, and how to get them.
+"""Weights of pose networks: which exist, under which license, and how to download them.
 
-Files go to huggingface_hub's cache, where other programs find them too, and are downloaded by that
-library (the extra ``weights``). It goes on where a connection was dropped and writes to a temporary
-name; that the bytes are those that the server announced is checked here, by their hash.
+Files are kept in huggingface_hub's cache, which other programs share. That library (the
+extra ``weights``) downloads them and resumes dropped connections. Their hashes are checked here.
 """
 
 from __future__ import annotations
@@ -14,103 +13,114 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from igsr._internal.atomic_write import atomic_write
 from igsr.errors import IgsrError
-from igsr.pose.huggingface_cache import cache_folder, cached_snapshots
 
-#: Set to anything but 0, it forbids downloads.
+#: Environment variable that forbids downloads, unless it is 0.
 OFFLINE = "IGSR_OFFLINE"
-#: Where files come from, if not from huggingface.co.
+#: Environment variable with the server's address, by default huggingface.co.
 ENDPOINT = "HF_ENDPOINT"
-#: Bytes hashed at a time.
-_PART = 1 << 20
+_HASHED_BYTES = 1 << 20
+_FILES = ("model.safetensors", "config.json")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Weights:
     """Published weights of a pose network.
 
     Attributes:
-        name: what igsr calls them.
-        estimator: what uses them.
+        name: in igsr.
+        estimator: that uses them.
         model: "owner/name" on huggingface.co.
-        files: names of the files that are needed, the weights first.
-        size: bytes to download, about.
-        licence: SPDX identifier of the licence that the publisher states.
-        fetched: whether igsr downloads them; of weights whose terms forbid commercial use it does
-            not, for their terms are to be accepted by whoever downloads them.
-        purpose: what they are for.
+        files: names of the needed files, the weights first.
+        size: bytes to download, approximately.
+        licence: SPDX identifier of the license that the publisher states.
+        fetched: whether igsr downloads them. It does not download weights for non-commercial use,
+            since the user has to accept their terms.
+        purpose: description for users.
     """
 
     name: str
     estimator: str
     model: str
-    files: tuple[str, ...]
+    files: tuple[str, ...] = _FILES
     size: int
-    licence: str
-    fetched: bool
+    licence: str = "Apache-2.0"
+    fetched: bool = True
     purpose: str
 
     @property
     def page(self) -> str:
-        """Where they are described, with their terms."""
+        """The page with their description and terms."""
         return f"https://huggingface.co/{self.model}"
 
     @property
     def path(self) -> Path | None:
-        """The file of the weights in the cache, or None if a file is missing there."""
+        """The file of the weights in the cache; None if a file is missing there."""
         for folder in cached_snapshots(self.model):
             if all((folder / name).is_file() for name in self.files):
                 return folder / self.files[0]
         return None
 
 
-_FILES = ("model.safetensors", "config.json")
-#: By name, in the order that they are listed.
+#: Published weights by name, in the order of lists.
 KNOWN = {
-    one.name: one
-    for one in (
+    weights.name: weights
+    for weights in (
         Weights(
-            "da3-base",
-            "da3",
-            "depth-anything/DA3-BASE",
-            _FILES,
-            541_000_000,
-            "Apache-2.0",
-            True,
-            "cameras and depths of all photos in one pass",
+            name="da3-base",
+            estimator="da3",
+            model="depth-anything/DA3-BASE",
+            size=541_000_000,
+            purpose="cameras and depths of all photos in one pass",
         ),
         Weights(
-            "da3-small",
-            "da3",
-            "depth-anything/DA3-SMALL",
-            _FILES,
-            137_000_000,
-            "Apache-2.0",
-            True,
-            "the same with a quarter of the memory and time",
+            name="da3-small",
+            estimator="da3",
+            model="depth-anything/DA3-SMALL",
+            size=137_000_000,
+            purpose="the same with a quarter of the memory and time",
         ),
         Weights(
-            "dust3r-512-dpt",
-            "dust3r",
-            "naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
-            _FILES,
-            2_280_000_000,
-            "CC-BY-NC-SA-4.0",
-            False,
-            "points of pairs of photos; few photos from far apart",
+            name="dust3r-512-dpt",
+            estimator="dust3r",
+            model="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
+            size=2_280_000_000,
+            licence="CC-BY-NC-SA-4.0",
+            fetched=False,
+            purpose="points of pairs of photos; few photos from far apart",
         ),
     )
 }
 
 
-def known_weights(name: str) -> Weights:
-    """The weights of a name.
+def cache_folder() -> Path:
+    """The cache: HF_HUB_CACHE, else ``hub`` in HF_HOME, else in the user's cache folder."""
+    home = os.environ.get("HF_HOME") or (
+        Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "huggingface"
+    )
+    return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
 
-    Args:
-        name: of ``KNOWN``.
+
+def cached_snapshots(model: str) -> list[Path]:
+    """Folders of the cached revisions of "owner/name", the current one first, then by name."""
+    folder = _model_folder(model)
+    try:
+        current = (folder / "refs" / "main").read_text(errors="replace").strip()
+    except OSError:
+        current = ""
+    return sorted(folder.glob("snapshots/*/"), key=lambda path: (path.name != current, path.name))
+
+
+def _model_folder(model: str) -> Path:
+    return cache_folder() / f"models--{model.replace('/', '--')}"
+
+
+def known_weights(name: str) -> Weights:
+    """Look up weights by name.
 
     Raises:
-        IgsrError: there are none of that name.
+        IgsrError: the name is not in ``KNOWN``.
     """
     if name not in KNOWN:
         raise IgsrError(f"there are no weights {name!r}; name one of {', '.join(KNOWN)}")
@@ -118,13 +128,10 @@ def known_weights(name: str) -> Weights:
 
 
 def weights_path(name: str) -> Path:
-    """The file of weights in the cache; nothing is downloaded.
-
-    Args:
-        name: of ``KNOWN``.
+    """Find the file of weights in the cache; nothing is downloaded.
 
     Raises:
-        IgsrError: there are none of that name, or they are not in the cache.
+        IgsrError: the name is not in ``KNOWN``, or the weights are not in the cache.
     """
     weights = known_weights(name)
     if weights.path is None:
@@ -134,20 +141,13 @@ def weights_path(name: str) -> Path:
 
 
 def fetch_weights(name: str) -> Path:
-    """Download weights to the cache, and check them there.
+    """Download weights to the cache and check their hashes, also of files that are already there.
 
-    What is there already is checked too. A dropped connection is taken up where it was; what is not
-    whole, or not what the server announced, is removed.
-
-    Args:
-        name: of ``KNOWN``.
-
-    Returns:
-        The file of the weights.
+    Incomplete files are removed, as are files whose hash differs from the server's.
 
     Raises:
-        IgsrError: there are none of that name, igsr does not download them, downloads are forbidden
-            (IGSR_OFFLINE), huggingface_hub is not installed, or the download failed.
+        IgsrError: the name is not in ``KNOWN``, igsr does not download these weights, downloads
+            are forbidden (IGSR_OFFLINE), huggingface_hub is missing, or the download failed.
     """
     weights = known_weights(name)
     if not weights.fetched:
@@ -166,7 +166,7 @@ def fetch_weights(name: str) -> Path:
     source: dict[str, Any] = {"endpoint": os.environ.get(ENDPOINT) or None, "token": False}
     commit: str | None = None  # of the first file: all must be of one revision
     try:
-        # The small file first: what answers wrongly is known before the large one is loaded.
+        # The small file first, so that a wrong server is noticed before the large download.
         for file in reversed(weights.files):
             url = huggingface_hub.hf_hub_url(
                 weights.model, file, revision=commit, endpoint=source["endpoint"]
@@ -175,39 +175,35 @@ def fetch_weights(name: str) -> Path:
             commit = commit or announced.commit_hash
             path = Path(
                 huggingface_hub.hf_hub_download(
-                    weights.model,
-                    file,
-                    revision=commit,
-                    cache_dir=cache_folder(),
-                    **source,
+                    weights.model, file, revision=commit, cache_dir=cache_folder(), **source
                 )
             )
-            if not _is_what_was_announced(path, announced.etag):
-                _remove(path)
+            if not _has_hash(path, announced.etag):
+                # The link in the snapshot, and its target.
+                path.resolve().unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
                 raise IgsrError(
-                    f"{file} of {weights.model} is not what the server announced, so it was "
+                    f"{file} of {weights.model} does not have the server's hash, so it was "
                     "removed; try again, or look for a proxy that changes downloads"
                 )
-        _set_current(weights, path)
+        # As the library does for a branch.
+        with atomic_write(_model_folder(weights.model) / "refs" / "main") as temporary:
+            temporary.write_text(path.parent.name)
     except IgsrError:
         raise
-    except Exception as error:  # several libraries' own
+    except Exception as error:  # of several libraries
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise IgsrError(f"{name} could not be downloaded ({reason}); try again") from error
     return path
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 of a file, in hexadecimal digits.
-
-    Args:
-        path: of the file.
-    """
+    """The SHA-256 of a file, in hexadecimal digits."""
     return _digest(path, hashlib.sha256())
 
 
-def _is_what_was_announced(path: Path, etag: str | None) -> bool:
-    """Whether a file has the hash that the server gave: SHA-256, or git's SHA-1 of small files."""
+def _has_hash(path: Path, etag: str | None) -> bool:
+    """Check a file against the server's hash: SHA-256, or git's SHA-1 for small files."""
     etag = (etag or "").lower()
     if re.fullmatch("[0-9a-f]{64}", etag):
         return sha256_of(path) == etag
@@ -219,22 +215,6 @@ def _is_what_was_announced(path: Path, etag: str | None) -> bool:
 
 def _digest(path: Path, digest: Any) -> str:
     with path.open("rb") as file:
-        while part := file.read(_PART):
+        while part := file.read(_HASHED_BYTES):
             digest.update(part)
-    found: str = digest.hexdigest()
-    return found
-
-
-def _remove(path: Path) -> None:
-    """Take a file out of the cache: the link in the snapshot, and what it leads to."""
-    path.resolve().unlink(missing_ok=True)
-    path.unlink(missing_ok=True)
-
-
-def _set_current(weights: Weights, path: Path) -> None:
-    """Note the revision as the model's current one, as the library does for a branch."""
-    from igsr._internal.atomic_write import atomic_write
-
-    reference = cache_folder() / f"models--{weights.model.replace('/', '--')}" / "refs" / "main"
-    with atomic_write(reference) as temporary:
-        temporary.write_text(path.parent.name)
+    return str(digest.hexdigest())

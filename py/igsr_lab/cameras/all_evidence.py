@@ -83,7 +83,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=384)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    fewest = all_evidence.FEWEST_PLACED
+    fewest = all_evidence.MIN_PLACED
     for path in asked.captures:
         photos, cameras, depths = truth(path, asked.size)
         true = [cameras[photo.name] for photo in photos]
@@ -105,12 +105,12 @@ def main() -> None:
         spoiled = {**depths, name: (FACTOR * depths[name] * noise).astype(np.float32)}
         try:
             # COLMAP's model then is no start, and the adjustment has to do it all.
-            all_evidence.FEWEST_PLACED = len(photos) + 1
+            all_evidence.MIN_PLACED = len(photos) + 1
             told("adjusted", Da3(network)(photos).cameras)
             wrong = NoisyNetwork(cameras, spoiled, seed=asked.seed)
             told("adjusted, one photo's depths wrong", Da3(wrong)(photos).cameras)
         finally:
-            all_evidence.FEWEST_PLACED = fewest
+            all_evidence.MIN_PLACED = fewest
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.geometry.similarity import Similarity
 from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.da3.preprocessing import resampling_of
+from igsr.pose.da3.prediction import resampling_of
 
 Float64 = npt.NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Noise:
 
 
 class NoisyNetwork:
-    """Stands where a network stands (``igsr.pose.da3.passes.Predictor``).
+    """Stands where a network stands (``igsr.pose.da3.prediction.Predictor``).
 
     Args:
         cameras: true ones, by photo name.

@@ -21,7 +21,7 @@ from igsr.evaluation.metrics import psnr
 from igsr.evaluation.scores import WHITE
 from igsr.fitting.fit_capture import fingerprint, fit_with_cameras
 from igsr.fitting.presets import PAPER_STEPS, preset_settings
-from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
+from igsr_lab.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
 from igsr_lab.denoiser.pair_files import Pairs, write_pairs
 from igsr_lab.denoiser.pair_renders import check_one_size, rendered_pairs
 

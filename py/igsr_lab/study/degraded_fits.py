@@ -21,7 +21,7 @@ from igsr.errors import IgsrError
 from igsr.evaluation.scores import known_background
 from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.presets import PAPER_STEPS, preset_settings
-from igsr.geometry.camera_noise import AFFINE, MATRIX, Noise, noise_unit, noisy_view
+from igsr_lab.camera_noise import AFFINE, MATRIX, Noise, noise_unit, noisy_view
 from igsr_lab.denoiser.pair_files import write_pairs
 from igsr_lab.denoiser.pair_renders import check_one_size, rendered_pairs
 from igsr_lab.study.real_captures import is_dtu

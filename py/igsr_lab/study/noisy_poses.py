@@ -27,9 +27,9 @@ from igsr.fitting.fit_capture import fit_with_cameras
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.presets import preset_settings
 from igsr.fitting.settings import Poses
-from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
+from igsr_lab.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
 from igsr_lab.study.markdown_table import markdown_table
 from igsr_lab.study.study_files import headed, text_of, write_study_files
 

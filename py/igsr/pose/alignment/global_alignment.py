@@ -1,7 +1,6 @@
-"""Global alignment: from pointmaps of pairs of photos to cameras and depths of all of them.
+"""Global alignment of pointmaps (Wang et al. 2024, section 3.4).
 
-DUSt3R's (Wang et al. 2024, section 3.4). ``docs/how-it-works/alignment.md`` says where
-ours differs and why.
+``docs/how-it-works/alignment.md`` describes how it differs from DUSt3R's, and why.
 """
 
 from __future__ import annotations
@@ -15,52 +14,45 @@ import torch
 
 from igsr.capture import Camera
 from igsr.errors import IgsrError
-from igsr.geometry.similarity import Similarity, apply
-from igsr.pose.alignment.aligned_photo import AlignedPhoto
-from igsr.pose.alignment.depths_on_rays import CHUNK, depths_on_rays
-from igsr.pose.alignment.initial_alignment import start
+from igsr.geometry.similarity import Similarity
+from igsr.pose.alignment.camera_solvers import BATCH_NUMBERS, depths_on_rays
+from igsr.pose.alignment.initial_alignment import Placement, components, start
 from igsr.pose.alignment.objective import Objective
-from igsr.pose.alignment.observations import (
+from igsr.pose.alignment.predictions import (
     Edge,
     Observations,
+    PairPrediction,
+    PhotoToAlign,
     observe,
-    sides,
-    strong_edges,
+    overlapping_edges,
     usable_confidence,
 )
-from igsr.pose.alignment.placement import Placement, inverse, joined
-from igsr.pose.alignment.predictions import PairPrediction, PhotoToAlign, checked_predictions
-from igsr.pose.alignment.spanning_tree import components
-from igsr.pose.grid import Grid
+from igsr.pose.depth_maps import AlignedPhoto
+from igsr.pose.grid import Grid, ray_slopes
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 
-#: Steps of the optimiser.
+#: Default number of optimizer steps.
 STEPS = 300
-#: Its rate falls from the first to the last by a cosine; both momenta, as in DUSt3R.
-FIRST_RATE, LAST_RATE, BETAS = 0.01, 1e-6, (0.9, 0.9)
-#: Gradients are per pixel of millions: what Adam adds to their size must be far below.
+#: Learning rates of the first and the last step, with cosine decay between them.
+FIRST_RATE = 0.01
+LAST_RATE = 1e-6
+#: Momenta, as in DUSt3R.
+BETAS = (0.9, 0.9)
+#: Gradients are of millions of pixels each, so Adam's epsilon must be far smaller.
 ADAM_EPSILON = 1e-15
 
 
 @dataclass(eq=False)
 class Alignment:
-    """What the alignment found.
+    """Result of the alignment."""
 
-    Attributes:
-        photos: None where one is not registered.
-        pairs: the directed pairs that were aligned.
-        start_loss: the objective after the start; its unit is the median depth.
-        loss: the objective at the end.
-        warnings: messages that name the photos that are not registered.
-    """
-
-    photos: list[AlignedPhoto | None]
-    pairs: list[tuple[int, int]]
-    start_loss: float
-    loss: float
-    warnings: list[str]
+    photos: list[AlignedPhoto | None]  # None for unregistered ones
+    pairs: list[tuple[int, int]]  # the aligned ordered pairs
+    start_loss: float  # initial objective, in units of the median depth
+    loss: float  # final objective
+    warnings: list[str]  # name unregistered photos
 
 
 def align(
@@ -71,117 +63,104 @@ def align(
     seed: int = 0,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Alignment:
-    """Cameras and depths that agree best with what was predicted for pairs of photos.
+    """Estimate the cameras and depths that best agree with the predictions for pairs of photos.
 
-    Without fixed poses the world is the camera frame of the strongest pair's first photo, and its
-    unit that in which this pair's points lie 1 from their middle on average. One fixed pose sets
-    the world but not its unit, two or more at different places set both.
+    Without fixed poses, the world is the camera frame of the best pair's first photo, and its unit
+    the mean distance of that pair's points from their center. One fixed pose defines the world but
+    not its unit; two or more at different places define both.
 
-    Pairs that have nothing in common are left out. Of photos that then fall into groups, the group
-    with most fixed poses is placed, and of those with equally many the largest.
+    Pairs that do not overlap are ignored. If photos then form several groups, the group with the
+    most fixed poses, then the largest, is placed.
 
     Deterministic for given predictions, seed and number of threads.
 
     Args:
-        predictions: of directed pairs.
+        predictions: for ordered pairs.
         photos: in the order that predictions count them.
-        steps: of the optimiser; 0 ends with the start.
-        seed: what RANSAC draws from.
-        progress: called as progress("alignment", done, all).
+        steps: of the optimizer; 0 keeps the initialization.
+        seed: of RANSAC.
+        progress: called as progress("alignment", done, total).
 
     Raises:
-        IgsrError: a prediction does not fit its photos, steps is not a whole number of at least 0,
-            or no two photos have anything in common.
+        IgsrError: no two photos overlap.
     """
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 0:
-        raise IgsrError(f"steps is {steps!r}; give a whole number that is not negative")
-    edges, observations, begun, depths = _started(
-        strong_edges(checked_predictions(photos, predictions)), photos, seed
+    edges, observations, initial, depths = _initialized(
+        overlapping_edges(predictions), photos, seed
     )
-    normal = _normal_frame(begun, depths)
+    # Optimize with the cameras' mean at zero and the median depth at one.
+    unit = float(np.median(np.concatenate(list(depths.values()))))
+    centers = [-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in initial.viewmats.values()]
+    normal = Similarity(1.0 / unit, np.eye(3), -np.mean(centers, axis=0) / unit)
     objective = Objective(
         observations,
-        begun.mapped(normal),
+        initial.mapped(normal),
         {i: normal.scale * depth for i, depth in depths.items()},
         photos,
     )
-    start_loss, loss = _optimise(objective, steps, progress)
-    found = objective.found().mapped(inverse(normal))
-    if all(photos[i].viewmat is None for i in found.viewmats):
-        anchor = found.viewmats[int(observations.edges[np.argmax(observations.scores), 0])]
-        found = found.mapped(Similarity(1.0, anchor[:3, :3], anchor[:3, 3]))
+    start_loss, loss = _optimize(objective, steps, progress)
+    placement = objective.placement().mapped(normal.inverse())
+    if all(photos[i].viewmat is None for i in placement.viewmats):
+        anchor = placement.viewmats[int(observations.edges[np.argmax(observations.scores), 0])]
+        placement = placement.mapped(Similarity(1.0, anchor[:3, :3], anchor[:3, 3]))
 
-    placed: list[AlignedPhoto | None] = []
+    aligned: list[AlignedPhoto | None] = []
     warnings = []
     for i, photo in enumerate(photos):
-        if i not in found.viewmats:
-            placed.append(None)
+        if i not in placement.viewmats:
+            aligned.append(None)
             warnings.append(
-                f"{photo.name} could not be aligned: the network sees nothing in it that the "
-                "other photos show too"
+                f"{photo.name} could not be aligned: the network sees no overlap with the other "
+                "photos"
             )
             continue
-        viewmat = found.viewmats[i] if photo.viewmat is None else photo.viewmat
-        camera = Camera(viewmat, found.intrinsics[i], photo.width, photo.height)
-        depth, confidence = _depth(edges, observations, found.edges, i, camera, photo.grid)
-        placed.append(AlignedPhoto(camera, photo.grid, depth, confidence))
-    pairs = [(edge.prediction.first, edge.prediction.second) for edge in edges]
-    return Alignment(placed, pairs, start_loss, loss, warnings)
+        viewmat = placement.viewmats[i] if photo.viewmat is None else photo.viewmat
+        camera = Camera(viewmat, placement.intrinsics[i], photo.width, photo.height)
+        depth, confidence = _depth_map(edges, observations, placement.edges, i, camera, photo.grid)
+        aligned.append(AlignedPhoto(camera, photo.grid, depth, confidence))
+    return Alignment(
+        aligned, [edge.prediction.photos for edge in edges], start_loss, loss, warnings
+    )
 
 
-def _started(
+def _initialized(
     edges: list[Edge], photos: Sequence[PhotoToAlign], seed: int
 ) -> tuple[list[Edge], Observations, Placement, dict[int, Float64]]:
-    """The edges of the photos that are placed, what they say, and where the alignment starts."""
-    while True:
-        if not edges:
-            raise IgsrError(
-                "no two of the photos show the same thing, as far as the network can tell; give "
-                "photos that overlap more"
-            )
-        group = _group_to_place(edges, photos)
-        edges = [edge for edge in edges if edge.prediction.first in group]
-        observations = observe(edges, photos)
-        begun = start(observations, photos, seed)
-        if not isinstance(begun, list):
-            return edges, observations, *begun
-        edges = [edge for e, edge in enumerate(edges) if e not in begun]
-
-
-def _group_to_place(edges: list[Edge], photos: Sequence[PhotoToAlign]) -> set[int]:
-    """The connected photos with most fixed poses, then most photos, then the highest scores."""
-    ends = [(edge.prediction.first, edge.prediction.second) for edge in edges]
+    """Edges and observations of the photos that are placed, and their initial placement."""
 
     def rank(group: list[int]) -> tuple[int, int, float]:
         fixed = sum(photos[i].viewmat is not None for i in group) if len(group) > 1 else 0
         return fixed, len(group), sum(e.score for e in edges if e.prediction.first in group)
 
-    best = max(components(len(photos), ends), key=rank)
-    return set(best)
+    while edges:
+        groups = components(len(photos), [edge.prediction.photos for edge in edges])
+        group = max(groups, key=rank)
+        edges = [edge for edge in edges if edge.prediction.first in group]
+        observations = observe(edges, photos)
+        initial = start(observations, photos, seed)
+        if not isinstance(initial, list):
+            return edges, observations, *initial
+        edges = [edge for e, edge in enumerate(edges) if e not in initial]
+    raise IgsrError(
+        "the network sees no overlap between any two photos; give photos that overlap more"
+    )
 
 
-def _normal_frame(start: Placement, depths: dict[int, Float64]) -> Similarity:
-    """What brings the cameras' mean to zero and the median depth to one."""
-    unit = float(np.median(np.concatenate(list(depths.values()))))
-    centres = [-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in start.viewmats.values()]
-    return Similarity(1.0 / unit, np.eye(3), -np.mean(centres, axis=0) / unit)
-
-
-def _optimise(
+def _optimize(
     objective: Objective, steps: int, progress: Callable[[str, int, int], None] | None
 ) -> tuple[float, float]:
-    """Adam from the start to the best that it comes by: the objective at the start, and there.
+    """Run Adam and keep the best parameters; the initial and the best objective.
 
-    What is exact already has no gradient worth the name, and steps of the first rate lead away.
+    The last parameters may be worse than the first: if the predictions are exact, the gradients
+    are only noise.
     """
-    optimiser = torch.optim.Adam(
+    optimizer = torch.optim.Adam(
         objective.parameters, lr=FIRST_RATE, betas=BETAS, eps=ADAM_EPSILON, foreach=True
     )
-    least, best, begun = np.inf, [p.detach().clone() for p in objective.parameters], 0.0
+    least, best, initial = np.inf, [p.detach().clone() for p in objective.parameters], 0.0
     for step in range(steps + 1):
         loss = objective.loss()
         if step == 0:
-            begun = loss
+            initial = loss
         if loss < least:
             least = loss
             for kept, parameter in zip(best, objective.parameters, strict=True):
@@ -189,16 +168,16 @@ def _optimise(
         if progress is not None:
             progress("alignment", step, steps)
         if step < steps:
-            done = 0.5 - 0.5 * np.cos(np.pi * step / steps)
-            optimiser.param_groups[0]["lr"] = FIRST_RATE + (LAST_RATE - FIRST_RATE) * done
-            optimiser.step()
+            decay = 0.5 - 0.5 * np.cos(np.pi * step / steps)
+            optimizer.param_groups[0]["lr"] = FIRST_RATE + (LAST_RATE - FIRST_RATE) * decay
+            optimizer.step()
     with torch.no_grad():
         for parameter, kept in zip(objective.parameters, best, strict=True):
             parameter.copy_(kept)
-    return begun, least
+    return initial, least
 
 
-def _depth(
+def _depth_map(
     edges: Sequence[Edge],
     observations: Observations,
     placed: Sequence[Similarity],
@@ -206,30 +185,29 @@ def _depth(
     camera: Camera,
     grid: Grid,
 ) -> tuple[Float32, Float32]:
-    """Depth and confidence [h, w] of all pixels of a photo's grid, thinned or not."""
-    slopes = ((grid.photo_pixels() - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]).T
+    """Depth and confidence [h, w] of all pixels of a photo's grid, also of a thinned one."""
+    slopes = ray_slopes(grid.photo_pixels(), camera.K).T
     to_camera = Similarity(1.0, camera.viewmat[:3, :3], camera.viewmat[:3, 3])
     seen = observations.photos[photo]
     maps, frames = [], []
     for e, is_first in zip(seen.edges, seen.is_first, strict=True):
         unit = observations.units[e]
-        stored = Similarity(1.0 / unit, np.eye(3), -observations.centres[e] / unit)
-        frames.append(joined(to_camera, joined(placed[e], stored)))
-        points, confidence = sides(edges[e].prediction)[0 if is_first else 1]
+        stored = Similarity(1.0 / unit, np.eye(3), -observations.centers[e] / unit)
+        frames.append(to_camera @ (placed[e] @ stored))
+        points, confidence = edges[e].prediction.sides[0 if is_first else 1]
         maps.append((points, usable_confidence(points, confidence)))
     depth = np.empty((grid.height, grid.width), dtype=np.float32)
-    confidence = np.max([sure for _, sure in maps], axis=0)
-    # All maps at once would be a second copy of them.
-    step = max(1, CHUNK // (3 * len(maps) * grid.width))
+    # In batches: all maps at once would be a second copy of them.
+    step = max(1, BATCH_NUMBERS // (3 * len(maps) * grid.width))
     for begin in range(0, grid.height, step):
         rows = slice(begin, begin + step)
-        sure = np.stack([c[rows].ravel() for _, c in maps])
+        usable = np.stack([c[rows].ravel() for _, c in maps])
         local = [
-            apply(frame, np.where(c > 1.0, xyz[rows].reshape(-1, 3).T, 0.0).astype(np.float64))
-            for frame, (xyz, _), c in zip(frames, maps, sure, strict=True)
+            frame.apply(np.where(c > 1.0, xyz[rows].reshape(-1, 3).T, 0.0).astype(np.float64))
+            for frame, (xyz, _), c in zip(frames, maps, usable, strict=True)
         ]
-        own = slice(begin * grid.width, begin * grid.width + sure.shape[1])
-        found = depths_on_rays(np.stack(local), np.log(sure), slopes[:, own])
-        depth[rows] = found.reshape(-1, grid.width)
+        own = slice(begin * grid.width, begin * grid.width + usable.shape[1])
+        part = depths_on_rays(np.stack(local), np.log(usable), slopes[:, own])
+        depth[rows] = part.reshape(-1, grid.width)
     depth[~(depth > 0.0)] = np.nan
-    return depth, confidence
+    return depth, np.max([c for _, c in maps], axis=0)

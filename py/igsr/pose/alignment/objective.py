@@ -1,11 +1,11 @@
-"""What the alignment minimises, and its gradient.
+"""The objective of the alignment, and its gradient.
 
     sum_e sum_p ln(c_first) ||X_first(p) - s_e R_e q_first(p) - t_e|| / sum_e pixels of e's first
     + the same over the second photos
 
 X_i(p) = C_i + R_i d_i(p) (x, y, 1) is the world point of a pixel, q_e(p) its prediction on edge e,
-and c_e(p) the raw confidence of that (Wang et al. 2024, equation 5; the logarithm and the two
-means are those of its published code).
+and c_e(p) the raw confidence (Wang et al. 2024, equation 5; the logarithm and the two means are
+as in the published code).
 """
 
 from __future__ import annotations
@@ -19,64 +19,54 @@ import torch
 from torch import Tensor
 
 from igsr.geometry.similarity import Similarity
-from igsr.pose.alignment.observations import Observations
-from igsr.pose.alignment.placement import Placement
-from igsr.pose.alignment.predictions import PhotoToAlign
+from igsr.pose.alignment.camera_solvers import BATCH_NUMBERS
+from igsr.pose.alignment.initial_alignment import Placement
+from igsr.pose.alignment.predictions import Observations, PhotoToAlign
+from igsr.pose.grid import ray_slopes
 
 Float64 = npt.NDArray[np.float64]
 
-#: Numbers that are worked on at once: they should stay in a core's cache.
-CHUNK = 200_000
-#: Distances below this, in world units, weigh no more.
-NO_DISTANCE = 1e-9
+#: Minimum distance in the weights, world units.
+MIN_DISTANCE = 1e-9
 
 
 @dataclass(eq=False)
 class _Photo:
-    """One photo's part: K rows of P pixels."""
+    """Terms of one photo: P pixels on K edges."""
 
     points: Tensor  # float32 [K, 3, P]
     weights: Tensor  # float32 [K, P]
     edges: Tensor  # [K]
-    slopes: Tensor  # float32 [2, P], (x, y) of the rays at the start
-    depths: Tensor  # float32 [P], at the start
+    slopes: Tensor  # float32 [2, P], (x, y) of the initial rays
+    depths: Tensor  # float32 [P], initial
     part: slice  # of all photos' depths
     focal: int  # index into the free focal lengths, or -1
 
 
 class Objective:
-    """Cameras, depths and edges as differences to where they start.
+    """Cameras, depths and edges, as differences to an initial placement.
 
-    Rotations are Gibbs vectors (axis times the tangent of half the angle) after the start's;
-    depths, focal lengths and scales are logarithms of ratios. All begin at zero.
-
-    Attributes:
-        edge_turns: float64 [E, 3].
-        edge_moves: float64 [E, 3], world units.
-        edge_scales: float64 [E].
-        turns: float64 [N, 3], of the photos in the order of their indices.
-        moves: float64 [N, 3], world units.
-        focals: float64 [G], one per group of photos whose focal length is free.
-        depths: float32 [sum of P], of all photos.
+    Rotations are Gibbs vectors (axis times the tangent of half the angle) after the initial
+    rotation; depths, focal lengths and scales are logarithms of ratios. All begin at zero.
     """
 
     def __init__(
         self,
         observations: Observations,
-        start: Placement,
+        initial: Placement,
         depths: dict[int, Float64],
         photos: Sequence[PhotoToAlign],
     ) -> None:
-        """Set out from a start.
+        """Begin at an initial placement.
 
         Args:
-            observations: what is aligned.
-            start: of these.
+            observations: to be aligned.
+            initial: the placement.
             depths: [P] of each photo's pixels, positive.
-            photos: all of them. Where the poses of none or of one are fixed, or all fixed ones are
-                at one place, the mean scale of the edges is held: all else would shrink to nothing.
+            photos: all of them. Unless poses are fixed at two places, the mean scale of the edges
+                is fixed: otherwise everything would shrink to a point.
         """
-        self._start = start
+        self._initial = initial
         self.photos = sorted(observations.photos)
         free_groups: dict[Hashable, int] = {}
         for i in self.photos:
@@ -91,8 +81,8 @@ class Objective:
         self._parts: list[_Photo] = []
         begin = 0
         for i in self.photos:
-            seen, K = observations.photos[i], start.intrinsics[i]
-            slopes = (seen.pixels - K[[0, 1], 2]) / K[[0, 1], [0, 1]]
+            seen = observations.photos[i]
+            slopes = ray_slopes(seen.pixels, initial.intrinsics[i])
             weights = torch.from_numpy(seen.confidence).log()
             weights /= torch.where(torch.from_numpy(seen.is_first), *areas)[:, None]
             end = begin + len(seen.pixels)
@@ -108,16 +98,16 @@ class Objective:
                 )
             )
             begin = end
-        views = np.stack([start.viewmats[i] for i in self.photos])
+        views = np.stack([initial.viewmats[i] for i in self.photos])
         self._rotations = torch.from_numpy(views[:, :3, :3].transpose(0, 2, 1).copy())
-        self._centres = -(self._rotations @ torch.from_numpy(views[:, :3, 3:]))[..., 0]
-        self._edge_rotations = torch.from_numpy(np.stack([e.rotation for e in start.edges]))
-        self._edge_translations = torch.from_numpy(np.stack([e.translation for e in start.edges]))
-        self._edge_scales = torch.tensor([e.scale for e in start.edges], dtype=torch.float64)
+        self._centers = -(self._rotations @ torch.from_numpy(views[:, :3, 3:]))[..., 0]
+        self._edge_rotations = torch.from_numpy(np.stack([e.rotation for e in initial.edges]))
+        self._edge_translations = torch.from_numpy(np.stack([e.translation for e in initial.edges]))
+        self._edge_scales = torch.tensor([e.scale for e in initial.edges], dtype=torch.float64)
         free = [float(photos[i].viewmat is None) for i in self.photos]
         self._free = torch.tensor(free, dtype=torch.float64)[:, None]
-        held = self._centres[self._free[:, 0] == 0.0]
-        self._hold_scale = len(held) < 2 or float((held - held[0]).abs().max()) < 1e-9
+        fixed = self._centers[self._free[:, 0] == 0.0]
+        self._fix_scale = len(fixed) < 2 or float((fixed - fixed[0]).abs().max()) < 1e-9
 
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(*shape, dtype=torch.float64, requires_grad=True)
@@ -126,46 +116,37 @@ class Objective:
         self.edge_turns, self.edge_moves = zeros(edge_count, 3), zeros(edge_count, 3)
         self.edge_scales = zeros(edge_count)
         self.turns, self.moves = zeros(count, 3), zeros(count, 3)
-        self.focals = zeros(len(free_groups))
-        self.depths = torch.zeros(begin, dtype=torch.float32, requires_grad=True)
-
-    @property
-    def parameters(self) -> list[Tensor]:
-        """All that can be optimised."""
-        return [
-            self.edge_turns,
-            self.edge_moves,
-            self.edge_scales,
-            self.turns,
-            self.moves,
-            self.focals,
-            self.depths,
+        self.focals = zeros(len(free_groups))  # one per group of photos whose focal length is free
+        self.depths = torch.zeros(begin, dtype=torch.float32, requires_grad=True)  # of all photos
+        self.parameters = [
+            *(self.edge_turns, self.edge_moves, self.edge_scales),
+            *(self.turns, self.moves, self.focals, self.depths),
         ]
 
     def edges(self) -> tuple[Tensor, Tensor]:
         """Scaled rotations [E, 3, 3] and translations [E, 3] of edges to the world."""
         ratios = self.edge_scales
-        if self._hold_scale:
+        if self._fix_scale:
             ratios = ratios - ratios.mean()
         scales = self._edge_scales * ratios.exp()
         turned = _rotations(self.edge_turns) @ self._edge_rotations
         return scales[:, None, None] * turned, self._edge_translations + self.edge_moves
 
     def cameras(self) -> tuple[Tensor, Tensor]:
-        """Rotations [N, 3, 3] from cameras to the world, and camera centres [N, 3]."""
+        """Rotations [N, 3, 3] from cameras to the world, and camera centers [N, 3]."""
         turned = _rotations(self.turns * self._free) @ self._rotations
-        return turned, self._centres + self.moves * self._free
+        return turned, self._centers + self.moves * self._free
 
-    def found(self) -> Placement:
-        """Cameras and edges as the parameters say, in the frame of the start."""
-        rotations, centres = (x.detach().numpy() for x in self.cameras())
+    def placement(self) -> Placement:
+        """Cameras and edges at the current parameters."""
+        rotations, centers = (x.detach().numpy() for x in self.cameras())
         matrices, translations = (x.detach().numpy() for x in self.edges())
         viewmats, intrinsics = {}, {}
         for n, (i, photo) in enumerate(zip(self.photos, self._parts, strict=True)):
             viewmats[i] = np.eye(4)
             viewmats[i][:3, :3] = rotations[n].T
-            viewmats[i][:3, 3] = -rotations[n].T @ centres[n]
-            intrinsics[i] = self._start.intrinsics[i].copy()
+            viewmats[i][:3, 3] = -rotations[n].T @ centers[n]
+            intrinsics[i] = self._initial.intrinsics[i].copy()
             if photo.focal >= 0:
                 intrinsics[i][[0, 1], [0, 1]] *= float(self.focals.detach()[photo.focal].exp())
         edges = []
@@ -175,7 +156,7 @@ class Objective:
         return Placement(viewmats, intrinsics, edges)
 
     def loss(self) -> float:
-        """The loss, whose gradient is put into ``grad`` of the parameters."""
+        """Compute the loss, and set ``grad`` of the parameters."""
         edges, cameras = self.edges(), self.cameras()
         A, t, R, C = (x.detach().float() for x in (*edges, *cameras))
         gradients = [torch.zeros_like(x) for x in (A, t, R, C)]
@@ -186,7 +167,7 @@ class Objective:
             zoom = float(torch.exp(-self.focals.detach()[photo.focal])) if photo.focal >= 0 else 1.0
             edge_A, edge_t = A[photo.edges], t[photo.edges]
             sums = [torch.zeros_like(edge_A), torch.zeros_like(edge_t)]
-            step = max(1, CHUNK // (3 * len(photo.edges)))
+            step = max(1, BATCH_NUMBERS // (3 * len(photo.edges)))
             for begin in range(0, len(photo.depths), step):
                 part = slice(begin, begin + step)
                 own = slice(
@@ -198,10 +179,10 @@ class Objective:
                 points, weights = photo.points[:, :, part], photo.weights[:, part]
                 off = world - edge_t[:, :, None]
                 off.baddbmm_(edge_A, points, alpha=-1.0)
-                # linalg.vector_norm over the middle dimension takes fifty times as long.
+                # linalg.vector_norm over the middle dimension is fifty times slower.
                 distance = off.square().sum(dim=1).sqrt_()
                 total += float((weights * distance).sum())
-                weights = weights / distance.clamp_(min=NO_DISTANCE)
+                weights = weights / distance.clamp_(min=MIN_DISTANCE)
                 off *= weights[:, None]
                 sums[0] -= torch.bmm(off, points.transpose(1, 2))
                 sums[1] -= off.sum(dim=2)

@@ -1,8 +1,8 @@
-"""Points and cameras from matches and from cameras that are known roughly.
+"""Adjust approximate cameras to matches: triangulation and bundle adjustment in turn.
 
-Points are triangulated with the cameras as they are, under bounds that are as wide as such cameras
-are wrong, and bundle adjustment moves cameras and points; then again under narrower bounds. Unlike
-the incremental mapper this places no photo: it needs no first pair and no order.
+Points are triangulated with error bounds that suit approximate cameras, then cameras and points
+are adjusted, and again with narrower bounds. Unlike the incremental mapper, this needs no first
+pair and no order of photos.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy.typing as npt
 from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import PoseEvidence, intrinsic_matrix
-from igsr.pose.alignment import AlignedPhoto
+from igsr.pose.colmap.attempts import THRESHOLDS
 from igsr.pose.colmap.database import image_id
-from igsr.pose.colmap.evidence import STEPS
 from igsr.pose.colmap.mapping import mapping_options
+from igsr.pose.depth_maps import AlignedPhoto
 from igsr.pose.estimate import Progress
 from igsr.pose.prior_adjustment import (
     Bundle,
@@ -33,30 +33,33 @@ from igsr.pose.prior_adjustment import (
 
 Float64 = npt.NDArray[np.float64]
 
-#: Bounds of each round: degrees between rays that make a point, and the part of the photo's longer
-#: side that an observation may be off. The first are those of a network's cameras, the last
+#: Bounds of each round: maximum angle between rays to a point, degrees, and maximum reprojection
+#: error as a fraction of the photo's longer side. The first suit a network's cameras, the last are
 #: COLMAP's for photos of 400 pixels and more.
 ROUNDS = ((8.0, 0.1), (4.0, 0.03), (2.0, 0.01), (2.0, 0.005))
-#: Bundle adjustments within each round, and the part of the observations that changes at the end.
-REFINEMENTS, SETTLED = 3, 5e-3
-#: Points of a photo, at least, for its camera to rest on features.
-FEWEST_POINTS = 15
-#: Photos of which uncertainties are told at most: memory and time grow with their square.
-MOST_TOLD = 100
-#: Part of a round's bound, in pixels, beyond which an observation weighs less; pixels at least.
-ROBUST, LEAST_ROBUST = 0.1, 1.0
+#: Maximum bundle adjustments per round; a round ends if at most this fraction of observations
+#: changes.
+MAX_ADJUSTMENTS = 3
+SETTLED_FRACTION = 5e-3
+#: Minimum number of points of a photo for its camera to rest on features.
+MIN_POINTS = 15
+#: Maximum number of photos for uncertainties: memory and time grow with its square.
+MAX_COVARIANCE_PHOTOS = 100
+#: Residuals beyond this fraction of a round's bound, and this many pixels, have less weight.
+ROBUST_FRACTION = 0.1
+MIN_ROBUST_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """What matches say of cameras, by the index of the photo.
+    """Adjusted cameras, by index of the photo.
 
     Attributes:
-        model: pycolmap's, of the photos with matches.
-        cameras: without the lenses' distortion, in the world of the predictions.
-        covariances: float64 [6, 6], of rotation (radians) about and translation (world units) along
+        model: pycolmap's reconstruction of the photos with matches.
+        cameras: without lens distortion, in the world of the predictions.
+        covariances: float64 [6, 6] of rotation (radians) about and translation (world units) along
             the camera's axes.
-        observed: number of points that a photo sees.
+        observed: number of points that the photo sees.
     """
 
     model: Any
@@ -75,25 +78,25 @@ def adjusted(
     seed: int,
     show: Progress,
 ) -> Adjusted:
-    """Adjust cameras to matches, with the prediction as a prior.
+    """Adjust cameras to matches, with predicted cameras as a prior.
 
     Photos of one device, size and EXIF focal length share their focal length. Principal points and
-    distortion stay.
+    distortion are fixed.
 
     Args:
-        photos: all.
-        starts: cameras by the index of the photo, at least two that have matches.
-        predicted: per photo what a network says of it, in the world of ``starts``; depths that it
-            is not sure of are NaN.
+        photos: all photos.
+        starts: initial cameras by index of the photo, at least two with matches.
+        predicted: a network's prediction per photo, in the world of ``starts``; NaN for uncertain
+            depths.
         spread: of the predicted cameras.
         matches: database of the photos.
-        lenses: parameters of COLMAP's cameras, by their numbers, where they are known.
+        lenses: known parameters of COLMAP's cameras, by camera id.
         seed: random seed.
-        show: called with "mapping", how much is done, and how much there is.
+        show: called with "mapping", done and total.
     """
     import pycolmap
 
-    options = mapping_options(len(starts), STEPS[-1], seed, matches)
+    options = mapping_options(len(starts), THRESHOLDS[-1], seed, matches)
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(matches) as opened:
         pipeline = pycolmap.IncrementalPipeline(options, opened, pycolmap.ReconstructionManager())
@@ -103,24 +106,24 @@ def adjusted(
         mapper.begin_reconstruction(model)
         state = _State(model, starts, predicted, spread)
         longest = max(max(photo.image.shape[:2]) for photo in photos)
-        for done, (angle, part) in enumerate(ROUNDS):
+        for done, (angle, fraction) in enumerate(ROUNDS):
             show("mapping", done * len(photos) // len(ROUNDS), len(photos))
             triangulation, mapping = options.get_triangulation(), options.get_mapper()
             triangulation.create_max_angle_error = angle
             triangulation.continue_max_angle_error = angle
             triangulation.re_max_angle_error = angle
-            triangulation.merge_max_reproj_error = part * longest
-            triangulation.complete_max_reproj_error = part * longest
-            mapping.filter_max_reproj_error = part * longest
+            triangulation.merge_max_reproj_error = fraction * longest
+            triangulation.complete_max_reproj_error = fraction * longest
+            mapping.filter_max_reproj_error = fraction * longest
             for image in sorted(model.reg_image_ids()):
                 mapper.triangulate_image(triangulation, image)
-            for _ in range(REFINEMENTS):
-                state.refine(max(LEAST_ROBUST, ROBUST * part * longest))
+            for _ in range(MAX_ADJUSTMENTS):
+                state.refine(max(MIN_ROBUST_PX, ROBUST_FRACTION * fraction * longest))
                 changed = mapper.complete_and_merge_tracks(triangulation)
                 changed += mapper.filter_points(mapping)
-                if changed <= SETTLED * model.compute_num_observations():
+                if changed <= SETTLED_FRACTION * model.compute_num_observations():
                     break
-        state.refine(LEAST_ROBUST)
+        state.refine(MIN_ROBUST_PX)
         mapper.end_reconstruction(False)
     model.update_point_3d_errors()
     show("mapping", len(photos), len(photos))
@@ -130,27 +133,26 @@ def adjusted(
 def evidence_of_model(
     photos: Sequence[Photo], cameras: Sequence[Camera | None], model: Any | None
 ) -> dict[int, PoseEvidence]:
-    """How well features alone know the cameras of COLMAP's model, by the index of the photo.
+    """Return the uncertainty of the cameras of COLMAP's model, by index of the photo.
 
     Args:
-        photos: all.
-        cameras: of the model, pinhole; None where a photo is not in it.
-        model: pycolmap's, or None. Of one with many photos nothing is told.
+        photos: all photos.
+        cameras: pinhole cameras of the model; None for photos that are not in it.
+        model: pycolmap's reconstruction or None; not evaluated for many photos.
     """
-    if model is None or not 2 < model.num_reg_images() <= MOST_TOLD:
+    if model is None or not 2 < model.num_reg_images() <= MAX_COVARIANCE_PHOTOS:
         return {}
-    starts = {i: one for i, one in enumerate(cameras) if one is not None}
-    nothing = [None] * len(photos)
-    known = _State(model, starts, nothing, Spread(1.0, 1.0)).result()
-    return {
-        i: PoseEvidence("features", float(np.degrees(turn)), move)
-        for i, covariance in known.covariances.items()
-        for turn, move in [deviations(covariance)]
-    }
+    starts = {i: camera for i, camera in enumerate(cameras) if camera is not None}
+    result = _State(model, starts, [None] * len(photos), Spread(1.0, 1.0)).result()
+    evidence = {}
+    for i, covariance in result.covariances.items():
+        rotation, translation = deviations(covariance)
+        evidence[i] = PoseEvidence("features", float(np.degrees(rotation)), translation)
+    return evidence
 
 
 def deviations(covariance: Float64) -> tuple[float, float]:
-    """Standard deviations per axis of a camera's rotation (radians) and centre (world units)."""
+    """Standard deviation per axis of a camera's rotation (radians) and center (world units)."""
     variances = np.maximum(np.diagonal(covariance), 0.0)
     return float(np.sqrt(variances[:3].mean())), float(np.sqrt(variances[3:].mean()))
 
@@ -161,7 +163,7 @@ def _set_cameras(
     starts: Mapping[int, Camera],
     lenses: Mapping[int, Sequence[float]],
 ) -> None:
-    """Place the photos in a model that has none placed."""
+    """Register the photos in a model without registered photos."""
     import pycolmap
 
     focals: dict[int, list[float]] = {}
@@ -176,16 +178,16 @@ def _set_cameras(
             focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
             focals.setdefault(image.camera_id, []).append(focal)
     for number, values in focals.items():
-        # An array that is changed in place would not be the camera's.
+        # Changes in place would be lost.
         parameters = np.array(model.cameras[number].params)
         parameters[0] = np.median(values)
         model.cameras[number].params = parameters
-    for number, known in lenses.items():
-        model.cameras[number].params = np.array(known)
+    for number, lens in lenses.items():
+        model.cameras[number].params = np.array(lens)
 
 
 class _State:
-    """The model as a bundle of arrays, and back."""
+    """Converts a model to arrays for bundle adjustment, and back."""
 
     def __init__(
         self,
@@ -200,16 +202,16 @@ class _State:
         self.sizes = [(starts[i].width, starts[i].height) for i in self.indices]
         self.numbers = sorted({self._image(i).camera_id for i in self.indices})
         self.scales = np.zeros(len(self.indices))
-        self.wanted = [None if (one := predicted[i]) is None else one.camera for i in self.indices]
+        self.priors = [None if (p := predicted[i]) is None else p.camera for i in self.indices]
 
     def refine(self, pixels: float) -> None:
-        """Move the model's cameras and points to where they fit best."""
+        """Adjust the model's cameras and points."""
         import pycolmap
 
         bundle, seen, ids = self._arrays()
         if not len(ids):
             return
-        bundle = adjusted_bundle(bundle, seen, self.wanted, self.spread, pixels)
+        bundle = adjusted_bundle(bundle, seen, self.priors, self.spread, pixels)
         self.scales = bundle.scales
         for i, camera in zip(self.indices, bundle.cameras, strict=True):
             image = self._image(i)
@@ -226,7 +228,7 @@ class _State:
         bundle, seen, ids = self._arrays()
         count = len(self.indices)
         if len(ids):
-            spreads = covariances(bundle, seen, self.wanted, self.spread)
+            spreads = covariances(bundle, seen, self.priors, self.spread)
             observed = np.bincount(seen.view, minlength=count)
         else:
             spreads, observed = np.zeros((count, 6, 6)), np.zeros(count, dtype=np.int64)
@@ -242,7 +244,7 @@ class _State:
         ids = sorted(self.model.point3D_ids())
         row = {number: k for k, number in enumerate(ids)}
         cameras, lenses = [], []
-        view, point, places, depths = [], [], [], []
+        view, point, positions, depths = [], [], [], []
         for k, (i, size) in enumerate(zip(self.indices, self.sizes, strict=True)):
             image = self._image(i)
             camera = self.model.cameras[image.camera_id]
@@ -254,19 +256,19 @@ class _State:
             observed = image.get_observation_points2D()
             if not len(observed):
                 continue
-            taken = np.stack([one.xy for one in observed])
-            view.append(np.full(len(taken), k))
-            point.append([row[one.point3D_id] for one in observed])
-            places.append(focal * camera.cam_from_img(taken) + [cx, cy])
+            xy = np.stack([observation.xy for observation in observed])
+            view.append(np.full(len(xy), k))
+            point.append([row[observation.point3D_id] for observation in observed])
+            positions.append(focal * camera.cam_from_img(xy) + [cx, cy])
             predicted = self.predicted[i]
-            nothing = np.full(len(taken), np.nan)
-            depths.append(nothing if predicted is None else predicted.depths_at(taken))
+            unknown = np.full(len(xy), np.nan)
+            depths.append(unknown if predicted is None else predicted.depths_at(xy))
         points = np.array([self.model.points3D[number].xyz for number in ids]).reshape(-1, 3)
         bundle = Bundle(cameras, np.array(lenses), points, self.scales)
         seen = Observations(
             np.concatenate([np.zeros(0, np.int64), *view]).astype(np.int64),
             np.concatenate([np.zeros(0, np.int64), *point]).astype(np.int64),
-            np.concatenate([np.zeros((0, 2)), *places]),
+            np.concatenate([np.zeros((0, 2)), *positions]),
             np.concatenate([np.zeros(0), *depths]),
         )
         return bundle, seen, ids

@@ -1,9 +1,9 @@
-"""Cameras of as many photos as possible: what is not placed is tried again with more and with less.
+"""Place as many photos as possible with COLMAP's mapper, with falling thresholds.
 
-Where COLMAP's own thresholds leave few photos out, these ask for more matches of their own, and the
-model is extended. Where they leave many out, all photos stand on little: every pair gets more
-matches, and the model is made anew. A model that contradicts its photos is made anew, too, without
-the matches that cannot all be right (``contradictions``).
+If COLMAP's own thresholds leave out few photos, more matches are searched for these, and the model
+is extended. If they leave out many, more matches are searched for all pairs, and mapping starts
+over. A model that contradicts its photos is mapped again without the wrong matches
+(``contradictions``).
 """
 
 from __future__ import annotations
@@ -26,32 +26,41 @@ from igsr.pose.colmap.contradictions import (
     parts,
 )
 from igsr.pose.colmap.database import image_id
-from igsr.pose.colmap.evidence import DOUBTFUL, STEPS, Evidence
-from igsr.pose.colmap.mapping import extend, map_photos
+from igsr.pose.colmap.mapping import Thresholds, extend, map_photos
 from igsr.pose.colmap.matching import matched_along_lines, with_focal_lengths
 from igsr.pose.estimate import Progress
 
-#: Up to this many photos, unregistered ones are tried again.
-FEW = 60
-#: The largest part of the photos that counts as few.
-FEW_MISSING = 0.25
-#: A model is made so often without matches that contradict others, at most.
-MOST_PARTINGS = 4
+#: COLMAP's thresholds first, then lower ones.
+THRESHOLDS = (
+    Thresholds(100, 16.0, 30, 1.5, True, False),
+    Thresholds(100, 16.0, 30, 1.5, False, False),
+    Thresholds(100, 16.0, 30, 1.5, False, True),
+    Thresholds(40, 6.0, 15, 1.0, False, True),
+    Thresholds(15, 2.0, 10, 0.5, False, True),
+)
+#: Models by these thresholds and later ones may be wrong.
+FIRST_DOUBTFUL = 3
+#: Maximum number of photos for retries.
+MAX_RETRY_PHOTOS = 60
+#: Maximum fraction of missing photos to extend a model instead of mapping again.
+MAX_MISSING_FRACTION = 0.25
+#: Maximum number of times that matches are left out for one model.
+MAX_REMAPPINGS = 4
 
 
 @dataclass(frozen=True)
 class Mapped:
-    """The model with most photos, and what is to be said of it.
+    """The model with most photos.
 
     Attributes:
-        model: pycolmap's, or None if no two photos can be placed.
-        doubtful: whether it stands on so little evidence that it may be wrong.
-        alike: number of pairs of photos whose matches were left out, since they contradict others.
+        model: pycolmap's reconstruction, or None if no two photos can be placed.
+        doubtful: whether its thresholds were so low that it may be wrong.
+        removed_pairs: number of pairs of photos whose matches were left out as contradictory.
     """
 
     model: Any | None
     doubtful: bool
-    alike: int
+    removed_pairs: int
 
 
 def mapped(
@@ -62,71 +71,69 @@ def mapped(
     *,
     sift: bool = True,
     usable: Mapping[int, npt.NDArray[np.bool_]] | None = None,
-    steps: Sequence[Evidence] = STEPS,
+    attempts: Sequence[Thresholds] = THRESHOLDS,
 ) -> Mapped:
     """Place photos.
 
     Args:
-        count: of photos.
-        matches: COLMAP's database of them, their features and matches; it may be changed.
+        count: number of photos.
+        matches: COLMAP's database with features and matches; it may be changed.
         seed: random seed.
-        show: called with "matching" and "mapping", how much is done, and how much there is.
-        sift: whether features are SIFT's: of these, more are matched where photos are missing.
-        usable: pixels [H, W] that have features, by COLMAP's number of the photo, where some have
-            none.
-        steps: in which thresholds fall; the first ones of ``STEPS``.
+        show: called with "matching" or "mapping", done and total.
+        sift: whether features are SIFT's, of which more matches can be searched.
+        usable: pixels [H, W] that can have features, by COLMAP's image id, for photos with a mask.
+        attempts: the first ones of ``THRESHOLDS``.
     """
-    strengths = {pair: len(found) for pair, found in links(matches).items()}
+    strengths = {pair: len(indices) for pair, indices in links(matches).items()}
     all_links = len(strengths)
     hopeless = set(range(count)) - {image - image_id(0) for pair in strengths for image in pair}
     source, database = matches, with_focal_lengths(matches, seed)
     best: Any | None = None
-    best_step = 0
-    looked_for: set[int] = set()
-    few = False
-    for step, evidence in enumerate(steps):
-        extending = few and step < DOUBTFUL
-        if evidence.guided_matching:
+    best_attempt = 0
+    guided: set[int] = set()
+    few_missing = False
+    for attempt, thresholds in enumerate(attempts):
+        extending = few_missing and attempt < FIRST_DOUBTFUL
+        if thresholds.guided_matching:
             wanted = _missing(best, count) if extending else set(range(count))
-            if not wanted <= looked_for:
-                looked_for = wanted
+            if not wanted <= guided:
+                guided = wanted
                 more = matched_along_lines(matches, wanted, show) if sift else None
                 if more is not None:
                     source, database = more, with_focal_lengths(more, seed)
-                elif _differ_in_matches_alone(STEPS[step - 1], evidence):
-                    continue
+                elif thresholds == replace(THRESHOLDS[attempt - 1], guided_matching=True):
+                    continue  # nothing differs from the attempt before
 
         if extending:
             model = copy.deepcopy(best)
-            extend(model, count, database, evidence, seed, show)
+            extend(model, count, database, thresholds, seed, show)
         else:
-            model = map_photos(count, database, evidence, seed, show)
-        for parting in range(MOST_PARTINGS):
+            model = map_photos(count, database, thresholds, seed, show)
+        for remapping in range(MAX_REMAPPINGS):
             wrong = _wrong_links(model, source, strengths, usable or {})
             if not wrong:
                 break
-            if step >= DOUBTFUL or parting + 1 == MOST_PARTINGS:
-                # What stands on little is no reason to leave out matches.
-                model = None
+            if attempt >= FIRST_DOUBTFUL or remapping + 1 == MAX_REMAPPINGS:
+                model = None  # a doubtful model is no reason to leave out matches
                 break
             for pair in wrong:
                 del strengths[pair]
             for file in {matches, source}:
                 leave_out(file, wrong)
             database = with_focal_lengths(source, seed)
-            # A model that is extended holds to what it has by these matches.
-            model = map_photos(count, database, evidence, seed, show)
+            # Mapped anew, because an extended model would keep its wrong cameras.
+            model = map_photos(count, database, thresholds, seed, show)
         if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
-            best, best_step = model, step
-        lost = _missing(best, count)
+            best, best_attempt = model, attempt
+        missing = _missing(best, count)
         if best is not None and len(strengths) < all_links:
             hopeless = _unlinked(best, strengths, count)
-        if best is not None and (count > FEW or lost <= hopeless):
+        if best is not None and (count > MAX_RETRY_PHOTOS or missing <= hopeless):
             break
-        if step == 0:
-            few = len(lost) <= FEW_MISSING * count
+        if attempt == 0:
+            few_missing = len(missing) <= MAX_MISSING_FRACTION * count
     show("mapping", count, count)
-    return Mapped(best, best_step >= DOUBTFUL, all_links - len(strengths))
+    return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths))
 
 
 def _wrong_links(
@@ -136,23 +143,19 @@ def _wrong_links(
     usable: Mapping[int, npt.NDArray[np.bool_]],
 ) -> set[Pair]:
     """Pairs of photos whose matches make a model contradict its photos."""
-    if model is None or model.num_reg_images() > FEW:
+    if model is None or model.num_reg_images() > MAX_RETRY_PHOTOS:
         return set()
     return links_between_parts(strengths, contradictions(model, links(source), usable))
 
 
 def _unlinked(model: Any, strengths: dict[Pair, int], count: int) -> set[int]:
-    """Indices of photos that no matches lead to from those of a model."""
+    """Indices of photos without a chain of matches to a model's photos."""
     part = parts(strengths, ())
-    own = {part.get(image) for image in model.reg_image_ids()}
-    return {index for index in range(count) if part.get(image_id(index)) not in own}
+    of_model = {part.get(image) for image in model.reg_image_ids()}
+    return {index for index in range(count) if part.get(image_id(index)) not in of_model}
 
 
 def _missing(model: Any | None, count: int) -> set[int]:
-    """Indices of photos that a model has not placed."""
+    """Indices of photos that are not in a model."""
     placed = set() if model is None else set(model.reg_image_ids())
     return {index for index in range(count) if image_id(index) not in placed}
-
-
-def _differ_in_matches_alone(before: Evidence, after: Evidence) -> bool:
-    return after == replace(before, guided_matching=True)

@@ -1,4 +1,4 @@
-"""Photos and cameras in COLMAP's database, by numbers that do not depend on threads."""
+"""Photos and cameras in COLMAP's database, with fixed ids."""
 
 from __future__ import annotations
 
@@ -11,27 +11,24 @@ import numpy as np
 from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import Photo
 
-#: Where nothing is known: the focal length over the longer side; 42 degrees, COLMAP's own.
-GUESSED_FOCAL = 1.2
+#: Default focal length in units of the longer side (COLMAP's own; 45 degrees).
+DEFAULT_FOCAL = 1.2
 
 
 def photo_file(index: int) -> str:
-    """The name of a photo in COLMAP's database: COLMAP is never given the users' file names."""
+    """The name of a photo in COLMAP's database."""
     return f"{index:06d}.png"
 
 
 def image_id(index: int) -> int:
-    """The number of a photo in COLMAP's database."""
+    """The id of a photo in COLMAP's database."""
     return index + 1
 
 
 def list_photos(photos: Sequence[Photo], database: Path) -> None:
-    """Number photos and cameras in the database.
+    """Write photos and cameras to the database; views of a panorama are a rig.
 
-    The views of a panorama are a rig: one pose places all of them.
-
-    Left to feature extraction, they are numbered as its threads end, and nothing after comes out
-    the same twice.
+    Feature extraction would number them in the order in which its threads end.
     """
     import pycolmap
 
@@ -60,32 +57,31 @@ def _camera(photo: Photo, number: int) -> Any:
     import pycolmap
 
     height, width = photo.image.shape[:2]
-    focal = photo.focal if photo.focal is not None else GUESSED_FOCAL * max(width, height)
+    focal = photo.focal if photo.focal is not None else DEFAULT_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(number, "SIMPLE_RADIAL", focal, width, height)
     camera.has_prior_focal_length = photo.focal is not None
     if photo.place is not None:
-        # Both axes have one focal length, within the rounding of a reduced size.
-        known = resized_camera(photo.place.camera, width, height)
-        camera.params = [known.K[0, 0], known.K[0, 2], known.K[1, 2], 0.0]
+        K = resized_camera(photo.place.camera, width, height).K
+        camera.params = [K[0, 0], K[0, 2], K[1, 2], 0.0]
     return camera
 
 
 def _rig(number: int, photos: Sequence[Photo], cameras: Sequence[int]) -> Any:
-    """A rig of one camera, or of the views of a panorama, whose directions are known."""
+    """A rig of one camera, or of the views of a panorama."""
     import pycolmap
 
     rig = pycolmap.Rig(rig_id=number)
     sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera) for camera in cameras]
     rig.add_ref_sensor(sensors[0])
-    turns = [photo.place.camera.viewmat[:3, :3] for photo in photos if photo.place is not None]
-    for own, sensor in zip(turns[1:], sensors[1:], strict=True):
-        turn = own @ turns[0].T
-        rig.add_sensor(sensor, pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3)))
+    rotations = [photo.place.camera.viewmat[:3, :3] for photo in photos if photo.place is not None]
+    for rotation, sensor in zip(rotations[1:], sensors[1:], strict=True):
+        relative = pycolmap.Rotation3d(rotation @ rotations[0].T)
+        rig.add_sensor(sensor, pycolmap.Rigid3d(relative, np.zeros(3)))
     return rig
 
 
 def known_cameras(database: Path) -> set[int]:
-    """Numbers of the cameras whose intrinsics are known exactly: those of panoramas' views."""
+    """Ids of the cameras of panoramas' views, whose intrinsics are exact."""
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
@@ -94,7 +90,7 @@ def known_cameras(database: Path) -> set[int]:
 
 
 def _groups(photos: Sequence[Photo]) -> list[list[list[int]]]:
-    """Indices of photos that share their intrinsics, those of one rig together."""
+    """Indices of photos with the same intrinsics, in groups of one rig."""
     rigs: dict[object, list[int]] = {}
     for index, photo in enumerate(photos):
         rigs.setdefault(index if photo.place is None else photo.place.rig, []).append(index)

@@ -1,8 +1,9 @@
-"""The estimator ``colmap``: features, matches, mapping, and again for photos that are missing."""
+"""The estimator ``colmap``: features, matches and mapping."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -16,27 +17,31 @@ from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.attempts import mapped
 from igsr.pose.colmap.database import image_id, list_photos
-from igsr.pose.colmap.distortion import without_distortion
-from igsr.pose.colmap.features import find_features, usable_pixels
-from igsr.pose.colmap.given_matches import matched_by
-from igsr.pose.colmap.matcher import Matcher, checked_matcher
+from igsr.pose.colmap.features import MAX_SIDE_PX, find_features, usable_pixels
+from igsr.pose.colmap.mapping import without_distortion
+from igsr.pose.colmap.matcher import Matcher, checked_matcher, matched_by
 from igsr.pose.colmap.matching import matched
+from igsr.pose.colmap.pairs import FOLLOWING_PHOTOS, MAX_EXHAUSTIVE_PHOTOS, SIMILAR_PHOTOS
 from igsr.pose.colmap.result import estimate_of
-from igsr.pose.colmap.time_estimate import camera_seconds
 from igsr.pose.estimate import Estimate, Progress
 
-#: Photos from which it is said how long they take.
-MANY = 200
+#: Warn of the time from this number of photos.
+MANY_PHOTOS = 200
+#: Seconds of one core for the features of a megapixel, for matching a pair of photos, and for
+#: placing a photo.
+FEATURES_SECONDS = 0.9
+PAIR_SECONDS = 0.15
+PLACE_SECONDS = 0.3
 
 
 class Colmap:
-    """Finds cameras with pycolmap; see the package.
+    """Finds cameras with pycolmap.
 
     Args:
-        matcher: finds and matches features; None is COLMAP's SIFT.
+        matcher: finds and matches features; None for SIFT.
 
     Raises:
-        IgsrError: the matcher has no name, by which found cameras are kept.
+        IgsrError: the matcher has no name.
     """
 
     name = "colmap"
@@ -49,40 +54,57 @@ class Colmap:
     ) -> Estimate:
         """Register as many photos as possible; see ``Estimator``.
 
-        The largest set of photos that hang together is kept. The same photos and seed give the same
-        bits on the same machine.
+        The largest connected set of photos is kept. Deterministic for a seed on one machine.
         """
         show = progress or (lambda stage, done, total: None)
-        if len(photos) > MANY:
+        if len(photos) > MANY_PHOTOS:
             sizes = [(photo.image.shape[1], photo.image.shape[0]) for photo in photos]
             minutes = camera_seconds(sizes) / 60.0
             warn_user(
                 f"COLMAP needs about {minutes:.0f} minutes for {len(photos)} photos; every third "
-                "is mostly enough"
+                "photo is usually enough"
             )
         with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, guarded(seed):
             workspace = Path(folder)
             matches = matched_photos(photos, workspace, self._matcher, seed, show)
             sift = self._matcher is None
-            found = mapped(
-                len(photos), matches, seed, show, sift=sift, usable=usable_by_number(photos)
+            result = mapped(
+                len(photos), matches, seed, show, sift=sift, usable=usable_by_image_id(photos)
             )
-            if found.model is not None:
-                found = replace(found, model=without_distortion(found.model))
-        return estimate_of(photos, found)
+            if result.model is not None:
+                result = replace(result, model=without_distortion(result.model))
+        return estimate_of(photos, result)
+
+
+def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:
+    """Estimate the seconds that COLMAP takes on this machine.
+
+    Args:
+        sizes: width and height of each photo, pixels.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    count, pixels = len(sizes), 0.0
+    for width, height in sizes:
+        scale = min(1.0, MAX_SIDE_PX / max(width, height))
+        pixels += width * height * scale * scale
+    pairs = count * (FOLLOWING_PHOTOS + SIMILAR_PHOTOS)
+    if count <= MAX_EXHAUSTIVE_PHOTOS:
+        pairs = count * (count - 1) // 2
+    parallel = FEATURES_SECONDS * pixels / 1e6 + PAIR_SECONDS * pairs
+    return parallel / max(1, cores or 1) + PLACE_SECONDS * count
 
 
 def matched_photos(
     photos: Sequence[Photo], workspace: Path, matcher: Matcher | None, seed: int, show: Progress
 ) -> Path:
-    """A database of photos, their features and verified matches.
+    """Create a database of photos, features and verified matches.
 
     Args:
         photos: at least two.
-        workspace: the folder that it is made in.
-        matcher: what finds and matches features; None for COLMAP's SIFT.
+        workspace: folder for the database.
+        matcher: finds and matches features; None for SIFT.
         seed: of the verification.
-        show: called with "features" and "matching", how much is done, and how much there is.
+        show: called with "features" or "matching", done and total.
 
     Raises:
         IgsrError: as ``matched_by``.
@@ -95,15 +117,15 @@ def matched_photos(
     return matched(len(photos), database, seed, show)
 
 
-def usable_by_number(photos: Sequence[Photo]) -> dict[int, npt.NDArray[np.bool_]]:
-    """Pixels [H, W] that have features, by COLMAP's number of the photo, where some have none."""
+def usable_by_image_id(photos: Sequence[Photo]) -> dict[int, npt.NDArray[np.bool_]]:
+    """Usable pixels [H, W] of photos that have unusable ones, by COLMAP's image id."""
     pixels = {image_id(i): usable_pixels(photo) for i, photo in enumerate(photos)}
     return {number: mask for number, mask in pixels.items() if mask is not None}
 
 
 @contextlib.contextmanager
 def guarded(seed: int) -> Iterator[None]:
-    """pycolmap without its log, with a fixed seed, and with failures as error messages.
+    """Run pycolmap without its log, with a fixed seed, and with failures as error messages.
 
     Args:
         seed: random seed.
@@ -121,8 +143,6 @@ def guarded(seed: int) -> Iterator[None]:
     except IgsrError:
         raise
     except (RuntimeError, ValueError) as error:
-        raise IgsrError(
-            f"COLMAP failed ({error}); leave out unusual photos and try again"
-        ) from error
+        raise IgsrError(f"COLMAP failed ({error}); remove unusual photos and try again") from error
     finally:
         pycolmap.logging.minloglevel = level

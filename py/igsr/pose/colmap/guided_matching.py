@@ -1,48 +1,112 @@
-"""More matches of two photos along their epipolar lines, by a matrix product of SIFT descriptors.
+"""Match features along epipolar lines, by a matrix product of SIFT descriptors.
 
-With the place of a feature known to a few pixels, fewer others compete with the right one, and more
-matches pass Lowe's ratio (COLMAP's guided matching, with its thresholds). The squared distances of
-all descriptors of two photos are one product of whole numbers below 2^24, which float32 holds
-exactly: the same on every machine, in whatever order it is summed.
+If the position of a feature is known to a few pixels, fewer candidates compete and more matches
+pass Lowe's ratio test (COLMAP's guided matching, with its thresholds). The squared distances of all
+descriptors are a product of integers below 2^24, which float32 represents exactly, so that the
+result does not depend on the order of summation.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from igsr.pose.colmap.epipolar import Constraint
-
 Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
 
-#: COLMAP's: the best must be nearer than this part of the distance to the second best (Lowe).
-LARGEST_RATIO = 0.8
-#: COLMAP's: the largest distance of two descriptors, whose length is about 512.
-LARGEST_DISTANCE = 0.7 * 512.0
-#: Features of the first photo compared at a time with all of the second: bounds memory at 16 MiB
-#: per buffer and 8192 features, and keeps a block near the processor.
-ROWS_AT_ONCE = 512
+#: Lowe's ratio: maximum distance to the best match over that to the second best, as COLMAP.
+MAX_RATIO = 0.8
+#: Maximum distance between descriptors of length 512, as COLMAP.
+MAX_DISTANCE = 0.7 * 512.0
+#: Features of the first photo in a batch; bounds a buffer for 8192 features to 16 MiB.
+BATCH_FEATURES = 512
+
+
+class Constraint(Protocol):
+    """Constrains where the features of two photos can correspond."""
+
+    def forbid(self, first: Float32, second: Float32, scores: Float32) -> None:
+        """Set scores [N, M] to -inf for places [N, 2] and [M, 2] that cannot correspond."""
+
+    def reversed(self) -> Constraint:
+        """The constraint from the second photo to the first."""
+
+
+@dataclass(frozen=True)
+class EpipolarLine:
+    """Correspondences lie on each other's epipolar lines."""
+
+    F: Float64  # fundamental matrix [3, 3]: second^T F first = 0
+    pixels: float  # maximum Sampson distance
+
+    def forbid(self, first: Float32, second: Float32, scores: Float32) -> None:
+        lines, others = _homogeneous(first) @ self.F.T, _homogeneous(second) @ self.F
+        # Normalized, so that squares stay within float32.
+        size = np.sqrt(np.mean(lines[:, :2] ** 2) + np.mean(others[:, :2] ** 2))
+        lines, others = lines / max(size, 1e-300), others / max(size, 1e-300)
+        # A matrix product of three columns would mostly wait for threads.
+        a, b, c = (column[:, None] for column in lines.astype(np.float32).T)
+        x, y = second.T
+        error = a * x
+        error += b * y
+        error += c
+        np.multiply(error, error, out=error)
+        limit = self.pixels**2
+        slopes = (limit * (lines[:, :2] ** 2).sum(axis=1)).astype(np.float32)
+        other_slopes = (limit * (others[:, :2] ** 2).sum(axis=1)).astype(np.float32)
+        error -= slopes[:, None]
+        np.copyto(scores, -np.inf, where=error > other_slopes)
+
+    def reversed(self) -> EpipolarLine:
+        return EpipolarLine(self.F.T, self.pixels)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Correspondences are mapped to each other by a homography."""
+
+    H: Float64  # [3, 3]
+    pixels: float  # maximum distance in the target photo
+    back: bool = False  # whether it maps from the second photo to the first
+
+    def forbid(self, first: Float32, second: Float32, scores: Float32) -> None:
+        source, target = (second, first) if self.back else (first, second)
+        mapped = _homogeneous(source) @ self.H.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            places = (mapped[:, :2] / mapped[:, 2:]).astype(np.float32)
+        if self.back:
+            places, target = target, places
+        distance = np.square(places[:, None, 0] - target[None, :, 0])
+        distance += np.square(places[:, None, 1] - target[None, :, 1])
+        # "not <=", since places may be NaN.
+        np.copyto(scores, -np.inf, where=~(distance <= self.pixels**2))
+
+    def reversed(self) -> Plane:
+        return Plane(self.H, self.pixels, not self.back)
+
+
+def _homogeneous(places: Float32) -> Float64:
+    return np.hstack([places.astype(np.float64), np.ones((len(places), 1))])
 
 
 @dataclass(frozen=True)
 class Features:
-    """Features of a photo, ready for comparison with those of others.
+    """Features of a photo, prepared for comparison.
 
-    Attributes:
-        xy: float32 [N, 2], pixels.
-        left: float32 [N, 130], right: float32 [N, 130]: the product of a row of ``left`` and a row
-            of another photo's ``right`` is minus the squared distance of their descriptors.
+    The product of a row of ``left`` and a row of another photo's ``right`` is the negative squared
+    distance of their descriptors.
     """
 
-    xy: Float32
-    left: Float32
-    right: Float32
+    xy: Float32  # [N, 2], pixels
+    left: Float32  # [N, 130]
+    right: Float32  # [N, 130]
 
 
 def comparable(xy: npt.ArrayLike, descriptors: npt.NDArray[np.uint8]) -> Features:
-    """Features at places [N, 2] in pixels, with descriptors uint8 [N, 128]."""
+    """Prepare features at places [N, 2] in pixels, with descriptors uint8 [N, 128]."""
     numbers = descriptors.astype(np.float32).reshape(-1, 128)
     squared = (numbers * numbers).sum(axis=1, keepdims=True)
     one = np.ones_like(squared)
@@ -56,48 +120,40 @@ def comparable(xy: npt.ArrayLike, descriptors: npt.NDArray[np.uint8]) -> Feature
 def guided_matches(
     first: Features, second: Features, constraint: Constraint
 ) -> npt.NDArray[np.uint32]:
-    """Pairs of features that are each other's clear best among those where the geometry allows.
-
-    Args:
-        first: features of one photo.
-        second: of another.
-        constraint: from the first photo to the second.
+    """Match features that are each other's best within a constraint and pass the ratio test.
 
     Returns:
-        Indices into both, uint32 [M, 2], by the first; no feature is in two pairs.
+        Indices into both, uint32 [M, 2], ascending in the first, none twice.
     """
-    best, clear = _clear_best(first, second, constraint)
-    candidates = np.flatnonzero(clear)
+    best, passed = _best(first, second, constraint)
+    candidates = np.flatnonzero(passed)
     partners = best[candidates]
-    asked = Features(second.xy[partners], second.left[partners], second.right[partners])
-    back, clear = _clear_best(asked, first, constraint.reversed())
-    mutual = clear & (back == candidates)
+    matched = Features(second.xy[partners], second.left[partners], second.right[partners])
+    back, passed = _best(matched, first, constraint.reversed())
+    mutual = passed & (back == candidates)
     return np.stack([candidates[mutual], partners[mutual]], axis=1).astype(np.uint32)
 
 
-def _clear_best(
+def _best(
     first: Features, second: Features, constraint: Constraint
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Of each of ``first`` the most similar of ``second``, and whether it is clearly so; both [N].
-
-    Only features where ``constraint`` allows compete.
-    """
+    """The best match [N] of each first feature, and whether it passes the tests [N]."""
     count, others = len(first.xy), len(second.xy)
     best = np.zeros(count, dtype=np.int64)
-    clear = np.zeros(count, dtype=bool)
+    passed = np.zeros(count, dtype=bool)
     if not others:
-        return best, clear
-    buffer = np.empty((min(count, ROWS_AT_ONCE), others), dtype=np.float32)
-    for start in range(0, count, ROWS_AT_ONCE):
-        some = slice(start, min(start + ROWS_AT_ONCE, count))
-        rows = np.arange(some.stop - some.start)
-        near = np.matmul(first.left[some], second.right.T, out=buffer[: len(rows)])
-        constraint.forbid(first.xy[some], second.xy, near)
-        best[some] = near.argmax(axis=1)
-        nearest = near[rows, best[some]]
-        near[rows, best[some]] = -np.inf
-        # Of squared distances, both limits are squared.
-        clear[some] = (nearest >= -(LARGEST_DISTANCE**2)) & (
-            nearest > LARGEST_RATIO**2 * near.max(axis=1)
+        return best, passed
+    buffer = np.empty((min(count, BATCH_FEATURES), others), dtype=np.float32)
+    for start in range(0, count, BATCH_FEATURES):
+        batch = slice(start, min(start + BATCH_FEATURES, count))
+        rows = np.arange(batch.stop - batch.start)
+        scores = np.matmul(first.left[batch], second.right.T, out=buffer[: len(rows)])
+        constraint.forbid(first.xy[batch], second.xy, scores)
+        best[batch] = scores.argmax(axis=1)
+        highest = scores[rows, best[batch]]
+        scores[rows, best[batch]] = -np.inf
+        # Scores are negative squared distances.
+        passed[batch] = (highest >= -(MAX_DISTANCE**2)) & (
+            highest > MAX_RATIO**2 * scores.max(axis=1)
         )
-    return best, clear
+    return best, passed

@@ -1,8 +1,8 @@
-"""Matches between photos, in copies of COLMAP's database, with focal lengths by them.
+"""Matches between photos in copies of COLMAP's database, and focal lengths from them.
 
-Photos that EXIF gives no focal length get one from the fundamental matrices of all pairs together
-(Sweeney et al., "Optimizing the Viewing Graph for Structure-from-Motion", ICCV 2015) before the
-first is registered: with few photos, a wrong initial focal length is the most common failure.
+Photos without a focal length in EXIF get one from the fundamental matrices of all pairs (Sweeney et
+al., "Optimizing the Viewing Graph for Structure-from-Motion", ICCV 2015): with few photos, a wrong
+initial focal length is the most common failure.
 """
 
 from __future__ import annotations
@@ -15,28 +15,34 @@ from typing import Any
 import numpy as np
 
 from igsr.pose.colmap.database import image_id, photo_file
-from igsr.pose.colmap.epipolar import Constraint, EpipolarLine, Plane
-from igsr.pose.colmap.guided_matching import Features, comparable, guided_matches
+from igsr.pose.colmap.guided_matching import (
+    Constraint,
+    EpipolarLine,
+    Features,
+    Plane,
+    comparable,
+    guided_matches,
+)
 from igsr.pose.colmap.pairs import in_tiles, pairs_to_match
 from igsr.pose.estimate import Progress
 
-#: Pairs that more matches are looked for in between two calls of progress.
-GUIDED_AT_ONCE = 8
-#: Pixels that a match may be off its epipolar line; COLMAP's.
-GUIDED_PIXELS = 4.0
+#: Pairs between two progress reports.
+PAIRS_PER_REPORT = 8
+#: Maximum distance of a match to its epipolar line, pixels (COLMAP's).
+MAX_DISTANCE_PX = 4.0
 
 
 def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
-    """A copy of the database of features, with matches that agree with the geometry of a pair.
+    """Copy a database of features and add geometrically verified matches.
 
     Args:
-        count: of photos.
+        count: number of photos.
         features: the database.
-        seed: of the search for the geometry.
-        show: called with "matching", pairs done and all pairs.
+        seed: of the verification.
+        show: called with "matching", done and total pairs.
 
     Returns:
-        The new database, beside the other. Its focal lengths are those of ``features``.
+        The new database in the same folder, with unchanged focal lengths.
     """
     import pycolmap
 
@@ -45,7 +51,7 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
     pairs = pairs_to_match(count, database)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    # The views of a panorama share a centre and show different directions.
+    # The views of a panorama have one center and different directions.
     matching.skip_image_pairs_in_same_frame = True
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
@@ -70,7 +76,7 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
 
 
 def with_focal_lengths(matches: Path, seed: int) -> Path:
-    """A copy of a database of matches, with focal lengths from all its pairs together."""
+    """Copy a database of matches and estimate focal lengths from all its pairs."""
     import pycolmap
 
     database = matches.with_name(f"calibrated_{matches.name}")
@@ -82,27 +88,28 @@ def with_focal_lengths(matches: Path, seed: int) -> Path:
 
 
 def with_matches(matches: Path) -> set[int]:
-    """Indices of photos that have matches with any other; those without cannot be placed."""
+    """Return the indices of photos with matches; photos without cannot be placed."""
     import pycolmap
 
-    found: set[int] = set()
+    matched: set[int] = set()
     with pycolmap.Database.open(matches) as opened:
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             if len(geometry.inlier_matches):
-                found.update(image - image_id(0) for image in pycolmap.pair_id_to_image_pair(pair))
-    return found
+                images = pycolmap.pair_id_to_image_pair(pair)
+                matched.update(image - image_id(0) for image in images)
+    return matched
 
 
 def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) -> Path | None:
-    """A copy of a database of matches, with more of them along the epipolar lines of pairs.
+    """Copy a database of matches and add matches along the epipolar lines of pairs.
 
     Args:
         matches: the database.
-        wanted: indices of photos that need more; pairs without any of them are left alone.
-        show: called with "matching", pairs done and all pairs that are looked at.
+        wanted: indices of photos that need more matches; only pairs with these are searched.
+        show: called with "matching", done and total pairs.
 
     Returns:
-        The new database, beside the other; None if no pair has gained a match.
+        The new database in the same folder; None if no pair gained a match.
     """
     import pycolmap
 
@@ -113,39 +120,39 @@ def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) 
     with pycolmap.Database.open(database) as opened:
         ids, geometries = opened.read_two_view_geometries()
         pairs = []
-        for pair, geometry in sorted(zip(ids, geometries, strict=True), key=lambda one: one[0]):
+        for pair, geometry in sorted(zip(ids, geometries, strict=True), key=lambda row: row[0]):
             a, b = pycolmap.pair_id_to_image_pair(pair)
             constraint = _constraint(geometry)
             if constraint is not None and (a in images or b in images):
                 pairs.append((a, b, geometry, constraint))
         features: dict[int, Features] = {}
         for done, (a, b, geometry, constraint) in enumerate(pairs):
-            if done % GUIDED_AT_ONCE == 0:
+            if done % PAIRS_PER_REPORT == 0:
                 show("matching", done, len(pairs))
             for image in {a, b} - features.keys():
                 features[image] = comparable(
                     opened.read_keypoints(image)[:, :2], opened.read_descriptors(image).data
                 )
-            found = guided_matches(features[a], features[b], constraint)
-            if len(found) > len(geometry.inlier_matches):
-                geometry.inlier_matches = found
+            inliers = guided_matches(features[a], features[b], constraint)
+            if len(inliers) > len(geometry.inlier_matches):
+                geometry.inlier_matches = inliers
                 opened.update_two_view_geometry(a, b, geometry)
                 gained = True
-            # Pairs are in order of their first photo: of the others, few are needed again soon.
+            # Bounds memory: pairs are ordered by their first photo.
             features = {image: kept for image, kept in features.items() if image == a}
         show("matching", len(pairs), len(pairs))
     return database if gained else None
 
 
 def _constraint(geometry: Any) -> Constraint | None:
-    """What guides further matches of a pair, or None if its geometry is not known."""
+    """The constraint on further matches of a pair; None if its geometry is unknown."""
     import pycolmap
 
     kinds = pycolmap.TwoViewGeometryConfiguration
     lines = [int(kind) for kind in (kinds.CALIBRATED, kinds.UNCALIBRATED)]
     planes = [int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)]
     if geometry.config in lines and geometry.F is not None:
-        return EpipolarLine(np.array(geometry.F, dtype=np.float64), GUIDED_PIXELS)
+        return EpipolarLine(np.array(geometry.F, dtype=np.float64), MAX_DISTANCE_PX)
     if geometry.config in planes and geometry.H is not None:
-        return Plane(np.array(geometry.H, dtype=np.float64), GUIDED_PIXELS)
+        return Plane(np.array(geometry.H, dtype=np.float64), MAX_DISTANCE_PX)
     return None

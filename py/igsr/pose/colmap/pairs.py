@@ -1,7 +1,7 @@
-"""Which pairs of photos are matched: of few photos all, of many those that look alike.
+"""Choose pairs of photos to match: all of few photos, similar ones of many.
 
-Of many photos, those near in the order of names are taken and those whose largest features match
-(Wu, "Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3).
+Of many photos, each is matched with those that follow it by name and those whose largest features
+match (Wu, "Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3).
 """
 
 from __future__ import annotations
@@ -14,42 +14,45 @@ import numpy.typing as npt
 
 from igsr.pose.colmap.database import photo_file
 
-#: Up to this many photos, every pair is matched.
-EXHAUSTIVE = 60
-#: Of more photos, each is matched with those that follow it by name and those most similar to it.
-FOLLOWING = 8
-MOST_SIMILAR = 16
-#: Number of largest features by which similar photos are found, and least matches of them.
+#: Maximum number of photos for matching every pair.
+MAX_EXHAUSTIVE_PHOTOS = 60
+#: Of more photos, each is matched with this many that follow it and that are similar.
+FOLLOWING_PHOTOS = 8
+SIMILAR_PHOTOS = 16
+#: Number of largest features for finding similar photos, and the minimum matches of these.
 PRESELECTION_FEATURES = 128
-LEAST_SIMILAR = 4
-#: Photos on each side of a tile of pairs. COLMAP indexes the descriptors of every photo that a call
-#: names: a call of 40 pairs in their order took 1.5 times as long as all pairs at once, one of a
-#: tile 1.2 times. Between two tiles, Ctrl-C is heard.
-TILE = 8
+MIN_PRESELECTION_MATCHES = 4
+#: Photos on each side of a tile of pairs. COLMAP indexes the descriptors of every photo in a call,
+#: so a call per 40 pairs took 1.5 times as long as all pairs at once, and tiles 1.2 times. Ctrl-C
+#: is handled between tiles.
+TILE_PHOTOS = 8
 
 
 def pairs_to_match(count: int, database: Path) -> list[tuple[int, int]]:
-    """The pairs of photos to match, as indices; see the module."""
-    if count <= EXHAUSTIVE:
+    """Return the pairs of photos to match, as indices."""
+    if count <= MAX_EXHAUSTIVE_PHOTOS:
         return [(a, b) for a in range(count) for b in range(a + 1, count)]
-    pairs = {(a, b) for a in range(count) for b in range(a + 1, min(a + 1 + FOLLOWING, count))}
+    pairs = {
+        (a, b) for a in range(count) for b in range(a + 1, min(a + 1 + FOLLOWING_PHOTOS, count))
+    }
     similar = similarity(largest_features(count, database))
     for a in range(count):
-        best = np.argsort(-similar[a], kind="stable")[:MOST_SIMILAR]
-        pairs |= {(min(a, int(b)), max(a, int(b))) for b in best if similar[a, b] >= LEAST_SIMILAR}
+        for b in np.argsort(-similar[a], kind="stable")[:SIMILAR_PHOTOS]:
+            if similar[a, b] >= MIN_PRESELECTION_MATCHES:
+                pairs.add((min(a, int(b)), max(a, int(b))))
     return sorted(pairs)
 
 
 def in_tiles(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
-    """The same pairs in groups that name few photos each: squares of ``TILE`` by ``TILE``."""
+    """Group pairs into tiles of ``TILE_PHOTOS`` by ``TILE_PHOTOS`` photos."""
     tiles: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for a, b in sorted(pairs):
-        tiles.setdefault((a // TILE, b // TILE), []).append((a, b))
+        tiles.setdefault((a // TILE_PHOTOS, b // TILE_PHOTOS), []).append((a, b))
     return [tiles[key] for key in sorted(tiles)]
 
 
 def largest_features(count: int, database: Path) -> list[npt.NDArray[np.float32]]:
-    """Descriptors of length 1 of each photo's largest features."""
+    """Return the normalized descriptors of each photo's largest features."""
     import pycolmap
 
     largest_of = []
@@ -71,13 +74,13 @@ def largest_features(count: int, database: Path) -> list[npt.NDArray[np.float32]
 
 
 def similarity(descriptors: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
-    """How many of the largest features of each two photos are each other's clear best, [N, N]."""
-    count, most = len(descriptors), max(len(features) for features in descriptors)
-    padded = np.zeros((count, most, 128), dtype=np.float32)
+    """Count the mutual matches of the largest features of each pair of photos, [N, N]."""
+    count, longest = len(descriptors), max(len(features) for features in descriptors)
+    padded = np.zeros((count, longest, 128), dtype=np.float32)
     for index, features in enumerate(descriptors):
         padded[index, : len(features)] = features
     counts = np.zeros((count, count), dtype=np.int64)
-    rows = np.arange(most)
+    rows = np.arange(longest)
     for a in range(count - 1):
         others = padded[a + 1 :]
         similar = (others @ padded[a].T).swapaxes(1, 2)  # [photo, feature of a, feature of photo]
@@ -86,6 +89,6 @@ def similarity(descriptors: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int
         first = np.take_along_axis(similar, best[..., None], axis=2)[..., 0]
         np.put_along_axis(similar, best[..., None], -1.0, axis=2)
         near, next_near = (np.maximum(2.0 - 2.0 * s, 0.0) for s in (first, similar.max(axis=2)))
-        # Of squared distances, Lowe's ratio is 0.8 squared.
+        # Lowe's ratio of 0.8, of squared distances.
         counts[a, a + 1 :] = (mutual & (near < 0.64 * next_near)).sum(axis=1)
     return counts + counts.T

@@ -1,7 +1,7 @@
-"""Matches of photos that agree with what a network predicts.
+"""Use a network's prediction to find matches, and to leave out wrong ones.
 
-Of all features of two photos, those of other places drown the few right ones. Where roughly known
-cameras leave a band to look in, fewer compete.
+Roughly known cameras leave a band around the epipolar lines in which features are compared, so that
+fewer wrong ones compete with the right one.
 """
 
 from __future__ import annotations
@@ -16,66 +16,68 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr.capture import Camera
-from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.colmap.database import image_id
-from igsr.pose.colmap.epipolar import EpipolarLine
-from igsr.pose.colmap.given_matches import FEWEST
-from igsr.pose.colmap.guided_matching import Features, comparable, guided_matches
+from igsr.pose.colmap.guided_matching import (
+    EpipolarLine,
+    Features,
+    comparable,
+    guided_matches,
+)
+from igsr.pose.colmap.matcher import MIN_MATCHES
+from igsr.pose.depth_maps import AlignedPhoto
 from igsr.pose.estimate import Progress
+from igsr.pose.grid import ray_slopes
 
-#: Half of the band's width, as a part of the photo's longer side: about two degrees.
+#: Half the width of the band, as a fraction of the longer side: about two degrees.
 BAND = 0.03
-#: Part of a photo's points, at least, that another must show for the two to overlap; points asked.
-OVERLAP, ASKED = 0.1, 500
-#: Matches in the band, at least: of repeated patterns some fit to some geometry by chance.
-FEWEST_IN_BAND = 30
-#: Parts of the longer side that matches may be from where the prediction has them: all together, as
-#: cameras that are turned wrongly have them, in the median; and each by itself.
-TOGETHER, ALONE = 0.08, 0.05
-#: Part of a pair's matches that must agree with the prediction for these to be kept.
-LEAST_LEFT = 0.5
-#: Part that depths may differ by where two photos show one surface.
-SAME_SURFACE = 0.3
+#: Minimum fraction of a photo's points that another shows for the two to overlap.
+MIN_OVERLAP = 0.1
+#: Number of points for that test.
+OVERLAP_POINTS = 500
+#: Maximum relative difference of depths on one surface.
+MAX_DEPTH_DIFFERENCE = 0.3
+#: Minimum number of matches in the band; repeated patterns give a few by chance.
+MIN_BAND_MATCHES = 30
+#: Maximum median error of a pair's matches, which all share if a camera has a wrong rotation, as a
+#: fraction of the longer side.
+MAX_SHARED_ERROR = 0.08
+#: Maximum error of a match beyond that, as a fraction of the longer side.
+MAX_OWN_ERROR = 0.05
+#: Minimum fraction of a pair's matches that must agree with the prediction to be kept.
+MIN_AGREEING = 0.5
 
 
 def overlapping(photos: Sequence[AlignedPhoto | None]) -> list[tuple[int, int]]:
-    """Pairs of photos, by index, of which at least one shows a part of what the other shows.
-
-    Args:
-        photos: as a network predicts them, in one world; None where nothing is predicted.
-    """
+    """Indices of pairs of predicted photos in one world that show parts of each other."""
     points: dict[int, npt.NDArray[np.float64]] = {}
     for i, photo in enumerate(photos):
         if photo is not None:
             xyz, _ = photo.world_points()
-            points[i] = xyz[:: max(1, len(xyz) // ASKED)]
+            points[i] = xyz[:: max(1, len(xyz) // OVERLAP_POINTS)]
     return [
         (a, b)
         for a, b in combinations(points, 2)
-        if max(_shown(points[a], photos[b]), _shown(points[b], photos[a])) >= OVERLAP
+        if max(_shown(points[a], photos[b]), _shown(points[b], photos[a])) >= MIN_OVERLAP
     ]
 
 
 def _shown(xyz: npt.NDArray[np.float64], photo: AlignedPhoto | None) -> float:
-    """The part of points [M, 3] that a photo shows."""
+    """The fraction of points [M, 3] that a photo shows."""
     if photo is None or not len(xyz):
         return 0.0
     shown, z, surface, _ = photo.shown_at(xyz)
     with np.errstate(invalid="ignore"):
-        return float(np.mean(shown & (np.abs(z - surface) < SAME_SURFACE * z)))
+        return float(np.mean(shown & (np.abs(z - surface) < MAX_DEPTH_DIFFERENCE * z)))
 
 
 def matched_by_prediction(
-    matches: Path,
-    photos: Sequence[AlignedPhoto | None],
-    seed: int,
-    show: Progress,
+    matches: Path, photos: Sequence[AlignedPhoto | None], seed: int, show: Progress
 ) -> Path:
-    """A copy of a database, with matches of pairs that have none, along the predicted lines.
+    """Copy a database, and match overlapping pairs without matches along the predicted lines.
 
     Args:
-        matches: the database of the photos, with SIFT features.
-        photos: as a network predicts them, in one world; depths that it is not sure of are NaN.
+        matches: database with SIFT features.
+        photos: predicted, in one world; depths that are not confident are NaN.
         seed: of the verification.
         show: called with "matching", pairs done and all pairs.
     """
@@ -91,11 +93,11 @@ def matched_by_prediction(
     with pycolmap.Database.open(database) as opened:
         for done, (a, b) in enumerate(pairs):
             show("matching", done, len(pairs))
-            if opened.exists_two_view_geometry(image_id(a), image_id(b)):
-                known = opened.read_two_view_geometry(image_id(a), image_id(b))
-                if len(known.inlier_matches) >= FEWEST:
+            ids = image_id(a), image_id(b)
+            if opened.exists_two_view_geometry(*ids):
+                if len(opened.read_two_view_geometry(*ids).inlier_matches) >= MIN_MATCHES:
                     continue
-                opened.delete_two_view_geometry(image_id(a), image_id(b))
+                opened.delete_two_view_geometry(*ids)
             for i in {a, b} - features.keys():
                 features[i] = comparable(
                     opened.read_keypoints(image_id(i))[:, :2],
@@ -103,27 +105,32 @@ def matched_by_prediction(
                 )
             one, other = cameras[a], cameras[b]
             band = BAND * max(one.width, one.height, other.width, other.height)
-            found = guided_matches(features[a], features[b], EpipolarLine(_lines(one, other), band))
-            if len(found) < FEWEST_IN_BAND:
+            line = EpipolarLine(_fundamental_matrix(one, other), band)
+            found = guided_matches(features[a], features[b], line)
+            if len(found) < MIN_BAND_MATCHES:
                 continue
-            places = (features[i].xy.astype(np.float64) for i in (a, b))
             geometry = pycolmap.estimate_two_view_geometry(
-                _camera(one), next(places), _camera(other), next(places), found, options
+                _pinhole(one),
+                features[a].xy.astype(np.float64),
+                _pinhole(other),
+                features[b].xy.astype(np.float64),
+                found,
+                options,
             )
-            if len(geometry.inlier_matches) >= FEWEST_IN_BAND:
-                opened.write_two_view_geometry(image_id(a), image_id(b), geometry)
+            if len(geometry.inlier_matches) >= MIN_BAND_MATCHES:
+                opened.write_two_view_geometry(*ids, geometry)
     show("matching", len(pairs), len(pairs))
     return database
 
 
 def without_contradictions(matches: Path, photos: Sequence[AlignedPhoto | None]) -> Path:
-    """A copy of a database, without the matches that contradict what a network predicts.
+    """Copy a database without the matches that contradict a network's prediction.
 
-    Sides of an object that look alike match, and agree with some geometry of their pair. A pair of
-    which fewer than half of the matches are left has none.
+    Matches between similar sides of an object may agree with some geometry of their pair. If fewer
+    than half of a pair's matches agree with the prediction, all are left out.
 
     Args:
-        matches: the database of the photos.
+        matches: database.
         photos: as for ``matched_by_prediction``.
     """
     import pycolmap
@@ -132,25 +139,28 @@ def without_contradictions(matches: Path, photos: Sequence[AlignedPhoto | None])
     shutil.copyfile(matches, database)
     with pycolmap.Database.open(database) as opened:
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            first, second = pycolmap.pair_id_to_image_pair(pair)
-            one, other = (photos[number - image_id(0)] for number in (first, second))
-            found = geometry.inlier_matches
-            if one is None or other is None or not len(found):
+            ids = pycolmap.pair_id_to_image_pair(pair)
+            one, other = (photos[number - image_id(0)] for number in ids)
+            inliers = geometry.inlier_matches
+            if one is None or other is None or not len(inliers):
                 continue
-            places = [opened.read_keypoints(number)[:, :2] for number in (first, second)]
-            ways = (
-                (one, other, places[0][found[:, 0]], places[1][found[:, 1]]),
-                (other, one, places[1][found[:, 1]], places[0][found[:, 0]]),
-            )
+            places = [
+                opened.read_keypoints(number)[inliers[:, side], :2]
+                for side, number in enumerate(ids)
+            ]
             # The depths of one of the two photos may be wrong.
-            agrees = max((_agrees(*way) for way in ways), key=np.count_nonzero)
+            agrees = max(
+                _agrees(one, other, places[0], places[1]),
+                _agrees(other, one, places[1], places[0]),
+                key=np.count_nonzero,
+            )
             if agrees.all():
                 continue
-            if np.count_nonzero(agrees) >= max(FEWEST, LEAST_LEFT * len(found)):
-                geometry.inlier_matches = found[agrees]
-                opened.update_two_view_geometry(first, second, geometry)
+            if np.count_nonzero(agrees) >= max(MIN_MATCHES, MIN_AGREEING * len(inliers)):
+                geometry.inlier_matches = inliers[agrees]
+                opened.update_two_view_geometry(*ids, geometry)
             else:
-                opened.delete_two_view_geometry(first, second)
+                opened.delete_two_view_geometry(*ids)
     return database
 
 
@@ -160,47 +170,45 @@ def _agrees(
     places: npt.NDArray[np.float32],
     other_places: npt.NDArray[np.float32],
 ) -> npt.NDArray[np.bool_]:
-    """Which matches [M] are where the other photo shows the same place, as it is predicted.
+    """Which matches [M] agree with the prediction; all do if too few depths are known.
 
-    A camera that is predicted with a wrong turn shifts all matches alike. Matches of a side that
-    looks like another are off each by itself. What the network is not sure of agrees.
+    A wrong rotation of a camera shifts all matches alike; matches between similar sides have
+    different errors.
     """
-    off = _off(one, other, places, other_places)
-    known = ~np.isnan(off[:, 0])
-    if np.count_nonzero(known) < FEWEST:
-        return np.ones(len(off), dtype=bool)
-    shift = np.median(off[known], axis=0)
-    if not np.linalg.norm(shift) <= TOGETHER:
-        return np.zeros(len(off), dtype=bool)
-    return np.asarray(~known | (np.linalg.norm(off - shift, axis=1) <= ALONE))
+    errors = _errors(one, other, places, other_places)
+    known = ~np.isnan(errors[:, 0])
+    if np.count_nonzero(known) < MIN_MATCHES:
+        return np.ones(len(errors), dtype=bool)
+    shift = np.median(errors[known], axis=0)
+    if not np.linalg.norm(shift) <= MAX_SHARED_ERROR:
+        return np.zeros(len(errors), dtype=bool)
+    return np.asarray(~known | (np.linalg.norm(errors - shift, axis=1) <= MAX_OWN_ERROR))
 
 
-def _off(
+def _errors(
     one: AlignedPhoto,
     other: AlignedPhoto,
     places: npt.NDArray[np.float32],
     other_places: npt.NDArray[np.float32],
 ) -> npt.NDArray[np.float64]:
-    """How far matches are from where the other photo shows the place [M, 2], in its longer sides.
+    """Errors of the predicted places in the other photo [M, 2], in units of its longer side.
 
-    Infinite where the place is behind the other camera, NaN where its depth is unknown.
+    Infinite for places behind the other camera, NaN for unknown depths.
     """
-    K, viewmat = one.camera.K, one.camera.viewmat
-    slopes = (places - K[[0, 1], 2]) / K[[0, 1], [0, 1]]
+    slopes = ray_slopes(places, one.camera.K)
     local = np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0)
     local *= one.depths_at(places.astype(np.float64))[:, None]
-    K = other.camera.K
+    viewmat, K = one.camera.viewmat, other.camera.K
     seen = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
     seen = seen @ other.camera.viewmat[:3, :3].T + other.camera.viewmat[:3, 3]
     with np.errstate(all="ignore"):
         pixels = seen[:, :2] / seen[:, 2:] * K[[0, 1], [0, 1]] + K[[0, 1], 2]
-    off = (pixels - other_places) / max(other.camera.width, other.camera.height)
-    off[seen[:, 2] <= 0.0] = np.inf
-    return np.asarray(off)
+    errors = (pixels - other_places) / max(other.camera.width, other.camera.height)
+    errors[seen[:, 2] <= 0.0] = np.inf
+    return np.asarray(errors)
 
 
-def _lines(one: Camera, other: Camera) -> npt.NDArray[np.float64]:
-    """The fundamental matrix from one photo to another."""
+def _fundamental_matrix(one: Camera, other: Camera) -> npt.NDArray[np.float64]:
     relative = other.viewmat @ np.linalg.inv(one.viewmat)
     x, y, z = relative[:3, 3]
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ relative[:3, :3]
@@ -210,7 +218,7 @@ def _lines(one: Camera, other: Camera) -> npt.NDArray[np.float64]:
     return fundamental
 
 
-def _camera(camera: Camera) -> Any:
+def _pinhole(camera: Camera) -> Any:
     import pycolmap
 
     K = camera.K

@@ -1,4 +1,4 @@
-"""What a COLMAP model says, as an ``Estimate``: cameras, lenses, coloured points and tracks."""
+"""Convert a COLMAP model to an ``Estimate``: cameras, lenses, colored points and tracks."""
 
 from __future__ import annotations
 
@@ -20,14 +20,9 @@ from igsr.pose.estimate import Estimate
 Float64 = npt.NDArray[np.float64]
 
 
-def estimate_of(photos: Sequence[Photo], found: Mapped) -> Estimate:
-    """Cameras, points and warnings.
-
-    Args:
-        photos: all that were given.
-        found: the model of them.
-    """
-    model = found.model
+def estimate_of(photos: Sequence[Photo], mapped: Mapped) -> Estimate:
+    """Return cameras, points and warnings of a model of the photos."""
+    model = mapped.model
     nothing: list[Any] = [None] * len(photos)
     if model is None:
         return Estimate(nothing, None, nothing, nothing, [])
@@ -44,23 +39,23 @@ def estimate_of(photos: Sequence[Photo], found: Mapped) -> Estimate:
         cameras[index] = Camera(viewmat, intrinsic_matrix(focal, focal, cx, cy), width, height)
         lenses[index] = Lens(False, (k,)) if k != 0.0 else None
     sentences = []
-    lost = [photo.name for photo, camera in zip(photos, cameras, strict=True) if camera is None]
-    if lost:
-        cause = "not registered" if found.alike else "too few matches for"
+    missing = [photo.name for photo, camera in zip(photos, cameras, strict=True) if camera is None]
+    if missing:
+        cause = "not registered" if mapped.removed_pairs else "too few matches for"
         sentences.append(
-            f"{len(photos) - len(lost)} of {len(photos)} photos are registered; {cause}: "
-            f"{', '.join(lost)}."
+            f"{len(photos) - len(missing)} of {len(photos)} photos are registered; {cause}: "
+            f"{', '.join(missing)}."
         )
-    if found.alike:
-        mend = " Add photos that lead from these to the others." if lost else ""
+    if mapped.removed_pairs:
+        advice = " Add photos between these and the registered ones." if missing else ""
         sentences.append(
-            "Some photos show places that look alike: matches between them contradict others and "
-            f"were left out (pairs of photos: {found.alike}).{mend}"
+            "Some photos show places that look alike: matches between them contradict other "
+            f"matches and were not used (pairs of photos: {mapped.removed_pairs}).{advice}"
         )
-    if found.doubtful:
+    if mapped.doubtful:
         sentences.append(
             "The photos have few matches, so cameras were found with lower thresholds and may be "
-            "wrong; check the plot, or add photos between those that you have."
+            "wrong; check the plot, or add photos between them."
         )
     points = _points(photos, model, index_of)
     if points is not None:
@@ -69,7 +64,7 @@ def estimate_of(photos: Sequence[Photo], found: Mapped) -> Estimate:
 
 
 def _points(photos: Sequence[Photo], model: Any, index_of: dict[int, int]) -> Points | None:
-    """Points with their mean colour; confident where many photos see them in nearly one place."""
+    """Points with mean colors and a confidence by number of photos and reprojection error."""
     rows = {point_id: row for row, point_id in enumerate(sorted(model.point3D_ids()))}
     if not rows:
         return None
@@ -80,12 +75,12 @@ def _points(photos: Sequence[Photo], model: Any, index_of: dict[int, int]) -> Po
         observed = model.images[image_id].get_observation_points2D()
         if not observed:
             continue
-        at = np.array([rows[point.point3D_id] for point in observed])
+        index_of_point = np.array([rows[point.point3D_id] for point in observed])
         column, row = np.array([point.xy for point in observed]).astype(np.int64).T
         height, width = photos[index].image.shape[:2]
         pixels = photos[index].image[row.clip(0, height - 1), column.clip(0, width - 1), :3]
-        np.add.at(colors, at, pixels.astype(np.float64))
-        np.add.at(seen, at, 1.0)
+        np.add.at(colors, index_of_point, pixels.astype(np.float64))
+        np.add.at(seen, index_of_point, 1.0)
     rgb = (colors / np.maximum(seen, 1.0)[:, None]).round().astype(np.uint8)
     errors = np.array([max(point.error, 0.0) for point in points])
     return Points(
@@ -103,22 +98,22 @@ def _tracks(
     cameras: Sequence[Camera | None],
     lenses: Sequence[Lens | None],
 ) -> Tracks:
-    """Where the registered photos see the points, with lens distortion undone."""
+    """Observations of points in the registered photos, without lens distortion."""
     rows = {point_id: row for row, point_id in enumerate(sorted(model.point3D_ids()))}
     view: list[int] = []
     point: list[int] = []
-    places: list[Float64] = []
+    positions: list[Float64] = []
     for number, image_id in enumerate(index_of):
         for observed in model.images[image_id].get_observation_points2D():
             view.append(number)
             point.append(rows[observed.point3D_id])
-            places.append(observed.xy)
+            positions.append(observed.xy)
     registered = list(index_of.values())
     tracks = Tracks(
         [photos[index].name for index in registered],
         np.array(view, dtype=np.int64),
         np.array(point, dtype=np.int64),
-        np.array(places, dtype=np.float64).reshape(-1, 2),
+        np.array(positions, dtype=np.float64).reshape(-1, 2),
     )
     registered_cameras = [camera for camera in cameras if camera is not None]
     return straightened(tracks, xyz, registered_cameras, [lenses[index] for index in registered])

@@ -1,9 +1,9 @@
-"""Cameras of Depth Anything 3: from and to the network's nine numbers, and from its rays.
+"""Cameras of Depth Anything 3: pose encodings, and cameras from rays (arXiv 2511.10647, section 3).
 
-arXiv 2511.10647, section 3. A pose encoding is (t, q, fov_h, fov_w): the camera's centre in the
-world, its rotation camera to world as a quaternion (x, y, z, w) of any length, and the vertical and
-horizontal field of view in radians. The principal point is the image's centre, of which the nine
-numbers cannot tell otherwise. Axes are OpenCV's; pixels have their centres at +0.5.
+A pose encoding is (t, q, fov_h, fov_w): the camera's center in the world, its camera-to-world
+rotation as a quaternion (x, y, z, w) of any length, and the vertical and horizontal field of view
+in radians. The principal point is the center of the image. Axes are OpenCV's; pixels have their
+centers at +0.5.
 """
 
 from __future__ import annotations
@@ -21,48 +21,38 @@ from igsr.errors import IgsrError
 
 Float64 = npt.NDArray[np.float64]
 
-#: The least tangent of half a field of view.
-LEAST_TANGENT = 1e-6
-#: The least distance that the unit of given cameras is taken to be.
-LEAST_UNIT = 0.1
-
-#: Part of the rays, the surest, that samples are drawn from; samples, and rays in each.
-CANDIDATES, SAMPLES, SAMPLE = 0.3, 100, 8
-#: Distance on the plane of 2 x 2 within which a ray agrees with a homography.
-AGREES = 0.2
-#: A ray's z in the world below which its place on the plane is not known.
-LEAST_Z = 1e-4
-DECOMPOSITIONS = ("centred", "free", "official")
+#: Minimum tangent of half a field of view.
+MIN_TANGENT = 1e-6
+#: Minimum unit of known cameras.
+MIN_UNIT = 0.1
+#: Fraction of the rays, the most confident ones, that RANSAC samples from.
+SAMPLED_FRACTION = 0.3
+#: Number of RANSAC samples, and of rays in each.
+SAMPLES = 100
+SAMPLE_RAYS = 8
+#: Maximum distance of inliers, on an image plane of 2 x 2.
+MAX_INLIER_DISTANCE = 0.2
+#: Minimum z of a ray in the world; with less, its point on the plane is not defined.
+MIN_RAY_Z = 1e-4
 
 
 def decode_pose(
     encoding: npt.ArrayLike | Tensor, height: int, width: int
 ) -> tuple[Float64, Float64]:
-    """Cameras of pose encodings.
+    """Convert pose encodings [S, 9] to world-to-camera [S, 3, 4] and intrinsics [S, 3, 3], pixels.
 
-    Args:
-        encoding: float [S, 9].
-        height, width: of the views, pixels.
-
-    Returns:
-        World to camera float64 [S, 3, 4] and intrinsics float64 [S, 3, 3] in pixels. A field of
-        view of 0, or of pi and more, gives a focal length of 500 000 sides.
-
-    Raises:
-        IgsrError: the encoding has another shape.
+    A field of view of 0, or of pi and more, gives a focal length of 500 000 sides.
     """
-    numbers = _array(encoding, "encoding", 2, 9)
-    # The encoding has w last.
-    centre, c2w = numbers[:, :3], rotations_of(np.roll(_unit(numbers[:, 3:7]), 1, axis=-1))
-    tangents = np.maximum(np.tan(numbers[:, 7:] / 2.0), LEAST_TANGENT)
+    numbers = _numpy(encoding)
+    # w comes last.
+    center, c2w = numbers[:, :3], rotations_of(np.roll(_unit(numbers[:, 3:7]), 1, axis=-1))
+    tangents = np.maximum(np.tan(numbers[:, 7:] / 2.0), MIN_TANGENT)
     focal_y, focal_x = (height / 2.0) / tangents[:, 0], (width / 2.0) / tangents[:, 1]
-    intrinsics = np.stack(
-        [
-            intrinsic_matrix(float(fx), float(fy), width / 2.0, height / 2.0)
-            for fx, fy in zip(focal_x, focal_y, strict=True)
-        ]
-    )
-    return _w2c(c2w, centre), intrinsics
+    intrinsics = [
+        intrinsic_matrix(float(fx), float(fy), width / 2.0, height / 2.0)
+        for fx, fy in zip(focal_x, focal_y, strict=True)
+    ]
+    return _w2c(c2w, center), np.stack(intrinsics)
 
 
 def encode_pose(
@@ -70,42 +60,33 @@ def encode_pose(
     intrinsics: npt.ArrayLike | Tensor,
     sizes: Sequence[tuple[int, int]],
 ) -> Tensor:
-    """Pose encodings of cameras; their principal points are not encoded.
+    """Convert cameras to pose encodings float64 [S, 9], without their principal points.
 
     Args:
-        viewmats: float [S, 4, 4] or [S, 3, 4], world to camera.
-        intrinsics: float [S, 3, 3], pixels.
+        viewmats: [S, 4, 4] or [S, 3, 4], world to camera.
+        intrinsics: [S, 3, 3], pixels.
         sizes: height and width of each view, pixels.
-
-    Returns:
-        float64 [S, 9], quaternions of length 1 with w not negative.
     """
     w2c = _numpy(viewmats)[:, :3]
     rotation, K = w2c[:, :, :3].swapaxes(1, 2), _numpy(intrinsics)
-    centres = -(rotation @ w2c[:, :, 3:])[..., 0]
-    sides = np.array(sizes, dtype=np.float64)
+    centers = -(rotation @ w2c[:, :, 3:])[..., 0]
     focals = np.stack([K[:, 1, 1], K[:, 0, 0]], axis=-1)
     quaternions = np.stack([_quaternion(one) for one in rotation])
-    fields = 2.0 * np.arctan(sides / 2.0 / focals)
-    return torch.from_numpy(np.concatenate([centres, quaternions, fields], axis=1))
+    fields = 2.0 * np.arctan(np.array(sizes, dtype=np.float64) / 2.0 / focals)
+    return torch.from_numpy(np.concatenate([centers, quaternions, fields], axis=1))
 
 
 def normalized_viewmats(viewmats: npt.ArrayLike | Tensor) -> Float64:
-    """Cameras in the frame of the first and in the unit that the network was trained with.
+    """Map world-to-camera [S, 4, 4] to the frame of the first and the unit of the training.
 
-    Args:
-        viewmats: float [S, 4, 4], world to camera.
-
-    Returns:
-        float64 [S, 4, 4]: the first is the identity, and the median distance of the centres from
-        the first (the lower one of an even number, the first's own 0 counts) is 1, unless it was
-        below 0.1.
+    The median distance of all centers from the first (the lower one of an even number) becomes 1,
+    unless it was below 0.1.
     """
-    given = _numpy(viewmats)
-    relative: Float64 = given @ np.linalg.inv(given[0])
-    centres = -(relative[:, :3, :3].swapaxes(1, 2) @ relative[:, :3, 3:])[..., 0]
-    distances = np.sort(np.linalg.norm(centres - centres[0], axis=1))
-    relative[:, :3, 3] /= max(LEAST_UNIT, float(distances[(len(distances) - 1) // 2]))
+    world = _numpy(viewmats)
+    relative: Float64 = world @ np.linalg.inv(world[0])
+    centers = -(relative[:, :3, :3].swapaxes(1, 2) @ relative[:, :3, 3:])[..., 0]
+    distances = np.sort(np.linalg.norm(centers - centers[0], axis=1))
+    relative[:, :3, 3] /= max(MIN_UNIT, float(distances[(len(distances) - 1) // 2]))
     return relative
 
 
@@ -114,124 +95,88 @@ def cameras_of_rays(
     confidence: npt.ArrayLike | Tensor,
     height: int,
     width: int,
-    samples: npt.ArrayLike | Tensor | None = None,
-    decomposition: str = "centred",
+    samples: npt.ArrayLike | None = None,
     seed: int = 0,
+    official: bool = False,
 ) -> tuple[Float64, Float64]:
-    """Cameras that explain the rays of views best.
+    """Estimate the cameras that explain the rays of views best.
 
-    The rays' directions are a homography of their places in the image, which RANSAC finds and a fit
-    to all rays that agree with it refines.
+    The rays' directions are a homography of their positions in the image, which RANSAC finds and a
+    fit to all inliers refines. Its lower triangular factor gives rotation and focal lengths.
 
     Args:
         rays: float [S, h, w, 6], direction and origin, evenly over the image.
         confidence: float [S, h, w], weights of rays, not negative.
         height, width: of the views, pixels.
-        samples: int [samples, 8], counting the surest 30 % of a view's rays from the surest; drawn
-            by ``seed`` if None.
-        decomposition: how rotation and intrinsics are had from a homography. "centred", for photos
-            whose principal point is in the middle: a lower triangular factor gives rotation and
-            focal lengths, so that noise moves no principal point. "free", for photos that were cut:
-            an upper triangular one, which is exact for any principal point. "official": as
-            "centred", with the principal point that the lower triangular factor has, which is
-            wrong for photos that were cut.
-        seed: random seed.
+        samples: int [samples, 8], ranks of rays in the order of their confidence; by default drawn
+            from the most confident 30 %.
+        seed: of the samples.
+        official: compute as the published code, which takes the principal point from the lower
+            triangular factor, and divides by a z near 0 for views across the reference.
 
     Returns:
-        World to camera float64 [S, 3, 4] and intrinsics float64 [S, 3, 3] in pixels.
+        World to camera float64 [S, 3, 4], and intrinsics float64 [S, 3, 3] in pixels.
 
     Raises:
-        IgsrError: an array has another shape, the decomposition is unknown, or a view's rays fit no
-            camera.
+        IgsrError: no camera fits the rays of a view.
     """
-    if decomposition not in DECOMPOSITIONS:
-        raise IgsrError(
-            f"decomposition is {decomposition!r}; give one of {', '.join(DECOMPOSITIONS)}"
-        )
-    all_rays, weights = _array(rays, "rays", 4, 6), _numpy(confidence)
-    if weights.shape != all_rays.shape[:3]:
-        raise IgsrError(
-            f"confidence has shape {list(weights.shape)}; give {list(all_rays.shape[:3])}, a "
-            "weight per ray"
-        )
+    all_rays, weights = _numpy(rays), _numpy(confidence)
     rows, columns = weights.shape[1:]
     x = -1.0 + (2.0 * np.arange(columns) + 1.0) / columns
     y = -1.0 + (2.0 * np.arange(rows) + 1.0) / rows
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    candidates = max(SAMPLE, int(CANDIDATES * len(places)))
+    candidates = max(SAMPLE_RAYS, int(SAMPLED_FRACTION * len(places)))
     if samples is None:
-        drawn = np.random.default_rng(seed).random((SAMPLES, SAMPLE))
+        drawn = np.random.default_rng(seed).random((SAMPLES, SAMPLE_RAYS))
         samples = (drawn * min(candidates, len(places))).astype(np.int64)
-    chosen = np.asarray(_numpy(samples), dtype=np.int64)
-    rotations, centres, intrinsics = [], [], []
+    ranks = np.asarray(samples, dtype=np.int64)
+    rotations, centers, intrinsics = [], [], []
     for n, (view, weight) in enumerate(zip(all_rays, weights, strict=True)):
-        directions, origins = view.reshape(-1, 6)[:, :3], view.reshape(-1, 6)[:, 3:]
-        known = np.isfinite(view.reshape(-1, 6)).all(axis=1) & np.isfinite(weight.ravel())
-        directions, origins = (np.where(known[:, None], one, 1.0) for one in (directions, origins))
-        weight = np.where(known, weight.ravel(), 0.0)
-        # Published code divides by the world's z, which is near 0 for views across the reference.
-        towards = np.eye(3) if decomposition == "official" else _turn_ahead(directions, weight)
-        directions = directions @ towards.T
-        weight = np.where(np.abs(directions[:, 2]) > LEAST_Z, weight, 0.0)
+        flat, weight = view.reshape(-1, 6), weight.ravel()
+        known = np.isfinite(flat).all(axis=1) & np.isfinite(weight)
+        weight = np.where(known, weight, 0.0)
+        directions, origins = (
+            np.where(known[:, None], part, 1.0) for part in np.split(flat, 2, axis=1)
+        )
+        turn = np.eye(3) if official else _turn_ahead(directions, weight)
+        directions = directions @ turn.T
+        weight = np.where(np.abs(directions[:, 2]) > MIN_RAY_Z, weight, 0.0)
         directions[weight == 0.0] = 1.0
         targets = directions[:, :2] / directions[:, 2:]
-        surest = np.argsort(-weight, kind="stable")[:candidates]
-        homography = _homography_of(places, targets, weight, surest[chosen])
+        best = np.argsort(-weight, kind="stable")[:candidates]
+        homography = _homography(places, targets, weight, best[ranks])
         if homography is None:
-            raise IgsrError(f"the rays of view {n} fit no camera; its prediction is of no use")
-        rotation, K = _decomposed(homography, decomposition)
-        rotations.append(towards.T @ rotation)
-        total = weight.sum()
-        centres.append(weight @ origins / total)
+            raise IgsrError(f"the rays of view {n} fit no camera, so its prediction is useless")
+        rotation, K = _decomposed(homography)
+        rotations.append(turn.T @ rotation)
+        centers.append(weight @ origins / weight.sum())
         half = np.array([width / 2.0, height / 2.0])
-        centre = half if decomposition == "centred" else (K[:2, 2] + 1.0) * half
+        center = (K[:2, 2] + 1.0) * half if official else half
         intrinsics.append(
-            intrinsic_matrix(K[0, 0] * half[0], K[1, 1] * half[1], centre[0], centre[1])
+            intrinsic_matrix(K[0, 0] * half[0], K[1, 1] * half[1], center[0], center[1])
         )
-    return _w2c(np.stack(rotations), np.stack(centres)), np.stack(intrinsics)
+    return _w2c(np.stack(rotations), np.stack(centers)), np.stack(intrinsics)
 
 
 def _turn_ahead(directions: Float64, weights: Float64) -> Float64:
-    """The rotation [3, 3] that turns the mean of directions [N, 3] onto the z axis."""
+    """The rotation [3, 3] of the mean of directions [N, 3] onto the z axis."""
     x, y, z = _unit(weights @ _unit(directions))
-    # The reflection that swaps that direction with z, after one that changes nothing of z.
+    # The reflection that swaps that direction with z, after one that leaves z unchanged.
     between = _unit(np.array([x, y, z + np.copysign(1.0, z)]))
     swap = 2.0 * np.outer(between, between) - np.eye(3)
     turn: Float64 = swap if z >= 0.0 else np.diag([1.0, -1.0, -1.0]) @ swap
     return turn
 
 
-def _homography_of(
+def _homography(
     places: Float64, targets: Float64, weights: Float64, samples: npt.NDArray[np.int64]
 ) -> Float64 | None:
-    """The homography [3, 3] from places [N, 2] to targets [N, 2] that most weight agrees with.
-
-    Args:
-        places, targets, weights: [N, 2], [N, 2], [N].
-        samples: [samples, 8], indices of N.
-    """
-    equations = _equations(places, targets)
-    best, best_score = None, 0.0
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for sample in samples:
-            agrees = _agreeing(_solved(equations, weights, sample), places, targets) & (weights > 0)
-            score = float(weights[agrees].sum())
-            if score > best_score:
-                best, best_score = agrees, score
-    if best is None:
-        return None
-    refined = _solved(equations, weights, np.flatnonzero(best))
-    if not (np.isfinite(refined).all() and abs(np.linalg.det(refined)) > 0.0):
-        return None
-    return refined if np.linalg.det(refined) > 0.0 else -refined
-
-
-def _equations(places: Float64, targets: Float64) -> Float64:
-    """[N, 2, 9]: the rows of the direct linear transform, each zero for the right homography."""
+    """The homography [3, 3] from places [N, 2] to targets [N, 2] with the most inlier weight."""
+    # The rows [N, 2, 9] of the direct linear transform.
     whole = np.pad(places, ((0, 0), (0, 1)), constant_values=1.0)
     nothing = np.zeros_like(whole)
     u, v = targets[:, :1], targets[:, 1:]
-    return np.stack(
+    equations = np.stack(
         [
             np.concatenate([whole, nothing, -u * whole], axis=1),
             np.concatenate([nothing, whole, -v * whole], axis=1),
@@ -239,31 +184,34 @@ def _equations(places: Float64, targets: Float64) -> Float64:
         axis=1,
     )
 
+    def solved(used: npt.NDArray[np.int64]) -> Float64:
+        rows = (equations[used] * np.sqrt(weights[used])[:, None, None]).reshape(-1, 9)
+        # Faster than a singular value decomposition of all rows.
+        solution = np.linalg.eigh(rows.T @ rows)[1][:, 0]
+        homography: Float64 = (solution / solution[8]).reshape(3, 3)
+        return homography
 
-def _solved(equations: Float64, weights: Float64, used: npt.NDArray[np.int64]) -> Float64:
-    """The homography [3, 3] with the least weighted sum of squares, H[2, 2] = 1."""
-    rows = (equations[used] * np.sqrt(weights[used])[:, None, None]).reshape(-1, 9)
-    # The eigenvector of a 9 x 9 matrix, where a singular value decomposition of all rows would
-    # form a matrix of their number squared.
-    solution = np.linalg.eigh(rows.T @ rows)[1][:, 0]
-    homography: Float64 = (solution / solution[8]).reshape(3, 3)
-    return homography
+    inliers, best_score = None, 0.0
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for sample in samples:
+            homography = solved(sample)
+            mapped = places @ homography[:, :2].T + homography[:, 2]
+            distance = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - targets, axis=1)
+            near = (distance < MAX_INLIER_DISTANCE) & (weights > 0)
+            score = float(weights[near].sum())
+            if score > best_score:
+                inliers, best_score = near, score
+    if inliers is None:
+        return None
+    refined = solved(np.flatnonzero(inliers))
+    determinant = np.linalg.det(refined)
+    if not (np.isfinite(refined).all() and abs(determinant) > 0.0):
+        return None
+    return refined if determinant > 0.0 else -refined
 
 
-def _agreeing(homography: Float64, places: Float64, targets: Float64) -> npt.NDArray[np.bool_]:
-    mapped = places @ homography[:, :2].T + homography[:, 2]
-    off = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - targets, axis=1)
-    return np.asarray(off < AGREES)
-
-
-def _decomposed(homography: Float64, decomposition: str) -> tuple[Float64, Float64]:
-    """Rotation camera to world [3, 3] and intrinsics [3, 3] on the plane of 2 x 2."""
-    if decomposition == "free":
-        rotation, factor = np.linalg.qr(homography)
-        signs = np.where(np.diag(factor) < 0.0, -1.0, 1.0)
-        inverse = signs[:, None] * factor
-        K = np.linalg.inv(inverse / inverse[2, 2])
-        return rotation * signs, K / K[2, 2]
+def _decomposed(homography: Float64) -> tuple[Float64, Float64]:
+    """Camera-to-world rotation [3, 3], and intrinsics [3, 3] on an image plane of 2 x 2."""
     # Reversing the columns before a QR makes the triangular factor a lower one.
     rotation, factor = np.linalg.qr(homography[:, ::-1])
     rotation, factor = rotation[:, ::-1], factor[::-1, ::-1]
@@ -274,10 +222,10 @@ def _decomposed(homography: Float64, decomposition: str) -> tuple[Float64, Float
     return rotation * signs, K
 
 
-def _w2c(rotations: Float64, centres: Float64) -> Float64:
-    """World to camera [S, 3, 4] of rotations camera to world [S, 3, 3] and centres [S, 3]."""
+def _w2c(rotations: Float64, centers: Float64) -> Float64:
+    """World to camera [S, 3, 4] of camera-to-world rotations [S, 3, 3] and centers [S, 3]."""
     back = rotations.swapaxes(1, 2)
-    return np.concatenate([back, -back @ centres[..., None]], axis=2)
+    return np.concatenate([back, -back @ centers[..., None]], axis=2)
 
 
 def _quaternion(rotation: Float64) -> Float64:
@@ -305,11 +253,3 @@ def _numpy(value: npt.ArrayLike | Tensor) -> Float64:
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
     return np.asarray(value, dtype=np.float64)
-
-
-def _array(value: npt.ArrayLike | Tensor, name: str, dimensions: int, last: int) -> Float64:
-    array = _numpy(value)
-    if array.ndim != dimensions or array.shape[-1] != last:
-        sizes = ", ".join(["S", "h", "w"][: dimensions - 1] + [str(last)])
-        raise IgsrError(f"{name} has shape {list(array.shape)}; give [{sizes}]")
-    return array

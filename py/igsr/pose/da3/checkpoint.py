@@ -1,16 +1,13 @@
-"""Checkpoints of Depth Anything 3: found, read as the untrusted files they are, checked by key.
+"""Read and check checkpoints of Depth Anything 3, which are untrusted files.
 
-A checkpoint is a safetensors file, which holds arrays and text and nothing that could be run, with
-a ``config.json`` beside it that says the size. A file alone tells its size by its shapes.
+A checkpoint is a safetensors file, which holds only arrays and text, with a ``config.json`` next to
+it that gives the size. Without that file, the shapes give the size. Nothing in them is run.
 """
 
 from __future__ import annotations
 
-import json
-import os
 import re
-import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,272 +16,217 @@ from safetensors import safe_open
 from torch import Tensor
 
 from igsr.errors import IgsrError
-from igsr.pose.da3.config import SIZES, NetworkConfig, size_of
+from igsr.pose.checkpoint_search import WEIGHTS, exists
+from igsr.pose.da3.backbone import BASE, FIRST_GLOBAL, OUTPUT_BLOCKS, SMALL, NetworkConfig
 from igsr.pose.da3.head import RAY_LEVEL, SHARED_NORM
 from igsr.pose.da3.network import Da3Network
-from igsr.pose.huggingface_cache import cached_snapshots
+from igsr.pose.networks import (
+    Checkpoint,
+    checked_weight,
+    config_of,
+    with_weights,
+    without_weights,
+)
 
-#: Names a checkpoint that is to be used wherever it lies.
-VARIABLE = "IGSR_DA3"
-#: The published models, as huggingface names them, the better first.
-PUBLISHED = ("depth-anything/DA3-BASE", "depth-anything/DA3-SMALL")
-#: Of the published models, and what is said of one that was trained by igsr.
-LICENCE = "Apache-2.0"
-#: The file in a folder of a checkpoint.
-WEIGHTS, CONFIG = "model.safetensors", "config.json"
-#: What all keys begin with.
-PREFIX = "model."
+#: License of the published models.
+LICENSE = "Apache-2.0"
+#: The implemented sizes, by the names of the published models.
+SIZES = {"da3-small": SMALL, "da3-base": BASE}
 
-#: Bytes that a config.json may have.
-_LONGEST_TEXT = 100_000
-#: Unknown keys that a warning names.
-_NAMED = 20
-
-#: Outputs at other levels than the one that is used, of which only training has need.
-_UNNEEDED = re.compile(r"head\.scratch\.output_conv[12]_aux\.[012]\..*")
-#: What the larger models have, and the two of the smaller ones do not.
+#: Prefix of all keys.
+_PREFIX = "model."
+#: The same sizes, by the names of the backbone in a config.json.
+_NET_NAMES = {"vits": "da3-small", "vitb": "da3-base"}
+#: Outputs of the ray chain at other levels, which are for training.
+_UNUSED = re.compile(r"head\.scratch\.output_conv[12]_aux\.[012]\..*")
+#: Keys of the larger models.
 _LARGER = re.compile(
     r"(da3|da3_metric|gs_head|gs_adapter)\..*|backbone\.pretrained\.blocks\.1[2-9]\..*"
 )
-_WIDTHS = {config.embed_dim: name for name, config in SIZES.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """A checked checkpoint.
-
-    Attributes:
-        name: one of ``SIZES``.
-        config: its sizes.
-        weights: float32, exactly the keys and shapes of a ``Da3Network`` of that size.
-        unknown: keys of the file that no part of the network has, sorted; they were ignored.
-    """
-
-    name: str
-    config: NetworkConfig
-    weights: dict[str, Tensor]
-    unknown: list[str]
-
-
-def stated(config: NetworkConfig) -> dict[str, str]:
-    """The "name" of a network of one of the ``SIZES``, and the "licence" of its weights."""
-    name = next(name for name, size in SIZES.items() if size == config)
-    return {"name": name, "licence": LICENCE}
-
-
-def find_checkpoint(named: str | Path | None = None) -> Path | None:
-    """Where a checkpoint lies: the named one, else what IGSR_DA3 names, else a cached one.
-
-    The cache is huggingface_hub's, looked through for BASE, then SMALL; nothing is downloaded.
-
-    Args:
-        named: a safetensors file, a folder that holds ``model.safetensors``, or None.
-
-    Returns:
-        The safetensors file.
-
-    Raises:
-        IgsrError: what is named, here or by IGSR_DA3, is no such file or folder.
-    """
-    for source, value in (("checkpoint", named), (VARIABLE, os.environ.get(VARIABLE))):
-        if value:
-            path = Path(value).expanduser()
-            path = path / WEIGHTS if _is(path, Path.is_dir) else path
-            if not _is(path, Path.is_file):
-                raise IgsrError(
-                    f"{source} names {str(path)!r}, which is no file; name a checkpoint of Depth "
-                    "Anything 3, or get one by 'igsr weights fetch'"
-                )
-            return path
-    for model in PUBLISHED:
-        for folder in cached_snapshots(model):
-            if _is(folder / WEIGHTS, Path.is_file):
-                return folder / WEIGHTS
-    return None
 
 
 def load_network(path: str | Path, device: str | None = None) -> Da3Network:
-    """A network with a checkpoint's weights, ready to predict.
-
-    Keys that were ignored are listed in a warning.
-
-    Args:
-        path: a safetensors file, or the folder that it lies in as ``model.safetensors``.
-        device: where it is to run, such as "cpu" or "cuda:1"; by default "cuda" where there is one.
+    """Load a network to a device, by default "cuda" if available, else "cpu".
 
     Raises:
         IgsrError: as ``load_checkpoint``, or the device cannot be used.
     """
-    checkpoint = load_checkpoint(path)
-    if checkpoint.unknown:
-        named = ", ".join(checkpoint.unknown[:_NAMED])
-        more = len(checkpoint.unknown) - _NAMED
-        warnings.warn(
-            f"{path} has keys that Depth Anything 3 has no use for, which were ignored: {named}"
-            + (f" and {more} more." if more > 0 else "."),
-            stacklevel=2,
-        )
-    network = _without_weights(checkpoint.config)
-    network.load_state_dict(checkpoint.weights, assign=True)
-    network.requires_grad_(False)
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return network.to(device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).strip().splitlines() or ["no reason given"]
-        raise IgsrError(
-            f"device {device!r} cannot hold the network ({reason[0]}); give 'cpu'"
-        ) from error
+    return with_weights(Da3Network, load_checkpoint(path), path, device)
 
 
-def load_checkpoint(path: str | Path) -> Checkpoint:
-    """A checkpoint's size and weights; nothing in its files is run or imported.
-
-    Args:
-        path: as for ``load_network``.
+def load_checkpoint(path: str | Path) -> Checkpoint[NetworkConfig]:
+    """Read and check a safetensors file, or a folder with ``model.safetensors``.
 
     Raises:
         IgsrError: the file is missing, damaged or of another network, or lacks a key or has it in
-            another shape; the message names what.
+            another shape.
     """
     path = Path(path)
-    path = path / WEIGHTS if _is(path, Path.is_dir) else path
-    if not _is(path, Path.is_file):
-        raise IgsrError(
-            f"{path} is no file; name a checkpoint of Depth Anything 3, or the folder that holds "
-            f"its {WEIGHTS}"
-        )
+    path = path / WEIGHTS if exists(path, folder=True) else path
+    if not exists(path):
+        raise IgsrError(f"{path} does not exist; name a checkpoint of Depth Anything 3")
     if path.suffix != ".safetensors":
         raise IgsrError(
-            f"{path} is no .safetensors file, the only kind that Depth Anything 3 comes in; name "
-            f"its {WEIGHTS}"
+            f"{path} is not a .safetensors file, the only format of Depth Anything 3; name its "
+            f"{WEIGHTS}"
         )
-    beside = _size_beside(path)
+    described = config_of(path)
+    name = None if described is None else size_of(described, str(path.parent / "config.json"))
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
-            # Keys are read by shape before anything is read whole.
+            # Shapes are checked before any array is read.
             shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
-            name = beside or _size_of_shapes(path, shapes)
-            _check_larger(path, shapes)
-            config = SIZES[name]
-            weights, unknown = read_weights(path, file, shapes, config)
+            if any(_LARGER.fullmatch(key.removeprefix(_PREFIX)) for key in shapes):
+                raise IgsrError(
+                    f"{path} is a checkpoint of a larger model of Depth Anything 3; those are not "
+                    "implemented, and most are for non-commercial use; name one of DA3-SMALL or "
+                    "DA3-BASE"
+                )
+            name = name or _size_of_shapes(path, shapes)
+            weights, unknown = read_weights(path, file, shapes, SIZES[name])
     except IgsrError:
         raise
-    except Exception as error:  # the library's own exception is not all that it raises
-        raise IgsrError(f"{path} is damaged or no safetensors; download it again") from error
-    return Checkpoint(name, config, weights, unknown)
+    except Exception as error:  # the library raises more than its own exception
+        raise IgsrError(f"{path} is damaged or not safetensors; download it again") from error
+    return Checkpoint(SIZES[name], weights, unknown)
 
 
 def read_weights(
-    path: Path, file: Any, shapes: dict[str, tuple[int, ...]], config: NetworkConfig
+    path: Path, file: Any, shapes: Mapping[str, tuple[int, ...]], config: NetworkConfig
 ) -> tuple[dict[str, Tensor], list[str]]:
-    """The weights of a network of given sizes, and the keys that it has no use for.
-
-    Args:
-        path: for messages.
-        file: an open safetensors file.
-        shapes: per key of the file.
-        config: the sizes.
-
-    Raises:
-        IgsrError: as ``load_checkpoint``.
-    """
-    wanted = _without_weights(config).state_dict()
+    """Read the weights of a network from an open file, and list the keys that it does not have."""
     weights, used = {}, set()
-    for key, tensor in wanted.items():
+    for key, tensor in without_weights(Da3Network, config).state_dict().items():
         stored = _stored_keys(key, shapes)
         values = [_weight(path, file, shapes, one, tuple(tensor.shape)) for one in stored]
         if any(not torch.equal(values[0], value) for value in values[1:]):
             raise IgsrError(
-                f"{path}: its {stored[0]} and {stored[1]} differ, and the network has one norm for "
-                "both; it is damaged or of another network"
+                f"{path}: {stored[0]} and {stored[1]} differ, but the network shares this norm; "
+                "the file is damaged or of another network"
             )
         weights[key] = values[0]
         used.update(stored)
-    unknown = [key for key in shapes if key not in used and not _UNNEEDED.fullmatch(_short(key))]
+    unknown = [
+        key
+        for key in shapes
+        if key not in used and not _UNUSED.fullmatch(key.removeprefix(_PREFIX))
+    ]
     return weights, sorted(unknown)
 
 
-def _stored_keys(key: str, shapes: dict[str, tuple[int, ...]]) -> list[str]:
-    """The keys of the file that hold a weight; there is one more for the shared norm.
+def _stored_keys(key: str, shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """The keys of the file for a weight; the shared norm may have one or two.
 
-    safetensors keeps a tensor that has several names once, under the first of them.
+    safetensors stores a tensor with several names once, under the first of them.
     """
     used, first = (f"head.{SHARED_NORM.format(level)}." for level in (RAY_LEVEL, 0))
     if not key.startswith(used):
-        return [PREFIX + key]
-    both = [PREFIX + key, PREFIX + key.replace(used, first)]
+        return [_PREFIX + key]
+    both = [_PREFIX + key, _PREFIX + key.replace(used, first)]
     return [one for one in both if one in shapes] or both[1:]
 
 
 def _weight(
     path: Path,
     file: Any,
-    shapes: dict[str, tuple[int, ...]],
+    shapes: Mapping[str, tuple[int, ...]],
     key: str,
     shape: tuple[int, ...],
 ) -> Tensor:
-    """A stored tensor as float32, refused if it is none or has another shape."""
     if key not in shapes:
         raise IgsrError(f"{path} has no {key}; it is incomplete or of another network")
     if shapes[key] != shape:
         raise IgsrError(
-            f"{path}: its {key} has shape {list(shapes[key])} where {list(shape)} belongs; it is "
+            f"{path}: {key} has shape {list(shapes[key])} instead of {list(shape)}; the file is "
             "damaged or of another network"
         )
-    value: Tensor = file.get_tensor(key)
-    if not value.is_floating_point():
-        raise IgsrError(f"{path}: its {key} is no array of floats; use the published checkpoint")
-    value = value.to(torch.float32).contiguous()
+    value = checked_weight(path, key, file.get_tensor(key), shape)
     if not bool(torch.isfinite(value).all()):
-        raise IgsrError(f"{path}: its {key} holds numbers that are not finite; download it again")
+        raise IgsrError(f"{path}: {key} has values that are not finite; download it again")
     return value
 
 
-def _size_beside(path: Path) -> str | None:
-    """Name by the ``config.json`` beside a checkpoint; None where there is none."""
-    beside = path.parent / CONFIG
-    try:
-        if not beside.exists():
-            return None
-        if beside.stat().st_size > _LONGEST_TEXT:
-            raise ValueError("it is too long")
-        content = json.loads(beside.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise IgsrError(f"{beside} cannot be read ({error}); download it again") from error
-    return size_of(content, str(beside))
-
-
-def _size_of_shapes(path: Path, shapes: dict[str, tuple[int, ...]]) -> str:
-    _check_larger(path, shapes)
-    token = shapes.get(f"{PREFIX}backbone.pretrained.cls_token", ())
-    if len(token) == 3 and token[2] in _WIDTHS:
-        return _WIDTHS[token[2]]
+def _size_of_shapes(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> str:
+    token = shapes.get(f"{_PREFIX}backbone.pretrained.cls_token", ())
+    for name, config in SIZES.items():
+        if len(token) == 3 and token[2] == config.embed_dim:
+            return name
     raise IgsrError(
-        f"{path} is no checkpoint of Depth Anything 3 SMALL or BASE; name one of them, or put its "
-        f"{CONFIG} beside it"
+        f"{path} is not a checkpoint of Depth Anything 3 SMALL or BASE; name one of them, or put "
+        "its config.json next to it"
     )
 
 
-def _check_larger(path: Path, shapes: dict[str, tuple[int, ...]]) -> None:
-    if any(_LARGER.fullmatch(_short(key)) for key in shapes):
-        raise IgsrError(
-            f"{path} is a checkpoint of a larger model of Depth Anything 3, most of which are for "
-            "non-commercial use and none of which is implemented; name one of DA3-SMALL or DA3-BASE"
-        )
+def size_of(content: Mapping[str, Any], source: str) -> str:
+    """The name, one of ``SIZES``, of the network that a ``config.json`` describes.
+
+    The file names Python classes, which are compared and not imported.
+
+    Raises:
+        IgsrError: the content is incomplete, or a name or number belongs to another network.
+    """
+
+    def check(name: str, value: Any, matches: bool, wanted: str) -> None:
+        if not matches:
+            raise IgsrError(
+                f"{source}: {name} is {value!r} instead of {wanted}; only DA3-SMALL and DA3-BASE "
+                "are implemented, so name a checkpoint of one of them"
+            )
+
+    def part(name: str) -> Mapping[str, Any]:
+        described = parts.get(name)
+        if not isinstance(described, Mapping):
+            raise IgsrError(f"{source} does not describe {name}; download it again")
+        return described
+
+    named = content.get("model_name")
+    known = named is None or (isinstance(named, str) and named in SIZES)
+    check("model_name", named, known, " or ".join(SIZES))
+    parts: Any = content.get("config")
+    if parts is None and named is not None:
+        return str(named)
+    if not isinstance(parts, Mapping):
+        raise IgsrError(f"{source} has no network under 'config'; download it again")
+    net = part("net").get("name")
+    check("net.name", net, isinstance(net, str) and net in _NET_NAMES, " or ".join(_NET_NAMES))
+    size = _NET_NAMES[str(net)]
+    check("net.name", net, named in (None, size), f"the one for {named}")
+    for name, (class_name, numbers) in _described(SIZES[size]).items():
+        if name == "cam_enc" and name not in parts:
+            continue  # only needed for known cameras
+        described = part(name)
+        declared = described.get("__object__", {})
+        declared = declared.get("name") if isinstance(declared, Mapping) else declared
+        check(f"{name}.__object__.name", declared, declared in (None, class_name), class_name)
+        for field, wanted in numbers.items():
+            value = described.get(field, wanted)
+            check(f"{name}.{field}", value, value == wanted, repr(wanted))
+    return size
 
 
-def _short(key: str) -> str:
-    return key.removeprefix(PREFIX)
-
-
-def _without_weights(config: NetworkConfig) -> Da3Network:
-    with torch.device("meta"):
-        return Da3Network(config).eval()
-
-
-def _is(path: Path, kind: Any) -> bool:
-    try:
-        return bool(kind(path))
-    except (OSError, ValueError):  # a name that no file can have
-        return False
+def _described(config: NetworkConfig) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Class name and numbers of each part of a network, as in a ``config.json``."""
+    dim = config.embed_dim
+    return {
+        "net": (
+            "DinoV2",
+            {
+                "out_layers": list(OUTPUT_BLOCKS),
+                "alt_start": FIRST_GLOBAL,
+                "qknorm_start": FIRST_GLOBAL,
+                "rope_start": FIRST_GLOBAL,
+                "cat_token": True,
+            },
+        ),
+        "head": (
+            "DualDPT",
+            {
+                "dim_in": 2 * dim,
+                "output_dim": 2,
+                "features": config.features,
+                "out_channels": list(config.out_channels),
+            },
+        ),
+        "cam_enc": ("CameraEnc", {"dim_out": dim}),
+        "cam_dec": ("CameraDec", {"dim_in": 2 * dim}),
+    }

@@ -1,6 +1,6 @@
-"""Depth Anything 3: depths, rays and cameras of all views of a scene from their pixels.
+"""Depth Anything 3: depths, rays and cameras of all views of a scene (arXiv 2511.10647, section 3).
 
-arXiv 2511.10647. Module names are those of the checkpoints' keys.
+Module names are as in the checkpoints.
 """
 
 from __future__ import annotations
@@ -11,136 +11,113 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from igsr.errors import IgsrError
-from igsr.pose.da3.backbone import Backbone
-from igsr.pose.da3.camera_heads import CameraDecoder, CameraEncoder
+from igsr.pose.da3.backbone import Block, NetworkConfig, Transformer
 from igsr.pose.da3.cameras import encode_pose, normalized_viewmats
-from igsr.pose.da3.config import PATCH, NetworkConfig
-from igsr.pose.da3.head import DualHead, ViewMaps
-from igsr.pose.da3.reference_view import REFERENCES, USUAL, reference_view
+from igsr.pose.da3.head import DualHead
 
-__all__ = ["Da3Network", "NetworkConfig", "Prediction", "ViewPrediction"]
+#: Numbers of a pose encoding: center, quaternion, two fields of view.
+ENCODING = 9
+#: Blocks of the camera encoder.
+CAMERA_DEPTH = 4
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPrediction:
-    """What the network says of one view of H x W pixels (gh = H / 14, gw = W / 14).
+    """Predictions for one view of H x W pixels (gh = H / 14, gw = W / 14).
 
-    Attributes:
-        depth: float32 [H, W], z-depth in the pass's own unit, positive.
-        confidence: float32 [H, W], above 1, not calibrated.
-        rays: float32 [8 gh, 8 gw, 6], direction (its z in the camera is 1) and origin in the
-            pass's world frame; None if not asked for.
-        ray_confidence: float32 [8 gh, 8 gw], above 1; None if not asked for.
-        pose_encoding: float32 [9], see ``igsr.pose.da3.cameras.decode_pose``.
+    A ray is its direction (with z of 1 in the camera) and origin in the pass's world frame, at the
+    pixel centers of a grid of 8 gh x 8 gw. Confidences are not calibrated.
     """
 
-    depth: Tensor
-    confidence: Tensor
-    rays: Tensor | None
-    ray_confidence: Tensor | None
-    pose_encoding: Tensor
+    depth: Tensor  # float32 [H, W], z-depth in an arbitrary unit per pass, positive
+    confidence: Tensor  # float32 [H, W], above 1
+    rays: Tensor | None  # float32 [8 gh, 8 gw, 6]; None if not computed
+    ray_confidence: Tensor | None  # float32 [8 gh, 8 gw], above 1; None if not computed
+    pose_encoding: Tensor  # float32 [9], see ``igsr.pose.da3.cameras``
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """What the network says of S views of one size; fields as ``ViewPrediction``'s, stacked.
+class CameraDecoder(nn.Module):
+    """Decode pose encodings [..., 9] from tokens [..., dim]."""
 
-    Attributes:
-        depth: float32 [S, H, W].
-        confidence: float32 [S, H, W].
-        rays: float32 [S, 8 gh, 8 gw, 6].
-        ray_confidence: float32 [S, 8 gh, 8 gw].
-        pose_encoding: float32 [S, 9].
-    """
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.backbone = nn.Sequential(
+            nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, dim), nn.ReLU()
+        )
+        self.fc_t, self.fc_qvec = nn.Linear(dim, 3), nn.Linear(dim, 4)
+        self.fc_fov = nn.Sequential(nn.Linear(dim, 2), nn.ReLU())
 
-    depth: Tensor
-    confidence: Tensor
-    rays: Tensor
-    ray_confidence: Tensor
-    pose_encoding: Tensor
+    def forward(self, token: Tensor) -> Tensor:
+        x = self.backbone(token.float())
+        return torch.cat([self.fc_t(x), self.fc_qvec(x), self.fc_fov(x)], dim=-1)
+
+
+class CameraEncoder(nn.Module):
+    """Encode the pose encodings [S, 9] of all views of a pass to tokens float32 [S, dim]."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.pose_branch = nn.ModuleDict(
+            {"fc1": nn.Linear(ENCODING, dim // 2), "fc2": nn.Linear(dim // 2, dim)}
+        )
+        self.token_norm = nn.LayerNorm(dim)
+        # Unlike the backbone's, these blocks' norms have torch's default epsilon.
+        self.trunk = nn.ModuleList(
+            Block(dim, heads, norm_eps=1e-5, normalized=False) for _ in range(CAMERA_DEPTH)
+        )
+        self.trunk_norm = nn.LayerNorm(dim)
+
+    def forward(self, encodings: Tensor) -> Tensor:
+        hidden = nn.functional.gelu(self.pose_branch["fc1"](encodings))
+        tokens = self.token_norm(self.pose_branch["fc2"](hidden).float())
+        for block in self.trunk:
+            (tokens,) = block([tokens])
+        return self.trunk_norm(tokens)
 
 
 class Da3Network(nn.Module):
-    """The any-view network.
-
-    Args:
-        config: the sizes.
-    """
+    """The network for any number of views."""
 
     def __init__(self, config: NetworkConfig) -> None:
-        """Make the layers."""
         super().__init__()
         self.config = config
-        self.backbone = Backbone(config)
+        self.backbone = nn.ModuleDict({"pretrained": Transformer(config)})
         self.head = DualHead(config)
         self.cam_dec = CameraDecoder(2 * config.embed_dim)
         self.cam_enc = CameraEncoder(config.embed_dim, config.camera_heads)
 
-    def forward(
-        self,
-        pixels: Tensor,
-        reference: str = USUAL,
-        viewmats: Tensor | None = None,
-        intrinsics: Tensor | None = None,
-    ) -> Prediction:
-        """Depths, rays and cameras of views of one size.
-
-        Args:
-            pixels: float32 [S, 3, H, W], as ``igsr.pose.da3.preprocessing`` makes them.
-            reference, viewmats, intrinsics: as ``predict``.
-
-        Raises:
-            IgsrError: as ``predict``.
-        """
-        views = self.predict(list(pixels), reference, viewmats, intrinsics)
-        stacked = {
-            name: torch.stack([getattr(view, name) for view in views])
-            for name in ("depth", "confidence", "rays", "ray_confidence", "pose_encoding")
-        }
-        return Prediction(**stacked)
-
     def predict(
         self,
         views: Sequence[Tensor],
-        reference: str = USUAL,
         viewmats: Tensor | None = None,
         intrinsics: Tensor | None = None,
         *,
         rays: bool = True,
+        reference: int | None = None,
     ) -> list[ViewPrediction]:
-        """Depths, rays and cameras of views that may differ in size.
+        """Predict depths, rays and cameras of views that may differ in size.
 
-        Time grows with the square of the number of views, memory with the number.
+        Time grows with the square of the number of views, memory linearly.
 
         Args:
             views: float32 [3, H, W] each, H and W multiples of 14.
-            reference: how the view is chosen whose camera frame the world is close to; one of
-                ``igsr.pose.da3.reference_view.REFERENCES``.
-            viewmats: float [S, 4, 4], world to camera, any world and unit, if cameras are known.
-            intrinsics: float [S, 3, 3], pixels of the views; given if ``viewmats`` are.
-            rays: whether rays are wanted; they take about as long as depth.
+            viewmats: float [S, 4, 4], world to camera, in any world and unit, if known.
+            intrinsics: float [S, 3, 3], pixels of the views; needed with ``viewmats``.
+            rays: whether to predict rays, which takes about as long as depth.
+            reference: index of the view whose camera frame the world is close to; by default it is
+                chosen. Of one or two views, and with known cameras, it is always the first.
 
         Returns:
-            What is said of each view, in the order given.
-
-        Raises:
-            IgsrError: there is no view, a view has another shape, ``reference`` is unknown, or only
-                one of ``viewmats`` and ``intrinsics`` is given or it is not of all views.
+            Predictions per view.
         """
-        _check(views, reference, viewmats, intrinsics)
-        tokens = None
+        tokens, device = None, views[0].device
         if viewmats is not None and intrinsics is not None:
             sizes = [(view.shape[-2], view.shape[-1]) for view in views]
             encoding = encode_pose(normalized_viewmats(viewmats), intrinsics, sizes)
-            device = views[0].device
             with torch.autocast(device.type, enabled=False):
                 tokens = self.cam_enc(encoding.to(device, torch.float32))
-        features = self.backbone(
-            views, lambda all_tokens: reference_view(all_tokens, reference), tokens
-        )
-        result = []
-        device = views[0].device
+        features = self.backbone["pretrained"](views, reference, tokens)
+        predictions = []
         # Depths span orders of magnitude, which half precision and TF32 would round visibly.
         with (
             torch.autocast(device.type, enabled=False),
@@ -148,29 +125,7 @@ class Da3Network(nn.Module):
         ):
             while features:
                 view = features.pop(0)
-                maps: ViewMaps = self.head(view, rays)
-                result.append(ViewPrediction(**vars(maps), pose_encoding=self.cam_dec(view.token)))
-        return result
-
-
-def _check(
-    views: Sequence[Tensor], reference: str, viewmats: Tensor | None, intrinsics: Tensor | None
-) -> None:
-    if not views:
-        raise IgsrError("views is empty; give at least one")
-    for n, view in enumerate(views):
-        shape = list(view.shape)
-        if len(shape) != 3 or shape[0] != 3 or any(n < 1 or n % PATCH for n in shape[1:]):
-            raise IgsrError(
-                f"view {n} has shape {shape}; give [3, H, W] with H and W multiples of {PATCH}"
-            )
-    if reference not in REFERENCES:
-        raise IgsrError(f"reference is {reference!r}; give one of {', '.join(REFERENCES)}")
-    if (viewmats is None) != (intrinsics is None):
-        raise IgsrError("viewmats and intrinsics belong together; give both or neither")
-    for name, value, side in (("viewmats", viewmats, 4), ("intrinsics", intrinsics, 3)):
-        if value is not None and list(value.shape) != [len(views), side, side]:
-            raise IgsrError(
-                f"{name} has shape {list(value.shape)}; give {[len(views), side, side]}, one for "
-                "every view: the network knows no views without cameras among those that have them"
-            )
+                depth, confidence, ray, ray_confidence = self.head(view, rays)
+                encoding = self.cam_dec(view.token)
+                predictions.append(ViewPrediction(depth, confidence, ray, ray_confidence, encoding))
+        return predictions

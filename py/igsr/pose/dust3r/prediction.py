@@ -1,8 +1,8 @@
-"""Pairs of photos shown to the network, and what is kept of what it says.
+"""Run DUSt3R on pairs of photos.
 
-Each photo is encoded once; the decoders run per pair. A prediction is kept as samples on a grid,
-so that memory grows with the number of pairs slowly; only the surest pointmap of each photo is kept
-at the network's resolution, for depths.
+Each photo is encoded once; the decoders run per pair. Of a prediction, samples on a grid are kept,
+so that memory grows slowly with the number of pairs. Only the most confident pointmap of each photo
+is kept at the network's resolution, for its depths.
 """
 
 from __future__ import annotations
@@ -10,132 +10,158 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from PIL import Image
 
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
-from igsr.pose.alignment.predictions import PairPrediction
-from igsr.pose.dust3r.heads import PATCH
-from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig, Tokens
-from igsr.pose.dust3r.preprocessing import Crop, crop_of, network_input
-from igsr.pose.grid import Grid
-from igsr.pose.network_arrays import float32_array, half_precision
-from igsr.pose.photo_samples import usable
+from igsr.pose.alignment import PairPrediction
+from igsr.pose.dust3r.network import PATCH, Dust3rNetwork, Tokens
+from igsr.pose.grid import Grid, on_white
+from igsr.pose.networks import float32_array, half_precision
 
 Float32 = npt.NDArray[np.float32]
-Bool = npt.NDArray[np.bool_]
 
-#: Samples along the longer side of a prediction's grid, at most.
-LONGEST_GRID = 128
-#: Ordered pairs that go through the decoders together: a pair and its mirror image.
-TOGETHER = 2
-#: Confidence of samples that may not be used: its logarithm, their weight, is 0.
+#: Image size of the model that was trained on squares only.
+SQUARE_SIZE = 224
+#: Maximum number of samples along the longer side of a prediction's grid. Samples are float32:
+#: float16 would round points by a quarter of a pixel at the edge of a photo of 512 pixels.
+MAX_GRID_SIDE = 128
+#: Ordered pairs in a batch of the decoders: a pair and its mirror image.
+BATCH_PAIRS = 2
+#: Confidence of samples that must not be used: their weight, its logarithm, is 0.
 NO_CONFIDENCE = np.float32(1.0)
 
-# Bytes of a point and its confidence in float32. Half precision would round points by up to
-# 1/2048, a quarter of a pixel at the edge of a photo of 512 pixels, where focal lengths are sought
-# to 1/1000.
-_SAMPLE = 4 * 4
-# Bytes per pixel and ordered pair that the heads' maps take at once, as measured.
-_WORK = 3000
+
+@dataclass(frozen=True)
+class Crop:
+    """The part of a resized photo that the network sees; all sizes in pixels."""
+
+    photo_width: int
+    photo_height: int
+    resized_width: int
+    resized_height: int
+    left: int  # first column of the part in the resized photo
+    top: int  # first row
+    width: int  # of the part, a multiple of 16
+    height: int
+
+    def grid(self, columns: range, rows: range) -> Grid:
+        """The grid of these columns and rows of the part."""
+        scale_x = self.photo_width / self.resized_width
+        scale_y = self.photo_height / self.resized_height
+        # The center of the grid's first cell, 0.5, is the center of the first sampled pixel.
+        left = self.left + columns.start + 0.5 - 0.5 * columns.step
+        top = self.top + rows.start + 0.5 - 0.5 * rows.step
+        return Grid(
+            height=len(rows),
+            width=len(columns),
+            scale_x=columns.step * scale_x,
+            scale_y=rows.step * scale_y,
+            offset_x=left * scale_x,
+            offset_y=top * scale_y,
+        )
+
+
+def crop_of(photo: Photo, image_size: int) -> Crop:
+    """Choose what a model sees of a photo, as the published inference does.
+
+    Args:
+        photo: any photo.
+        image_size: of the model, pixels. 224 takes a central square; others scale the longer side
+            to it and crop square photos to 4:3. Both sides are cropped to multiples of a patch.
+
+    Raises:
+        IgsrError: image or mask have a wrong type or shape, or the photo is too narrow.
+    """
+    image = photo.image
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise IgsrError(
+            f"{photo.name}: its image is {image.dtype} {list(image.shape)}; give uint8 [H, W, 3] "
+            "or [H, W, 4]"
+        )
+    if photo.mask is not None and photo.mask.shape != image.shape[:2]:
+        raise IgsrError(
+            f"{photo.name}: its mask has shape {list(photo.mask.shape)}; give "
+            f"{list(image.shape[:2])}, as the photo"
+        )
+    height, width = image.shape[:2]
+    longer, shorter = max(width, height), min(width, height)
+    if shorter * image_size < PATCH * longer:
+        raise IgsrError(
+            f"{photo.name} is {width}x{height} pixels, too narrow for DUSt3R; crop it or leave it "
+            "out"
+        )
+    side = round(image_size * longer / shorter) if image_size == SQUARE_SIZE else image_size
+    resized_width, resized_height = round(width * side / longer), round(height * side / longer)
+    half_width, half_height = resized_width // 2, resized_height // 2
+    left, top = half_width, half_height
+    if image_size == SQUARE_SIZE:
+        half_width = half_height = min(half_width, half_height)
+    else:
+        # Halves of multiples of 16.
+        half_width, half_height = (half // 8 * 8 for half in (half_width, half_height))
+        if resized_width == resized_height:
+            half_height = half_width * 3 // 4 // 8 * 8
+    return Crop(
+        photo_width=width,
+        photo_height=height,
+        resized_width=resized_width,
+        resized_height=resized_height,
+        left=left - half_width,
+        top=top - half_height,
+        width=2 * half_width,
+        height=2 * half_height,
+    )
+
+
+def network_input(photo: Photo, crop: Crop) -> Float32:
+    """The pixels [3, h, w] of a crop in [-1, 1], transparency on white."""
+    image = Image.fromarray(on_white(photo.image))
+    # The filters of the models' training: others show in the predictions.
+    shrinks = max(crop.photo_width, crop.photo_height) > max(
+        crop.resized_width, crop.resized_height
+    )
+    filtered = Image.Resampling.LANCZOS if shrinks else Image.Resampling.BICUBIC
+    resized = np.asarray(image.resize((crop.resized_width, crop.resized_height), filtered))
+    part = resized[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
+    values = part.transpose(2, 0, 1).astype(np.float32) / np.float32(255.0)
+    return (values - np.float32(0.5)) / np.float32(0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class DensePrediction:
-    """A photo's own pointmap at the network's resolution.
+class DenseMap:
+    """The most confident pointmap of a photo in its own frame, at the network's resolution.
 
-    Attributes:
-        prediction: index of the ``PairPrediction`` that it belongs to, of those in which the photo
-            is the first that of the highest product of mean confidences (the score by which
-            alignment ranks pairs). Unit and frame are that prediction's.
-        points: float32 [H, W, 3].
-        confidence: float32 [H, W], raw; 1 where the photo may not be used.
-        grid: how the map lies in the photo.
-        rows, columns: the samples of which the prediction's grid consists:
-            ``points[rows, columns]`` is its ``first_points``.
+    Of the pairs with this photo first, it has the highest product of mean confidences, the score by
+    which the alignment ranks pairs.
     """
 
-    prediction: int
-    points: np.ndarray
-    confidence: np.ndarray
-    grid: Grid
-    rows: slice
-    columns: slice
+    depth: Float32  # [H, W], z of the points, in the unit of that pair
+    confidence: Float32  # [H, W], raw; 1 for pixels that must not be used
+    grid: Grid  # position of the map in the photo
+    rows: range  # of the samples in the pair's prediction
+    columns: range
 
 
 @dataclass(frozen=True)
 class DenseGrid(Grid):
-    """The grid of a photo with its pointmap at the network's resolution.
+    """The grid of a photo's predictions, with its dense map if it is the first of a pair."""
 
-    Attributes:
-        dense: None where the photo is the first of no pair.
-    """
-
-    dense: DensePrediction | None = None
-
-
-class MemoryBound(NamedTuple):
-    """Bytes that prediction needs at most.
-
-    Attributes:
-        device: where the network runs: its weights, encoded photos and a pair's maps.
-        kept: in main memory: the predictions.
-    """
-
-    device: int
-    kept: int
-
-
-def memory_bound(
-    config: NetworkConfig, photos: int, pairs: int, longest: int = LONGEST_GRID
-) -> MemoryBound:
-    """Bytes that predicting ``pairs`` ordered pairs of ``photos`` photos needs at most.
-
-    With T tokens and S grid samples per photo, weights of W bytes and C channels of the encoder:
-    device = W + 4 T C photos + 3000 * 256 T * 2 and kept = 32 S pairs + 16 * 256 T photos. Nothing
-    grows faster than photos or pairs. The photos themselves and torch's own needs come on top.
-
-    Args:
-        config: the network's sizes.
-        photos: how many are in pairs.
-        pairs: ordered pairs.
-        longest: as for ``DustPredictor``.
-    """
-    with torch.device("meta"):
-        weights = sum(weight.numel() for weight in Dust3rNetwork(config).parameters())
-    size = config.image_size
-    # Photos that are nearly square have nearly so many.
-    pixels = size * size
-    samples = len(grid_samples(size, stride_for(size, longest))) ** 2
-    return MemoryBound(
-        device=4 * weights
-        + photos * pixels // PATCH**2 * config.encoder_dim * 4
-        + TOGETHER * pixels * _WORK,
-        kept=pairs * 2 * samples * _SAMPLE + photos * pixels * _SAMPLE,
-    )
+    dense: DenseMap | None = None
 
 
 class DustPredictor:
     """DUSt3R as the predictor of the alignment.
 
-    The network runs where its weights are; on CUDA devices encoder and decoders in half precision
-    (bfloat16, or float16 where the device has no bfloat16), the heads in float32 everywhere.
+    On CUDA devices encoder and decoders run in half precision (bfloat16, else float16), the heads
+    in float32."""
 
-    Args:
-        network: with weights, as ``load_network`` gives it.
-        longest: samples along the longer side of a prediction's grid, at most.
-    """
-
-    def __init__(self, network: Dust3rNetwork, longest: int = LONGEST_GRID) -> None:
-        """Keep the network."""
-        if longest < 2:
-            raise IgsrError(f"longest is {longest}; give at least 2 samples")
+    def __init__(self, network: Dust3rNetwork) -> None:
         self.network = network
-        self.longest = longest
 
     def __call__(
         self,
@@ -143,32 +169,18 @@ class DustPredictor:
         pairs: Sequence[tuple[int, int]],
         progress: Callable[[str, int, int], None] | None = None,
     ) -> tuple[list[Grid], list[PairPrediction]]:
-        """What the network sees in ordered pairs of photos.
+        """As ``Predictor``: a ``DenseGrid`` per photo, and a prediction per pair, in that order.
 
-        Confidence is 1, which weighs nothing, where a photo is masked or transparent.
-
-        Args:
-            photos: of any sizes.
-            pairs: indices of photos; the points of both are in the first one's frame. A photo's
-                features are kept from its first pair to its last, so sorted pairs need the least.
-            progress: called with ("pairs", how many are done, of all).
-
-        Returns:
-            A ``DenseGrid`` per photo, and a prediction per pair, in the pairs' order.
+        Masked and transparent pixels have confidence 1, that is no weight. Sorted pairs take the
+        least memory, since photos are forgotten after their last pair.
 
         Raises:
-            IgsrError: a pair is none of two photos, a photo is too narrow, or the network gives
-                what is not finite.
+            IgsrError: a photo is too narrow, or the predictions are not finite.
         """
-        for pair in pairs:
-            if len(set(pair)) != 2 or not all(0 <= photo < len(photos) for photo in pair):
-                raise IgsrError(
-                    f"pairs holds {pair}; give two different indices of the {len(photos)} photos"
-                )
-        views = [_View(photo, self.network.config, self.longest) for photo in photos]
+        views = [_View(photo, self.network.config.image_size) for photo in photos]
         encoded = _EncodedPhotos(self.network, views, pairs)
         predictions: list[PairPrediction] = []
-        dense: list[DensePrediction | None] = [None] * len(photos)
+        dense: list[DenseMap | None] = [None] * len(photos)
         scores = [0.0] * len(photos)
         with torch.inference_mode(), half_precision(encoded.device):
             for batch in _batches(pairs, views):
@@ -178,80 +190,58 @@ class DustPredictor:
                 whole = [
                     (float32_array(side.points), float32_array(side.confidence)) for side in maps
                 ]
-                for n, (first, second) in enumerate(batch):
+                for n, pair in enumerate(batch):
+                    pair_views = [views[i] for i in pair]
                     points = [side[0][n] for side in whole]
                     confidences = [
-                        views[i].masked(side[1][n])
-                        for i, side in zip((first, second), whole, strict=True)
+                        np.where(view.hidden, NO_CONFIDENCE, side[1][n])
+                        for view, side in zip(pair_views, whole, strict=True)
                     ]
                     if not all(np.isfinite(x).all() for x in (*points, *confidences)):
+                        names = " and ".join(photos[i].name for i in pair)
                         raise IgsrError(
-                            f"The network gives numbers that are not finite for "
-                            f"{photos[first].name} and {photos[second].name}; its checkpoint is "
-                            "damaged, download it again"
+                            f"The predictions for {names} are not finite, so the checkpoint is "
+                            "damaged; download it again"
                         )
+                    first = pair[0]
                     score = float(confidences[0].mean()) * float(confidences[1].mean())
                     if score > scores[first]:
                         scores[first] = score
-                        dense[first] = views[first].dense(
-                            len(predictions), points[0], confidences[0]
+                        depth = points[0][..., 2].copy()
+                        view = pair_views[0]
+                        dense[first] = DenseMap(
+                            depth, confidences[0], view.whole, view.rows, view.columns
                         )
-                    predictions.append(
-                        PairPrediction(
-                            first,
-                            second,
-                            views[first].sampled(points[0]),
-                            views[first].sampled(confidences[0]),
-                            views[second].sampled(points[1]),
-                            views[second].sampled(confidences[1]),
-                        )
+                    samples = (
+                        array[np.ix_(view.rows, view.columns)]
+                        for view, *arrays in zip(pair_views, points, confidences, strict=True)
+                        for array in arrays
                     )
+                    predictions.append(PairPrediction(*pair, *samples))
                 if progress is not None:
                     progress("pairs", len(predictions), len(pairs))
-        grids: list[Grid] = [view.grid(own) for view, own in zip(views, dense, strict=True)]
+        grids: list[Grid] = [
+            DenseGrid(**vars(view.crop.grid(view.columns, view.rows)), dense=own)
+            for view, own in zip(views, dense, strict=True)
+        ]
         return grids, predictions
 
 
 class _View:
-    """A photo's place in the network's input and the samples that are kept of it."""
+    """A photo's crop, and the samples of it that are kept."""
 
-    def __init__(self, photo: Photo, config: NetworkConfig, longest: int) -> None:
+    def __init__(self, photo: Photo, image_size: int) -> None:
         self.photo = photo
-        self.crop: Crop = crop_of(photo, config.image_size)
-        stride = stride_for(max(self.crop.width, self.crop.height), longest)
-        self.rows = grid_samples(self.crop.height, stride)
-        self.columns = grid_samples(self.crop.width, stride)
+        self.crop = crop_of(photo, image_size)
+        self.shape = self.crop.height, self.crop.width
+        stride = stride_for(max(self.shape))
+        self.rows, self.columns = (grid_samples(side, stride) for side in self.shape)
         self.whole = self.crop.grid(range(self.crop.width), range(self.crop.height))
-        self.hidden: Bool = ~usable(photo, self.whole)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.crop.height, self.crop.width
-
-    def masked(self, confidence: Float32) -> Float32:
-        return np.where(self.hidden, NO_CONFIDENCE, confidence)
-
-    def sampled(self, array: Float32) -> Float32:
-        # A copy: a view would keep the whole array.
-        return array[_slice(self.rows), _slice(self.columns)].copy()
-
-    def dense(self, prediction: int, points: Float32, confidence: Float32) -> DensePrediction:
-        return DensePrediction(
-            prediction,
-            points.copy(),
-            confidence,
-            self.whole,
-            _slice(self.rows),
-            _slice(self.columns),
-        )
-
-    def grid(self, dense: DensePrediction | None) -> DenseGrid:
-        kept = self.crop.grid(self.columns, self.rows)
-        return DenseGrid(**vars(kept), dense=dense)
+        self.hidden = ~self.whole.usable(photo)
 
 
 class _EncodedPhotos:
-    """Photos' tokens from their first pair to their last."""
+    """Tokens of photos, kept from their first pair to their last."""
 
     def __init__(
         self, network: Dust3rNetwork, views: list[_View], pairs: Sequence[tuple[int, int]]
@@ -263,16 +253,13 @@ class _EncodedPhotos:
         self.tokens: dict[int, Tokens] = {}
 
     def batch(self, photos: list[int]) -> Tokens:
-        tokens = [self._encoded(photo) for photo in photos]
-        features = torch.cat([one.features for one in tokens])
-        return Tokens(features, tokens[0].rows, tokens[0].columns)
-
-    def _encoded(self, photo: int) -> Tokens:
-        if photo not in self.tokens:
+        for photo in set(photos) - self.tokens.keys():
             view = self.views[photo]
             image = torch.from_numpy(network_input(view.photo, view.crop)[None])
             self.tokens[photo] = self.network.encode(image.to(self.device))
-        return self.tokens[photo]
+        first = self.tokens[photos[0]]
+        features = torch.cat([self.tokens[photo].features for photo in photos])
+        return Tokens(features, first.rows, first.columns)
 
     def release(self, batch: list[tuple[int, int]]) -> None:
         for pair in batch:
@@ -282,41 +269,36 @@ class _EncodedPhotos:
                     del self.tokens[photo]
 
 
-def stride_for(side: int, longest: int) -> int:
-    """Pixels from sample to sample of a grid with at most ``longest`` along ``side`` pixels.
+def stride_for(side: int) -> int:
+    """Pixels between samples, so that at most ``MAX_GRID_SIDE`` lie along ``side`` pixels.
 
-    It is odd, so that samples can lie symmetrically about the centre of an even number of pixels,
-    and under 16, so that no side of a crop is left without.
+    It is odd, so that samples can lie symmetrically about the center of an even number of pixels,
+    and below 16, so that every side of a crop has samples.
     """
     stride = 1
-    while len(grid_samples(side, stride)) > longest and stride < PATCH - 1:
+    while len(grid_samples(side, stride)) > MAX_GRID_SIDE and stride < PATCH - 1:
         stride += 2
     return stride
 
 
 def grid_samples(side: int, stride: int) -> range:
-    """Pixels of an even ``side`` that a grid has: as many as fit, an even number about the centre.
+    """Sampled pixels of an even ``side``: an even number, symmetric about the center.
 
-    So the middle of a grid is the middle of what the network sees, where it takes the principal
-    point to be.
+    So the center of a grid is the center of the input, its principal point.
     """
     count = ((side - 1) // stride + 1) // 2 * 2
     start = (side - 1 - (count - 1) * stride) // 2
     return range(start, start + count * stride, stride)
 
 
-def _slice(samples: range) -> slice:
-    return slice(samples.start, samples.stop, samples.step)
-
-
 def _batches(
     pairs: Sequence[tuple[int, int]], views: list[_View]
 ) -> Iterator[list[tuple[int, int]]]:
-    """Pairs that follow each other and have photos of the same two shapes."""
+    """Group consecutive pairs whose photos have the same two shapes."""
     batch: list[tuple[int, int]] = []
     for pair in pairs:
         if batch and (
-            len(batch) == TOGETHER
+            len(batch) == BATCH_PAIRS
             or any(views[a].shape != views[b].shape for a, b in zip(pair, batch[0], strict=True))
         ):
             yield batch

@@ -1,4 +1,4 @@
-"""Noise on camera poses, for studies and for training pairs of the denoiser."""
+"""Add noise to camera poses, for studies and for training pairs of the denoiser."""
 
 from __future__ import annotations
 
@@ -16,9 +16,12 @@ Float64 = npt.NDArray[np.float64]
 #: Distance of NeRF Synthetic's cameras from the origin, world units.
 VIEWING_DISTANCE = 4.03
 
-#: Kinds of noise: on all twelve numbers of camera-to-world, then made rigid again; the same with
-#: the shear kept; turns about a random axis through the camera's centre.
-MATRIX, AFFINE, TURN = "matrix", "raw-affine", "turn"
+#: Noise on all twelve numbers of camera-to-world, which is then made rigid again.
+MATRIX = "matrix"
+#: The same, keeping the shear.
+AFFINE = "raw-affine"
+#: Rotation about a random axis through the camera's center.
+TURN = "turn"
 
 
 @dataclass(frozen=True)
@@ -29,36 +32,35 @@ class Noise:
     size: float
 
     def __str__(self) -> str:
-        """As tables and file names have it."""
+        """As in tables and file names."""
         return f"{self.kind} {self.size:g}" + ("°" if self.kind == TURN else "")
 
 
 def noise_unit(views: Sequence[View]) -> float:
-    """Unit of length for noise on positions: what one unit of NeRF Synthetic is in this scene.
+    """Unit of length for noise on positions: the length of one unit of NeRF Synthetic.
 
-    NeRF Synthetic's cameras stand ``VIEWING_DISTANCE`` from their focus point. The focus point of
-    ``views`` is the point nearest to all optical axes.
+    NeRF Synthetic's cameras are ``VIEWING_DISTANCE`` from their focus point, the point nearest to
+    all optical axes.
     """
-    # Each axis contributes the part of an offset from it that is across it.
     across = []
     for view in views:
         axis = view.camera.viewmat[2, :3]
         across.append(np.eye(3) - np.outer(axis, axis))
-    centres = np.stack([view.camera.centre for view in views])
-    pulled = np.einsum("nij,nj->i", np.stack(across), centres - centres[0])
-    target = centres[0] + np.linalg.lstsq(np.sum(across, axis=0), pulled, rcond=1e-6)[0]
-    distance = float(np.mean(np.linalg.norm(centres - target, axis=1)))
+    centers = np.stack([view.camera.centre for view in views])
+    pulled = np.einsum("nij,nj->i", np.stack(across), centers - centers[0])
+    target = centers[0] + np.linalg.lstsq(np.sum(across, axis=0), pulled, rcond=1e-6)[0]
+    distance = float(np.mean(np.linalg.norm(centers - target, axis=1)))
     return distance / VIEWING_DISTANCE if distance > 0.0 else 1.0
 
 
 def noisy_view(view: View, noise: Noise, random: np.random.Generator, unit: float = 1.0) -> View:
-    """The view with noise on its camera; with "raw-affine" the photo is sheared as well.
+    """Add noise to a view's camera; "raw-affine" also shears the photo.
 
     ``unit`` scales the noise on the position (``noise_unit``).
 
-    A camera-to-world matrix with noise is no longer rigid. Its shear and stretch can be written as
-    another focal length, principal point and skew of a rigid camera at the same centre; the skew
-    moves each row of the photo sideways as a whole.
+    A camera-to-world matrix with noise is not rigid. Its shear and stretch are equivalent to other
+    focal lengths, principal point and skew of a rigid camera at the same center; the skew shifts
+    each row of the photo sideways.
     """
     camera = view.camera
     to_world = np.linalg.inv(camera.viewmat)
@@ -83,10 +85,10 @@ def noisy_view(view: View, noise: Noise, random: np.random.Generator, unit: floa
     )
 
 
-def _camera(camera: Camera, rotation: Float64, centre: Float64, K: Float64) -> Camera:
+def _camera(camera: Camera, rotation: Float64, center: Float64, K: Float64) -> Camera:
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ centre
+    viewmat[:3, 3] = -rotation @ center
     return replace(camera, viewmat=viewmat, K=K)
 
 
@@ -100,7 +102,7 @@ def _rotation(axis: Float64) -> Float64:
 
 
 def _upper_times_rotation(matrix: Float64) -> tuple[Float64, Float64]:
-    """The factors of a matrix with positive determinant, the upper one's diagonal positive."""
+    """Factor a matrix with positive determinant; the diagonal of the upper factor is positive."""
     q, r = np.linalg.qr(matrix[::-1].T)
     upper, rotation = r.T[::-1, ::-1], q.T[::-1]
     signs = np.sign(np.diag(upper))
@@ -111,7 +113,7 @@ def _rows_shifted(image: npt.NDArray[np.uint8], shifts: Float64) -> npt.NDArray[
     """Row y of the result at column x is the photo's row y at x + shifts[y]."""
     pixels = image.astype(np.float64)
     if image.shape[2] == 4:
-        # Colours of transparent pixels are of no meaning and must not mix in.
+        # Premultiplied, so that colors of transparent pixels do not mix in.
         pixels[..., :3] *= pixels[..., 3:] / 255.0
     at = np.arange(image.shape[1], dtype=np.float64)
     for row, shift in zip(pixels, shifts, strict=True):
