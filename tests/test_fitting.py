@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from made_up_tracks import tracked
 
 import igsr
 from igsr.evaluation import metrics
@@ -23,6 +24,7 @@ from igsr.fitting import fit_capture, train
 from igsr.fitting.checkpoint import load_checkpoint, save_checkpoint
 from igsr.fitting.fingerprint import fingerprint
 from igsr.fitting.settings import FitSettings
+from igsr.rendering.renders import render
 
 STEPS = 420  # density control runs every 25 steps from 75 on
 OPTIONS = {"steps": STEPS, "backend": "cpu", "max_splats": 400, "sh_degree": 1, "backdrop": False}
@@ -111,6 +113,34 @@ def test_a_stopped_fit_resumes_with_the_same_bits(capture, tmp_path, backend, st
     assert ours.keys() == theirs.keys()
     for name in ours:
         assert np.array_equal(ours[name], theirs[name]), name
+
+
+@pytest.fixture(scope="module")
+def measured(capture):
+    """The capture with depths, and points with tracks."""
+    scene = scenes.splats()
+    depths = [render(scene, view.camera, backend="cpu").expected_depth for view in capture.views]
+    views = [replace(v, depth=depth) for v, depth in zip(capture.views, depths, strict=True)]
+    return igsr.Capture(capture.path, views, tracked(views, scene.means.astype(np.float64)))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"dropout": 0.2},
+        {"exposure": "on"},
+        {"depth_weight": 2.0, "start": "rays"},
+        {"poses": "joint", "focal": "per-camera"},
+        {"poses": "joint", "focal": "shared", "start": "random"},
+    ],
+)
+def test_all_state_is_in_the_checkpoint(measured, tmp_path, options):
+    options = OPTIONS | {"steps": 120} | options
+    whole = fit_capture(measured, **options)
+    resumed = scenes.resumed_fit(measured, tmp_path / "checkpoint.npz", 50, **options)
+    assert resumed.splats == whole.splats
+    assert resumed.capture == whole.capture
+    assert fit(measured, steps=120) != whole.splats
 
 
 @pytest.mark.parametrize("place", ["listener", "loop"])
@@ -241,8 +271,15 @@ def test_splats_start_at_points_however_far_away(capture):
         ({"sh_degree": 5}, "sh_degree must be from 0 to 4"),
         ({"max_splats": 0}, "max_splats must be from 1"),
         ({"density": "magic"}, "density must be one of"),
+        ({"poses": "free"}, "poses must be one of"),
+        ({"focal": 3}, "focal must be one of"),
+        ({"start": "sphere"}, "start must be one of auto"),
+        ({"start": "points"}, "made-up has fewer than 100 points to start from; use another"),
+        ({"dropout": 0.95}, "dropout must be a number from 0 to 0.9"),
+        ({"depth_weight": float("nan")}, "depth_weight must be a number from 0 to 100"),
+        ({"backdrop": "yes"}, "backdrop must be True or False"),
         ({"backend": "reference"}, "reference renders but does not fit"),
-        ({"backend": "abacus"}, "backend"),
+        ({"backend": "abacus"}, "backend must be auto, cpu or gpu, not 'abacus'"),
         ({"background": (2.0, 0.0, 0.0)}, "background must be"),
         ({"background": 5}, "background must be"),
         ({"background": "red"}, "background must be"),
@@ -250,9 +287,14 @@ def test_splats_start_at_points_however_far_away(capture):
 )
 def test_bad_settings_are_named(capture, options, message):
     with pytest.raises(igsr.IgsrError, match=message):
-        fit(capture, **options)
-    with pytest.raises(igsr.IgsrError, match=message):
-        igsr.fit(capture, **options)
+        igsr.fit(capture, **OPTIONS | options)
+
+
+def test_unknown_settings_and_captures_are_named(capture):
+    with pytest.raises(igsr.IgsrError, match="unknown setting preset"):
+        fit(capture, preset="3dgs")
+    with pytest.raises(igsr.IgsrError, match=r"capture must be a Capture, not str; igsr\.load"):
+        fit("photos")
 
 
 def test_resume_needs_a_folder(capture):
@@ -340,20 +382,36 @@ def finished(capture, tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "changed", [{"seed": 3}, {"steps": 21}, {"max_splats": 399}, {"density": "fixed"}]
+    "changed",
+    [
+        {"seed": 3},
+        {"steps": 21},
+        {"density": "fixed"},
+        {"learning_rate": 1.5},
+        {"exposure": "on"},
+        {"transients": "off"},
+    ],
 )
 def test_resume_refuses_other_settings(capture, finished, changed):
     with pytest.raises(igsr.IgsrError, match=f"was made with {next(iter(changed))}"):
         fit_capture(capture, checkpoint=finished, resume=True, **SHORT | changed)
 
 
-def test_resume_refuses_other_photos_and_versions(capture, finished, tmp_path):
-    views = [replace(view) for view in capture.views]
-    views[1].image = views[1].image.copy()
-    views[1].image[0, 0] ^= 1
-    changed = igsr.Capture(capture.path, views)
-    with pytest.raises(igsr.IgsrError, match="made from other photos"):
-        fit_capture(changed, checkpoint=finished, resume=True, **SHORT)
+@pytest.mark.parametrize("part", ["pixel", "depth", "tracks"])
+def test_resume_refuses_other_photos(measured, tmp_path, part):
+    options = SHORT | {"poses": "joint", "checkpoint": tmp_path / "checkpoint.npz"}
+    fit_capture(measured, **options)
+    view = measured.train_views[1]
+    image, depth = view.image.copy(), view.depth * np.float32(1.01)
+    image[0, 0] ^= 1
+    changes = {"pixel": {"image": image}, "depth": {"depth": depth}, "tracks": {}}[part]
+    views = [replace(v, **changes) if v is view else v for v in measured.views]
+    changed = igsr.Capture(measured.path, views, None if part == "tracks" else measured.points)
+    with pytest.raises(igsr.IgsrError, match="made from other photos, masks, cameras, tracks"):
+        fit_capture(changed, resume=True, **options)
+
+
+def test_resume_refuses_other_versions(capture, finished, tmp_path):
     state, settings = load_checkpoint(finished)
     path = tmp_path / "other.npz"
     for other, message in (

@@ -170,20 +170,6 @@ def test_cpu_and_gpu_fit_alike(made):
     assert cpu == pytest.approx(gpu, abs=0.1)
 
 
-def test_a_fit_to_depths_resumes_with_the_same_bits(made, tmp_path):
-    path, options = tmp_path / "checkpoint.npz", OPTIONS | {"steps": 60}
-    assert scenes.resumed_fit(made, path, 20, **options).splats == fit(made, **options)
-    other = with_factors(made, {2: 1.01})
-    with pytest.raises(igsr.IgsrError, match="other photos"):
-        fit(other, checkpoint=path, resume=True, **options)
-
-
-@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf"), 1e9, "much"])
-def test_an_invalid_weight_is_named(made, weight):
-    with pytest.raises(igsr.IgsrError, match="depth_weight"):
-        fit(made, depth_weight=weight)
-
-
 # ---- depths in the unit of the cameras -----------------------------------------------------------
 
 

@@ -167,17 +167,6 @@ def test_a_shared_focal_length_is_found(exact):
         assert np.allclose(view.camera.viewmat, start.camera.viewmat, rtol=0.0, atol=1e-12)
 
 
-def test_a_joint_fit_resumes_with_the_same_bits(exact, tmp_path):
-    given, path = with_errors(exact), tmp_path / "checkpoint.npz"
-    options = JOINT | {"steps": 300, "focal": "per-camera"}
-    splats, capture = scenes.fit_with_cameras(given, **options)
-    resumed = scenes.resumed_fit(given, path, 130, **options)
-    assert resumed.splats == splats
-    assert resumed.capture == capture
-    with pytest.raises(igsr.IgsrError, match="was made with poses"):
-        fit_capture(given, checkpoint=path, resume=True, **options | {"poses": "fixed"})
-
-
 def test_a_fit_that_ends_among_rough_cameras_has_no_checkpoint(tmp_path):
     capture, path, events = scenes.capture(views=8, size=128), tmp_path / "a.npz", []
 
@@ -246,12 +235,6 @@ def test_damaged_camera_states_are_refused(exact, tmp_path):
         np.savez(options["checkpoint"], **good | {name: change(good[name])})
         with pytest.raises(igsr.IgsrError, match="checkpoint"):
             fit_capture(exact, resume=True, **options)
-
-
-@pytest.mark.parametrize(("name", "value"), [("poses", "free"), ("focal", "one"), ("poses", 3)])
-def test_unknown_choices_are_named(exact, name, value):
-    with pytest.raises(igsr.IgsrError, match=f"{name} must be one of"):
-        igsr.fit(exact, steps=1, **{name: value})
 
 
 def test_fit_writes_optimized_cameras_that_load_again(exact, tmp_path):

@@ -1,4 +1,4 @@
-"""Settings chosen by photos and quality, initializations, and dropout."""
+"""Settings chosen by photos and quality, and initializations."""
 
 from __future__ import annotations
 
@@ -35,11 +35,6 @@ from igsr.fitting.photo_statistics import (
 @pytest.fixture(scope="module")
 def capture():
     return scenes.capture(views=8, size=40, alpha=True)
-
-
-def fit(capture, **options):
-    arguments = {"steps": 200, "backend": "cpu", "max_splats": 400, "sh_degree": 0, **options}
-    return scenes.fit(capture, **arguments)
 
 
 def statistics(photos, overlap=8.0, spacing_deg=5.0, pixels=100_000.0):
@@ -186,31 +181,6 @@ def test_detail_is_the_mean_of_a_few_photos_or_files(tmp_path):
     files[5].write_text("no photo")
     assert detail_of_files(files, None) == pytest.approx(np.mean([counts[k] for k in (0, 10, 15)]))
     assert detail_of_files([], None) == 0.0
-
-
-def test_dropout_changes_the_fit_repeats_and_resumes(capture, tmp_path):
-    options = {"steps": 200, "backend": "cpu", "max_splats": 400, "sh_degree": 0, "dropout": 0.3}
-    dropped = fit(capture, **options)
-    assert fit(capture, **options) == dropped
-    assert fit(capture, dropout=0.0) != dropped
-    assert scenes.resumed_fit(capture, tmp_path / "a.npz", 90, **options).splats == dropped
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"dropout": 0.95}, "dropout must be a number from 0 to 0.9"),
-        ({"dropout": float("nan")}, "dropout must be a number from 0 to 0.9"),
-        ({"dropout": True}, "dropout must be"),
-        ({"backdrop": "yes"}, "backdrop must be True or False"),
-        ({"start": "sphere"}, "start must be one of auto"),
-        ({"start": "points"}, r"^made-up has fewer than 100 points to start from; use another start\.$"),
-        ({"preset": "3dgs"}, "unknown setting preset"),
-    ],
-)
-def test_bad_settings_are_named(capture, options, message):
-    with pytest.raises(igsr.IgsrError, match=message):
-        fit(capture, **options)
 
 
 def count_outside_hull(splats, capture):

@@ -361,8 +361,6 @@ def test_a_stopped_fit_resumes_with_the_same_masks_and_bits(
     resumed = fit(visited, checkpoint=path, resume=True)
     assert resumed.splats == whole.splats
     assert resumed.capture == whole.capture
-    with pytest.raises(igsr.IgsrError, match="transients"):
-        fit(visited, checkpoint=path, resume=True, transients="on")
 
 
 @pytest.mark.usefixtures("single_steps")
