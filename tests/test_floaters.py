@@ -41,14 +41,25 @@ def before(view, distance=1.2):
     return camera.centre + distance * camera.viewmat[2, :3]
 
 
+def ball_and(means, **options):
+    """The ball, and specks after it."""
+    return joined([BALL, specks(means, **options)])
+
+
+def photos_of(scene=BALL, views=6, **options):
+    return scenes.capture(views=views, scene=scene, **options).views
+
+
+ABOVE = [0.0, 40.0, 0.0]  # outside of all photos
+
+
 # ---- evidence of photos ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_sightings_count_cameras_that_see_a_splat(backend):
-    views = scenes.capture(views=4, scene=BALL).views
-    hidden = [[0.0, 40.0, 0.0]]  # above all pictures
-    model = joined([BALL, specks([before(views[0]), *hidden], size=0.02, opacity=-1.0)])
+    views = photos_of()
+    model = ball_and([before(views[0]), ABOVE], size=0.02, opacity=-1.0)
     seen = sightings(model, [view.camera for view in views], backend)
     assert seen.shown[-2:].tolist() == [1, 0]
     assert seen.before[-2:].tolist() == [1, 0]
@@ -60,21 +71,19 @@ def test_sightings_count_cameras_that_see_a_splat(backend):
 
 def test_needed_by_others_is_the_growth_of_the_squared_error(monkeypatch):
     monkeypatch.setattr(photo_evidence, "PROBES_PER_PHOTO", 2000)
-    views = scenes.capture(views=3, size=32, scene=scenes.splats(8, seed=5)).views
+    views = photos_of(scenes.splats(8, seed=5), views=3, size=32)
     model = scenes.splats(8, degree=1)
     model.opacities[:] = np.linspace(-1.0, 1.0, 8)  # below the clamp at 0.99
     estimated = needed_by_others(model, views, BLACK, backend="reference")
 
     def errors(splats):
         renders = [igsr.render(splats, v.camera, BLACK, "reference").color for v in views]
-        return np.array(
-            [np.square(c - v.image / 255.0).sum() for c, v in zip(renders, views, strict=True)]
-        )
+        pairs = zip(renders, views, strict=True)
+        return np.array([np.square(color - v.image / 255.0).sum() for color, v in pairs])
 
     for k in range(8):
-        without = subset(model, np.arange(8) != k)
-        grown = errors(without) - errors(model)
-        assert estimated[k] == pytest.approx(grown.sum() - grown.max(), rel=0.1, abs=0.3)
+        growth = errors(subset(model, np.arange(8) != k)) - errors(model)
+        assert estimated[k] == pytest.approx(growth.sum() - growth.max(), rel=0.1, abs=0.3)
 
 
 def test_masked_pixels_need_nothing():
@@ -84,16 +93,15 @@ def test_masked_pixels_need_nothing():
     assert needed_by_others(BALL, views, BLACK, backend="cpu").any()
 
 
-def with_masks_of(views, scene, splats):
+def with_masks_of(views, splats):
     """The views with masks of the pixels that these splats cover."""
-    cut = subset(scene, splats)
-    alphas = [igsr.render(cut, view.camera, backend="cpu").alpha for view in views]
+    alphas = [igsr.render(splats, view.camera, backend="cpu").alpha for view in views]
     return [replace(view, mask=alpha > 0.05) for view, alpha in zip(views, alphas, strict=True)]
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_sightings_measure_the_unmasked_area(backend):
-    views = with_masks_of(scenes.capture(views=4, scene=BALL).views, BALL, np.arange(60) < 8)
+    views = with_masks_of(photos_of(), subset(BALL, slice(8)))
     cameras, masks = [view.camera for view in views], [view.mask for view in views]
     seen = sightings(BALL, cameras, backend, masks)
     alphas = [igsr.render(BALL, camera, backend=backend).alpha for camera in cameras]
@@ -104,99 +112,75 @@ def test_sightings_measure_the_unmasked_area(backend):
     assert np.array_equal(everywhere.counted, everywhere.area)
 
 
+def unsupported(model, views, backend="cpu"):
+    """Indices of the splats that photos do not support, by kind."""
+    kinds = unsupported_splats(model, views, BLACK, backend=backend)
+    return {kind: np.flatnonzero(mask).tolist() for kind, mask in kinds.items()}
+
+
 def test_masked_splats_are_found_unless_a_photo_counts_them():
-    aside = specks([[0.0, -1.5, 0.0], [0.3, -1.5, 0.0]], size=0.08)
-    scene = joined([BALL, aside])
-    ball = np.arange(62) < 60
-    views = scenes.capture(views=6, scene=scene).views
-    masked = with_masks_of(views, scene, ball)
-    kinds = unsupported_splats(scene, masked, BLACK, backend="cpu")
-    assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
-    assert not unsupported_splats(scene, views, BLACK, backend="cpu")["masked"].any()
-    # Splats that are masked in only half of the photos are kept.
-    some = [*masked[:3], *views[3:]]
-    assert not unsupported_splats(scene, some, BLACK, backend="cpu")["masked"].any()
+    scene = ball_and([[0.0, -1.5, 0.0], [0.3, -1.5, 0.0]], size=0.08)
+    views = photos_of(scene)
+    masked = with_masks_of(views, BALL)
+    assert unsupported(scene, masked)["masked"] == [60, 61]
+    assert unsupported(scene, views)["masked"] == []
+    assert unsupported(scene, [*masked[:3], *views[3:]])["masked"] == []
     # Pseudo-views are not evidence, since they show the fit.
     pseudo = [scenes.pseudo_view(view) for view in views]
-    kinds = unsupported_splats(scene, [*masked, *pseudo], BLACK, backend="cpu")
-    assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
+    assert unsupported(scene, [*masked, *pseudo])["masked"] == [60, 61]
 
 
 def test_tiny_masked_splats_are_left_to_pseudo_views():
-    speck = specks([[0.1, -1.4, 0.0]], size=0.004, opacity=-1.0)
-    scene = joined([BALL, speck])
-    ball = np.arange(61) < 60
-    views = scenes.capture(views=6, scene=scene).views
-    masked = with_masks_of(views, scene, ball)
-    cameras = [view.camera for view in views]
-    assert 0.0 < sightings(scene, cameras, "cpu").area[-1] < photo_evidence.MIN_AREA_PX
+    scene = ball_and([[0.1, -1.4, 0.0]], size=0.004, opacity=-1.0)
+    views = photos_of(scene)
+    area = sightings(scene, [view.camera for view in views], "cpu").area[-1]
+    assert 0.0 < area < photo_evidence.MIN_AREA_PX
     pseudo = [scenes.pseudo_view(view) for view in views]
-    many = [*masked, *(pseudo * 40)]
-    kinds = unsupported_splats(scene, many, BLACK, backend="cpu")
-    assert not any(kind[-1] for kind in kinds.values())
+    found = unsupported(scene, [*with_masks_of(views, BALL), *(pseudo * 40)])
+    assert not any(60 in indices for indices in found.values())
 
 
-def test_unseen_and_floating_splats_are_found():
-    views = scenes.capture(views=6, scene=BALL).views
-    unseen, floating = [0.0, 40.0, 0.0], before(views[2])
-    model = joined([BALL, specks([unseen, floating], size=0.03, opacity=-1.0)])
-    kinds = unsupported_splats(model, views, BLACK, backend="cpu")
-    assert np.flatnonzero(kinds["unseen"]).tolist() == [60]
-    assert np.flatnonzero(kinds["floating"]).tolist() == [61]
+@pytest.mark.parametrize("backend", ["cpu", "gpu", "reference"])
+def test_unseen_and_floating_splats_are_found(backend):
+    views = photos_of()
+    model = ball_and([ABOVE, before(views[2])], size=0.03, opacity=-1.0)
+    expected = {"unseen": [60], "masked": [], "floating": [61]}
+    assert unsupported(model, views, backend) == expected
 
 
-def test_near_objects_seen_by_all_photos_are_kept():
-    """A thin veil round the ball: before it in every photo, and needed by all of them."""
+def test_near_objects_that_all_photos_show_are_kept():
+    """A thin veil around the ball: in front of it in every photo, and needed by all of them."""
     angles = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     ring = [[2.4 * np.sin(a), y, -2.4 * np.cos(a)] for a in angles for y in (-0.3, 0.0, 0.3)]
-    veil = specks(ring, size=0.12, opacity=-2.0, color=0.9)
-    scene = joined([BALL, veil])
-    views = scenes.capture(views=12, scene=scene).views
+    scene = ball_and(ring, size=0.12, opacity=-2.0, color=0.9)
+    views = photos_of(scene, views=12)
     seen = sightings(scene, [view.camera for view in views], "cpu")
     assert (seen.before[60:] > 0).sum() > 60
-    found = unsupported_splats(scene, views, BLACK, backend="cpu")["floating"]
-    assert not found[seen.shown > 1].any()
+    assert not (seen.shown[unsupported(scene, views)["floating"]] > 1).any()
     # Photos without the veil do not need it, even from behind.
-    bare = scenes.capture(views=12, scene=BALL).views
-    found = unsupported_splats(scene, bare, BLACK, backend="cpu")["floating"]
-    assert found.sum() > 0
-    assert not found[:60].any()
+    floating = unsupported(scene, photos_of(views=12))["floating"]
+    assert floating
+    assert min(floating) >= 60
 
 
-def test_unsampled_photos_keep_their_splats(monkeypatch):
-    views = scenes.capture(views=6, scene=BALL, arc=0.3).views
-    speck = specks([before(views[3])], size=0.03, opacity=-1.0)
-    model = joined([BALL, speck])
-    seen = sightings(speck, [view.camera for view in views], "cpu")
-    assert seen.shown[0] > 1
-    assert unsupported_splats(model, views, BLACK, backend="cpu")["floating"][-1]
+def test_splats_of_photos_that_are_not_sampled_are_kept(monkeypatch):
+    views = photos_of(arc=0.3)
+    model = ball_and([before(views[3])], size=0.03, opacity=-1.0)
+    assert sightings(model, [view.camera for view in views], "cpu").shown[60] > 1
+    assert unsupported(model, views)["floating"] == [60]
     monkeypatch.setattr(removal, "MAX_NEED_PHOTOS", 1)
     elsewhere = scenes.ring_camera(0.0, centre=(50.0, 0.0, 0.0))
     photos = [replace(views[0], camera=elsewhere), *views]
-    assert not unsupported_splats(model, photos, BLACK, backend="cpu")["floating"][-1]
+    assert unsupported(model, photos)["floating"] == []
 
 
 def test_pseudo_views_keep_splats_but_find_no_floaters():
-    views = scenes.capture(views=6, scene=BALL).views
-    model = joined([BALL, specks([before(views[2])], size=0.03, opacity=-1.0)])
-    pseudo = scenes.pseudo_view(views[2])
-    others = [view for k, view in enumerate(views) if k != 2]
-    assert unsupported_splats(model, others, BLACK, backend="cpu")["unseen"][-1]
-    kinds = unsupported_splats(model, [*others, pseudo], BLACK, backend="cpu")
-    assert not kinds["unseen"][-1]
-    assert not kinds["floating"][-1]
-
-
-def test_cpu_gpu_and_reference_find_the_same():
-    views = scenes.capture(views=4, scene=BALL).views
-    model = joined([BALL, specks([[0.0, 40.0, 0.0], before(views[2])], size=0.03, opacity=-1.0)])
-    found = {
-        name: unsupported_splats(model, views, BLACK, backend=name)
-        for name in ("cpu", "gpu", "reference")
-    }
-    for name in ("gpu", "reference"):
-        for kind, mask in found["cpu"].items():
-            assert np.array_equal(mask, found[name][kind]), (name, kind)
+    views = photos_of()
+    model = ball_and([before(views[2])], size=0.03, opacity=-1.0)
+    others = [*views[:2], *views[3:]]
+    assert unsupported(model, others)["unseen"] == [60]
+    found = unsupported(model, [*others, scenes.pseudo_view(views[2])])
+    assert found["unseen"] == found["floating"] == []
 
 
 # ---- stray splats ------------------------------------------------------------------------------
