@@ -328,15 +328,6 @@ def test_fit_applies_every_setting(capture):
     assert result.settings == FitSettings(**settings)
 
 
-def test_numpy_numbers_are_numbers(capture, tmp_path):
-    numbers = {"steps": np.int64(20), "max_splats": np.int64(40), "sh_degree": np.int64(0)}
-    black = np.zeros(3, dtype=np.float32)
-    path = tmp_path / "checkpoint.npz"
-    splats = fit(capture, **numbers, seed=np.uint8(3), background=black, checkpoint=path)
-    plain = {name: int(number) for name, number in numbers.items()}
-    assert splats == fit(capture, **plain, seed=3, background=(0.0, 0.0, 0.0))
-
-
 def test_a_checkpoint_that_cannot_be_written_is_found_before_the_fit(capture, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
