@@ -131,6 +131,13 @@ class Browser:
         """A mouse event, such as "mousePressed"."""
         self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
+    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str) -> None:
+        """A drag with the "left" or "right" mouse button."""
+        buttons = {"left": 1, "right": 2}[button]
+        self.mouse("mousePressed", *start, button=button, buttons=buttons, clickCount=1)
+        self.mouse("mouseMoved", *end, button=button, buttons=buttons)
+        self.mouse("mouseReleased", *end, button=button)
+
     def touch(self, kind: str, points: list[tuple[float, float]]) -> None:
         """A touch event, such as "touchStart", with the fingers that are down."""
         fingers = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
@@ -141,7 +148,7 @@ class Browser:
         self._ask("Input.dispatchKeyEvent", type=kind, key=key, code=code)
 
     def screenshot(self, path: Path) -> None:
-        """What the page shows, as a PNG."""
+        """Save a screenshot of the page as PNG."""
         path.write_bytes(base64.b64decode(self._ask("Page.captureScreenshot")["data"]))
 
     def _ask(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:

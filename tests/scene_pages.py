@@ -64,7 +64,7 @@ def opened(browser, path, splats, cameras=(), background=BACKGROUND):
 
 
 def drawn(browser, camera, timeout=60.0):
-    """What the page draws for a camera, uint8 [H, W, 3]."""
+    """The page's picture of a camera, int [H, W, 3]."""
     K = camera.K
     lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height]
     rows = camera.viewmat[:3].ravel().tolist()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from igsr import rasterization
 from igsr.capture import Camera, Capture, PseudoView, View
 from igsr.fitting import fit_capture
 from igsr.rendering.renders import render
@@ -36,6 +37,16 @@ def torch_scene(count=12, cameras=2, degree=2, seed=0, dtype=torch.float32):
         "backgrounds": torch.rand(cameras, 3, generator=generator, dtype=torch.float64),
     }
     return {name: tensor.to(dtype) for name, tensor in scene.items()}
+
+
+#: Size of the picture of ``torch_scene``.
+WIDTH, HEIGHT = 24, 20
+
+
+def rasterized(scene, **options):
+    """``rasterization`` of ``torch_scene``, by default of SH degree 2 on the CPU."""
+    arguments = {"sh_degree": 2, "backend": "cpu", **options}
+    return rasterization(**scene, width=WIDTH, height=HEIGHT, **arguments)
 
 
 def splats(count=40, degree=1, seed=0, origin=(0.0, 0.0, 0.0)):

@@ -1,6 +1,6 @@
 """Splat files read by numpy, from the formats' descriptions: a second opinion on our readers.
 
-Each decoder returns means, log-scales, quats wxyz, opacities in [0, 1], DC colours in [0, 1] and
+Each decoder returns means, log-scales, quats wxyz, opacities in [0, 1], DC colors in [0, 1] and
 higher SH [N, K, 3], in the frame of the file.
 """
 
@@ -20,7 +20,7 @@ from PIL import Image
 C0 = 0.28209479177387814
 Decoded = dict[str, npt.NDArray[np.float64]]
 
-#: Where y is up and z back instead of down and forward.
+#: Formats with y up and z back instead of down and forward.
 Y_UP = ("spz", "glb", "gltf")
 #: Sign that the half turn about x gives each SH coefficient of degree 1 to 3, from the polynomials.
 SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float64)

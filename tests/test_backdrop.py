@@ -24,7 +24,7 @@ SKY = (51, 128, 204)
 
 @pytest.fixture(autouse=True)
 def small_scenes_have_one(monkeypatch):
-    monkeypatch.setattr(backdrop, "LEAST_SPLATS", 0)
+    monkeypatch.setattr(backdrop, "MIN_SPLATS", 0)
 
 
 def before_sky(views=6, arc=2.0 * np.pi):
@@ -163,7 +163,7 @@ def test_no_backdrop_for_few_splats_or_no_extent(monkeypatch, photos):
     at_camera = replace(BALL, means=np.tile(still, (len(BALL), 1)).astype(np.float32))
     same_place = [replace(v, camera=photos.views[0].camera) for v in photos.views]
     assert with_backdrop(at_camera, same_place, "cpu") is at_camera
-    monkeypatch.setattr(backdrop, "LEAST_SPLATS", len(BALL) + 1)
+    monkeypatch.setattr(backdrop, "MIN_SPLATS", len(BALL) + 1)
     assert with_backdrop(BALL, photos.views, "cpu") is BALL
 
 

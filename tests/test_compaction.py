@@ -1,4 +1,4 @@
-"""``igsr compact``: what splats contribute, the search for the smallest model, the command."""
+"""``igsr compact``: contribution of splats, search for the smallest model, command."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ import igsr
 from igsr.compaction import contribution, validation
 from igsr.compaction.validation import loss_of_change, photo_validation, self_validation
 from igsr.evaluation import metrics
+from igsr.splats import joined, subset
 
 
 def wall(count=2000, seed=0):
-    """A flat wall of one colour, as a fit leaves it: many small splats, nothing to see on it."""
+    """A flat wall of one color, made of many small splats."""
     random = np.random.default_rng(seed)
     columns = round(math.sqrt(count * 1.25))
     grid = np.indices((columns, -(-count // columns))).reshape(2, -1).T[:count]
@@ -34,7 +35,7 @@ def wall(count=2000, seed=0):
 
 
 def beads(colors, opacities, depths):
-    """Round splats one behind the other on the axis of ``ring_camera(0)``, seen in that order."""
+    """Round splats in a row on the axis of ``ring_camera(0)``, the nearest first."""
     count = len(depths)
     sh = (np.asarray(colors, np.float32)[:, None] - 0.5) / np.float32(0.28209479177387814)
     return igsr.Splats(
@@ -55,20 +56,14 @@ def small_pictures(monkeypatch):
 
 @pytest.fixture(scope="module")
 def photos():
-    """A capture of a scene, and a model of it: of wrong colours, with 120 faint splats too many."""
+    """A capture of a scene, and a model of it with wrong colors and 120 superfluous splats."""
     scene = scenes.splats(count=40, degree=1)
     wrong = np.random.default_rng(7).normal(scale=0.1, size=scene.sh.shape).astype(np.float32)
     off = replace(scene, sh=scene.sh + wrong)
     rest = [scenes.splats(count=40, degree=1, seed=seed) for seed in (1, 2, 3)]
     for useless in rest:
         useless.opacities[:] = -5.0
-    model = igsr.Splats(
-        *(
-            np.concatenate([getattr(part, name) for part in (off, *rest)])
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        )
-    )
-    return scenes.capture(views=8, size=40, alpha=True, scene=scene), model
+    return scenes.capture(views=8, size=40, alpha=True, scene=scene), joined([off, *rest])
 
 
 # ---- contribution ------------------------------------------------------------------------------
@@ -107,7 +102,7 @@ def test_change_is_the_derivative_of_the_picture():
         assert estimate[i] == pytest.approx(truth, rel=0.25)
 
 
-def test_what_is_hidden_or_before_its_own_colour_is_not_important():
+def test_hidden_splats_are_not_important():
     red, green = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1)
     camera = [scenes.ring_camera(0.0)]
     before_own = contribution(beads([red, red], [3, 6], [-0.5, 0.5]), camera, backend="cpu")
@@ -159,7 +154,7 @@ def test_cameras_around_see_the_scene_from_all_sides():
 # ---- the search --------------------------------------------------------------------------------
 
 
-def test_a_wall_of_one_colour_does_not_cost_a_thousand_splats():
+def test_a_wall_of_one_color_is_compacted():
     whole = wall()
     compaction = igsr.compact(whole, 0.1, steps=160, backend="cpu")
     assert len(compaction.splats) < 400
@@ -206,32 +201,24 @@ def test_same_seed_same_bits(photos):
     assert first.splats.means.tobytes() != other.splats.means.tobytes()
 
 
-def test_what_nobody_sees_goes_without_harm():
+def test_invisible_splats_are_removed_without_loss():
     """Steps of fitting would only hurt a model that is validated on its own renders."""
     seen = scenes.splats(count=30, degree=1)
     inside = replace(scenes.splats(count=30, degree=1), opacities=np.full(30, -9.0, np.float32))
-    model = igsr.Splats(
-        *(
-            np.concatenate([getattr(part, name) for part in (seen, inside)])
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        )
-    )
-    report = igsr.compact(model, 1e-4, psnr=20.0, steps=4, backend="cpu").report
+    report = igsr.compact(joined([seen, inside]), 1e-4, psnr=20.0, steps=4, backend="cpu").report
     assert report["result"]["splats"] < 45
     assert report["result"]["loss"] <= 1e-4
 
 
-def test_nothing_smaller_within_the_loss_leaves_the_model(photos):
+def test_the_model_is_kept_if_nothing_smaller_is_within_the_loss(photos):
     capture, model = photos
-    needed = igsr.Splats(
-        *(getattr(model, name)[:40] for name in ("means", "quats", "scales", "opacities", "sh"))
-    )
+    needed = subset(model, slice(40))
     compaction = igsr.compact(needed, 1e-6, capture, steps=1, backend="cpu")
     assert compaction.report["result"] == compaction.report["whole"]
     np.testing.assert_array_equal(compaction.splats.means, needed.means)
 
 
-def test_colours_that_do_not_depend_on_the_view_lose_their_bands():
+def test_view_independent_colors_lose_their_bands():
     flat = wall(60)
     bands = np.zeros((60, 9, 3), np.float32)
     bands[:, :1] = flat.sh
@@ -271,7 +258,7 @@ def test_bad_arguments_are_named(name, value):
         igsr.compact(wall(10), **{"backend": "cpu", name: value})
 
 
-def test_scenes_and_captures_that_cannot_be_used(photos):
+def test_unusable_scenes_and_captures_are_refused(photos):
     capture, model = photos
     empty = wall(3)
     empty.opacities[:] = np.nan
@@ -339,7 +326,7 @@ def test_command_without_its_scene(igsr_here, tmp_path):
     assert "none.ply" in result.stderr
 
 
-def test_progress_may_end_it():
+def test_progress_can_stop_the_compaction():
     seen = []
 
     def stop(now):

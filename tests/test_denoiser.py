@@ -45,14 +45,14 @@ def test_a_new_network_changes_little(photos):
     assert not image.any()
 
 
-def test_photos_that_do_not_see_a_pixel_are_not_mixed_in():
+def test_invalid_photos_are_not_mixed_in():
     inputs = torch.rand(1, CHANNELS, 8, 8)
     inputs[:, COLOR + BUFFERS + COLOR :: PHOTO] = 0.0
     image, _ = DenoiserNetwork(SMALL)(inputs)
     assert torch.equal(image, inputs[:, :COLOR])
 
 
-def test_what_the_architecture_leaves_out_does_not_matter():
+def test_disabled_inputs_have_no_effect():
     inputs = torch.rand(1, CHANNELS, 16, 16)
     other = inputs.clone()
     other[:, COLOR : COLOR + 8] = 0.5
@@ -66,7 +66,7 @@ def test_what_the_architecture_leaves_out_does_not_matter():
         assert torch.equal(made(inputs)[0], made(other)[0]) is same
 
 
-def test_an_output_depends_on_pixels_within_reach_only():
+def test_outputs_depend_only_on_pixels_within_reach():
     made = network(Architecture(4, (2, 2, 4)))
     inputs = torch.rand(1, CHANNELS, 16, 2 * REACH_PX + 32)
     changed = inputs.clone()
@@ -77,7 +77,7 @@ def test_an_output_depends_on_pixels_within_reach_only():
     assert difference[8 + REACH_PX :].max() == 0.0
 
 
-def test_tiles_give_what_the_whole_gives(monkeypatch):
+def test_tiles_equal_the_whole(monkeypatch):
     color = np.random.default_rng(0).uniform(size=(50, 230, 3)).astype(np.float32)
     cleaner = NetworkDenoiser(network(Architecture(4, (2, 2, 4))))
     whole = cleaner(Buffers(color), [])
@@ -89,7 +89,7 @@ def test_tiles_give_what_the_whole_gives(monkeypatch):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 500), (2, 8000), (33, 7)])
-def test_any_size_comes_out_as_it_went_in(size):
+def test_any_size_is_preserved(size):
     color = np.random.default_rng(0).uniform(size=(*size, 3)).astype(np.float32)
     picture, confidence = denoise(color, denoiser=NetworkDenoiser(network()))
     assert picture.shape == (*size, 3)
@@ -99,7 +99,7 @@ def test_any_size_comes_out_as_it_went_in(size):
     assert 0.0 <= confidence.min() <= confidence.max() <= 1.0
 
 
-def test_a_change_that_nobody_sees_is_not_made():
+def test_invisible_changes_are_not_made():
     color = np.random.default_rng(0).uniform(0.1, 0.9, size=(20, 20, 3)).astype(np.float32)
     for brighter, same in ((0.9 * MIN_CHANGE, True), (1.1 * MIN_CHANGE, False)):
         picture, _ = denoise(color, denoiser=NetworkDenoiser(brightening(brighter, 1e-3)))
@@ -115,7 +115,7 @@ def brightening(by, error):
     return made
 
 
-def test_a_change_counts_by_its_size_beside_the_error_that_is_expected():
+def test_changes_are_reduced_by_their_expected_error():
     color = np.full((20, 20, 3), 0.4, np.float32)
     for error, part in ((1e-3, 1.0), (0.1 / DOUBT, 0.5), (0.3 / DOUBT, 0.1)):
         cleaner = NetworkDenoiser(brightening(0.1, error))
@@ -126,7 +126,7 @@ def test_a_change_counts_by_its_size_beside_the_error_that_is_expected():
         assert picture == pytest.approx(0.5, abs=1e-6), "every change is made"
 
 
-def test_pixels_that_are_not_numbers_are_filled_in_without_confidence():
+def test_nonfinite_pixels_are_filled_with_zero_confidence():
     color = np.full((20, 20, 3), 0.5, np.float32)
     color[3, 4] = np.nan
     color[5, 6, 1] = np.inf
@@ -136,7 +136,7 @@ def test_pixels_that_are_not_numbers_are_filled_in_without_confidence():
     assert (np.delete(confidence.ravel(), [3 * 20 + 4, 5 * 20 + 6]) > 0.0).all()
 
 
-def test_renders_of_all_kinds_are_taken():
+def test_renders_of_all_types_are_accepted():
     cleaner = NetworkDenoiser(network())
     color = np.random.default_rng(0).integers(0, 255, (8, 9, 3), dtype=np.uint8)
     floats = color.astype(np.float32) / 255
@@ -160,7 +160,7 @@ def test_renders_of_all_kinds_are_taken():
         denoise(np.zeros((2, 2, 3), np.int64), denoiser=cleaner)
 
 
-def test_a_network_comes_back_from_its_file(tmp_path):
+def test_networks_survive_files(tmp_path):
     architecture = Architecture(6, (0, 1, 2), residual=False, photos="attention")
     save_network(network(architecture), tmp_path / "a.safetensors", {"seed": 3})
     read = load_network(tmp_path / "a.safetensors")
@@ -169,7 +169,7 @@ def test_a_network_comes_back_from_its_file(tmp_path):
     assert torch.allclose(read(inputs)[0], network(architecture)(inputs)[0], rtol=1e-2, atol=5e-2)
 
 
-def test_damaged_files_of_weights_are_refused_in_a_sentence(tmp_path):
+def test_damaged_weights_are_refused(tmp_path):
     from safetensors.torch import load_file, save_file
 
     path = tmp_path / "a.safetensors"
@@ -219,7 +219,7 @@ def test_damaged_files_of_weights_are_refused_in_a_sentence(tmp_path):
     refused("does not exist")
 
 
-def test_without_weights_of_its_own_igsr_says_what_to_give(monkeypatch, tmp_path):
+def test_missing_shipped_weights_give_advice(monkeypatch, tmp_path):
     from igsr.denoiser import weights
 
     monkeypatch.setattr(weights, "SHIPPED", tmp_path / "denoiser.safetensors")

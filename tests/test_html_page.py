@@ -45,7 +45,7 @@ def near(pixels, color):
     return int((np.abs(pixels - color).max(axis=-1) < 40).sum())
 
 
-def test_a_browser_shows_it(browser, report, tmp_path):
+def test_a_browser_draws_the_cameras(browser, report, tmp_path):
     pixels = cameras_drawn(browser, report)
     for color in (PHOTOS, ADDED):
         assert near(pixels, color) > 100
@@ -56,7 +56,7 @@ def test_a_browser_shows_it(browser, report, tmp_path):
         assert near(without, color) == 0
 
 
-def test_held_out_photos_are_compared_by_a_line_to_drag(browser, tmp_path):
+def test_held_out_photos_have_a_slider(browser, tmp_path):
     capture = scenes.capture(views=8, size=40, alpha=True)
 
     def sure(buffers, photos):
@@ -104,7 +104,7 @@ def held_out(gains):
         ([0.5, 0.6, float("inf")], ""),
     ],
 )
-def test_gain_is_told_from_chance(gains, verdict):
+def test_gains_within_chance_are_reported(gains, verdict):
     assert held_out(gains).verdict == verdict
 
 

@@ -53,7 +53,7 @@ def seen(splats, size=64, finer=1):
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
-def test_fewer_splats_look_alike(wall, levels, level):
+def test_coarser_levels_look_similar(wall, levels, level):
     out, written = levels
     assert written.counts[0] == len(wall)
     assert 0.2 < written.counts[level] / written.counts[level - 1] < 0.3
@@ -70,8 +70,8 @@ def test_fewer_splats_look_alike(wall, levels, level):
     assert error < 0.8 * np.sqrt(np.mean((seen(left_out, size) - true) ** 2))
 
 
-def test_one_turned_splat_stays_as_it_is(wall, tmp_path):
-    """Two at one place: their spread, turned as it is, is that of the one that they become."""
+def test_merging_keeps_a_rotated_shape(wall, tmp_path):
+    """Two equal splats are merged into one of the same shape."""
     quats = np.array([[0.8, 0.2, -0.5, 0.3]] * 2, np.float32)
     two = replace(wall, quats=quats, **{n: getattr(wall, n)[[0, 0]] for n in NAMES if n != "quats"})
     scales = np.log(np.array([[0.5, 0.2, 0.05]] * 2, np.float32))
@@ -87,8 +87,8 @@ def test_one_turned_splat_stays_as_it_is(wall, tmp_path):
     assert seen(one) == pytest.approx(seen(single), abs=0.02)
 
 
-def test_what_is_darker_than_black_is_black_in_a_mean(wall, tmp_path):
-    """It is drawn black: merged with a white one it is grey, not black."""
+def test_negative_colors_are_merged_as_black(wall, tmp_path):
+    """It is drawn black: merged with a white one it is gray, not black."""
     two = replace(wall, **{name: getattr(wall, name)[[0, 0]] for name in NAMES})
     sh = np.zeros((2, 1, 3), np.float32)
     sh[0], sh[1] = 0.5 / 0.28209479, -40.0
@@ -98,7 +98,7 @@ def test_what_is_darker_than_black_is_black_in_a_mean(wall, tmp_path):
     assert 0.5 + 0.28209479 * one.sh[0, 0] == pytest.approx(0.5, abs=0.01)
 
 
-def test_chunks_are_sog_as_another_decoder_reads_it(levels):
+def test_chunks_match_an_independent_decoder(levels):
     """Positions of a chunk, decoded in numpy by the published formulas, lie in its cells' boxes."""
     from PIL import Image
 
@@ -126,7 +126,7 @@ def test_chunks_are_sog_as_another_decoder_reads_it(levels):
     assert checked == index["count"]
 
 
-def test_the_page_shows_the_finest_level_that_it_holds(levels, monkeypatch):
+def test_the_page_shows_the_finest_level_that_fits(levels, monkeypatch):
     out, written = levels
     check_viewable(out)
     (found,) = live_models(out)
@@ -140,7 +140,7 @@ def test_the_page_shows_the_finest_level_that_it_holds(levels, monkeypatch):
         level_within(out / "lod-meta.json", 3)
 
 
-def test_a_chunk_is_a_splat_file_of_its_own(levels):
+def test_a_chunk_is_a_splat_file(levels):
     out, _ = levels
     name = json.loads((out / "lod-meta.json").read_text())["filenames"][0]
     chunk = igsr.Splats.load(out / name)
@@ -160,7 +160,7 @@ def test_other_formats_have_levels_too(wall, tmp_path, ending):
     assert np.allclose(found.bounds(), world, atol=1e-3)
 
 
-def test_the_command_writes_levels_and_says_what_it_cannot(tmp_path):
+def test_the_convert_command_writes_levels(tmp_path):
     scenes.splats(count=50).save(tmp_path / "scene.ply")
 
     def run(*words):

@@ -1,4 +1,4 @@
-"""What limits a scene: the rule, its thresholds and its sentences."""
+"""Limits of a scene: the rule, its thresholds and its sentences."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CAMERAS, NOTHING = LimitKind.cameras, LimitKind.nothing
         (29.0, 22.0, 20.0, PHOTOS),  # refining that does harm says nothing
     ],
 )
-def test_the_longest_of_three_lengths_names_the_limit(train, held_out, refined, kind):
+def test_the_largest_difference_is_the_limit(train, held_out, refined, kind):
     limit = limit_of(train, held_out, refined)
     assert limit.kind is kind
     assert f"{train:.1f} dB" in limit.sentence
@@ -35,7 +35,7 @@ def test_the_longest_of_three_lengths_names_the_limit(train, held_out, refined, 
         assert (text in limit.sentence) == (other is kind)
 
 
-def test_what_helps_second_is_said_where_it_is_worth_it():
+def test_the_second_largest_difference_is_mentioned():
     assert "more photos would, too" in limit_of(22.2, 17.1).sentence
     assert "too" not in limit_of(22.0, 21.0).sentence
     assert "more splats and steps would, too" in limit_of(26.0, 18.0).sentence
@@ -50,7 +50,7 @@ def test_thresholds():
     assert limit_of(40.0, 40.0 - MIN_GAIN_DB).kind is PHOTOS
 
 
-def test_without_held_out_photos_it_says_what_can_be_said():
+def test_limits_without_held_out_photos():
     low, high = limit_of(20.0), limit_of(34.0)
     assert (low.kind, high.kind) == (SPLATS, NOTHING)
     assert "more splats and steps would help;" in low.sentence

@@ -1,4 +1,4 @@
-"""Metrics against independent computations, and what masks and small pictures do to them."""
+"""Metrics against independent computations, with masks and small pictures."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_equal_pictures_score_perfectly():
     assert scores["flip"] == 0.0
 
 
-def test_ssim_matches_torchmetrics_where_borders_do_not_reach():
+def test_ssim_matches_torchmetrics_inside_the_border():
     photo = picture()
     render = noisy(photo)
 
@@ -126,20 +126,20 @@ def test_unusable_pictures_are_named(render, photo, mask, name):
         metrics.score(render, photo, mask)
 
 
-def test_color_correction_takes_exposure_and_tone_out():
+def test_color_correction_removes_exposure_and_tone():
     photo = np.clip(picture(height=48, width=56).astype(float) * 0.6 + 40, 0, 255).astype(np.uint8)
     brighter = np.clip(photo.astype(float) * [0.7, 0.8, 0.9] + [20, 0, 10], 0, 255).astype(np.uint8)
     curve = (255 * (photo / 255) ** 1.3).astype(np.uint8)
     for render in (brighter, curve):
         assert metrics.psnr(render, photo) < 26
         assert metrics.psnr(metrics.color_corrected(render, photo), photo) > 38
-    # What is no matter of colors stays.
+    # Other errors stay.
     scores = metrics.score(noisy(photo, 40), photo)
     assert scores["cc_psnr"] < scores["psnr"] + 1.5
     assert scores["cc_ssim"] < scores["ssim"] + 0.1
 
 
-def test_color_correction_is_fitted_to_pixels_that_count_and_are_not_clipped():
+def test_color_correction_ignores_masked_and_clipped_pixels():
     photo = np.clip(picture(height=48, width=56).astype(float) * 0.6 + 40, 0, 255).astype(np.uint8)
     render = (photo * 0.8).astype(np.uint8)
     mask = np.ones(photo.shape[:2], dtype=bool)

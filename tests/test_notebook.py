@@ -7,10 +7,12 @@ import pytest
 from nbclient import NotebookClient
 from scene_pages import model
 
+import igsr
+
 SPLATS = """
 import igsr
 splats = igsr.Splats.load("scene.ply")
-splats.show()
+splats.show(height=300)
 """
 REFINED = """
 from igsr.refinement.results import Refined, Round
@@ -34,7 +36,7 @@ def outputs(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("cell", "labels"), [(0, ["scene"]), (1, ["first fit", "round 1"])])
-def test_a_cell_shows_the_viewer(browser, tmp_path, outputs, cell, labels):
+def test_a_notebook_cell_shows_the_viewer(browser, tmp_path, outputs, cell, labels):
     (tmp_path / "book.html").write_text(WAIT + outputs[cell], encoding="utf-8")
     browser.open(tmp_path / "book.html")
     assert browser.problems == []
@@ -42,3 +44,9 @@ def test_a_cell_shows_the_viewer(browser, tmp_path, outputs, cell, labels):
     found = browser.run("frames[0].igsr.models.source.entries.map(({ label }) => label)")
     assert found == labels
     assert browser.run("frames[0].igsr.viewer.main.scene.count") == 400
+    assert browser.run("frames[0].innerHeight") == 300
+
+
+def test_a_height_below_one_pixel_is_refused():
+    with pytest.raises(igsr.IgsrError, match="height"):
+        model().show(height=0)

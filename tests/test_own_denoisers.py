@@ -1,4 +1,4 @@
-"""Denoisers of one's own: by name, without confidence, and of a single-step network."""
+"""Custom denoisers: by name, without confidence, and of single-step networks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_confidence_and_error_are_inverse():
     assert confidence_of(errors)[2] == pytest.approx(0.5)
 
 
-def test_a_picture_alone_gets_a_confidence_by_its_changes():
+def test_pictures_without_confidence_get_one_from_changes():
     color = np.full((24, 32, 3), 0.5, np.float32)
     picture = color.copy()
     picture[:, 16:] = 0.8
@@ -43,7 +43,7 @@ def test_a_picture_alone_gets_a_confidence_by_its_changes():
 
 
 @pytest.mark.usefixtures("small_fits")
-def test_a_confidence_that_is_given_is_kept(ball_photos):
+def test_a_given_confidence_is_kept(ball_photos):
     def sure(buffers, photos):
         return truthful(buffers, photos)[0], np.full(buffers.color.shape[:2], 0.6, np.float32)
 
@@ -106,7 +106,7 @@ def test_a_factory_is_found_by_module_or_file(module, module_name):
         ("my_denoiser:nothing", "must return a function of a render and photos, not NoneType"),
     ],
 )
-def test_names_that_make_no_denoiser_are_told(module, name, said):
+def test_bad_names_are_refused(module, name, said):
     with pytest.raises(igsr.IgsrError, match=said):
         named_denoiser(name)
 
@@ -124,7 +124,7 @@ def run(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def test_denoise_apply_takes_a_name(module, scene):
+def test_the_denoise_command_takes_a_name(module, scene):
     options = ("--capture", "ball", "--out", "clean", "--holdout", 4, "--backend", "cpu", "--json")
     done = run("denoise", "ball.ply", *options, "--denoiser", "my_denoiser:make")
     assert done.exit_code == 0, done.output
@@ -134,7 +134,7 @@ def test_denoise_apply_takes_a_name(module, scene):
 
 
 @pytest.mark.parametrize("command", ["apply", "refine"])
-def test_the_commands_tell_what_is_wrong_with_a_name(module, scene, command):
+def test_commands_refuse_bad_names(module, scene, command):
     given = {
         "apply": ("denoise", "ball.ply", "--capture", "ball", "--out", "out"),
         "refine": ("refine", "ball", "--out", "out", "--steps", 5),
@@ -148,7 +148,7 @@ def test_the_commands_tell_what_is_wrong_with_a_name(module, scene, command):
     assert not (scene / "out").exists()
 
 
-def test_refine_takes_a_name(module, scene):
+def test_the_refine_command_takes_a_name(module, scene):
     done = run(
         "refine", "ball", "--out", "out", "--steps", 30, "--rounds", 1, "--backend", "cpu",
         "--denoiser", "my_denoiser:make", "--no-html", "--json",
@@ -168,7 +168,7 @@ def source(offset, color):
     return Source(camera, picture, np.ones((30, 30), bool), np.ones((30, 30), np.float32))
 
 
-def test_the_model_gets_the_nearest_photo_and_padded_pictures():
+def test_models_get_the_nearest_photo_and_padded_pictures():
     seen = []
 
     def model(render, photo):
@@ -188,7 +188,7 @@ def test_the_model_gets_the_nearest_photo_and_padded_pictures():
     assert seen[-1][1] is None
 
 
-def test_large_renders_are_cleaned_small_and_keep_their_detail():
+def test_large_renders_are_reduced_but_keep_detail():
     sizes = []
 
     def model(render, photo):
@@ -204,7 +204,7 @@ def test_large_renders_are_cleaned_small_and_keep_their_detail():
     assert np.isfinite(SingleStepDenoiser(model)(Buffers(broken), [])).all()
 
 
-def test_models_and_sizes_that_do_not_fit_are_told():
+def test_bad_models_and_sizes_are_refused():
     with pytest.raises(igsr.IgsrError, match=r"returned \[1, 3, 8, 8\] for \[1, 3, 16, 16\]"):
         SingleStepDenoiser(lambda render, photo: render[..., ::2, ::2])(
             Buffers(np.zeros((16, 16, 3), np.float32)), []
@@ -262,6 +262,6 @@ def test_the_example_adapts_difix(tmp_path, monkeypatch):
     assert confidence.max() < 0.25
 
 
-def test_without_difix_the_example_says_what_is_missing():
+def test_the_example_without_difix_is_an_error():
     with pytest.raises(igsr.IgsrError, match="No module named 'pipeline_difix'"):
         named_denoiser(f"{EXAMPLE}:make")

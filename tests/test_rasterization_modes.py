@@ -6,20 +6,14 @@ import gsplat
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
-from scenes import torch_scene
+from scenes import HEIGHT, WIDTH, torch_scene
+from scenes import rasterized as run
 
 from igsr import rasterization
 
-WIDTH, HEIGHT = 24, 20
-
-
-def run(scene, **options):
-    arguments = {"sh_degree": 2, "backend": "cpu", **options}
-    return rasterization(**scene, width=WIDTH, height=HEIGHT, **arguments)
-
 
 def small_scene(count=6, **options):
-    """Of 8 x 5 pixels, so that every pixel can be a loss of its own."""
+    """A scene for 8 x 5 pixels, each of which is a separate loss."""
     scene = torch_scene(count=count, **options)
     scene["Ks"][:, :2] = scene["Ks"][:, :2] / 3.0
     return scene
@@ -64,7 +58,7 @@ def test_absgrad_sums_the_absolute_gradients_of_all_pixels(
     assert (means2d.grad - total).abs().max() <= bound * scale
 
 
-def test_absgrad_changes_nothing_else_and_is_that_of_the_last_backward():
+def test_absgrad_changes_nothing_else_and_is_of_the_last_backward():
     outcomes = []
     for absgrad in (False, True):
         scene = torch_scene(count=30)
@@ -100,7 +94,7 @@ def test_gsplats_strategy_reads_absgrad(packed):
 
 
 @pytest.mark.parametrize("eps2d", [0.3, 1.5])
-def test_antialiased_opacities_are_gsplats(eps2d):
+def test_antialiased_opacities_match_gsplat(eps2d):
     """Against gsplat's own formula, in its plain-torch twin of the CUDA kernel."""
     scene = torch_scene(count=20, dtype=torch.float64)
     scene["scales"] = scene["scales"] * torch.logspace(-3, 0, 20, dtype=torch.float64)[:, None]
@@ -124,13 +118,13 @@ def test_antialiased_opacities_are_gsplats(eps2d):
     assert torch.allclose(meta["conics"][drawn], conics[drawn], rtol=1e-6, atol=1e-9)
     assert drawn.any()
     assert (meta["opacities"][drawn] < 0.9 * classic["opacities"][drawn]).any()
-    # What falls under 1/255 is not drawn.
+    # Opacities under 1/255 are not drawn.
     was_drawn = (classic["radii"] > 0).all(dim=-1)
     assert (expected[was_drawn & ~drawn] < 1 / 255).all()
     assert (was_drawn & ~drawn).any()
 
 
-def test_antialiased_without_blur_is_classic():
+def test_antialiased_without_blur_equals_classic():
     scene = torch_scene(count=20)
     plain, _, _ = run(scene, eps2d=0.0)
     antialiased, _, _ = run(scene, eps2d=0.0, rasterize_mode="antialiased")

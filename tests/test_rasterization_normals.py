@@ -1,4 +1,4 @@
-"""``rasterization(render_normals=True)``: which normal, in which frame, with which weights."""
+"""``rasterization(render_normals=True)``: the axis, the frame and the weights."""
 
 from __future__ import annotations
 
@@ -6,20 +6,15 @@ import math
 
 import pytest
 import torch
-from scenes import torch_scene
-
-from igsr import rasterization
-
-WIDTH, HEIGHT = 24, 20
+from scenes import HEIGHT, WIDTH, rasterized, torch_scene
 
 
 def run(scene, **options):
-    arguments = {"sh_degree": 2, "backend": "cpu", "render_normals": True, **options}
-    return rasterization(**scene, width=WIDTH, height=HEIGHT, **arguments)
+    return rasterized(scene, **{"render_normals": True, **options})
 
 
 def disc(shortest, quat=(1.0, 0.0, 0.0, 0.0)):
-    """One big disc before the camera, thin along one of its own axes."""
+    """One big disc in front of the camera, thin along one axis."""
     scene = torch_scene(count=1, cameras=1)
     scene["means"] = torch.tensor([[0.0, 0.0, 4.0]])
     scene["scales"] = torch.full((1, 3), 0.8)
@@ -46,7 +41,7 @@ HALF = math.sqrt(0.5)
     ],
 )
 @pytest.mark.parametrize("packed", [False, True])
-def test_the_shortest_axis_facing_the_camera(shortest, quat, expected, packed):
+def test_normals_are_shortest_axes_facing_the_camera(shortest, quat, expected, packed):
     _, alpha, meta = run(disc(shortest, quat), packed=packed)
     normals = meta["render_normals"]
     assert normals.shape == (1, HEIGHT, WIDTH, 3)
@@ -80,7 +75,7 @@ def test_normals_have_the_weights_of_the_colors_and_change_no_picture(render_mod
     assert torch.equal(alpha, plain_alpha)
     assert "render_normals" not in plain_meta
 
-    # The same normals given as colours, made here another way.
+    # The same normals as colors, computed independently.
     w, x, y, z = torch.nn.functional.normalize(scene["quats"].double(), dim=-1).unbind(dim=-1)
     zero = torch.zeros_like(w)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
@@ -91,12 +86,7 @@ def test_normals_have_the_weights_of_the_colors_and_change_no_picture(render_mod
     towards = centres[:, None].double() - scene["means"]
     facing = (towards * normals).sum(dim=-1, keepdim=True).sign() * normals
     colors = facing.float()
-    expected, _, _ = rasterization(
-        **{**scene, "colors": colors, "backgrounds": None},
-        width=WIDTH,
-        height=HEIGHT,
-        backend="cpu",
-    )
+    expected, _, _ = rasterized({**scene, "colors": colors, "backgrounds": None}, sh_degree=None)
     assert (meta["render_normals"] - expected).abs().max() <= 2e-6
 
 
@@ -115,20 +105,3 @@ def test_gradients_of_normals_match_finite_differences():
     _, _, meta = run(scene, backend="reference")
     (from_normals,) = torch.autograd.grad(meta["render_normals"][..., 0].sum(), inputs[1])
     assert from_normals.abs().max() > 1e-3
-
-
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
-@pytest.mark.parametrize("slot", ["means", "quats", "scales", "opacities"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e38, 0.0])
-def test_what_is_not_drawn_spoils_no_normal(slot, value, backend):
-    scene = torch_scene(count=8)
-    scene[slot].view(8, -1)[3] = value
-    for tensor in scene.values():
-        tensor.requires_grad_()
-    _, _, meta = run(scene, packed=False, backend=backend)
-    assert torch.isfinite(meta["render_normals"]).all()
-    meta["render_normals"].square().sum().backward()
-    for name, tensor in scene.items():
-        # The pass of the colours is not needed for the normals, and neither are backgrounds.
-        assert tensor.grad is None or torch.isfinite(tensor.grad).all(), name
-    assert scene["quats"].grad.any()

@@ -1,4 +1,4 @@
-"""``rasterization`` on drawn sizes, counts and poisoned values: what must hold whatever is given.
+"""Properties of ``rasterization`` for random sizes, counts and poisoned values.
 
 The profile in conftest.py makes the draws the same on every run.
 """
@@ -97,7 +97,7 @@ def test_every_call_has_the_right_shapes_and_finite_numbers(call):
 
 @given(call=calls())
 @settings(max_examples=25)
-def test_every_call_repeats_bit_for_bit_and_packed_is_the_same(call):
+def test_every_call_is_deterministic_with_and_without_packed(call):
     scene, options = call
     shown, _, gradients = outcome(scene, options)
     for packed in (options["packed"], not options["packed"]):
@@ -114,7 +114,7 @@ def test_every_call_repeats_bit_for_bit_and_packed_is_the_same(call):
     place=st.integers(0, 10_000),
 )
 @settings(max_examples=250)
-def test_a_poisoned_splat_is_not_there_or_renders_finite(call, poison, name, place):
+def test_poisoned_splats_are_dropped_or_finite(call, poison, name, place):
     scene, options = call
     count = len(scene["means"])
     scene[name] = scene[name].contiguous()

@@ -1,4 +1,4 @@
-"""Evaluation and what is left beside the splats: report.json and views.png."""
+"""Evaluation, report.json and views.png."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from igsr.fitting.presets import settings_for
 from igsr.fitting.run import Progress
 
 
-def test_the_true_scene_scores_perfectly_and_another_does_not():
+def test_the_true_scene_scores_perfectly():
     scene = scenes.splats()
     capture = scenes.capture(views=8, scene=scene)
     scores = igsr.evaluate(scene, capture, backend="reference")
@@ -50,7 +50,7 @@ def test_alpha_photos_are_scored_over_the_background():
     capture = scenes.capture(views=8, alpha=True, scene=scene)
     for background in (None, (0.0, 0.0, 0.0), (0.1, 0.5, 0.9)):
         scores = igsr.evaluate(scene, capture, background=background, backend="reference")
-        # Straight colours and alpha each lost up to half a step of 8 bits; SH may exceed 1.
+        # Straight colors and alpha each lost up to half a step of 8 bits; SH may exceed 1.
         assert scores["psnr"] > 35
         assert scores["protocol"]["background"] == list(background or (1.0, 1.0, 1.0))
     image = np.array([[[200, 100, 0, 255], [200, 100, 0, 0], [200, 100, 0, 51]]], dtype=np.uint8)
@@ -58,7 +58,7 @@ def test_alpha_photos_are_scored_over_the_background():
     assert over.tolist() == [[[200, 100, 0], [0, 255, 255], [40, 224, 204]]]
 
 
-def test_masks_reach_the_scores():
+def test_masked_pixels_are_not_scored():
     scene = scenes.splats()
     views = []
     for view in scenes.capture(views=8, scene=scene).views:
@@ -85,7 +85,7 @@ def scored(name="a/b.png", size=(30, 50), mask=None):
     return ScoredView(name, photo, render, mask, {"psnr": 12.345})
 
 
-def test_error_picture_shows_where_the_error_is():
+def test_error_picture_is_bright_at_errors():
     view = scored()
     picture = error_picture(view)
     assert not picture[:, 10:].reshape(-1, 3).max(axis=0)[:2].any()  # black: no error
@@ -162,7 +162,7 @@ def test_fitted_photos_are_scored_at_most_ten_evenly_spaced():
         assert quick[name] == pytest.approx(whole[name], abs=1e-12)
 
 
-def test_a_fits_page_escapes_what_it_shows(tmp_path, monkeypatch):
+def test_the_fit_page_escapes_text(tmp_path, monkeypatch):
     name = '"><script>alert("photo")</script>\udcff.png'
     made = scenes.capture(views=5, size=16)
     views = [replace(view, name=f"{k}{name}") for k, view in enumerate(made.views)]

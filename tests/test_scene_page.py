@@ -1,4 +1,4 @@
-"""``scene.html`` in a real browser: it draws what the renderer draws, and heeds hand and keys."""
+"""``scene.html`` in a real browser: pictures as the renderer's, mouse, touch and keys."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from igsr.rendering.scene_page import PageCamera, scene_page, write_scene_page
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_pictures_are_the_renderers(browser, tmp_path, degree):
+def test_pictures_match_the_renderer(browser, tmp_path, degree):
     splats = model(degree)
     opened(browser, tmp_path / "scene.html", splats)
     check_pictures(browser, splats, three_cameras())
@@ -46,7 +46,7 @@ def test_scenes_in_any_unit(browser, tmp_path, size):
         assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
 
 
-def test_splats_far_out_do_not_make_the_others_coarse(browser, tmp_path):
+def test_far_splats_do_not_reduce_precision(browser, tmp_path):
     splats = model()
     splats.means += np.float32(50.0)
     splats.means[7], splats.means[8, 2] = 1e30, 1e5
@@ -99,7 +99,7 @@ def test_depth_view_and_focus(browser, tmp_path):
 # ---- the page ----------------------------------------------------------------------------------
 
 
-def test_it_asks_nothing_of_any_address(browser, tmp_path):
+def test_the_page_makes_no_requests(browser, tmp_path):
     path = opened(browser, tmp_path / "scene.html", model(), named(three_cameras()))
     assert browser.problems == []
     # The worker is made of the page's own text.
@@ -115,7 +115,7 @@ def test_it_asks_nothing_of_any_address(browser, tmp_path):
     assert refused
 
 
-def test_hands_and_keys_move_the_camera(browser, tmp_path):
+def test_mouse_and_keys_move_the_camera(browser, tmp_path):
     opened(browser, tmp_path / "scene.html", model(), named(three_cameras()))
 
     def state():
@@ -124,9 +124,7 @@ def test_hands_and_keys_move_the_camera(browser, tmp_path):
 
     first = state()
     assert first["camera"] == 0
-    browser.mouse("mousePressed", 300, 200, button="left", buttons=1, clickCount=1)
-    browser.mouse("mouseMoved", 360, 220, button="left", buttons=1)
-    browser.mouse("mouseReleased", 360, 220, button="left")
+    browser.drag((300, 200), (360, 220), "left")
     orbited = state()
     assert orbited["camera"] == -1
     assert orbited["distance"] == pytest.approx(first["distance"])
@@ -139,9 +137,7 @@ def test_hands_and_keys_move_the_camera(browser, tmp_path):
     assert zoomed["distance"] == pytest.approx(orbited["distance"] * np.exp(-0.2), rel=1e-6)
     assert zoomed["forward"] == pytest.approx(orbited["forward"])
 
-    browser.mouse("mousePressed", 300, 200, button="right", buttons=2, clickCount=1)
-    browser.mouse("mouseMoved", 340, 200, button="right", buttons=2)
-    browser.mouse("mouseReleased", 340, 200, button="right")
+    browser.drag((300, 200), (340, 200), "right")
     panned = state()
     assert panned["forward"] == pytest.approx(zoomed["forward"])
     assert np.linalg.norm(np.subtract(panned["position"], zoomed["position"])) > 0.01
@@ -203,7 +199,7 @@ def test_without_cameras_it_shows_the_whole_scene(browser, tmp_path):
     assert np.dot(to_middle, state["forward"]) == pytest.approx(state["distance"], rel=1e-6)
 
 
-def test_an_empty_model_is_said(browser, tmp_path):
+def test_an_empty_model_gives_a_message(browser, tmp_path):
     shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 1, 3))
     empty = igsr.Splats(*(np.zeros(shape, np.float32) for shape in shapes))
     write_scene_page(tmp_path / "scene.html", empty)
@@ -215,7 +211,7 @@ def test_an_empty_model_is_said(browser, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "byte", "base64", "other", "count"])
-def test_a_damaged_page_says_so(browser, tmp_path, damage):
+def test_a_damaged_page_gives_a_message(browser, tmp_path, damage):
     page, _ = scene_page(model())
     found = re.search(r'id="model-0">([^<]+)<', page)
     assert found is not None
@@ -254,7 +250,7 @@ def test_without_webgl_or_a_worker(browser, tmp_path):
     check_pictures(browser, model(), three_cameras())
 
 
-def test_names_cannot_break_out(browser, tmp_path):
+def test_names_cannot_inject_scripts(browser, tmp_path):
     name = '</script><script>window.broken = true</script>"\udcff@CSP@.png'
     cameras = [PageCamera(name, three_cameras()[0])]
     write_scene_page(tmp_path / "scene.html", model(), cameras, title=name)
@@ -263,20 +259,6 @@ def test_names_cannot_break_out(browser, tmp_path):
     assert browser.run("window.igsr.error") is None
     assert browser.run("window.broken") is None
     assert "</script>" in browser.run("document.getElementById('cameras').options[1].text")
-
-
-def test_a_notebook_shows_it(browser, tmp_path):
-    shown = model().show(scenes.capture(views=2, size=8), height=300)
-    wait = """<script>window.igsr = { ready: new Promise((resolve) => addEventListener("load", () =>
-        frames[0].igsr.ready.then(resolve))) }</script>"""
-    (tmp_path / "book.html").write_text(wait + shown._repr_html_(), encoding="utf-8")
-    browser.open(tmp_path / "book.html")
-    assert browser.problems == []
-    assert browser.run("frames[0].igsr.error") is None
-    assert browser.run("frames[0].igsr.state().camera") == 0
-    assert browser.run("frames[0].innerHeight") == 300
-    with pytest.raises(igsr.IgsrError, match="height"):
-        model().show(height=0)
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0), (0.0, 0.0, 1.5), (0.0, 0.0, float("nan"))])

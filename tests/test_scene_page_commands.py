@@ -77,13 +77,13 @@ def test_convert_finds_cameras_and_background(browser, tmp_path):
         ("{", None),
     ],
 )
-def test_the_background_is_that_of_the_report(tmp_path, report, background):
+def test_background_is_read_from_the_report(tmp_path, report, background):
     (tmp_path / "report.json").write_text(report)
     assert background_beside(tmp_path / "scene.ply") == background
 
 
 @pytest.mark.parametrize("place", ["", "rounds/0", "checkpoints"])
-def test_cameras_and_background_are_those_of_the_run_that_a_scene_is_of(tmp_path, place):
+def test_cameras_and_background_of_a_scenes_run(tmp_path, place):
     made = scenes.capture(views=2, size=16)
     write_cameras(tmp_path / "cameras.json", made.views)
     (tmp_path / "report.json").write_text('{"protocol": {"background": [1, 0, 1]}}')
@@ -95,7 +95,7 @@ def test_cameras_and_background_are_those_of_the_run_that_a_scene_is_of(tmp_path
     assert cameras_beside(elsewhere) == []
 
 
-def test_a_fit_writes_it(browser, tmp_path):
+def test_a_fit_writes_the_page(browser, tmp_path):
     made = scenes.capture(views=5, size=24)
     capture, out = scenes.write_capture(tmp_path / "capture", made), tmp_path / "out"
     words = ["fit", str(capture), "--out", str(out), "--steps", "4", "--backend", "cpu"]
@@ -114,7 +114,7 @@ def test_a_fit_writes_it(browser, tmp_path):
     assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
 
 
-def test_a_fit_outlives_a_page_that_cannot_be_written(tmp_path):
+def test_a_page_that_cannot_be_written_is_a_warning(tmp_path):
     (tmp_path / "scene.html").mkdir()
     with pytest.warns(UserWarning, match=r"scene\.html is not written: Cannot write"):
         assert not write_page(tmp_path, model(), scenes.capture(views=2, size=8))

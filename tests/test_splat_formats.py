@@ -18,7 +18,7 @@ from igsr.cli import app
 from igsr.splats import SPLAT_ENDINGS
 
 WRITABLE = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "gltf")
-#: A folder of splat files that other programs wrote, for whoever has one.
+#: An optional folder of splat files from other programs.
 OTHERS = os.environ.get("IGSR_FORMAT_FILES")
 
 
@@ -52,10 +52,10 @@ def assert_agrees(path: Path) -> int:
 
 @pytest.mark.parametrize("ending", [ending for ending in WRITABLE if ending != "gltf"])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_numpy_finds_in_our_files_what_we_find(tmp_path, ending, degree):
+def test_readers_agree_with_numpy_decoders(tmp_path, ending, degree):
     path = tmp_path / f"scene.{ending}"
     splats = scenes.splats(degree=degree)
-    # Within what every format holds.
+    # Within the range of every format.
     splats.sh = np.clip(splats.sh, -0.99, 0.99)
     notes = splats.save(path)
     assert bool(notes) == (ending == "splat" and degree > 0)
@@ -69,13 +69,13 @@ if OTHERS is not None:  # for measuring: such files are not the project's
         assert files
         for path in files:
             if path.suffix == ".spz" and path.read_bytes().startswith(b"NGSP"):
-                # Version 4, which numpy cannot unpack: it opens, and has what version 3 has.
+                # numpy cannot unpack version 4.
                 assert len(igsr.Splats.load(path)) > 0
                 continue
             assert assert_agrees(path) > 0, path
 
 
-def test_a_picture_survives_every_format(tmp_path):
+def test_pictures_survive_every_format(tmp_path):
     splats = scenes.splats(degree=0)
     camera = scenes.ring_camera(0.4)
     before = igsr.render(splats, camera, backend="cpu").color
@@ -88,7 +88,7 @@ def test_a_picture_survives_every_format(tmp_path):
         assert before.max() > 0.3
 
 
-def test_antialiased_splats_come_back_and_are_drawn_so(tmp_path):
+def test_the_antialiased_flag_survives_files(tmp_path):
     splats = scenes.splats(degree=0)
     splats.scales -= 3.0
     camera = scenes.ring_camera(0.4)
@@ -112,7 +112,7 @@ def test_fits_refuse_antialiased_splats():
         igsr.refine_cameras(splats, [], (0.0, 0.0, 0.0))
 
 
-def test_convert_says_what_is_lost(tmp_path):
+def test_convert_reports_lost_data(tmp_path):
     scene, target = tmp_path / "scene.ply", tmp_path / "new" / "scene.splat"
     splats = scenes.splats(degree=2, origin=(100.0, 0.0, 0.0))
     splats.sh = np.clip(splats.sh, -1.5, 1.5)
@@ -142,7 +142,7 @@ def test_convert_refuses_other_endings(tmp_path, name):
     assert not (tmp_path / name).exists()
 
 
-def test_convert_refuses_what_is_no_splat_file(tmp_path):
+def test_convert_refuses_other_files(tmp_path):
     photo = tmp_path / "photo.ply"
     photo.write_bytes(b"\xff\xd8\xff\xe0\x00\x10JFIF\x00" + bytes(300))
     for path in (photo, tmp_path / "none.spz"):
@@ -153,7 +153,7 @@ def test_convert_refuses_what_is_no_splat_file(tmp_path):
     assert not (tmp_path / "scene.spz").exists()
 
 
-def test_notes_of_a_file_are_warnings(tmp_path):
+def test_ignored_parts_of_a_file_are_warnings(tmp_path):
     path = tmp_path / "scene.gltf"
     scenes.splats(degree=0).save(path)
     document = json.loads(path.read_text())

@@ -40,7 +40,7 @@ def test_far_origin_survives_a_file(tmp_path):
     assert before.max() > 0.3
 
 
-def test_no_splats_are_a_scene_too(tmp_path):
+def test_an_empty_scene_is_valid(tmp_path):
     empty = igsr.Splats(
         **{
             field.name: getattr(scenes.splats(), field.name)[:0]
@@ -103,7 +103,7 @@ def test_bounds_are_in_the_world_frame():
     assert np.allclose(high, splats.means.max(axis=0) + [10, 20, 30], atol=1e-5)
 
 
-def test_bounds_and_orbit_leave_out_what_is_not_finite():
+def test_bounds_and_orbit_ignore_nonfinite_splats():
     splats = scenes.splats()
     splats.means[3, 1] = np.nan
     splats.means[4, 0] = np.inf
@@ -115,17 +115,17 @@ def test_bounds_and_orbit_leave_out_what_is_not_finite():
     assert np.array_equal(high, splats.means[kept].max(axis=0))
     arrays = {n: a for n, a in vars(splats).items() if n not in ("origin", "antialiased")}
     clean = igsr.Splats(**{name: array[kept] for name, array in arrays.items()})
-    for ours, theirs in zip(orbit(splats, None, 3), orbit(clean, None, 3), strict=True):
+    for ours, theirs in zip(orbit(splats, [], 3), orbit(clean, [], 3), strict=True):
         assert np.array_equal(ours.viewmat, theirs.viewmat)
     splats.means[:] = np.nan
     assert splats.bounds() is None
     with pytest.raises(igsr.IgsrError, match="no finite splats"):
-        orbit(splats, None, 3)
+        orbit(splats, [], 3)
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 def test_pipes_and_devices_are_refused_at_once(tmp_path):
-    """Whoever opened a pipe that nobody writes to would wait for ever."""
+    """Opening a pipe would wait for a writer."""
     os.mkfifo(tmp_path / "pipe.ply")
     os.mkfifo(tmp_path / "pipe.bin")
     (tmp_path / "scene.gltf").write_text(

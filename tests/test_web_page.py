@@ -1,4 +1,4 @@
-"""The page of ``igsr view --web`` in a real browser: it follows what changes, and compares."""
+"""The page of ``igsr view --web`` in a real browser: updates and comparisons."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from igsr.rendering.scene_page import PageModel, write_scene_page
 BLACK = (0.0, 0.0, 0.0)
 #: Three models that no one takes for one another.
 ROUNDS = [model(0, 300), model(1), model(2, 500)]
-#: Where the view is, in the world.
+#: Position and direction of the view in the world.
 WORLD = """(({ main, viewpoint }) => {
   const { position, forward } = viewpoint.between(main.scene, { origin: [0, 0, 0], unit: 1 });
   return [...position, ...forward];
@@ -48,7 +48,7 @@ def picture(splats, camera):
 
 
 def write_round(folder, number):
-    """What a refinement has written after a round."""
+    """Write the files of a refinement after a round."""
     rounds = [{"splats": 300, "test": {"psnr": 20.0 + k}, "accepted": True} for k in range(number)]
     ROUNDS[number].save(folder / "rounds" / str(number) / "scene.ply")
     rounds.append({"splats": 300, "test": {"psnr": 20.0 + number}, "accepted": True})
@@ -68,7 +68,7 @@ def choose(browser, id, value):
     )
 
 
-def test_it_shows_round_after_round_without_a_reload(browser, tmp_path):
+def test_new_rounds_appear_without_a_reload(browser, tmp_path):
     views = [igsr.View("a.png", camera, "train", np.zeros((144, 160, 3), np.uint8))
              for camera in three_cameras()]  # fmt: skip
     with served(tmp_path) as server:
@@ -82,9 +82,7 @@ def test_it_shows_round_after_round_without_a_reload(browser, tmp_path):
             wait_for(browser, f"window.igsr.viewer.main?.scene.count === {len(ROUNDS[number])}")
             if number == 0:
                 wait_for(browser, "window.igsr.viewer.camera === 0")
-                browser.mouse("mousePressed", 300, 200, button="left", buttons=1, clickCount=1)
-                browser.mouse("mouseMoved", 360, 220, button="left", buttons=1)
-                browser.mouse("mouseReleased", 360, 220, button="left")
+                browser.drag((300, 200), (360, 220), "left")
                 before = browser.run(WORLD)
             wait_for(browser, f"document.getElementById('scores').rows.length === {number + 2}")
         assert browser.run(WORLD) == pytest.approx(before, abs=1e-6), "the view stays"
@@ -101,11 +99,11 @@ def test_it_shows_round_after_round_without_a_reload(browser, tmp_path):
         choose(browser, "shown", "round-0")
         wait_for(browser, "window.igsr.viewer.main.scene.count === 300")
         assert np.abs(drawn(browser, camera) - picture(ROUNDS[0], camera)).mean() <= MEAN
-        # A round of a new run: what is shown follows its file.
+        # A round of a new run: the page follows its file.
         ROUNDS[1].save(tmp_path / "rounds" / "0" / "scene.ply")
         wait_for(browser, "window.igsr.viewer.main.scene.count === 400")
         kept = browser.run("[...window.igsr.models.kept.values()].map((one) => one.scene.count)")
-        assert sorted(kept) == [400, 400, 500], "what has been replaced is let go"
+        assert sorted(kept) == [400, 400, 500], "replaced models are unloaded"
         assert browser.problems == []
         own = server.url.rsplit("/", 2)[0]
         assert all(url.startswith((own, f"blob:{own}", "data:")) for url in browser.requests)
@@ -138,9 +136,7 @@ def test_two_rounds_at_a_divider(browser, tmp_path):
     browser.key("ArrowRight", "ArrowRight")
     assert browser.run("window.igsr.viewer.divider") == pytest.approx(0.27)
     x = 0.27 * 640
-    browser.mouse("mousePressed", x, 200, button="left", buttons=1, clickCount=1)
-    browser.mouse("mouseMoved", 480, 200, button="left", buttons=1)
-    browser.mouse("mouseReleased", 480, 200, button="left")
+    browser.drag((x, 200), (480, 200), "left")
     assert browser.run("window.igsr.viewer.divider") == pytest.approx(0.75, abs=0.01)
     after = browser.run("window.igsr.state()")
     assert after["position"] == pytest.approx(before["position"]), "the camera stays"
@@ -150,7 +146,7 @@ def test_two_rounds_at_a_divider(browser, tmp_path):
     assert browser.problems == []
 
 
-def test_a_photo_lies_on_its_render(browser, tmp_path):
+def test_photos_align_with_renders(browser, tmp_path):
     camera = three_cameras()[0]
     photo = picture(ROUNDS[1], camera).astype(np.uint8)
     capture = igsr.Capture(tmp_path, [igsr.View("a/b.png", camera, "test", photo)])
@@ -187,7 +183,7 @@ def test_a_photo_lies_on_its_render(browser, tmp_path):
         assert exact < 0.8 * np.abs(shifted - screens[0])[middle].mean()
 
 
-def test_a_damaged_file_is_said_and_what_is_shown_stays(browser, tmp_path):
+def test_a_damaged_file_gives_a_message_and_the_old_model_stays(browser, tmp_path):
     scene = tmp_path / "scene.ply"
     ROUNDS[0].save(scene)
     with served(scene) as server:
@@ -206,7 +202,7 @@ def test_a_damaged_file_is_said_and_what_is_shown_stays(browser, tmp_path):
     assert browser.run("window.igsr.viewer.main.scene.count") == 400
 
 
-def test_names_are_text(browser, tmp_path):
+def test_names_are_shown_as_text(browser, tmp_path):
     name = "<img src=x onerror='window.broken = true'>"
     (tmp_path / name).mkdir()
     FollowedRun(tmp_path / name).tell(name, 0.1)
@@ -219,14 +215,14 @@ def test_names_are_text(browser, tmp_path):
         assert browser.problems == []
 
 
-def test_pages_that_would_be_large_show_the_last_model_alone(monkeypatch):
+def test_large_pages_contain_only_the_last_model(monkeypatch):
     models = [PageModel(str(k), splats) for k, splats in enumerate(ROUNDS)]
     assert scene_page.compared(models) == models
     monkeypatch.setattr(scene_page, "MAX_COMPARED_SPLATS", 1199)
     assert scene_page.compared(models) == models[-1:]
 
 
-def test_a_refinement_shows_itself_in_a_notebook(browser, helped, tmp_path):
+def test_notebooks_and_reports_show_a_refinement(browser, helped, tmp_path):
     refined, out, _ = helped
     wait = """<script>window.igsr = { ready: new Promise((resolve) => addEventListener("load", () =>
         frames[0].igsr.ready.then(resolve))) }</script>"""

@@ -1,4 +1,4 @@
-"""The server of ``igsr view --web``: who is answered, what is found, and what it survives."""
+"""The server of ``igsr view --web``: access, models, runs, and bad clients."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from igsr.rendering import live_view, run_folder
 from igsr.rendering.live_server import is_loopback, open_server
 from igsr.rendering.run_folder import run_background, run_progress, run_scores
 
-SECRET = b"nobody but the owner reads this"
+SECRET = b"only the owner reads this"
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +37,11 @@ def scene(tmp_path_factory):
     return path
 
 
-# ---- who is answered -----------------------------------------------------------------------------
+# ---- access --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["", "state", "surroundings", "model?id=scene", "photo?number=0"])
-def test_without_the_token_nothing_is_answered(scene, name):
+def test_requests_without_the_token_are_refused(scene, name):
     with served(scene) as server:
         right = server.token
         for wrong in (
@@ -83,7 +83,7 @@ def test_without_the_token_nothing_is_answered(scene, name):
         "static/../secret.txt",
     ],
 )
-def test_names_are_no_paths(tmp_path, scene, name):
+def test_names_are_not_used_as_paths(tmp_path, scene, name):
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "scene.ply").write_bytes(scene.read_bytes())
@@ -95,7 +95,7 @@ def test_names_are_no_paths(tmp_path, scene, name):
         assert SECRET not in content
 
 
-def test_photos_outside_of_the_folder_are_not_shown(tmp_path):
+def test_photos_outside_the_folder_are_not_served(tmp_path):
     made = scenes.capture(views=4, size=8)
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -115,7 +115,7 @@ def test_photos_outside_of_the_folder_are_not_shown(tmp_path):
         assert with_token(server, "photo?number=1")[0] == 404
 
 
-def test_a_photo_that_is_damaged_is_said(tmp_path):
+def test_a_damaged_photo_gives_an_error(tmp_path):
     made = scenes.capture(views=1, size=8)
     (tmp_path / "in.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
     view = igsr.View("in.png", made.views[0].camera, "train", made.views[0].image)
@@ -126,10 +126,10 @@ def test_a_photo_that_is_damaged_is_said(tmp_path):
         assert b"in.png cannot be shown" in content
 
 
-# ---- what it survives ----------------------------------------------------------------------------
+# ---- load and bad clients ------------------------------------------------------------------------
 
 
-def test_a_hundred_requests_at_once_pack_a_model_once(scene, monkeypatch):
+def test_concurrent_requests_pack_a_model_once(scene, monkeypatch):
     packed = []
 
     def pack(found):
@@ -144,7 +144,7 @@ def test_a_hundred_requests_at_once_pack_a_model_once(scene, monkeypatch):
     assert len(packed) == 1
 
 
-def test_browsers_that_leave_and_say_nothing_are_survived(scene, monkeypatch, caplog):
+def test_silent_and_disconnected_clients_do_no_harm(scene, monkeypatch, caplog):
     monkeypatch.setattr(live_view, "_packed", lambda found: b"x" * 20_000_000)
     with served(scene) as server:
         silent = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(20)]
@@ -163,7 +163,7 @@ def test_browsers_that_leave_and_say_nothing_are_survived(scene, monkeypatch, ca
     assert caplog.records == []
 
 
-def test_a_port_that_is_taken_is_said(scene):
+def test_a_taken_port_is_an_error(scene):
     with served(scene) as server:
         taken = server.server_port
         with pytest.raises(igsr.IgsrError, match=f"port {taken} .*--port"):
@@ -172,15 +172,15 @@ def test_a_port_that_is_taken_is_said(scene):
             open_server(server.view, "192.0.2.1", 0)
 
 
-def test_addresses_that_other_computers_reach_are_told():
+def test_loopback_addresses():
     assert all(map(is_loopback, ["127.0.0.1", "127.1.2.3", "::1", "localhost"]))
     assert not any(map(is_loopback, ["0.0.0.0", "::", "192.168.1.2", "box", ""]))
 
 
-# ---- what is found -------------------------------------------------------------------------------
+# ---- models and runs -----------------------------------------------------------------------------
 
 
-def test_a_fit_and_its_checkpoint(tmp_path):
+def test_a_running_fit_and_its_checkpoint(tmp_path):
     made = scenes.capture(views=5, size=24)
     folder = tmp_path / "out"
     folder.mkdir()
@@ -229,7 +229,7 @@ def test_a_fit_and_its_checkpoint(tmp_path):
         assert state["run"] is None
 
 
-def test_a_scene_that_lay_there_before_says_so(tmp_path):
+def test_an_older_scene_is_labeled(tmp_path):
     model().save(tmp_path / "scene.ply")
     os.utime(tmp_path / "scene.ply", (1e9, 1e9))
     followed = FollowedRun(tmp_path)
@@ -287,7 +287,7 @@ def test_a_refinement_has_rounds_and_their_scores(tmp_path):
         assert state_of(server)["newest"] == "round-10"
 
 
-def test_two_paths_are_told_apart(tmp_path, scene):
+def test_two_paths_have_different_models(tmp_path, scene):
     model(0).save(tmp_path / "other.spz")
     with served(scene, tmp_path / "other.spz") as server:
         models = state_of(server)["models"]
@@ -309,7 +309,7 @@ def test_two_paths_are_told_apart(tmp_path, scene):
         "[" * 100_000,
     ],
 )
-def test_files_of_a_run_are_untrusted(tmp_path, text):
+def test_malformed_files_of_a_run_are_ignored(tmp_path, text):
     (tmp_path / "view").mkdir()
     for name in ("report.json", "view/progress.json", "view/run.json", "view/cameras.json"):
         (tmp_path / name).write_text(text)
@@ -320,7 +320,7 @@ def test_files_of_a_run_are_untrusted(tmp_path, text):
     assert run_background(tmp_path) is None
 
 
-def test_a_run_that_is_silent_is_said(tmp_path, monkeypatch):
+def test_silent_runs_are_reported(tmp_path, monkeypatch):
     folder = tmp_path / "view"
     folder.mkdir()
     (folder / "progress.json").write_text('{"text": "fit", "done": 7}')
@@ -348,7 +348,7 @@ def started(tmp_path, *words):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # Where the tests run in the background of a shell, children would ignore Ctrl-C.
+        # Children of a background shell would ignore Ctrl-C.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
@@ -393,7 +393,7 @@ def test_the_command_serves_until_ctrl_c(tmp_path, scene, options, notices):
         (["SCENE", "--web", "--cameras", "no"], "no"),
     ],
 )
-def test_mistakes_are_said(tmp_path, scene, words, message):
+def test_mistakes_give_one_message(tmp_path, scene, words, message):
     (tmp_path / "damaged.ply").write_text("no splats")
     named = {"SCENE": scene, "DAMAGED": tmp_path / "damaged.ply"}
     process = started(tmp_path, *(named.get(word, word) for word in words))

@@ -1,4 +1,4 @@
-"""The server of ``igsr view --web`` for tests, and what they ask it."""
+"""The server of ``igsr view --web`` for tests, and requests to it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def served(*paths, cameras=None):
 
 
 def asked(server, target):
-    """Status and content of an address, without what a browser would make of it."""
+    """Request an address as it is, without normalization; return status and content."""
     with socket.create_connection(("127.0.0.1", server.server_port), timeout=30) as connection:
         connection.sendall(f"GET {target} HTTP/1.0\r\n\r\n".encode())
         answer = http.client.HTTPResponse(connection)
@@ -49,10 +49,10 @@ def state_of(server):
 
 
 def view_until_ctrl_c(command, folder, variables):
-    """What the browser view that a command starts says of its state; then it gets Ctrl-C.
+    """Start the browser view by a command, read its state, and stop it with Ctrl-C.
 
     Returns:
-        The state, the exit status and what the command wrote to stderr.
+        The state, the exit status and stderr.
     """
     process = subprocess.Popen(
         command,

@@ -27,16 +27,16 @@ logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float32]
 
-#: The arrays of splats, a row for each.
+#: The arrays of splats, one row per splat.
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
-#: Highest spherical-harmonics degree there is code for.
 MAX_SH_DEGREE = 4
 
-#: Splats of a backdrop (``igsr.rendering.backdrop``), and logit of their opacities.
-BACKDROP_SPLATS, BACKDROP_OPACITY = 200, 6.0
+#: Number of splats of a backdrop (``igsr.rendering.backdrop``), and their opacity logit.
+BACKDROP_SPLATS = 200
+BACKDROP_OPACITY = 6.0
 
-#: Endings of the files that :meth:`Splats.load` reads, in lower case.
+#: Suffixes of the files that :meth:`Splats.load` reads, in lower case.
 SPLAT_ENDINGS = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb", ".gltf")
 
 
@@ -44,19 +44,19 @@ SPLAT_ENDINGS = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb", ".gltf")
 class Splats(ArrayEquality, NotebookPicture):
     """N Gaussians with unbounded parameters, as the optimizer sees them.
 
-    Two are equal (``==``) if all their parameters are. A notebook shows them as a small render.
+    Two are equal (``==``) if all their parameters are. Notebooks show a small render.
 
     Attributes:
-        means: [N, 3] float32, centres relative to ``origin``, in the capture's world units.
-        quats: [N, 4] float32, rotations w x y z, not necessarily normalised.
+        means: [N, 3] float32, centers relative to ``origin``, world units of the capture.
+        quats: [N, 4] float32, rotations w x y z, not necessarily normalized.
         scales: [N, 3] float32, natural logarithms of the standard deviations.
         opacities: [N] float32, logits.
         sh: [N, K, 3] float32, spherical-harmonics coefficients, K = (degree + 1)^2, degree 0-4;
-            colour = max(0, 0.5 + SH(direction from camera to mean)).
+            color = max(0, 0.5 + SH(direction from camera to mean)).
         origin: [3] float64, world position that ``means`` are relative to. It keeps scenes far
             from zero (map coordinates) precise in float32.
-        antialiased: whether they were fitted, and must be drawn, with antialiased opacities
-            (Mip-Splatting's 2D filter).
+        antialiased: whether opacities are antialiased (Mip-Splatting's 2D filter), in the fit and
+            in renders.
 
     Raises:
         IgsrError: an array has the wrong shape or dtype; the message names it.
@@ -110,47 +110,44 @@ class Splats(ArrayEquality, NotebookPicture):
 
     @property
     def backdrop_splats(self) -> int:
-        """How many splats, the last ones, are a backdrop (``igsr.rendering.backdrop``), or 0.
+        """Number of the last splats that are a backdrop (``igsr.rendering.backdrop``), or 0.
 
-        They are known by their shapes, which are all alike, so only in formats that keep numbers as
-        they are.
+        A backdrop is recognized by its equal shapes, so only in formats without loss.
         """
-        last = slice(len(self) - BACKDROP_SPLATS, None)
         if len(self) < BACKDROP_SPLATS:
             return 0
-        alike = (
+        last = slice(len(self) - BACKDROP_SPLATS, None)
+        equal = (
             (self.opacities[last] == np.float32(BACKDROP_OPACITY)).all()
             and (self.scales[last] == self.scales[-1, 0]).all()
             and (self.quats[last] == [1.0, 0.0, 0.0, 0.0]).all()
             and (self.sh[last, 1:] == 0.0).all()
         )
-        return BACKDROP_SPLATS if alike else 0
+        return BACKDROP_SPLATS if equal else 0
 
     def without_backdrop(self) -> Splats:
-        """The splats without their backdrop; the same ones if they have none."""
-        kept = len(self) - self.backdrop_splats
-        if kept == len(self):
-            return self
-        return subset(self, slice(kept))
+        """Return the splats without their backdrop, or ``self`` if they have none."""
+        count = self.backdrop_splats
+        return subset(self, slice(len(self) - count)) if count else self
 
     def with_backdrop_of(self, other: Splats) -> Splats:
-        """The splats, which have no backdrop, and behind them that of another scene, if it has one.
+        """Add the backdrop of another scene, if it has one, to splats without a backdrop.
 
         Args:
-            other: in the same world; its spherical harmonics may have another degree.
+            other: a scene in the same world; its SH degree may differ.
         """
         count = other.backdrop_splats
         if not count:
             return self
         last = slice(-count, None)
         sh = np.zeros((count, *self.sh.shape[1:]), np.float32)
-        sh[:, 0] = other.sh[last, 0]  # it has no other bands
+        sh[:, 0] = other.sh[last, 0]  # further bands are zero
         means = (other.means[last] + (other.origin - self.origin)).astype(np.float32)
         return joined([self, replace(subset(other, last), means=means, sh=sh)])
 
     @property
     def finite(self) -> npt.NDArray[np.bool_]:
-        """bool [N]: which splats have only finite parameters. The others are not drawn."""
+        """bool [N], whether all parameters are finite. Splats with other ones are not drawn."""
         finite: npt.NDArray[np.bool_] = np.isfinite(self.opacities)
         for rows in (self.means, self.quats, self.scales):
             finite &= np.isfinite(rows).all(axis=1)
@@ -158,10 +155,10 @@ class Splats(ArrayEquality, NotebookPicture):
         return finite
 
     def bounds(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
-        """The box around the centres of the finite splats, in the world frame.
+        """Compute the box around the centers of the finite splats.
 
         Returns:
-            Its lowest and highest corner, float64 [3] each; None if no splat is finite.
+            Lower and upper corner, float64 [3], world frame; None if no splat is finite.
         """
         world = self.means[self.finite].astype(np.float64) + self.origin
         if len(world) == 0:
@@ -175,27 +172,24 @@ class Splats(ArrayEquality, NotebookPicture):
         *,
         origin: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> dict[str, Any]:
-        """The arguments of ``igsr.rasterization`` that describe these splats.
+        """Return the splats as arguments of ``igsr.rasterization`` or gsplat's.
 
         ``rasterization(**splats.to_torch(), viewmats=..., Ks=..., width=..., height=...)`` draws
-        what ``igsr.render`` draws. gsplat's ``rasterization`` takes the same arguments.
-
-        ``rasterization`` takes activated parameters: scales are positive lengths and opacities lie
-        in [0, 1], where ``Splats`` holds logarithms and logits. A gradient of the returned tensors
-        is one of the activated parameters.
+        the same as ``igsr.render``. The parameters are activated: scales are lengths and opacities
+        are in [0, 1], not logarithms and logits.
 
         Args:
-            device: where the tensors lie; None is the CPU.
+            device: of the tensors; None is the CPU.
             requires_grad: whether the tensors are leaves that collect gradients.
-            origin: [3], world position that the returned means are relative to. Zero puts them
-                into the world frame, which in float32 is coarse for a scene far from zero (map
-                coordinates). Give ``splats.origin`` there, and move the cameras along:
-                ``viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin``, in float64.
+            origin: [3], world position that the returned means are relative to. Zero is too coarse
+                in float32 for a scene far from zero (map coordinates). Use ``splats.origin`` then,
+                and move the cameras: ``viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin``, in
+                float64.
 
         Returns:
             "means" [N, 3], "quats" [N, 4] (w x y z), "scales" [N, 3], "opacities" [N] and "colors"
-            [N, K, 3] (spherical harmonics), all float32; "sh_degree", int; and "rasterize_mode",
-            "antialiased" or "classic". The tensors share no memory with the splats.
+            [N, K, 3] (spherical harmonics), all float32 copies; "sh_degree", int; and
+            "rasterize_mode", "antialiased" or "classic".
 
         Raises:
             IgsrError: ``origin`` is not three finite numbers.
@@ -230,39 +224,38 @@ class Splats(ArrayEquality, NotebookPicture):
         background: Sequence[float] = (0.0, 0.0, 0.0),
         height: int = 480,
     ) -> Any:
-        """A viewer for notebooks: return it from a cell, then drag to orbit.
+        """Make a viewer for notebooks: return it from a cell, then drag to orbit.
 
         Args:
-            capture: an ``igsr.Capture``, whose cameras to jump to; the view starts at the first.
-                None starts at the whole scene.
+            capture: an ``igsr.Capture`` with cameras to jump to; the view starts at the first one.
+                None starts with a view of the whole scene.
             background: RGB in [0, 1] behind the splats.
             height: of the viewer, pixels.
 
         Returns:
-            An object that notebooks show (``_repr_html_``): the page that ``igsr convert`` writes.
+            An object with ``_repr_html_``: the page that ``igsr convert`` writes.
 
         Raises:
             IgsrError: an argument cannot be used, or the page cannot hold the splats.
         """
-        # By name: the viewer lies in a room above this one.
+        # By name, since the viewer imports this module.
         page = pkgutil.resolve_name("igsr.rendering.notebook_page:notebook_page")
         return page(self, capture, background, height)
 
     def save(self, path: str | os.PathLike[str]) -> list[str]:
-        """Write a file; the ending of ``path`` sets its format.
+        """Write a file in the format of its suffix.
 
-        ``.ply`` (INRIA's, which holds everything), ``.compressed.ply``, ``.splat``, ``.spz``,
-        ``.sog``, ``.glb`` or ``.gltf``. The file is written whole or not at all: after a failure,
-        an older file of that name is still there.
+        ``.ply`` (INRIA's, lossless), ``.compressed.ply``, ``.splat``, ``.spz``, ``.sog``, ``.glb``
+        or ``.gltf``. If writing fails, an older file stays as it is.
 
         Args:
-            path: the file; its folder is made if it is missing.
+            path: the file; its folder is created.
 
         Returns:
-            A message for each thing that the format cannot hold.
+            Messages about data that the format cannot hold.
 
         Raises:
-            IgsrError: the file cannot be written, or its ending is none of these.
+            IgsrError: the file cannot be written, or its suffix is unknown.
         """
         try:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -274,22 +267,18 @@ class Splats(ArrayEquality, NotebookPicture):
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Splats:
-        """Read a splat file: what :meth:`save` writes, or ``.ksplat``.
+        """Read a splat file: any format of :meth:`save`, or ``.ksplat``.
 
-        The content decides which format it is, not the ending. A ``UserWarning`` names each part
-        of the file that is ignored.
+        The format is detected from the content. A ``UserWarning`` names ignored parts of the file.
 
         Args:
             path: the file.
 
-        Returns:
-            The splats.
-
         Raises:
-            IgsrError: there is no such file, or it is not a splat file; the message says why.
+            IgsrError: the file does not exist or is not a splat file; the message says why.
         """
         if Path(path).exists() and not Path(path).is_file() and not Path(path).is_dir():
-            raise IgsrError(f"{path} is a pipe or a device; save what it gives to a file first.")
+            raise IgsrError(f"{path} is a pipe or a device; save its content to a file first.")
         if (Path(path) / _core.LEVELS_INDEX).is_file():
             raise IgsrError(
                 f"{path} is a scene in levels of detail; splat-view draws it, and a level's "
@@ -309,17 +298,12 @@ class Splats(ArrayEquality, NotebookPicture):
 
 
 def subset(splats: Splats, chosen: npt.NDArray[np.bool_] | slice) -> Splats:
-    """The chosen splats, in their order.
-
-    Args:
-        splats: the scene.
-        chosen: bool [N], or a slice.
-    """
+    """Return the ``chosen`` splats, bool [N] or a slice."""
     return replace(splats, **{name: getattr(splats, name)[chosen] for name in PARAMETERS})
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Splats of one origin and SH degree as one scene, in this order."""
+    """Concatenate splats of the same origin and SH degree."""
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in PARAMETERS
     }

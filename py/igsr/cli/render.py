@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import Backend
-from igsr.capture import Camera, Capture, load_capture
+from igsr.capture import Camera, View, load_capture
+from igsr.capture.downscaling import reduced_size, resized_camera
 from igsr.cli.error_messages import error_messages
 from igsr.cli.options import (
     NAMED_COLORS,
@@ -27,6 +29,8 @@ from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background
 from igsr.geometry.camera_paths import orbit
 from igsr.rendering.renders import render
+from igsr.rendering.run_folder import CAMERAS, Color, background_beside, cameras_of
+from igsr.rendering.scene_page import PageCamera
 from igsr.splats import Splats
 
 
@@ -37,7 +41,11 @@ def render_command(
     ],
     cameras: Annotated[
         Path | None,
-        option("--cameras", metavar="CAPTURE", help="Render from the cameras of a capture."),
+        option(
+            "--cameras",
+            metavar="CAPTURE",
+            help="Render from the cameras of a capture, or of the folder of a fit.",
+        ),
     ] = None,
     orbit_frames: Annotated[
         int | None,
@@ -63,18 +71,17 @@ def render_command(
     with error_messages():
         name = resolved(backend)
         splats = Splats.load(scene)
-        capture = None if cameras is None else load_capture(cameras, max_size)
-        color = background_color(background) or (
-            NAMED_COLORS["black"] if capture is None else default_background(capture)
-        )
+        views, default_color = _views(scene, cameras, max_size)
+        color = background_color(background) or default_color
         if orbit_frames is not None:
             if exr:
                 raise IgsrError("--exr writes images and --orbit writes a video; leave one out.")
             if out.suffix.lower() not in (".mp4", ".mkv", ".mov"):
                 raise IgsrError(f"--out {out} must be a video file such as orbit.mp4 with --orbit.")
-            files = [_write_orbit(splats, orbit(splats, capture, orbit_frames), out, color, name)]
-        elif capture is not None:
-            files = _write_pictures(splats, capture, out, color, name, exr)
+            path = orbit(splats, [view.camera for view in views], orbit_frames)
+            files = [_write_orbit(splats, path, out, color, name)]
+        elif views:
+            files = _write_pictures(splats, views, out, color, name, exr)
         else:
             raise IgsrError("Give the cameras: --cameras CAPTURE, --orbit FRAMES, or both.")
     if as_json:
@@ -85,11 +92,28 @@ def render_command(
         )
 
 
+def _views(
+    scene: Path, cameras: Path | None, max_size: int | None
+) -> tuple[Sequence[View | PageCamera], Color]:
+    """Cameras with their names, and the default background."""
+    black = NAMED_COLORS["black"]
+    if cameras is None:
+        return [], black
+    if CAMERAS in (cameras.name, *(path.name for path in cameras.glob("*.json"))):
+        views = []
+        for view in cameras_of(cameras):
+            size = reduced_size(view.camera.width, view.camera.height, max_size)
+            views.append(PageCamera(view.name, resized_camera(view.camera, *size)))
+        return views, background_beside(scene) or black
+    capture = load_capture(cameras, max_size)
+    return capture.views, default_background(capture)
+
+
 def _write_orbit(
     splats: Splats,
     path_cameras: list[Camera],
     out: Path,
-    background: tuple[float, float, float],
+    background: Color,
     backend: Backend,
 ) -> Path:
     from igsr.rendering.video import write_video
@@ -101,9 +125,9 @@ def _write_orbit(
 
 def _write_pictures(
     splats: Splats,
-    capture: Capture,
+    views: Sequence[View | PageCamera],
     out: Path,
-    background: tuple[float, float, float],
+    background: Color,
     backend: Backend,
     exr: bool,
 ) -> list[Path]:
@@ -111,7 +135,7 @@ def _write_pictures(
 
     suffix = ".exr" if exr else ".png"
     files: list[Path] = []
-    for view in capture.views:
+    for view in views:
         path = out / picture_name(view.name, suffix)
         if path in files:
             path = out / picture_name(view.name + suffix, suffix)

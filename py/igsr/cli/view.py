@@ -25,16 +25,14 @@ from igsr.capture.write_files import png_names
 from igsr.cli.error_messages import INTERRUPTED, error_messages, print_message
 from igsr.cli.web_view import has_display, serve_web_view
 from igsr.errors import IgsrError
+from igsr.rendering.run_folder import CAMERAS, VIEW
 
 PROGRAM = (sys.executable, "-m", "igsr.rendering.window")
 #: Do not import modules from the current folder.
 ENVIRONMENT = {"PYTHONSAFEPATH": "1"}
 #: Options of the viewer that open no window.
 WITHOUT_WINDOW = ("--screenshot", "--frames", "--time", "--help", "-h", "--version")
-CAMERAS = "cameras.json"
 OWN_HOST = "127.0.0.1"
-#: Subfolder of a run with photos and cameras for the page.
-VIEW = "view"
 #: Unknown options are the viewer's.
 PASSED_ON = {"ignore_unknown_options": True}
 #: Longest side of the photos for the viewer.

@@ -77,9 +77,6 @@ def refined(
         seed: of the order of views and the colors.
         backend: "auto", "cpu" or "gpu".
         on_steps: called with the number of steps done.
-
-    Raises:
-        IgsrError: the views or splats cannot be used; the message names the reason.
     """
     degree = round(state["sh"].shape[1] ** 0.5) - 1
     # The learning rates of the last third of a fit suit a nearly correct model.

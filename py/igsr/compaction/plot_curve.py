@@ -14,14 +14,11 @@ RESULT_COLOR = "#009e73"
 
 
 def write_plot(path: Path, report: dict[str, Any]) -> None:
-    """Plot the loss against the number of splats and against bytes, as PNG.
+    """Plot the loss against the number of splats and against bytes.
 
     Args:
-        path: the file to write.
+        path: the PNG to write.
         report: ``Compaction.report``.
-
-    Raises:
-        IgsrError: the file cannot be written.
     """
     from matplotlib.figure import Figure
 

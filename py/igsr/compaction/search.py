@@ -7,7 +7,7 @@ import numbers
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -290,9 +290,7 @@ class _Search:
             "splats": len(model),
             "sh_degree": model.sh_degree,
             "bytes": size,
-            "loss": score.loss,
-            "psnr": score.psnr,
-            "ssim": score.ssim,
+            **asdict(score),
             "settled": settled,
             "seconds": round(time.perf_counter() - started, 3),
         }

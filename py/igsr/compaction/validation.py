@@ -90,11 +90,7 @@ def loss_of_change(psnr: float, model_psnr: float) -> float:
 def photo_validation(
     splats: Splats, capture: Capture, background: Sequence[float] | None, backend: Backend
 ) -> Validation:
-    """Validate on photos: the test views, or held-out train views if there are none.
-
-    Raises:
-        IgsrError: it has no view to train on, or none to validate on.
-    """
+    """Validate on photos: the test views, or held-out train views if there are none."""
     if not capture.test_views and len(capture.views) >= 2:
         capture = capture.with_holdout(min(PHOTO_HOLDOUT, len(capture.views)))
     if not capture.test_views or not capture.train_views:
@@ -119,11 +115,7 @@ def photo_validation(
 def self_validation(
     splats: Splats, background: Sequence[float] | None, psnr: float | None, backend: Backend
 ) -> Validation:
-    """Validate on renders of the original model, from cameras around it.
-
-    Raises:
-        IgsrError: no splat is finite.
-    """
+    """Validate on renders of the original model, from cameras around it."""
     color = _triple(GRAY if background is None else background)
     train_views, validation_views = [], []
     for i, camera in enumerate(cameras_around(splats, AROUND_CAMERAS, AROUND_SIDE_PX)):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from igsr.denoiser.cleaning import Denoiser, NetworkDenoiser, denoise
     from igsr.denoiser.named import named_denoiser
     from igsr.denoiser.single_step import SingleStepDenoiser
-    from igsr.denoiser.warping import Source, Warped, photo_sources, warp_photos
+    from igsr.denoiser.warping import Source, photo_sources
     from igsr.denoiser.weights import load_network, save_network
 
 __all__ = [
@@ -27,7 +27,6 @@ __all__ = [
     "NetworkDenoiser",
     "SingleStepDenoiser",
     "Source",
-    "Warped",
     "denoise",
     "load_network",
     "named_denoiser",
@@ -35,7 +34,6 @@ __all__ = [
     "photo_support",
     "render_buffers",
     "save_network",
-    "warp_photos",
 ]
 
 if not TYPE_CHECKING:
@@ -46,7 +44,7 @@ if not TYPE_CHECKING:
             "igsr.denoiser.cleaning": ("Denoiser", "NetworkDenoiser", "denoise"),
             "igsr.denoiser.named": ("named_denoiser",),
             "igsr.denoiser.single_step": ("SingleStepDenoiser",),
-            "igsr.denoiser.warping": ("Source", "Warped", "photo_sources", "warp_photos"),
+            "igsr.denoiser.warping": ("Source", "photo_sources"),
             "igsr.denoiser.weights": ("load_network", "save_network"),
         },
     )

@@ -30,17 +30,10 @@ def error_of(confidence: Float32) -> Float32:
 
 
 def claimed_by_change(render: Float32, picture: Float32) -> Float32:
-    """Estimate the error of a denoised picture that comes without a confidence.
+    """Estimate the error [H, W] of a denoised picture that comes without a confidence.
 
     Large changes mean large errors, and part of an error remains: the estimate is the mean absolute
     change around each pixel, plus ``MIN_CLAIMED_ERROR``.
-
-    Args:
-        render: float [H, W, 3], before denoising.
-        picture: float [H, W, 3], after denoising.
-
-    Returns:
-        Expected absolute error, float32 [H, W].
     """
     change = torch.from_numpy(np.abs(picture - np.nan_to_num(render)).mean(axis=-1))
     window = 2 * CHANGE_RADIUS_PX + 1

@@ -93,7 +93,7 @@ def warp_photos(
     Args:
         camera: of the render.
         depth: [H, W], mean z along the camera's axis, world units.
-        alpha: [H, W]; pixels below ``SURFACE_ALPHA`` have no surface.
+        alpha: [H, W].
         sources: the photos.
         keep: number of photos to keep per pixel, K.
     """

@@ -11,7 +11,6 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from igsr._internal.atomic_write import atomic_write
-from igsr.evaluation.metrics import flip_map
 from igsr.evaluation.scores import ScoredView
 
 #: Maximum number of views on a contact sheet.
@@ -39,18 +38,20 @@ def sheet_names(names: Sequence[str]) -> set[str]:
 
 
 def error_picture(scored: ScoredView) -> npt.NDArray[np.uint8]:
-    """Draw the absolute error of a render, averaged over the channels, in false color.
+    """Draw the absolute error, mean over channels, in false color; masked pixels are gray."""
+    from matplotlib import colormaps
 
-    Returns:
-        uint8 [H, W, 3]: matplotlib's "inferno" up to ``ERROR_WHITE``; masked pixels are gray.
-    """
     difference = np.abs(scored.render.astype(np.float32) - scored.photo).mean(axis=2) / 255.0
-    return _false_color(difference / ERROR_WHITE, "inferno", scored)
+    shade = np.clip(difference / ERROR_WHITE, 0.0, 1.0)
+    picture = np.asarray(colormaps["inferno"](shade, bytes=True))[..., :3].copy()
+    if scored.mask is not None:
+        picture[~scored.mask] = MASKED_GRAY
+    return picture
 
 
 def contact_sheet(views: Sequence[ScoredView]) -> Image.Image:
     """Draw photo, render and error of each view, labeled with its name and PSNR."""
-    return _sheet(
+    return panels_sheet(
         [
             [
                 (one.photo, one.name),
@@ -62,52 +63,9 @@ def contact_sheet(views: Sequence[ScoredView]) -> Image.Image:
     )
 
 
-def flip_picture(scored: ScoredView) -> npt.NDArray[np.uint8]:
-    """Draw the FLIP error of each pixel in false color.
-
-    Returns:
-        uint8 [H, W, 3]: matplotlib's "magma" from 0 to 1; masked pixels are gray.
-    """
-    errors = flip_map(scored.render, scored.photo, scored.mask)
-    return _false_color(errors, "magma", scored)
-
-
-def _false_color(
-    errors: npt.NDArray[np.float32], colormap: str, scored: ScoredView
-) -> npt.NDArray[np.uint8]:
-    from matplotlib import colormaps
-
-    colors = colormaps[colormap](np.clip(errors, 0.0, 1.0), bytes=True)
-    picture = np.asarray(colors)[..., :3].copy()
-    if scored.mask is not None:
-        picture[~scored.mask] = MASKED_GRAY
-    return picture
-
-
-def flip_sheet(views: Sequence[ScoredView], side: int = PANEL_SIDE_PX) -> Image.Image:
-    """Draw photo, render and FLIP error of each view, one view per row.
-
-    Args:
-        views: at least one.
-        side: longest side of a picture on the sheet, pixels.
-    """
-    return _sheet(
-        [
-            [
-                (one.photo, one.name),
-                (one.render, f"render  {one.scores['psnr']:.2f} dB"),
-                (flip_picture(one), f"FLIP {one.scores['flip']:.4f}"),
-            ]
-            for one in views
-        ],
-        columns=1,
-        side=side,
-    )
-
-
 def rounds_sheet(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> Image.Image:
     """Draw each photo with its render after the first fit and after the last round."""
-    return _sheet(
+    return panels_sheet(
         [
             [
                 (one.photo, one.name),
@@ -119,11 +77,12 @@ def rounds_sheet(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> I
     )
 
 
-def _sheet(
+def panels_sheet(
     rows_of_panels: Sequence[Sequence[tuple[npt.NDArray[np.uint8], str]]],
     columns: int | None = None,
     side: int = PANEL_SIDE_PX,
 ) -> Image.Image:
+    """Draw rows of labeled pictures, each picture at most ``side`` pixels long, in columns."""
     if not rows_of_panels:
         raise ValueError("views: a contact sheet needs at least one")
     if columns is None:
@@ -144,11 +103,7 @@ def _sheet(
 
 
 def save_sheet(path: Path, sheet: Image.Image) -> None:
-    """Write a contact sheet as PNG.
-
-    Raises:
-        IgsrError: the file cannot be written.
-    """
+    """Write a contact sheet as PNG."""
     with atomic_write(path) as temporary:
         sheet.save(temporary, format="PNG", optimize=True)
 

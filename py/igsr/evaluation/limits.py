@@ -62,8 +62,8 @@ def limit_of(train: float, held_out: float | None = None, refined: float | None 
 
     Args:
         train: mean PSNR of fitted photos, dB.
-        held_out: mean PSNR of held-out photos with their given cameras, dB; None without them.
-        refined: the same with refined cameras, or None.
+        held_out: of held-out photos with their given cameras, dB; None without them.
+        refined: of held-out photos with refined cameras, dB; or None.
     """
     left = max(0.0, REPRODUCED_DB - train)
     if held_out is None:

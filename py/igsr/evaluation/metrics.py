@@ -89,14 +89,10 @@ def _planes(picture: Image) -> Planes:
 
 
 def _windowed(x: Planes, y: Planes) -> Iterator[tuple[slice, Planes, Planes, Planes, Planes]]:
-    """Compute the terms of SSIM, in strips of rows.
+    """Compute the terms of SSIM of ``x``, ``y`` [C, H + 10, W + 10], in strips of rows.
 
-    Args:
-        x, y: float64 [C, H + 10, W + 10] in [0, 1].
-
-    Yields:
-        A slice of the H rows; numerator and denominator of the luminance term, then of the
-        contrast and structure term, float64 [C, rows, W] each.
+    Yields a slice of the H rows; numerator and denominator of the luminance term, then of the
+    contrast and structure term, float64 [C, rows, W] each.
     """
     offset = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     window = np.exp(-(offset**2) / (2.0 * SSIM_SIGMA**2))
@@ -133,11 +129,8 @@ def _windowed(x: Planes, y: Planes) -> Iterator[tuple[slice, Planes, Planes, Pla
 def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float | None:
     """Compute the multi-scale SSIM (Wang et al. 2003) as torchmetrics does.
 
-    Five scales, 11 x 11 Gaussian window with sigma 1.5, negative terms set to 0. There is
-    no map per pixel, so masked pixels count as equal.
-
-    Returns:
-        The score, or None if the shorter side is less than 176 pixels.
+    Five scales, 11 x 11 Gaussian window with sigma 1.5, negative terms set to 0. There is no map
+    per pixel, so masked pixels count as equal. None if the shorter side is less than 176 pixels.
     """
     render, photo, _ = _checked(render, photo, mask)
     if min(photo.shape[:2]) < MS_SSIM_MIN_SIDE:
@@ -168,51 +161,39 @@ def _halved(planes: Planes) -> Planes:
     return np.asarray(even.reshape(channels, height // 2, 2, width // 2, 2).mean(axis=(2, 4)))
 
 
-def flip_map(render: Image, photo: Image, mask: Mask | None = None) -> npt.NDArray[np.float32]:
-    """Compute the LDR-FLIP error of each pixel, float32 [H, W]; see ``flip``."""
-    return _flip(*_checked(render, photo, mask)[:2], compute_mean=False)[0]
-
-
 def flip(render: Image, photo: Image, mask: Mask | None = None) -> float:
     """Compute the mean LDR-FLIP error (Andersson et al. 2020): 0 for equal pictures, at worst 1.
 
     flip-evaluator's defaults: 67 pixels per degree (0.7 m from a 0.7 m wide 4K monitor).
     """
     render, photo, mask = _checked(render, photo, mask)
-    error_map, mean = _flip(render, photo, compute_mean=True)
-    return mean if mask is None else float(error_map[mask].mean())
+    errors, mean = flip_errors(render, photo)
+    return mean if mask is None else float(errors[mask].mean())
 
 
-def _flip(render: Image, photo: Image, compute_mean: bool) -> tuple[npt.NDArray[np.float32], float]:
+def flip_errors(render: Image, photo: Image) -> tuple[npt.NDArray[np.float32], float]:
+    """Compute the LDR-FLIP error of each pixel, float32 [H, W], and their mean."""
     import flip_evaluator
 
-    error_map, mean, _ = flip_evaluator.evaluate(
+    errors, mean, _ = flip_evaluator.evaluate(
         photo.astype(np.float32) / 255.0,
         render.astype(np.float32) / 255.0,
         "LDR",
         inputsRGB=True,
         applyMagma=False,
-        computeMeanError=compute_mean,
+        computeMeanError=True,
     )
-    per_pixel = np.asarray(error_map, np.float32).reshape(*photo.shape[:2], -1)[..., 0]
-    return per_pixel, float(mean)
+    return np.asarray(errors, np.float32).reshape(*photo.shape[:2], -1)[..., 0], float(mean)
 
 
 def color_corrected(render: Image, photo: Image, mask: Mask | None = None) -> Image:
     """Map the render's colors to the photo's by a quadratic polynomial of R, G and B.
 
     This removes differences of exposure, white balance and tone. Each channel is fitted by least
-    squares to pixels that are not clipped in either picture, five times, each time on the previous
-    result. The method is ``color_correct`` of Mip-NeRF 360 (Barron et al. 2022, multinerf
-    ``internal/image.py``) and of gsplat's cc_psnr, but rounds to 8 bits.
-
-    Args:
-        render: uint8 [H, W, 3].
-        photo: uint8 [H, W, 3].
-        mask: bool [H, W], True for pixels to fit to; all pixels are mapped.
-
-    Returns:
-        uint8 [H, W, 3]. Channels with too few pixels to fit to do not change.
+    squares to pixels that count and are not clipped in either picture, five times, each time on the
+    previous result; channels with too few such pixels do not change. The method is
+    ``color_correct`` of Mip-NeRF 360 (Barron et al. 2022, multinerf ``internal/image.py``) and of
+    gsplat's cc_psnr, but rounds to 8 bits.
     """
     render, photo, mask = _checked(render, photo, mask)
     target, colors = (_planes(picture).reshape(3, -1) for picture in (photo, render))
@@ -256,17 +237,9 @@ def _quadratic(colors: Planes) -> Planes:
 def score(
     render: Image, photo: Image, mask: Mask | None = None, names: Sequence[str] = METRICS
 ) -> dict[str, float | None]:
-    """Compute several metrics of one picture.
+    """Compute the metrics ``names`` of one picture; "ms_ssim" is None for small pictures.
 
-    Args:
-        render: uint8 [H, W, 3].
-        photo: uint8 [H, W, 3].
-        mask: bool [H, W], True for pixels that count.
-        names: metrics to compute, of ``METRICS``; "cc_psnr" and "cc_ssim" are of the render after
-            ``color_corrected``.
-
-    Returns:
-        The scores by name; "ms_ssim" is None for small pictures.
+    "cc_psnr" and "cc_ssim" are of the render after ``color_corrected``.
     """
     metrics = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "flip": flip}
     scores = {name: metrics[name](render, photo, mask) for name in metrics if name in names}

@@ -34,31 +34,13 @@ def train_scores(
     background: Sequence[float],
     backend: Backend = "auto",
 ) -> dict[str, Any]:
-    """Score ``train_photos`` and return ``mean_of`` them.
-
-    Args:
-        splats: the scene.
-        capture: photos and cameras.
-        background: RGB in [0, 1] behind renders and photos with alpha.
-        backend: "auto", "cpu", "gpu" or "reference".
-
-    Raises:
-        IgsrError: a mask leaves no pixel to score.
-    """
+    """Score ``train_photos`` and return ``mean_of`` them."""
     scored = quick_views(splats, train_photos(capture), background, backend)
     return mean_of(list(scored), len(capture.train_views))
 
 
 def mean_of(scored: Sequence[ScoredView], count: int) -> dict[str, Any]:
-    """Average scored views, for reports.
-
-    Args:
-        scored: with "psnr" and "ssim".
-        count: number of photos that ``scored`` were taken from.
-
-    Returns:
-        Mean "psnr" in dB and "ssim", number of scored "views", and ``count`` as "of".
-    """
+    """Average the scores of some of ``count`` photos: "psnr", "ssim", "views" and "of"."""
     return {
         "psnr": float(np.mean([one.scores["psnr"] for one in scored])),
         "ssim": float(np.mean([one.scores["ssim"] for one in scored])),

@@ -38,17 +38,7 @@ PHOTO, ADDED, REJECTED = 0, 1, 2
 
 
 def write_template(path: Path, templates: Path, name: str, variables: Mapping[str, Any]) -> None:
-    """Write a page.
-
-    Args:
-        path: the file to write.
-        templates: folder of the page's template.
-        name: of the template.
-        variables: of the template.
-
-    Raises:
-        IgsrError: the file cannot be written.
-    """
+    """Write a page from the template ``name`` in the folder ``templates``."""
     shared = Path(__file__).with_name("templates")
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([templates, shared]),
@@ -64,11 +54,7 @@ def write_template(path: Path, templates: Path, name: str, variables: Mapping[st
 
 
 def beside(views: Sequence[ScoredView]) -> list[dict[str, Any]]:
-    """Prepare photo, render and error of each view for the template.
-
-    Args:
-        views: with "psnr" among their scores.
-    """
+    """Prepare photo, render and error of each view, scored by PSNR, for the template."""
     return [
         {
             "name": one.name,
@@ -118,12 +104,7 @@ def fitted_cameras(capture: Capture) -> list[PageCamera]:
 def part_rows(
     parts: Mapping[str, Mapping[str, Any]], names: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Return the rows of the table of time and memory.
-
-    Args:
-        parts: usage of each part, from the report.
-        names: display names of parts; the default is the part's name.
-    """
+    """Return the rows of the table of time and memory; ``names`` are display names of parts."""
     return [{"name": names.get(name, name), **usage} for name, usage in parts.items()]
 
 
@@ -156,12 +137,7 @@ def drawn_cameras(
 
 
 def jpeg(picture: npt.NDArray[np.uint8], longest: int) -> str:
-    """Encode a picture, uint8 [H, W] or [H, W, 3], as JPEG in base64.
-
-    Args:
-        picture: the picture.
-        longest: maximum longest side, pixels.
-    """
+    """Encode a picture, uint8 [H, W] or [H, W, 3], as JPEG of ``longest`` pixels in base64."""
     image = Image.fromarray(picture)
     image.thumbnail((longest, longest), Image.Resampling.BOX)
     file = io.BytesIO()

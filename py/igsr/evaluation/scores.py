@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -48,89 +48,37 @@ class ScoredView(ArrayEquality):
         return f"ScoredView({self.name!r}, PSNR {self.scores['psnr']:.2f} dB)"
 
 
-class ViewScores(TypedDict):
-    """The scores of one view: a row of ``Scores.views``."""
+class Scores(dict[str, Any]):
+    """Mean scores over the views of a split, and the scores of each view.
 
-    name: str
+    A dictionary whose items are also typed attributes: ``scores["psnr"]`` is ``scores.psnr``.
+
+    Attributes:
+        psnr: peak signal-to-noise ratio in dB, at most 100; higher is better.
+        ssim: structural similarity, 1 for equal pictures; higher is better.
+        ms_ssim: multi-scale SSIM over the views that are large enough; None if none is.
+        flip: LDR-FLIP error, 0 for equal pictures; lower is better.
+        cc_psnr: PSNR in dB after color correction, which removes exposure and white balance.
+        cc_ssim: SSIM after color correction.
+        protocol: the evaluation protocol: "split", "views", "background" and descriptions.
+        views: of each view: "name", its scores by name, "width", "height" and "masked".
+    """
+
     psnr: float
     ssim: float
     ms_ssim: float | None
     flip: float
     cc_psnr: float
     cc_ssim: float
-    width: int
-    height: int
-    masked: bool
+    protocol: dict[str, Any]
+    views: list[dict[str, Any]]
 
+    if not TYPE_CHECKING:
 
-class Protocol(TypedDict, total=False):
-    """Evaluation protocol, for reports.
-
-    ``split`` is "test" or "train", ``views`` the number of views, ``background`` RGB in [0, 1];
-    ``pixels``, ``ssim``, ``flip`` and ``color_correction`` are descriptions. Commands add
-    ``holdout`` (every ``holdout``-th view is a test view) and ``of`` (number of views that the
-    scored ones, evenly spaced, were taken from).
-    """
-
-    split: str
-    views: int
-    background: list[float]
-    pixels: str
-    ssim: str
-    flip: str
-    color_correction: str
-    holdout: int | None
-    of: int
-
-
-class Scores(dict[str, Any]):
-    """Mean scores over the views of a split, and the scores of each view.
-
-    A dictionary whose items are also typed attributes: ``scores["psnr"]`` is ``scores.psnr``.
-    """
-
-    @property
-    def psnr(self) -> float:
-        """Peak signal-to-noise ratio in dB, at most 100. Higher is better."""
-        return float(self["psnr"])
-
-    @property
-    def ssim(self) -> float:
-        """Structural similarity, 1 for equal pictures. Higher is better."""
-        return float(self["ssim"])
-
-    @property
-    def ms_ssim(self) -> float | None:
-        """Multi-scale SSIM over the views that are large enough for it, or None if none is."""
-        value: float | None = self["ms_ssim"]
-        return value
-
-    @property
-    def flip(self) -> float:
-        """LDR-FLIP error, 0 for equal pictures. Lower is better."""
-        return float(self["flip"])
-
-    @property
-    def cc_psnr(self) -> float:
-        """PSNR in dB after color correction, which removes exposure and white balance."""
-        return float(self["cc_psnr"])
-
-    @property
-    def cc_ssim(self) -> float:
-        """SSIM after color correction."""
-        return float(self["cc_ssim"])
-
-    @property
-    def protocol(self) -> Protocol:
-        """The evaluation protocol."""
-        protocol: Protocol = self["protocol"]
-        return protocol
-
-    @property
-    def views(self) -> list[ViewScores]:
-        """The scores of each view, in the order of the capture."""
-        views: list[ViewScores] = self["views"]
-        return views
+        def __getattr__(self, name: str) -> Any:
+            if name not in Scores.__annotations__:
+                raise AttributeError(f"Scores has no attribute {name!r}")
+            return self[name]
 
     def __repr__(self) -> str:
         ms_ssim = "-" if self.ms_ssim is None else f"{self.ms_ssim:.4f}"
@@ -159,15 +107,7 @@ def default_split(capture: Capture) -> Split:
 def over_background(
     image: npt.NDArray[np.uint8], background: Sequence[float]
 ) -> npt.NDArray[np.uint8]:
-    """Composite a photo over a background.
-
-    Args:
-        image: uint8 [H, W, 3], or [H, W, 4] with straight alpha.
-        background: RGB in [0, 1].
-
-    Returns:
-        uint8 [H, W, 3]; an image without alpha is returned unchanged.
-    """
+    """Composite a photo, uint8 [H, W, 3] or [H, W, 4] with straight alpha, over RGB in [0, 1]."""
     if image.shape[2] == 3:
         return image
     alpha = image[..., 3:].astype(np.float64) / 255.0
@@ -177,11 +117,7 @@ def over_background(
 
 
 def views_of_split(capture: Capture, split: Split) -> list[View]:
-    """Return the capture's "train" or "test" views.
-
-    Raises:
-        IgsrError: the split has no views, or ``split`` is another name.
-    """
+    """Return the capture's "train" or "test" views, at least one."""
     if split not in ("train", "test"):
         raise IgsrError(f'split must be "train" or "test", not {split!r}.')
     views = capture.test_views if split == "test" else capture.train_views
@@ -224,17 +160,7 @@ def score_views(
 def render_of(
     splats: Splats, view: View, background: Sequence[float], backend: Backend = "auto"
 ) -> metrics.Image:
-    """Render a view in 8 bits, with the view's exposure if it is known.
-
-    Args:
-        splats: the scene.
-        view: the view with its camera and exposure.
-        background: RGB in [0, 1].
-        backend: "auto", "cpu", "gpu" or "reference".
-
-    Returns:
-        uint8 [H, W, 3].
-    """
+    """Render a view in 8 bits, uint8 [H, W, 3], with the view's exposure if it is known."""
     picture = render(splats, view.camera, background, backend)
     if view.exposure is not None:
         alpha = picture.alpha if view.image.shape[2] == 4 else None
@@ -244,11 +170,7 @@ def render_of(
 
 
 def check_masks(views: Sequence[View]) -> None:
-    """Check that each view can be scored.
-
-    Raises:
-        IgsrError: a mask leaves no pixel to score; the message names the view.
-    """
+    """Raise an ``IgsrError`` that names a view whose mask leaves no pixel to score."""
     for view in views:
         if view.mask is not None and not view.mask.any():
             raise IgsrError(f"{view.name}: its mask leaves no pixel to score; remove the view.")

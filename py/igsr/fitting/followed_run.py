@@ -24,12 +24,8 @@ from igsr.capture.write_cameras import write_cameras
 from igsr.capture.write_files import png_names
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import over_background
+from igsr.rendering.run_folder import CAMERAS, PROGRESS, RUN, VIEW
 
-#: The folder in that of the run, and its files.
-VIEW = "view"
-RUN = "run.json"
-PROGRESS = "progress.json"
-CAMERAS = "cameras.json"
 #: Folders of photos, by their split.
 PHOTOS = {"test": "held-out", "train": "fitted"}
 #: Maximum number of photos, evenly spaced, and the longest side of each, pixels.

@@ -54,18 +54,13 @@ def sightings(
 ) -> Sightings:
     """Count the cameras that see each splat, and how often it is in front of the surface.
 
-    The surface is a pixel's expected depth. A splat is compared with its mean over the splat's
-    pixels.
+    The surface is the mean expected depth of the splat's pixels.
 
     Args:
         splats: the scene.
         cameras: of the photos.
         backend: "auto", "cpu", "gpu" or "reference".
         masks: bool [H, W] for each camera, True for pixels that count; None if all count.
-
-    Raises:
-        ValueError: the parameters cannot be drawn; the message names the argument.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     area, counted = np.zeros((2, len(splats)))
     shown, before = np.zeros((2, len(splats)), np.int64)
@@ -105,10 +100,6 @@ def behind_masks(
     Returns:
         bool [N]: True if at least ``MIN_MASKED_FRACTION`` of the splat's area in a photo is masked,
         and the unmasked area in all other photos together is smaller than that.
-
-    Raises:
-        ValueError: the parameters cannot be drawn; the message names the argument.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     total = np.zeros(len(splats))
     areas = []  # only of photos with masks, since there may be thousands without
@@ -136,10 +127,11 @@ def needed_by_others(
     seed: int = 0,
     backend: str = "auto",
 ) -> Float64:
-    """Estimate how much the squared error of the photos grows without a splat.
+    """Estimate how much the photos' squared error grows without a splat, [N].
 
     The photo whose error grows most is left out: a splat that only one photo needs was made up for
-    it, since all other photos show empty space there.
+    it, since all other photos show empty space there. So the result is at most 0 if no other photo
+    needs the splat, and 0 if at most one photo shows it.
 
     A render is linear in the opacity ``o`` of one splat, up to the clamp at 0.99. Removing the
     splat changes the color C by ``-o dC/do`` and the squared error E by
@@ -152,14 +144,6 @@ def needed_by_others(
         background: RGB in [0, 1] behind renders and photos with alpha, for views without their own.
         seed: of the random signs.
         backend: "auto", "cpu", "gpu" or "reference".
-
-    Returns:
-        float64 [N], summed over pixels and channels (colors in [0, 1]). At or below 0, no
-        other photo needs the splat; 0 if at most one photo shows it.
-
-    Raises:
-        ValueError: the parameters cannot be drawn; the message names the argument.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     dtype = _core.working_dtype(_core.resolve_backend(backend))
     random = np.random.default_rng([seed, 0xF10A])

@@ -88,15 +88,9 @@ def remove_floaters(
 
 
 def stray_splats(splats: Splats) -> dict[str, Bool]:
-    """Find splats that cannot be seen or are alone.
+    """Find splats that are "invisible" or "alone", bool [N] each.
 
     If more than half are alone, the scene consists of such splats, and none is stray.
-
-    Args:
-        splats: the scene.
-
-    Returns:
-        bool [N] under "invisible" and "alone".
     """
     min_logit = np.log(_core.ALPHA_MIN / (1.0 - _core.ALPHA_MIN))
     invisible = ~splats.finite | ~(splats.opacities >= min_logit)
@@ -109,16 +103,10 @@ def stray_splats(splats: Splats) -> dict[str, Bool]:
 
 
 def alone(splats: Splats) -> Bool:
-    """Find splats with few others near, relative to their own size.
+    """Find splats, all finite, with few neighbors, relative to their own size, bool [N].
 
     Centers are counted in a cube of 3 x 3 x 3 cells around the splat's. The side of a cell is one
     to two times ``NEIGHBOR_SIGMAS`` standard deviations.
-
-    Args:
-        splats: the scene; all its parameters must be finite.
-
-    Returns:
-        bool [N].
     """
     means = splats.means.astype(np.float64)
     # Clipped to the exponents of float64.
@@ -154,7 +142,7 @@ def unsupported_splats(
     seed: int = 0,
     backend: str = "auto",
 ) -> dict[str, Bool]:
-    """Find splats that no photo shows, that masks hide, and that float.
+    """Find splats that are "unseen", "masked" or "floating", bool [N] each; none is of two kinds.
 
     Args:
         splats: the scene.
@@ -162,12 +150,6 @@ def unsupported_splats(
         background: RGB in [0, 1] behind renders and photos with alpha.
         seed: of the random numbers that estimate which photos need a splat.
         backend: "auto", "cpu", "gpu" or "reference".
-
-    Returns:
-        bool [N] under "unseen", "masked" and "floating"; no splat is of two kinds.
-
-    Raises:
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     photos = photos_among(views)
     masks = [view.mask for view in photos]

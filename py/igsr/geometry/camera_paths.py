@@ -2,54 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
-from igsr.capture import Camera, Capture
+from igsr.capture import Camera
 from igsr.errors import IgsrError
 from igsr.geometry.focus_point import focus_point
 from igsr.splats import Splats
 
 Vector = npt.NDArray[np.float64]
 
-#: Picture and vertical field of view where no capture says them.
+#: Image size, vertical field of view and elevation above the horizon without cameras of photos.
 DEFAULT_SIZE = (800, 600)
-DEFAULT_FOV_DEGREES = 45.0
-#: Elevation above the horizon where no capture says it.
-DEFAULT_ELEVATION_DEGREES = 20.0
+DEFAULT_FOV_DEG = 45.0
+DEFAULT_ELEVATION_DEG = 20.0
 
 
-def orbit(splats: Splats, capture: Capture | None, frames: int) -> list[Camera]:
-    """``frames`` cameras on a circle around the scene.
+def orbit(splats: Splats, cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """Return cameras on a circle around the scene.
 
-    With a capture, the circle is fitted to its cameras: around the point they look at, at their
-    median distance and height, with their up direction, and with the first camera's lens. Without
-    one it goes around the middle of the splats, z up.
+    The circle is fitted to the given cameras: around their focus point, at their median distance
+    and height, with their mean up direction and the first one's lens. Without cameras it is around
+    the middle of the splats, z up.
 
     Args:
         splats: the scene.
-        capture: whose cameras the circle is fitted to, or None.
+        cameras: of photos of the scene; may be empty.
         frames: number of cameras, at least 1.
 
     Raises:
-        IgsrError: ``frames`` is under 1, or there are no finite splats to look at.
+        IgsrError: ``frames`` is below 1, or there are no finite splats.
     """
     if frames < 1:
         raise IgsrError(f"orbit must have at least 1 frame, not {frames}.")
-    if capture is None:
+    if not cameras:
         target, distance = _framed(splats)
         up = np.array([0.0, 0.0, 1.0])
         start = np.array([0.0, -1.0, 0.0])
-        elevation = np.radians(DEFAULT_ELEVATION_DEGREES)
+        elevation = np.radians(DEFAULT_ELEVATION_DEG)
         radius, height = distance * np.cos(elevation), distance * np.sin(elevation)
         columns, rows = DEFAULT_SIZE
         K = _default_lens(columns, rows)
     else:
-        cameras = [view.camera for view in capture.views]
-        centres = np.stack([camera.centre for camera in cameras])
-        target = focus_point(cameras)
+        centers = np.stack([camera.centre for camera in cameras])
+        target = focus_point(list(cameras))
         up = _unit(-np.mean([camera.viewmat[1, :3] for camera in cameras], axis=0))
-        offsets = centres - target
+        offsets = centers - target
         heights = offsets @ up
         flat = offsets - heights[:, None] * up
         radius = float(np.median(np.linalg.norm(flat, axis=1)))
@@ -113,12 +113,12 @@ def _framed(splats: Splats) -> tuple[Vector, float]:
     solid = points[logits >= np.median(logits)]
     target = np.median(solid, axis=0)
     reach = np.quantile(np.linalg.norm(solid - target, axis=1), 0.9)
-    distance = max(float(reach), 1e-6) / np.tan(np.radians(DEFAULT_FOV_DEGREES / 2)) * 1.2
+    distance = max(float(reach), 1e-6) / np.tan(np.radians(DEFAULT_FOV_DEG / 2)) * 1.2
     return target, float(distance)
 
 
 def _default_lens(columns: int, rows: int) -> npt.NDArray[np.float64]:
-    focal = rows / 2 / np.tan(np.radians(DEFAULT_FOV_DEGREES / 2))
+    focal = rows / 2 / np.tan(np.radians(DEFAULT_FOV_DEG / 2))
     return np.array([[focal, 0.0, columns / 2], [0.0, focal, rows / 2], [0.0, 0.0, 1.0]])
 
 

@@ -1,4 +1,4 @@
-"""``apply_exposure``: a rendered picture as a photo of some exposure and white balance has it."""
+"""``apply_exposure``: apply a photo's exposure and white balance to a rendered picture."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ from igsr.errors import IgsrError
 
 
 def apply_exposure(image: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
-    """Give rendered pictures the exposures of their photos, before the loss.
+    """Apply exposures to rendered pictures, differentiably, before the loss.
 
-    For training loops of one's own: with a parameter ``gain`` (1 at first) and ``offset`` (0) for
-    each photo, differentiable in all three. It is what ``igsr.fit`` does with ``exposure="on"``
-    (the renderer's stage ``exposure``). Keep the means of log gain and of offset over the photos at
-    zero: brighter splats with lower gains look the same.
+    For custom training loops: optimize a ``gain``, initially 1, and an ``offset``, initially 0, per
+    photo, as ``igsr.fit`` does with ``exposure="on"``. Keep the means of log gain and of offset
+    over the photos at zero: brighter splats with lower gains look the same.
 
     Args:
-        image: [..., H, W, 3], rendered RGB, encoded as photos are (sRGB), 1 at the brightest.
-        gain: [..., 3], factors of R, G and B, above 0.
-        offset: [..., 3], added after it.
+        image: [..., H, W, 3] rendered RGB, sRGB-encoded like photos, in [0, 1].
+        gain: [..., 3] factors of R, G and B, above 0.
+        offset: [..., 3], added after ``gain``.
 
     Returns:
-        [..., H, W, 3], ``gain * image + offset`` cut to [0, 1]. The gradient goes back where
-        nothing is cut, and where it brings a cut color closer to what a photo holds.
+        [..., H, W, 3], ``gain * image + offset`` clamped to [0, 1]. Clamped colors have a gradient
+        only if it moves them towards [0, 1].
 
     Raises:
-        IgsrError: the shapes do not go together.
+        IgsrError: the shapes do not match.
     """
     batch = image.shape[:-3]
     if image.ndim < 3 or image.shape[-1] != 3:
@@ -45,5 +44,5 @@ def apply_exposure(image: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
                 else v.masked_fill(((raw > 1.0) & (v < 0.0)) | ((raw < 0.0) & (v > 0.0)), 0.0)
             )
         )
-    # The value is the cut one, the gradient that of what was cut.
+    # The value is clamped, but the gradient is not.
     return colors + (colors.clamp(0.0, 1.0) - colors).detach()

@@ -72,15 +72,7 @@ def write_levels(
 
 
 def level_within(path: str | os.PathLike[str], max_splats: int = MAX_PAGE_SPLATS) -> Splats:
-    """Read the finest level of a scene with at most ``max_splats`` splats.
-
-    Args:
-        path: a ``lod-meta.json``.
-        max_splats: maximum number of splats.
-
-    Raises:
-        IgsrError: a file cannot be read, or the coarsest level has more splats.
-    """
+    """Read the finest level of a ``lod-meta.json`` with at most ``max_splats`` splats."""
     try:
         read = _core.read_level(os.fspath(path), max_splats)
     except (OSError, ValueError) as error:

@@ -34,11 +34,7 @@ class LiveModel:
     changed: int
 
     def load(self) -> Splats:
-        """Read the splats; of a scene in levels, the finest level that the page can hold.
-
-        Raises:
-            IgsrError: the file cannot be read.
-        """
+        """Read the splats; of a scene in levels, the finest level that the page can hold."""
         if self.path.name == INDEX:
             return level_within(self.path)
         if self.path.suffix != CHECKPOINT_SUFFIX:
@@ -111,11 +107,7 @@ def _existing(named: list[tuple[str, str, Path]]) -> list[LiveModel]:
 
 
 def check_viewable(path: Path) -> None:
-    """Check that a path can be shown, now or after a run has written to it.
-
-    Raises:
-        IgsrError: there is no such file or folder, or the file is not a model.
-    """
+    """Check that a path can be shown, now or after a run has written to it."""
     if path.is_dir():
         return
     if not path.is_file():

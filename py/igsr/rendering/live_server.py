@@ -43,15 +43,7 @@ def is_loopback(host: str) -> bool:
 
 
 class ViewServer(ThreadingHTTPServer):
-    """A server that answers requests with its token.
-
-    Attributes:
-        view: answers the requests.
-        token: the first part of every path.
-
-    Raises:
-        OSError: the port is taken, or the host is not an address of this computer.
-    """
+    """A server that answers requests whose path begins with its token."""
 
     daemon_threads = True
     # The default backlog of 5 drops requests of a browser under load.
@@ -99,7 +91,7 @@ class ViewServer(ThreadingHTTPServer):
             self._slots.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Log errors, except those of browsers that disconnect."""
+        """Log an error, unless a browser disconnected."""
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             logger.exception("a request failed")
 
@@ -180,9 +172,6 @@ def open_server(view: LiveView, host: str, port: int | None) -> ViewServer:
         view: answers the requests.
         host: address of this computer to listen at.
         port: None takes ``PORT``, or the next free one.
-
-    Raises:
-        IgsrError: the port is taken, or the address is not of this computer.
     """
     ports = range(PORT, PORT + PORTS_TO_TRY) if port is None else (port,)
     for number in ports:

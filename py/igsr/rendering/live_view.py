@@ -48,7 +48,7 @@ class LiveView:
 
     Args:
         paths: splat files, and folders of fits and refinements; at least one.
-        cameras: a ``cameras.json`` with photos in its folder, instead of those of ``paths``.
+        cameras: a ``cameras.json`` to use instead of the paths' own, with photos in its folder.
     """
 
     def __init__(self, paths: Sequence[Path], cameras: Path | None = None) -> None:
@@ -84,7 +84,7 @@ class LiveView:
         }
 
     def surroundings(self) -> dict[str, Any]:
-        """Return cameras, those with photos first, up axis and background."""
+        """Return cameras, sorted by whether they have a photo, up axis and background."""
         now = self._current_surroundings()
         answer = surroundings([camera for camera, _ in now.cameras], now.background)
         for number, (_, photo) in enumerate(now.cameras):
@@ -94,12 +94,7 @@ class LiveView:
         return answer
 
     def photo(self, number: int) -> bytes:
-        """Return the photo of a camera as JPEG.
-
-        Raises:
-            KeyError: there is no photo of this number.
-            IgsrError: the photo cannot be read.
-        """
+        """Return the photo of a camera as JPEG; a KeyError if there is none."""
         cameras = self._current_surroundings().cameras
         path = cameras[number][1] if 0 <= number < len(cameras) else None
         if path is None:
@@ -109,9 +104,7 @@ class LiveView:
     def model(self, id: str) -> bytes:
         """Return a model for the page: the length of a JSON text (u32), the text, packed splats.
 
-        Raises:
-            KeyError: there is no model of this id.
-            IgsrError: the model cannot be read.
+        Raises a KeyError if the id is unknown.
         """
         model = {one.id: one for one in self._models()}[id]
         key = (model.id, model.version)

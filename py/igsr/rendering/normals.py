@@ -9,22 +9,16 @@ from torch import Tensor
 def facing_normals(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, drawn: Tensor
 ) -> Tensor:
-    """The normal of each splat.
-
-    The gradient reaches ``quats``. The choice of the axis and of its sign has no gradient.
+    """Compute unit normals [N, 3], world frame, with gradients of ``quats``.
 
     Args:
-        means: [N, 3] centres, world frame.
+        means: [N, 3] centers, world frame.
         quats: [N, 4] rotations w x y z of any length.
-        scales: [N, 3] standard deviations along the splat's axes; of equal ones the first counts
-            as the shortest.
+        scales: [N, 3] standard deviations along the splat's axes.
         viewmat: [4, 4] world-to-camera.
-        drawn: bool [N]; splats that are not drawn may have any values, NaN too.
-
-    Returns:
-        [N, 3] unit normals in the world frame, zero for splats that are not drawn.
+        drawn: bool [N]; other splats may have any values, even NaN, and get zero normals.
     """
-    # Before anything is computed: 0 x NaN in a backward pass would be NaN.
+    # First, since 0 x NaN in a backward pass would be NaN.
     upright = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
     quats = torch.where(drawn[:, None], quats, upright)
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(dim=-1)
@@ -42,7 +36,7 @@ def facing_normals(
     with torch.no_grad():
         viewmat = viewmat.to(means)
         rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
-        directions = (means @ rotation.T + translation) @ rotation  # camera to centre, world frame
+        directions = (means @ rotation.T + translation) @ rotation  # camera to center, world frame
         away = (normals * directions).sum(dim=-1) > 0
         signs = torch.where(away, -1.0, 1.0).to(normals) * drawn
     return normals * signs[:, None]

@@ -1,4 +1,4 @@
-"""A scene page within a notebook."""
+"""Scene pages in notebooks."""
 
 from __future__ import annotations
 
@@ -12,27 +12,20 @@ from igsr.splats import Splats
 
 
 class NotebookPage:
-    """A viewer that a notebook shows where a cell returns it."""
+    """A viewer for notebooks: the page's HTML in a frame of ``height`` pixels."""
 
     def __init__(self, page: str, height: int) -> None:
-        """Take a page's text and its height in pixels."""
         self._page, self._height = page, height
 
     def __repr__(self) -> str:
         return f"NotebookPage({len(self._page)} bytes, {self._height} pixels high)"
 
     def _repr_html_(self) -> str:
-        """The page in a frame."""
         return framed(self._page, self._height)
 
 
 def framed(page: str, height: int) -> str:
-    """A page within another: HTML of a frame as wide as there is room.
-
-    Args:
-        page: its text.
-        height: in pixels.
-    """
+    """Return HTML of a frame of full width and ``height`` pixels with ``page``."""
     return (
         f'<iframe srcdoc="{html.escape(page)}" '
         f'style="width:100%;height:{height}px;border:0"></iframe>'
@@ -45,11 +38,7 @@ def notebook_page(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     height: int = 480,
 ) -> NotebookPage:
-    """What ``Splats.show`` and ``Refined.show`` return.
-
-    Raises:
-        IgsrError: as ``write_scene_page``, or ``height`` is under 1.
-    """
+    """Make the result of ``Splats.show`` and ``Refined.show``."""
     if height < 1:
         raise IgsrError(f"height must be at least 1 pixel, not {height}")
     views = [] if capture is None else capture.views

@@ -14,7 +14,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -40,18 +39,8 @@ PROJECTED = (*DIFFERENTIABLE, "radii")
 IMAGE = ("color", "alpha", "depth", "transmittance")
 
 
-@dataclass(frozen=True)
-class _Settings:
-    """Arguments without gradients that both halves need."""
-
-    width: int
-    height: int
-    near: float
-    far: float
-    eps2d: float
-    antialiased: bool
-    sh_degree: int | None
-    backend: str
+#: Arguments of ``_core.project`` that do not depend on the camera.
+Options = dict[str, Any]
 
 
 def _array(tensor: Tensor, dtype: Any) -> npt.NDArray[Any]:
@@ -84,26 +73,18 @@ class _Project(torch.autograd.Function):
         colors: Tensor,
         viewmat: Tensor,
         K: Tensor,
-        settings: _Settings,
+        options: Options,
     ) -> tuple[Tensor, ...]:
-        dtype = _core.working_dtype(settings.backend)
+        dtype = _core.working_dtype(options["backend"])
         names = ("means", "quats", "scales", "opacities", "colors")
         splats = (means, quats, scales, opacities, colors)
         inputs: dict[str, Any] = {
             name: _array(tensor, dtype) for name, tensor in zip(names, splats, strict=True)
         }
-        options: dict[str, Any] = {
-            "sh_degree": settings.sh_degree,
-            "raw_parameters": False,
+        options = {
+            **options,
             "viewmat": _array(viewmat, np.float64),
             "intrinsics": _array(K, np.float64)[[0, 1, 0, 1], [0, 1, 2, 2]],
-            "width": settings.width,
-            "height": settings.height,
-            "near": settings.near,
-            "far": settings.far,
-            "eps2d": settings.eps2d,
-            "antialiased": settings.antialiased,
-            "backend": settings.backend,
         }
         projected = _core.project(**inputs, **options)
         outputs = tuple(_tensor(projected[name], means) for name in PROJECTED)
@@ -143,23 +124,23 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any,
         background: Tensor,
-        settings: _Settings,
+        options: Options,
         keep_absolute: Callable[[Tensor], None] | None,
         *projected: Tensor,
     ) -> tuple[Tensor, ...]:
-        dtype = _core.working_dtype(settings.backend)
+        dtype = _core.working_dtype(options["backend"])
         # Gradients of unused outputs come as None, not as zeros.
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(background, *projected)
         ctx.projected = {n: _array(t, dtype) for n, t in zip(PROJECTED, projected, strict=True)}
         ctx.keep_absolute = keep_absolute
-        ctx.background, ctx.backend = _array(background, dtype), settings.backend
+        ctx.background, ctx.backend = _array(background, dtype), options["backend"]
         ctx.image = _core.rasterize(
             ctx.projected,
-            width=settings.width,
-            height=settings.height,
+            width=options["width"],
+            height=options["height"],
             background=ctx.background,
-            backend=settings.backend,
+            backend=ctx.backend,
         )
         return tuple(_tensor(ctx.image[name], background) for name in IMAGE)
 
@@ -289,16 +270,17 @@ def rasterization(
             a tensor that it needs was changed in place.
     """
     check_arguments(locals())
-    settings = _Settings(
-        width,
-        height,
-        near_plane,
-        min(far_plane, FLOAT32_MAX),
-        eps2d,
-        rasterize_mode == "antialiased",
-        sh_degree,
-        _core.resolve_backend(backend),
-    )
+    options = {
+        "sh_degree": sh_degree,
+        "raw_parameters": False,
+        "width": width,
+        "height": height,
+        "near": near_plane,
+        "far": min(far_plane, FLOAT32_MAX),
+        "eps2d": eps2d,
+        "antialiased": rasterize_mode == "antialiased",
+        "backend": _core.resolve_backend(backend),
+    }
     channels = colors.shape[-1]
     per_camera_colors = colors.dim() == (3 if sh_degree is None else 4)
     further: Tensor | None = None
@@ -310,7 +292,7 @@ def rasterization(
     views, ids = [], []
     for c in range(len(viewmats)):
         of_camera = (colors[c] if per_camera_colors else colors, viewmats[c], Ks[c])
-        outputs = _Project.apply(means, quats, scales, opacities, *of_camera, settings)
+        outputs = _Project.apply(means, quats, scales, opacities, *of_camera, options)
         view = dict(zip(PROJECTED, outputs, strict=True))
         if radius_clip > 0.0:
             radii = view["radii"]
@@ -340,21 +322,21 @@ def rasterization(
                 None if masks is None else masks[c],
                 channels,
                 render_mode,
-                settings,
+                options,
                 _absgrad_keeper(means2d, segment) if absgrad else None,
             )
         )
     pictures, alphas, normals = zip(*drawings, strict=True)
-    meta = _meta(joined, ids if packed else None, settings, len(views))
+    meta = _meta(joined, ids if packed else None, width, height, len(views))
     if render_normals:
         meta["render_normals"] = torch.stack(normals)
     return _joined(list(pictures), packed=False), torch.stack(alphas), meta
 
 
 def _meta(
-    joined: dict[str, Tensor], ids: list[Tensor] | None, settings: _Settings, cameras: int
+    joined: dict[str, Tensor], ids: list[Tensor] | None, width: int, height: int, cameras: int
 ) -> dict[str, Any]:
-    """gsplat's ``meta``; ``ids`` are those of each camera's visible splats if packed."""
+    """gsplat's ``meta``; if packed, ``ids`` are the visible splats of each camera."""
     p, q, r = joined["factors"].unbind(dim=-1)
     meta: dict[str, Any] = {
         "batch_ids": None,
@@ -366,11 +348,11 @@ def _meta(
         "depths": joined["depths"],
         "conics": torch.stack([p * p, p * q, q * q + r * r], dim=-1),
         "opacities": joined["opacities"],
-        "width": settings.width,
-        "height": settings.height,
+        "width": width,
+        "height": height,
         "tile_size": _core.TILE_SIZE,
-        "tile_width": math.ceil(settings.width / _core.TILE_SIZE),
-        "tile_height": math.ceil(settings.height / _core.TILE_SIZE),
+        "tile_width": math.ceil(width / _core.TILE_SIZE),
+        "tile_height": math.ceil(height / _core.TILE_SIZE),
         "n_batches": 1,
         "n_cameras": cameras,
     }
@@ -423,7 +405,7 @@ def _draw(
     mask: Tensor | None,
     channels: int,
     render_mode: RenderMode,
-    settings: _Settings,
+    options: Options,
     keep_absolute: Callable[[Tensor], None] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Draw one camera's picture [H, W, X], alpha [H, W, 1] and normals [H, W, 3], if asked for.
@@ -445,7 +427,7 @@ def _draw(
     passes = [
         _Rasterize.apply(
             group_behind,
-            settings,
+            options,
             keep_absolute,
             *(group if name == "colors" else view[name] for name in PROJECTED),
         )

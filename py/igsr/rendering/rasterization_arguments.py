@@ -18,7 +18,7 @@ RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 
-#: Arguments of gsplat of which only the default is accepted.
+#: Arguments of gsplat that accept only this default.
 UNSUPPORTED: dict[str, Any] = {
     "tile_size": _core.TILE_SIZE,
     "camera_model": "pinhole",
@@ -81,7 +81,7 @@ def _check_unsupported(arguments: dict[str, Any]) -> None:
         if name == "tile_size" and value is None:
             continue  # the default of gsplat's development branch
         if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
-            continue  # gsplat's default is an enum of its own
+            continue  # gsplat's default is its own enum
         default = UNSUPPORTED[name]
         # Arrays do not compare to a single truth value.
         is_plain = isinstance(value, (str, bool, numbers.Number))

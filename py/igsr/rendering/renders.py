@@ -20,17 +20,16 @@ from igsr.splats import FloatArray, Splats
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Render(ArrayEquality, NotebookPicture):
-    """What one camera sees. All arrays are float32.
+    """A rendered view. All arrays are float32.
 
-    Two renders are equal (``==``) if all their arrays are. A notebook shows the picture.
+    Two renders are equal (``==``) if all their arrays are. Notebooks show the picture.
 
     Attributes:
         color: [H, W, 3], RGB over the background. Not clamped: SH may exceed 1.
         alpha: [H, W], accumulated opacity in [0, 1].
-        depth: [H, W], accumulated camera-space z, the sum of weight * z, in world units.
-        expected_depth: [H, W], depth / alpha, 0 where alpha is 0, in world units.
-        transmittance: [H, W], the share of the background that shows. It is what the renderer
-            multiplied up, which is more precise than 1 - alpha.
+        depth: [H, W], accumulated camera-space z, the sum of weight * z, world units.
+        expected_depth: [H, W], depth / alpha, 0 if alpha is 0, world units.
+        transmittance: [H, W], visible fraction of the background, more precise than 1 - alpha.
     """
 
     _pictures_by: ClassVar[str] = "igsr.rendering.thumbnails:render_pictures"
@@ -46,7 +45,7 @@ class Render(ArrayEquality, NotebookPicture):
         return f"Render({width}x{height})"
 
     def to_uint8(self) -> npt.NDArray[np.uint8]:
-        """The picture in 8 bits, uint8 [H, W, 3]: ``color`` clamped to [0, 1] and rounded."""
+        """Return ``color`` clamped to [0, 1] and rounded to 8 bits, uint8 [H, W, 3]."""
         finite = np.nan_to_num(self.color, nan=0.0, posinf=1.0, neginf=0.0)
         return (np.clip(finite, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
@@ -59,17 +58,14 @@ def render(
 ) -> Render:
     """Render ``splats`` from one camera.
 
-    The result is deterministic: the same on every run and with any number of threads.
+    The result is deterministic, with any number of threads.
 
     Args:
         splats: the scene.
-        camera: pinhole camera, OpenCV axes, pixel centres at +0.5, world frame of the capture.
+        camera: pinhole camera, OpenCV axes, pixel centers at +0.5, world frame of the capture.
         background: RGB in [0, 1] behind the splats.
         backend: "auto" (a real GPU if one answers, else "cpu"), "cpu", "gpu", or "reference"
             (computes in float64).
-
-    Returns:
-        Color, alpha, depth and transmittance of each pixel.
 
     Raises:
         IgsrError: an argument cannot be used; the message names it.
@@ -82,7 +78,14 @@ def render(
     if background_color.shape != (3,) or not np.isfinite(background_color).all():
         raise IgsrError("background must be three finite numbers")
     try:
-        image = _render_arrays(splats, camera, background_color, backend)
+        resolved = _core.resolve_backend(backend)
+        image = _core.rasterize(
+            project(splats, camera, resolved),
+            width=camera.width,
+            height=camera.height,
+            background=background_color.astype(_core.working_dtype(resolved)),
+            backend=resolved,
+        )
     except ValueError as error:
         raise IgsrError(f"{error}.") from error
     color, alpha, depth, transmittance = (
@@ -94,20 +97,7 @@ def render(
 
 
 def project(splats: Splats, camera: Camera, backend: str) -> dict[str, npt.NDArray[Any]]:
-    """Project splats to 2D Gaussians in the picture of one camera.
-
-    Args:
-        splats: the scene.
-        camera: pinhole camera, OpenCV axes, world frame of the capture.
-        backend: "cpu", "gpu" or "reference".
-
-    Returns:
-        What ``_core.project`` returns and ``_core.rasterize`` takes.
-
-    Raises:
-        ValueError: the parameters cannot be drawn; the message names the argument.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
-    """
+    """Project splats to 2D Gaussians: the arrays of ``_core.project``, for ``_core.rasterize``."""
     dtype = _core.working_dtype(backend)
     parameters = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     projected: dict[str, npt.NDArray[Any]] = _core.project(
@@ -127,37 +117,15 @@ def project(splats: Splats, camera: Camera, backend: str) -> dict[str, npt.NDArr
     return projected
 
 
-def _render_arrays(
-    splats: Splats, camera: Camera, background: npt.NDArray[np.float64], backend: str
-) -> dict[str, npt.NDArray[Any]]:
-    backend = _core.resolve_backend(backend)
-    image: dict[str, npt.NDArray[Any]] = _core.rasterize(
-        project(splats, camera, backend),
-        width=camera.width,
-        height=camera.height,
-        background=background.astype(_core.working_dtype(backend)),
-        backend=backend,
-    )
-    return image
-
-
 def viewmat_about(
     origin: npt.NDArray[np.float64], viewmat: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """The world-to-camera matrix for points that are relative to ``origin``.
-
-    Args:
-        origin: float64 [3], world frame.
-        viewmat: [4, 4], world to camera.
-
-    Returns:
-        float64 [4, 4], composed in float64.
-    """
+    """Return the world-to-camera matrix, float64 [4, 4], for points relative to ``origin`` [3]."""
     composed = np.array(viewmat, dtype=np.float64)
     composed[:3, 3] += composed[:3, :3] @ origin
     return composed
 
 
 def intrinsics_of(K: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """fx, fy, cx, cy [4] float64 of a pinhole matrix [3, 3]."""
+    """Return fx, fy, cx, cy, float64 [4], of a pinhole matrix [3, 3]."""
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64)

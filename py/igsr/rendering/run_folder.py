@@ -35,14 +35,7 @@ MISSING = "–"
 
 
 def cameras_of(capture: Path) -> list[PageCamera]:
-    """Read the cameras of a capture or a ``cameras.json``, without photos.
-
-    Args:
-        capture: a ``cameras.json`` of igsr, its folder, or a capture for ``load_capture``.
-
-    Raises:
-        IgsrError: there is no such capture, or it cannot be read.
-    """
+    """Read the cameras of a ``cameras.json``, its folder, or any capture, without photos."""
     for path in (capture, capture / CAMERAS):
         if path.name == CAMERAS and path.is_file():
             return [PageCamera(name, camera) for name, camera in read_cameras(path)]
@@ -105,7 +98,7 @@ def run_scores(folder: Path) -> dict[str, Any]:
         rows = [_round_row(number, row) for number, row in enumerate(_rounds(report))]
         return {"head": ["PSNR, dB", "test", "cross-validation", "splats"], "rows": rows}
     if run_progress(folder) is not None or "psnr" not in report:
-        return {"head": [], "rows": []}  # a report beside a running fit is of an earlier run
+        return {"head": [], "rows": []}  # while a fit runs, the report is an earlier run's
     metrics = ("psnr", "ssim", "flip")
     is_held_out = _member(report, "protocol").get("split") == "test"
     rows = [["held-out photos" if is_held_out else "fitted photos", *_texts(report, metrics)]]

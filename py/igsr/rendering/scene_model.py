@@ -1,7 +1,7 @@
 """Pack a model for a scene page: its splats relative to their center, in a compact format.
 
 The format has the numbers of a ``.spz`` in an order that compresses better: splats along a Morton
-curve, positions as differences with only as many bits as the scene needs, and bytes of one kind
+curve, positions as differences with only the bits that the scene needs, and bytes of one kind
 together. Large models share at most 65 536 rows of spherical harmonics. ``web/packed.js`` reads
 it. The gzipped content is::
 
@@ -60,8 +60,8 @@ class EmbeddedModel:
         count: number of splats.
         origin: float64 [3], median of the visible splats, world units.
         unit: factor of lengths.
-        radius: radius around the origin, times ``unit``, of 90 % of the visible splats, at most
-            four times that of 50 %.
+        radius: times ``unit``; contains 90 % of the visible splats, but is at most four times the
+            radius that contains 50 %.
         notes: messages about data that the format cannot hold.
     """
 
@@ -77,9 +77,6 @@ def embedded_model(splats: Splats) -> EmbeddedModel:
     """Pack a model for a page.
 
     Splats that are not finite, or farther than ``MAX_DISTANCE_RADII``, are left out.
-
-    Raises:
-        IgsrError: the format cannot hold the model.
     """
     center, radius = _extent(splats.without_backdrop())
     offsets = splats.means - center.astype(np.float32)
@@ -222,7 +219,7 @@ def _integers(positions: Bytes) -> Int64:
 
 
 def _coarser(fixed: Int64, fraction: int, radius: float) -> tuple[Int64, int]:
-    """Positions with only as many bits as the scene needs, and the number of dropped bits."""
+    """Positions with only the bits that the scene needs, and the number of dropped bits."""
     steps = radius * 2.0**fraction / STEPS_PER_RADIUS
     dropped = min(fraction, max(0, int(np.floor(np.log2(steps))) if steps > 0.0 else 0))
     return (fixed + ((1 << dropped) >> 1)) >> dropped, dropped

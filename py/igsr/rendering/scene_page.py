@@ -1,7 +1,4 @@
-"""``scene.html``: models and a viewer in one file, which needs nothing but a browser.
-
-The page's parts are the files of ``web/``, one job each; this module puts them together.
-"""
+"""``scene.html``: models and a viewer in one self-contained file, from the parts in ``web/``."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ from igsr.errors import IgsrError
 from igsr.rendering.scene_model import EmbeddedModel, embedded_model
 from igsr.splats import Splats
 
-#: Scripts in the order that they are put together; the last one starts the page.
+#: Scripts in the order of concatenation; the last one starts the page.
 SCRIPTS = (
     "unpack.js",
     "packed.js",
@@ -40,7 +37,7 @@ SCRIPTS = (
     "live.js",
     "main.js",
 )
-#: Shaders by the names that the painter knows.
+#: Shaders by their names in ``painter.js``.
 SHADERS = {
     "harmonics": "harmonics.glsl",
     "splatVertex": "splat.vert",
@@ -48,12 +45,11 @@ SHADERS = {
     "presentVertex": "present.vert",
     "presentFragment": "present.frag",
 }
-#: Near plane of small scenes, in their radii, as in splat-view.
-NEAR_PART = 0.05
-#: Up axis of scenes without cameras, as COLMAP's and INRIA's scenes have it.
+#: Near plane of small scenes, in radii, as in splat-view.
+NEAR_RADII = 0.05
+#: Up axis of scenes without cameras, as in COLMAP's and INRIA's scenes.
 UP = (0.0, -1.0, 0.0)
-#: Pages with more splats in all leave out the models that the last is compared with: two or three
-#: times as many bytes would be too many to send.
+#: Maximum total number of splats of a page with several models.
 MAX_COMPARED_SPLATS = 300_000
 
 
@@ -62,7 +58,7 @@ class PageCamera:
     """A camera that the page can jump to.
 
     Attributes:
-        name: what the page calls it, a photo's name.
+        name: name of the photo.
         camera: pinhole camera, OpenCV axes, world frame of the capture.
     """
 
@@ -75,7 +71,7 @@ class PageModel:
     """One of several models in a page.
 
     Attributes:
-        label: what the page calls it.
+        label: its name on the page.
         splats: the model.
     """
 
@@ -90,21 +86,20 @@ def write_scene_page(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "scene",
 ) -> list[str]:
-    """Write a page that shows a model, whole or not at all.
+    """Write a self-contained page that shows models.
 
-    The page asks no other file or address for anything. It starts at the first camera; without
-    cameras, at a view of the whole scene from a little above.
+    The view starts at the first camera; without cameras, it frames the whole scene.
 
     Args:
-        path: where to; its folder is made if it is missing.
-        splats: the model; or several, of which the last is shown and any two are compared at a
-            divider. Splats that are not finite are left out.
+        path: the file to write; its folder is created.
+        splats: a model, or several to compare at a divider, the main one last. Splats that are not
+            finite are left out.
         cameras: cameras to jump to, in the order of the page's list.
         background: RGB in [0, 1] behind the splats.
         title: the page's title, and the name of its screenshots.
 
     Returns:
-        A message for each thing that the page cannot hold, such as clipped values.
+        Messages about data that the page cannot hold, such as clipped values.
 
     Raises:
         IgsrError: ``background`` is not three numbers in [0, 1], the page's packed format cannot
@@ -112,7 +107,7 @@ def write_scene_page(
     """
     text, notes = scene_page(splats, cameras, background, title)
     with atomic_write(path) as temporary:
-        # A photo may be named by bytes that are no text.
+        # File names may contain bytes that are not text.
         temporary.write_text(text, encoding="utf-8", errors="xmlcharrefreplace")
     return notes
 
@@ -125,9 +120,9 @@ def scene_page(
     *,
     compares: bool = False,
 ) -> tuple[str, list[str]]:
-    """The page of ``write_scene_page`` as text, and its messages.
+    """Return the page of ``write_scene_page`` and its messages.
 
-    With ``compares`` it starts with the first of several models beside the last.
+    With ``compares``, it starts with a comparison of the first and the last model.
     """
     named = [PageModel(title, splats)] if isinstance(splats, Splats) else list(splats)
     models = [embedded_model(one.splats) for one in named]
@@ -145,33 +140,29 @@ def scene_page(
 
 
 def live_page(title: str) -> str:
-    """A page without a model, which asks the server that it comes from for all there is to show."""
+    """Return a page without a model, which requests everything from its server."""
     return _page({"live": True, "models": [], **surroundings((), (0.0, 0.0, 0.0))}, [], title)
 
 
 def compared(models: Sequence[PageModel]) -> list[PageModel]:
-    """The models that a page has room for: all, or the last alone."""
+    """Return all models if they fit into a page, else only the last one."""
     fits = sum(len(one.splats) for one in models) <= MAX_COMPARED_SPLATS
     return list(models) if fits else [models[-1]]
 
 
 def described_model(model: EmbeddedModel) -> dict[str, Any]:
-    """What the page's script reads of a model beside its bytes."""
+    """Return the metadata of a model for the page's script."""
     return {
         "count": model.count,
         "origin": model.origin.tolist(),
         "unit": model.unit,
         "radius": model.radius,
-        "near": min(_core.NEAR_PLANE * model.unit, NEAR_PART * model.radius),
+        "near": min(_core.NEAR_PLANE * model.unit, NEAR_RADII * model.radius),
     }
 
 
 def surroundings(cameras: Sequence[PageCamera], background: Sequence[float]) -> dict[str, Any]:
-    """What the page's script reads that is no model: cameras, up axis, background.
-
-    Raises:
-        IgsrError: ``background`` is not three numbers in [0, 1].
-    """
+    """Return cameras, up axis and background for the page's script."""
     color = [float(channel) for channel in background]
     if len(color) != 3 or not all(0.0 <= channel <= 1.0 for channel in color):
         raise IgsrError("background must be three numbers in [0, 1]")
@@ -203,8 +194,8 @@ def _page(scene: dict[str, Any], models: Sequence[EmbeddedModel], title: str) ->
         ),
         "SCRIPT": script,
     }
-    # In one pass: what is put in may itself look like a place.
-    return re.sub(r"@([A-Z]+)@", lambda place: values[place[1]], _part("page.html"))
+    # In one pass, since values may look like placeholders.
+    return re.sub(r"@([A-Z]+)@", lambda match: values[match[1]], _part("page.html"))
 
 
 def _camera(one: PageCamera) -> dict[str, Any]:
@@ -219,7 +210,7 @@ def _camera(one: PageCamera) -> dict[str, Any]:
 
 
 def _up(cameras: Sequence[PageCamera]) -> list[float]:
-    """The mean up axis of the cameras; -y where there are none, or they have none in common."""
+    """The mean up axis of the cameras; the default without cameras or a common axis."""
     up = np.asarray(UP)
     if cameras:
         mean = -np.mean([one.camera.viewmat[1, :3] for one in cameras], axis=0)
@@ -229,10 +220,7 @@ def _up(cameras: Sequence[PageCamera]) -> list[float]:
 
 
 def _content_security_policy(script: str, style: str, *, is_live: bool) -> str:
-    """Allows this script and style alone, and a worker made of the script's text.
-
-    A live page may ask the server that it comes from; any other may ask nothing.
-    """
+    """Allow only this script and style, its workers, and for a live page requests to its server."""
     hashes = {
         name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
         for name, text in (("script", script), ("style", style))
@@ -245,7 +233,7 @@ def _content_security_policy(script: str, style: str, *, is_live: bool) -> str:
 
 
 def _json(value: dict[str, Any]) -> str:
-    """JSON that may stand in an HTML script element, whatever names it holds."""
+    """JSON that is safe in an HTML script element."""
     return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
 
 

@@ -17,21 +17,11 @@ Array = npt.NDArray[Any]
 
 
 class DifferentiableRender:
-    """A render of splats, and the gradients of its colors.
-
-    Args:
-        splats: the scene.
-        camera: pinhole camera, OpenCV axes, world frame of the capture.
-        background: RGB in [0, 1].
-        backend: "auto", "cpu", "gpu" or "reference".
+    """A render of splats over a background, and the gradients of its colors.
 
     Attributes:
-        projected: 2D splats, as returned by ``_core.project``.
-        image: pictures, as returned by ``_core.rasterize``.
-
-    Raises:
-        ValueError: the parameters cannot be drawn; the message names the argument.
-        RuntimeError: backend "gpu" was asked for and no adapter answers.
+        projected: 2D splats, from ``_core.project``.
+        image: pictures, from ``_core.rasterize``.
     """
 
     def __init__(
@@ -72,19 +62,9 @@ def splat_weights(
     backend: str = "auto",
     mask: npt.NDArray[np.bool_] | None = None,
 ) -> Array:
-    """Sum the blending weights of each splat over a picture.
+    """Sum the blending weights of each splat over a picture: its visible area in pixels, [N].
 
-    Args:
-        splats: the scene.
-        camera: of the picture.
-        backend: "auto", "cpu", "gpu" or "reference".
-        mask: bool [H, W], True for pixels that count; None counts all.
-
-    Returns:
-        [N] in the backend's dtype: the visible area of each splat, in pixels.
-
-    Raises:
-        ValueError, RuntimeError: as ``DifferentiableRender``.
+    ``mask`` is bool [H, W], True for pixels that count; None counts all.
     """
     picture = DifferentiableRender(splats, camera, np.zeros(3), backend)
     v_color = np.ones_like(picture.image["color"])

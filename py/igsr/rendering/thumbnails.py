@@ -11,25 +11,25 @@ from igsr.rendering.renders import Render, render
 if TYPE_CHECKING:
     from igsr.splats import Splats
 
-#: A render for a notebook is made on the CPU: small, without waking a GPU.
+#: Small renders need no GPU.
 BACKEND: Backend = "cpu"
-#: Pictures of splats: as many sides of the scene.
-SIDES = 2
+#: Number of pictures of a scene, from different sides.
+VIEWS = 2
 
 
 def splats_pictures(splats: Splats) -> list[Picture]:
-    """The scene from a few sides, each at a distance that frames it."""
+    """Render the scene from a few sides."""
     from igsr.geometry.camera_paths import cameras_around
 
-    cameras = cameras_around(splats, SIDES, MAX_SIDE_PX)
+    cameras = cameras_around(splats, VIEWS, MAX_SIDE_PX)
     return [render(splats, camera, backend=BACKEND).to_uint8() for camera in cameras]
 
 
 def render_pictures(picture: Render) -> list[Picture]:
-    """The render itself."""
+    """Return the render."""
     return [picture.to_uint8()]
 
 
 def refined_pictures(refined: Any) -> list[Picture]:
-    """The scene of a refinement, as ``splats_pictures``."""
+    """Render the scene of a refinement; see ``splats_pictures``."""
     return splats_pictures(refined.splats)

@@ -15,18 +15,10 @@ from igsr.errors import IgsrError
 
 
 def write_video(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: int = 30) -> None:
-    """Write frames as H.264, or as MPEG-4 where H.264 is not built in.
+    """Write frames, uint8 [H, W, 3], as H.264, or as MPEG-4 if H.264 is not available.
 
-    An odd width or height loses its last column or row: 4:2:0 video has pairs of pixels.
-
-    Args:
-        path: the file; its suffix sets the container, such as ``.mp4``.
-        frames: uint8 [H, W, 3] each, all of one size.
-        fps: frames per second.
-
-    Raises:
-        IgsrError: the file cannot be written, its suffix is not a video format, there are no
-            frames, or they are smaller than 2 x 2 pixels.
+    The suffix of ``path`` sets the container. An odd last column or row is dropped, since 4:2:0
+    video needs even sizes.
     """
     import av
 
@@ -44,7 +36,7 @@ def write_video(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: int = 
                         raise IgsrError("A video needs pictures of at least 2 x 2 pixels.")
                     stream = cast(av.VideoStream, container.add_stream(codec, rate=Fraction(fps)))
                     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-                    # Visually lossless, to keep the fine detail of splats.
+                    # Visually lossless.
                     stream.options = {"crf": "16"} if codec == "libx264" else {"qscale": "2"}
                 cropped = np.ascontiguousarray(frame[:height, :width])
                 picture = av.VideoFrame.from_ndarray(cropped, format="rgb24")

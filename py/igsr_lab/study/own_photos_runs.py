@@ -18,7 +18,7 @@ from igsr.capture import Camera, Capture, View, load_capture
 from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import FRAMES
 from igsr.errors import IgsrError
-from igsr.evaluation.contact_sheet import flip_sheet, save_sheet, sheet_names
+from igsr.evaluation.contact_sheet import save_sheet, sheet_names
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.quick_scores import quick_views, train_photos
 from igsr.evaluation.scores import METRICS, ScoredView, default_background, score_views
@@ -33,6 +33,7 @@ from igsr_lab.denoiser.perceptual_distance import (
     SqueezeNetDistance,
     picture_distance,
 )
+from igsr_lab.study.flip_sheet import flip_sheet
 from igsr_lab.study.left_half import LEFT_HALF, left_half_scores
 
 #: Pictures on a sheet have at most so many pixels on their longest side: fog must be seen.

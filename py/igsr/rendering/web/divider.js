@@ -1,6 +1,6 @@
-// What stands left of the divider: another model, or the photo of the camera that is looked through.
+// The divider: another model or the current camera's photo on its left.
 
-const KEY_STEP = 0.02; // parts of the width for an arrow key
+const KEY_STEP = 0.02; // fraction of the width per arrow key
 
 class Divider {
   constructor(viewer) {
@@ -18,7 +18,7 @@ class Divider {
       const step = { ArrowLeft: -KEY_STEP, ArrowRight: KEY_STEP }[event.key];
       if (step === undefined) return;
       event.preventDefault();
-      // It would turn the camera.
+      // The key would also turn the camera.
       event.stopPropagation();
       this.move(viewer.divider + step);
     });
@@ -30,7 +30,7 @@ class Divider {
     this.place();
   }
 
-  /** Where the line and the photo are, and what is written beside the line. */
+  /** Updates the positions of the line and the photo, and the labels. */
   place() {
     const { viewer, photo, line } = this;
     const { clientWidth: width, clientHeight: height } = viewer.canvas;
@@ -56,7 +56,7 @@ class Divider {
     line.setAttribute("aria-valuenow", String(Math.round(100 * viewer.divider)));
     const [before, after] = this.labels;
     const isAway = this.wantsPhoto && source === undefined;
-    // Above the buttons, which take more rows on a phone.
+    // Above the buttons, which take several rows on a phone.
     const bottom = `${document.getElementById("panel").offsetHeight + 8}px`;
     for (const id of ["before", "after"]) document.getElementById(id).style.bottom = bottom;
     document.getElementById("before").textContent = isAway ? "go to a photo's camera" : before;

@@ -1,14 +1,13 @@
-// Drags, wheel, touches and keys move the viewpoint.
+// Moves the viewpoint by drags, wheel, touches and keys.
 
 const TURN = 0.005; // radians per pixel of a drag
-const TURN_KEYS = 1.2; // radians per second for arrow keys
-const WHEEL = 0.002; // logarithm of the zoom factor per pixel of the wheel
-const SPEED = 0.8; // of keys, in distances to the pivot per second
+const TURN_KEYS = 1.2; // radians per second of an arrow key
+const WHEEL = 0.002; // logarithm of the zoom factor, per pixel of the wheel
+const SPEED = 0.8; // of keys, distances to the pivot per second
 const FAST = 4; // factor of the speed with Shift
-const LONGEST = 0.1; // seconds that one movement by key covers at most: nothing jumps after a pause
-const LINE = 40; // pixels of a wheel's line
+const MAX_STEP_S = 0.1; // maximum time step of a movement by key, to avoid jumps after a pause
+const LINE = 40; // pixels per line of the wheel
 
-/** Listens on the canvas of a viewer, and moves its viewpoint. */
 class Gestures {
   constructor(viewer) {
     this.viewer = viewer;
@@ -35,7 +34,7 @@ class Gestures {
     try {
       this.viewer.canvas.setPointerCapture(event.pointerId);
     } catch {
-      // A pointer that has gone already.
+      // The pointer is already gone.
     }
     this.pointers.set(event.pointerId, { x, y, pans: event.button !== 0 || event.shiftKey });
   }
@@ -48,7 +47,7 @@ class Gestures {
     const { viewpoint, up, flies } = this.viewer;
     const reach = this.viewer.reach();
     if (others.length > 0) {
-      // Two fingers: each brings half of the shift; their distance zooms.
+      // Two fingers: each contributes half of the shift, and their distance zooms.
       viewpoint.pan(((x - before.x) / 2) * reach, ((y - before.y) / 2) * reach);
       const apart = (at) => Math.hypot(at.x - others[0].x, at.y - others[0].y);
       if (apart(before) > 1 && apart({ x, y }) > 1) this.zoom(apart({ x, y }) / apart(before));
@@ -66,7 +65,7 @@ class Gestures {
   wheel(event) {
     event.preventDefault();
     const unit = event.deltaMode === WheelEvent.DOM_DELTA_PIXEL ? 1 : LINE;
-    // A pinch on a touch pad comes as a wheel with Ctrl and small numbers.
+    // A pinch on a touch pad is a wheel event with Ctrl and small deltas.
     this.zoom(Math.exp(-event.deltaY * unit * WHEEL * (event.ctrlKey ? 5 : 1)));
     this.viewer.moved();
   }
@@ -91,10 +90,10 @@ class Gestures {
     this.isFast = event.shiftKey;
   }
 
-  /** Moves by the keys that are down; whether any is. Called before each frame. */
+  /** Moves by the pressed keys, before each frame. Returns whether a key is pressed. */
   step(now) {
     if (this.down.size === 0) return false;
-    const seconds = Math.min(LONGEST, Math.max(0, (now - this.last) / 1000));
+    const seconds = Math.min(MAX_STEP_S, Math.max(0, (now - this.last) / 1000));
     this.last = now;
     const pair = (less, more) => Number(this.down.has(more)) - Number(this.down.has(less));
     const { viewpoint, up, flies } = this.viewer;

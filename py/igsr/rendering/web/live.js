@@ -1,9 +1,9 @@
-// Follows the server of `igsr view --web`: what there is to show, asked for once a second.
+// Follows the server of `igsr view --web`: requests its state once a second.
 
-const ASK_EVERY = 1000; // milliseconds
-const NARROW = 700; // pixels
+const POLL_MS = 1000;
+const NARROW_PX = 700;
 
-/** Models that the server has. Its addresses are relative to the page's, which has the token. */
+/** Models of the server. Addresses are relative to the page's, which contains the token. */
 class LiveModels {
   constructor() {
     this.subject = "The model";
@@ -30,19 +30,19 @@ async function askServer(path) {
   return answer.json();
 }
 
-/** Shows what the server has, again and again; resolves after the first time. */
+/** Shows the server's state repeatedly; resolves after the first time. */
 async function follow(viewer, models, source, panel) {
   const status = new Status();
   let [surroundings, showing, problem] = ["", "", ""];
-  const bring = async () => {
+  const refresh = async () => {
     problem = "";
     if (!viewer.main && models.mainEntry) say(LOADING);
     try {
       await models.refresh();
     } catch (error) {
-      // A damaged file, or one that has just been replaced: what is shown stays.
+      // The file is damaged or was just replaced: the current models stay.
       problem = error.message;
-      // Where the connection broke, the same is asked for again.
+      // After a broken connection, request the same again.
       if (error.cause instanceof TypeError) showing = "";
     }
   };
@@ -57,7 +57,7 @@ async function follow(viewer, models, source, panel) {
     const wanted = JSON.stringify([models.mainEntry, models.otherEntry]);
     if (wanted !== showing) {
       showing = wanted;
-      await bring();
+      await refresh();
     }
     panel.update();
     if (viewer.main) panel.show();
@@ -65,22 +65,22 @@ async function follow(viewer, models, source, panel) {
   };
   const again = async () => {
     try {
-      // A page that nobody sees need not know.
+      // Hidden pages do not poll.
       if (!document.hidden) await step();
     } catch (error) {
       status.lost(error instanceof TypeError ? "igsr view does not answer; the page asks again." : error.message);
     }
-    setTimeout(again, ASK_EVERY);
+    setTimeout(again, POLL_MS);
   };
   await again();
 }
 
-/** What is said of a run: how far it is, and its scores. */
+/** Progress and scores of a run. */
 class Status {
   constructor() {
     this.box = document.getElementById("status");
-    // There it would hide the scene.
-    this.box.open = window.innerWidth >= NARROW;
+    // On narrow screens it would hide the scene.
+    this.box.open = window.innerWidth >= NARROW_PX;
   }
 
   lost(message) {

@@ -1,10 +1,10 @@
-// Starts the page. `window.igsr` lets a program look on and steer.
+// Starts the page. `window.igsr` is an interface for programs.
 
 const loadingBox = document.getElementById("loading");
 const messageBox = document.getElementById("message");
 const bar = document.getElementById("bar");
 
-/** Shows a message in the middle of the page; an empty one goes. */
+/** Shows a message in the middle of the page; an empty one hides it. */
 function say(message) {
   bar.hidden = message !== LOADING;
   loadingBox.hidden = message === "";
@@ -50,7 +50,7 @@ async function start() {
   say("");
 }
 
-/** What a program may ask and do. */
+/** Fills the interface for programs. */
 function makeHandle(handle, viewer, models) {
   handle.viewer = viewer;
   handle.models = models;
@@ -63,7 +63,7 @@ function makeHandle(handle, viewer, models) {
     showsDepth: viewer.showsDepth,
     blendsFloats: viewer.painter.hasFloats,
   });
-  // The picture of one camera in its own size: RGBA, the lowest row first.
+  // The picture of a camera in its own size: RGBA, bottom row first.
   handle.picture = async (rows, lens) => {
     viewer.fixedSize = [lens[4], lens[5]];
     viewer.look(rows, lens);

@@ -1,8 +1,8 @@
-// Which models are shown: the newest or a chosen one, and beside it another.
+// The models on screen: the newest or a chosen one, and optionally another to compare.
 
 const LOADING = "Loading …";
-// Most models that are kept ready; going back to one of them takes no time.
-const MODELS_KEPT = 4;
+// Maximum number of models to keep on the GPU, for fast switching.
+const MAX_KEPT_MODELS = 4;
 
 /** Models in the page itself. */
 class EmbeddedModels {
@@ -13,25 +13,25 @@ class EmbeddedModels {
     this.newest = this.entries.at(-1)?.id;
   }
 
-  /** What the page says of a model, and its packed bytes. */
+  /** Reads a model's metadata and packed bytes. */
   async read(entry, progress) {
     const text = document.getElementById(`model-${entry.id}`).textContent;
     return { scene: this.scenes[Number(entry.id)], packed: await decodeBase64(text, progress) };
   }
 }
 
-/** Unpacks what a source has read. Throws an Error if it cannot be read. */
+/** Unpacks a model. Throws an Error if it is damaged. */
 async function unpackedModel({ scene, packed }, progress) {
   const bytes = await unpackGzip(packed, PACKED_HEADER, packedSize, progress);
   const model = unpackSplats(bytes);
-  if (model.count !== scene.count) throw new Error("it does not have as many splats as the page says");
+  if (model.count !== scene.count) throw new Error("its number of splats differs from the page's");
   return model;
 }
 
 class Models {
   constructor(viewer, source, progress) {
     Object.assign(this, { viewer, source, progress });
-    // Ids; "" is the newest model, and nothing beside it.
+    // Ids; "" is the newest model, and no comparison.
     this.main = this.other = "";
     if (viewer.page.compares) this.other = source.entries[0].id;
     this.kept = new Map();
@@ -52,13 +52,13 @@ class Models {
     return entry === this.mainEntry ? undefined : entry;
   }
 
-  /** Shows one model, and beside it another. */
+  /** Chooses the main model and the one to compare. */
   choose(main, other) {
     [this.main, this.other] = [main, other];
     return this.refresh();
   }
 
-  /** Brings what is chosen in the version that there is; while it comes, the old one is shown. */
+  /** Loads the current versions of the chosen models; the old ones stay until then. */
   refresh() {
     this.isWanted = true;
     this.running ??= this.run().finally(() => {
@@ -93,7 +93,7 @@ class Models {
         throw new Error(`${this.source.subject} cannot be read: ${error.message.replace(/\.$/, "")}.`, { cause: error });
       }
     }
-    // The last in the map is the one used last.
+    // The map is ordered by last use.
     this.kept.delete(key);
     this.kept.set(key, shown);
     return shown;
@@ -102,7 +102,7 @@ class Models {
   forget(used) {
     const current = new Set(this.source.entries.map(({ id, version }) => `${id} ${version}`));
     for (const [key, shown] of this.kept) {
-      if (used.includes(shown) || (current.has(key) && this.kept.size <= MODELS_KEPT)) continue;
+      if (used.includes(shown) || (current.has(key) && this.kept.size <= MAX_KEPT_MODELS)) continue;
       this.viewer.unload(shown);
       this.kept.delete(key);
     }

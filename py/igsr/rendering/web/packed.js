@@ -1,6 +1,6 @@
-// Splats from the page's packed bytes (scene_model.py), as they go to the GPU: still in 8 bits.
+// Converts the page's packed bytes (scene_model.py) to textures; values stay in 8 bits.
 //
-// The frame is that of a .spz, y up and z back; the painter turns cameras to it.
+// The frame is a .spz's, y up and z back; the painter rotates cameras to it.
 
 const PACKED_HEADER = 20;
 const PACKED_MAGIC = 0x50534749; // "IGSP"
@@ -8,10 +8,10 @@ const SPLAT_TEXEL_WORDS = 8; // two texels of four 32-bit words
 
 const harmonicsOf = (degree) => (degree + 1) * (degree + 1) - 1;
 
-/** What the header says. Throws an Error if it is not one. */
+/** Reads the header. Throws an Error if it is damaged. */
 function readHeader(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, PACKED_HEADER);
-  if (view.getUint32(0, true) !== PACKED_MAGIC) throw new Error("it does not start as igsr writes it");
+  if (view.getUint32(0, true) !== PACKED_MAGIC) throw new Error("it was not written by igsr");
   const version = view.getUint32(4, true);
   if (version !== 1) throw new Error(`it is of version ${version}, not 1`);
   const [count, rows] = [view.getUint32(8, true), view.getUint32(16, true)];
@@ -23,7 +23,7 @@ function readHeader(bytes) {
   return { count, degree, fractionBits, rows, hasPalette, antialiased: (flags & 1) === 1 };
 }
 
-/** Bytes of each array: positions, opacities, colours, scales, rotations, rows' numbers, rows. */
+/** Bytes of each array: positions, opacities, colors, scales, rotations, row numbers, rows. */
 function arraySizes({ count, degree, rows, hasPalette }) {
   const sizes = [12, 1, 3, 3, 4, hasPalette ? 2 : 0].map((each) => each * count);
   return [...sizes, 3 * harmonicsOf(degree) * rows];
@@ -31,7 +31,7 @@ function arraySizes({ count, degree, rows, hasPalette }) {
 
 const packedSize = (bytes) => arraySizes(readHeader(bytes)).reduce((a, b) => a + b, PACKED_HEADER);
 
-/** Positions from planes of zigzag differences: Float32Array, 3 a splat. */
+/** Sums planes of zigzag differences to positions: Float32Array, 3 per splat. */
 function sumDifferences(planes, count, unit) {
   const positions = new Float32Array(3 * count);
   for (let axis = 0; axis < 3; axis++) {
@@ -48,11 +48,11 @@ function sumDifferences(planes, count, unit) {
 }
 
 /**
- * All splats of bytes whose length is `packedSize`.
+ * Unpacks bytes of length `packedSize`.
  *
- * Returns `positions` (Float32Array, 3 a splat), `texels` (Uint32Array, 8 a splat: x, y, z as bits
- * of float32; colour and opacity; log-scales; rotation; row of harmonics; one unused) and
- * `harmonics` (Uint32Array, rows of one word for R, G and B of each coefficient but the first).
+ * Returns `positions` (Float32Array, 3 per splat), `texels` (Uint32Array, 8 per splat: x, y, z as
+ * bits of float32; color and opacity; log-scales; rotation; row of harmonics; unused) and
+ * `harmonics` (Uint32Array, rows with one RGB word per coefficient except the first).
  */
 function unpackSplats(bytes) {
   const header = readHeader(bytes);

@@ -1,10 +1,10 @@
-// Draws models with WebGL 2: a quad for each splat, back to front, into half floats where it can.
+// Draws models with WebGL 2: one quad per splat, back to front, in half floats if available.
 
-// Texels in a row of the data textures; every WebGL 2 has as many.
+// Texels per row of the data textures, supported by every WebGL 2.
 const TEXTURE_WIDTH = 2048;
 
 class Painter {
-  /** `page` has shaders, constants and the background. Throws an Error that says why it cannot draw. */
+  /** `page` has shaders, constants and the background. Throws an Error if WebGL 2 is unavailable. */
   constructor(canvas, page) {
     this.canvas = canvas;
     this.page = page;
@@ -12,7 +12,7 @@ class Painter {
     const gl = canvas.getContext("webgl2", options);
     if (!gl) throw new Error("this browser has no WebGL 2, or it is turned off");
     this.gl = gl;
-    // Without one of these, pictures are blended in 8 bits.
+    // Without these, pictures are blended in 8 bits.
     this.hasFloats = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
     this.programs = new Map();
     const { presentVertex, presentFragment } = page.shaders;
@@ -21,7 +21,7 @@ class Painter {
     this.target = { width: 0, height: 0 };
   }
 
-  /** Brings a model to the GPU. Throws an Error if it has no room there. */
+  /** Uploads a model to the GPU. Throws an Error if it is too large. */
   load(model, scene) {
     const gl = this.gl;
     const head = this.head({ NEAR: scene.near, DEGREE: model.degree });
@@ -46,7 +46,7 @@ class Painter {
     return layer;
   }
 
-  /** Takes a model off the GPU. */
+  /** Removes a model from the GPU. */
   unload(layer) {
     const gl = this.gl;
     gl.deleteTexture(layer.splatTexture);
@@ -67,7 +67,7 @@ class Painter {
     ].join("\n");
   }
 
-  /** A program of two shaders; one that was made before is used again. */
+  /** Compiles and links two shaders, or returns the cached program. */
   program(vertex, fragment) {
     const key = vertex + fragment;
     if (!this.programs.has(key)) this.programs.set(key, this.made(vertex, fragment));
@@ -82,7 +82,7 @@ class Painter {
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
-      // It goes with the program.
+      // It is deleted with the program.
       gl.deleteShader(shader);
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
         throw new Error(`a shader does not compile: ${gl.getShaderInfoLog(shader)}`);
@@ -100,7 +100,7 @@ class Painter {
     return { program, uniforms };
   }
 
-  /** A texture of four words a texel, TEXTURE_WIDTH texels a row. */
+  /** Makes a texture with four words per texel, TEXTURE_WIDTH texels per row. */
   dataTexture(words) {
     const gl = this.gl;
     const rows = Math.max(1, Math.ceil(words.length / (4 * TEXTURE_WIDTH)));
@@ -121,7 +121,7 @@ class Painter {
     return texture;
   }
 
-  /** Takes the indices of the splats to draw, farthest first. */
+  /** Sets the indices of the splats to draw, farthest first. */
   setOrder(layer, order) {
     const gl = this.gl;
     gl.bindBuffer(gl.ARRAY_BUFFER, layer.order);
@@ -129,7 +129,7 @@ class Painter {
     layer.drawn = order.length;
   }
 
-  /** Where splats are blended, as large as the canvas. */
+  /** Resizes the target of the blending to the canvas. */
   resize() {
     const gl = this.gl;
     const { width, height } = this.canvas;
@@ -164,7 +164,7 @@ class Painter {
     gl.clear(gl.COLOR_BUFFER_BIT);
     const { program, uniforms } = layer.splats;
     gl.useProgram(program);
-    // The file's y and z point the other way. Matrices go column by column.
+    // The file's y and z axes are flipped. Matrices are in column order.
     const axes = [view.right, view.down, view.forward];
     gl.uniformMatrix3fv(uniforms.rotation, false, [1, -1, -1].flatMap((sign, k) => axes.map((axis) => sign * axis[k])));
     gl.uniform3fv(uniforms.translation, view.translation);
@@ -222,7 +222,7 @@ class Painter {
     gl.disable(gl.SCISSOR_TEST);
   }
 
-  /** The expected depth at a pixel of the canvas, counted from the top; null where there is nothing. */
+  /** The expected depth at a pixel of the canvas, from the top left; null in empty pixels. */
   depthAt(layer, view, lens, x, y) {
     const gl = this.gl;
     this.blend(layer, view, lens, true);
@@ -233,7 +233,7 @@ class Painter {
     return alpha < 0.1 ? null : (out[0] / out[3]) * this.depthUnit(layer, view);
   }
 
-  /** RGBA of the canvas, the lowest row first. Only right after `draw`. */
+  /** RGBA of the canvas, bottom row first. Only valid directly after `draw`. */
   pixels() {
     const gl = this.gl;
     const out = new Uint8Array(4 * this.target.width * this.target.height);
@@ -248,7 +248,7 @@ function nearestTexels(gl) {
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
 }
 
-/** A number as GLSL writes floats; the degree is compared by the preprocessor and stays whole. */
+/** Formats a GLSL float; the degree stays an integer for the preprocessor. */
 function glslNumber(name, value) {
   return name === "DEGREE" || /[.e]/.test(String(value)) ? String(value) : `${value}.0`;
 }

@@ -14,7 +14,7 @@ class Panel {
       if (number >= 0) viewer.jump(number);
     });
     for (const list of [this.shown, this.beside]) list.addEventListener("change", () => this.choose());
-    // Keys move the camera again, and do not choose another.
+    // Keys move the camera again instead of changing the choice.
     for (const list of [this.cameras, this.shown, this.beside]) list.addEventListener("change", () => list.blur());
     const keys = this.element("keys");
     const actions = {
@@ -54,7 +54,7 @@ class Panel {
     this.update();
   }
 
-  /** Writes the lists anew, where they have changed, and what is chosen in them. */
+  /** Updates the lists, if they have changed, and their choices. */
   update() {
     const { viewer, models, divider } = this;
     const { cameras } = viewer.page;

@@ -1,4 +1,4 @@
-// The blended picture over the background; or depths as grey, near ones light.
+// The blended picture over the background, or depths in gray, near ones light.
 
 uniform sampler2D picture;
 uniform vec3 background;

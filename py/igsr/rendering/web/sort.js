@@ -1,15 +1,15 @@
-// The order that splats are drawn in, farthest first, found in a worker.
+// Sorts splats by depth, farthest first, in a worker.
 
 /**
- * Sorts by depth, in one counting sort on 16 bits. Runs in the worker too, so it uses nothing from
- * outside. `positions` has 3 numbers a splat; depth is `axis`·position + `offset`. Splats nearer
- * than `near` are left out. Returns their indices, a Uint32Array.
+ * Sorts by depth, in one counting sort on 16 bits. Self-contained, since its source also runs in
+ * the worker. `positions` has 3 numbers per splat; depth is `axis`·position + `offset`. Returns the
+ * indices of splats that are not nearer than `near`, a Uint32Array.
  */
 function sortByDepth(positions, axis, offset, near) {
   const count = positions.length / 3;
   const depths = new Float32Array(count);
-  // Positive floats are ordered as their bits are. Bits are nearly logarithms: a far splat does
-  // not make the steps between near ones coarse.
+  // The bits of positive floats have the order of the floats and are nearly logarithmic, so that
+  // far splats do not make the steps between near ones coarse.
   const bits = new Uint32Array(depths.buffer);
   const [ax, ay, az] = axis;
   let least = 0xffffffff;
@@ -33,14 +33,14 @@ function sortByDepth(positions, axis, offset, near) {
   }
   for (let key = 0; key < 0x10000; key++) starts[key + 1] += starts[key];
   const order = new Uint32Array(drawn);
-  // From the last, so that of two at one depth the earlier is drawn over the later.
+  // Backwards, so that at equal depth the earlier splat is drawn over the later one.
   for (let i = count - 1; i >= 0; i--) {
     if (bits[i] !== 0) order[starts[keyOf(i)]++] = i;
   }
   return order;
 }
 
-/** Sorts in a worker, one request at a time; of those that wait, only the newest. */
+/** Sorts in a worker, one request at a time; only the newest waiting request is kept. */
 class Sorter {
   constructor(positions, onOrder) {
     this.onOrder = onOrder;
@@ -74,7 +74,7 @@ class Sorter {
     if (!this.busy) this.start();
   }
 
-  /** Ends the worker; nothing is sorted after this. */
+  /** Terminates the worker. */
   stop() {
     this.worker?.terminate();
     URL.revokeObjectURL(this.address);
@@ -93,7 +93,7 @@ class Sorter {
     else setTimeout(() => this.sortHere(), 0);
   }
 
-  /** Some browsers allow no worker in a file from the disk: sort on the page then. */
+  /** Sorts on the page, since some browsers allow no worker for local files. */
   withoutWorker() {
     this.worker = null;
     if (this.busy) this.sortHere();

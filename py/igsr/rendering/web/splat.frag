@@ -1,4 +1,4 @@
-// One pixel of a splat, premultiplied: blended over what lies behind it.
+// One premultiplied pixel of a splat.
 
 in vec2 whitened;
 flat in vec4 paint;

@@ -1,19 +1,19 @@
-// One corner of one splat's quad: the renderer's "project", on the splat's 8-bit numbers.
+// One corner of a splat's quad: the renderer's "project" for 8-bit parameters.
 
 uniform usampler2D splats;
 uniform usampler2D harmonics;
-uniform mat3 rotation;    // from the file's frame to the camera's axes
+uniform mat3 rotation;    // file's frame to camera axes
 uniform vec3 translation;
 uniform vec4 lens;        // fx, fy, cx, cy in pixels
 uniform vec2 size;        // of the picture, pixels
-uniform vec4 limits;      // lowest and highest x/z, lowest and highest y/z of the Jacobian
+uniform vec4 limits;      // bounds of x/z, then of y/z, for the Jacobian
 uniform bool antialiased;
 uniform bool showsDepth;
-uniform float depthUnit;  // depths are drawn as multiples of this: half floats end at 65504
+uniform float depthUnit;  // depths are divided by this, since half floats end at 65504
 
 in uint index;
-out vec2 whitened;        // offset from the centre in standard deviations
-flat out vec4 paint;      // colour, or depth; opacity
+out vec2 whitened;        // offset from the center, standard deviations
+flat out vec4 paint;      // color or depth; opacity
 
 const float TINY = 0.25 / 255.0;
 
@@ -25,7 +25,7 @@ vec4 bytes(uint word) {
     return vec4(word & 255u, (word >> 8) & 255u, (word >> 16) & 255u, word >> 24);
 }
 
-// Three components in 10 bits each, sign and magnitude; the largest is left out. x, y, z, w.
+// x, y, z, w: three components in 10 bits each, sign and magnitude, without the largest.
 vec4 quaternion(uint word) {
     uint largest = word >> 30;
     vec4 q = vec4(0.0);
@@ -68,7 +68,7 @@ void main() {
     vec3 m0 = (transpose(axes) * ((rows[0] - rows[2] * slope.x) * (lens.x / t.z))) * scales;
     vec3 m1 = (transpose(axes) * ((rows[1] - rows[2] * slope.y) * (lens.y / t.z))) * scales;
     float sxx = dot(m0, m0), sxy = dot(m0, m1), syy = dot(m1, m1);
-    // As sums of positive terms, so that needles keep their digits.
+    // Sums of positive terms, without cancellation for needles.
     vec3 area = cross(m0, m1);
     float sharp = dot(area, area);
     float det = sharp + BLUR * (sxx + syy) + BLUR * BLUR;
@@ -78,7 +78,7 @@ void main() {
     if (antialiased) opacity *= sqrt(sharp / det);
     if (opacity <= ALPHA_MIN) return;
 
-    // The factor (p, q; 0, r) takes pixels to standard deviations; its inverse, corners to pixels.
+    // The factor (p, q; 0, r) converts pixels to standard deviations; its inverse places corners.
     float cyy = syy + BLUR;
     float p = sqrt(cyy / det), q = -sxy / cyy * p, r = inversesqrt(cyy);
     float reach = sqrt(2.0 * log(opacity / ALPHA_MIN));

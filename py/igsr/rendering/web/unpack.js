@@ -1,14 +1,14 @@
-// The embedded file's bytes: base64 text, then gzip, with progress.
+// Decodes base64 and gzip, with progress.
 
-// Multiple of 4: each piece of base64 then stands alone.
+// A multiple of 4, so that each piece of base64 can be decoded separately.
 const PIECE = 1 << 20;
-// Deflate cannot pack more tightly than this.
+// Maximum compression ratio of Deflate.
 const DEFLATE_RATIO_MAX = 1032;
 
-/** Lets the browser draw the loading bar. */
+/** Yields to the browser, to draw the loading bar. */
 const breathe = () => new Promise((resolve) => setTimeout(resolve, 0));
 
-/** Bytes of a base64 text. `progress` gets a part of 1. Throws an Error if it is no base64. */
+/** Decodes base64. `progress` gets numbers up to 1. Throws an Error for other text. */
 async function decodeBase64(text, progress) {
   const clean = text.trim();
   if (clean.length % 4 !== 0) throw new Error("its text ends early");
@@ -31,8 +31,8 @@ async function decodeBase64(text, progress) {
 }
 
 /**
- * Unpacks gzip. `sizeOf` takes the first bytes and says how many there must be in all, so that a
- * damaged file cannot ask for any amount of memory.
+ * Unpacks gzip. `sizeOf` computes the total size from the header, so that a damaged file cannot
+ * allocate arbitrary memory.
  */
 async function unpackGzip(bytes, headerSize, sizeOf, progress) {
   if (typeof DecompressionStream === "undefined") {

@@ -1,8 +1,8 @@
-// What is shown, and when it is drawn: only after something has changed.
+// The models, camera and options on screen; draws only after changes.
 
-// Vertical field of view where no camera says it, radians.
+// Vertical field of view without a camera, radians.
 const FOV = (50 * Math.PI) / 180;
-// Most pixels of the canvas for one of the page: phones have three and more.
+// Maximum canvas pixels per page pixel; phones have three and more.
 const PIXEL_RATIO_MAX = 2;
 
 class Viewer {
@@ -15,13 +15,13 @@ class Viewer {
     this.waiters = [];
     this.onChange = () => {};
     this.painter = new Painter(canvas, page);
-    // What is shown right of the divider, or everywhere; and left of it.
+    // The main model, and the one left of the divider.
     this.main = this.other = null;
     this.divider = 0.5;
     window.addEventListener("resize", () => this.changed());
   }
 
-  /** The page and the model that is shown. */
+  /** The page's and the main model's metadata. */
   get scene() {
     return { ...this.page, ...this.main.scene };
   }
@@ -30,7 +30,7 @@ class Viewer {
     return this.page.up;
   }
 
-  /** Makes a model ready to be shown. */
+  /** Uploads a model and starts its sorter. */
   load(model, scene) {
     const shown = { scene, layer: this.painter.load(model, scene) };
     shown.sorter = new Sorter(model.positions, (order) => {
@@ -45,7 +45,7 @@ class Viewer {
     this.painter.unload(shown.layer);
   }
 
-  /** Shows a model, and left of the divider another, if there is one. The view stays. */
+  /** Shows a model, and optionally another left of the divider. The viewpoint stays. */
   show(main, other = null) {
     const before = this.main;
     [this.main, this.other] = [main, other];
@@ -60,7 +60,7 @@ class Viewer {
     this.gestures ||= new Gestures(this);
   }
 
-  /** Takes other cameras, background and up axis. The view stays, unless nobody has chosen one yet. */
+  /** Changes cameras, background and up axis. The viewpoint stays, once the user has moved it. */
   surround({ cameras, background, up }) {
     const before = this.page.cameras;
     const name = before[this.camera]?.name;
@@ -70,7 +70,7 @@ class Viewer {
     this.changed();
   }
 
-  /** Goes to the camera of a photo, by its number; beyond the last follows the first. */
+  /** Goes to a camera by its number, modulo their count. */
   jump(number) {
     const count = this.page.cameras.length;
     if (count === 0) return;
@@ -79,10 +79,10 @@ class Viewer {
     this.look(rows, lens);
   }
 
-  /** Takes a world-to-camera matrix, 3 rows of 4, and fx, fy, cx, cy, width, height in pixels. */
+  /** Sets the camera: world-to-camera matrix, 3 rows of 4; fx, fy, cx, cy, width, height in pixels. */
   look(rows, [fx, fy, cx, cy, width, height]) {
     const { origin, unit, radius } = this.main.scene;
-    // The model's numbers are relative to an origin, and may be in another unit.
+    // The model's coordinates have their own origin and unit.
     const moved = rows.slice();
     for (let i = 0; i < 3; i++) {
       moved[4 * i + 3] = (rows[4 * i + 3] + dot(rows.slice(4 * i, 4 * i + 3), origin)) * unit;
@@ -92,11 +92,10 @@ class Viewer {
     this.changed();
   }
 
-  /** Shows the whole scene, from a little above. */
+  /** Shows the whole scene from slightly above. */
   frameScene() {
     const { radius } = this.main.scene;
     const [width, height] = this.size();
-    // The narrower side decides.
     const focal = Math.min(width, height) / 2 / Math.tan(FOV / 2);
     this.lens = { fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height };
     this.viewpoint = Viewpoint.framing(radius, this.up, FOV);
@@ -104,7 +103,7 @@ class Viewer {
     this.changed();
   }
 
-  /** The viewpoint was moved by hand. */
+  /** Called after the user has moved the viewpoint. */
   moved() {
     this.wasMoved = true;
     this.camera = -1;
@@ -147,7 +146,7 @@ class Viewer {
 
   drawPart({ layer, sorter, scene }, viewpoint, lens, from, to) {
     const { forward, translation } = viewpoint;
-    // As in the painter: the file's y and z point the other way.
+    // The file's y and z axes are flipped, as in the painter.
     const axis = [forward[0], -forward[1], -forward[2]];
     sorter.request(axis, translation[2], scene.near);
     this.painter.draw(layer, viewpoint, lens, this.showsDepth, from, to);
@@ -157,14 +156,14 @@ class Viewer {
     return [this.main, this.other].every((shown) => !shown || shown.sorter.settled);
   }
 
-  /** World units at the pivot for each pixel of the page. */
+  /** World units at the pivot per pixel of the page. */
   reach() {
     const [width, height] = this.size();
     const scale = height / Math.max(1, this.canvas.clientHeight);
     return (this.viewpoint.distance * scale) / fittedLens(this.lens, width, height).fy;
   }
 
-  /** Orbits about what is seen at a point of the page from now on. */
+  /** Sets the pivot to the surface at a point of the page. */
   focus(clientX, clientY) {
     const [width, height] = this.size();
     const lens = fittedLens(this.lens, width, height);
@@ -191,7 +190,7 @@ class Viewer {
     this.changed();
   }
 
-  /** What a key does. */
+  /** Handles a key. */
   command(key) {
     const commands = {
       "[": () => this.jump(this.camera < 0 ? 0 : this.camera - 1),
@@ -206,7 +205,7 @@ class Viewer {
     if (Object.hasOwn(commands, name)) commands[name]();
   }
 
-  /** Saves what is shown as a PNG. */
+  /** Saves the picture as PNG. */
   save() {
     this.draw();
     this.canvas.toBlob((blob) => {
@@ -219,7 +218,7 @@ class Viewer {
     });
   }
 
-  /** Resolves once splats are sorted for the viewpoint, and drawn. */
+  /** Resolves after splats are sorted for the viewpoint and drawn. */
   settled() {
     this.redraw();
     return new Promise((resolve) => this.waiters.push(resolve));

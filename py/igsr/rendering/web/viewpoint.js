@@ -1,5 +1,5 @@
-// A view of the scene, and how it is moved. Axes of cameras: x right, y down, z forward.
-// The scene's middle is the origin.
+// A viewpoint and its movements. Camera axes: x right, y down, z forward. The origin is the
+// scene's center.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -8,20 +8,20 @@ const plus = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
 const times = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
 const unitVector = (a) => times(a, 1 / (Math.hypot(...a) || 1));
 
-/** `v` turned about a unit axis, right-handed, by radians. */
+/** Rotates `v` around a unit axis, right-handed, by radians. */
 function turned(v, axis, angle) {
   const [c, s] = [Math.cos(angle), Math.sin(angle)];
   return plus(plus(times(v, c), cross(axis, v), s), axis, dot(axis, v) * (1 - c));
 }
 
-/** Any unit vector at a right angle. */
+/** Any perpendicular unit vector. */
 function anyNormal(v) {
   return unitVector(cross(v, Math.abs(v[0]) < 0.5 ? [1, 0, 0] : [0, 1, 0]));
 }
 
-// Smallest angle between the viewing direction and the up axis, radians.
+// Minimum angle between the viewing direction and the up axis, radians.
 const POLE = 0.02;
-// Elevation of the view of a whole scene, radians.
+// Elevation of the view of the whole scene, radians.
 const ELEVATION = Math.PI / 12;
 
 class Viewpoint {
@@ -37,7 +37,7 @@ class Viewpoint {
     return new Viewpoint(position, right, cross(forward, right), forward, Math.hypot(...plus(target, position, -1)));
   }
 
-  /** A view in which a ball about the origin fills the picture, from a little above. `fov`: radians. */
+  /** A view from slightly above in which a ball around the origin fills the picture. `fov`: radians. */
   static framing(radius, up, fov) {
     const usual = Math.abs(up[2]) > 0.9 ? [0, 1, 0] : [0, 0, 1];
     let level = plus(usual, up, -dot(up, usual));
@@ -47,7 +47,7 @@ class Viewpoint {
     return Viewpoint.looking(times(back, distance), [0, 0, 0], up);
   }
 
-  /** Of a world-to-camera matrix, 3 rows of 4; the pivot is ahead, nearest to the origin. */
+  /** From a world-to-camera matrix, 3 rows of 4; the pivot is the point ahead nearest to the origin. */
   static ofCamera(rows, radius) {
     const [right, down, forward] = [0, 1, 2].map((i) => rows.slice(4 * i, 4 * i + 3));
     const axes = [right, down, forward];
@@ -56,7 +56,7 @@ class Viewpoint {
     return new Viewpoint(position, right, down, forward, Math.max(ahead, 0.1 * radius));
   }
 
-  /** The same view in another model's numbers: each is relative to its origin, in its unit. */
+  /** Converts to another model's coordinates, with its origin and unit. */
   between(from, to) {
     const world = plus(times(this.position, 1 / from.unit), from.origin);
     const position = times(plus(world, to.origin, -1), to.unit);
@@ -72,14 +72,14 @@ class Viewpoint {
     return [this.right, this.down, this.forward].map((axis) => -dot(axis, this.position));
   }
 
-  /** Looks around: radians to the right about `up`, and upward; never past the poles. */
+  /** Looks around: radians to the right around `up`, and upward, but not past the poles. */
   turn(yaw, pitch, up) {
     const fromUp = Math.acos(Math.min(1, Math.max(-1, dot(this.forward, up))));
     const lean = Math.min(fromUp - POLE, Math.max(fromUp - (Math.PI - POLE), pitch));
     const right = this.right;
     const move = (v) => turned(turned(v, right, lean), up, -yaw);
     this.forward = unitVector(move(this.forward));
-    // Rounding must not build up over many turns.
+    // Orthonormalized, so that rounding errors do not accumulate.
     this.down = unitVector(cross(this.forward, move(right)));
     this.right = cross(this.down, this.forward);
   }
@@ -90,7 +90,7 @@ class Viewpoint {
     this.position = plus(pivot, this.forward, -this.distance);
   }
 
-  /** Moves so that what lies at the pivot follows the pointer: world units to the right and down. */
+  /** Moves the pivot with the pointer: world units to the right and down. */
   pan(right, down) {
     this.position = plus(plus(this.position, this.right, -right), this.down, -down);
   }
@@ -107,7 +107,7 @@ class Viewpoint {
   }
 }
 
-/** A lens for a picture of another size that still shows all of its own picture. */
+/** Fits a lens to another picture size, so that its whole picture is visible. */
 function fittedLens(lens, width, height) {
   const scale = Math.min(width / lens.width, height / lens.height);
   return {
