@@ -17,8 +17,8 @@ from igsr.fitting.time_estimate import (
     StepTime,
     fit_seconds,
     other_seconds,
-    timed_steps,
     slowdown,
+    timed_steps,
     work_done,
 )
 from igsr.pose.colmap.estimator import camera_seconds

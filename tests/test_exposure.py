@@ -82,7 +82,7 @@ def test_equal_exposures_are_not_optimized():
 
 
 def test_gains_within_their_errors_are_not_optimized():
-    # Each photo is brighter on one side and darker on the other, which no gain explains.
+    # Each photo is brighter on its left or right side, which no gain explains.
     views, points = wall(count=4)
     ramp = np.linspace(-0.5, 0.5, 96)[None, :, None]
     uneven = [
@@ -189,7 +189,7 @@ def fit(capture, **options):
 @pytest.mark.parametrize("alpha", [False, True])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_fit_finds_exposures_and_the_colors_of_the_mean_photo(alpha, seed):
-    # All photos see the same side; few of them would say little about the others.
+    # All photos see the same side, so that they share many points.
     capture = scenes.capture(views=16, size=40, alpha=alpha, arc=1.0)
     exposures = random_exposures(len(capture.train_views), 0.25, 0.0, seed)
     photos = with_exposures(capture, exposures)

@@ -88,7 +88,7 @@ def test_settings_are_checked_before_photos_are_read(tmp_path, igsr_here):
     ran = igsr_here("fit", tmp_path / "nothing", "--out", tmp_path / "out", "--steps", 0)
     assert ran.returncode == 1
     assert ran.stderr == "steps must be from 1 to 10000000, not 0.\n"
-    with pytest.raises(igsr.IgsrError, match="dropout must be a number from 0 to 0.9"):
+    with pytest.raises(igsr.IgsrError, match=r"dropout must be a number from 0 to 0.9"):
         igsr.fit(tmp_path / "nothing", out=tmp_path / "out", dropout=0.95)
     refused = igsr_here("fit", tmp_path, "--out", tmp_path / "out", "--backend", "reference")
     assert refused.returncode == 2

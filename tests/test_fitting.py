@@ -1,4 +1,4 @@
-"""Fits: they learn, repeat, resume with the same bits, and refuse what they cannot use."""
+"""Fits learn, repeat and resume with the same bits, and refuse bad arguments and checkpoints."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def whole(capture):
 
 @pytest.fixture
 def single_steps(monkeypatch):
-    """Fits report each step, so listeners end them where they want."""
+    """Fits report each step, so listeners can end them at any step."""
     monkeypatch.setattr(train, "CHUNK_SECONDS", 0.0)
 
 

@@ -86,7 +86,7 @@ def test_a_fit_starts_from_depths(made):
     assert chosen_start(made) == "depths"
     splats, start = initial_splats(made, 0, 2000, 0)
     assert start == "depths"
-    assert len(splats) == 1000  # as many can be added later
+    assert len(splats) == 1000  # density control adds the rest
     assert off_walls(splats.means + splats.origin).max() < 1e-3
 
 
@@ -120,7 +120,7 @@ def test_masked_transparent_and_uncertain_pixels_have_no_points(made):
 def test_points_of_a_wrong_depth_map_are_left_out(made):
     wrong = with_factors(made, {2: 0.5})
     world, *_ = given_points(wrong.train_views, 4000, np.random.default_rng(0))
-    # All points of three photos; of the fourth, only those that no other photo contradicts.
+    # All points of three photos; of the fourth, only points that no photo contradicts.
     assert np.mean(off_walls(world) > 0.1) < 0.06
     whole, *_ = given_points(made.train_views, 4000, np.random.default_rng(0))
     assert len(whole) == 4000
@@ -237,7 +237,7 @@ def test_depths_without_a_majority_against_them_are_kept(made):
     assert depths_left_out(made) == []
     # Two photos that disagree: either may be right.
     assert depths_left_out(with_factors(made, {2: 2.0, 3: None, 5: None})) == [3, 5]
-    # A common factor is no contradiction.
+    # A common factor contradicts nothing.
     assert depths_left_out(with_factors(made, dict.fromkeys(range(6), 1.5))) == []
     # Photos without depths, and none at all.
     none = without_depths(made)
@@ -246,9 +246,9 @@ def test_depths_without_a_majority_against_them_are_kept(made):
 
 
 def test_hidden_surfaces_are_no_contradiction():
-    # Photos of both sides of a wall: each sees the other's points behind its own surface.
+    # Photos of both sides of a wall: each sees the points of the far side behind its surface.
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
-    behind[2, 3] = 6.0  # the other camera stands 6 units away and looks back
+    behind[2, 3] = 6.0  # 6 units away, looking back
     views = []
     for k, viewmat in enumerate([np.eye(4), np.eye(4), behind, behind]):
         moved = viewmat.copy()

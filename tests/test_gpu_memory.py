@@ -32,7 +32,7 @@ print(resident() - before)
 
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory is read from Linux")
 def test_steps_leak_no_memory():
-    # In a process of its own, since other tests allocate and free memory.
+    # In a new process, since other tests allocate and free memory.
     program = PROGRAM.format(tests=str(Path(__file__).parent))
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

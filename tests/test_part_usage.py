@@ -19,7 +19,7 @@ MIB = 2**20
     not os.access(peak_memory.CLEAR_REFS, os.W_OK), reason="only Linux resets the peak"
 )
 def test_each_part_has_a_peak_of_its_own():
-    # In a process of its own, since memory of other tests may be freed in between.
+    # In a new process, since other tests may free memory in between.
     code = """
 import numpy as np
 from igsr._internal.part_usage import Parts, total

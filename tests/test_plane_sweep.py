@@ -1,4 +1,4 @@
-"""Points by plane sweep are on the surface, and none are made where photos do not show it."""
+"""Points by plane sweep are on the visible surface."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TOLERANCE = 0.3
 
 
 def wall(count=3, is_plain=lambda x: np.zeros(x.shape, dtype=bool), baseline=0.4, seed=0):
-    """Photos side by side of a wall at z = 4 with a random texture, gray where it is plain."""
+    """Photos side by side of a wall at z = 4 with a random texture, with gray parts."""
     texture = np.random.default_rng(seed).integers(0, 256, (40, 200, 3))
     views = []
     for i in range(count):
@@ -40,7 +40,7 @@ def wall(count=3, is_plain=lambda x: np.zeros(x.shape, dtype=bool), baseline=0.4
     return views
 
 
-#: The photos' axes are parallel, so only points show what they look at.
+#: The photos' axes are parallel, so their focus point is unknown without points.
 KNOWN = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)) + np.array([0.0, 0.0, DEPTH])
 
 

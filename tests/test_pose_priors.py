@@ -133,7 +133,7 @@ def test_only_points_that_the_views_see_count():
     wrong.tracks.xy[wrong.tracks.view == 3] += 50.0
     one, two = (pose_priors(VIEWS[:3], p, poses=True, focal="fixed") for p in (points, wrong))
     np.testing.assert_array_equal(one.information, two.information)
-    # Cameras that see at most two points are free; the others are held.
+    # Cameras that see at most two points are free; cameras with more points are held.
     few = (points.tracks.view < 2) | ((points.tracks.view == 2) & (points.tracks.point < 2))
     tracks = points.tracks
     points.tracks = replace(

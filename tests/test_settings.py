@@ -1,4 +1,4 @@
-"""Settings classes: what they check and keep."""
+"""Settings classes check and normalize their values."""
 
 from __future__ import annotations
 
@@ -68,5 +68,7 @@ def test_invalid_settings_are_named(bad, message):
 
 def test_settings_that_are_none_are_not_given():
     assert checked_given(Example, {"steps": np.int64(3), "hull": None}) == {"steps": 3}
-    with pytest.raises(igsr.IgsrError, match="^unknown setting stepz; known settings: steps, seed"):
+    with pytest.raises(
+        igsr.IgsrError, match=r"^unknown setting stepz; known settings: steps, seed"
+    ):
         checked_given(Example, {"stepz": 3})

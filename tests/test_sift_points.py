@@ -154,7 +154,7 @@ def test_only_consistent_tracks_become_points(photos, monkeypatch):
     pixels = np.stack([projected(view.camera, xyz) for view in photos]).clip(0, SIZE - 1)
     # The cameras stand side by side, so epipolar lines run along the rows.
     pixels[1, 1] += (6.0, 0.0)
-    pixels[1, 2] += (0.0, 6.0)  # the other two photos still determine the point
+    pixels[1, 2] += (0.0, 6.0)  # two photos still determine the point
     each = iter(pixels)
     features = np.eye(6, 128, dtype=np.float32)
     monkeypatch.setattr(module, "_features", lambda view: (next(each), features))
@@ -180,7 +180,7 @@ def test_a_start_from_features(photos, found, seed):
     assert len(splats) == SPLATS_PER_FEATURE * len(found[0])
     xyz = splats.means + splats.origin
     np.testing.assert_allclose(xyz[: len(found[0])], found[0], atol=1e-5)
-    # Points between those of a wall are on the wall, and at different places.
+    # Points between two points of a wall are on the wall, and at different places.
     between = xyz[len(found[0]) :]
     assert np.quantile(np.abs(between @ NORMAL), 0.8) < 0.05
     assert len(np.unique(between.round(4), axis=0)) > 0.95 * len(between)

@@ -1,4 +1,4 @@
-"""Transient objects, which one photo shows and the others do not, are found and masked."""
+"""Transient objects, which only one photo shows, are found and masked."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_objects_that_the_scene_lacks_are_not_transient():
     views = photos(scene=joined([WALL, board]))
     for view, without in zip(views, photos(), strict=True):
         assert np.abs(view.image.astype(int) - without.image).max() > 60, "the board is visible"
-    # Only the outermost photos show what the board hides from all others.
+    # Only the outermost photos show the wall behind the board.
     assert masked(find(views)[1:-1]) == []
 
 
