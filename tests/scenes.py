@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from igsr import rasterization
-from igsr.capture import Camera, Capture, View
+from igsr.capture import Camera, Capture, PseudoView, View
 from igsr.fitting import fit_capture
 from igsr.rendering.renders import render
 from igsr.splats import Splats
@@ -107,6 +108,12 @@ def capture(views=8, size=48, alpha=False, scene=None, arc=2.0 * np.pi):
     return Capture(Path("made-up"), result)
 
 
+def pseudo_view(view, **changes):
+    """The view as a pseudo-view, by default with a weight of 1 for each pixel."""
+    weights = np.ones(view.image.shape[:2], np.float32)
+    return PseudoView(**{**vars(view), "weights": weights, **changes})
+
+
 def write_capture(folder, made):
     """A made-up capture as transforms.json and PNG files; returns the folder."""
     import json
@@ -168,6 +175,13 @@ def fit_with_cameras(capture, steps=None, **options):
     """The splats of a fit, and the capture with fitted cameras, exposures and masks."""
     result = fit_capture(capture, steps=steps, **options)
     return result.splats, result.capture
+
+
+def resumed_fit(capture, checkpoint, stop, **options):
+    """The result of a fit that a listener ends at step ``stop`` and that is then resumed."""
+    with pytest.raises(Stop):
+        fit_capture(capture, checkpoint=checkpoint, report=stop_at(stop), **options)
+    return fit_capture(capture, checkpoint=checkpoint, resume=True, **options)
 
 
 class Stop(Exception):

@@ -86,7 +86,7 @@ def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, igsr_h
     assert len(colors) > 50  # five cameras, each of its own colour
     again = igsr_here("pose", photos, "--out", tmp_path / "plain")
     assert "5 of 6 photos registered by colmap" in again.stdout
-    refused(igsr_here("pose", photos, "--out", out), out, "holds something already")
+    refused(igsr_here("pose", photos, "--out", out), out, "is not empty")
     assert len(calls) == 2
 
 
@@ -138,7 +138,7 @@ def test_export(tmp_path, igsr_here, form):
     cameras = [view.camera for view in igsr.load_capture(out).views]
     exact = pose_accuracy(cameras, [view.camera for view in MADE.views])
     assert exact["ATE"] < 1e-9
-    refused(igsr_here("export", given, "--format", form, "--out", out), "holds something already")
+    refused(igsr_here("export", given, "--format", form, "--out", out), "is not empty")
 
 
 def test_fit_finds_cameras_once_and_keeps_them(photos, calls, tmp_path, igsr_here):

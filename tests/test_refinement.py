@@ -11,7 +11,7 @@ from refinements import SEED, contented, lying, refine, same, truthful, unsure
 
 import igsr
 from igsr.fitting import fitter, presets
-from igsr.fitting.photo_support import support_of
+from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import settings_for
 from igsr.refinement import cross_validation, stages
 from igsr.refinement.cross_validation import CrossValidation, combined_error
@@ -110,11 +110,11 @@ def test_folds_are_fitted_as_all_photos_are(ball_photos, monkeypatch):
     """The folds have fewer photos, further apart, but are fitted with the settings for all."""
     photos = ball_photos.train_views
     assert len(photos) == 9
-    monkeypatch.setattr(presets, "WIDE_APART", support_of(photos).apart + 0.1)
-    monkeypatch.setattr(presets, "SH2_PHOTOS", support_of(photos).seen_by)
+    monkeypatch.setattr(presets, "WIDE_APART", photo_statistics(photos).apart + 0.1)
+    monkeypatch.setattr(presets, "SH2_PHOTOS", photo_statistics(photos).seen_by)
     monkeypatch.setattr(presets, "MOST_DROPOUT", 0.9)
-    dropout = settings_for("default", support_of(photos)).dropout
-    assert settings_for("default", support_of(photos[::2])).dropout != dropout
+    dropout = settings_for("default", photo_statistics(photos)).dropout
+    assert settings_for("default", photo_statistics(photos[::2])).dropout != dropout
     settings = []
     real = stages.fit_with_cameras
 

@@ -276,7 +276,7 @@ def test_photos_that_cannot_be_registered_are_named(tmp_path, monkeypatch):
     own.parent.mkdir(parents=True)
     own.write_text("mine")
     for resume in (False, True):
-        with pytest.raises(igsr.IgsrError, match="capture holds something already"):
+        with pytest.raises(igsr.IgsrError, match="capture is not empty"):
             igsr.refine(tmp_path / "photos", 1, **given, resume=resume)
     assert own.read_text() == "mine"
     own.unlink()

@@ -17,7 +17,7 @@ _in_run: ContextVar[bool] = ContextVar("igsr_in_run", default=False)
 
 @contextlib.contextmanager
 def progress_bar(*, shown: bool = True) -> Iterator[Callable[[Event], None]]:
-    """A bar on stderr; yields the function that shows an event.
+    """A bar on stderr, if that is a terminal; yields the function that shows an event.
 
     The bar appears with the first event, so an earlier error is a single line. Events with a
     fraction of the whole run move one bar; other stages have a bar of their own.
@@ -26,13 +26,15 @@ def progress_bar(*, shown: bool = True) -> Iterator[Callable[[Event], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+    console = Console(file=sys.stderr, highlight=False)
     bar = Progress(
         TextColumn("{task.description} {task.fields[counts]}"),
         BarColumn(bar_width=30),
         TextColumn("{task.fields[message]}"),
         TimeRemainingColumn(compact=True),
-        console=Console(file=sys.stderr, highlight=False),
-        disable=not shown,
+        console=console,
+        # Elsewhere, rich would print an empty line in place of the bar.
+        disable=not (shown and (console.is_interactive or console.is_jupyter)),
         transient=True,
     )
     tasks: dict[str, Any] = {}
@@ -42,7 +44,7 @@ def progress_bar(*, shown: bool = True) -> Iterator[Callable[[Event], None]]:
             return
         if event.stage == NOTE:
             if shown:
-                bar.console.print(event.message, markup=False, soft_wrap=True)
+                console.print(event.message, markup=False, soft_wrap=True)
             return
         bar.start()
         key = "whole run" if event.part is not None else event.stage
