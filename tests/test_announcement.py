@@ -10,7 +10,7 @@ import pytest
 import scenes
 from PIL import Image
 
-from igsr.capture.overview import Overview, look_at
+from igsr.capture.load import Overview, look_at
 from igsr.fitting import announcement, settings_for
 from igsr.fitting.time_estimate import (
     TYPICAL,
